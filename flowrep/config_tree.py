@@ -1,0 +1,13 @@
+"""Where the Hydra tree lies: `conf/` beside the package in a checkout, inside it in a wheel."""
+
+from pathlib import Path
+
+_IN_WHEEL = Path(__file__).resolve().parent / "conf"
+_IN_CHECKOUT = Path(__file__).resolve().parent.parent / "conf"
+
+CONF_DIR: Path = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
+
+
+def group_choices(group: str) -> list[str]:
+    """Returns the names that a config group offers, sorted, e.g. `group_choices("scene")`."""
+    return sorted(path.stem for path in (CONF_DIR / group).glob("*.yaml"))
