@@ -1,0 +1,60 @@
+# `make help` lists the targets. Everything happens in .venv at the root of the checkout.
+
+# The newest Python that pybullet has wheels for; override with `make train PYTHON=...`.
+PYTHON ?= $(shell command -v python3.11 || command -v python3.10 || command -v python3)
+# Installed before all that depends on torch, so that pip doesn't pick a build of its own choice.
+TORCH ?= torch==2.13.0
+ARGS ?=
+
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install train evaluate test lint types format bench smoke wheel clean check-python
+
+help:  ## List the targets
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
+
+check-python:
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v in ((3, 10), (3, 11)) else "flowrep needs CPython 3.10 or 3.11, because pybullet has wheels for no other (found %d.%d): try `make PYTHON=python3.11`" % v)'
+
+$(INSTALLED): pyproject.toml | check-python
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	@touch $@
+
+install: $(INSTALLED)  ## Create .venv and install flowrep into it
+
+train: $(INSTALLED)  ## Train and evaluate an agent on Straight Road: make train ARGS="seed=1"
+	$(BIN)/python -m flowrep.train preset=laptop $(ARGS)
+
+evaluate: $(INSTALLED)  ## Evaluate a run: make evaluate ARGS="run=outputs/..."
+	$(BIN)/python -m flowrep.evaluate $(ARGS)
+
+smoke: $(INSTALLED)  ## A whole run in seconds
+	$(BIN)/python -m flowrep.train debug=smoke $(ARGS)
+
+test: $(INSTALLED)  ## Run the tests
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(INSTALLED)  ## Check style and formatting
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(INSTALLED)  ## Check types
+	$(BIN)/mypy
+
+format: $(INSTALLED)  ## Mend style and formatting
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(INSTALLED)  ## Run the benchmarks, one after the other
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[bench]"
+	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+wheel: $(INSTALLED)  ## Build the wheel into dist/
+	$(BIN)/python -m build --wheel
+
+clean:  ## Remove .venv, builds and caches; never outputs/
+	rm -rf .venv dist build .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,44 @@
+"""Stopping a run so that nothing is lost: Ctrl-C and SIGTERM ask, the loop answers."""
+
+import signal
+from types import FrameType
+from typing import Any
+
+
+class StopRequest:
+    """Turns SIGINT and SIGTERM into a question that the loop asks between two steps.
+
+    The first signal sets `received`; a second one ends the process at once, as it would have
+    without this. Use it as a context manager: the previous handlers come back at its end.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        """Prepares; handlers are installed on entering."""
+        self.received: signal.Signals | None = None
+        self._previous: dict[signal.Signals, Any] = {}
+
+    @property
+    def exit_code(self) -> int:
+        """The exit code that shells expect of a process ended by the received signal."""
+        return 0 if self.received is None else 128 + self.received
+
+    def __bool__(self) -> bool:
+        """Says whether a stop was asked for."""
+        return self.received is not None
+
+    def __enter__(self) -> "StopRequest":
+        """Installs the handlers."""
+        self._previous = {number: signal.signal(number, self._receive) for number in self.SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Gives the handlers back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        self.received = signal.Signals(number)
+        for each, handler in self._previous.items():
+            signal.signal(each, handler)

@@ -1,0 +1,131 @@
+"""A run's folder: resolved config, metrics as CSV and TensorBoard, checkpoint, evaluation."""
+
+import csv
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from torchrl.record.loggers import TensorboardLogger
+
+EVALUATION_COLUMNS = (
+    "scene",
+    "representations",
+    "seed",
+    "frames",
+    "policy",
+    "speed",
+    "fps",
+    "episode_seed",
+    "outcome",
+    "return",
+    "length",
+)
+
+
+class RunFolder:
+    """The files of one run, by name.
+
+    ```
+    config.yaml              the resolved config, enough to resume or evaluate
+    metrics.csv              a row for each logged step; tensorboard/ holds the same
+    checkpoint/              what a resumed run continues from
+    evaluation.csv           a row for each evaluated episode
+    videos/                  what the agent saw and did
+    ```
+
+    Raises:
+        FileNotFoundError: from `config` and `existing`, when the folder holds no run.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Creates the folder where it is missing."""
+        self.path = Path(path)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._tensorboard: Any = None
+
+    @classmethod
+    def existing(cls, path: str | Path) -> "RunFolder":
+        """Opens a folder that holds a run, and creates none."""
+        if not (Path(path) / "config.yaml").is_file():
+            raise FileNotFoundError(
+                f"'{path}' holds no run: it has no config.yaml. Give the folder that a training "
+                "printed as its run folder, e.g. outputs/2026-01-31/12-00-00_straight_road_ego+obj_s0"
+            )
+        return cls(path)
+
+    @property
+    def checkpoint_path(self) -> Path:
+        """The file that holds the last complete state of the run."""
+        return self.path / "checkpoint" / "latest.safetensors"
+
+    @property
+    def evaluation_path(self) -> Path:
+        """The table of evaluated episodes."""
+        return self.path / "evaluation.csv"
+
+    @property
+    def metrics_path(self) -> Path:
+        """The table of logged training steps."""
+        return self.path / "metrics.csv"
+
+    def video_path(self, name: str) -> Path:
+        """The file for a video of that name."""
+        (self.path / "videos").mkdir(exist_ok=True)
+        return self.path / "videos" / f"{name}.mp4"
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Writes the resolved config."""
+        text = yaml.safe_dump(dict(config), sort_keys=False)
+        (self.path / "config.yaml").write_text(text, encoding="utf-8")
+
+    def read_config(self) -> dict[str, Any]:
+        """Returns the resolved config that the run was started with."""
+        return yaml.safe_load((self.path / "config.yaml").read_text(encoding="utf-8"))
+
+    def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
+        """Appends one row to metrics.csv and the same values to TensorBoard."""
+        append_rows(self.metrics_path, [{"frames": frames, **metrics}])
+        if self._tensorboard is None:
+            self._tensorboard = TensorboardLogger("tensorboard", str(self.path))
+        for name, value in metrics.items():
+            self._tensorboard.log_scalar(name, value, frames)
+
+    def forget_after(self, frames: int) -> None:
+        """Drops what was logged after `frames`: a resumed run writes those rows again."""
+        for path in (self.metrics_path, self.evaluation_path):
+            if path.is_file():
+                with path.open(newline="", encoding="utf-8") as file:
+                    rows = [row for row in csv.DictReader(file) if int(row["frames"]) <= frames]
+                shortened = path.with_suffix(".tmp")
+                shortened.unlink(missing_ok=True)
+                append_rows(shortened, rows)
+                shortened.replace(path) if rows else path.unlink()
+
+    def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Appends evaluated episodes to evaluation.csv."""
+        append_rows(self.evaluation_path, rows, EVALUATION_COLUMNS)
+
+
+def append_rows(
+    path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
+) -> None:
+    """Appends rows to a CSV table, writing its header first where the file is new.
+
+    Raises:
+        ValueError: a row's columns are not those of the table.
+    """
+    rows = list(rows)
+    if not rows:
+        return
+    is_new = not path.is_file() or path.stat().st_size == 0
+    if is_new:
+        names = list(columns or rows[0])
+    else:
+        with path.open(newline="", encoding="utf-8") as file:
+            names = next(csv.reader(file))
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names)
+        if is_new:
+            writer.writeheader()
+        writer.writerows(rows)

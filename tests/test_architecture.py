@@ -1,0 +1,82 @@
+"""Imports point one way: train, evaluate → experiment → envs → transforms → geometry → torch."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import flowrep
+
+PACKAGE = Path(flowrep.__file__).parent
+
+FLOWREP_IMPORTS_ALLOWED = {
+    "geometry": {"geometry"},
+    "transforms": {"transforms", "geometry"},
+    "agent": {"agent"},
+    "envs": {"envs", "transforms", "geometry", "config_tree"},
+    "viz": {"viz"},
+    "experiment": {"experiment", "envs", "agent", "transforms", "geometry", "viz"},
+}
+THIRD_PARTY_ONLY_IN = {
+    "pybullet": {"envs/simulator.py"},
+    "hydra": {"train.py", "evaluate.py", "command_line.py"},
+}
+PACKAGES_LIMITED_TO = {
+    "geometry": {"torch"},
+    "transforms": {"torch", "tensordict", "torchrl"},
+    "agent": {"torch", "tensordict", "torchrl", "safetensors", "numpy"},
+}
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Full dotted names of every module that a file imports, wherever in the file."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import; write the full name"
+            names.add(node.module)
+    return names
+
+
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_point_one_way(path):
+    place = path.relative_to(PACKAGE)
+    part = place.parts[0].removesuffix(".py")
+    imported = imported_modules(path)
+    inside = {name.split(".")[1] for name in imported if name.startswith("flowrep.")}
+    outside = {name.split(".")[0] for name in imported} - {"flowrep"} - sys.stdlib_module_names
+    if part in FLOWREP_IMPORTS_ALLOWED:
+        assert inside <= FLOWREP_IMPORTS_ALLOWED[part]
+    if part in PACKAGES_LIMITED_TO:
+        assert outside <= PACKAGES_LIMITED_TO[part]
+    for package, places in THIRD_PARTY_ONLY_IN.items():
+        assert package not in outside or str(place) in places
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_modules_have_a_noun_for_a_name_and_one_reason_to_exist(path):
+    assert path.stem not in {"utils", "common", "helpers", "misc"}
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 300
+
+
+def test_the_transforms_bring_torch_tensordict_and_torchrl_alone():
+    """What torchrl itself imports is its own business; flowrep adds nothing to it."""
+    code = (
+        "import sys, torch, tensordict, torchrl, torchrl.envs; before = set(sys.modules)\n"
+        "import flowrep.transforms\n"
+        "added = {name.split('.')[0] for name in set(sys.modules) - before}\n"
+        "unwanted = {'pybullet', 'hydra', 'omegaconf', 'matplotlib', 'cv2', 'shapely', 'imageio',"
+        " 'gymnasium', 'yaml', 'safetensors'}\n"
+        "print(sorted((added & unwanted) | ({'pybullet', 'hydra', 'matplotlib', 'cv2', 'shapely'}"
+        " & set(sys.modules))))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "[]"
