@@ -1,0 +1,63 @@
+"""Shape and dtype checks of geometry's arguments: static, so they cost nothing once compiled."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def check_shape(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> None:
+    """Returns nothing; complains unless `tensor` ends in `trailing` and holds floats.
+
+    Args:
+        name: the argument's name, for the message.
+        tensor: the argument.
+        trailing: sizes of the last dims; a string stands for any size and names it.
+
+    Raises:
+        ValueError: another number or size of trailing dims.
+        TypeError: integers, or not a tensor.
+    """
+    check_is_tensor(name, tensor)
+    if not tensor.is_floating_point():
+        raise TypeError(
+            f"{name} must be floating point (metres, pixels), got {tensor.dtype}; "
+            "convert it first, e.g. millimetres with `depth.float() / 1000`"
+        )
+    check_trailing(name, tensor, trailing)
+
+
+def check_is_tensor(name: str, tensor: object) -> None:
+    """Returns nothing; complains unless `tensor` is a torch tensor."""
+    if not isinstance(tensor, Tensor):
+        raise TypeError(
+            f"{name} must be a torch.Tensor, got {type(tensor).__name__}; "
+            "wrap it with torch.as_tensor"
+        )
+
+
+def check_trailing(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> None:
+    """Returns nothing; complains unless the last dims of `tensor` are `trailing`."""
+    wanted_dims = len(trailing)
+    fits = tensor.ndim >= wanted_dims and all(
+        isinstance(want, str) or got == want
+        for got, want in zip(tensor.shape[tensor.ndim - wanted_dims :], trailing)
+    )
+    if not fits:
+        wanted = ", ".join(["*B", *(str(size) for size in trailing)])
+        raise ValueError(f"{name} must be [{wanted}], got {list(tensor.shape)}")
+
+
+def broadcast_batch(**batches: torch.Size) -> torch.Size:
+    """Returns the common leading batch of several arguments.
+
+    Raises:
+        ValueError: they do not broadcast; the message lists each argument's batch.
+    """
+    try:
+        return torch.broadcast_shapes(*batches.values())
+    except RuntimeError as error:
+        listing = ", ".join(f"{name} {list(batch)}" for name, batch in batches.items())
+        raise ValueError(
+            f"leading batch dims do not broadcast: {listing}; give each the same batch, or none"
+        ) from error
