@@ -1,0 +1,24 @@
+"""TorchRL transforms that turn sensor maps into mid-level representations."""
+
+from flowrep.transforms.depth import Depth
+from flowrep.transforms.flow import FlowFactorize, RawFlow
+from flowrep.transforms.frame_stack import FrameStack
+from flowrep.transforms.rgb import Rgb
+from flowrep.transforms.segmentation import Segmentation
+from flowrep.transforms.stack import (
+    REPRESENTATIONS,
+    representation_options,
+    representation_stack,
+)
+
+__all__ = [
+    "REPRESENTATIONS",
+    "Depth",
+    "FlowFactorize",
+    "FrameStack",
+    "RawFlow",
+    "Rgb",
+    "Segmentation",
+    "representation_options",
+    "representation_stack",
+]

@@ -1,0 +1,156 @@
+"""One pure `compute` behind the four entries that TorchRL calls on a transform."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, TypeAlias
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs.transforms import Transform
+
+# One key (a string, or a tuple of strings where it is nested) or a list of keys, as TorchRL has it.
+Keys: TypeAlias = NestedKey | list[NestedKey]
+
+
+class MissingKey(KeyError):
+    """A key that a representation needs and the env does not offer."""
+
+    def __str__(self) -> str:
+        """Returns the sentence as it was written: KeyError would print its repr."""
+        return str(self.args[0])
+
+
+class Reads(NamedTuple):
+    """What a transform expects under one input key, whatever the leading batch.
+
+    `shape` holds the trailing sizes: numbers are fixed, letters only have to agree between inputs.
+    """
+
+    shape: tuple[int | str, ...]
+    kind: Literal["float", "integer", "any"] = "any"
+
+    def __str__(self) -> str:
+        """Returns the layout as the documentation writes it, e.g. `float [*B, 1, H, W]`."""
+        sizes = ", ".join(str(size) for size in self.shape)
+        return f"{'' if self.kind == 'any' else self.kind + ' '}[*B, {sizes}]"
+
+
+DEPTH = Reads((1, "H", "W"), "float")
+IDS = Reads((1, "H", "W"), "integer")
+FLOW = Reads((2, "H", "W"), "float")
+RGB = Reads((3, "H", "W"), "integer")
+MAP = Reads(("C", "H", "W"))
+MOTION = Reads((4, 4), "float")
+MOTIONS = Reads(("N", 4, 4), "float")
+
+
+class MapTransform(Transform):
+    """Reads tensors under `in_keys`, writes what `compute` makes of them under `out_keys`.
+
+    A subclass states what it reads (`reads`, one entry an input key), the pure function `compute`
+    and the specs of what it writes (`output_specs`). It keeps no state between calls, so it gives
+    the same answer in an env, at a reset and on shuffled samples of a replay buffer.
+
+    Args:
+        reads: the expected layout of each input, in the order of `in_keys`.
+        in_keys: keys that are read.
+        out_keys: keys that are written.
+    """
+
+    def __init__(self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys) -> None:
+        super().__init__(in_keys=in_keys, out_keys=out_keys)
+        if len(self.in_keys) != len(reads):
+            raise ValueError(
+                f"{type(self).__name__} reads {len(reads)} keys "
+                f"({', '.join(map(str, reads))}), in_keys has {len(self.in_keys)}: {self.in_keys}"
+            )
+        self.reads = tuple(reads)
+        self.label = " and ".join(repr(key) for key in self.out_keys)
+
+    def _check_layout(self, maps: Sequence[Tensor | TensorSpec]) -> None:
+        sizes: dict[str, int] = {}
+        batch = None
+        for key, reads, value in zip(self.in_keys, self.reads, maps):
+            shape, rank = tuple(value.shape), len(reads.shape)
+            ok = len(shape) >= rank and _is_kind(value.dtype, reads.kind)
+            for want, size in zip(reads.shape, shape[-rank:]):
+                ok = ok and size == (
+                    want if isinstance(want, int) else sizes.setdefault(want, size)
+                )
+            batch = shape[:-rank] if batch is None else batch
+            if not ok or shape[:-rank] != batch:
+                agreed = ", ".join(f"{name} = {size}" for name, size in sizes.items())
+                raise ValueError(
+                    f"representation {self.label}: key {key!r} should be {reads}"
+                    f"{f' with *B = {list(batch)}' if batch else ''}"
+                    f"{f', {agreed}' if agreed else ''}; got {value.dtype} {list(shape)}"
+                )
+
+    def _missing(self, key: NestedKey, offered: TensorDictBase | Composite) -> MissingKey:
+        keys = sorted(offered.keys(True, True), key=str)
+        return MissingKey(
+            f"representation {self.label} needs key {key!r}; "
+            f"the env offers {keys}. Name another one with in_keys=, or let the env emit it."
+        )
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        maps = []
+        for key in self.in_keys:
+            value = next_tensordict.get(key, None)
+            if value is None:
+                if self.missing_tolerance:
+                    return next_tensordict
+                raise self._missing(key, next_tensordict)
+            maps.append(value)
+        self._check_layout(maps)
+        for key, value in zip(self.out_keys, self.compute(*maps)):
+            next_tensordict.set(key, value)
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    @dispatch(source="in_keys", dest="out_keys")
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the outputs of a batch of any shape, at its root and under `"next"`.
+
+        `"next"` is left alone where it holds none of the inputs (a buffer that stores only the
+        reward there, for instance).
+        """
+        tensordict = self._call(tensordict)
+        following = tensordict.get("next", None)
+        if following is not None and any(key in following.keys(True) for key in self.in_keys):
+            tensordict.set("next", self._call(following))
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Returns the specs with those of the outputs added."""
+        offered = observation_spec.keys(True, True)
+        for key in self.in_keys:
+            if key not in offered:
+                raise self._missing(key, observation_spec)
+        specs = [observation_spec[key] for key in self.in_keys]
+        self._check_layout(specs)
+        observation_spec = observation_spec.clone()
+        for key, spec in zip(self.out_keys, self.output_specs(*specs)):
+            observation_spec[key] = spec
+        return observation_spec
+
+    def __repr__(self) -> str:
+        """Returns the keys that are read and written."""
+        return f"{type(self).__name__}({self.in_keys} -> {self.out_keys})"
+
+
+def _is_kind(dtype: torch.dtype, kind: str) -> bool:
+    if kind == "float":
+        return dtype.is_floating_point
+    if kind == "integer":
+        return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
+    return True

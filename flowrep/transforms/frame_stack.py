@@ -1,0 +1,181 @@
+"""The last k frames of a map, exact across resets, in batched envs and in a replay buffer."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, expand_as_right
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+
+from flowrep.transforms.base import Keys, MapTransform, MissingKey, Reads
+
+
+class FrameStack(MapTransform):
+    """The last `k` frames on the channel dimension, oldest first.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | a map `[*B, C, H, W]` | its stack | same type, `[*B, k·C, H, W]` | the map's | the map's |
+
+    After a reset all k frames are the episode's first. The stack of the step before is read from
+    the TensorDict that goes into `step`, where the env declares it as part of its state, as
+    TorchRL's `StepCounter` does: nothing is remembered between calls, so stacks can't bleed from
+    one episode or one env into another.
+
+    In a replay buffer the stored root stack and the next frame give the next stack exactly,
+    shuffled or not. A batch without a stored stack has to be a trajectory, with a dimension named
+    "time" and `("next", "done")`; its first frame counts as an episode's first.
+
+    Args:
+        k: number of frames, at least 1.
+        in_keys: maps to stack.
+        out_keys: where each stack goes; may not be its map's key.
+
+    Raises:
+        ValueError: for k < 1 or an output key that is also read.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> frames = torch.arange(3.0).reshape(3, 1, 1, 1)
+        >>> done = torch.tensor([[False], [True], [False]])  # the third frame starts anew
+        >>> td = TensorDict({"depth": frames, "next": {"depth": frames + 1, "done": done}}, [3])
+        >>> td.names = ["time"]
+        >>> FrameStack(k=2, in_keys=["depth"], out_keys=["depth2"])(td)["depth2"].flatten(1)
+        tensor([[0., 0.],
+                [0., 1.],
+                [2., 2.]])
+    """
+
+    def __init__(self, *, k: int = 2, in_keys: Keys, out_keys: Keys) -> None:
+        maps = len(in_keys) if isinstance(in_keys, list) else 1
+        reads = [Reads((f"C{i}", f"H{i}", f"W{i}")) for i in range(maps)]
+        super().__init__(reads, in_keys, out_keys)
+        if k < 1:
+            raise ValueError(f"k is the number of frames, at least 1; got {k}")
+        if len(self.out_keys) != len(self.in_keys) or set(self.in_keys) & set(self.out_keys):
+            raise ValueError(
+                f"FrameStack needs an output key of its own for each input key; "
+                f"got {self.in_keys} -> {self.out_keys}"
+            )
+        self.k = int(k)
+
+    def compute(self, *frames: Tensor) -> tuple[Tensor, ...]:
+        """Returns the stacks at an episode's first frames: k times the frame."""
+        return tuple(torch.cat([frame] * self.k, -3) for frame in frames)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for frame_key, stack_key in zip(self.in_keys, self.out_keys):
+            frame, stack = next_tensordict.get(frame_key, None), tensordict.get(stack_key, None)
+            if frame is None:
+                raise self._missing(frame_key, next_tensordict)
+            if stack is None:
+                raise MissingKey(
+                    f"representation {stack_key!r} needs the stack of the step before: give step "
+                    f"the TensorDict of reset or step_mdp, which holds {stack_key!r}"
+                )
+            next_tensordict.set(stack_key, push_frame(stack, frame))
+        return next_tensordict
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        """Starts the stacks anew in the envs that have just reset themselves."""
+        reset = tensordict.get("_reset")
+        for stack_key in self.out_keys:
+            stack = tensordict_reset.get(stack_key)
+            newest = stack.chunk(self.k, -3)[-1]
+            first = torch.cat([newest] * self.k, -3)
+            mask = expand_as_right(reset.reshape(tensordict.batch_size), stack)
+            tensordict_reset.set(stack_key, torch.where(mask, first, stack))
+        return tensordict_reset
+
+    @dispatch(source="in_keys", dest="out_keys")
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the stacks of a replay batch, at its root and under `"next"`."""
+        following = tensordict.get("next", None)
+        for frame_key, stack_key in zip(self.in_keys, self.out_keys):
+            stack = tensordict.get(stack_key, None)
+            if stack is None:
+                stack = self._stack_from_trajectory(tensordict, frame_key, stack_key)
+                tensordict.set(stack_key, stack)
+            frame = None if following is None else following.get(frame_key, None)
+            if frame is not None:
+                tensordict.set(_under_next(stack_key), push_frame(stack, frame))
+        return tensordict
+
+    def _stack_from_trajectory(
+        self, tensordict: TensorDictBase, frame_key: NestedKey, stack_key: NestedKey
+    ) -> Tensor:
+        frames, done = tensordict.get(frame_key, None), tensordict.get(("next", "done"), None)
+        if frames is None:
+            raise self._missing(frame_key, tensordict)
+        if done is None or "time" not in tensordict.names:
+            raise MissingKey(
+                f"representation {stack_key!r} is not in the batch, and its frames can't be told "
+                f"apart: store {stack_key!r}, or give a trajectory with ('next', 'done') and a "
+                f"dimension named 'time' (td.refine_names(..., 'time')); names are "
+                f"{tensordict.names}"
+            )
+        done = done.flatten(tensordict.ndim).any(-1) if done.ndim > tensordict.ndim else done
+        return stack_trajectory(frames, done, self.k, tensordict.names.index("time"))
+
+    def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
+        """Returns each map's spec with k times the channels."""
+        return tuple(_stacked(spec, self.k) for spec in specs)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Returns the specs of what `step` reads, with the stacks of the step before added."""
+        input_spec = super().transform_input_spec(input_spec)
+        if self.parent is None:
+            return input_spec
+        observation_spec = self.transform_observation_spec(self.parent.observation_spec)
+        for stack_key in self.out_keys:
+            input_spec["full_state_spec"][stack_key] = observation_spec[stack_key]
+        return input_spec
+
+
+def push_frame(stack: Tensor, frame: Tensor) -> Tensor:
+    """Returns the stack `[*B, k·C, H, W]` one frame `[*B, C, H, W]` later."""
+    return torch.cat([stack[..., frame.shape[-3] :, :, :], frame], -3)
+
+
+def stack_trajectory(frames: Tensor, done: Tensor, k: int, time_dim: int) -> Tensor:
+    """Returns the stack at every step of a trajectory, as the env made it step by step.
+
+    Args:
+        frames: `[*B, C, H, W]`, with time at `time_dim` of the batch.
+        done: `[*B]`, whether the episode ended with the step that follows the frame.
+        k: number of frames.
+        time_dim: position of time in the batch.
+    """
+    frames, done = frames.movedim(time_dim, 0), done.movedim(time_dim, 0)
+    step = torch.arange(len(frames), device=frames.device)
+    step = expand_as_right(step, done)  # [T, *B]
+    begins = torch.cat([torch.ones_like(done[:1]), done[:-1]])
+    first = torch.where(begins, step, 0).cummax(0).values  # where each step's episode begins
+    ages = range(k - 1, -1, -1)  # oldest first
+    picked = [torch.maximum(step - age, first) for age in ages]
+    stack = torch.cat([frames.gather(0, expand_as_right(i, frames)) for i in picked], -3)
+    return stack.movedim(0, time_dim)
+
+
+def _under_next(key: NestedKey) -> tuple[str, ...]:
+    return ("next", key) if isinstance(key, str) else ("next", *key)
+
+
+def _stacked(spec: TensorSpec, k: int) -> TensorSpec:
+    *batch, channels, height, width = spec.shape
+    shape = torch.Size([*batch, k * channels, height, width])
+    if isinstance(spec, Categorical):
+        return Categorical(spec.n, shape=shape, device=spec.device, dtype=spec.dtype)
+    if isinstance(spec, Bounded):
+        low, high = (torch.cat([side] * k, -3) for side in (spec.space.low, spec.space.high))
+        return Bounded(low, high, shape=shape, device=spec.device, dtype=spec.dtype)
+    if isinstance(spec, Unbounded):
+        return Unbounded(shape, device=spec.device, dtype=spec.dtype)
+    raise TypeError(
+        f"FrameStack stacks maps with a Categorical, Bounded or Unbounded spec, got {spec}"
+    )

@@ -1,0 +1,77 @@
+"""Semantic classes as ids or as one map a class."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, TensorSpec
+
+from flowrep.transforms.base import IDS, Keys, MapTransform
+
+ENCODINGS = ("ids", "onehot")
+
+
+class Segmentation(MapTransform):
+    """Class of every pixel: the paper's semantic segmentation.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "semantic")` | `"seg"`, ids | uint8 `[*B, 1, H, W]` | 0 … n − 1 | class |
+    | | `"seg"`, onehot | float32 `[*B, n, H, W]` | 0 or 1 | |
+
+    Ids are an eighth of a one-hot float map of two classes in a replay buffer. Their spec is a
+    `Categorical` that knows n, which is all that a network needs to expand them. An id outside
+    0 … n − 1 is a pixel of no class: all zeros in the one-hot encoding.
+
+    Args:
+        num_classes: number n of classes, 1 to 256.
+        encoding: `"ids"` or `"onehot"`.
+        in_keys: where the ids lie.
+        out_keys: where the representation goes.
+
+    Raises:
+        ValueError: for an unknown encoding or a number of classes that uint8 can't hold.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> sensor = {"semantic": torch.tensor([[[0, 2, 1]]], dtype=torch.uint8)}
+        >>> td = TensorDict({"sensor": sensor})
+        >>> Segmentation(num_classes=3, encoding="onehot")(td)["seg"][:, 0]
+        tensor([[1., 0., 0.],
+                [0., 0., 1.],
+                [0., 1., 0.]])
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        *,
+        encoding: str = "ids",
+        in_keys: Keys = ("sensor", "semantic"),
+        out_keys: Keys = "seg",
+    ) -> None:
+        super().__init__([IDS], in_keys, out_keys)
+        if encoding not in ENCODINGS:
+            raise ValueError(f"encoding is one of {list(ENCODINGS)}, got {encoding!r}")
+        if not 1 <= num_classes <= 256:
+            raise ValueError(f"num_classes is 1 to 256 (ids are uint8), got {num_classes}")
+        self.num_classes = int(num_classes)
+        self.encoding = encoding
+
+    def compute(self, ids: Tensor) -> tuple[Tensor]:
+        """Returns the classes, encoded as asked for."""
+        if self.encoding == "ids":
+            return (ids.to(torch.uint8),)
+        classes = torch.arange(self.num_classes, device=ids.device)[:, None, None]
+        return ((ids == classes).float(),)  # [*B, n, H, W]
+
+    def output_specs(self, ids: TensorSpec) -> tuple[TensorSpec]:
+        """Returns a categorical spec for ids, a bounded one for one-hot maps."""
+        if self.encoding == "ids":
+            spec = Categorical(
+                self.num_classes, shape=ids.shape, device=ids.device, dtype=torch.uint8
+            )
+            return (spec,)
+        shape = (*ids.shape[:-3], self.num_classes, *ids.shape[-2:])
+        return (Bounded(0.0, 1.0, shape=shape, device=ids.device, dtype=torch.float32),)

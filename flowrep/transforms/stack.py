@@ -1,0 +1,185 @@
+"""A list of representations' names to the transforms that write them, each thing computed once."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
+
+from flowrep.transforms.depth import Depth
+from flowrep.transforms.flow import FlowFactorize, Intrinsics, RawFlow
+from flowrep.transforms.frame_stack import FrameStack
+from flowrep.transforms.rgb import Rgb
+from flowrep.transforms.segmentation import Segmentation
+
+# What makes each representation, in the order of computation.
+_MADE_BY: dict[str, tuple[type[Transform], ...]] = {
+    "rgb": (Rgb,),
+    "seg": (Segmentation,),
+    "depth": (Depth,),
+    "raw": (RawFlow,),
+    "ego": (FlowFactorize,),
+    "obj": (FlowFactorize,),
+    "seg2": (FrameStack, Segmentation),
+    "depth2": (FrameStack, Depth),
+}
+_STACK_OF = {"seg2": "seg", "depth2": "depth"}
+_FLOWS = ("raw", "ego", "obj")
+
+REPRESENTATIONS: tuple[str, ...] = tuple(_MADE_BY)
+
+# Parameters that say how transforms are wired up, which representation_stack decides.
+_WIRING = {
+    "self", "in_keys", "out_keys", "outputs", "invalid", "intrinsics", "num_classes", "dt_s"
+}  # fmt: skip
+
+_UNSCALED = "_raw"  # raw flow in px/step, nan where unknown: what FlowFactorize reads
+
+
+def representation_options(name: str) -> dict[str, Any]:
+    """Returns a representation's options with their defaults, e.g. `range_m` of depth.
+
+    Example:
+        >>> representation_options("depth2")
+        {'k': 2, 'range_m': 100.0, 'missing': 0.0}
+    """
+    return {
+        parameter.name: parameter.default
+        for made_by in _MADE_BY[name]
+        for parameter in inspect.signature(made_by).parameters.values()
+        if parameter.name not in _WIRING
+    }
+
+
+def representation_stack(
+    representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None],
+    *,
+    intrinsics: Intrinsics | None = None,
+    num_classes: int | None = None,
+    dt_s: float | None = None,
+) -> Compose:
+    """Returns the transforms that write the representations at the root of the TensorDict.
+
+    What several of them need is computed once: `["ego", "obj"]` factorises once, `["seg", "seg2"]`
+    encodes once. What is computed on the way and wasn't asked for is dropped again.
+
+    Args:
+        representations: names, or a mapping from name to options (`representation_options`); a
+            name is one of `REPRESENTATIONS`, its key in the TensorDict is the same.
+        intrinsics: K `[3, 3]` of the sensor maps in pixels; raw, ego and obj need it.
+        num_classes: number of semantic classes; seg and seg2 need it.
+        dt_s: seconds a step lasts; flow in `px_per_s` needs it.
+
+    Raises:
+        ValueError: for an unknown or repeated name, an unknown option, or a missing argument.
+
+    Example:
+        >>> K = [[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]]
+        >>> representation_stack(["ego"], intrinsics=K)
+        Compose(
+            FlowFactorize([('sensor', 'depth'), ('sensor', 'prev_from_curr')] -> ['ego']))
+    """
+    chosen = _with_options(representations)
+    if num_classes is None and ("seg" in chosen or "seg2" in chosen):
+        raise ValueError("representations seg and seg2 need num_classes=")
+    if intrinsics is None and any(name in chosen for name in _FLOWS):
+        raise ValueError(f"representations {', '.join(_FLOWS)} need intrinsics=, the camera's K")
+    makers = _frame_makers(chosen, num_classes)
+    if intrinsics is not None:
+        makers += _flow_makers({n: chosen[n] for n in _FLOWS if n in chosen}, intrinsics, dt_s)
+    written = [key for maker in makers for key in maker.out_keys]
+    hidden = [key for key in written if key not in chosen]
+    return Compose(*makers, *([DropKeys(*hidden)] if hidden else []))
+
+
+class DropKeys(ExcludeTransform):
+    """Drops keys that served other transforms, at the root and under `"next"`."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns a batch without the keys."""
+        return tensordict.exclude(
+            *self.excluded_keys, *(("next", key) for key in self.excluded_keys)
+        )
+
+
+def _with_options(
+    representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None],
+) -> dict[str, dict[str, Any]]:
+    if isinstance(representations, str):
+        raise ValueError(f"representations is a list of names, e.g. [{representations!r}]")
+    names = list(representations)
+    for name in names:
+        if name not in _MADE_BY:
+            raise ValueError(_unknown("representation", name, REPRESENTATIONS))
+        if names.count(name) > 1:
+            raise ValueError(f"representation {name!r} is named {names.count(name)} times")
+    given = representations if isinstance(representations, Mapping) else {}
+    chosen = {}
+    for name in names:
+        options = representation_options(name)
+        for option, value in dict(given.get(name) or {}).items():
+            if option not in options:
+                raise ValueError(_unknown(f"option of representation {name!r}:", option, options))
+            options[option] = value
+        chosen[name] = options
+    if not chosen:
+        raise ValueError(f"no representation is named; there are {list(REPRESENTATIONS)}")
+    return chosen
+
+
+def _unknown(what: str, name: str, known: Sequence[str] | Mapping[str, Any]) -> str:
+    close = difflib.get_close_matches(str(name), list(known), n=1)
+    hint = f", did you mean {close[0]!r}?" if close else ""
+    return f"unknown {what} {name!r}{hint} There are {list(known)}"
+
+
+def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) -> list[Transform]:
+    """Returns the transforms of all representations but flow."""
+    makers: list[Transform] = []
+    stacks: list[Transform] = []
+    context = {"seg": {"num_classes": num_classes}}
+    for name, options in chosen.items():
+        if name in _STACK_OF:
+            frame = _STACK_OF[name]
+            stack_options = {"k": options["k"]}
+            options = {key: value for key, value in options.items() if key != "k"}
+            shared = frame in chosen and chosen[frame] == options
+            key = frame if shared else f"_{frame}"
+            stacks.append(FrameStack(in_keys=[key], out_keys=[name], **stack_options))
+            if shared:
+                continue
+        elif name in _FLOWS:
+            continue
+        else:
+            frame, key = name, name
+        makers.append(_MADE_BY[frame][0](**context.get(frame, {}), **options, out_keys=[key]))
+    return makers + stacks
+
+
+def _flow_makers(
+    flows: dict[str, dict[str, Any]], intrinsics: Intrinsics, dt_s: float | None
+) -> list[Transform]:
+    """Returns one RawFlow, if raw flow is needed, and one FlowFactorize, if a factor is."""
+    if "obj" not in flows:
+        makers: list[Transform] = []
+        if "raw" in flows:
+            makers.append(RawFlow(intrinsics, dt_s=dt_s, **flows["raw"]))
+        if "ego" in flows:
+            makers.append(FlowFactorize(intrinsics, outputs=["ego"], dt_s=dt_s, **flows["ego"]))
+        return makers
+    raw = RawFlow(intrinsics, invalid=math.nan, out_keys=[_UNSCALED])
+    raw.label = "'obj'"
+    factors = FlowFactorize(
+        intrinsics,
+        outputs=list(flows),
+        scale={name: options["scale"] for name, options in flows.items()},
+        unit={name: options["unit"] for name, options in flows.items()},
+        dt_s=dt_s,
+        in_keys=[_UNSCALED, ("sensor", "depth"), ("sensor", "prev_from_curr")],
+    )
+    return [raw, factors]
