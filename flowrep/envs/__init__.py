@@ -1,0 +1,25 @@
+"""Streets with pedestrians in PyBullet: gymnasium environments and `make_env` for TorchRL."""
+
+import gymnasium
+
+from flowrep.envs.loading import load_scene, scene_names
+from flowrep.envs.outcome import Outcome
+from flowrep.envs.scene import Scene
+from flowrep.envs.schema import SceneError
+from flowrep.envs.simulator import Simulator as Simulator  # says at once where pybullet is missing
+from flowrep.envs.street_env import StreetEnv
+
+gymnasium.register(
+    "flowrep/StraightRoad-v0",
+    entry_point="flowrep.envs.street_env:StreetEnv",
+    kwargs={"scene": "straight_road"},
+)
+
+__all__ = [
+    "Outcome",
+    "Scene",
+    "SceneError",
+    "StreetEnv",
+    "load_scene",
+    "scene_names",
+]

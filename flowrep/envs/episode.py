@@ -1,0 +1,122 @@
+"""One drive through a scene: where everything is and how the drive stands, without any picture.
+
+All of an episode is a function of the scene, the speed range, the frame rate, the episode's seed
+and the actions.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from flowrep.envs.layout import Layout
+from flowrep.envs.outcome import Outcome
+from flowrep.envs.pedestrians import Crowd, draw_crowd
+from flowrep.envs.scene import Path, Range
+from flowrep.envs.street import Street
+from flowrep.envs.vehicle import VehicleState, footprint_corners, roll, turn
+
+Array = NDArray[np.float64]
+# Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't pass anyone by.
+_CHECKS_HZ = 24.0
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where the vehicle and the pedestrians' clock stand; ticks count the footprint's checks."""
+
+    vehicle: VehicleState
+    ticks: int
+
+
+class Rules:
+    """What does not change between the episodes of a scene: its plan, its clock, its limits."""
+
+    def __init__(self, layout: Layout, frame_rate_hz: float) -> None:
+        """Prepares the tests for a layout at a frame rate."""
+        self.layout = layout
+        self.dt_s = 1.0 / frame_rate_hz
+        self.ticks_a_step = math.ceil(_CHECKS_HZ / frame_rate_hz - 1e-9)
+        self.tick_s = self.dt_s / self.ticks_a_step
+        self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
+        vehicle = layout.scene.vehicle
+        reach = math.hypot(vehicle.length_m, vehicle.width_m) / 2
+        self._surely_inside = layout.drivable.buffer(-reach)
+        shapely.prepare(self._surely_inside)
+
+    def is_out_of_bounds(self, state: VehicleState) -> bool:
+        """Returns whether any part of the footprint is off the road."""
+        if shapely.contains_xy(self._surely_inside, state.x_m, state.y_m):
+            return False
+        corners = footprint_corners(state, self.layout.scene.vehicle)
+        return not self.layout.drivable.covers(Polygon(corners))
+
+
+class Episode:
+    """The state of one drive."""
+
+    def __init__(
+        self,
+        rules: Rules,
+        episode_seed: int,
+        speed_mps: Range,
+        *,
+        path: str | None = None,
+        vehicle_speed_mps: float | None = None,
+    ) -> None:
+        """Draws the path and the pedestrians from the episode's seed, and stands at the start."""
+        scene = rules.layout.scene
+        rng = np.random.default_rng(episode_seed)
+        drawn = scene.paths[int(rng.integers(len(scene.paths)))]
+        self.rules = rules
+        self.seed = episode_seed
+        self.path = drawn if path is None else _path_named(scene.paths, path)
+        self.crowd: Crowd = draw_crowd(rules.layout, scene.pedestrian_groups, speed_mps, rng)
+        self.vehicle_speed_mps = (
+            scene.vehicle.speed_mps if vehicle_speed_mps is None else vehicle_speed_mps
+        )
+        self.goal = rules.layout.zones[self.path.end]
+        self.now = Moment(rules.layout.start_state(self.path.start), 0)
+        self.before = self.now
+        self.steps = 0
+        self.outcome = Outcome.RUNNING
+        self.hit = ""
+
+    def pedestrian_poses(self, moment: Moment) -> Array:
+        """Returns where everyone is at a moment, planar poses [P, 3]."""
+        return self.crowd.poses(moment.ticks * self.rules.tick_s)
+
+    def step(self, action: int, street: Street) -> None:
+        """Drives one step; it ends early where the episode does."""
+        rules = self.rules
+        state = turn(self.now.vehicle, action, rules.dt_s, rules.layout.scene.vehicle)
+        self.before, moment = self.now, replace(self.now, vehicle=state)
+        for _ in range(rules.ticks_a_step):
+            state = roll(moment.vehicle, rules.tick_s, self.vehicle_speed_mps)
+            moment = Moment(state, moment.ticks + 1)
+            self._judge(moment, street)
+            if self.outcome:
+                break
+        self.now = moment
+        self.steps += 1
+        if not self.outcome and self.steps >= rules.limit_steps:
+            self.outcome = Outcome.TIMEOUT
+
+    def _judge(self, moment: Moment, street: Street) -> None:
+        self.hit = street.hit(moment.vehicle, self.pedestrian_poses(moment))
+        if self.hit:
+            self.outcome = Outcome.COLLISION
+        elif self.rules.is_out_of_bounds(moment.vehicle):
+            self.outcome = Outcome.OUT_OF_BOUNDS
+        elif shapely.contains_xy(self.goal, moment.vehicle.x_m, moment.vehicle.y_m):
+            self.outcome = Outcome.SUCCESS
+
+
+def _path_named(paths: tuple[Path, ...], name: str) -> Path:
+    for path in paths:
+        if path.name == name:
+            return path
+    raise ValueError(f"unknown path {name!r}; the scene has {[path.name for path in paths]}")

@@ -1,0 +1,85 @@
+"""One small picture that colours every mesh: a row of plain paints, then house fronts."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIZE_PX = 256
+_SWATCH_PX = 16
+_FRONT_PX = (60, 64)  # height, width of one house front in the picture
+_FLOORS = (2, 3, 4, 5)
+
+PAINTS: dict[str, tuple[int, int, int]] = {
+    "asphalt": (84, 84, 90),
+    "lane_mark": (226, 222, 206),
+    "paving": (178, 168, 156),
+    "skin": (224, 176, 144),
+    "trousers": (44, 52, 84),
+    "shirt_red": (196, 52, 52),
+    "shirt_green": (58, 140, 84),
+    "shirt_yellow": (222, 178, 60),
+    "shirt_blue": (60, 104, 190),
+    "roof": (92, 66, 58),
+    "grass": (110, 150, 74),
+    "leaf": (48, 112, 56),
+    "wood": (128, 92, 60),
+    "metal": (90, 94, 100),
+    "car_body": (52, 84, 168),
+    "glass": (60, 76, 92),
+}
+SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
+_WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))
+NUM_FRONTS = len(_WALLS) * len(_FLOORS)
+
+# (u0, v0, u1, v1): a rectangle of the picture, v downwards.
+Patch = tuple[float, float, float, float]
+
+
+def swatch(name: str) -> Patch:
+    """Returns the middle of a plain paint, as a patch without extent."""
+    u = (list(PAINTS).index(name) + 0.5) * _SWATCH_PX / SIZE_PX
+    v = 0.5 * _SWATCH_PX / SIZE_PX
+    return (u, v, u, v)
+
+
+def wall(variant: int) -> Patch:
+    """Returns a plain piece of a house front's wall, without extent."""
+    u0, v0, _, _ = front(variant)
+    return (u0 + 1.5 / SIZE_PX, v0 + 1.5 / SIZE_PX) * 2
+
+
+def front(variant: int) -> Patch:
+    """Returns the patch of house front number `variant` (taken modulo their number)."""
+    row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
+    top = _SWATCH_PX + row * _FRONT_PX[0]
+    left = column * _FRONT_PX[1]
+    pixels = np.array([left + 0.5, top + 0.5, left + _FRONT_PX[1] - 0.5, top + _FRONT_PX[0] - 0.5])
+    u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
+    return (u0, v0, u1, v1)
+
+
+def picture() -> NDArray[np.uint8]:
+    """Returns the picture [SIZE_PX, SIZE_PX, 3]."""
+    image = np.zeros((SIZE_PX, SIZE_PX, 3), dtype=np.uint8)
+    for i, rgb in enumerate(PAINTS.values()):
+        image[:_SWATCH_PX, i * _SWATCH_PX : (i + 1) * _SWATCH_PX] = rgb
+    height, width = _FRONT_PX
+    for row, floors in enumerate(_FLOORS):
+        for column, rgb in enumerate(_WALLS):
+            top, left = _SWATCH_PX + row * height, column * width
+            image[top : top + height, left : left + width] = _house_front(floors, rgb)
+    return image
+
+
+def _house_front(floors: int, rgb: tuple[int, int, int]) -> NDArray[np.uint8]:
+    height, width = _FRONT_PX
+    image = np.full((height, width, 3), rgb, dtype=np.uint8)
+    storey, bay = height // floors, width // 4
+    for floor in range(floors):
+        top = floor * storey + storey // 4
+        image[floor * storey] = np.array(rgb) * 0.8
+        for column in range(4):
+            left = column * bay + bay // 4
+            image[top : top + storey // 2, left : left + bay // 2] = PAINTS["glass"]
+    # A door in the second bay of the ground floor, down to the street.
+    image[height - storey * 2 // 3 :, bay + bay // 4 : 2 * bay - bay // 4] = PAINTS["wood"]
+    return image

@@ -1,0 +1,97 @@
+"""People who walk back and forth on their lines: where each stands is a function of time alone."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.envs.layout import Layout
+from flowrep.envs.scene import PedestrianGroup, Range
+
+Array = NDArray[np.float64]
+_TURN_S = 0.6  # about-turn at either end of a walk
+
+
+class Crowd:
+    """All people of one episode."""
+
+    def __init__(self, lines: list[Array], speeds_mps: Array, phases: Array) -> None:
+        """Sets out the crowd.
+
+        Args:
+            lines: the walk of each person, points [M, 2].
+            speeds_mps: speed of each [P]; 0 for one who stands.
+            phases: where each is at time 0 [P]: a share of the way there and back, in [0, 1).
+        """
+        most = max((len(line) for line in lines), default=2)
+        # Short lines end in copies of their last point, which have no length.
+        padded = [np.concatenate([line, np.repeat(line[-1:], most - len(line), 0)]) for line in lines]
+        self._points = np.array(padded).reshape(len(lines), most, 2)  # [P, M, 2]
+        steps = np.diff(self._points, axis=1)
+        lengths = np.hypot(steps[..., 0], steps[..., 1])
+        self._marks = np.concatenate([np.zeros((len(lines), 1)), lengths.cumsum(axis=1)], axis=1)
+        self._headings = np.arctan2(steps[..., 1], steps[..., 0])
+        self._speeds = np.asarray(speeds_mps, dtype=np.float64)
+        self._length = self._marks[:, -1]
+        self._start = np.asarray(phases, dtype=np.float64) * 2 * self._length
+        self._people = np.arange(len(lines))
+        last = most - 1 - (lengths[:, ::-1] > 0).argmax(axis=1) if len(lines) else np.zeros(0)
+        self._last_step = last.astype(np.int64) - 1
+
+    def __len__(self) -> int:
+        """How many people there are."""
+        return len(self._people)
+
+    def poses(self, time_s: float) -> Array:
+        """Returns where everyone is, planar poses [P, 3], at a time since the episode's start."""
+        if not len(self):
+            return np.zeros((0, 3))
+        # There and back: a triangle wave over twice the line's length.
+        along = (self._start + self._speeds * time_s) % (2 * self._length)
+        back = along > self._length
+        at = np.where(back, 2 * self._length - along, along)
+        step = (at[:, None] >= self._marks[:, 1:-1]).sum(axis=1)
+        step = np.minimum(step, self._last_step)
+        heading = self._headings[self._people, step]
+        past = at - self._marks[self._people, step]
+        poses = np.empty((len(self), 3))
+        poses[:, :2] = self._points[self._people, step]
+        poses[:, 0] += past * np.cos(heading)
+        poses[:, 1] += past * np.sin(heading)
+        poses[:, 2] = heading + self._facing(along)
+        return poses
+
+    def _facing(self, along: Array) -> Array:
+        # 0 on the way there, π on the way back, turned evenly over _TURN_S around either end.
+        half_m = np.maximum(0.5 * _TURN_S * self._speeds, 1e-9)
+        full = 2 * self._length
+        to_far_end = along - self._length
+        to_near_end = np.where(along > self._length, along - full, along)
+        turned_far = np.clip(0.5 + 0.5 * to_far_end / half_m, 0.0, 1.0)
+        turned_near = np.clip(0.5 + 0.5 * to_near_end / half_m, 0.0, 1.0)
+        is_near_far_end = np.abs(to_far_end) <= np.abs(to_near_end)
+        return math.pi * np.where(is_near_far_end, turned_far, 1.0 + turned_near)
+
+
+def draw_crowd(
+    layout: Layout, groups: tuple[PedestrianGroup, ...], speed_mps: Range, rng: np.random.Generator
+) -> Crowd:
+    """Returns a crowd with phases, directions, speeds and places drawn for one episode."""
+    lines: list[Array] = []
+    speeds: list[float] = []
+    phases: list[float] = []
+    for group in groups:
+        low, high = speed_mps if group.speed_mps is None else group.speed_mps
+        draws = 1 if group.draw == "group" else group.count
+        # A uniform phase over the way there and back draws the direction too.
+        phase = np.resize(rng.uniform(0.0, 1.0, draws), group.count)
+        speed = np.resize(rng.uniform(low, high, draws), group.count)
+        lateral = rng.uniform(-0.5, 0.5, group.count) * group.spread_m
+        ahead = rng.uniform(-0.5, 0.5, group.count) * group.spread_m
+        for i in range(group.count):
+            line = layout.walk_line(group.walk, float(lateral[i]))
+            there_and_back = 2 * np.hypot(*np.diff(line, axis=0).T).sum()
+            lines.append(line)
+            speeds.append(0.0 if i < group.standing else float(speed[i]))
+            phases.append(float((phase[i] + ahead[i] / there_and_back) % 1.0))
+    return Crowd(lines, np.array(speeds), np.array(phases))

@@ -1,0 +1,153 @@
+"""What a scene is: frozen data whose field names are the YAML's keys."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from flowrep.envs.camera import CameraConfig
+from flowrep.envs.vehicle import VehicleConfig
+
+SpeedMode = Literal["low", "normal", "high"]
+Point = tuple[float, float]
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One stretch of centreline: straight, or an arc (positive degrees turn left)."""
+
+    straight_m: float | None = None
+    arc_radius_m: float | None = None
+    arc_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Road:
+    """A drivable ribbon along a centreline, with a sidewalk on either side."""
+
+    name: str
+    start_m: Point
+    heading_deg: float
+    width_m: float
+    sidewalk_m: float
+    pieces: tuple[Piece, ...]
+
+
+@dataclass(frozen=True)
+class Zone:
+    """The whole width of a road between two distances from its start.
+
+    A vehicle that starts here stands in its middle, along the road, or against it if `reverse`.
+    """
+
+    name: str
+    road: str
+    from_m: float
+    to_m: float
+    reverse: bool = False
+
+
+@dataclass(frozen=True)
+class Path:
+    """One task: from a start zone along `via` roads to an ending zone, with exits closed."""
+
+    name: str
+    start: str
+    end: str
+    via: tuple[str, ...] = ()
+    closures: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A building across a road, there in the episodes whose path names it."""
+
+    name: str
+    road: str
+    at_m: float
+    depth_m: float
+    height_m: float
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Where a group walks back and forth: across a road, along it, or through given points."""
+
+    kind: Literal["across", "along", "points"]
+    road: str | None = None
+    at_m: float | None = None
+    from_m: float | None = None
+    to_m: float | None = None
+    offset_m: float = 0.0
+    points_m: tuple[Point, ...] = ()
+
+
+@dataclass(frozen=True)
+class PedestrianGroup:
+    """People on one walk; `standing` of them never move.
+
+    `draw` says whether speed, phase and direction are drawn once for the group or for each person.
+    """
+
+    name: str
+    count: int
+    spread_m: float
+    walk: Walk
+    standing: int = 0
+    draw: Literal["group", "pedestrian"] = "group"
+    speed_mps: Range | None = None
+
+
+@dataclass(frozen=True)
+class BuildingRow:
+    """House fronts along one side of a road, or one house across its start or end."""
+
+    road: str
+    side: Literal["left", "right", "start", "end"]
+    from_m: float
+    to_m: float
+    setback_m: float
+    front_m: Range
+    depth_m: Range
+    height_m: Range
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A box that stands still: what it is, where, which way it faces, (length, width, height)."""
+
+    category: str
+    center_m: Point
+    yaw_deg: float
+    size_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A whole environment as data; `load_scene` reads and checks one."""
+
+    name: str
+    frame_rate_hz: float
+    time_limit_steps: int
+    categories: tuple[str, ...]
+    layout_seed: int
+    camera: CameraConfig
+    vehicle: VehicleConfig
+    roads: tuple[Road, ...]
+    zones: tuple[Zone, ...]
+    paths: tuple[Path, ...]
+    pedestrian_speed_mps: Mapping[SpeedMode, Range]
+    pedestrian_groups: tuple[PedestrianGroup, ...] = ()
+    building_rows: tuple[BuildingRow, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
+    closures: tuple[Closure, ...] = field(default=())
+
+    @property
+    def time_limit_s(self) -> float:
+        """The time limit in seconds, whatever the frame rate."""
+        return self.time_limit_steps / self.frame_rate_hz
+
+    @property
+    def num_pedestrians(self) -> int:
+        """How many people the scene holds: the largest instance id."""
+        return sum(group.count for group in self.pedestrian_groups)

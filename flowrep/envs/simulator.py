@@ -1,0 +1,220 @@
+"""PyBullet, and the only file that knows of it: bodies, collisions, pictures.
+
+One DIRECT client a simulator, given back by `close()` or when the simulator is collected.
+"""
+
+import math
+import os
+import tempfile
+import weakref
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.envs.meshes import Mesh
+from flowrep.envs.palette import CATEGORY_ID
+
+try:
+    import pybullet
+except ImportError as error:
+    raise ImportError(
+        "flowrep.envs needs pybullet, which has wheels for CPython 3.10 and 3.11 only: "
+        "use such a Python and run: pip install 'flowrep[sim]'"
+    ) from error
+
+_LIGHT = {
+    "lightDirection": [-4.0, 3.0, 9.0],
+    "lightColor": [1.0, 1.0, 1.0],
+    "lightAmbientCoeff": 0.62,
+    "lightDiffuseCoeff": 0.46,
+    "lightSpecularCoeff": 0.0,
+    "shadow": 0,
+    "renderer": pybullet.ER_TINY_RENDERER,
+}
+_HIDDEN_Z_M = -1000.0
+
+
+class Picture(NamedTuple):
+    """What one look of the camera gives, all [H, W] but `rgba` [H, W, 4]."""
+
+    rgba: NDArray[np.uint8]
+    zbuffer: NDArray[np.float32]
+    body: NDArray[np.int32]  # -1 where there is none
+
+
+class Simulator:
+    """A world of bodies that stand where they are put; nothing falls, nothing is integrated."""
+
+    def __init__(self, texture_rgb: NDArray[np.uint8]) -> None:
+        """Connects, and loads the picture [S, S, 3] that colours every mesh."""
+        self._client = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            raise RuntimeError("PyBullet gave no client: close some environments first")
+        self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
+        self._texture = self._load_texture(texture_rgb)
+        self._class_of_body: list[int] = []
+        self._instance_of_body: list[int] = []
+        self._vehicle = -1
+        self._vehicle_half_height_m = 0.0
+
+    def close(self) -> None:
+        """Gives the client back; a second call does nothing."""
+        self._finalizer()
+
+    def add_body(
+        self,
+        mesh: Mesh,
+        category: str,
+        *,
+        instance: int = 0,
+        cylinder_m: tuple[float, float] | None = None,
+        boxes_m: tuple[tuple[float, float, float, float, float, float], ...] = (),
+    ) -> int:
+        """Returns the number of a new body at the origin.
+
+        Args:
+            mesh: what is seen.
+            category: its class in the semantic map.
+            instance: its id in the instance map; 0 for the static world.
+            cylinder_m: (radius, height) of a collision cylinder that stands on the ground.
+            boxes_m: collision boxes (x, y, yaw, length, width, height) that stand on the ground.
+        """
+        visual = pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=mesh.vertices,
+            indices=mesh.indices,
+            normals=mesh.normals,
+            uvs=mesh.uvs,
+            rgbaColor=[1.0, 1.0, 1.0, 1.0],
+            physicsClientId=self._client,
+        )
+        collision = self._collision_shape(cylinder_m, boxes_m)
+        body = pybullet.createMultiBody(
+            0.0, collision, visual, [0.0, 0.0, 0.0], physicsClientId=self._client
+        )
+        pybullet.changeVisualShape(
+            body, -1, textureUniqueId=self._texture, physicsClientId=self._client
+        )
+        self._register(body, category, instance)
+        return body
+
+    def add_vehicle(self, length_m: float, width_m: float, height_m: float) -> None:
+        """Adds the vehicle: a box that collides and that no camera sees."""
+        half = [length_m / 2, width_m / 2, height_m / 2]
+        collision = pybullet.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._client
+        )
+        # PyBullet draws the collision shape of a body without a visual one: give it a point.
+        point = pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=[[0.0, 0.0, 0.0]] * 3,
+            indices=[0, 1, 2],
+            physicsClientId=self._client,
+        )
+        self._vehicle = pybullet.createMultiBody(
+            1.0, collision, point, [0.0, 0.0, 0.0], physicsClientId=self._client
+        )
+        self._vehicle_half_height_m = height_m / 2
+        self._register(self._vehicle, "sky", 0)
+
+    def class_lookup(self) -> NDArray[np.uint8]:
+        """Returns class ids by body number; the last entry, which index -1 reads, is the sky."""
+        return np.array([*self._class_of_body, CATEGORY_ID["sky"]], dtype=np.uint8)
+
+    def instance_lookup(self) -> NDArray[np.uint8]:
+        """Returns instance ids by body number; the last entry, which index -1 reads, is 0."""
+        return np.array([*self._instance_of_body, 0], dtype=np.uint8)
+
+    def place(self, body: int, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Puts a body on the ground at a planar pose."""
+        half = 0.5 * yaw_rad
+        pybullet.resetBasePositionAndOrientation(
+            body,
+            (x_m, y_m, 0.0),
+            (0.0, 0.0, math.sin(half), math.cos(half)),
+            physicsClientId=self._client,
+        )
+
+    def hide(self, body: int) -> None:
+        """Puts a body where neither the camera nor the vehicle meets it."""
+        pybullet.resetBasePositionAndOrientation(
+            body, (0.0, 0.0, _HIDDEN_Z_M), (0.0, 0.0, 0.0, 1.0), physicsClientId=self._client
+        )
+
+    def place_vehicle(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Puts the vehicle's footprint at a planar pose."""
+        half = 0.5 * yaw_rad
+        pybullet.resetBasePositionAndOrientation(
+            self._vehicle,
+            (x_m, y_m, self._vehicle_half_height_m),
+            (0.0, 0.0, math.sin(half), math.cos(half)),
+            physicsClientId=self._client,
+        )
+
+    def vehicle_touches(self, body: int) -> bool:
+        """Returns whether the vehicle and a body overlap where they now stand."""
+        return bool(
+            pybullet.getClosestPoints(self._vehicle, body, 0.0, physicsClientId=self._client)
+        )
+
+    def look(
+        self, view: list[float], projection: list[float], height_px: int, width_px: int
+    ) -> Picture:
+        """Returns the picture of the software renderer, without shadows."""
+        _, _, rgba, zbuffer, body = pybullet.getCameraImage(
+            width_px, height_px, view, projection, physicsClientId=self._client, **_LIGHT
+        )
+        shape = (height_px, width_px)
+        return Picture(
+            np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4),
+            np.asarray(zbuffer, dtype=np.float32).reshape(shape),
+            np.asarray(body, dtype=np.int32).reshape(shape),
+        )
+
+    def _collision_shape(
+        self,
+        cylinder_m: tuple[float, float] | None,
+        boxes_m: tuple[tuple[float, float, float, float, float, float], ...],
+    ) -> int:
+        if cylinder_m is not None:
+            radius, height = cylinder_m
+            return pybullet.createCollisionShape(
+                pybullet.GEOM_CYLINDER,
+                radius=radius,
+                height=height,
+                collisionFramePosition=[0.0, 0.0, height / 2],
+                physicsClientId=self._client,
+            )
+        if not boxes_m:
+            return -1
+        return pybullet.createCollisionShapeArray(
+            shapeTypes=[pybullet.GEOM_BOX] * len(boxes_m),
+            halfExtents=[[box[3] / 2, box[4] / 2, box[5] / 2] for box in boxes_m],
+            collisionFramePositions=[[box[0], box[1], box[5] / 2] for box in boxes_m],
+            collisionFrameOrientations=[
+                [0.0, 0.0, math.sin(box[2] / 2), math.cos(box[2] / 2)] for box in boxes_m
+            ],
+            physicsClientId=self._client,
+        )
+
+    def _register(self, body: int, category: str, instance: int) -> None:
+        # PyBullet numbers the bodies of a client from 0, so that lists can be lookup tables.
+        if body != len(self._class_of_body):
+            raise RuntimeError(f"PyBullet numbered body {len(self._class_of_body)} as {body}")
+        self._class_of_body.append(CATEGORY_ID[category])
+        self._instance_of_body.append(instance)
+
+    def _load_texture(self, rgb: NDArray[np.uint8]) -> int:
+        # PyBullet reads textures from files alone, and counts v from the bottom row upwards. TGA is
+        # 18 bytes and the pixels, as BGR.
+        height, width, _ = rgb.shape
+        size = width.to_bytes(2, "little") + height.to_bytes(2, "little")
+        header = bytes([0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0]) + size + bytes([24, 0x20])
+        handle, path = tempfile.mkstemp(suffix=".tga")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(header + rgb[::-1, :, ::-1].tobytes())
+            return pybullet.loadTexture(path, physicsClientId=self._client)
+        finally:
+            os.unlink(path)

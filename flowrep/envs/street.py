@@ -1,0 +1,119 @@
+"""A laid-out scene as bodies in the simulator: what the camera sees and the vehicle can hit."""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.envs import meshes, paint
+from flowrep.envs.layout import Box, Layout
+from flowrep.envs.simulator import Simulator
+from flowrep.envs.vehicle import VehicleState
+
+Array = NDArray[np.float64]
+_BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
+
+
+class Street:
+    """The bodies of one scene. Closures start hidden, pedestrians at the origin."""
+
+    def __init__(self, layout: Layout) -> None:
+        """Builds every body of the scene in a simulator of its own."""
+        self.simulator = Simulator(paint.picture())
+        vehicle = layout.scene.vehicle
+        self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
+        self._vehicle_reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
+        self._solids: list[tuple[int, str, Array, Array]] = []
+        self._add_ground(layout)
+        self._add_solids(layout)
+        self._closures = {
+            name: self._add_closure(box) for name, box in layout.closures.items()
+        }
+        self._pedestrians = [
+            self.simulator.add_body(
+                meshes.pedestrian_mesh(i),
+                "pedestrian",
+                instance=i + 1,
+                cylinder_m=(meshes.PEDESTRIAN_RADIUS_M, meshes.PEDESTRIAN_HEIGHT_M),
+            )
+            for i in range(layout.scene.num_pedestrians)
+        ]
+        self.close_exits(())
+
+    def close_exits(self, names: Iterable[str]) -> None:
+        """Puts up the closures that are named and takes away all others."""
+        self._closed = tuple(names)
+        for name, (body, *_) in self._closures.items():
+            if name in self._closed:
+                self.simulator.place(body, 0.0, 0.0, 0.0)
+            else:
+                self.simulator.hide(body)
+
+    def place_pedestrians(self, poses: Array) -> None:
+        """Puts everyone at their planar pose [P, 3]."""
+        place = self.simulator.place
+        for body, (x, y, yaw) in zip(self._pedestrians, poses.tolist()):
+            place(body, x, y, yaw)
+
+    def hit(self, state: VehicleState, poses: Array) -> str:
+        """Returns the category of what the vehicle overlaps, or "".
+
+        Only what is near enough to be touched is put before the simulator's collision oracle.
+        """
+        near = []
+        if len(poses):
+            reach = self._vehicle_reach_m + meshes.PEDESTRIAN_RADIUS_M
+            gap = np.hypot(poses[:, 0] - state.x_m, poses[:, 1] - state.y_m)
+            for i in np.flatnonzero(gap <= reach).tolist():
+                self.simulator.place(self._pedestrians[i], *poses[i].tolist())
+                near.append((self._pedestrians[i], "pedestrian"))
+        solids = [*self._solids, *(self._closures[name] for name in self._closed)]
+        for body, category, centres, reaches in solids:
+            gap = np.hypot(centres[:, 0] - state.x_m, centres[:, 1] - state.y_m)
+            if (gap <= reaches + self._vehicle_reach_m).any():
+                near.append((body, category))
+        if not near:
+            return ""
+        self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)
+        return next((name for body, name in near if self.simulator.vehicle_touches(body)), "")
+
+    def _add_ground(self, layout: Layout) -> None:
+        road = meshes.Mesh()
+        road.ground(layout.drivable, 0.0, "asphalt")
+        for line in layout.lines.values():
+            road.add(meshes.lane_marks(line))
+        self.simulator.add_body(road, "road")
+        if not layout.sidewalks.is_empty:
+            # The paving runs on under the houses, so that no gap opens between them.
+            paving = meshes.Mesh()
+            paving.ground(layout.sidewalks.buffer(2.0).difference(layout.drivable), 0.0, "paving")
+            self.simulator.add_body(paving, "sidewalk")
+
+    def _add_solids(self, layout: Layout) -> None:
+        by_category: dict[str, list[Box]] = {}
+        for box in (*layout.buildings, *layout.obstacles):
+            by_category.setdefault(box.category, []).append(box)
+        houses = set(map(id, layout.buildings))
+        for category, boxes in by_category.items():
+            for first in range(0, len(boxes), _BOXES_A_BODY):
+                mesh, chunk = meshes.Mesh(), boxes[first : first + _BOXES_A_BODY]
+                for box in chunk:
+                    is_house = id(box) in houses
+                    mesh.add(meshes.house_mesh(box) if is_house else meshes.obstacle_mesh(box))
+                self._solids.append(self._add_solid(mesh, category, chunk))
+
+    def _add_closure(self, box: Box) -> tuple[int, str, Array, Array]:
+        return self._add_solid(meshes.house_mesh(box, both_sides=True), box.category, [box])
+
+    def _add_solid(
+        self, mesh: meshes.Mesh, category: str, boxes: list[Box]
+    ) -> tuple[int, str, Array, Array]:
+        body = self.simulator.add_body(
+            mesh,
+            category,
+            boxes_m=tuple((box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes),
+        )
+        centres = np.array([(box.x_m, box.y_m) for box in boxes])
+        reaches = np.array([math.hypot(*box.size_m[:2]) / 2 for box in boxes])
+        return body, category, centres, reaches
