@@ -3,6 +3,7 @@
 import gymnasium
 
 from flowrep.envs.loading import load_scene, scene_names
+from flowrep.envs.make import get_states, make_env, set_states, streets
 from flowrep.envs.outcome import Outcome
 from flowrep.envs.scene import Scene
 from flowrep.envs.schema import SceneError
@@ -20,6 +21,10 @@ __all__ = [
     "Scene",
     "SceneError",
     "StreetEnv",
+    "get_states",
     "load_scene",
+    "make_env",
     "scene_names",
+    "set_states",
+    "streets",
 ]
