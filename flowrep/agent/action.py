@@ -1,0 +1,33 @@
+"""What an agent needs to know of a discrete action space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torchrl.data import Categorical, OneHot, TensorSpec
+from torchrl.modules import OneHotCategorical
+
+
+@dataclass(frozen=True)
+class DiscreteActions:
+    """How many actions there are, TorchRL's name of their coding, and a distribution over them."""
+
+    count: int
+    space: str
+    distribution: type[torch.distributions.Distribution]
+
+    @classmethod
+    def from_spec(cls, spec: TensorSpec) -> DiscreteActions:
+        """Reads a `Categorical` or `OneHot` spec.
+
+        Raises:
+            TypeError: on any other.
+        """
+        if isinstance(spec, Categorical):
+            return cls(int(spec.space.n), "categorical", torch.distributions.Categorical)
+        if isinstance(spec, OneHot):
+            return cls(int(spec.space.n), "one-hot", OneHotCategorical)
+        raise TypeError(
+            f"discrete SAC needs a Categorical or OneHot action spec, got {type(spec).__name__}"
+        )

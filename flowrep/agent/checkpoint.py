@@ -1,0 +1,131 @@
+"""One file that a run continues from: tensors and plain data, written whole or not at all.
+
+The file is a safetensors file. Its header's metadata carry one JSON document that mirrors the
+nested state, in which a tensor is `{"tensor": name}`. Nothing in it can run code.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+FORMAT = "flowrep checkpoint 1"
+
+
+class CheckpointError(Exception):
+    """A checkpoint could not be written or read; the message says which and what to do."""
+
+
+def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
+    """Writes `state` to `path`; whatever happens on the way, the file there is a whole one.
+
+    Args:
+        path: the folder is made if it does not exist.
+        state: dicts with string keys, lists, tensors, str, int, float, bool and None, nested at
+            will. Tuples come back as lists.
+
+    Raises:
+        TypeError: naming the place of anything else.
+        CheckpointError: if it cannot be written (disk full, read-only); the file that was there
+            before is still there.
+    """
+    path = Path(path)
+    tensors: dict[str, Tensor] = {}
+    document = json.dumps(_without_tensors(state, "", tensors))
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_file(tensors, partial, metadata={"format": FORMAT, "state": document})
+        _flush(partial)
+        os.replace(partial, path)
+        _flush(path.parent)
+    except (OSError, SafetensorError) as error:
+        partial.unlink(missing_ok=True)
+        kept = "; the previous checkpoint is untouched" if path.exists() else ""
+        raise CheckpointError(
+            f"cannot write the checkpoint {path}: {error}{kept}. Free some space or make the "
+            "folder writable"
+        ) from error
+
+
+def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Returns the state that `save_checkpoint` wrote, tensors on the CPU.
+
+    Raises:
+        CheckpointError: if there is none, or it is damaged or something else.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint at {path}: name a run folder that has saved one")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise CheckpointError(
+                    f"{path} is a safetensors file but not a flowrep checkpoint of this version "
+                    f"({FORMAT!r}); start the run anew"
+                )
+            return _with_tensors(json.loads(metadata["state"]), file.get_tensor)
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(
+            f"{path} is not a readable checkpoint ({error}): it is damaged or of another kind; "
+            "delete it and start the run anew"
+        ) from error
+
+
+def _flush(path: Path) -> None:
+    """Waits until a file's contents, or a folder's entries, are on disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _without_tensors(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
+    """Returns `value` as JSON data; moves its tensors to `tensors`, named by their place."""
+    if isinstance(value, Tensor):
+        name = place or "value"
+        # a view that shares memory is stored as what it shows
+        tensors[name] = value.detach().cpu().contiguous()
+        return {"tensor": name}
+    if isinstance(value, Mapping):
+        bad = [key for key in value if not isinstance(key, str)]
+        if bad:
+            raise TypeError(f"checkpoint[{place!r}] has the key {bad[0]!r}: only strings are kept")
+        items = {
+            k: _without_tensors(v, f"{place}/{k}".lstrip("/"), tensors) for k, v in value.items()
+        }
+        return {"dict": items}
+    if isinstance(value, list | tuple):
+        return [
+            _without_tensors(v, f"{place}/{i}".lstrip("/"), tensors) for i, v in enumerate(value)
+        ]
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {"float": repr(value)}
+    raise TypeError(
+        f"checkpoint[{place!r}] is a {type(value).__name__}: expected a tensor, dict, list, str, "
+        "int, float, bool or None"
+    )
+
+
+def _with_tensors(value: Any, get_tensor: Any) -> Any:
+    """Undoes `_without_tensors`."""
+    if isinstance(value, list):
+        return [_with_tensors(item, get_tensor) for item in value]
+    if isinstance(value, dict):
+        ((kind, content),) = value.items()
+        if kind == "dict":
+            return {key: _with_tensors(item, get_tensor) for key, item in content.items()}
+        return get_tensor(content) if kind == "tensor" else float(content)
+    return value

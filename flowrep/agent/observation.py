@@ -1,0 +1,166 @@
+"""How observation maps are packed for storage and decoded for a network, from their specs alone.
+
+| spec | means | the network sees |
+| --- | --- | --- |
+| `Categorical(n)` | a class id a pixel, C stacked frames | one-hot, `C * n` channels |
+| `Bounded(0, 255, uint8)` | intensity | `x / 255`, C channels |
+| any float | a quantity | itself, C channels |
+
+Maps are kept *packed*: the first convolution of the Nature encoder has kernel 8 and stride 4, which
+is the same sum as kernel 2 and stride 1 over blocks of 4 × 4 pixels taken as channels. Two input
+channels become 32, what vector units like, and the block order is made once, when a frame is
+stored, instead of at every update.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Categorical, Composite, TensorSpec
+
+BLOCK = 4  # the stride of the first convolution
+KERNEL = 2 * BLOCK
+MIN_SIZE = 36  # three convolutions of 8/4, 4/2 and 3/1 leave one pixel of 36
+_FLOAT16_MAX = torch.finfo(torch.float16).max
+
+
+@dataclass(frozen=True)
+class MapCodec:
+    """One map: its place in the TensorDict, its size, what its numbers mean and how they are read.
+
+    `dtype` is what the network computes in: bfloat16 or float32.
+    """
+
+    key: NestedKey
+    channels: int
+    height: int
+    width: int
+    num_classes: int | None
+    is_byte: bool
+    dtype: torch.dtype
+
+    @property
+    def network_channels(self) -> int:
+        """Channels of the decoded map, before packing."""
+        return self.channels * (self.num_classes or 1)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Height and width in blocks; rows and columns that no kernel reaches are left out."""
+        height, width = ((size - KERNEL) // BLOCK + 2 for size in (self.height, self.width))
+        return height, width
+
+    @property
+    def stored_dtype(self) -> torch.dtype:
+        """uint8 for ids and intensities; two bytes for the rest, those the network reads best."""
+        if self.num_classes or self.is_byte:
+            return torch.uint8
+        return torch.bfloat16 if self.dtype is torch.bfloat16 else torch.float16
+
+    def batch_shape(self, x: Tensor) -> tuple[int, ...]:
+        """Returns the leading dims of a raw map `[*B, C, H, W]`.
+
+        Raises:
+            ValueError: if the last three are not those of the spec.
+        """
+        expected = (self.channels, self.height, self.width)
+        if tuple(x.shape[-3:]) != expected:
+            raise ValueError(
+                f"{self.key!r}: the agent was built for maps {expected}, got {tuple(x.shape[-3:])}"
+            )
+        return tuple(x.shape[:-3])
+
+    def pack(self, x: Tensor) -> Tensor:
+        """Returns `x` `[*B, C, H, W]` as blocks `[*B, h, w, C * 16]`; values and dtype stay."""
+        rows, columns = self.grid
+        x = x[..., : rows * BLOCK, : columns * BLOCK]
+        x = x.unflatten(-1, (columns, BLOCK)).unflatten(-3, (rows, BLOCK))  # [*B, C, h, 4, w, 4]
+        x = x.movedim((-4, -2), (-5, -4))  # [*B, h, w, C, 4, 4]
+        return x.flatten(-3)
+
+    def compact(self, packed: Tensor) -> Tensor:
+        """Returns `packed` in `stored_dtype`; numbers beyond float16's range saturate."""
+        if self.stored_dtype is torch.float16:
+            packed = packed.clamp(-_FLOAT16_MAX, _FLOAT16_MAX)
+        return packed.to(self.stored_dtype)
+
+    def decode(self, packed: Tensor) -> Tensor:
+        """Returns `[N, network_channels * 16, h, w]`, channels last in memory, for the encoder."""
+        if self.num_classes:
+            ids = torch.arange(self.num_classes, device=packed.device, dtype=packed.dtype)
+            packed = (packed.unsqueeze(-1) == ids).flatten(-2)  # [N, h, w, C * 16 * n]
+        decoded = packed.to(self.dtype)
+        if self.is_byte:
+            decoded = decoded / 255
+        return decoded.permute(0, 3, 1, 2)
+
+    def pack_weight(self, weight: Tensor) -> Tensor:
+        """Returns a `[out, C * n, 8, 8]` kernel as `[out, C * 16 * n, 2, 2]` over packed maps."""
+        classes = self.num_classes or 1
+        weight = weight.unflatten(-1, (2, BLOCK)).unflatten(-3, (2, BLOCK))
+        weight = weight.unflatten(1, (self.channels, classes))  # [out, C, n, 2, 4, 2, 4]
+        return weight.permute(0, 1, 4, 6, 2, 3, 5).flatten(1, 4)
+
+
+def map_codecs(
+    observation_spec: Composite, keys: Sequence[NestedKey], dtype: torch.dtype
+) -> tuple[MapCodec, ...]:
+    """Returns one codec a key, in order, read off the specs (their last three dims are C, H, W).
+
+    Raises:
+        ValueError: if `keys` is empty, or a map has the wrong rank, type or size.
+        KeyError: if the spec lacks a key.
+    """
+    if not keys:
+        raise ValueError("the agent needs at least one observation key, got none")
+    offered = observation_spec.keys(include_nested=True, leaves_only=True)
+    for key in keys:
+        if key not in offered:
+            raise KeyError(f"the agent reads {key!r}; the environment offers {list(offered)}")
+    return tuple(_codec(key, observation_spec[key], dtype) for key in keys)
+
+
+def _codec(key: NestedKey, spec: TensorSpec, dtype: torch.dtype) -> MapCodec:
+    if len(spec.shape) < 3:
+        raise ValueError(f"{key!r}: expected a map [..., C, H, W], got shape {tuple(spec.shape)}")
+    channels, height, width = spec.shape[-3:]
+    if min(height, width) < MIN_SIZE:
+        raise ValueError(
+            f"{key!r} is {height}x{width}: the Nature encoder needs at least "
+            f"{MIN_SIZE}x{MIN_SIZE} pixels; raise the camera's height_px and width_px"
+        )
+    num_classes, is_byte = None, False
+    if isinstance(spec, Categorical):
+        num_classes = int(spec.space.n)
+        if num_classes > 256:
+            raise ValueError(f"{key!r} has {num_classes} classes; ids are stored in a byte: <= 256")
+    elif spec.dtype is torch.uint8:
+        is_byte = True
+        low, high = spec.space.low.min().item(), spec.space.high.max().item()
+        if (low, high) != (0, 255):
+            raise ValueError(
+                f"{key!r} is uint8 in [{low}, {high}], which could be ids or intensities: declare "
+                "it Categorical(n) or Bounded(0, 255)"
+            )
+    elif not spec.dtype.is_floating_point:
+        raise ValueError(
+            f"{key!r} has dtype {spec.dtype}: expected Categorical ids, uint8 in 0..255, or floats"
+        )
+    return MapCodec(key, channels, height, width, num_classes, is_byte, dtype)
+
+
+def decode_maps(codecs: Sequence[MapCodec], packed: TensorDictBase) -> tuple[Tensor, ...]:
+    """Returns the decoded maps of a batch `[N]` of packed ones."""
+    return tuple(codec.decode(packed[codec.key]) for codec in codecs)
+
+
+def compact_maps(codecs: Sequence[MapCodec], observation: TensorDictBase) -> TensorDictBase:
+    """Returns the observation's maps packed and in their stored dtype, and nothing else."""
+    stored = observation.empty()
+    for codec in codecs:
+        stored[codec.key] = codec.compact(codec.pack(observation[codec.key]))
+    return stored

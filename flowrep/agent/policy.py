@@ -1,0 +1,56 @@
+"""The acting side: raw maps in, one action out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import NestedKey
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
+from torch import Tensor, nn
+
+from flowrep.agent.action import DiscreteActions
+from flowrep.agent.encoder import Encoder
+from flowrep.agent.heads import Head
+from flowrep.agent.observation import MapCodec
+
+
+class PolicyNetwork(nn.Module):
+    """Returns action logits `[*B, n]` of raw maps `[*B, C, H, W]`, one argument a map."""
+
+    def __init__(self, codecs: Sequence[MapCodec], encoder: Encoder, head: Head) -> None:
+        super().__init__()
+        self.codecs = tuple(codecs)
+        self.encoder, self.head = encoder, head
+
+    def forward(self, *maps: Tensor) -> Tensor:
+        """Returns the logits; the maps are packed, decoded and encoded on the way."""
+        images = []
+        for codec, x in zip(self.codecs, maps):
+            batch = codec.batch_shape(x)
+            packed = codec.pack(x.reshape(-1, *x.shape[-3:]))
+            images.append(codec.decode(packed))
+        return self.head(self.encoder(images)).reshape(*batch, -1)
+
+
+def stochastic_policy(
+    network: nn.Module, in_keys: Sequence[NestedKey], actions: DiscreteActions
+) -> ProbabilisticTensorDictSequential:
+    """Returns a module that writes `action`, drawn from the softmax of the network's logits.
+
+    It draws at random unless TorchRL's `set_exploration_type(ExplorationType.DETERMINISTIC)` is in
+    force, under which it takes the likeliest action.
+    """
+    draw = ProbabilisticTensorDictModule(
+        in_keys=["logits"],
+        out_keys=["action"],
+        distribution_class=actions.distribution,
+        distribution_kwargs={"validate_args": False},
+        default_interaction_type=InteractionType.RANDOM,
+    )
+    logits = TensorDictModule(network, in_keys=list(in_keys), out_keys=["logits"])
+    return ProbabilisticTensorDictSequential(logits, draw)

@@ -1,0 +1,193 @@
+"""What the agent remembers: packed maps, each stored once, sampled uniformly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from flowrep.agent.observation import MapCodec, compact_maps
+
+
+class ReplayMemory:
+    """A ring of transitions that stores an observation once, not again as the one before's next.
+
+    A slot holds the maps seen, the action taken and what it brought; `next` is looked up in the
+    slot of the frame that followed. A transition can be sampled as soon as that frame is known, so
+    the latest step of each environment waits for the following one. Where an episode terminated
+    there is nothing to look up: its value is masked by `terminated`, and the slot's own maps stand
+    in. Where it was cut off without terminating (`truncated`, or a restart between two calls) the
+    following frame was never stored, and the transition is left out of the samples.
+
+    Args:
+        codecs: the maps to keep; see `flowrep.agent.observation`.
+        capacity: slots; the oldest transition is overwritten.
+        batch_size: transitions a sample, drawn with replacement.
+        frames_per_update: environment frames for each gradient step, for the training loop.
+        learning_starts: frames before the first one, for the training loop.
+        device: where frames are kept and samples appear.
+    """
+
+    def __init__(
+        self,
+        codecs: Sequence[MapCodec],
+        *,
+        capacity: int,
+        batch_size: int,
+        frames_per_update: int,
+        learning_starts: int,
+        device: torch.device | str,
+    ) -> None:
+        self.codecs = tuple(codecs)
+        self.capacity, self.batch_size = capacity, batch_size
+        self.frames_per_update, self.learning_starts = frames_per_update, learning_starts
+        self.device = torch.device(device)
+        self._frames: TensorDictBase | None = None  # [capacity], allocated by the first extend
+        self._next_slot = torch.full((capacity,), -1)  # -1: the following frame is not stored
+        self._cursor = 0
+        self._size = 0
+        self._tail: TensorDictBase | None = None  # [N]: each environment's latest step
+        self._usable = torch.empty(0, dtype=torch.long)
+
+    def __len__(self) -> int:
+        """Returns the number of transitions stored."""
+        return self._size
+
+    def extend(self, frames: TensorDictBase) -> None:
+        """Stores steps of N environments: `[N]`, `[N, T]`, or as a TorchRL collector returns them.
+
+        Args:
+            frames: with the maps, `action` and, under `next`, the maps, `reward`, `done` and
+                `terminated`. A dim named `time` is taken as such; without one, a single dim is N.
+
+        Raises:
+            ValueError: if the steps, with the N before them, do not fit into the capacity.
+        """
+        steps = _time_first(frames)  # [T, N]
+        times, width = steps.batch_size
+        if (times + 1) * width > self.capacity:
+            raise ValueError(
+                f"a replay capacity of {self.capacity} cannot take {times} steps of {width} "
+                f"environments; it has to hold {(times + 1) * width}: raise replay_capacity or "
+                "lower num_envs"
+            )
+        slots = (self._cursor + torch.arange(times * width)) % self.capacity
+        steps = steps.reshape(-1)
+        seen = compact_maps(self.codecs, steps).to(self.device)
+        outcome = steps["next"].select("reward", "done", "terminated").to(self.device)
+        self._write(slots, seen.clone(False).update({"action": steps["action"], **outcome}))
+        self._cursor = (self._cursor + times * width) % self.capacity
+        self._size = min(self._size + times * width, self.capacity)
+        latest = TensorDict(
+            {
+                "slot": slots,
+                "next": compact_maps(self.codecs, steps["next"]).to(self.device),
+                "done": (outcome["done"] | outcome["terminated"]).reshape(-1),
+            },
+            [times * width],
+        )
+        terminated = outcome["terminated"].reshape(-1).cpu()
+        self._next_slot[slots] = torch.where(terminated, slots, -1)
+        self._link(latest, seen, width)
+        self._tail = latest[-width:].clone()
+        self._usable = (self._next_slot >= 0).nonzero().squeeze(-1)
+
+    def _write(self, slots: Tensor, rows: TensorDictBase) -> None:
+        if self._frames is None:
+            # pages that no frame has reached take no memory yet
+            self._frames = rows[0].apply(
+                lambda row: row.new_empty(self.capacity, *row.shape),
+                batch_size=[self.capacity],
+                device=self.device,
+            )
+        self._frames[slots.to(self.device)] = rows.to(self.device)
+
+    def _link(self, latest: TensorDictBase, seen: TensorDictBase, width: int) -> None:
+        """Points each step to the one after it, where that one is its continuation."""
+        follower_slot = latest["slot"]
+        if self._tail is not None and self._tail.batch_size[0] == width:
+            latest = torch.cat([self._tail, latest])
+        else:
+            follower_slot, seen = follower_slot[width:], seen[width:]
+        earlier = latest[:-width]
+        continues = ~earlier["done"]
+        for codec in self.codecs:
+            continues &= _same_rows(earlier["next", codec.key], seen[codec.key])
+        continues = continues.cpu()
+        self._next_slot[earlier["slot"][continues].cpu()] = follower_slot[continues]
+
+    def sample(self) -> TensorDictBase:
+        """Returns `batch_size` transitions, uniform with replacement, maps packed.
+
+        Raises:
+            RuntimeError: if no transition is complete yet.
+        """
+        if self._frames is None or not len(self._usable):
+            raise RuntimeError("nothing to sample: extend the replay memory by two steps first")
+        chosen = self._usable[torch.randint(len(self._usable), (self.batch_size,))]
+        following = self._next_slot[chosen].to(self.device)
+        chosen = chosen.to(self.device)
+        frames = self._frames
+        batch = TensorDict({}, [self.batch_size])
+        batch["action"] = frames["action"].index_select(0, chosen)
+        for codec in self.codecs:
+            batch[codec.key] = frames[codec.key].index_select(0, chosen)
+            batch["next", codec.key] = frames[codec.key].index_select(0, following)
+        for name in ("reward", "done", "terminated"):
+            batch["next", name] = frames[name].index_select(0, chosen)
+        return batch
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns everything that sampling and extending depend on, tensors uncopied."""
+        frames = None if self._frames is None else self._frames[: self._size]
+        return {
+            "capacity": self.capacity,
+            "cursor": self._cursor,
+            "size": self._size,
+            "next_slot": self._next_slot,
+            "frames": None if frames is None else frames.to_dict(),
+            "tail": None if self._tail is None else self._tail.to_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from a `state_dict`.
+
+        Raises:
+            ValueError: if it was taken from a memory of another capacity.
+        """
+        if state["capacity"] != self.capacity:
+            raise ValueError(
+                f"the saved replay memory has capacity {state['capacity']}, this one "
+                f"{self.capacity}; set replay_capacity={state['capacity']}"
+            )
+        self._cursor, self._size = state["cursor"], state["size"]
+        self._next_slot = state["next_slot"].clone()
+        self._frames, self._tail = None, None
+        if state["frames"] is not None:
+            frames = TensorDict(state["frames"], [self._size])
+            self._write(torch.arange(self._size), frames)
+        if state["tail"] is not None:
+            width = len(state["tail"]["slot"])
+            self._tail = TensorDict(state["tail"], [width]).to(self.device).clone()
+        self._usable = (self._next_slot >= 0).nonzero().squeeze(-1)
+
+
+def _time_first(frames: TensorDictBase) -> TensorDictBase:
+    """Returns the frames as `[T, N]`."""
+    names = list(frames.names)
+    time = names.index("time") if "time" in names else None
+    if time is None and frames.ndim < 2:
+        return frames.reshape(1, -1)
+    time = frames.ndim - 1 if time is None else time
+    frames = frames.permute(time, *[dim for dim in range(frames.ndim) if dim != time])
+    return frames.reshape(frames.shape[0], -1)
+
+
+def _same_rows(a: Tensor, b: Tensor) -> Tensor:
+    """Returns which rows of two equally typed tensors are the same, bit for bit."""
+    if a.dtype.is_floating_point:
+        a, b = a.view(torch.int16), b.view(torch.int16)
+    return (a == b).flatten(1).all(1)
