@@ -1,8 +1,9 @@
 """TorchRL transforms that turn sensor maps into mid-level representations."""
 
 from flowrep.transforms.depth import Depth
-from flowrep.transforms.flow import FlowFactorize, RawFlow
+from flowrep.transforms.flow_factorize import FlowFactorize
 from flowrep.transforms.frame_stack import FrameStack
+from flowrep.transforms.raw_flow import RawFlow
 from flowrep.transforms.rgb import Rgb
 from flowrep.transforms.segmentation import Segmentation
 from flowrep.transforms.stack import (

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
 import torch
@@ -44,7 +45,6 @@ DEPTH = Reads((1, "H", "W"), "float")
 IDS = Reads((1, "H", "W"), "integer")
 FLOW = Reads((2, "H", "W"), "float")
 RGB = Reads((3, "H", "W"), "integer")
-MAP = Reads(("C", "H", "W"))
 MOTION = Reads((4, 4), "float")
 MOTIONS = Reads(("N", 4, 4), "float")
 
@@ -62,6 +62,11 @@ class MapTransform(Transform):
         out_keys: keys that are written.
     """
 
+    # Pure: one tensor an input key in, one tensor an output key out.
+    compute: Callable[..., tuple[Tensor, ...]]
+    # The specs of the input keys in, those of the output keys out.
+    output_specs: Callable[..., tuple[TensorSpec, ...]]
+
     def __init__(self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys) -> None:
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         if len(self.in_keys) != len(reads):
@@ -70,25 +75,25 @@ class MapTransform(Transform):
                 f"({', '.join(map(str, reads))}), in_keys has {len(self.in_keys)}: {self.in_keys}"
             )
         self.reads = tuple(reads)
+        self.compiled = False
         self.label = " and ".join(repr(key) for key in self.out_keys)
 
     def _check_layout(self, maps: Sequence[Tensor | TensorSpec]) -> None:
-        sizes: dict[str, int] = {}
-        batch = None
+        """Complains about the first input whose layout is wrong or disagrees with the others."""
+        agreed: dict[str, int] = {}
+        batch = maps[0].shape[: -len(self.reads[0].shape)]
         for key, reads, value in zip(self.in_keys, self.reads, maps):
-            shape, rank = tuple(value.shape), len(reads.shape)
-            ok = len(shape) >= rank and _is_kind(value.dtype, reads.kind)
-            for want, size in zip(reads.shape, shape[-rank:]):
-                ok = ok and size == (
-                    want if isinstance(want, int) else sizes.setdefault(want, size)
-                )
-            batch = shape[:-rank] if batch is None else batch
-            if not ok or shape[:-rank] != batch:
-                agreed = ", ".join(f"{name} = {size}" for name, size in sizes.items())
+            rank = len(reads.shape)
+            sizes = [
+                size if isinstance(size, int) else agreed.setdefault(size, got)
+                for size, got in zip(reads.shape, value.shape[-rank:])
+            ]
+            if tuple(value.shape) != (*batch, *sizes) or not _is_kind(value.dtype, reads.kind):
+                known = {"*B": list(batch), **agreed}
                 raise ValueError(
-                    f"representation {self.label}: key {key!r} should be {reads}"
-                    f"{f' with *B = {list(batch)}' if batch else ''}"
-                    f"{f', {agreed}' if agreed else ''}; got {value.dtype} {list(shape)}"
+                    f"representation {self.label}: key {key!r} should be {reads} with "
+                    f"{', '.join(f'{name} = {size}' for name, size in known.items())}; "
+                    f"got {value.dtype} {list(value.shape)}"
                 )
 
     def _missing(self, key: NestedKey, offered: TensorDictBase | Composite) -> MissingKey:
@@ -108,7 +113,10 @@ class MapTransform(Transform):
                 raise self._missing(key, next_tensordict)
             maps.append(value)
         self._check_layout(maps)
-        for key, value in zip(self.out_keys, self.compute(*maps)):
+        compute = type(self).compute
+        if self.compiled:
+            compute = _compiled(compute)
+        for key, value in zip(self.out_keys, compute(self, *maps)):
             next_tensordict.set(key, value)
         return next_tensordict
 
@@ -146,6 +154,12 @@ class MapTransform(Transform):
     def __repr__(self) -> str:
         """Returns the keys that are read and written."""
         return f"{type(self).__name__}({self.in_keys} -> {self.out_keys})"
+
+
+@functools.cache
+def _compiled(compute: Callable[..., tuple[Tensor, ...]]) -> Callable[..., tuple[Tensor, ...]]:
+    """Returns a class's compiled `compute`, kept outside of instances: those stay picklable."""
+    return torch.compile(compute, fullgraph=True)
 
 
 def _is_kind(dtype: torch.dtype, kind: str) -> bool:

@@ -12,8 +12,10 @@ from tensordict import TensorDictBase
 from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
 
 from flowrep.transforms.depth import Depth
-from flowrep.transforms.flow import FlowFactorize, Intrinsics, RawFlow
+from flowrep.transforms.flow import Intrinsics
+from flowrep.transforms.flow_factorize import FlowFactorize
 from flowrep.transforms.frame_stack import FrameStack
+from flowrep.transforms.raw_flow import RawFlow
 from flowrep.transforms.rgb import Rgb
 from flowrep.transforms.segmentation import Segmentation
 
@@ -35,7 +37,8 @@ REPRESENTATIONS: tuple[str, ...] = tuple(_MADE_BY)
 
 # Parameters that say how transforms are wired up, which representation_stack decides.
 _WIRING = {
-    "self", "in_keys", "out_keys", "outputs", "invalid", "intrinsics", "num_classes", "dt_s"
+    "self", "in_keys", "out_keys", "outputs", "invalid", "intrinsics", "num_classes", "dt_s",
+    "compiled",
 }  # fmt: skip
 
 _UNSCALED = "_raw"  # raw flow in px/step, nan where unknown: what FlowFactorize reads
@@ -62,6 +65,7 @@ def representation_stack(
     intrinsics: Intrinsics | None = None,
     num_classes: int | None = None,
     dt_s: float | None = None,
+    compiled: bool = False,
 ) -> Compose:
     """Returns the transforms that write the representations at the root of the TensorDict.
 
@@ -74,6 +78,7 @@ def representation_stack(
         intrinsics: K `[3, 3]` of the sensor maps in pixels; raw, ego and obj need it.
         num_classes: number of semantic classes; seg and seg2 need it.
         dt_s: seconds a step lasts; flow in `px_per_s` needs it.
+        compiled: whether flow is computed through `torch.compile`.
 
     Raises:
         ValueError: for an unknown or repeated name, an unknown option, or a missing argument.
@@ -91,7 +96,8 @@ def representation_stack(
         raise ValueError(f"representations {', '.join(_FLOWS)} need intrinsics=, the camera's K")
     makers = _frame_makers(chosen, num_classes)
     if intrinsics is not None:
-        makers += _flow_makers({n: chosen[n] for n in _FLOWS if n in chosen}, intrinsics, dt_s)
+        flows = {name: chosen[name] for name in _FLOWS if name in chosen}
+        makers += _flow_makers(flows, intrinsics, {"dt_s": dt_s, "compiled": compiled})
     written = [key for maker in makers for key in maker.out_keys]
     hidden = [key for key in written if key not in chosen]
     return Compose(*makers, *([DropKeys(*hidden)] if hidden else []))
@@ -162,24 +168,24 @@ def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) ->
 
 
 def _flow_makers(
-    flows: dict[str, dict[str, Any]], intrinsics: Intrinsics, dt_s: float | None
+    flows: dict[str, dict[str, Any]], intrinsics: Intrinsics, context: dict[str, Any]
 ) -> list[Transform]:
     """Returns one RawFlow, if raw flow is needed, and one FlowFactorize, if a factor is."""
-    if "obj" not in flows:
-        makers: list[Transform] = []
-        if "raw" in flows:
-            makers.append(RawFlow(intrinsics, dt_s=dt_s, **flows["raw"]))
-        if "ego" in flows:
-            makers.append(FlowFactorize(intrinsics, outputs=["ego"], dt_s=dt_s, **flows["ego"]))
-        return makers
-    raw = RawFlow(intrinsics, invalid=math.nan, out_keys=[_UNSCALED])
-    raw.label = "'obj'"
-    factors = FlowFactorize(
-        intrinsics,
-        outputs=list(flows),
-        scale={name: options["scale"] for name, options in flows.items()},
-        unit={name: options["unit"] for name, options in flows.items()},
-        dt_s=dt_s,
-        in_keys=[_UNSCALED, ("sensor", "depth"), ("sensor", "prev_from_curr")],
-    )
-    return [raw, factors]
+    if "obj" in flows:
+        raw = RawFlow(intrinsics, invalid=math.nan, out_keys=_UNSCALED, **context)
+        raw.label = "'obj'"
+        factors = FlowFactorize(
+            intrinsics,
+            outputs=list(flows),
+            scale={name: options["scale"] for name, options in flows.items()},
+            unit={name: options["unit"] for name, options in flows.items()},
+            in_keys=[_UNSCALED, ("sensor", "depth"), ("sensor", "prev_from_curr")],
+            **context,
+        )
+        return [raw, factors]
+    makers: list[Transform] = []
+    if "raw" in flows:
+        makers.append(RawFlow(intrinsics, **flows["raw"], **context))
+    if "ego" in flows:
+        makers.append(FlowFactorize(intrinsics, outputs=["ego"], **flows["ego"], **context))
+    return makers
