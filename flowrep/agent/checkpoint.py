@@ -40,7 +40,8 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
     path = Path(path)
     tensors: dict[str, Tensor] = {}
     document = json.dumps(_without_tensors(state, "", tensors))
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    # one name a run, so that a writer that was killed leaves no pile of halves behind
+    partial = path.with_name(f".{path.name}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         save_file(tensors, partial, metadata={"format": FORMAT, "state": document})

@@ -53,4 +53,4 @@ def stochastic_policy(
         default_interaction_type=InteractionType.RANDOM,
     )
     logits = TensorDictModule(network, in_keys=list(in_keys), out_keys=["logits"])
-    return ProbabilisticTensorDictSequential(logits, draw)
+    return ProbabilisticTensorDictSequential(logits, draw).select_out_keys("action")

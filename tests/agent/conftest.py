@@ -1,0 +1,94 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+
+from flowrep.agent import DiscreteSAC
+
+HEIGHT, WIDTH = 38, 45  # neither square nor a multiple of the first stride
+
+
+@pytest.fixture
+def observation_spec():
+    """Three kinds of map, as a vector of five environments declares them."""
+    shape = (5, 2, HEIGHT, WIDTH)
+    return Composite(
+        {
+            "flow": Unbounded(shape, dtype=torch.float32),
+            "seg": Categorical(4, (5, 1, HEIGHT, WIDTH), dtype=torch.uint8),
+            "rgb": Bounded(0, 255, (5, 3, HEIGHT, WIDTH), dtype=torch.uint8),
+        },
+        shape=(5,),
+    )
+
+
+@pytest.fixture
+def make_agent(observation_spec):
+    """Builds a small float32 agent; keyword arguments replace its settings."""
+
+    def make(spec=observation_spec, keys=("flow", "seg"), action_spec=None, seed=0, **changes):
+        settings = {
+            "total_frames": 1000,
+            "device": "cpu",
+            "encoder": "shared",
+            "precision": "fp32",
+            "learning_rate": 3e-4,
+            "initial_alpha": 0.5,
+            "target_entropy_weight": 0.2,
+            "gamma": 0.99,
+            "tau": 0.005,
+            "hidden_size": 32,
+            "batch_size": 16,
+            "replay_capacity": 100,
+            "frames_per_update": 10,
+            "learning_starts": None,
+        }
+        torch.manual_seed(seed)
+        action_spec = Categorical(3) if action_spec is None else action_spec
+        return DiscreteSAC(spec, action_spec, list(keys), **(settings | changes))
+
+    return make
+
+
+@pytest.fixture
+def random_maps(observation_spec):
+    """Draws maps of every kind; floats are numbers that float16 holds exactly."""
+
+    def draw(*batch):
+        spec = observation_spec[0].expand(batch) if batch else observation_spec[0]
+        maps = spec.rand()
+        maps["flow"] = maps["flow"].half().float()
+        return maps
+
+    return draw
+
+
+@pytest.fixture
+def random_steps(random_maps):
+    """Draws `[N]` unconnected steps; about a third of them terminated."""
+
+    def draw(size):
+        steps = random_maps(size)
+        steps["action"] = torch.randint(3, (size,))
+        steps["next"] = random_maps(size)
+        steps["next", "reward"] = torch.randn(size, 1)
+        steps["next", "terminated"] = torch.rand(size, 1) < 0.3
+        steps["next", "done"] = steps["next", "terminated"].clone()
+        return steps
+
+    return draw
+
+
+@pytest.fixture
+def random_batch(random_steps):
+    """Draws a batch as `ReplayMemory.sample` returns it, for an agent's maps."""
+    from flowrep.agent.observation import compact_maps
+
+    def draw(agent, size=16):
+        steps = random_steps(size)
+        following = compact_maps(agent.codecs, steps["next"])
+        following.update(steps["next"].select("reward", "terminated", "done"))
+        batch = compact_maps(agent.codecs, steps)
+        return TensorDict({**batch, "action": steps["action"], "next": following}, [size])
+
+    return draw
