@@ -79,6 +79,9 @@ def check_overrides(config_name: str, overrides: Sequence[str]) -> None:
     for override in parsed:
         if override.type is OverrideType.CHANGE and override not in chosen:
             _check_key(override.key_or_group, config)
+    missing = OmegaConf.missing_keys(_compose(config_name, [_one_value(o) for o in parsed]))
+    if missing:
+        raise UsageError(f"'{min(missing)}' needs a value: {min(missing)}=...")
 
 
 def _choices(override: Override) -> list[str]:

@@ -1,0 +1,53 @@
+"""From a resolved config to the env and the agent that it describes."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from torchrl.envs import EnvBase
+
+from flowrep.agent import DiscreteSAC
+from flowrep.command_line import UsageError
+from flowrep.envs import make_env
+
+Config = Mapping[str, Any]
+
+
+def choose_device(name: str) -> torch.device:
+    """Returns the device of that name, for "auto" a CUDA device where there is one.
+
+    Raises:
+        UsageError: torch knows no such device, or this machine has none.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise UsageError(f"device '{name}' can't be used: {reason}. Try device=cpu") from None
+
+
+def build_env(config: Config, **changes: Any) -> EnvBase:
+    """Returns the env that the config describes; `changes` go to `make_env` in its place."""
+    arguments = {
+        "scene": config["scene"],
+        "representations": config["representations"],
+        "num_envs": config["num_envs"],
+        "device": choose_device(config["device"]),
+        "speed": config["speed"],
+    }
+    return make_env(**(arguments | changes))
+
+
+def build_agent(config: Config, env: EnvBase) -> DiscreteSAC:
+    """Returns the config's algorithm, untrained, on what the env emits."""
+    return instantiate(
+        config["algorithm"],
+        observation_spec=env.observation_spec,
+        action_spec=env.action_spec,
+        keys=list(config["representations"]),
+        total_frames=config["total_frames"],
+        device=choose_device(config["device"]),
+    )

@@ -1,0 +1,109 @@
+"""Evaluates a trained agent: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
+
+from functools import partial
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig, ListConfig
+
+from flowrep.agent import CheckpointError, DiscreteSAC, load_checkpoint
+from flowrep.build import Config, build_agent, build_env
+from flowrep.command_line import UsageError, exit_with, run_command
+from flowrep.config_tree import CONF_DIR
+from flowrep.experiment.comparison import compare, print_table, with_origin
+from flowrep.experiment.interruption import StopRequest
+from flowrep.experiment.recording import record_episode
+from flowrep.experiment.run_folder import RunFolder
+
+POLICIES = ("greedy", "sampled")
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="evaluate")
+def run(config: DictConfig) -> None:
+    """Runs episodes of a saved agent and of baselines, prints a table and keeps the rows."""
+    try:
+        folder = RunFolder.existing(config.run)
+        trained = folder.read_config() | {"device": config.device, "num_envs": config.num_envs}
+        speeds, rates, policies = check(config, trained)
+        agent, frames = load_agent(trained, folder)
+    except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
+        exit_with(str(error))
+    with StopRequest() as stop:
+        rows = compare(
+            {name: agent.policy for name in policies},
+            partial(build_env, trained),
+            speeds=speeds,
+            fps=rates,
+            episodes=config.episodes,
+            seed=config.seed,
+            baselines=config.baselines,
+            should_stop=lambda: bool(stop),
+        )
+        folder.log_episodes(with_origin(rows, trained, frames))
+        print_table(rows)
+        print(f"{len(rows)} episodes added to {folder.evaluation_path}")
+        if not stop:
+            film(agent, trained, folder, config, speeds, rates)
+
+
+def check(config: DictConfig, trained: Config) -> tuple[list[str], list[float], list[str]]:
+    """Returns speeds, frame rates and policies as lists, after refusing what can't be run.
+
+    Raises:
+        UsageError: naming the key, what came and what exists.
+    """
+    speeds, rates, policies = (as_list(config[key]) for key in ("speed", "fps", "policy"))
+    known = list(trained["scene"]["pedestrian_speed_mps"])
+    for what, names, there_are in (("speed", speeds, known), ("policy", policies, POLICIES)):
+        for name in names:
+            if name not in there_are:
+                raise UsageError(f"unknown {what} '{name}'; there are: {', '.join(there_are)}")
+    for rate in rates:
+        if not isinstance(rate, int | float) or rate <= 0:
+            raise UsageError(f"fps should be positive numbers of frames a second, not {rate!r}")
+    for key in ("episodes", "num_envs"):
+        if not isinstance(config[key], int) or config[key] < 1:
+            raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
+    return speeds, [float(rate) for rate in rates], policies
+
+
+def as_list(value: Any) -> list[Any]:
+    """Returns a list as it is, and a single value as a list of one."""
+    return list(value) if isinstance(value, ListConfig) else [value]
+
+
+def load_agent(trained: Config, folder: RunFolder) -> tuple[DiscreteSAC, int]:
+    """Returns the run's agent and the number of frames that it was trained for."""
+    state = load_checkpoint(folder.checkpoint_path)
+    env = build_env(trained, num_envs=1)
+    agent = build_agent(trained, env)
+    env.close()
+    agent.load_state_dict(state["agent"])
+    return agent, state["frames"]
+
+
+def film(
+    agent: DiscreteSAC,
+    trained: Config,
+    folder: RunFolder,
+    config: DictConfig,
+    speeds: list[str],
+    rates: list[float],
+) -> None:
+    """Writes `video` episodes for each speed and frame rate."""
+    for speed in speeds:
+        for rate in rates:
+            for number in range(config.video):
+                path = folder.video_path(f"{speed}_{rate:g}fps_{number}")
+                make = partial(build_env, trained, num_envs=1, speed=speed, frame_rate_hz=rate)
+                record_episode(make, agent.policy, path, seed=config.seed + number)
+                print(f"video: {path}")
+
+
+def main() -> None:
+    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    run_command("evaluate", run)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Pictures of a run, drawn from its tables."""
+
+import csv
+from collections import defaultdict
+
+from matplotlib.figure import Figure
+
+from flowrep.experiment.evaluation import outcome_shares
+from flowrep.experiment.run_folder import RunFolder
+
+
+def draw_learning_curve(run: RunFolder) -> None:
+    """Draws success over frames into learning_curve.png, from metrics.csv and evaluation.csv.
+
+    The line is the share of the last training episodes (sampled actions); the points are greedy
+    evaluations at the training speed, with 95 % Wilson intervals.
+    """
+    metrics = _read(run.metrics_path)
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.add_subplot(
+        xlabel="environment frames", ylabel="share of episodes that succeed", ylim=(0, 1)
+    )
+    frames = [int(row["frames"]) for row in metrics]
+    axes.plot(frames, [float(row["success"]) for row in metrics], label="training, sampled actions")
+    for number, (at, low, share, high) in enumerate(_evaluated(run)):
+        axes.errorbar(
+            at,
+            share,
+            [[share - low], [high - share]],
+            fmt="o",
+            color="C1",
+            capsize=3,
+            label=None if number else "evaluation, greedy actions",
+        )
+    axes.legend(loc="upper left")
+    axes.grid(alpha=0.3)
+    figure.savefig(run.path / "learning_curve.png", dpi=120)
+
+
+def _evaluated(run: RunFolder) -> list[tuple[int, float, float, float]]:
+    """Frames, lower end, share of success, upper end for each greedy evaluation while training."""
+    speed = run.read_config()["speed"]
+    outcomes = defaultdict(list)
+    for row in _read(run.evaluation_path):
+        if row["policy"] == "greedy" and row["speed"] == speed:
+            outcomes[int(row["frames"])].append(row["outcome"])
+    points = []
+    for frames, names in sorted(outcomes.items()):
+        share, low, high = outcome_shares(names)["success"]
+        points.append((frames, low, share, high))
+    return points
+
+
+def _read(path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))

@@ -1,0 +1,148 @@
+"""Trains an agent: `python -m flowrep.train representations=[ego,obj] preset=laptop`."""
+
+import sys
+from functools import partial
+from typing import Any
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from flowrep.agent import CheckpointError, keep_freed_memory
+from flowrep.build import Config, build_agent, build_env
+from flowrep.command_line import UsageError, exit_with, run_command
+from flowrep.config_tree import CONF_DIR
+from flowrep.experiment.comparison import compare, print_table, with_origin
+from flowrep.experiment.figures import draw_learning_curve
+from flowrep.experiment.interruption import StopRequest
+from flowrep.experiment.recording import record_episode
+from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.training import Training, train
+
+EVALUATION_SEED = 1_000_000  # first of the evaluated episodes; training takes those below
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="train")
+def run(config: DictConfig) -> None:
+    """Trains, evaluates and films one agent, or continues a run with `resume=`."""
+    try:
+        folder, plain = open_run(config)
+        check(plain)
+        training = build(plain, folder)
+    except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
+        exit_with(str(error))
+    print(f"run folder: {folder.path}")
+    with StopRequest() as stop:
+        clock = train(training, plain, stop, partial(log_evaluation, training, plain))
+        print(f"wall time: {clock.summary()}")
+        print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
+        if not stop:
+            final_evaluation(training, plain, stop)
+    training.env.close()
+    if stop:
+        print(
+            f"\nstopped after {training.frames} frames; all is saved. Continue with\n"
+            f"  python -m flowrep.train resume={folder.path}"
+        )
+        sys.exit(stop.exit_code)
+
+
+def open_run(config: DictConfig) -> tuple[RunFolder, dict[str, Any]]:
+    """Returns the run's folder and its config: a new one, or that of the run to resume."""
+    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    if config.resume is None:
+        folder = RunFolder(HydraConfig.get().runtime.output_dir)
+        folder.write_config(plain)
+        return folder, plain
+    others = [o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "device="))]
+    if others:
+        raise UsageError(
+            f"resume= continues a run with its own config, so '{others[0]}' would be ignored; "
+            "leave it out (device= may be changed)"
+        )
+    folder = RunFolder.existing(config.resume)
+    return folder, folder.read_config() | {"device": plain["device"], "resume": str(config.resume)}
+
+
+def check(config: Config) -> None:
+    """Refuses numbers that can't be, by name.
+
+    Raises:
+        UsageError: naming the key, what it should be and what it is.
+    """
+    for key in ("total_frames", "num_envs", "log_every_frames", "checkpoint_every_frames"):
+        if not isinstance(config[key], int) or config[key] < 1:
+            raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
+    if not isinstance(config["seed"], int) or not 0 <= config["seed"] < EVALUATION_SEED:
+        raise UsageError(f"seed should be a whole number from 0 to {EVALUATION_SEED - 1}")
+    if not config["representations"]:
+        raise UsageError("representations is empty; name one at least, e.g. representations=[ego]")
+    speeds = list(config["scene"]["pedestrian_speed_mps"])
+    for speed in [config["speed"], *config["evaluation"]["speeds"]]:
+        if speed not in speeds:
+            raise UsageError(f"unknown speed '{speed}'; the scene has: {', '.join(speeds)}")
+
+
+def build(config: Config, folder: RunFolder) -> Training:
+    """Returns the run at its start, or at its checkpoint where it has one."""
+    keep_freed_memory()
+    torch.manual_seed(config["seed"])
+    env = build_env(config)
+    env.set_seed(config["seed"] * config["num_envs"])
+    training = Training(env, build_agent(config, env), folder)
+    if config["resume"] is not None and folder.checkpoint_path.exists():
+        training.load()
+    return training
+
+
+def log_evaluation(training: Training, config: Config, frames: int) -> None:
+    """Runs greedy episodes at the training speed and appends them to evaluation.csv."""
+    evaluation = config["evaluation"]
+    with torch.random.fork_rng(devices=[]):
+        rows = compare(
+            {"greedy": training.agent.policy},
+            partial(build_env, config),
+            speeds=[config["speed"]],
+            fps=[config["scene"]["frame_rate_hz"]],
+            episodes=evaluation["episodes"],
+            seed=EVALUATION_SEED,
+            baselines=False,
+        )
+    training.run.log_episodes(with_origin(rows, config, frames))
+
+
+def final_evaluation(training: Training, config: Config, stop: StopRequest) -> None:
+    """Compares the agent with baselines at each speed, films an episode and draws the figures."""
+    evaluation, run = config["evaluation"], training.run
+    rows = compare(
+        {"greedy": training.agent.policy, "sampled": training.agent.policy},
+        partial(build_env, config),
+        speeds=evaluation["speeds"],
+        fps=[config["scene"]["frame_rate_hz"]],
+        episodes=evaluation["final_episodes"],
+        seed=EVALUATION_SEED + config["num_envs"],
+        should_stop=lambda: bool(stop),
+    )
+    if stop:
+        return
+    run.log_episodes(with_origin(rows, config, training.frames))
+    print_table(rows)
+    draw_learning_curve(run)
+    if evaluation["video"]:
+        path = run.video_path(f"episode_{config['speed']}")
+        record_episode(partial(build_env, config, num_envs=1), training.agent.policy, path)
+        print(f"video: {path}")
+
+
+def main() -> None:
+    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    resumed = [a.removeprefix("resume=") for a in sys.argv[1:] if a.startswith("resume=")]
+    if resumed and not any(a.startswith("hydra.run.dir=") for a in sys.argv):
+        # A resumed run stays in its folder, whose .hydra/ keeps telling how it was started.
+        sys.argv += [f"hydra.run.dir={resumed[-1]}", "hydra.output_subdir=null"]
+    run_command("train", run)
+
+
+if __name__ == "__main__":
+    main()
