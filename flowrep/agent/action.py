@@ -24,9 +24,9 @@ class DiscreteActions:
         Raises:
             TypeError: on any other.
         """
-        if isinstance(spec, Categorical):
+        if type(spec) is Categorical:  # its subclasses are codings of several choices at once
             return cls(int(spec.space.n), "categorical", torch.distributions.Categorical)
-        if isinstance(spec, OneHot):
+        if type(spec) is OneHot:
             return cls(int(spec.space.n), "one-hot", OneHotCategorical)
         raise TypeError(
             f"discrete SAC needs a Categorical or OneHot action spec, got {type(spec).__name__}"

@@ -101,14 +101,16 @@ class DiscreteSAC:
 
         actions = DiscreteActions.from_spec(action_spec)
         with self.device:
-            critic_encoder = Encoder(self.codecs)
-            actor_encoder = critic_encoder if encoder == "shared" else Encoder(self.codecs)
-            width = critic_encoder.embedding_size
-            actor_head = Head(width, hidden_size, actions.count)
-            critic_head = Head(width, hidden_size, actions.count)
-        self.encoder_is_shared = encoder == "shared"
-        self.actor_encoder, self.critic_encoder = actor_encoder, critic_encoder
-        self.target_encoder = copy.deepcopy(critic_encoder).requires_grad_(False)
+            self.critic_encoder = Encoder(self.codecs)
+            self.encoder_is_shared = encoder == "shared"
+            self.actor_encoder = (
+                self.critic_encoder if self.encoder_is_shared else Encoder(self.codecs)
+            )
+            sizes = (self.critic_encoder.embedding_size, hidden_size, actions.count)
+            actor_head, critic_head = Head(*sizes), Head(*sizes)
+        self.target_encoder = copy.deepcopy(self.critic_encoder).requires_grad_(False)
+        network = PolicyNetwork(self.codecs, self.actor_encoder, actor_head)
+        self.policy = stochastic_policy(network, list(keys), actions)
         self.loss = DiscreteSACLoss(
             stochastic_policy(actor_head, ["actor_embedding"], actions),
             TensorDictModule(critic_head, ["critic_embedding"], ["action_value"]),
@@ -125,10 +127,8 @@ class DiscreteSAC:
         self.tau = tau
         self._move_target_heads = SoftUpdate(self.loss, tau=tau)
         self._weights = dict(self._named_weights())
-        self._trained = {n: w for n, w in self._weights.items() if w.requires_grad}
-        self.optimizer = torch.optim.Adam(self._trained.values(), lr=learning_rate, fused=True)
-        network = PolicyNetwork(self.codecs, actor_encoder, actor_head)
-        self.policy = stochastic_policy(network, list(keys), actions)
+        self.trained = {n: w for n, w in self._weights.items() if w.requires_grad}
+        self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
         """Takes one gradient step on a batch from `replay.sample()`; returns detached metrics."""
@@ -142,6 +142,9 @@ class DiscreteSAC:
         self._move_targets()
         self.updates += 1
         metrics = TensorDict({name: value.detach() for name, value in losses.items()})
+        metrics["grad_norm"] = torch.nn.utils.get_total_norm(
+            [w.grad for w in self.trained.values()]
+        )
         metrics["learning_rate"] = torch.tensor(learning_rate)
         return metrics
 
@@ -153,12 +156,16 @@ class DiscreteSAC:
         embedded["critic_embedding"] = embedded["critic_embedding"].detach()
         actor_loss, actor_info = self.loss.actor_loss(embedded)
         negative_entropy = actor_info["log_prob"]
+        alpha = self.loss.log_alpha.detach().exp()
+        entropy = -negative_entropy.mean()
         return {
             "q_loss": q_loss,
             "actor_loss": actor_loss,
             "alpha_loss": self.loss.alpha_loss(negative_entropy).mean(),
-            "alpha": self.loss.log_alpha.detach().exp(),
-            "entropy": -negative_entropy.mean(),
+            "alpha": alpha,
+            "entropy": entropy,
+            # L_π = -α · entropy - mean Σ_a π min_i Q_i
+            "q_mean": -(actor_loss.detach() + alpha * entropy),
             "td_error": critic_info["td_error"].mean(),
         }
 
@@ -205,7 +212,7 @@ class DiscreteSAC:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns weights, targets, log α, Adam's moments and the schedule's position."""
-        moments = {n: dict(self.optimizer.state[w]) for n, w in self._trained.items()}
+        moments = {n: dict(self.optimizer.state[w]) for n, w in self.trained.items()}
         return {
             "weights": {name: weight.detach() for name, weight in self._weights.items()},
             "moments": moments if self.updates else {},
@@ -235,7 +242,7 @@ class DiscreteSAC:
         for name, weight in self._weights.items():
             weight.copy_(saved[name])
         for name, moments in state["moments"].items():
-            weight = self._trained[name]
+            weight = self.trained[name]
             self.optimizer.state[weight] = {
                 key: value.to(weight.device, copy=True) for key, value in moments.items()
             }

@@ -1,9 +1,9 @@
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from flowrep.agent import DiscreteSAC
+from flowrep.agent.observation import compact_maps
 
 HEIGHT, WIDTH = 38, 45  # neither square nor a multiple of the first stride
 
@@ -80,15 +80,13 @@ def random_steps(random_maps):
 
 
 @pytest.fixture
-def random_batch(random_steps):
-    """Draws a batch as `ReplayMemory.sample` returns it, for an agent's maps."""
-    from flowrep.agent.observation import compact_maps
+def as_batch():
+    """Turns steps into what `ReplayMemory.sample` returns of them."""
 
-    def draw(agent, size=16):
-        steps = random_steps(size)
+    def convert(agent, steps):
         following = compact_maps(agent.codecs, steps["next"])
         following.update(steps["next"].select("reward", "terminated", "done"))
         batch = compact_maps(agent.codecs, steps)
-        return TensorDict({**batch, "action": steps["action"], "next": following}, [size])
+        return batch.update({"action": steps["action"], "next": following})
 
-    return draw
+    return convert

@@ -34,7 +34,9 @@ def test_encodes_like_the_plain_network(height, width, features):
     x = torch.randn(3, 2, height, width)
     assert encoder.linear.in_features == features
     expected = plain_nature(encoder, x.double())
-    torch.testing.assert_close(encoder(c.decode(c.pack(x))).double(), expected, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(
+        encoder(c.decode(c.pack(x))).double(), expected, rtol=1e-4, atol=1e-6
+    )
 
 
 def test_bfloat16_stays_within_its_precision():

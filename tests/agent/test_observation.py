@@ -30,7 +30,9 @@ def test_rows_and_columns_that_no_kernel_reaches_are_left_out():
 def by_hand(name, x):
     """What the network should see of a raw map: channel c * n + id is 1 where frame c shows id."""
     if name == "seg":
-        return torch.stack([(x[:, c] == i) for c in range(x.shape[1]) for i in range(4)], 1).double()
+        return torch.stack(
+            [(x[:, c] == i) for c in range(x.shape[1]) for i in range(4)], 1
+        ).double()
     return x.double() / 255 if name == "rgb" else x.double()
 
 

@@ -1,0 +1,121 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import Categorical, Composite, OneHot, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+
+def acting(agent, maps, kind=ExplorationType.RANDOM):
+    with torch.no_grad(), set_exploration_type(kind):
+        return agent.policy(maps.clone())["action"]
+
+
+def probabilities(agent, maps):
+    with torch.no_grad():
+        return agent.policy.get_dist(maps.clone()).probs
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
+def test_any_leading_batch_acts_like_a_loop(make_agent, random_maps, batch):
+    agent, maps = make_agent(), random_maps(*batch)
+    probs = probabilities(agent, maps)
+    assert probs.shape == (*batch, 3)
+    looped = [probabilities(agent, one) for one in (maps.reshape(-1) if batch else [maps])]
+    torch.testing.assert_close(probs.reshape(-1, 3), torch.stack(looped))
+    assert acting(agent, maps).shape == batch
+
+
+def test_deterministic_exploration_takes_the_likeliest_action(make_agent, random_maps):
+    agent, maps = make_agent(), random_maps(20)
+    expected = probabilities(agent, maps).argmax(-1)
+    for _ in range(3):
+        assert torch.equal(acting(agent, maps, ExplorationType.DETERMINISTIC), expected)
+
+
+def test_otherwise_actions_are_drawn_from_the_policy(make_agent, random_maps):
+    agent, maps = make_agent(), random_maps(1)
+    agent.policy[0].module.head.output.bias.data = torch.tensor([0.0, 1.0, -1.0])
+    expected = probabilities(agent, maps)[0]
+    actions = acting(agent, maps.expand(3000).contiguous())
+    shares = torch.bincount(actions, minlength=3) / 3000
+    # three standard deviations of a share are 0.027
+    torch.testing.assert_close(shares, expected, atol=0.03, rtol=0)
+
+
+def test_one_hot_actions(make_agent, random_maps):
+    agent, maps = make_agent(action_spec=OneHot(3)), random_maps(4)
+    action = acting(agent, maps, ExplorationType.DETERMINISTIC)
+    assert action.shape == (4, 3)
+    assert torch.equal(action.argmax(-1), probabilities(agent, maps).argmax(-1))
+
+
+def test_writes_the_action_and_nothing_else(make_agent, random_maps):
+    agent, maps = make_agent(), random_maps(2)
+    assert set(agent.policy(maps.clone()).keys()) - set(maps.keys()) == {"action"}
+
+
+def test_acts_with_the_weights_that_an_update_left(make_agent, random_steps, as_batch):
+    agent, steps = make_agent(learning_rate=0.01), random_steps(8)
+    before = probabilities(agent, steps)
+    agent.update(as_batch(agent, steps))
+    assert not torch.equal(probabilities(agent, steps), before)
+
+
+def test_maps_of_another_size_are_refused(make_agent, random_maps):
+    agent, maps = make_agent(), random_maps(2)
+    maps["flow"] = maps["flow"][..., :-1]
+    with pytest.raises(ValueError, match=r"'flow': .* maps \(2, 38, 45\), got \(2, 38, 44\)"):
+        agent.policy(maps)
+
+
+class Clock(EnvBase):
+    """Three environments whose one map shows the time; environment i ends at time 2 + i."""
+
+    def __init__(self):
+        super().__init__(batch_size=[3])
+        shape = (3, 1, 36, 36)
+        self.observation_spec = Composite(view=Unbounded(shape), shape=(3,))
+        self.action_spec = Categorical(3, shape=(3,))
+        self.reward_spec = Unbounded((3, 1))
+        self.time = torch.zeros(3)
+
+    def view(self):
+        return self.time.view(3, 1, 1, 1).expand(3, 1, 36, 36).clone()
+
+    def _reset(self, tensordict):
+        reset = torch.ones(3, dtype=torch.bool)
+        if tensordict is not None and "_reset" in tensordict:
+            reset = tensordict["_reset"].reshape(3)
+        self.time = torch.where(reset, torch.zeros(3), self.time)
+        return TensorDict({"view": self.view()}, [3])
+
+    def _step(self, tensordict):
+        self.time = self.time + 1
+        done = (self.time == torch.tensor([2.0, 3.0, 4.0])).unsqueeze(1)
+        reward = self.time.unsqueeze(1)
+        return TensorDict(
+            {"view": self.view(), "reward": reward, "done": done, "terminated": done}, [3]
+        )
+
+    def _set_seed(self, seed):
+        pass
+
+
+def test_a_torchrl_collector_acts_with_it_and_the_replay_takes_its_frames(make_agent):
+    env = Clock()
+    agent = make_agent(
+        env.observation_spec, ["view"], env.full_action_spec["action"], batch_size=200
+    )
+    collector = Collector(env, agent.policy, frames_per_batch=9, total_frames=54)
+    for frames in collector:
+        agent.replay.extend(frames)
+    collector.shutdown()
+    batch = agent.replay.sample()
+    now, later = batch["view"][:, 0, 0, 0], batch["next", "view"][:, 0, 0, 0]
+    terminated = batch["next", "terminated"].squeeze(1)
+    assert len(agent.replay) == 54
+    assert terminated.any()
+    assert torch.equal(batch["next", "reward"].squeeze(1), now.float() + 1)
+    assert torch.equal(later[~terminated], now[~terminated] + 1)

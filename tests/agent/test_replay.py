@@ -1,0 +1,189 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
+
+from flowrep.agent.observation import map_codecs
+from flowrep.agent.replay import ReplayMemory
+
+SPEC = Composite(view=Unbounded((1, 36, 36)))
+
+
+def memory(capacity=100, batch_size=400, dtype=torch.float32):
+    codecs = map_codecs(SPEC, ["view"], dtype)
+    return ReplayMemory(
+        codecs, capacity=capacity, batch_size=batch_size, frames_per_update=1, learning_starts=1,
+        device="cpu",
+    )  # fmt: skip
+
+
+def view(numbers):
+    """Maps that show one number each."""
+    numbers = torch.as_tensor(numbers, dtype=torch.float32)
+    return numbers[..., None, None, None].expand(*numbers.shape, 1, 36, 36).clone()
+
+
+def step(seen, following, ended="", action=None):
+    """One step of N environments; `ended` has a letter for each: t(erminated), c(ut off), or -."""
+    size = len(seen)
+    ended = ended or "-" * size
+    terminated = torch.tensor([e == "t" for e in ended]).unsqueeze(1)
+    done = torch.tensor([e != "-" for e in ended]).unsqueeze(1)
+    action = torch.tensor(seen if action is None else action, dtype=torch.long)
+    return TensorDict(
+        {
+            "view": view(seen),
+            "action": action,
+            "next": {
+                "view": view(following),
+                "reward": torch.tensor(following, dtype=torch.float32).unsqueeze(1),
+                "terminated": terminated,
+                "done": done,
+            },
+        },
+        [size],
+    )
+
+
+def transitions(replay):
+    """The distinct (seen, action, reward, next, terminated) among a large sample, sorted."""
+    batch = replay.sample()
+    columns = [
+        batch["view"][:, 0, 0, 0], batch["action"], batch["next", "reward"][:, 0],
+        batch["next", "view"][:, 0, 0, 0], batch["next", "terminated"][:, 0],
+    ]  # fmt: skip
+    rows = torch.stack([column.double() for column in columns], 1)
+    return [tuple(int(x) for x in row) for row in rows.unique(dim=0)]
+
+
+def test_next_is_the_frame_that_followed_in_the_same_environment():
+    replay = memory()
+    replay.extend(step([10, 20], [11, 21]))
+    replay.extend(step([11, 21], [12, 22]))
+    replay.extend(step([12, 22], [13, 23]))
+    # the latest step of each environment waits for its next frame
+    assert transitions(replay) == [
+        (10, 10, 11, 11, 0), (11, 11, 12, 12, 0), (20, 20, 21, 21, 0), (21, 21, 22, 22, 0),
+    ]  # fmt: skip
+
+
+def test_a_terminated_step_is_there_at_once_with_its_own_map_as_a_stand_in():
+    replay = memory()
+    replay.extend(step([10, 20], [11, 21], ended="t-"))
+    assert transitions(replay) == [(10, 10, 11, 10, 1)]
+    replay.extend(step([50, 21], [51, 22]))
+    # 50 is a new episode: it is not what followed 10
+    assert transitions(replay) == [(10, 10, 11, 10, 1), (20, 20, 21, 21, 0)]
+
+
+def test_a_step_that_was_cut_off_is_left_out():
+    replay = memory()
+    replay.extend(step([10, 20], [11, 21], ended="c-"))
+    replay.extend(step([50, 21], [51, 22]))
+    replay.extend(step([51, 22], [52, 23]))
+    assert transitions(replay) == [
+        (20, 20, 21, 21, 0), (21, 21, 22, 22, 0), (50, 50, 51, 51, 0),
+    ]  # fmt: skip
+
+
+def test_a_restart_between_two_calls_does_not_join_two_episodes():
+    replay = memory()
+    replay.extend(step([10, 20], [11, 21]))
+    replay.extend(step([0, 21], [1, 22]))  # environment 0 began anew without saying so
+    replay.extend(step([1, 22], [2, 23]))
+    assert transitions(replay) == [(0, 0, 1, 1, 0), (20, 20, 21, 21, 0), (21, 21, 22, 22, 0)]
+
+
+def test_a_batch_of_steps_is_stored_as_the_steps_one_by_one():
+    steps = [
+        step([10, 20], [11, 21]),
+        step([11, 21], [12, 22], ended="-t"),
+        step([12, 40], [13, 41], ended="t-"),
+        step([60, 41], [61, 42]),
+    ]
+    one_by_one, at_once, named = memory(), memory(), memory()
+    for s in steps:
+        one_by_one.extend(s)
+    at_once.extend(torch.stack(steps[:3], 1))
+    at_once.extend(torch.stack(steps[3:], 1))
+    time_last = torch.stack(steps, 1)
+    time_last.names = [None, "time"]
+    named.extend(time_last)
+    expected = [
+        (10, 10, 11, 11, 0), (11, 11, 12, 12, 0), (12, 12, 13, 12, 1), (20, 20, 21, 21, 0),
+        (21, 21, 22, 21, 1), (40, 40, 41, 41, 0),
+    ]  # fmt: skip
+    assert transitions(one_by_one) == transitions(at_once) == transitions(named) == expected
+
+
+def test_a_single_trajectory_names_its_time():
+    replay = memory()
+    steps = torch.cat([step([i], [i + 1]) for i in range(4)])
+    steps.names = ["time"]
+    replay.extend(steps)
+    assert transitions(replay) == [(i, i, i + 1, i + 1, 0) for i in range(3)]
+
+
+def test_the_oldest_are_overwritten():
+    replay = memory(capacity=7)  # not a multiple of the two environments
+    for i in range(9):
+        replay.extend(step([i, 100 + i], [i + 1, 101 + i]))
+    assert len(replay) == 7
+    # of slots for steps 5 (second half), 6, 7, 8 all but step 8 know their next frame
+    assert transitions(replay) == [
+        (i, i, i + 1, i + 1, 0) for i in (6, 7)] + [(i, i, i + 1, i + 1, 0) for i in (105, 106, 107)
+    ]  # fmt: skip
+
+
+def test_sampling_is_uniform_with_replacement():
+    torch.manual_seed(0)
+    replay = memory(batch_size=4000)
+    replay.extend(step(list(range(5)), list(range(1, 6)), ended="ttttt"))
+    counts = torch.bincount(replay.sample()["action"], minlength=5)
+    # four standard deviations of 800 draws are 101
+    assert ((counts - 800).abs() < 101).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_maps_are_kept_once_and_in_two_bytes_a_number(dtype):
+    replay = memory(capacity=50, dtype=dtype)
+    for i in range(30):
+        replay.extend(step([i, 50 + i], [i + 1, 51 + i]))
+    frames = replay.state_dict()["frames"]
+    maps = [t for t in frames.values() if t.dim() > 2]
+    assert [t.nbytes for t in maps] == [50 * 36 * 36 * 2]
+
+
+def test_what_does_not_fit_is_refused_with_the_size_that_does():
+    with pytest.raises(ValueError, match=r"capacity of 5 .* one|hold 6"):
+        memory(capacity=5).extend(step([1, 2, 3], [2, 3, 4]))
+    memory(capacity=6).extend(step([1, 2, 3], [2, 3, 4]))
+
+
+def test_an_empty_memory_says_so():
+    with pytest.raises(RuntimeError, match="nothing to sample"):
+        memory().sample()
+
+
+def test_a_restored_memory_goes_on_as_the_saved_one():
+    first = memory(capacity=11)
+    for i in range(8):
+        first.extend(step([i, 100 + i], [i + 1, 101 + i]))
+    state = first.state_dict()
+    state = {k: dict(v) if isinstance(v, dict) else v for k, v in state.items()}
+    second = memory(capacity=11)
+    second.load_state_dict(state)
+    for replay in (first, second):
+        replay.extend(step([8, 108], [9, 109]))
+        torch.manual_seed(3)
+        replay.drawn = replay.sample()
+    assert (first.drawn == second.drawn).all()
+    with pytest.raises(ValueError, match="capacity 11, this one 12; set replay_capacity=11"):
+        memory(capacity=12).load_state_dict(state)
+
+
+def test_a_memory_restored_before_any_frame_works():
+    replay = memory()
+    replay.load_state_dict(memory().state_dict())
+    replay.extend(step([1], [2], ended="t"))
+    assert transitions(replay) == [(1, 1, 2, 1, 1)]
