@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
+from hydra.utils import get_class
 from torchrl.envs import EnvBase
 
 from flowrep.agent import DiscreteSAC
@@ -43,11 +43,13 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
 
 def build_agent(config: Config, env: EnvBase) -> DiscreteSAC:
     """Returns the config's algorithm, untrained, on what the env emits."""
-    return instantiate(
-        config["algorithm"],
-        observation_spec=env.observation_spec,
-        action_spec=env.action_spec,
-        keys=list(config["representations"]),
+    options = dict(config["algorithm"])
+    algorithm = get_class(options.pop("_target_"))
+    return algorithm(
+        env.observation_spec,
+        env.action_spec,
+        list(config["representations"]),
         total_frames=config["total_frames"],
         device=choose_device(config["device"]),
+        **options,
     )

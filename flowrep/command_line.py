@@ -108,7 +108,9 @@ def _one_value(override: Override) -> str:
 
 def _check_known(name: str, known: Sequence[str], what: str) -> None:
     if name not in known:
-        raise UsageError(f"unknown {what} '{name}'{_closest(name, known)}; there are: {', '.join(known)}")
+        raise UsageError(
+            f"unknown {what} '{name}'{_closest(name, known)}; there are: {', '.join(known)}"
+        )
 
 
 def _check_key(key: str, config: DictConfig) -> None:

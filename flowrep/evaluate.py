@@ -30,7 +30,7 @@ def run(config: DictConfig) -> None:
         exit_with(str(error))
     with StopRequest() as stop:
         rows = compare(
-            {name: agent.policy for name in policies},
+            dict.fromkeys(policies, agent.policy),
             partial(build_env, trained),
             speeds=speeds,
             fps=rates,
@@ -95,8 +95,9 @@ def film(
         for rate in rates:
             for number in range(config.video):
                 path = folder.video_path(f"{speed}_{rate:g}fps_{number}")
-                make = partial(build_env, trained, num_envs=1, speed=speed, frame_rate_hz=rate)
-                record_episode(make, agent.policy, path, seed=config.seed + number)
+                make = partial(build_env, trained, speed=speed, frame_rate_hz=rate)
+                seen = trained["representations"]
+                record_episode(make, agent.policy, seen, path, seed=config.seed + number)
                 print(f"video: {path}")
 
 

@@ -55,7 +55,9 @@ def open_run(config: DictConfig) -> tuple[RunFolder, dict[str, Any]]:
         folder = RunFolder(HydraConfig.get().runtime.output_dir)
         folder.write_config(plain)
         return folder, plain
-    others = [o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "device="))]
+    others = [
+        o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "device="))
+    ]
     if others:
         raise UsageError(
             f"resume= continues a run with its own config, so '{others[0]}' would be ignored; "
@@ -115,13 +117,14 @@ def log_evaluation(training: Training, config: Config, frames: int) -> None:
 def final_evaluation(training: Training, config: Config, stop: StopRequest) -> None:
     """Compares the agent with baselines at each speed, films an episode and draws the figures."""
     evaluation, run = config["evaluation"], training.run
+    seed = EVALUATION_SEED + config["num_envs"]
     rows = compare(
         {"greedy": training.agent.policy, "sampled": training.agent.policy},
         partial(build_env, config),
         speeds=evaluation["speeds"],
         fps=[config["scene"]["frame_rate_hz"]],
         episodes=evaluation["final_episodes"],
-        seed=EVALUATION_SEED + config["num_envs"],
+        seed=seed,
         should_stop=lambda: bool(stop),
     )
     if stop:
@@ -131,7 +134,8 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
     draw_learning_curve(run)
     if evaluation["video"]:
         path = run.video_path(f"episode_{config['speed']}")
-        record_episode(partial(build_env, config, num_envs=1), training.agent.policy, path)
+        make_env = partial(build_env, config)
+        record_episode(make_env, training.agent.policy, config["representations"], path, seed=seed)
         print(f"video: {path}")
 
 

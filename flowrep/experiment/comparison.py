@@ -1,9 +1,11 @@
 """An agent beside baselines on the same episodes: rows for evaluation.csv and a table to read."""
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+from rich import box
 from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDictBase
@@ -111,17 +113,20 @@ def _row(policy: str, speed: str, fps: float, episode: Episode) -> Row:
 
 def print_table(rows: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
     """Prints the share of each outcome in %, with its 95 % Wilson interval."""
-    table = Table(title="Share of episodes in % [95 % interval]")
-    for heading in ("speed", "fps", "policy", "episodes", *OUTCOMES[1:]):
-        table.add_column(heading.replace("_", " "), justify="left" if heading == "policy" else "right")
-    keys = list(dict.fromkeys((row["speed"], row["fps"], row["policy"]) for row in rows))
-    for before, key in zip([None, *keys], keys):
-        outcomes = [
-            row["outcome"] for row in rows if (row["speed"], row["fps"], row["policy"]) == key
-        ]
+    table = Table(title="Share of episodes in % [95 % interval]", box=box.SIMPLE, pad_edge=False)
+    for heading in ("speed", "fps", "policy", "episodes"):
+        table.add_column(heading, no_wrap=True)
+    for heading in OUTCOMES[1:]:
+        table.add_column(heading.replace("_", " "), justify="right", no_wrap=True)
+    by_policy: dict[tuple[str, float, str], list[str]] = defaultdict(list)
+    for row in rows:
+        by_policy[row["speed"], row["fps"], row["policy"]].append(row["outcome"])
+    shown: tuple[str, float] | None = None
+    for (speed, fps, policy), outcomes in by_policy.items():
+        if shown not in (None, (speed, fps)):
+            table.add_section()
+        shown = speed, fps
         shares = outcome_shares(outcomes).values()
         cells = [f"{100 * s:.0f} [{100 * low:.0f}–{100 * high:.0f}]" for s, low, high in shares]
-        if before and before[:2] != key[:2]:
-            table.add_section()
-        table.add_row(str(key[0]), str(key[1]), str(key[2]), str(len(outcomes)), *cells)
-    (console or Console()).print(table)
+        table.add_row(speed, f"{float(fps):g}", policy, str(len(outcomes)), *cells)
+    (console or Console(width=max(88, Console().width))).print(table)

@@ -1,7 +1,8 @@
 """Films an episode: what the camera sees and every representation of it, side by side."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -55,7 +56,12 @@ def maps_of(tensordict: TensorDictBase, intrinsics: Tensor) -> Maps:
 
 
 def record_episode(
-    make_env: Callable[..., EnvBase], policy: Policy, representations, path: Path, *, seed: int
+    make_env: Callable[..., EnvBase],
+    policy: Policy,
+    representations: Mapping[str, Any],
+    path: Path,
+    *,
+    seed: int,
 ) -> str:
     """Writes the video of one greedy episode to `path`; returns how it ended.
 
@@ -66,7 +72,9 @@ def record_episode(
         path: the mp4 file.
         seed: of the environment, which draws the episode.
     """
-    env = make_env(representations=dict(representations) | {"rgb": {}}, keep_sensor=True, num_envs=1)
+    env = make_env(
+        representations=dict(representations) | {"rgb": {}}, keep_sensor=True, num_envs=1
+    )
     env.set_seed(seed)
     frames, outcome = film_episode(env, policy)
     fps = streets(env)[0].frame_rate_hz

@@ -50,7 +50,7 @@ class RunFolder:
         if not (Path(path) / "config.yaml").is_file():
             raise FileNotFoundError(
                 f"'{path}' holds no run: it has no config.yaml. Give the folder that a training "
-                "printed as its run folder, e.g. outputs/2026-01-31/12-00-00_straight_road_ego+obj_s0"
+                "printed as its run folder"
             )
         return cls(path)
 

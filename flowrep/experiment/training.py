@@ -82,7 +82,7 @@ def train(
     training: Training,
     config: Mapping[str, Any],
     stop: StopRequest,
-    evaluate: Callable[[int], float],
+    evaluate: Callable[[int], None],
 ) -> Stopwatch:
     """Trains until `total_frames` or until a stop is asked for; the last state is saved.
 
@@ -90,7 +90,7 @@ def train(
         training: a new or a restored run.
         config: the resolved config.
         stop: asked between two steps.
-        evaluate: gets the number of frames, returns a success rate to show.
+        evaluate: gets the number of frames.
 
     Returns:
         Where the wall time went.
