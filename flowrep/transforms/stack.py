@@ -47,10 +47,15 @@ _UNSCALED = "_raw"  # raw flow in px/step, nan where unknown: what FlowFactorize
 def representation_options(name: str) -> dict[str, Any]:
     """Returns a representation's options with their defaults, e.g. `range_m` of depth.
 
+    Raises:
+        ValueError: for an unknown name.
+
     Example:
         >>> representation_options("depth2")
         {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
+    if name not in _MADE_BY:
+        raise ValueError(_unknown("representation", name, REPRESENTATIONS))
     return {
         parameter.name: parameter.default
         for made_by in _MADE_BY[name]
@@ -120,15 +125,16 @@ def _with_options(
         raise ValueError(f"representations is a list of names, e.g. [{representations!r}]")
     names = list(representations)
     for name in names:
-        if name not in _MADE_BY:
-            raise ValueError(_unknown("representation", name, REPRESENTATIONS))
         if names.count(name) > 1:
             raise ValueError(f"representation {name!r} is named {names.count(name)} times")
     given = representations if isinstance(representations, Mapping) else {}
     chosen = {}
     for name in names:
         options = representation_options(name)
-        for option, value in dict(given.get(name) or {}).items():
+        own = given.get(name) or {}
+        if not isinstance(own, Mapping):
+            raise ValueError(f"options of representation {name!r} are a mapping, got {own!r}")
+        for option, value in own.items():
             if option not in options:
                 raise ValueError(_unknown(f"option of representation {name!r}:", option, options))
             options[option] = value
@@ -140,7 +146,7 @@ def _with_options(
 
 def _unknown(what: str, name: str, known: Sequence[str] | Mapping[str, Any]) -> str:
     close = difflib.get_close_matches(str(name), list(known), n=1)
-    hint = f", did you mean {close[0]!r}?" if close else ""
+    hint = f", did you mean {close[0]!r}?" if close else "."
     return f"unknown {what} {name!r}{hint} There are {list(known)}"
 
 

@@ -1,0 +1,182 @@
+"""What all transforms share: errors that help, "next", any batch, compilation."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+
+from flowrep.transforms import Depth, FlowFactorize, FrameStack, RawFlow, Rgb, Segmentation, base
+from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv, frame
+
+COMPILE = torch.compile
+
+TRANSFORMS = {
+    "seg": lambda: Segmentation(NUM_CLASSES),
+    "onehot": lambda: Segmentation(NUM_CLASSES, encoding="onehot"),
+    "depth": lambda: Depth(range_m=14.0),
+    "rgb": Rgb,
+    "raw": lambda: RawFlow(INTRINSICS, scale=0.5, outputs=["raw", "valid"]),
+    "ego": lambda: FlowFactorize(INTRINSICS, outputs=["ego"]),
+    "ego, obj": lambda: FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
+    "stack": lambda: FrameStack(k=3, in_keys=[("sensor", "rgb")], out_keys=["rgb3"]),
+}
+each_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=list(TRANSFORMS))
+
+
+def moments(*batch: int) -> TensorDict:
+    """Returns frames of different envs and steps, with a raw flow of their own."""
+    count = torch.Size(batch).numel()
+    frames = [frame(i % 3, i % 2, i) for i in range(count)]
+    td = torch.stack([TensorDict({"sensor": one}) for one in frames])
+    td = TensorDict(td, [count])
+    td["raw"] = torch.randn(count, 2, 5, 7, generator=torch.manual_seed(1))
+    return td.reshape(batch) if batch else td[0]
+
+
+def inputs(transform, td: TensorDict) -> list[torch.Tensor]:
+    return [td[key] for key in transform.in_keys]
+
+
+@each_transform
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)], ids=str)
+def test_any_batch_equals_a_loop_over_frames(make, batch):
+    transform, td = make(), moments(*batch)
+    together = transform.compute(*inputs(transform, td))
+    alone = [transform.compute(*inputs(transform, one)) for one in td.reshape(-1)]
+    for i, output in enumerate(together):
+        assert output.shape[: len(batch)] == batch
+        want = torch.stack([outputs[i] for outputs in alone])
+        assert torch.equal(output.reshape(want.shape), want)
+
+
+@each_transform
+def test_compute_is_pure_and_compiles_to_one_graph(make):
+    transform, td = make(), moments(2)
+    before = td.clone()
+    want = transform.compute(*inputs(transform, td))
+    got = torch.compile(transform.compute, fullgraph=True, backend="eager")(*inputs(transform, td))
+    assert all(torch.equal(a, b) for a, b in zip(got, want))
+    for key in transform.in_keys:
+        assert torch.equal(td[key].nan_to_num(), before[key].nan_to_num())
+
+
+def test_compiled_flow_goes_through_torch_compile_and_stays_picklable(monkeypatch):
+    # The eager backend traces without compiling C++: geometry's tests cover the real one.
+    compiled = []
+
+    def spy(function, **options):
+        compiled.append((function, options))
+        return COMPILE(function, backend="eager", **options)
+
+    monkeypatch.setattr(torch, "compile", spy)
+    base._compiled.cache_clear()
+    td = moments(2)
+    transform = RawFlow(INTRINSICS, compiled=True)
+    fused = transform(td.clone())["raw"]
+    assert compiled == [(RawFlow.compute, {"fullgraph": True})]
+    assert torch.equal(fused, RawFlow(INTRINSICS)(td.clone())["raw"])
+    assert torch.equal(fused, pickle.loads(pickle.dumps(transform))(td.clone())["raw"])
+    base._compiled.cache_clear()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@each_transform
+def test_cuda_equals_cpu(make):
+    transform, td = make(), moments(2, 1)
+    want = transform.compute(*inputs(transform, td))
+    transform, td = transform.to("cuda"), td.to("cuda")
+    got = transform.compute(*inputs(transform, td))
+    for on_cuda, on_cpu in zip(got, want):
+        assert on_cuda.device.type == "cuda"
+        torch.testing.assert_close(on_cuda.cpu(), on_cpu, atol=1e-5, rtol=1e-5)
+
+
+@each_transform
+def test_moves_to_another_device_and_type(make):
+    transform = make().to("meta")
+    td = moments(2).to("meta")
+    outputs = transform.compute(*inputs(transform, td))
+    assert all(output.device.type == "meta" for output in outputs)
+
+
+def test_float64_maps_give_float64_flow_as_the_spec_says():
+    td = moments(2)
+    td["sensor", "depth"] = td["sensor", "depth"].double()
+    env = TransformedEnv(FakeSensorEnv((2,)), RawFlow(INTRINSICS))
+    assert env.observation_spec["raw"].dtype == torch.float32
+    assert RawFlow(INTRINSICS)(td)["raw"].dtype == torch.float64
+
+
+def test_missing_key_is_named_with_what_the_env_offers_before_the_first_step():
+    env = TransformedEnv(FakeSensorEnv(), Depth(in_keys=["range"]))
+    with pytest.raises(KeyError) as error:
+        env.observation_spec  # noqa: B018
+    message = str(error.value)
+    assert "representation 'depth' needs key 'range'" in message
+    assert "('sensor', 'depth')" in message
+    assert "\\" not in message  # KeyError would quote the sentence
+
+
+def test_missing_key_is_named_on_a_batch():
+    td = moments(2)
+    del td["sensor", "instance"]
+    with pytest.raises(KeyError, match=r"'raw' needs key \('sensor', 'instance'\)"):
+        RawFlow(INTRINSICS)(td)
+
+
+def test_missing_key_is_tolerated_when_torchrl_asks_for_it():
+    transform = Depth()
+    transform.set_missing_tolerance(True)
+    assert "depth" not in transform(TensorDict({"reward": torch.zeros(3, 1)}, [3]))
+
+
+def test_next_without_any_input_is_left_alone():
+    td = moments(2)
+    td["next"] = TensorDict({"reward": torch.ones(2, 1)}, [2])
+    assert list(Depth()(td)["next"].keys()) == ["reward"]
+
+
+def test_next_with_some_inputs_is_an_error():
+    td = moments(2)
+    td["next"] = TensorDict({"sensor": {"depth": td["sensor", "depth"]}}, [2])
+    with pytest.raises(KeyError, match="prev_from_curr"):
+        FlowFactorize(INTRINSICS, outputs=["ego"])(td)
+
+
+def test_keywords_instead_of_a_tensordict():
+    depth = torch.full((1, 2, 3), 50.0)
+    assert torch.equal(Depth()(sensor_depth=depth), depth / 100)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("depth", torch.ones(2, 5, 7), r"\('sensor', 'depth'\) should be float \[\*B, 1, H, W\]"),
+        ("depth", torch.ones(2, 1, 5, 7).long(), r"float \[\*B, 1, H, W\].*got torch.int64"),
+        ("instance", torch.ones(2, 1, 5, 7), r"integer \[\*B, 1, H, W\].*got torch.float32"),
+        ("instance", torch.ones(2, 1, 7, 5).byte(), r"H = 5, W = 7.*\[2, 1, 7, 5\]"),
+        ("instance_motion", torch.eye(4).expand(2, 4, 4), r"\[\*B, N, 4, 4\].*\[2, 4, 4\]"),
+    ],
+)
+def test_wrong_layout_is_refused_on_a_batch(key, value, expected):
+    td = moments(2)
+    td["sensor", key] = value
+    with pytest.raises(ValueError, match=expected):
+        RawFlow(INTRINSICS)(td)
+
+
+def test_wrong_layout_is_refused_before_the_first_step():
+    env = TransformedEnv(FakeSensorEnv((3,)), Depth(in_keys=[("sensor", "rgb")]))
+    with pytest.raises(ValueError, match=r"'depth'.*float \[\*B, 1, H, W\].*\[3, 3, 5, 7\]"):
+        env.observation_spec  # noqa: B018
+
+
+def test_wrong_number_of_keys_is_refused():
+    with pytest.raises(ValueError, match=r"reads 3 keys .* in_keys has 1"):
+        RawFlow(INTRINSICS, in_keys=["depth"])
+    with pytest.raises(ValueError, match=r"\['ego', 'obj'\]: out_keys needs as many"):
+        FlowFactorize(INTRINSICS, out_keys=["ego"])

@@ -1,0 +1,113 @@
+"""Segmentation, depth and colour: values worked by hand, specs that tell the truth."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical
+from torchrl.envs import TransformedEnv, check_env_specs
+
+from flowrep.transforms import Depth, Rgb, Segmentation
+from tests.transforms.fake_env import NUM_CLASSES, FakeSensorEnv
+
+IDS = torch.tensor([[[2, 0, 1], [1, 1, 2]]], dtype=torch.uint8)  # [1, 2, 3]
+
+
+def read(transform, name: str, value: torch.Tensor) -> torch.Tensor:
+    td = transform(TensorDict({"sensor": {name: value}}))
+    return td[transform.out_keys[0]]
+
+
+def spec_of(transform, batch: tuple[int, ...] = (3,)):
+    env = TransformedEnv(FakeSensorEnv(batch), transform)
+    check_env_specs(env)
+    return env.observation_spec[transform.out_keys[0]]
+
+
+def test_ids_stay_ids():
+    got = read(Segmentation(3), "semantic", IDS)
+    assert got.dtype == torch.uint8
+    assert torch.equal(got, IDS)
+
+
+def test_wider_ids_become_uint8():
+    assert read(Segmentation(3), "semantic", IDS.to(torch.int16)).dtype == torch.uint8
+
+
+def test_onehot_has_a_map_a_class():
+    got = read(Segmentation(4, encoding="onehot"), "semantic", IDS)
+    assert got.tolist() == [
+        [[0, 1, 0], [0, 0, 0]],
+        [[0, 0, 1], [1, 1, 0]],
+        [[1, 0, 0], [0, 0, 1]],
+        [[0, 0, 0], [0, 0, 0]],
+    ]
+
+
+def test_spec_of_ids_knows_the_number_of_classes():
+    spec = spec_of(Segmentation(NUM_CLASSES))
+    assert isinstance(spec, Categorical)
+    assert spec.space.n == NUM_CLASSES
+    assert (spec.shape, spec.dtype) == ((3, 1, 5, 7), torch.uint8)
+
+
+def test_spec_of_onehot_has_a_channel_a_class():
+    spec = spec_of(Segmentation(NUM_CLASSES, encoding="onehot"))
+    assert isinstance(spec, Bounded)
+    assert (spec.shape, spec.dtype) == ((3, 4, 5, 7), torch.float32)
+    assert (spec.space.low.max(), spec.space.high.min()) == (0, 1)
+
+
+def test_an_env_with_more_classes_than_told_is_caught_by_its_specs():
+    with pytest.raises(AssertionError):
+        check_env_specs(TransformedEnv(FakeSensorEnv(), Segmentation(NUM_CLASSES - 1)))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"num_classes": 3, "encoding": "rgb"}, r"\['ids', 'onehot'\], got 'rgb'"),
+        ({"num_classes": 0}, "1 to 256"),
+        ({"num_classes": 257}, "1 to 256"),
+    ],
+)
+def test_segmentation_refuses(options, expected):
+    with pytest.raises(ValueError, match=expected):
+        Segmentation(**options)
+
+
+def test_depth_is_clipped_and_finite():
+    depth = torch.tensor([[[10.0, 50.0, 0.0], [40.0, math.inf, math.nan]]])
+    got = read(Depth(range_m=40.0, missing=0.75), "depth", depth)
+    assert got.tolist() == [[[0.25, 1.0, 0.0], [1.0, 1.0, 0.75]]]
+    assert read(Depth(), "depth", depth)[0, 1, 2] == 0.0
+
+
+def test_spec_of_depth_is_bounded():
+    spec = spec_of(Depth())
+    assert (spec.shape, spec.dtype) == ((3, 1, 5, 7), torch.float32)
+    assert (spec.space.low.min(), spec.space.high.max()) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"range_m": 0.0}, "range_m is a positive"),
+        ({"range_m": math.inf}, "range_m is a positive"),
+        ({"missing": 1.5}, r"missing is the value in \[0, 1\]"),
+    ],
+)
+def test_depth_refuses(options, expected):
+    with pytest.raises(ValueError, match=expected):
+        Depth(**options)
+
+
+def test_rgb_passes_and_its_spec_says_255():
+    picture = torch.arange(12, dtype=torch.uint8).reshape(3, 1, 4) * 20
+    assert torch.equal(read(Rgb(), "rgb", picture), picture)
+    spec = spec_of(Rgb())
+    assert (spec.shape, spec.dtype) == ((3, 3, 5, 7), torch.uint8)
+    assert (spec.space.low.min(), spec.space.high.max()) == (0, 255)

@@ -1,0 +1,32 @@
+"""conf/representations: one file a representation, its options and defaults those of the code."""
+
+from __future__ import annotations
+
+import pytest
+
+from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.transforms import REPRESENTATIONS, representation_options, representation_stack
+
+yaml = pytest.importorskip("yaml")
+
+K = [[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]]
+
+
+def read(name: str) -> dict:
+    return yaml.safe_load((CONF_DIR / "representations" / f"{name}.yaml").read_text())
+
+
+def test_there_is_a_file_for_each_representation():
+    assert sorted(REPRESENTATIONS) == group_choices("representations")
+
+
+@pytest.mark.parametrize("name", REPRESENTATIONS)
+def test_file_names_the_representation_and_spells_its_options(name):
+    config = read(name)
+    assert list(config) == [name]
+    assert list(config[name].items()) == list(representation_options(name).items())
+
+
+def test_all_files_together_make_a_stack():
+    chosen = {name: read(name)[name] for name in REPRESENTATIONS}
+    assert representation_stack(chosen, intrinsics=K, num_classes=5)
