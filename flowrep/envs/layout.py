@@ -42,9 +42,7 @@ class Box:
         return Polygon(
             [
                 (self.x_m + cosine * u - sine * v, self.y_m + sine * u + cosine * v)
-                for u, v in (
-                    (forward, left), (-forward, left), (-forward, -left), (forward, -left)
-                )
+                for u, v in ((forward, left), (-forward, left), (-forward, -left), (forward, -left))
             ]
         )
 
@@ -99,8 +97,7 @@ class Layout:
         self.closures = {closure.name: self._closure_box(closure) for closure in scene.closures}
         self.buildings = self._buildings()
         self.obstacles = tuple(
-            Box(o.category, *o.center_m, math.radians(o.yaw_deg), o.size_m)
-            for o in scene.obstacles
+            Box(o.category, *o.center_m, math.radians(o.yaw_deg), o.size_m) for o in scene.obstacles
         )
         shapely.prepare(self.drivable)
 

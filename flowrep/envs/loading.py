@@ -147,7 +147,9 @@ def _check_names(scene: Scene, source: str) -> None:
     for group in scene.pedestrian_groups:
         key = f"pedestrian_groups.{group.name}.walk"
         needed = {
-            "across": ("road", "at_m"), "along": ("road", "from_m", "to_m"), "points": ("points_m",)
+            "across": ("road", "at_m"),
+            "along": ("road", "from_m", "to_m"),
+            "points": ("points_m",),
         }[group.walk.kind]
         for name in needed:
             if getattr(group.walk, name) in (None, ()):

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from torchrl.data import Composite
 from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
 from flowrep.envs.loading import load_scene
@@ -34,7 +35,7 @@ class SensorObservation(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         """Wraps a `StreetEnv`."""
         super().__init__(env)
-        beside = {
+        beside: dict[str, spaces.Space] = {
             "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
             "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
         }
@@ -61,6 +62,19 @@ class SensorObservation(gym.Wrapper):
             "outcome": np.array([_OUTCOME_CODE[info["outcome"]]], dtype=np.uint8),
             "episode_seed": np.array([info["episode_seed"]], dtype=np.int64),
         }
+
+
+class DropSensor(ExcludeTransform):
+    """Drops all ("sensor", ...) keys, once the representations have been made from them."""
+
+    def __init__(self) -> None:
+        """Excludes the whole of "sensor"."""
+        super().__init__("sensor")
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Returns the specs without "sensor"."""
+        del output_spec["full_observation_spec"]["sensor"]
+        return output_spec
 
 
 def make_env(
@@ -113,7 +127,7 @@ def make_env(
     if keep_sensor:
         sensors = [name for name in SENSORS if name in sensors or name != "rgb"]
     elif sensors:
-        transforms.append(ExcludeTransform(*(("sensor", name) for name in sensors)))
+        transforms.append(DropSensor())
     vector = SyncVectorEnv(
         [lambda: SensorObservation(street(sensors=sensors))] * num_envs,
         autoreset_mode=AutoresetMode.DISABLED,

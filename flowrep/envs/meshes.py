@@ -114,8 +114,13 @@ def house_mesh(box: Box, *, both_sides: bool = False) -> Mesh:
 def obstacle_mesh(box: Box) -> Mesh:
     """Returns a plain box painted as its category is."""
     paints = {
-        "building": "roof", "tree": "leaf", "fence": "wood", "car": "car_body",
-        "traffic_light": "metal", "pedestrian": "shirt_red", "sidewalk": "paving",
+        "building": "roof",
+        "tree": "leaf",
+        "fence": "wood",
+        "car": "car_body",
+        "traffic_light": "metal",
+        "pedestrian": "shirt_red",
+        "sidewalk": "paving",
     }
     length, width, height = box.size_m
     mesh = Mesh()

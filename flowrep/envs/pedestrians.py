@@ -25,7 +25,9 @@ class Crowd:
         """
         most = max((len(line) for line in lines), default=2)
         # Short lines end in copies of their last point, which have no length.
-        padded = [np.concatenate([line, np.repeat(line[-1:], most - len(line), 0)]) for line in lines]
+        padded = [
+            np.concatenate([line, np.repeat(line[-1:], most - len(line), 0)]) for line in lines
+        ]
         self._points = np.array(padded).reshape(len(lines), most, 2)  # [P, M, 2]
         steps = np.diff(self._points, axis=1)
         lengths = np.hypot(steps[..., 0], steps[..., 1])

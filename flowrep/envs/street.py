@@ -27,9 +27,7 @@ class Street:
         self._solids: list[tuple[int, str, Array, Array]] = []
         self._add_ground(layout)
         self._add_solids(layout)
-        self._closures = {
-            name: self._add_closure(box) for name, box in layout.closures.items()
-        }
+        self._closures = {name: self._add_closure(box) for name, box in layout.closures.items()}
         self._pedestrians = [
             self.simulator.add_body(
                 meshes.pedestrian_mesh(i),

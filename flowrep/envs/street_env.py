@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -42,8 +42,8 @@ class StreetEnv(gym.Env):
     | `depth` | [1, H, W] | float32 | metres along z; sky is inf |
     | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.envs.palette` |
     | `instance` | [1, H, W] | uint8 | pedestrian's number from 1; 0 is the static world |
-    | `prev_from_curr` | [4, 4] | float32 | current camera's frame into the previous one's |
-    | `instance_motion` | [1 + P, 4, 4] | float32 | the same by instance; row 0 is the static world's |
+    | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
+    | `instance_motion` | [1 + P, 4, 4] | float32 | the same by instance; row 0: static world |
     | `rgb` | [3, H, W] | uint8 | |
 
     At reset the previous pose is the current one. `info` holds `outcome`, `hit` (the category of
@@ -57,7 +57,10 @@ class StreetEnv(gym.Env):
         render_mode: "rgb_array" or None.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 12}
+    metadata: dict[str, Any] = {  # noqa: RUF012 - gymnasium declares it so
+        "render_modes": ["rgb_array"],
+        "render_fps": 12,
+    }
 
     def __init__(
         self,
@@ -233,7 +236,7 @@ class StreetEnv(gym.Env):
     def _observation_space(self) -> spaces.Dict:
         size = (self.scene.camera.height_px, self.scene.camera.width_px)
         people = self.scene.num_pedestrians
-        every = {
+        every: dict[str, spaces.Space] = {
             "depth": spaces.Box(0.0, np.inf, (1, *size), np.float32),
             "semantic": spaces.Box(0, self.num_classes - 1, (1, *size), np.uint8),
             "instance": spaces.Box(0, max(people, 1), (1, *size), np.uint8),

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +26,13 @@ class VehicleConfig:
 class VehicleState(NamedTuple):
     """Pose of the footprint's centre and yaw rate; scalars, or arrays of one shape."""
 
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    yaw_rate_rps: float
+    x_m: Any
+    y_m: Any
+    yaw_rad: Any
+    yaw_rate_rps: Any
 
 
-def turn(
-    state: VehicleState, action: int, dt_s: float, vehicle: VehicleConfig
-) -> VehicleState:
+def turn(state: VehicleState, action: Any, dt_s: float, vehicle: VehicleConfig) -> VehicleState:
     """Returns the state with its yaw rate changed by the action: plus or minus α·Δt, or nothing."""
     limit = math.radians(vehicle.max_yaw_rate_dps)
     step = math.radians(vehicle.yaw_acceleration_dps2) * dt_s

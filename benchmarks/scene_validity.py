@@ -1,0 +1,50 @@
+"""Is a scene a fair task? The planner must reach the ending zone, chance and habit must not.
+
+python benchmarks/scene_validity.py --scenes straight_road --episodes 500
+"""
+
+import argparse
+import time
+from collections import Counter
+
+from flowrep.envs import BASELINES, StreetEnv, drives, load_scene, scene_names
+from flowrep.experiment.evaluation import wilson_interval
+
+OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
+BOUNDS = {"planner": (0.95, 1.0), "never_turn": (0.0, 0.15), "random": (0.0, 0.05)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", nargs="+", default=scene_names())
+    parser.add_argument("--episodes", type=int, default=500)
+    parser.add_argument("--drivers", nargs="+", default=list(BASELINES), choices=list(BASELINES))
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    print(
+        f"{'scene':<20}{'speed':<8}{'driver':<12}", *(f"{name:<19}" for name in OUTCOMES), "valid"
+    )
+    for name in args.scenes:
+        scene = load_scene(name)
+        for speed in scene.pedestrian_speed_mps:
+            for driver in args.drivers:
+                started = time.perf_counter()
+                env = StreetEnv(scene, speed=speed, sensors=())
+                ended = drives(env, BASELINES[driver](), args.episodes, seed=args.seed)
+                counts = Counter(drive.outcome for drive in ended)
+                env.close()
+                cells = [cell(counts[outcome], args.episodes) for outcome in OUTCOMES]
+                low, high = BOUNDS[driver]
+                is_valid = low <= counts["success"] / args.episodes <= high
+                seconds = time.perf_counter() - started
+                row = f"{scene.name:<20}{speed:<8}{driver:<12}"
+                print(row, *cells, "yes" if is_valid else "NO", f"({seconds:.0f} s)", flush=True)
+
+
+def cell(count: int, episodes: int) -> str:
+    low, high = wilson_interval(count, episodes)
+    return f"{f'{100 * count / episodes:.1f} [{100 * low:.1f}, {100 * high:.1f}]':<19}"
+
+
+if __name__ == "__main__":
+    main()

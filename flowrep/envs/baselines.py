@@ -1,0 +1,63 @@
+"""Drivers that learn nothing, which any agent is measured beside."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowrep.envs.planner import Planner
+from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.vehicle import NO_OP
+
+Driver = Callable[[StreetEnv], int]
+
+
+def never_turn(env: StreetEnv) -> int:
+    """Returns NO_OP: drives on as at the start."""
+    return NO_OP
+
+
+class RandomDriver:
+    """Returns actions drawn evenly."""
+
+    def __init__(self, seed: int = 0) -> None:
+        """Seeds its own generator."""
+        self._rng = np.random.default_rng(seed)
+
+    def __call__(self, env: StreetEnv) -> int:
+        """Returns one of the three actions."""
+        return int(self._rng.integers(3))
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One finished episode: which one, how it ended, what was hit, its return and its steps."""
+
+    episode_seed: int
+    outcome: str
+    hit: str
+    total_reward: float
+    steps: int
+
+
+def drives(env: StreetEnv, driver: Driver, episodes: int, *, seed: int) -> Iterator[Drive]:
+    """Yields finished episodes, the same ones for every driver.
+
+    >>> env = StreetEnv("straight_road", sensors=())
+    >>> [drive.outcome in ("success", "collision") for drive in drives(env, never_turn, 2, seed=0)]
+    [True, True]
+    """
+    for number in range(episodes):
+        env.reset(seed=seed if number == 0 else None)
+        total, ended = 0.0, False
+        while not ended:
+            _, reward, ended, _, info = env.step(driver(env))
+            total += reward
+        yield Drive(info["episode_seed"], info["outcome"], info["hit"], total, env.episode.steps)
+
+
+BASELINES: dict[str, Callable[[], Driver]] = {
+    "planner": Planner,
+    "never_turn": lambda: never_turn,
+    "random": RandomDriver,
+}
