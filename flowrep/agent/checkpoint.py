@@ -10,6 +10,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +45,13 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
     partial = path.with_name(f".{path.name}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, partial, metadata={"format": FORMAT, "state": document})
+        save_file(_unshared(tensors), partial, metadata={"format": FORMAT, "state": document})
         _flush(partial)
         os.replace(partial, path)
         _flush(path.parent)
     except (OSError, SafetensorError) as error:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
         kept = "; the previous checkpoint is untouched" if path.exists() else ""
         raise CheckpointError(
             f"cannot write the checkpoint {path}: {error}{kept}. Free some space or make the "
@@ -74,8 +76,11 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
                     f"{path} is a safetensors file but not a flowrep checkpoint of this version "
                     f"({FORMAT!r}); start the run anew"
                 )
-            return _with_tensors(json.loads(metadata["state"]), file.get_tensor)
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+            state = _with_tensors(json.loads(metadata["state"]), file.get_tensor)
+            if not isinstance(state, dict):
+                raise TypeError(f"it holds a {type(state).__name__}, not a dict")
+            return state
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise CheckpointError(
             f"{path} is not a readable checkpoint ({error}): it is damaged or of another kind; "
             "delete it and start the run anew"
@@ -94,22 +99,16 @@ def _flush(path: Path) -> None:
 def _without_tensors(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
     """Returns `value` as JSON data; moves its tensors to `tensors`, named by their place."""
     if isinstance(value, Tensor):
-        name = place or "value"
-        # a view that shares memory is stored as what it shows
-        tensors[name] = value.detach().cpu().contiguous()
-        return {"tensor": name}
+        tensors[place] = value.detach().cpu().contiguous()
+        return {"tensor": place}
     if isinstance(value, Mapping):
         bad = [key for key in value if not isinstance(key, str)]
         if bad:
             raise TypeError(f"checkpoint[{place!r}] has the key {bad[0]!r}: only strings are kept")
-        items = {
-            k: _without_tensors(v, f"{place}/{k}".lstrip("/"), tensors) for k, v in value.items()
-        }
+        items = {k: _without_tensors(v, place + _segment(k), tensors) for k, v in value.items()}
         return {"dict": items}
     if isinstance(value, list | tuple):
-        return [
-            _without_tensors(v, f"{place}/{i}".lstrip("/"), tensors) for i, v in enumerate(value)
-        ]
+        return [_without_tensors(v, place + _segment(str(i)), tensors) for i, v in enumerate(value)]
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, float):
@@ -118,6 +117,22 @@ def _without_tensors(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
         f"checkpoint[{place!r}] is a {type(value).__name__}: expected a tensor, dict, list, str, "
         "int, float, bool or None"
     )
+
+
+def _unshared(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Returns the tensors, copied where two share memory, which the format refuses."""
+    seen: set[int] = set()
+    unshared = {}
+    for name, tensor in tensors.items():
+        memory = tensor.untyped_storage().data_ptr()
+        unshared[name] = tensor.clone() if memory in seen else tensor
+        seen.add(memory)
+    return unshared
+
+
+def _segment(key: str) -> str:
+    """Returns a key as one step of a path, with the escapes of JSON pointers."""
+    return "/" + key.replace("~", "~0").replace("/", "~1")
 
 
 def _with_tensors(value: Any, get_tensor: Any) -> Any:

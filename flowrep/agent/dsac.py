@@ -142,9 +142,8 @@ class DiscreteSAC:
         self._move_targets()
         self.updates += 1
         metrics = TensorDict({name: value.detach() for name, value in losses.items()})
-        metrics["grad_norm"] = torch.nn.utils.get_total_norm(
-            [w.grad for w in self.trained.values()]
-        )
+        gradients = [w.grad for w in self.trained.values() if w.grad is not None]
+        metrics["grad_norm"] = torch.nn.utils.get_total_norm(gradients)
         metrics["learning_rate"] = torch.tensor(learning_rate)
         return metrics
 

@@ -1,0 +1,180 @@
+import os
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
+
+
+def same(a, b):
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and a.shape == b.shape and torch.equal(a, b)
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list):
+        return len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and a == b
+
+
+def test_every_kind_of_value_comes_back_as_it_was(tmp_path):
+    shared = torch.arange(12).reshape(3, 4)
+    state = {
+        "weights": {"conv.weight": torch.randn(2, 3), "half": torch.randn(3).half()},
+        "transposed": shared.t(),
+        "row": shared[1],
+        "tied": [shared, shared],
+        "nothing": torch.empty(0, 2),
+        "scalar": torch.tensor(True),
+        "bf16": torch.randn(2).bfloat16(),
+        "updates": 7,
+        "alpha": 0.1 + 0.2,
+        "bounds": [float("-inf"), 1e-300],
+        "flag": False,
+        "missing": None,
+        "rng": {"state": [3, 2**70, None], "name": "PCG64"},
+        "tensor": {"tensor": "a dict that looks like a reference"},
+        "slash/ed": {"a": torch.ones(1)},
+        "": {"empty key": []},
+    }
+    save_checkpoint(tmp_path / "new folder" / "c.safetensors", state)
+    assert same(load_checkpoint(tmp_path / "new folder" / "c.safetensors"), state)
+    assert os.listdir(tmp_path / "new folder") == ["c.safetensors"]
+
+
+def test_names_that_collide_are_kept_apart(tmp_path):
+    zero, one, two, three = torch.arange(4)
+    state = {"a/b": zero, "a": {"b": one}, "": {"a": {"b": two}}, "a~1b": three}
+    save_checkpoint(tmp_path / "c", state)
+    assert same(load_checkpoint(tmp_path / "c"), state)
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({"a": {"b": object()}}, r"checkpoint\['/a/b'\] is a object"),
+        ({"a": [1, {2}]}, r"checkpoint\['/a/1'\] is a set"),
+        ({"a": {0: 1}}, r"checkpoint\['/a'\] has the key 0"),
+    ],
+)
+def test_what_cannot_be_kept_is_named_by_its_place(tmp_path, state, message):
+    with pytest.raises(TypeError, match=message):
+        save_checkpoint(tmp_path / "c", state)
+    assert not list(tmp_path.iterdir())
+
+
+def truncated(path):
+    save_checkpoint(path, {"a": torch.ones(100)})
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+def a_pickle(path):
+    path.write_bytes(pickle.dumps({"a": 1}))
+
+
+def a_torch_file(path):
+    torch.save({"a": torch.ones(2)}, path)
+
+
+def a_header_of_terabytes(path):
+    path.write_bytes((2**42).to_bytes(8, "little") + b"{}")
+
+
+def foreign(path):
+    save_file({"a": torch.ones(2)}, path)
+
+
+def broken_document(path):
+    metadata = {"format": "flowrep checkpoint 1", "state": '{"dict": {"a": {"tensor": "b"}}}'}
+    save_file({"a": torch.ones(2)}, path, metadata=metadata)
+
+
+def strange_document(path):
+    metadata = {"format": "flowrep checkpoint 1", "state": '{"x": 1, "y": 2}'}
+    save_file({"a": torch.ones(2)}, path, metadata=metadata)
+
+
+def deep_document(path):
+    metadata = {"format": "flowrep checkpoint 1", "state": "[" * 100_000}
+    save_file({"a": torch.ones(2)}, path, metadata=metadata)
+
+
+def a_list(path):
+    save_file({}, path, metadata={"format": "flowrep checkpoint 1", "state": "[1]"})
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        truncated, empty, a_pickle, a_torch_file, a_header_of_terabytes, foreign, broken_document,
+        strange_document, deep_document, a_list,
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_checkpoint_is_named_with_a_way_out(tmp_path, damage):
+    path = tmp_path / "c.safetensors"
+    damage(path)
+    with pytest.raises(CheckpointError, match=r"c\.safetensors.* start the run anew"):
+        load_checkpoint(path)
+
+
+def test_a_missing_checkpoint_is_named(tmp_path):
+    with pytest.raises(CheckpointError, match=r"no checkpoint at .*c\.safetensors"):
+        load_checkpoint(tmp_path / "c.safetensors")
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(tmp_path):
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, {"a": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+        with pytest.raises(CheckpointError, match=r"cannot write .*previous checkpoint is untouch"):
+            save_checkpoint(path, {"a": torch.ones(10_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert load_checkpoint(path) == {"a": 1}
+    assert os.listdir(tmp_path) == ["c.safetensors"]
+
+
+def test_a_folder_that_cannot_be_written_is_one_error(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(CheckpointError, match=r"cannot write the checkpoint .*file/c"):
+        save_checkpoint(tmp_path / "file" / "c", {"a": 1})
+
+
+def test_a_writer_killed_at_any_instant_leaves_a_whole_checkpoint(tmp_path):
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, {"version": 0, "a": torch.zeros(200_000)})
+    code = (
+        "import sys, torch; from flowrep.agent.checkpoint import save_checkpoint\n"
+        "for i in range(1, 10**6):\n"
+        "    save_checkpoint(sys.argv[1], {'version': i, 'a': torch.full((200_000,), i)})\n"
+        "    if i == 1: print('started', flush=True)\n"
+    )
+    writer = subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE)
+    try:
+        assert writer.stdout.readline() == b"started\n"
+        versions = []
+        for _ in range(10):  # what a reader finds at any time is what a kill would leave
+            state = load_checkpoint(path)
+            assert (state["a"] == state["version"]).all()
+            versions.append(state["version"])
+    finally:
+        writer.kill()
+        writer.wait()
+    state = load_checkpoint(path)
+    assert (state["a"] == state["version"]).all()
+    assert versions == sorted(versions)
+    save_checkpoint(path, {"version": -1})
+    assert os.listdir(tmp_path) == ["c.safetensors"]
