@@ -1,23 +1,18 @@
-"""Flow that rigid motion causes, in closed form: one pass over the pixels, no point cloud.
+"""Flow that rigid motion causes: of a static world, of moving bodies, and the difference.
 
-With x~ = p - c the pixel from the principal point, K' the intrinsics without it, and
-`prev_from_curr` = (R, T), the point that pixel p shows at depth Z was seen at
-
-    p' ~ (I + A) x~ + e / Z,    A = K' (R - I) K'^-1,    e = K' T        (homogeneous)
-
-so that with q = A x~ + e / Z the flow p - p' is (x~ qz - qx, y~ qz - qy) / (1 + qz). Nothing
-large is subtracted from anything large: float32 stays an order of magnitude nearer to float64
-than p - p' by the homography K R K^-1 does, and no motion gives exactly 0.
+Every function is the closed form of `flowrep.geometry.closed_form`: one pass over the pixels, no
+point cloud in memory.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from flowrep.geometry.camera import centred_pixels
+from flowrep.geometry import closed_form
 from flowrep.geometry.checks import broadcast_batch, check_is_tensor, check_shape, check_trailing
 
 
@@ -72,9 +67,10 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
     (tensor([[-0.5000, -0.5000]]), tensor([[True, True]]))
     """
     batch = _check(depth, K, prev_from_curr, dt)
-    dtype = _dtype(depth, K, prev_from_curr)
-    coefficients = [c[..., None, None, None] for c in _coefficients(K, prev_from_curr, dtype)]
-    return _cast(_flow(depth.expand(*batch, -1, -1, -1), K, coefficients, dt), dtype)
+    dtype, compute = _dtypes(depth, K, prev_from_curr)
+    depth = depth.expand(*batch, -1, -1, -1)
+    u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, compute)
+    return Flow(closed_form.stack_planes(u, v).to(dtype), closed_form.mask_channel(valid))
 
 
 def rigid_flow(
@@ -111,29 +107,19 @@ def rigid_flow(
     >>> rigid_flow(depth, instance, K, motions).flow[1]
     tensor([[2., 2.]])
     """
+    motions = prev_from_curr_by_instance
     check_is_tensor("instance", instance)
     if instance.is_floating_point() or instance.is_complex() or instance.dtype == torch.bool:
         raise TypeError(f"instance must hold integer ids, got {instance.dtype}")
     check_trailing("instance", instance, (1, "H", "W"))
-    check_shape("prev_from_curr_by_instance", prev_from_curr_by_instance, ("N", 4, 4))
-    if instance.shape[-2:] != depth.shape[-2:]:
-        raise ValueError(
-            f"instance and depth must have one size, got {list(instance.shape[-2:])} "
-            f"and {list(depth.shape[-2:])}"
-        )
-    motions = prev_from_curr_by_instance
+    check_shape("prev_from_curr_by_instance", motions, ("N", 4, 4))
     batch = _check(depth, K, motions[..., 0, :, :], dt)
+    _check_same_size("instance", instance, depth)
     batch = broadcast_batch(others=batch, instance=instance.shape[:-3])
-    dtype = _dtype(depth, K, motions)
-    depth = depth.expand(*batch, -1, -1, -1)
-    row_of_pixel = instance.long().expand(*batch, -1, -1, -1).flatten(-3)  # [*B, H*W]
-
-    def per_pixel(by_instance: Tensor) -> Tensor:  # [*B, N] -> [*B, 1, H, W]
-        rows = by_instance.expand(*batch, -1)
-        return rows.gather(-1, row_of_pixel).unflatten(-1, depth.shape[-3:])
-
-    by_instance = _coefficients(K.unsqueeze(-3), motions, dtype)
-    return _cast(_flow(depth, K, [per_pixel(c) for c in by_instance], dt), dtype)
+    dtype, compute = _dtypes(depth, K, motions)
+    depth, instance = (image.expand(*batch, -1, -1, -1) for image in (depth, instance))
+    u, v, valid = closed_form.body_planes(depth, instance, K, motions, dt, compute)
+    return Flow(closed_form.stack_planes(u, v).to(dtype), closed_form.mask_channel(valid))
 
 
 def factorize(
@@ -169,17 +155,22 @@ def factorize(
     (tensor([-0.5000, -0.5000]), tensor([0.0000, 3.5000]))
     """
     check_shape("raw", raw, (2, "H", "W"))
-    if raw.shape[-2:] != depth.shape[-2:]:
-        raise ValueError(
-            f"raw and depth must have one size, got {list(raw.shape[-2:])} "
-            f"and {list(depth.shape[-2:])}"
-        )
-    ego, valid = ego_flow(depth, K, prev_from_curr, dt=dt)
-    broadcast_batch(raw=raw.shape[:-3], others=ego.shape[:-3])
-    obj = raw - ego
-    u_finite, v_finite = torch.isfinite(raw).split(1, -3)
-    valid = valid & u_finite & v_finite
-    return Factors(ego, torch.where(valid, obj, 0.0), valid)
+    batch = _check(depth, K, prev_from_curr, dt)
+    _check_same_size("raw", raw, depth)
+    batch = broadcast_batch(others=batch, raw=raw.shape[:-3])
+    dtype, compute = _dtypes(depth, K, prev_from_curr)
+    depth = depth.expand(*batch, -1, -1, -1)
+    u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, compute)
+    u, v = u.to(dtype), v.to(dtype)
+    raw_u, raw_v = raw.expand(*batch, -1, -1, -1).unbind(-3)
+    measured = raw_u.abs() + raw_v.abs() < math.inf
+    # Two masks in turn, not their conjunction: inductor would spill that one to memory.
+    obj_u, obj_v = (
+        torch.where(valid, torch.where(measured, difference, 0.0), 0.0)
+        for difference in (raw_u - u, raw_v - v)
+    )
+    ego, obj = closed_form.stack_planes(u, v), closed_form.stack_planes(obj_u, obj_v)
+    return Factors(ego, obj, closed_form.mask_channel(valid & measured))
 
 
 def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torch.Size:
@@ -195,55 +186,18 @@ def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torc
     return broadcast_batch(**batches)
 
 
-def _dtype(depth: Tensor, K: Tensor, motion: Tensor) -> torch.dtype:
-    return torch.promote_types(torch.promote_types(depth.dtype, K.dtype), motion.dtype)
+def _check_same_size(name: str, image: Tensor, depth: Tensor) -> None:
+    """Returns nothing; complains unless an image has depth's height and width."""
+    if image.shape[-2:] != depth.shape[-2:]:
+        raise ValueError(
+            f"{name} and depth must have one (height, width), "
+            f"got {list(image.shape[-2:])} and {list(depth.shape[-2:])}"
+        )
 
 
-def _cast(result: Flow, dtype: torch.dtype) -> Flow:
-    return Flow(result.flow.to(dtype), result.valid)
-
-
-def _coefficients(K: Tensor, prev_from_curr: Tensor, dtype: torch.dtype) -> list[Tensor]:
-    """Returns the twelve numbers of A (row by row) and e, each with the motion's batch.
-
-    Written out instead of multiplied as matrices: a batched product may round differently from a
-    single one, and then a body that stands still would not have the camera's flow exactly.
-    """
-    compute = torch.promote_types(dtype, torch.float32)
-    K, motion = K.to(compute), prev_from_curr.to(compute)
-    fx, skew, fy = K[..., 0, 0], K[..., 0, 1], K[..., 1, 1]
-    d = [[motion[..., i, j] - float(i == j) for j in range(3)] for i in range(3)]
-    tx, ty, tz = motion[..., 0, 3], motion[..., 1, 3], motion[..., 2, 3]
-    rows = [
-        [fx * d[0][j] + skew * d[1][j] for j in range(3)],
-        [fy * d[1][j] for j in range(3)],
-        d[2],
-    ]  # K' (R - I)
-    a = []
-    for in_x, in_y, constant in rows:  # ... K'^-1
-        a_x = in_x / fx
-        a += [a_x, (in_y - skew * a_x) / fy, constant]
-    return [*a, fx * tx + skew * ty, fy * ty, tz]
-
-
-def _flow(depth: Tensor, K: Tensor, coefficients: list[Tensor], dt: float | Tensor) -> Flow:
-    axx, axy, ax, ayx, ayy, ay, azx, azy, az, ex, ey, ez = coefficients
-    dtype = axx.dtype
-    x, y = (
-        pixels.unsqueeze(-3)
-        for pixels in centred_pixels(depth.shape[-2], depth.shape[-1], K.to(dtype))
-    )
-    has_depth = depth > 0  # nan compares False
-    inverse_depth = torch.where(has_depth, depth, 1.0).to(dtype).reciprocal()  # 0 at infinity
-    qx = axx * x + (axy * y + ax) + ex * inverse_depth
-    qy = ayx * x + (ayy * y + ay) + ey * inverse_depth
-    qz = azx * x + (azy * y + az) + ez * inverse_depth
-    z_ratio = 1.0 + qz  # previous depth over current depth
-    valid = has_depth & (z_ratio > 0)
-    z_ratio = torch.where(valid, z_ratio, 1.0)
-    if isinstance(dt, Tensor):
-        z_ratio = z_ratio * dt.to(dtype)[..., None, None, None]
-    elif dt != 1.0:
-        z_ratio = z_ratio * dt
-    flow = torch.cat([(x * qz - qx) / z_ratio, (y * qz - qy) / z_ratio], -3)
-    return Flow(torch.where(valid, flow, 0.0), valid)
+def _dtypes(*tensors: Tensor) -> tuple[torch.dtype, torch.dtype]:
+    """Returns the result's dtype (the widest) and the one to compute in (at least float32)."""
+    dtype = tensors[0].dtype
+    for tensor in tensors[1:]:
+        dtype = torch.promote_types(dtype, tensor.dtype)
+    return dtype, torch.promote_types(dtype, torch.float32)
