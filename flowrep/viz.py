@@ -1,0 +1,239 @@
+"""Pictures of representations: fixed scales, one class palette, strips, PNG and mp4.
+
+Nothing here is normalised per image: a colour means the same in every frame and in every figure.
+Images are numpy uint8 `[H, W, 3]`. Maps go in as numpy or torch, `[C, H, W]`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
+    "sky": (112, 178, 232),
+    "road": (84, 84, 92),
+    "sidewalk": (196, 176, 160),
+    "building": (150, 84, 60),
+    "pedestrian": (222, 40, 60),
+    "terrain": (112, 158, 74),
+    "crosswalk": (238, 234, 220),
+    "tree": (36, 104, 48),
+    "fence": (214, 148, 70),
+    "car": (46, 64, 196),
+    "traffic_light": (250, 214, 40),
+}
+"""Class name to colour; a class id is the name's place in this table."""
+
+FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 2.0}
+"""Flow, in pixels, at which a representation's colour is full."""
+
+DEPTH_RANGE_M = 100.0
+
+_UNKNOWN = (128, 128, 128)
+# Near to far: dark ends in the black of "no surface".
+_DEPTH_COLOURS = np.array(
+    [(252, 253, 191), (254, 176, 120), (241, 96, 93), (183, 55, 121), (104, 28, 129), (40, 16, 80)],
+    dtype=np.float32,
+)
+_BAR_PX = 28
+_GAP_PX = 4
+_GAP_GREY = 200  # so that the white of no motion has an edge
+_TILE_PX = 240
+
+
+def flow_to_rgb(flow: Any, scale_px: float) -> Image:
+    """Returns flow as colour: direction is hue, magnitude is saturation on white.
+
+    Convention: right is red, down is yellow-green, left is cyan, up is violet. Saturation is the
+    square root of magnitude over `scale_px`, full from there on, so that a tenth of a pixel still
+    shows beside tens of pixels. Flow that is not finite is grey.
+
+    Args:
+        flow: `[2, H, W]`, (u right, v down), pixels.
+        scale_px: magnitude of full colour.
+
+    Raises:
+        ValueError: flow is not `[2, H, W]`, or the scale is not positive.
+
+    >>> flow_to_rgb(np.array([[[0.0, 2.0]], [[0.0, 0.0]]]), scale_px=2.0).tolist()
+    [[[255, 255, 255], [255, 0, 0]]]
+    """
+    flow = _channels("flow", flow, 2).astype(np.float32)
+    if not scale_px > 0:
+        raise ValueError(f"scale_px must be positive, got {scale_px}")
+    known = np.isfinite(flow).all(0)
+    u, v = np.where(known, flow, 0.0)
+    saturation = np.sqrt(np.minimum(np.hypot(u, v) / scale_px, 1.0))
+    hue = np.arctan2(v, u) * (3 / np.pi)  # [-3, 3], sixths of a turn
+    # HSV to RGB at full value: each channel is a trapezoid over hue, a third of a turn apart.
+    pure = np.clip(np.abs((hue[..., None] + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
+    rgb = 1 - saturation[..., None] * (1 - pure)
+    return np.where(known[..., None], np.rint(255 * rgb), _UNKNOWN).astype(np.uint8)
+
+
+def flow_wheel(size_px: int, background: tuple[int, int, int] = (255, 255, 255)) -> Image:
+    """Returns the legend of `flow_to_rgb`: a disc whose rim is the scale.
+
+    >>> flow_wheel(65)[32, 64].tolist()  # rightmost point: flow to the right
+    [255, 0, 0]
+    """
+    axis = np.linspace(-1, 1, size_px, dtype=np.float32)
+    u, v = np.meshgrid(axis, axis)
+    disc = flow_to_rgb(np.stack([u, v]), scale_px=1.0)
+    return np.where((np.hypot(u, v) <= 1 + 1 / size_px)[..., None], disc, background).astype(
+        np.uint8
+    )
+
+
+def classes_to_rgb(semantic: Any) -> Image:
+    """Returns class ids `[1, H, W]` in the colours of `CLASS_COLOURS`; unknown ids are grey."""
+    ids = _channels("semantic", semantic, 1)[0]
+    palette = np.full((256, 3), _UNKNOWN, dtype=np.uint8)
+    palette[: len(CLASS_COLOURS)] = list(CLASS_COLOURS.values())
+    return palette[ids.astype(np.uint8)]
+
+
+def depth_to_rgb(depth: Any, range_m: float = DEPTH_RANGE_M) -> Image:
+    """Returns depth `[1, H, W]` in metres as colour, near light and far dark, logarithmically.
+
+    From `range_m` on the colour stays; inf (no surface) is black, nan (missing) is grey.
+    """
+    metres = _channels("depth", depth, 1)[0].astype(np.float32)
+    surface = np.isfinite(metres)
+    place = np.log1p(np.clip(np.where(surface, metres, 0.0), 0, range_m)) / np.log1p(range_m)
+    stops = np.linspace(0, 1, len(_DEPTH_COLOURS))
+    rgb = np.stack([np.interp(place, stops, channel) for channel in _DEPTH_COLOURS.T], -1)
+    rgb[~surface] = 0
+    rgb[np.isnan(metres)] = _UNKNOWN
+    return np.rint(rgb).astype(np.uint8)
+
+
+def representation_strip(
+    maps: Mapping[str, Any],
+    *,
+    flow_scale_px: Mapping[str, float] = FLOW_SCALE_PX,
+    depth_range_m: float = DEPTH_RANGE_M,
+) -> Image:
+    """Returns what the camera sees and its representations side by side, labelled.
+
+    Args:
+        maps: any of rgb (uint8), semantic (ids), depth (metres), raw, ego, obj (pixels), each
+            `[C, H, W]`; drawn in this order, other keys are left out.
+        flow_scale_px: flow of full colour for raw, ego and obj; printed in the label.
+        depth_range_m: where depth's colours end; printed in the label.
+
+    Raises:
+        ValueError: a map's shape does not fit, or none of the names is there.
+    """
+    tiles: list[tuple[str, Callable[[Any], Image]]] = [
+        ("rgb", lambda rgb: np.moveaxis(_channels("rgb", rgb, 3), 0, -1).astype(np.uint8)),
+        ("semantic", classes_to_rgb),
+        ("depth", lambda depth: depth_to_rgb(depth, depth_range_m)),
+        *(
+            (name, lambda flow, scale_px=scale_px: flow_to_rgb(flow, scale_px))
+            for name, scale_px in flow_scale_px.items()
+        ),
+    ]
+    labels = {"rgb": "RGB", "semantic": "segmentation", "depth": f"depth, 0-{depth_range_m:g} m"}
+    labels |= {name: f"{name} flow, full at {scale:g} px" for name, scale in flow_scale_px.items()}
+    names = set(maps.keys())
+    images = {labels[name]: draw(maps[name]) for name, draw in tiles if name in names}
+    if not images:
+        raise ValueError(
+            f"nothing to draw: maps has {sorted(map(str, names))}, "
+            f"expected some of {[name for name, _ in tiles]}"
+        )
+    return strip(images, wheel_for=[labels[name] for name in flow_scale_px])
+
+
+def strip(images: Mapping[str, Image], *, wheel_for: Iterable[str] = ()) -> Image:
+    """Returns images of one size side by side, each under its label, small ones enlarged.
+
+    Enlarged by a whole factor and without interpolation: a pixel stays a square of one colour.
+
+    Args:
+        images: label to image `[H, W, 3]`.
+        wheel_for: labels that get the flow wheel beside them.
+
+    Raises:
+        ValueError: the images differ in size.
+    """
+    sizes = {image.shape for image in images.values()}
+    if len(sizes) != 1:
+        raise ValueError(f"a strip needs images of one size, got {sorted(sizes)}")
+    height, width, _ = sizes.pop()
+    zoom = max(1, round(_TILE_PX / max(height, width)))
+    with_wheel = frozenset(wheel_for)
+    columns: list[Image] = []
+    for label, image in images.items():
+        bar = _label_bar(label, width * zoom, label in with_wheel)
+        tile = image.repeat(zoom, axis=0).repeat(zoom, axis=1)
+        column = np.concatenate([bar, tile])
+        columns += [column, np.full((len(column), _GAP_PX, 3), _GAP_GREY, np.uint8)]
+    return np.concatenate(columns[:-1], axis=1)
+
+
+def contact_sheet(rows: Iterable[Image]) -> Image:
+    """Returns images below one another, narrower ones filled up with white."""
+    rows = list(rows)
+    width = max(row.shape[1] for row in rows)
+    filled = [
+        np.pad(r, ((0, _GAP_PX), (0, width - r.shape[1]), (0, 0)), constant_values=255)
+        for r in rows
+    ]
+    return np.concatenate(filled)[:-_GAP_PX]
+
+
+def write_png(path: str | Path, image: Image) -> None:
+    """Writes an image `[H, W, 3]`, and the folders above it."""
+    from PIL import Image as pillow
+
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    pillow.fromarray(image).save(path)
+
+
+def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
+    """Writes frames `[H, W, 3]` of one size as an mp4 (H.264) that browsers play.
+
+    Odd sizes, which the codec refuses, gain a white row or column.
+    """
+    import imageio.v2 as imageio
+
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    video: Any
+    with imageio.get_writer(
+        path, fps=fps, codec="libx264", quality=8, pixelformat="yuv420p", macro_block_size=1
+    ) as video:
+        for frame in frames:
+            odd_rows, odd_columns = frame.shape[0] % 2, frame.shape[1] % 2
+            fill = ((0, odd_rows), (0, odd_columns), (0, 0))
+            video.append_data(np.pad(frame, fill, constant_values=255))
+
+
+@lru_cache(maxsize=64)
+def _label_bar(label: str, width: int, with_wheel: bool) -> Image:
+    from PIL import Image as pillow
+    from PIL import ImageDraw, ImageFont
+
+    bar = pillow.new("RGB", (width, _BAR_PX), (255, 255, 255))
+    font = ImageFont.load_default(size=18)
+    ImageDraw.Draw(bar).text((2, _BAR_PX // 2), label, fill=(0, 0, 0), font=font, anchor="lm")
+    if with_wheel:
+        bar.paste(pillow.fromarray(flow_wheel(_BAR_PX - 2)), (width - _BAR_PX, 1))
+    return np.asarray(bar)
+
+
+def _channels(name: str, values: Any, channels: int) -> NDArray[Any]:
+    if hasattr(values, "detach"):  # a torch tensor, without importing torch
+        values = values.detach().cpu().numpy()
+    array = np.asarray(values)
+    if array.ndim != 3 or array.shape[0] != channels:
+        raise ValueError(f"{name} must be [{channels}, H, W], got {list(array.shape)}")
+    return array
