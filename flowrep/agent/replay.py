@@ -187,7 +187,8 @@ def _time_first(frames: TensorDictBase) -> TensorDictBase:
 
 
 def _same_rows(a: Tensor, b: Tensor) -> Tensor:
-    """Returns which rows of two equally typed tensors are the same, bit for bit."""
+    """Returns which rows of two tensors hold the same values; nan is nan, and -0 is 0."""
+    same = a == b
     if a.dtype.is_floating_point:
-        a, b = a.view(torch.int16), b.view(torch.int16)
-    return (a == b).flatten(1).all(1)
+        same |= a.isnan() & b.isnan()
+    return same.flatten(1).all(1)

@@ -166,8 +166,12 @@ def metrics_row(
 
 
 def progress_text(row: Mapping[str, float]) -> str:
-    """Returns what stands at the end of the progress line."""
-    return (
-        f"success {row['success']:.0%}, α {row['alpha']:.3f}, entropy {row['entropy']:.2f}, "
-        f"Q loss {row['q_loss']:.3g}, policy loss {row['actor_loss']:.3g}"
-    )
+    """Returns what stands at the end of the progress line; nothing stands for nan."""
+    shown = {
+        "success": f"{row['success']:.0%}",
+        "α": f"{row['alpha']:.3f}",
+        "entropy": f"{row['entropy']:.2f}",
+        "Q loss": f"{row['q_loss']:.3g}",
+        "policy loss": f"{row['actor_loss']:.3g}",
+    }
+    return ", ".join(f"{name} {text}" for name, text in shown.items() if "nan" not in text)

@@ -96,14 +96,15 @@ class FlowFactorize(FlowTransform):
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the outputs asked for, from (raw,) depth and camera motion."""
         *raw, depth, motion = maps
+        K = self.K.to(depth.dtype)  # as in RawFlow, else obj would be their rounding on static pixels
         made: dict[str, Tensor] = {}
         if raw:
-            factors = geometry.factorize(raw[0], depth, self.K, motion)
+            factors = geometry.factorize(raw[0], depth, K, motion)
             made["ego"], made["obj"], made["valid"] = factors
             if "raw" in self.outputs:
                 made["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
         else:
-            made["ego"], made["valid"] = geometry.ego_flow(depth, self.K, motion)
+            made["ego"], made["valid"] = geometry.ego_flow(depth, K, motion)
         return tuple(
             made[name] if name == "valid" else self._in_unit(name, made[name], depth.dtype)
             for name in self.outputs

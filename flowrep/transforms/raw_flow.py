@@ -99,7 +99,8 @@ class RawFlow(FlowTransform):
         self, depth: Tensor, instance: Tensor, instance_motion: Tensor
     ) -> tuple[Tensor, ...]:
         """Returns the outputs asked for."""
-        flow, valid = geometry.rigid_flow(depth, instance, self.K, instance_motion)
+        K = self.K.to(depth.dtype)
+        flow, valid = geometry.rigid_flow(depth, instance, K, instance_motion)
         if self.invalid != 0.0:
             flow = torch.where(valid, flow, self.invalid)
         return tuple(

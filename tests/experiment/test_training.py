@@ -1,0 +1,105 @@
+"""A run that is stopped and resumed is the run that was not."""
+
+import csv
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+pytest.importorskip("pybullet", reason="training drives the simulated street")
+
+from flowrep.experiment.interruption import StopRequest
+from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.training import Training, train
+from flowrep.train import build
+from tests.test_configs import composed
+
+
+def new_run(folder, *, resume=False) -> tuple[Training, dict]:
+    config = composed(
+        "debug=smoke", "num_envs=2", "total_frames=120", "checkpoint_every_frames=60",
+        "log_every_frames=20", "evaluation.every_frames=0", "algorithm.precision=fp32",
+        "algorithm.replay_capacity=64", "device=cpu", "seed=7",
+    )  # fmt: skip
+    config["resume"] = str(folder) if resume else None
+    return build(config, RunFolder(folder)), config
+
+
+class StopAfter(StopRequest):
+    """A stop that is asked for once a number of frames is reached."""
+
+    def __init__(self, training: Training, frames: int) -> None:
+        super().__init__()
+        self.training, self.frames = training, frames
+
+    def __bool__(self) -> bool:
+        return self.training.frames >= self.frames
+
+
+def finish(folder, *stops: int) -> Training:
+    """Trains in as many sessions as there are stops, and one more."""
+    for stop in stops:
+        training, config = new_run(folder, resume=(folder / "checkpoint").exists())
+        train(training, config, StopAfter(training, stop), lambda frames: None)
+        training.env.close()
+    training, config = new_run(folder, resume=bool(stops))
+    train(training, config, StopRequest(), lambda frames: None)
+    training.env.close()
+    return training
+
+
+def differing(a, b, place="") -> list[str]:
+    """Names every leaf in which two nested states differ."""
+    if isinstance(a, TensorDict):
+        a, b = a.to_dict(), b.to_dict()
+    if isinstance(a, dict):
+        return [
+            d for key in a.keys() | b.keys() for d in differing(a[key], b[key], f"{place}/{key}")
+        ]
+    if isinstance(a, list):
+        return [
+            d
+            for i, pair in enumerate(zip(a, b, strict=True))
+            for d in differing(*pair, f"{place}/{i}")
+        ]
+    same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+    return [] if same else [place]
+
+
+def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path):
+    whole = finish(tmp_path / "whole")
+    pieces = finish(tmp_path / "pieces", 34, 78)
+    assert whole.updates == pieces.updates > 5
+    assert differing(whole.state(), pieces.state()) == []
+
+
+def test_a_killed_run_continues_from_its_last_checkpoint_and_drops_later_rows(tmp_path):
+    training, config = new_run(tmp_path)
+    saved = []
+
+    class Killed(Exception):
+        pass
+
+    def save_once():
+        if saved:
+            raise Killed
+        saved.append(training.frames)
+        Training.save(training)
+
+    training.save = save_once
+    with pytest.raises(Killed):
+        train(training, config, StopRequest(), lambda frames: None)
+    training.env.close()
+    resumed, config = new_run(tmp_path, resume=True)
+    assert resumed.frames == saved[0] == 60
+    train(resumed, config, StopRequest(), lambda frames: None)
+    resumed.env.close()
+    with resumed.run.metrics_path.open(newline="") as file:
+        logged = [int(row["frames"]) for row in csv.DictReader(file)]
+    assert logged == sorted(set(logged))
+    assert logged[-1] == 120
+
+
+def test_the_loop_updates_once_for_ten_frames_after_the_first_batch(tmp_path):
+    training = finish(tmp_path)
+    assert training.updates == (120 - 16) // 10

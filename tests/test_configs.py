@@ -1,0 +1,82 @@
+"""Every file of conf/ composes, and everything in it is used."""
+
+import inspect
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_class
+from omegaconf import OmegaConf
+
+from flowrep.command_line import register_resolvers
+from flowrep.config_tree import CONF_DIR, group_choices
+
+pytest.importorskip("pybullet", reason="composed configs are built into environments")
+
+
+def composed(*overrides, name="train"):
+    register_resolvers()
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        config = compose(name, list(overrides))
+    return OmegaConf.to_container(config, resolve=True, throw_on_missing=name == "train")
+
+
+GROUP_FILES = [
+    (group.name, name)
+    for group in sorted(CONF_DIR.iterdir())
+    if group.is_dir()
+    for name in group_choices(group.name)
+]
+
+
+@pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
+def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
+    from flowrep.build import build_agent, build_env
+
+    choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
+    small = [] if group == "debug" else ["num_envs=1", "algorithm.replay_capacity=64"]
+    config = composed(choice, *small, "device=cpu")
+    env = build_env(config)
+    agent = build_agent(config, env)
+    action = agent.policy(env.reset())["action"]
+    env.close()
+    assert action.shape == env.batch_size
+
+
+@pytest.mark.parametrize("name", group_choices("representations"))
+def test_a_representation_is_one_key_named_as_its_file(name):
+    assert list(composed(f"representations=[{name}]")["representations"]) == [name]
+
+
+@pytest.mark.parametrize("name", group_choices("algorithm"))
+def test_an_algorithm_spells_out_every_option_of_its_class_in_its_order(name):
+    options = OmegaConf.to_container(OmegaConf.load(CONF_DIR / "algorithm" / f"{name}.yaml"))
+    parameters = inspect.signature(get_class(options.pop("_target_"))).parameters.values()
+    given_by_the_run = {"observation_spec", "action_spec", "keys", "total_frames", "device"}
+    assert list(options) == [p.name for p in parameters if p.name not in given_by_the_run]
+
+
+def test_representations_keep_the_order_of_the_command_line():
+    config = composed("representations=[seg2,ego,obj]")
+    assert list(config["representations"]) == ["seg2", "ego", "obj"]
+
+
+def test_the_default_is_the_papers_table_ii():
+    config = composed()
+    algorithm = config["algorithm"]
+    assert config["total_frames"] == 2_000_000
+    assert algorithm["learning_rate"] == 3e-4
+    assert algorithm["initial_alpha"] == 0.5
+    assert algorithm["replay_capacity"] == 10_240
+    assert algorithm["batch_size"] == 1024
+    assert algorithm["hidden_size"] == 512
+    assert algorithm["frames_per_update"] == 10
+    assert algorithm["target_entropy_weight"] == 0.2
+    camera = config["scene"]["camera"]
+    assert (camera["height_px"], camera["width_px"], camera["fov_deg"]) == (84, 84, 90)
+
+
+def test_run_folders_are_named_by_scene_representations_and_seed():
+    register_resolvers()
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        config = compose("train", ["representations=[ego,obj]", "seed=3"], return_hydra_config=True)
+    assert config.hydra.run.dir.endswith("_straight_road_ego+obj_s3")
