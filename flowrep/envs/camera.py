@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
+_GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,7 @@ def gl_projection(
 
 def gl_view(cam_from_world: Matrix) -> list[float]:
     """Returns the 16 numbers, column by column, of the OpenGL view matrix (y up, z backward)."""
-    gl_from_cv = np.diag([1.0, -1.0, -1.0, 1.0])
-    return (gl_from_cv @ cam_from_world).T.ravel().tolist()
+    return (_GL_FROM_CV @ cam_from_world).T.ravel().tolist()
 
 
 def vehicle_from_camera(camera: CameraConfig) -> Matrix:
@@ -89,6 +89,6 @@ def depth_from_zbuffer(
     zbuffer: NDArray[np.float32], near_m: float, far_m: float
 ) -> NDArray[np.float32]:
     """Returns metres along z for OpenGL depth-buffer values in [0, 1], of the same shape."""
-    # Near 1 the difference cancels: it is taken in float64.
-    gap = far_m - (far_m - near_m) * zbuffer.astype(np.float64)
-    return np.divide(far_m * near_m, gap, out=gap).astype(np.float32)
+    # far - (far - near)·z would cancel near z = 1, where 1 - z is exact in float32.
+    gap = np.float32(near_m) + np.float32(far_m - near_m) * (np.float32(1.0) - zbuffer)
+    return np.float32(far_m * near_m) / gap

@@ -22,6 +22,7 @@ from flowrep.envs.vehicle import VehicleState, footprint_corners, roll, turn
 Array = NDArray[np.float64]
 # Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't pass anyone by.
 _CHECKS_HZ = 24.0
+_POSES_KEPT = 16  # ticks whose poses are at hand: those of this step and of the one before
 
 
 @dataclass(frozen=True)
@@ -84,10 +85,15 @@ class Episode:
         self.steps = 0
         self.outcome = Outcome.RUNNING
         self.hit = ""
+        self._poses: dict[int, Array] = {}
 
     def pedestrian_poses(self, moment: Moment) -> Array:
-        """Returns where everyone is at a moment, planar poses [P, 3]."""
-        return self.crowd.poses(moment.ticks * self.rules.tick_s)
+        """Returns where everyone is at a moment, planar poses [P, 3], not to be written to."""
+        if moment.ticks not in self._poses:
+            if len(self._poses) > _POSES_KEPT:
+                self._poses.clear()
+            self._poses[moment.ticks] = self.crowd.poses(moment.ticks * self.rules.tick_s)
+        return self._poses[moment.ticks]
 
     def step(self, action: int, street: Street) -> None:
         """Drives one step; it ends early where the episode does."""
@@ -106,7 +112,8 @@ class Episode:
             self.outcome = Outcome.TIMEOUT
 
     def _judge(self, moment: Moment, street: Street) -> None:
-        self.hit = street.hit(moment.vehicle, self.pedestrian_poses(moment))
+        people = self.crowd.positions(moment.ticks * self.rules.tick_s)
+        self.hit = street.hit(moment.vehicle, people)
         if self.hit:
             self.outcome = Outcome.COLLISION
         elif self.rules.is_out_of_bounds(moment.vehicle):

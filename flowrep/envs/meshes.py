@@ -1,6 +1,7 @@
 """Low-polygon shapes as flat-shaded triangles with a colour each, and the scene's own shapes."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -12,6 +13,7 @@ from flowrep.envs.layout import Box
 from flowrep.envs.paint import SHIRTS, Patch, front, swatch, wall
 
 Array = NDArray[np.float64]
+Point3 = tuple[float, float, float]
 PEDESTRIAN_RADIUS_M = 0.25
 PEDESTRIAN_HEIGHT_M = 1.75
 _CELL_M = 15.0  # ground is cut into cells: the renderer interpolates short triangles better
@@ -44,15 +46,23 @@ class Mesh:
         u0, v0, u1, v1 = patch
         self.polygon(corners, [[u0, v1], [u1, v1], [u1, v0], [u0, v0]])
 
-    def box(self, low: Array, high: Array, side: Patch, *, right: Patch | None = None) -> None:
-        """Adds a box without its floor; `right` is the patch of its -y side, else as the others."""
+    def box(self, low: Point3, high: Point3, side: Patch, *, lid: bool = True) -> None:
+        """Adds a box without its floor, and without its lid unless asked for."""
+        self.walls(low, high, (side,) * 4)
+        if lid:
+            (x0, y0, _), (x1, y1, z1) = low, high
+            ring = [(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)]
+            self.quad(np.array(ring), side)
+
+    def walls(self, low: Point3, high: Point3, sides: Sequence[Patch | None]) -> None:
+        """Adds the upright faces of a box that have a patch: -y, +x, +y, -x."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-        for i, patch in enumerate((right or side, side, side, side)):
-            (ax, ay), (bx, by) = ring[i], ring[(i + 1) % 4]
-            corners = [(ax, ay, z0), (bx, by, z0), (bx, by, z1), (ax, ay, z1)]
-            self.quad(np.array(corners), patch)
-        self.quad(np.array([(x, y, z1) for x, y in ring]), side)
+        for i, patch in enumerate(sides):
+            if patch is not None:
+                (ax, ay), (bx, by) = ring[i], ring[(i + 1) % 4]
+                corners = [(ax, ay, z0), (bx, by, z0), (bx, by, z1), (ax, ay, z1)]
+                self.quad(np.array(corners), patch)
 
     def ground(self, area: BaseGeometry, height_m: float, paint: str) -> None:
         """Adds an area of the plan, level, cut into cells."""
@@ -91,23 +101,23 @@ def pedestrian_mesh(variant: int) -> Mesh:
     mesh = Mesh()
     shirt = swatch(SHIRTS[variant % len(SHIRTS)])
     for y in (-0.11, 0.11):
-        low, high = np.array([-0.09, y - 0.08, 0.0]), np.array([0.09, y + 0.08, 0.82])
-        mesh.box(low, high, swatch("trousers"))
-    mesh.box(np.array([-0.13, -0.24, 0.8]), np.array([0.13, 0.24, 1.45]), shirt)
-    mesh.box(np.array([-0.11, -0.1, 1.47]), np.array([0.12, 0.1, 1.75]), swatch("skin"))
+        low, high = (-0.09, y - 0.08, 0.0), (0.09, y + 0.08, 0.82)
+        mesh.box(low, high, swatch("trousers"), lid=False)
+    mesh.box((-0.13, -0.24, 0.8), (0.13, 0.24, 1.45), shirt)
+    mesh.box((-0.11, -0.1, 1.47), (0.12, 0.1, 1.75), swatch("skin"))
     return mesh
 
 
 def house_mesh(box: Box, *, both_sides: bool = False) -> Mesh:
-    """Returns a house: walls, a front of windows to its right (and left), a flat roof."""
+    """Returns what a street shows of a house: a front of windows to its right, its side walls.
+
+    With `both_sides` there is a front to its left too. No one looks at its roof.
+    """
     length, width, height = box.size_m
+    windows, plain = front(box.variant), wall(box.variant)
+    sides = (windows, plain, windows if both_sides else None, plain)
     mesh = Mesh()
-    low, high = np.array([-length / 2, -width / 2, 0.0]), np.array([length / 2, width / 2, height])
-    mesh.box(low, high, wall(box.variant), right=front(box.variant))
-    if both_sides:
-        skin = Mesh()
-        skin.box(low - [0, 0.01, 0], high - [0, 0.01, 0], wall(0), right=front(box.variant))
-        mesh.add(skin.moved(0.0, 0.0, math.pi))
+    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
     return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
 
 
@@ -124,7 +134,7 @@ def obstacle_mesh(box: Box) -> Mesh:
     }
     length, width, height = box.size_m
     mesh = Mesh()
-    low, high = np.array([-length / 2, -width / 2, 0.0]), np.array([length / 2, width / 2, height])
+    low, high = (-length / 2, -width / 2, 0.0), (length / 2, width / 2, height)
     mesh.box(low, high, swatch(paints.get(box.category, "metal")))
     return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
 

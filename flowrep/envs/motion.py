@@ -3,43 +3,64 @@
 Convention: `<to>_from_<from>`; a planar pose is (x, y, yaw), metres and radians, z up.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
 
-def world_from_body(poses: Array) -> Array:
-    """Returns the transforms [..., 4, 4] of planar poses [..., 3]."""
-    matrix = np.zeros((*poses.shape[:-1], 4, 4))
-    sine, cosine = np.sin(poses[..., 2]), np.cos(poses[..., 2])
-    matrix[..., 0, 0] = matrix[..., 1, 1] = cosine
-    matrix[..., 0, 1], matrix[..., 1, 0] = -sine, sine
-    matrix[..., :2, 3] = poses[..., :2]
-    matrix[..., 2, 2] = matrix[..., 3, 3] = 1.0
-    return matrix
+def planar(x_m: float, y_m: float, yaw_rad: float) -> Array:
+    """Returns the transform [4, 4] of a planar pose: body axes into the world's."""
+    sine, cosine = math.sin(yaw_rad), math.cos(yaw_rad)
+    return np.array(
+        [
+            [cosine, -sine, 0.0, x_m],
+            [sine, cosine, 0.0, y_m],
+            [0.0, 0.0, 1.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
-def inverse_rigid(matrix: Array) -> Array:
-    """Returns the inverses of rigid transforms [..., 4, 4]."""
-    inverse = np.zeros_like(matrix)
-    rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
-    inverse[..., :3, :3] = rotation
-    inverse[..., :3, 3] = -(rotation @ matrix[..., :3, 3:])[..., 0]
-    inverse[..., 3, 3] = 1.0
-    return inverse
+def planar_change(prev_poses: Array, poses: Array) -> Array:
+    """Returns prev_from_curr in world axes [P, 4, 4] of bodies at planar poses [P, 3].
+
+    It takes a point that rides on a body from where it is now to where it was.
+    """
+    change = np.zeros((len(poses), 4, 4))
+    turn = prev_poses[:, 2] - poses[:, 2]
+    sine, cosine = np.sin(turn), np.cos(turn)
+    change[:, 0, 0] = change[:, 1, 1] = cosine
+    change[:, 1, 0] = sine
+    change[:, 0, 1] = -sine
+    change[:, 0, 3] = prev_poses[:, 0] - (cosine * poses[:, 0] - sine * poses[:, 1])
+    change[:, 1, 3] = prev_poses[:, 1] - (sine * poses[:, 0] + cosine * poses[:, 1])
+    change[:, 2, 2] = change[:, 3, 3] = 1.0
+    return change
 
 
-def relative_camera(prev_world_from_cam: Array, world_from_cam: Array) -> Array:
+class CameraPose:
+    """Where the camera stands, both ways."""
+
+    def __init__(self, world_from_cam: Array) -> None:
+        """Inverts the rigid transform [4, 4]."""
+        self.world_from_cam = world_from_cam
+        self.cam_from_world = np.eye(4)
+        rotation = world_from_cam[:3, :3].T
+        self.cam_from_world[:3, :3] = rotation
+        self.cam_from_world[:3, 3] = -(rotation @ world_from_cam[:3, 3])
+
+
+def relative_camera(before: CameraPose, now: CameraPose) -> Array:
     """Returns prev_from_curr [4, 4]; the exact identity where the camera stood still."""
-    if np.array_equal(prev_world_from_cam, world_from_cam):
+    if np.array_equal(before.world_from_cam, now.world_from_cam):
         return np.eye(4)
-    return inverse_rigid(prev_world_from_cam) @ world_from_cam
+    return before.cam_from_world @ now.world_from_cam
 
 
-def instance_motion(
-    prev_world_from_cam: Array, world_from_cam: Array, prev_poses: Array, poses: Array
-) -> Array:
+def instance_motion(before: CameraPose, now: CameraPose, prev_poses: Array, poses: Array) -> Array:
     """Returns prev_from_curr by instance [1 + P, 4, 4] for bodies at planar poses [P, 3].
 
     Row 0 is the static world's. Row i takes a point that rides on body i, seen now in the current
@@ -47,12 +68,9 @@ def instance_motion(
     numbers, so that its object flow is exactly zero.
     """
     rows = np.empty((1 + len(poses), 4, 4))
-    rows[:] = relative_camera(prev_world_from_cam, world_from_cam)
+    rows[:] = relative_camera(before, now)
     moved = np.flatnonzero((poses != prev_poses).any(axis=-1))
     if moved.size:
-        prev_from_curr_in_world = world_from_body(prev_poses[moved]) @ inverse_rigid(
-            world_from_body(poses[moved])
-        )
-        prev_cam_from_world = inverse_rigid(prev_world_from_cam)
-        rows[1 + moved] = prev_cam_from_world @ prev_from_curr_in_world @ world_from_cam
+        change = planar_change(prev_poses[moved], poses[moved])
+        rows[1 + moved] = before.cam_from_world @ change @ now.world_from_cam
     return rows

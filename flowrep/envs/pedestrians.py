@@ -25,53 +25,60 @@ class Crowd:
         """
         most = max((len(line) for line in lines), default=2)
         # Short lines end in copies of their last point, which have no length.
-        padded = [
-            np.concatenate([line, np.repeat(line[-1:], most - len(line), 0)]) for line in lines
-        ]
+        padded = [line[np.minimum(np.arange(most), len(line) - 1)] for line in lines]
         self._points = np.array(padded).reshape(len(lines), most, 2)  # [P, M, 2]
         steps = np.diff(self._points, axis=1)
-        lengths = np.hypot(steps[..., 0], steps[..., 1])
-        self._marks = np.concatenate([np.zeros((len(lines), 1)), lengths.cumsum(axis=1)], axis=1)
+        lengths = np.hypot(steps[..., 0], steps[..., 1])  # [P, M - 1]
         self._headings = np.arctan2(steps[..., 1], steps[..., 0])
-        self._speeds = np.asarray(speeds_mps, dtype=np.float64)
+        self._directions = steps / np.maximum(lengths, 1e-12)[..., None]
+        self._marks = np.cumsum(np.pad(lengths, ((0, 0), (1, 0))), axis=1)
+        self._last_piece = np.maximum((lengths > 0).sum(axis=1) - 1, 0)
         self._length = self._marks[:, -1]
-        self._start = np.asarray(phases, dtype=np.float64) * 2 * self._length
+        self._there_and_back = 2 * self._length
+        self._speeds = np.asarray(speeds_mps, dtype=np.float64)
+        self._start = np.asarray(phases, dtype=np.float64) * self._there_and_back
         self._people = np.arange(len(lines))
-        last = most - 1 - (lengths[:, ::-1] > 0).argmax(axis=1) if len(lines) else np.zeros(0)
-        self._last_step = last.astype(np.int64) - 1
 
     def __len__(self) -> int:
         """How many people there are."""
         return len(self._people)
 
+    def positions(self, time_s: float) -> Array:
+        """Returns where everyone is [P, 2], at a time since the episode's start."""
+        return self._places(self._along(time_s))[0]
+
     def poses(self, time_s: float) -> Array:
-        """Returns where everyone is, planar poses [P, 3], at a time since the episode's start."""
-        if not len(self):
-            return np.zeros((0, 3))
-        # There and back: a triangle wave over twice the line's length.
-        along = (self._start + self._speeds * time_s) % (2 * self._length)
-        back = along > self._length
-        at = np.where(back, 2 * self._length - along, along)
-        step = (at[:, None] >= self._marks[:, 1:-1]).sum(axis=1)
-        step = np.minimum(step, self._last_step)
-        heading = self._headings[self._people, step]
-        past = at - self._marks[self._people, step]
-        poses = np.empty((len(self), 3))
-        poses[:, :2] = self._points[self._people, step]
-        poses[:, 0] += past * np.cos(heading)
-        poses[:, 1] += past * np.sin(heading)
-        poses[:, 2] = heading + self._facing(along)
-        return poses
+        """Returns where everyone is and looks, planar poses [P, 3]."""
+        along = self._along(time_s)
+        positions, headings = self._places(along)
+        return np.column_stack([positions, headings + self._facing(along)])
+
+    def _along(self, time_s: float) -> Array:
+        # Metres walked since the near end, in [0, there and back).
+        return (self._start + self._speeds * time_s) % self._there_and_back
+
+    def _places(self, along: Array) -> tuple[Array, Array]:
+        at = np.minimum(along, self._there_and_back - along)
+        if self._points.shape[1] == 2:
+            points, marks, directions, headings = (
+                array[:, 0]
+                for array in (self._points, self._marks, self._directions, self._headings)
+            )
+        else:
+            pieces = (at[:, None] >= self._marks[:, 1:-1]).sum(axis=1)
+            here = self._people, np.minimum(pieces, self._last_piece)
+            points, marks = self._points[here], self._marks[here]
+            directions, headings = self._directions[here], self._headings[here]
+        return points + (at - marks)[:, None] * directions, headings
 
     def _facing(self, along: Array) -> Array:
         # 0 on the way there, π on the way back, turned evenly over _TURN_S around either end.
         half_m = np.maximum(0.5 * _TURN_S * self._speeds, 1e-9)
-        full = 2 * self._length
         to_far_end = along - self._length
-        to_near_end = np.where(along > self._length, along - full, along)
+        past_near_end = np.where(to_far_end > 0, along - self._there_and_back, along)
         turned_far = np.clip(0.5 + 0.5 * to_far_end / half_m, 0.0, 1.0)
-        turned_near = np.clip(0.5 + 0.5 * to_near_end / half_m, 0.0, 1.0)
-        is_near_far_end = np.abs(to_far_end) <= np.abs(to_near_end)
+        turned_near = np.clip(0.5 + 0.5 * past_near_end / half_m, 0.0, 1.0)
+        is_near_far_end = np.abs(to_far_end) <= np.abs(past_near_end)
         return math.pi * np.where(is_near_far_end, turned_far, 1.0 + turned_near)
 
 

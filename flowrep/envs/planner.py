@@ -131,7 +131,7 @@ class _Search:
         return index[order[np.sort(first)[:most]]]
 
     def _touches(self, state: VehicleState, ticks: int) -> Array:
-        people = self.episode.crowd.poses(ticks * self.rules.tick_s)[:, :2]
+        people = self.episode.crowd.positions(ticks * self.rules.tick_s)
         reach = self.vehicle.length_m + self.vehicle.width_m
         low = np.array([state.x_m.min(), state.y_m.min()]) - reach
         high = np.array([state.x_m.max(), state.y_m.max()]) + reach

@@ -126,7 +126,7 @@ class Simulator:
         """Returns instance ids by body number; the last entry, which index -1 reads, is 0."""
         return np.array([*self._instance_of_body, 0], dtype=np.uint8)
 
-    def place(self, body: int, x_m: float, y_m: float, yaw_rad: float) -> None:
+    def place(self, body: int, x_m: float, y_m: float, yaw_rad: float = 0.0) -> None:
         """Puts a body on the ground at a planar pose."""
         half = 0.5 * yaw_rad
         pybullet.resetBasePositionAndOrientation(
@@ -135,6 +135,13 @@ class Simulator:
             (0.0, 0.0, math.sin(half), math.cos(half)),
             physicsClientId=self._client,
         )
+
+    def place_all(self, bodies: list[int], poses: NDArray[np.float64]) -> None:
+        """Puts bodies on the ground at planar poses [P, 3]."""
+        put, client = pybullet.resetBasePositionAndOrientation, self._client
+        sines, cosines = np.sin(0.5 * poses[:, 2]).tolist(), np.cos(0.5 * poses[:, 2]).tolist()
+        for body, (x, y, _), sine, cosine in zip(bodies, poses.tolist(), sines, cosines):
+            put(body, (x, y, 0.0), (0.0, 0.0, sine, cosine), physicsClientId=client)
 
     def hide(self, body: int) -> None:
         """Puts a body where neither the camera nor the vehicle meets it."""

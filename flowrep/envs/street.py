@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,14 @@ Array = NDArray[np.float64]
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
+class Solid(NamedTuple):
+    """Boxes that stand still and are one body."""
+
+    body: int
+    category: str
+    boxes: tuple[Box, ...]
+
+
 class Street:
     """The bodies of one scene. Closures start hidden, pedestrians at the origin."""
 
@@ -24,7 +33,7 @@ class Street:
         vehicle = layout.scene.vehicle
         self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
         self._vehicle_reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
-        self._solids: list[tuple[int, str, Array, Array]] = []
+        self._solids: list[Solid] = []
         self._add_ground(layout)
         self._add_solids(layout)
         self._closures = {name: self._add_closure(box) for name, box in layout.closures.items()}
@@ -41,36 +50,43 @@ class Street:
 
     def close_exits(self, names: Iterable[str]) -> None:
         """Puts up the closures that are named and takes away all others."""
-        self._closed = tuple(names)
-        for name, (body, *_) in self._closures.items():
+        self._closed = [name for name in self._closures if name in set(names)]
+        for name, solid in self._closures.items():
             if name in self._closed:
-                self.simulator.place(body, 0.0, 0.0, 0.0)
+                self.simulator.place(solid.body, 0.0, 0.0, 0.0)
             else:
-                self.simulator.hide(body)
+                self.simulator.hide(solid.body)
+        solids = [*self._solids, *(self._closures[name] for name in self._closed)]
+        self._owners = [solid for solid in solids for _ in solid.boxes]
+        boxes = [box for solid in solids for box in solid.boxes]
+        self._centres = np.array([(box.x_m, box.y_m) for box in boxes]).reshape(-1, 2)
+        reaches = [math.hypot(*box.size_m[:2]) / 2 for box in boxes]
+        self._reaches = np.array(reaches) + self._vehicle_reach_m
 
     def place_pedestrians(self, poses: Array) -> None:
         """Puts everyone at their planar pose [P, 3]."""
-        place = self.simulator.place
-        for body, (x, y, yaw) in zip(self._pedestrians, poses.tolist()):
-            place(body, x, y, yaw)
+        self.simulator.place_all(self._pedestrians, poses)
 
-    def hit(self, state: VehicleState, poses: Array) -> str:
+    def hit(self, state: VehicleState, people: Array) -> str:
         """Returns the category of what the vehicle overlaps, or "".
+
+        Args:
+            state: where the vehicle is.
+            people: where everyone is [P, 2].
 
         Only what is near enough to be touched is put before the simulator's collision oracle.
         """
+        reach = self._vehicle_reach_m + meshes.PEDESTRIAN_RADIUS_M
+        is_near = np.hypot(people[:, 0] - state.x_m, people[:, 1] - state.y_m) <= reach
+        gaps = np.hypot(self._centres[:, 0] - state.x_m, self._centres[:, 1] - state.y_m)
+        boxes = gaps <= self._reaches
         near = []
-        if len(poses):
-            reach = self._vehicle_reach_m + meshes.PEDESTRIAN_RADIUS_M
-            gap = np.hypot(poses[:, 0] - state.x_m, poses[:, 1] - state.y_m)
-            for i in np.flatnonzero(gap <= reach).tolist():
-                self.simulator.place(self._pedestrians[i], *poses[i].tolist())
-                near.append((self._pedestrians[i], "pedestrian"))
-        solids = [*self._solids, *(self._closures[name] for name in self._closed)]
-        for body, category, centres, reaches in solids:
-            gap = np.hypot(centres[:, 0] - state.x_m, centres[:, 1] - state.y_m)
-            if (gap <= reaches + self._vehicle_reach_m).any():
-                near.append((body, category))
+        for i in np.flatnonzero(is_near).tolist():
+            x_m, y_m = people[i].tolist()
+            self.simulator.place(self._pedestrians[i], x_m, y_m)
+            near.append((self._pedestrians[i], "pedestrian"))
+        for solid in {self._owners[i] for i in np.flatnonzero(boxes).tolist()}:
+            near.append((solid.body, solid.category))
         if not near:
             return ""
         self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)
@@ -101,17 +117,13 @@ class Street:
                     mesh.add(meshes.house_mesh(box) if is_house else meshes.obstacle_mesh(box))
                 self._solids.append(self._add_solid(mesh, category, chunk))
 
-    def _add_closure(self, box: Box) -> tuple[int, str, Array, Array]:
+    def _add_closure(self, box: Box) -> Solid:
         return self._add_solid(meshes.house_mesh(box, both_sides=True), box.category, [box])
 
-    def _add_solid(
-        self, mesh: meshes.Mesh, category: str, boxes: list[Box]
-    ) -> tuple[int, str, Array, Array]:
+    def _add_solid(self, mesh: meshes.Mesh, category: str, boxes: list[Box]) -> Solid:
         body = self.simulator.add_body(
             mesh,
             category,
             boxes_m=tuple((box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes),
         )
-        centres = np.array([(box.x_m, box.y_m) for box in boxes])
-        reaches = np.array([math.hypot(*box.size_m[:2]) / 2 for box in boxes])
-        return body, category, centres, reaches
+        return Solid(body, category, tuple(boxes))

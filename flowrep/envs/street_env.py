@@ -18,7 +18,7 @@ from flowrep.envs.camera import (
 from flowrep.envs.episode import Episode, Moment, Rules
 from flowrep.envs.layout import Layout
 from flowrep.envs.loading import load_scene
-from flowrep.envs.motion import instance_motion, inverse_rigid, relative_camera, world_from_body
+from flowrep.envs.motion import CameraPose, instance_motion, planar, relative_camera
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.palette import PALETTE_RGB, num_classes
 from flowrep.envs.scene import Range, Scene, SpeedMode
@@ -89,6 +89,7 @@ class StreetEnv(gym.Env):
         self._instance_of_body = self._street.simulator.instance_lookup()
         self._episode: Episode | None = None
         self._picture: Picture | None = None
+        self._camera_poses: dict[Moment, CameraPose] = {}
         self.action_space = spaces.Discrete(3)
         self.observation_space = self._observation_space()
 
@@ -194,26 +195,33 @@ class StreetEnv(gym.Env):
         if self._picture is None:
             now, camera = self.episode.now, self.scene.camera
             self._street.place_pedestrians(self.episode.pedestrian_poses(now))
-            view = gl_view(inverse_rigid(self._world_from_cam(now)))
+            view = gl_view(self._camera_pose(now).cam_from_world)
             self._picture = self._street.simulator.look(
                 view, self._projection, camera.height_px, camera.width_px
             )
         return self._picture
 
-    def _world_from_cam(self, moment: Moment) -> np.ndarray:
-        return world_from_body(np.array(moment.vehicle[:3])) @ self._vehicle_from_cam
+    def _camera_pose(self, moment: Moment) -> CameraPose:
+        # The poses of this step and of the one before are at hand.
+        if moment not in self._camera_poses:
+            vehicle = moment.vehicle
+            world_from_vehicle = planar(vehicle.x_m, vehicle.y_m, vehicle.yaw_rad)
+            if len(self._camera_poses) > 1:
+                self._camera_poses.pop(next(iter(self._camera_poses)))
+            self._camera_poses[moment] = CameraPose(world_from_vehicle @ self._vehicle_from_cam)
+        return self._camera_poses[moment]
 
     def _add_maps(self, observation: dict[str, Any], picture: Picture) -> None:
         body = picture.body
         if "depth" in self.sensors:
             camera = self.scene.camera
             depth = depth_from_zbuffer(picture.zbuffer, camera.near_m, camera.far_m)
-            depth[body < 0] = np.inf
+            np.putmask(depth, body < 0, np.inf)
             observation["depth"] = depth[None]
         if "semantic" in self.sensors:
-            observation["semantic"] = self._class_of_body[body][None]
+            observation["semantic"] = self._class_of_body.take(body)[None]
         if "instance" in self.sensors:
-            observation["instance"] = self._instance_of_body[body][None]
+            observation["instance"] = self._instance_of_body.take(body)[None]
         if "rgb" in self.sensors:
             observation["rgb"] = np.ascontiguousarray(self._rgb(picture).transpose(2, 0, 1))
 
@@ -224,7 +232,7 @@ class StreetEnv(gym.Env):
 
     def _add_motion(self, observation: dict[str, Any]) -> None:
         episode = self.episode
-        before, now = self._world_from_cam(episode.before), self._world_from_cam(episode.now)
+        before, now = self._camera_pose(episode.before), self._camera_pose(episode.now)
         if "instance_motion" in self.sensors:
             poses = [episode.pedestrian_poses(m) for m in (episode.before, episode.now)]
             rows = instance_motion(before, now, *poses).astype(np.float32)
