@@ -1,0 +1,187 @@
+"""Times one gradient step of discrete SAC, against TorchRL's stock recipe and the machine's floor.
+
+    python benchmarks/update.py [--device cuda] [--rounds 5] [--default-malloc] [--busy]
+
+All variants learn from the same transitions; each round times every variant once, in turn, and the
+machine's matrix products between them, so that a change of load hits all alike. The floor is the
+update's own count of operations at the measured rate of bfloat16 products. `--default-malloc`
+leaves glibc's allocator as it is, to show what `keep_freed_memory` is worth. On a machine that is
+busy with more, `--busy` runs on one thread and counts its processor time, not the clock's.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import DiscreteSACLoss, SoftUpdate
+
+from flowrep.agent import DiscreteSAC, keep_freed_memory
+
+MAPS = ("ego", "obj")
+CHANNELS, ACTIONS = 2, 3
+SIZES = {"laptop": (48, 256), "paper": (84, 1024)}  # pixels a side, batch
+
+
+def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
+    """Steps that all terminate, so that each is a transition at once."""
+
+    def maps() -> dict[str, torch.Tensor]:
+        return {name: torch.randn(batch, CHANNELS, side, side, device=device) for name in MAPS}
+
+    ends = torch.ones(batch, 1, dtype=torch.bool, device=device)
+    reward = torch.randn(batch, 1, device=device)
+    following = {**maps(), "reward": reward, "done": ends, "terminated": ends}
+    action = torch.randint(ACTIONS, (batch,), device=device)
+    return TensorDict({**maps(), "action": action, "next": following}, [batch], device=device)
+
+
+def flowrep_update(steps: TensorDict, encoder: str, precision: str) -> Callable[[], object]:
+    side, batch = steps["ego"].shape[-1], len(steps)
+    spec = Composite({name: Unbounded((CHANNELS, side, side)) for name in MAPS})
+    agent = DiscreteSAC(
+        spec, Categorical(ACTIONS), list(MAPS), total_frames=10**9, device=steps.device,
+        encoder=encoder, precision=precision, learning_rate=3e-4, initial_alpha=0.5,
+        target_entropy_weight=0.2, gamma=0.99, tau=0.005, hidden_size=512, batch_size=batch,
+        replay_capacity=2 * batch, frames_per_update=10, learning_starts=None,
+    )  # fmt: skip
+    agent.replay.extend(steps)
+    sample = agent.replay.sample()
+    return lambda: agent.update(sample)
+
+
+class StockNetwork(nn.Module):
+    """Nature encoders, a hidden layer and one number an action, as anyone would write it."""
+
+    def __init__(self, side: int) -> None:
+        super().__init__()
+        final = ((((side - 8) // 4 + 1) - 4) // 2 + 1) - 2
+        self.encoders = nn.ModuleList(
+            nn.Sequential(
+                nn.Conv2d(CHANNELS, 32, 8, 4), nn.LeakyReLU(), nn.Conv2d(32, 64, 4, 2),
+                nn.LeakyReLU(), nn.Conv2d(64, 64, 3), nn.LeakyReLU(), nn.Flatten(-3),
+                nn.Linear(64 * final * final, 512), nn.LeakyReLU(),
+            )
+            for _ in MAPS
+        )  # fmt: skip
+        self.head = nn.Sequential(
+            nn.Linear(512 * len(MAPS), 512), nn.SiLU(), nn.Linear(512, ACTIONS)
+        )
+
+    def forward(self, *maps: torch.Tensor) -> torch.Tensor:
+        return self.head(torch.cat([encode(x) for encode, x in zip(self.encoders, maps)], -1))
+
+
+def stock_update(steps: TensorDict) -> Callable[[], object]:
+    """TorchRL's `DiscreteSACLoss` as its examples use it: float32, two Q-networks under vmap."""
+    side = steps["ego"].shape[-1]
+    with torch.device(steps.device):
+        actor = TensorDictModule(StockNetwork(side), in_keys=[*MAPS], out_keys=["logits"])
+        critic = TensorDictModule(StockNetwork(side), in_keys=[*MAPS], out_keys=["action_value"])
+    policy = ProbabilisticActor(
+        actor, in_keys=["logits"], distribution_class=torch.distributions.Categorical
+    )
+    loss = DiscreteSACLoss(
+        policy, critic, action_space="categorical", num_actions=ACTIONS, loss_function="l2",
+        alpha_init=0.5, target_entropy_weight=0.2,
+    )  # fmt: skip
+    loss.make_value_estimator(gamma=0.99)
+    targets = SoftUpdate(loss, tau=0.005)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
+
+    def update() -> None:
+        losses = loss(steps)
+        (losses["loss_qvalue"] + losses["loss_actor"] + losses["loss_alpha"]).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        targets.step()
+
+    return update
+
+
+def matrix_product(dtype: torch.dtype, device: torch.device, side: int) -> Callable[[], object]:
+    a = torch.randn(side, side, dtype=dtype, device=device)
+    return lambda: a @ a
+
+
+def interleaved(
+    actions: dict[str, Callable[[], object]],
+    rounds: int,
+    device: torch.device,
+    clock: Callable[[], float],
+) -> dict[str, float]:
+    """Returns each action's median seconds over rounds in which all take turns."""
+    seconds: dict[str, list[float]] = {name: [] for name in actions}
+    for turn in range(rounds + 2):
+        for name, act in actions.items():
+            start = clock()
+            act()
+            if device.type == "cuda":
+                torch.cuda.synchronize()
+            if turn >= 2:  # the first two warm up
+                seconds[name].append(clock() - start)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def operations(update: Callable[[], object]) -> int:
+    with FlopCounterMode(display=False) as counter:
+        update()
+    return counter.get_total_flops()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=[*SIZES])
+    parser.add_argument("--default-malloc", action="store_true")
+    parser.add_argument("--busy", action="store_true")
+    args = parser.parse_args()
+    clock = time.process_time if args.busy else time.perf_counter
+    if args.busy:
+        torch.set_num_threads(1)
+    kept = not args.default_malloc and keep_freed_memory()
+    print(f"{args.device}, {torch.get_num_threads()} threads, freed memory kept: {kept}")
+    for size in args.sizes:
+        side, batch = SIZES[size]
+        torch.manual_seed(0)
+        steps = random_steps(side, batch, args.device)
+        updates = {
+            "flowrep shared bf16": flowrep_update(steps, "shared", "bf16"),
+            "flowrep separate bf16": flowrep_update(steps, "separate", "bf16"),
+            "flowrep shared fp32": flowrep_update(steps, "shared", "fp32"),
+            "flowrep separate fp32": flowrep_update(steps, "separate", "fp32"),
+            "TorchRL stock, separate fp32": stock_update(steps),
+        }
+        width = 8192 if args.device.type == "cuda" else 2048
+        types = {"bf16": torch.bfloat16, "fp32": torch.float32}
+        products = {n: matrix_product(t, args.device, width) for n, t in types.items()}
+        seconds = interleaved({**updates, **products}, args.rounds, args.device, clock)
+        rates = {name: 2 * width**3 / seconds[name] for name in products}
+        print(f"\n{size}: {side}x{side}, {len(MAPS)} maps of {CHANNELS} channels, batch {batch}")
+        print(", ".join(f"{n} products {r / 1e9:.0f} GFLOP/s" for n, r in rates.items()))
+        print("| update | s | GFLOP | bf16 floor, s | x floor | faster than stock |")
+        print("| --- | --- | --- | --- | --- | --- |")
+        stock = seconds["TorchRL stock, separate fp32"]
+        for name, update in updates.items():
+            count = None if "stock" in name else operations(update)
+            floor = count / rates["bf16"] if count else None
+            columns = [
+                f"{seconds[name]:.4f}",
+                f"{count / 1e9:.1f}" if count else "",
+                f"{floor:.4f}" if floor else "",
+                f"{seconds[name] / floor:.2f}" if floor else "",
+                f"{stock / seconds[name]:.1f}",
+            ]
+            print(f"| {name} | " + " | ".join(columns) + " |")
+
+
+if __name__ == "__main__":
+    main()
