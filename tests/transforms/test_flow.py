@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from flowrep.transforms import FlowFactorize, RawFlow
+from flowrep.transforms import FlowFactorize, RawFlow, representation_stack
 from tests.transforms.fake_env import INTRINSICS, STATUE, WALKER, FakeSensorEnv, frame
 
 # fx = 40, fy = 20, cx = 2, cy = 1: pixel (column 1, row 0) sits at x~ = -0.5, y~ = -0.5.
@@ -111,6 +111,15 @@ def test_a_body_that_came_from_behind_the_camera_has_no_flow():
     assert not td["valid"][0, 0, 1]
     assert (td["raw"][:, 0, 1] == 0).all()
     assert RawFlow(K, invalid=math.nan)(td)["raw"][:, 0, 1].isnan().all()
+
+
+def test_a_stack_gives_such_a_body_no_object_flow_either():
+    td = scene()
+    td["sensor", "instance_motion"][1, 2, 3] = -9.0
+    td = representation_stack(["raw", "ego", "obj"], intrinsics=K)(td)
+    assert td["ego"][0, 0, 1] == -2.0
+    assert (td["raw"][:, 0, 1] == 0).all()
+    assert (td["obj"][:, 0, 1] == 0).all()  # raw - ego would be +2
 
 
 def test_ego_alone_reads_no_raw_flow():

@@ -80,7 +80,7 @@ def test_segmentation_refuses(options, expected):
 
 
 def test_depth_is_clipped_and_finite():
-    depth = torch.tensor([[[10.0, 50.0, 0.0], [40.0, math.inf, math.nan]]])
+    depth = torch.tensor([[[10.0, 50.0, -4.0], [40.0, math.inf, math.nan]]])
     got = read(Depth(range_m=40.0, missing=0.75), "depth", depth)
     assert got.tolist() == [[[0.25, 1.0, 0.0], [1.0, 1.0, 0.75]]]
     assert read(Depth(), "depth", depth)[0, 1, 2] == 0.0
