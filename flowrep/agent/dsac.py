@@ -120,7 +120,7 @@ class DiscreteSAC:
             alpha_init=initial_alpha,
             target_entropy="auto",
             target_entropy_weight=target_entropy_weight,
-            # a loop over two small networks is faster than vmap, forward and backward
+            # for two small heads a loop is as fast as vmap, and asks nothing of what they do
             deactivate_vmap=True,
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)

@@ -157,12 +157,15 @@ def test_a_writer_killed_at_any_instant_leaves_a_whole_checkpoint(tmp_path):
     path = tmp_path / "c.safetensors"
     save_checkpoint(path, {"version": 0, "a": torch.zeros(200_000)})
     code = (
-        "import sys, torch; from flowrep.agent.checkpoint import save_checkpoint\n"
+        "import runpy, sys, torch\n"
+        "save_checkpoint = runpy.run_path(sys.argv[2])['save_checkpoint']\n"
         "for i in range(1, 10**6):\n"
         "    save_checkpoint(sys.argv[1], {'version': i, 'a': torch.full((200_000,), i)})\n"
         "    if i == 1: print('started', flush=True)\n"
     )
-    writer = subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE)
+    module = sys.modules[save_checkpoint.__module__].__file__
+    command = [sys.executable, "-c", code, path, module]
+    writer = subprocess.Popen(command, stdout=subprocess.PIPE)
     try:
         assert writer.stdout.readline() == b"started\n"
         versions = []

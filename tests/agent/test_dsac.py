@@ -172,9 +172,9 @@ def test_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch, encoder):
         spec, ["view"], Categorical(3), encoder=encoder, gamma=0.5, tau=0.1, learning_rate=1e-3,
         initial_alpha=0.01, total_frames=100_000,
     )  # fmt: skip
-    for _ in range(150):
-        cell, action, following, reached = corridor(48)
-        steps = Composite(view=Unbounded((1, 36, 40))).zero([48])
+    for _ in range(100):
+        cell, action, following, reached = corridor(32)
+        steps = Composite(view=Unbounded((1, 36, 40))).zero([32])
         steps.update({"view": picture(cell), "action": action})
         steps["next"] = steps.select("view").update({"view": picture(following)})
         steps["next", "reward"] = reached.float().unsqueeze(1)
