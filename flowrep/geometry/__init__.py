@@ -1,6 +1,6 @@
 """Cameras, rigid motions and the flow they cause: pure batched functions that need torch alone."""
 
-from flowrep.geometry.camera import intrinsics_from_fov, project, unproject
+from flowrep.geometry.camera import project, unproject
 from flowrep.geometry.flow import Factors, Flow, ego_flow, factorize, rigid_flow
 from flowrep.geometry.rigid import invert_rigid, relative_motion, transform_points
 
@@ -9,7 +9,6 @@ __all__ = [
     "Flow",
     "ego_flow",
     "factorize",
-    "intrinsics_from_fov",
     "invert_rigid",
     "project",
     "relative_motion",

@@ -90,36 +90,3 @@ def centred_pixels(height: int, width: int, K: Tensor) -> tuple[Tensor, Tensor]:
     u = torch.arange(width, dtype=K.dtype, device=K.device) + 0.5
     v = torch.arange(height, dtype=K.dtype, device=K.device) + 0.5
     return u - cx, v.unsqueeze(-1) - cy
-
-
-def intrinsics_from_fov(
-    height: int,
-    width: int,
-    vertical_fov_deg: float,
-    *,
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str | None = None,
-) -> Tensor:
-    """Returns the K `[3, 3]` of a centred camera with square pixels.
-
-    Convention: the field of view spans the image's height, from its upper to its lower edge; the
-    principal point is the image's middle, (W / 2, H / 2).
-
-    Args:
-        height: pixels.
-        width: pixels.
-        vertical_fov_deg: degrees, between 0 and 180.
-        dtype: of the result.
-        device: of the result.
-
-    Raises:
-        ValueError: the angle is outside (0, 180).
-
-    >>> intrinsics_from_fov(4, 6, 90.0)
-    tensor([[2., 0., 3.], [0., 2., 2.], [0., 0., 1.]])
-    """
-    if not 0.0 < vertical_fov_deg < 180.0:
-        raise ValueError(f"vertical_fov_deg must lie in (0, 180), got {vertical_fov_deg}")
-    focal_px = height / 2 / math.tan(math.radians(vertical_fov_deg) / 2)
-    rows = [[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]]
-    return torch.tensor(rows, dtype=dtype, device=device)

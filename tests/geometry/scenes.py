@@ -1,0 +1,51 @@
+"""Inputs for the geometry's tests: asymmetric, so that a swap of anything shows."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from flowrep.geometry import project, transform_points, unproject
+
+HEIGHT, WIDTH = 5, 7
+K = torch.tensor([[11.0, 0.7, 2.6], [0.0, 6.0, 3.1], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def rotation(x_rad: float, y_rad: float, z_rad: float) -> Tensor:
+    """Returns Rz Ry Rx `[3, 3]`, float64."""
+    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a), math.sin(a)) for a in (x_rad, y_rad, z_rad))
+    about_x = torch.tensor([[1, 0, 0], [0, cx, -sx], [0, sx, cx]], dtype=torch.float64)
+    about_y = torch.tensor([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], dtype=torch.float64)
+    about_z = torch.tensor([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]], dtype=torch.float64)
+    return about_z @ about_y @ about_x
+
+
+def rigid(angles_rad: tuple[float, float, float], translation_m: tuple[float, float, float]):
+    """Returns a rigid transform `[4, 4]`, float64."""
+    transform = torch.eye(4, dtype=torch.float64)
+    transform[:3, :3] = rotation(*angles_rad)
+    transform[:3, 3] = torch.tensor(translation_m, dtype=torch.float64)
+    return transform
+
+
+MOTION = rigid((0.03, -0.05, 0.02), (0.11, -0.07, 0.6))
+OTHER_MOTION = rigid((-0.02, 0.04, 0.01), (-0.4, 0.2, 0.3))
+
+
+def depth_map(*batch: int, seed: int = 0) -> Tensor:
+    """Returns depth between 2 and 20 m, `[*B, 1, 5, 7]`, float64."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (*batch, 1, HEIGHT, WIDTH)
+    return 2 + 18 * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+
+def flow_by_points(depth: Tensor, K: Tensor, prev_from_curr: Tensor) -> Tensor:
+    """Returns ego flow by way of a point cloud: unproject, move, project, subtract (unbatched)."""
+    points = transform_points(prev_from_curr, unproject(depth, K))
+    height, width = depth.shape[-2:]
+    v, u = torch.meshgrid(
+        torch.arange(height, dtype=K.dtype) + 0.5,
+        torch.arange(width, dtype=K.dtype) + 0.5,
+        indexing="ij",
+    )
+    return (torch.stack([u, v], -1) - project(points, K)).permute(2, 0, 1)

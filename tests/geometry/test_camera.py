@@ -1,0 +1,132 @@
+"""Projection and its inverse, worked by hand on an off-centre camera with fx != fy and skew."""
+
+from itertools import product
+
+import pytest
+import torch
+
+from flowrep.geometry import project, unproject
+from tests.geometry.scenes import HEIGHT, WIDTH, K, depth_map
+
+
+def camera(fx=100.0, skew=0.0, cx=32.0, fy=50.0, cy=24.0) -> torch.Tensor:
+    return torch.tensor([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def cameras(count: int) -> torch.Tensor:
+    return camera().expand(count, 3, 3)
+
+
+def test_project_by_hand():
+    # u = 100 * 1/4 + 32, v = 50 * 2/4 + 24. With fx and fy swapped: (44.5, 74).
+    pixel = project(torch.tensor([1.0, 2.0, 4.0]), camera())
+    assert pixel.tolist() == [57.0, 49.0]
+
+
+def test_project_skew_by_hand():
+    # u gains skew * y/z = 8 * 0.5. Were skew ignored, 57; were it applied to v, (57, 53).
+    pixel = project(torch.tensor([1.0, 2.0, 4.0]), camera(skew=8.0))
+    assert pixel.tolist() == [61.0, 49.0]
+
+
+def test_unproject_by_hand():
+    # Column 1, row 0: u = 1.5, v = 0.5. y = (0.5 - 0.25) / 0.5 * 2, x = (1.5 - 1) / 4 * 2.
+    point = unproject(torch.full((1, 1, 2), 2.0), camera(fx=4.0, cx=1.0, fy=0.5, cy=0.25))[0, 1]
+    assert point.tolist() == [0.25, 1.0, 2.0]
+
+
+def test_unproject_skew_by_hand():
+    # y/z = (0.5 - 0.25) / 0.5 = 0.5, so x/z = (1.5 - 1 - 3 * 0.5) / 4 = -0.25.
+    K_skew = camera(fx=4.0, skew=3.0, cx=1.0, fy=0.5, cy=0.25)
+    assert unproject(torch.full((1, 1, 2), 2.0), K_skew)[0, 1].tolist() == [-0.5, 1.0, 2.0]
+
+
+def test_pixel_to_camera_to_pixel_comes_back():
+    pixels = project(unproject(depth_map(), K), K)
+    v, u = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    torch.testing.assert_close(pixels, torch.stack([u, v], -1).double(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("z", [0.0, -4.0, float("nan")])
+def test_a_point_that_is_not_in_front_has_no_pixel(z):
+    # Divided blindly, (1, 2, -4) would land at (7, -1), mirrored through the centre.
+    assert project(torch.tensor([1.0, 2.0, z]), camera()).isnan().all()
+
+
+def test_a_point_behind_gives_no_nan_to_the_gradient_of_the_others():
+    points = torch.tensor([[1.0, 2.0, 4.0], [1.0, 2.0, 0.0]], requires_grad=True)
+    project(points, camera())[0].sum().backward()
+    # du/dx = fx / z = 25, dv/dy = fy / z = 12.5, d/dz = -(100 * 1 + 50 * 2) / 16.
+    assert points.grad.tolist() == [[25.0, 12.5, -12.5], [0.0, 0.0, 0.0]]
+
+
+def test_unproject_keeps_missing_and_infinite_depth_apart():
+    points = unproject(torch.tensor([[[float("nan"), float("inf"), 2.0]]]), camera())
+    assert points[0, 0].isnan().all()
+    assert points[0, 1, 2] == float("inf")
+    assert points[0, 2, 2] == 2.0
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
+def test_any_batch_equals_a_loop(batch):
+    generator = torch.Generator().manual_seed(1)
+    Ks = K + torch.rand((*batch, 3, 3), generator=generator, dtype=torch.float64)
+    depth = depth_map(*batch)
+    points = unproject(depth, Ks)
+    pixels = project(points, Ks)
+    assert points.shape == (*batch, HEIGHT, WIDTH, 3)
+    for at in product(*map(range, batch)):
+        assert torch.equal(points[at], unproject(depth[at], Ks[at]))
+        assert torch.equal(pixels[at], project(points[at], Ks[at]))
+    assert torch.equal(unproject(depth, K), unproject(depth, K.expand(*batch, 3, 3)))
+
+
+def test_camera_s_batch_is_the_leading_one_of_the_points():
+    Ks = torch.stack([camera(), camera(cx=0.0)])
+    points = torch.tensor([1.0, 2.0, 4.0]).expand(2, 5, 3)  # five points a camera
+    u = project(points, Ks)[..., 0]
+    assert u.tolist() == [[57.0] * 5, [25.0] * 5]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.bfloat16])
+def test_dtype_is_kept(dtype):
+    points = unproject(torch.full((1, 1, 2), 2.0, dtype=dtype), camera().to(dtype))
+    assert points.dtype == project(points, camera().to(dtype)).dtype == dtype
+
+
+def test_gradients():
+    depth = depth_map().requires_grad_()
+    camera_matrix = K.clone().requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda d, k: project(unproject(d, k) + 0.3, k), (depth, camera_matrix)
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: project(torch.ones(4), camera()), ValueError, r"points_cam must be \[\*B, 3\]"),
+        (lambda: project(torch.ones(3), torch.ones(3, 4)), ValueError, r"K must be.*got \[3, 4\]"),
+        (lambda: project(torch.ones(3), cameras(2)), ValueError, r"K has batch \[2\].*points_cam"),
+        (lambda: project(torch.ones(5, 3), cameras(2)), ValueError, r"K \[2\], points_cam \[5\]"),
+        (
+            lambda: unproject(torch.ones(4, 5), camera()),
+            ValueError,
+            r"depth must be \[\*B, 1, H, W\]",
+        ),
+        (
+            lambda: unproject(torch.ones(1, 4, 5, dtype=torch.int32), camera()),
+            TypeError,
+            "depth must be floating point.*int32.*/ 1000",
+        ),
+        (lambda: unproject([[1.0]], camera()), TypeError, "depth must be a torch.Tensor, got list"),
+        (
+            lambda: unproject(torch.ones(2, 1, 4, 5), cameras(3)),
+            ValueError,
+            r"depth \[2\], K \[3\]",
+        ),
+    ],
+)
+def test_mistakes_are_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
