@@ -60,18 +60,27 @@ class FlowTransform(MapTransform):
         self.compiled = bool(compiled)
         self.register_buffer("K", _as_intrinsics(intrinsics), persistent=False)
 
-    def _in_unit(self, name: str, flow: Tensor, dtype: torch.dtype) -> Tensor:
+    def _in_unit(self, name: str, flow: Tensor) -> Tensor:
         factor = self.factors[name]
-        return (flow if factor == 1.0 else flow * factor).to(dtype)
+        return flow if factor == 1.0 else flow * factor
+
+    def _at_one_precision(self, *maps: Tensor, depth: Tensor) -> list[Tensor]:
+        """Returns the maps, depth and K in depth's float type, float32 at least.
+
+        Raw flow and ego flow have to round alike: else obj were rounding noise where nothing moves.
+        """
+        dtype = torch.promote_types(depth.dtype, torch.float32)
+        return [tensor.to(dtype) for tensor in (*maps, depth, self.K)]
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns an unbounded spec a flow and a boolean one for the mask."""
         depth = next(spec for spec, reads in zip(specs, self.reads) if reads is DEPTH)
         batch, size, device = depth.shape[:-3], depth.shape[-2:], depth.device
+        dtype = torch.promote_types(depth.dtype, torch.float32)
         return tuple(
             Categorical(2, shape=(*batch, 1, *size), device=device, dtype=torch.bool)
             if name == "valid"
-            else Unbounded((*batch, 2, *size), device=device, dtype=depth.dtype)
+            else Unbounded((*batch, 2, *size), device=device, dtype=dtype)
             for name in self.outputs
         )
 

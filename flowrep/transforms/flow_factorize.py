@@ -96,7 +96,7 @@ class FlowFactorize(FlowTransform):
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the outputs asked for, from (raw,) depth and camera motion."""
         *raw, depth, motion = maps
-        K = self.K.to(depth.dtype)  # as in RawFlow, else obj would be their rounding on static pixels
+        *raw, motion, depth, K = self._at_one_precision(*raw, motion, depth=depth)
         made: dict[str, Tensor] = {}
         if raw:
             factors = geometry.factorize(raw[0], depth, K, motion)
@@ -106,6 +106,6 @@ class FlowFactorize(FlowTransform):
         else:
             made["ego"], made["valid"] = geometry.ego_flow(depth, K, motion)
         return tuple(
-            made[name] if name == "valid" else self._in_unit(name, made[name], depth.dtype)
+            made[name] if name == "valid" else self._in_unit(name, made[name])
             for name in self.outputs
         )

@@ -99,11 +99,10 @@ class RawFlow(FlowTransform):
         self, depth: Tensor, instance: Tensor, instance_motion: Tensor
     ) -> tuple[Tensor, ...]:
         """Returns the outputs asked for."""
-        K = self.K.to(depth.dtype)
-        flow, valid = geometry.rigid_flow(depth, instance, K, instance_motion)
+        motions, depth, K = self._at_one_precision(instance_motion, depth=depth)
+        flow, valid = geometry.rigid_flow(depth, instance, K, motions)
         if self.invalid != 0.0:
             flow = torch.where(valid, flow, self.invalid)
         return tuple(
-            valid if name == "valid" else self._in_unit(name, flow, depth.dtype)
-            for name in self.outputs
+            valid if name == "valid" else self._in_unit(name, flow) for name in self.outputs
         )

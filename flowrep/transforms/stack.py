@@ -154,22 +154,20 @@ def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) ->
     """Returns the transforms of all representations but flow."""
     makers: list[Transform] = []
     stacks: list[Transform] = []
-    context = {"seg": {"num_classes": num_classes}}
     for name, options in chosen.items():
+        if name in _FLOWS:
+            continue
+        frame, key = _STACK_OF.get(name, name), name
+        frame_options = {option: value for option, value in options.items() if option != "k"}
         if name in _STACK_OF:
-            frame = _STACK_OF[name]
-            stack_options = {"k": options["k"]}
-            options = {key: value for key, value in options.items() if key != "k"}
-            shared = frame in chosen and chosen[frame] == options
+            shared = chosen.get(frame) == frame_options
             key = frame if shared else f"_{frame}"
-            stacks.append(FrameStack(in_keys=[key], out_keys=[name], **stack_options))
+            stacks.append(FrameStack(k=options["k"], in_keys=key, out_keys=name))
             if shared:
                 continue
-        elif name in _FLOWS:
-            continue
-        else:
-            frame, key = name, name
-        makers.append(_MADE_BY[frame][0](**context.get(frame, {}), **options, out_keys=[key]))
+        if frame == "seg":
+            frame_options["num_classes"] = num_classes
+        makers.append(_MADE_BY[frame][-1](**frame_options, out_keys=key))
     return makers + stacks
 
 

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs.transforms import Compose
 
 from flowrep.transforms import FlowFactorize, RawFlow, representation_stack
 from tests.transforms.fake_env import INTRINSICS, STATUE, WALKER, FakeSensorEnv, frame
@@ -71,6 +72,24 @@ def test_object_flow_is_exactly_0_on_what_stands_still(options):
     assert (td["sensor", "instance"] == STATUE).any()
     hole = td["sensor", "depth"].isnan().expand(2, -1, -1)
     assert (split["obj"][moves & ~hole] != 0).all()
+
+
+@pytest.mark.parametrize("precision", [torch.float16, torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("other", [torch.float32, torch.float64], ids=str)
+def test_whatever_the_float_types_raw_and_ego_round_alike(precision, other):
+    td = TensorDict({"sensor": frame(env=1, episode=0, step=2)})
+    for key, dtype in (("depth", precision), ("prev_from_curr", other), ("instance_motion", other)):
+        td["sensor", key] = td["sensor", key].to(dtype)
+    intrinsics = torch.tensor(INTRINSICS, dtype=other)
+    intrinsics[0, 0] = 6.1  # not the same number in float32 and float64
+    for stack in (
+        Compose(RawFlow(intrinsics), FlowFactorize(intrinsics)),
+        representation_stack(["obj"], intrinsics=intrinsics),
+    ):
+        obj = stack(td.clone())["obj"]
+        still = (td["sensor", "instance"] != WALKER).expand(2, -1, -1)
+        assert (obj[still] == 0).all()
+        assert obj.dtype == torch.promote_types(precision, torch.float32)
 
 
 def test_still_camera_leaves_everything_to_the_objects():
