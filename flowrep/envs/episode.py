@@ -5,7 +5,8 @@ and the actions.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -19,7 +20,7 @@ from flowrep.envs.scene import Path, Range
 from flowrep.envs.street import Street
 from flowrep.envs.vehicle import VehicleState, footprint_corners, roll, turn
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 # Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't pass anyone by.
 _CHECKS_HZ = 24.0
 _POSES_KEPT = 16  # ticks whose poses are at hand: those of this step and of the one before
@@ -42,16 +43,20 @@ class Rules:
         self.dt_s = 1.0 / frame_rate_hz
         self.ticks_a_step = math.ceil(_CHECKS_HZ / frame_rate_hz - 1e-9)
         self.tick_s = self.dt_s / self.ticks_a_step
+        self.tick_numbers = np.arange(1, self.ticks_a_step + 1)
+        self.tick_times_s = self.tick_numbers * self.tick_s
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
         vehicle = layout.scene.vehicle
         reach = math.hypot(vehicle.length_m, vehicle.width_m) / 2
         self._surely_inside = layout.drivable.buffer(-reach)
         shapely.prepare(self._surely_inside)
 
+    def is_surely_inside(self, states: VehicleState) -> Array:
+        """Returns where the footprint is on the road whichever way it points; fields [T]."""
+        return shapely.contains_xy(self._surely_inside, states.x_m, states.y_m)
+
     def is_out_of_bounds(self, state: VehicleState) -> bool:
         """Returns whether any part of the footprint is off the road."""
-        if shapely.contains_xy(self._surely_inside, state.x_m, state.y_m):
-            return False
         corners = footprint_corners(state, self.layout.scene.vehicle)
         return not self.layout.drivable.covers(Polygon(corners))
 
@@ -98,28 +103,34 @@ class Episode:
     def step(self, action: int, street: Street) -> None:
         """Drives one step; it ends early where the episode does."""
         rules = self.rules
+        self.before = self.now
         state = turn(self.now.vehicle, action, rules.dt_s, rules.layout.scene.vehicle)
-        self.before, moment = self.now, replace(self.now, vehicle=state)
-        for _ in range(rules.ticks_a_step):
-            state = roll(moment.vehicle, rules.tick_s, self.vehicle_speed_mps)
-            moment = Moment(state, moment.ticks + 1)
-            self._judge(moment, street)
+        states = roll(state, rules.tick_times_s, self.vehicle_speed_mps)  # fields [T]
+        ticks = self.now.ticks + rules.tick_numbers
+        people = self.crowd.positions(ticks[:, None] * rules.tick_s)  # [T, P, 2]
+        is_safe = ~street.is_near(states, people) & rules.is_surely_inside(states)
+        has_arrived = shapely.contains_xy(self.goal, states.x_m, states.y_m)
+        for i in range(rules.ticks_a_step):
+            vehicle = VehicleState(
+                float(states.x_m[i]), float(states.y_m[i]), float(states.yaw_rad[i]), state[3]
+            )
+            if not is_safe[i]:
+                self._judge(vehicle, people[i], street)
+            if not self.outcome and has_arrived[i]:
+                self.outcome = Outcome.SUCCESS
             if self.outcome:
                 break
-        self.now = moment
+        self.now = Moment(vehicle, int(ticks[i]))
         self.steps += 1
         if not self.outcome and self.steps >= rules.limit_steps:
             self.outcome = Outcome.TIMEOUT
 
-    def _judge(self, moment: Moment, street: Street) -> None:
-        people = self.crowd.positions(moment.ticks * self.rules.tick_s)
-        self.hit = street.hit(moment.vehicle, people)
+    def _judge(self, vehicle: VehicleState, people: Array, street: Street) -> None:
+        self.hit = street.hit(vehicle, people)
         if self.hit:
             self.outcome = Outcome.COLLISION
-        elif self.rules.is_out_of_bounds(moment.vehicle):
+        elif self.rules.is_out_of_bounds(vehicle):
             self.outcome = Outcome.OUT_OF_BOUNDS
-        elif shapely.contains_xy(self.goal, moment.vehicle.x_m, moment.vehicle.y_m):
-            self.outcome = Outcome.SUCCESS
 
 
 def _path_named(paths: tuple[Path, ...], name: str) -> Path:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def planar(x_m: float, y_m: float, yaw_rad: float) -> Array:
@@ -42,15 +43,17 @@ def planar_change(prev_poses: Array, poses: Array) -> Array:
 
 
 class CameraPose:
-    """Where the camera stands, both ways."""
+    """Where a camera on a vehicle stands, both ways."""
 
-    def __init__(self, world_from_cam: Array) -> None:
-        """Inverts the rigid transform [4, 4]."""
-        self.world_from_cam = world_from_cam
-        self.cam_from_world = np.eye(4)
-        rotation = world_from_cam[:3, :3].T
-        self.cam_from_world[:3, :3] = rotation
-        self.cam_from_world[:3, 3] = -(rotation @ world_from_cam[:3, 3])
+    def __init__(self, x_m: float, y_m: float, yaw_rad: float, mount: Array) -> None:
+        """Puts the mount, vehicle_from_cam [4, 4], on a vehicle at a planar pose."""
+        world_from_vehicle = planar(x_m, y_m, yaw_rad)
+        self.world_from_cam = world_from_vehicle @ mount
+        # The inverse of a rigid transform (R, t) is (Rᵀ, -Rᵀt).
+        inverse = self.world_from_cam.T.copy()
+        inverse[:3, 3] = -(inverse[:3, :3] @ self.world_from_cam[:3, 3])
+        inverse[3] = _LAST_ROW
+        self.cam_from_world = inverse
 
 
 def relative_camera(before: CameraPose, now: CameraPose) -> Array:

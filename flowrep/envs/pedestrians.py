@@ -1,6 +1,7 @@
 """People who walk back and forth on their lines: where each stands is a function of time alone."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 from flowrep.envs.layout import Layout
 from flowrep.envs.scene import PedestrianGroup, Range
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 _TURN_S = 0.6  # about-turn at either end of a walk
 
 
@@ -43,8 +44,11 @@ class Crowd:
         """How many people there are."""
         return len(self._people)
 
-    def positions(self, time_s: float) -> Array:
-        """Returns where everyone is [P, 2], at a time since the episode's start."""
+    def positions(self, time_s: float | Array) -> Array:
+        """Returns where everyone is [P, 2] at a time since the episode's start.
+
+        Times [T, 1] give places [T, P, 2].
+        """
         return self._places(self._along(time_s))[0]
 
     def poses(self, time_s: float) -> Array:
@@ -53,7 +57,7 @@ class Crowd:
         positions, headings = self._places(along)
         return np.column_stack([positions, headings + self._facing(along)])
 
-    def _along(self, time_s: float) -> Array:
+    def _along(self, time_s: float | Array) -> Array:
         # Metres walked since the near end, in [0, there and back).
         return (self._start + self._speeds * time_s) % self._there_and_back
 
@@ -65,11 +69,11 @@ class Crowd:
                 for array in (self._points, self._marks, self._directions, self._headings)
             )
         else:
-            pieces = (at[:, None] >= self._marks[:, 1:-1]).sum(axis=1)
+            pieces = (at[..., None] >= self._marks[:, 1:-1]).sum(axis=-1)
             here = self._people, np.minimum(pieces, self._last_piece)
             points, marks = self._points[here], self._marks[here]
             directions, headings = self._directions[here], self._headings[here]
-        return points + (at - marks)[:, None] * directions, headings
+        return points + (at - marks)[..., None] * directions, headings
 
     def _facing(self, along: Array) -> Array:
         # 0 on the way there, π on the way back, turned evenly over _TURN_S around either end.

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from flowrep.envs.layout import Box, Layout
 from flowrep.envs.simulator import Simulator
 from flowrep.envs.vehicle import VehicleState
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
@@ -67,26 +67,41 @@ class Street:
         """Puts everyone at their planar pose [P, 3]."""
         self.simulator.place_all(self._pedestrians, poses)
 
+    def is_near(self, states: VehicleState, people: Array) -> Array:
+        """Returns where anything is near enough to be touched [T].
+
+        Args:
+            states: where the vehicle is, fields [T].
+            people: where everyone is then [T, P, 2].
+        """
+        states = VehicleState(*(np.asarray(value)[..., None] for value in states))
+        is_near = self._people_near(states, people).any(axis=-1)
+        return is_near | self._boxes_near(states).any(axis=-1)
+
+    def _people_near(self, state: VehicleState, people: Array) -> Array:
+        gaps = np.hypot(people[..., 0] - state.x_m, people[..., 1] - state.y_m)
+        return gaps <= self._vehicle_reach_m + meshes.PEDESTRIAN_RADIUS_M
+
+    def _boxes_near(self, state: VehicleState) -> Array:
+        gaps = np.hypot(self._centres[:, 0] - state.x_m, self._centres[:, 1] - state.y_m)
+        return gaps <= self._reaches
+
     def hit(self, state: VehicleState, people: Array) -> str:
         """Returns the category of what the vehicle overlaps, or "".
+
+        Only what is near enough to be touched is put before the simulator's collision oracle.
 
         Args:
             state: where the vehicle is.
             people: where everyone is [P, 2].
-
-        Only what is near enough to be touched is put before the simulator's collision oracle.
         """
-        reach = self._vehicle_reach_m + meshes.PEDESTRIAN_RADIUS_M
-        is_near = np.hypot(people[:, 0] - state.x_m, people[:, 1] - state.y_m) <= reach
-        gaps = np.hypot(self._centres[:, 0] - state.x_m, self._centres[:, 1] - state.y_m)
-        boxes = gaps <= self._reaches
         near = []
-        for i in np.flatnonzero(is_near).tolist():
+        for i in np.flatnonzero(self._people_near(state, people)).tolist():
             x_m, y_m = people[i].tolist()
             self.simulator.place(self._pedestrians[i], x_m, y_m)
             near.append((self._pedestrians[i], "pedestrian"))
-        for solid in {self._owners[i] for i in np.flatnonzero(boxes).tolist()}:
-            near.append((solid.body, solid.category))
+        owners = (self._owners[i] for i in np.flatnonzero(self._boxes_near(state)).tolist())
+        near += {solid.body: solid.category for solid in owners}.items()
         if not near:
             return ""
         self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)

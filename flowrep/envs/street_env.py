@@ -18,11 +18,11 @@ from flowrep.envs.camera import (
 from flowrep.envs.episode import Episode, Moment, Rules
 from flowrep.envs.layout import Layout
 from flowrep.envs.loading import load_scene
-from flowrep.envs.motion import CameraPose, instance_motion, planar, relative_camera
+from flowrep.envs.motion import CameraPose, instance_motion, relative_camera
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.palette import PALETTE_RGB, num_classes
 from flowrep.envs.scene import Range, Scene, SpeedMode
-from flowrep.envs.simulator import Picture
+from flowrep.envs.simulator import Picture, Simulator
 from flowrep.envs.street import Street
 from flowrep.envs.vehicle import VehicleState
 
@@ -85,8 +85,8 @@ class StreetEnv(gym.Env):
         self._vehicle_from_cam = vehicle_from_camera(camera)
         self._rules = Rules(Layout(self.scene), self.frame_rate_hz)
         self._street = Street(self._rules.layout)
-        self._class_of_body = self._street.simulator.class_lookup()
-        self._instance_of_body = self._street.simulator.instance_lookup()
+        self._class_of_body = self.simulator.class_lookup()
+        self._instance_of_body = self.simulator.instance_lookup()
         self._episode: Episode | None = None
         self._picture: Picture | None = None
         self._camera_poses: dict[Moment, CameraPose] = {}
@@ -99,6 +99,15 @@ class StreetEnv(gym.Env):
         if self._episode is None:
             raise RuntimeError("there is no episode yet: call reset() first")
         return self._episode
+
+    @property
+    def simulator(self) -> Simulator:
+        """The world of bodies that the camera looks at."""
+        return self._street.simulator
+
+    def camera_pose(self) -> CameraPose:
+        """Returns where the camera stands."""
+        return self._camera_pose(self.episode.now)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -138,7 +147,7 @@ class StreetEnv(gym.Env):
 
     def close(self) -> None:
         """Gives the simulator's client back."""
-        self._street.simulator.close()
+        self.simulator.close()
 
     def get_state(self) -> dict[str, Any]:
         """Returns all that the future depends on, as plain data that JSON can hold."""
@@ -196,7 +205,7 @@ class StreetEnv(gym.Env):
             now, camera = self.episode.now, self.scene.camera
             self._street.place_pedestrians(self.episode.pedestrian_poses(now))
             view = gl_view(self._camera_pose(now).cam_from_world)
-            self._picture = self._street.simulator.look(
+            self._picture = self.simulator.look(
                 view, self._projection, camera.height_px, camera.width_px
             )
         return self._picture
@@ -204,11 +213,10 @@ class StreetEnv(gym.Env):
     def _camera_pose(self, moment: Moment) -> CameraPose:
         # The poses of this step and of the one before are at hand.
         if moment not in self._camera_poses:
-            vehicle = moment.vehicle
-            world_from_vehicle = planar(vehicle.x_m, vehicle.y_m, vehicle.yaw_rad)
+            x_m, y_m, yaw_rad, _ = moment.vehicle
             if len(self._camera_poses) > 1:
                 self._camera_poses.pop(next(iter(self._camera_poses)))
-            self._camera_poses[moment] = CameraPose(world_from_vehicle @ self._vehicle_from_cam)
+            self._camera_poses[moment] = CameraPose(x_m, y_m, yaw_rad, self._vehicle_from_cam)
         return self._camera_poses[moment]
 
     def _add_maps(self, observation: dict[str, Any], picture: Picture) -> None:

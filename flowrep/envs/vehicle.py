@@ -40,7 +40,7 @@ def turn(state: VehicleState, action: Any, dt_s: float, vehicle: VehicleConfig) 
     return state._replace(yaw_rate_rps=np.minimum(np.maximum(rate, -limit), limit))
 
 
-def roll(state: VehicleState, dt_s: float, speed_mps: float) -> VehicleState:
+def roll(state: VehicleState, dt_s: Any, speed_mps: float) -> VehicleState:
     """Returns the state after `dt_s` on the circular arc of its yaw rate, exactly."""
     angle = state.yaw_rate_rps * dt_s
     # The chord of an arc of length d and angle a is d·sinc(a/2), along the mean heading.

@@ -1,0 +1,174 @@
+"""Flow against pictures alone: where a pixel is said to come from, the frame before shows it."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+from flowrep.envs import StreetEnv, load_scene, scene_names
+from flowrep.geometry import ego_flow, factorize, rigid_flow, unproject
+
+STILL, WALKING = (0.0, 0.0), (1.2, 1.8)
+LEFT, RIGHT, NO_OP = 1, 2, 0
+# A drive that keeps to the road and turns both ways.
+ACTIONS = [LEFT, RIGHT, RIGHT, LEFT, NO_OP, RIGHT, LEFT, LEFT, RIGHT, NO_OP] * 3
+
+
+def street(name, speed):
+    scene = load_scene(name)
+    # H and W differ, and the view is narrow, so that people are many pixels wide.
+    camera = replace(scene.camera, height_px=150, width_px=200, fov_deg=45.0)
+    return StreetEnv(replace(scene, camera=camera), speed=speed)
+
+
+def frames(env, actions, options=None):
+    """Yields the observations, as tensors, of an episode in which someone walks close by."""
+    observation, _ = env.reset(seed=0, options={"episode_seed": 7, **(options or {})})
+    yield tensors(observation)
+    for action in actions:
+        observation, _, ended, _, _ = env.step(action)
+        yield tensors(observation)
+        if ended:
+            return
+
+
+def tensors(observation):
+    return {key: torch.from_numpy(value) for key, value in observation.items()}
+
+
+def came_from(frame, K):
+    """Returns where pixels were (u, v) and their depth there, predicted from this frame alone."""
+    depth, instance = frame["depth"], frame["instance"].long()
+    height, width = depth.shape[-2:]
+    flow, valid = rigid_flow(depth, instance, K, frame["instance_motion"])
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    motion = frame["instance_motion"][instance[0]]  # [H, W, 4, 4]
+    points = unproject(depth, K.float())[..., None]
+    z = (motion[..., 2:3, :3] @ points)[..., 0, 0] + motion[..., 2, 3]
+    return u - flow[0], v - flow[1], torch.where(depth[0].isinf(), torch.inf, z), valid[0]
+
+
+def look_up(frame, u, v):
+    """Returns instance and depth at points between pixel centres, and where they are certain.
+
+    Inverse depth is linear in the image on a plane, so that its bilinear value is exact there. A
+    place is certain if the 4 × 4 pixels around show one instance, one class and one plane.
+    """
+    height, width = frame["depth"].shape[-2:]
+    left, top = (u - 0.5).floor().long(), (v - 0.5).floor().long()
+    inside = (left >= 1) & (left < width - 2) & (top >= 1) & (top < height - 2)
+    left, top = left.clamp(1, width - 3), top.clamp(1, height - 3)
+    a, b = u - 0.5 - left, v - 0.5 - top
+    around = range(-1, 3)
+    ids = 256 * frame["semantic"][0].long() + frame["instance"][0]
+    one = torch.stack([ids[top + j, left + i] == ids[top, left] for j in around for i in around])
+    inverse = 1.0 / frame["depth"][0].double()
+    corner = [inverse[top + j, left + i] for j in (0, 1) for i in (0, 1)]
+    value = (1 - b) * ((1 - a) * corner[0] + a * corner[1]) + b * (
+        (1 - a) * corner[2] + a * corner[3]
+    )
+    bends = [
+        sum(c * inverse[top + j + c_v, left + i + c_u] for c, c_u, c_v in second_difference)
+        for second_difference in (
+            ((1, 1, 0), (-2, 0, 0), (1, -1, 0)),
+            ((1, 0, 1), (-2, 0, 0), (1, 0, -1)),
+        )
+        for j in (0, 1)
+        for i in (0, 1)
+    ]
+    flat = torch.stack(bends).abs().amax(0) <= 2e-4 * value + 1e-12
+    return frame["instance"][0][top, left], 1.0 / value, inside & one.all(0) & flat
+
+
+def agreement(before, now, K):
+    """Returns, of static and of walking pixels, how many agree and how many were asked."""
+    u, v, z, valid = came_from(now, K)
+    instance, depth, certain = look_up(before, u, v)
+    own_certain = look_up(now, *reversed(torch.meshgrid(
+        torch.arange(z.shape[0]) + 0.5, torch.arange(z.shape[1]) + 0.5, indexing="ij"
+    )))[2]  # fmt: skip
+    occluded = depth < 0.98 * z
+    asked = valid & certain & own_certain & ~occluded
+    same_depth = (depth == z) | ((depth - z).abs() < 1e-3 * z)
+    agrees = (instance == now["instance"][0]) & same_depth
+    walks = now["instance"][0] > 0
+    return [
+        (int((agrees & asked & part).sum()), int((asked & part).sum()), int((valid & part).sum()))
+        for part in (~walks, walks)
+    ]
+
+
+def totals(name, change=lambda frame: frame):
+    env = street(name, WALKING)
+    K = torch.from_numpy(env.unwrapped.K)
+    counts, before = torch.zeros(2, 3), None
+    for frame in frames(env, ACTIONS):
+        if before is not None:
+            counts += torch.tensor(agreement(before, change(frame), K))
+        before = frame
+    env.close()
+    return counts
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_each_pixel_is_found_where_its_flow_says_it_was(name):
+    for agree, asked, seen in totals(name):
+        assert asked > 500
+        assert asked / seen > 0.3  # what is certain is no mere remnant
+        assert agree / asked >= 0.99
+
+
+def test_without_the_peoples_own_motion_people_are_not_found():
+    def without_own_motion(frame):
+        rows = frame["prev_from_curr"].expand_as(frame["instance_motion"])
+        return frame | {"instance_motion": rows}
+
+    (still, asked, _), (walking, asked_walking, _) = totals("straight_road", without_own_motion)
+    assert still / asked >= 0.99
+    assert walking / asked_walking < 0.9
+
+
+def flows(frame, K):
+    raw = rigid_flow(frame["depth"], frame["instance"].long(), K, frame["instance_motion"]).flow
+    factors = factorize(raw, frame["depth"], K, frame["prev_from_curr"])
+    return raw, factors.ego, factors.obj
+
+
+def test_a_camera_that_stands_has_no_ego_flow():
+    env = street("straight_road", WALKING)
+    K = torch.from_numpy(env.unwrapped.K)
+    moved = False
+    for frame in frames(env, [NO_OP] * 10, {"vehicle_speed_mps": 0.0}):
+        raw, ego, obj = flows(frame, K)
+        assert not ego.any()
+        torch.testing.assert_close(obj, raw, rtol=0, atol=0)
+        assert not raw[:, frame["instance"][0] == 0].any()
+        moved |= bool(raw.any())
+    assert moved
+    env.close()
+
+
+def test_people_who_stand_have_no_object_flow():
+    env = street("straight_road", STILL)
+    K = torch.from_numpy(env.unwrapped.K)
+    moved, seen = False, 0
+    for frame in frames(env, ACTIONS[:20]):
+        raw, _, obj = flows(frame, K)
+        assert not obj.any()
+        moved |= bool(raw.any())
+        seen += int((frame["instance"] > 0).sum())
+    assert moved
+    assert seen > 100
+    env.close()
+
+
+def test_at_reset_nothing_has_moved():
+    env = street("straight_road", WALKING)
+    frame = next(frames(env, []))
+    assert torch.equal(frame["prev_from_curr"], torch.eye(4))
+    assert torch.equal(frame["instance_motion"], torch.eye(4).expand_as(frame["instance_motion"]))
+    K = torch.from_numpy(env.unwrapped.K)
+    ego = partial(ego_flow, frame["depth"], K)
+    assert not ego(frame["prev_from_curr"]).flow.any()
+    env.close()
