@@ -151,6 +151,7 @@ def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
 
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
     """Takes every street back to a state of `get_states`; goes on from the TensorDict of then."""
+    env.reset()
     for street, state in zip(streets(env), states, strict=True):
         street.set_state(state)
 

@@ -76,7 +76,7 @@ class Street:
         """
         states = VehicleState(*(np.asarray(value)[..., None] for value in states))
         is_near = self._people_near(states, people).any(axis=-1)
-        return is_near | self._boxes_near(states).any(axis=-1)
+        return np.logical_or(is_near, self._boxes_near(states).any(axis=-1))
 
     def _people_near(self, state: VehicleState, people: Array) -> Array:
         gaps = np.hypot(people[..., 0] - state.x_m, people[..., 1] - state.y_m)

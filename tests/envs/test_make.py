@@ -1,0 +1,144 @@
+"""The TorchRL env: its specs, partial resets, the same episodes in one process and in two."""
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.envs import ParallelEnv
+from torchrl.envs.utils import check_env_specs
+
+from flowrep.envs import Outcome, get_states, make_env, set_states, streets
+
+
+@pytest.fixture
+def make():
+    """Makes envs that are closed when the test ends."""
+    made = []
+
+    def make(*args, **kwargs):
+        made.append(make_env(*args, **kwargs))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close(raise_if_closed=False)
+
+
+def actions_of(count, num_envs, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(3, (count, num_envs), generator=generator)
+
+
+def play(env, actions, start=None):
+    """Returns the steps of given actions, ended episodes begun anew."""
+    tensordict, steps = env.reset() if start is None else start, []
+    for action in actions:
+        stepped, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+        steps.append(stepped.clone())
+    return torch.stack(steps), tensordict
+
+
+def assert_same(a, b):
+    assert set(a.keys(True, True)) == set(b.keys(True, True))
+    for key in a.keys(True, True):
+        assert torch.equal(a[key], b[key]), key
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(
+    ("representations", "keep_sensor"),
+    [(("ego", "obj"), False), (("seg2", "rgb", "raw", "depth"), True), ((), False)],
+)
+def test_torchrls_own_checks_pass(make, representations, keep_sensor, num_envs):
+    env = make(representations=representations, num_envs=num_envs, keep_sensor=keep_sensor, seed=0)
+    check_env_specs(env)
+    assert env.batch_size == (num_envs,)
+
+
+def test_the_tensordict_has_the_representations_and_no_sensor(make):
+    env = make(representations=["obj", "seg"], num_envs=2, seed=0)
+    reset = env.reset()
+    assert set(reset.keys(True, True)) == {
+        "obj", "seg", "outcome", "episode_seed", "done", "terminated", "truncated"
+    }  # fmt: skip
+    assert reset["obj"].shape == (2, 2, 84, 84)
+    assert (reset["outcome"].dtype, reset["outcome"].shape) == (torch.uint8, (2, 1))
+    assert (reset["episode_seed"].dtype, reset["episode_seed"].shape) == (torch.int64, (2, 1))
+    assert env.action_spec.space.n == 3
+
+
+def test_only_what_is_read_is_rendered(make):
+    assert streets(make(representations=()))[0].sensors == ()
+    assert streets(make(representations=["seg"]))[0].sensors == ("semantic",)
+    assert streets(make(representations=["ego"]))[0].sensors == ("depth", "prev_from_curr")
+
+
+def test_options_of_a_representation_reach_its_transform(make):
+    plain = make(representations=["depth"], seed=0).reset()["depth"]
+    near = make(representations={"depth": {"range_m": 10.0}}, seed=0).reset()["depth"]
+    # Half the default range of 100 m in metres: what is 10 m away or more fills the short range.
+    assert (near[plain >= 0.1] == 1).all()
+    assert (near < 1).any()
+
+
+def test_an_episode_that_ends_begins_anew_alone(make):
+    env = make(representations=["seg"], num_envs=3, seed=1)
+    # The first turns off the road within 20 steps; the others go straight on.
+    actions = torch.tensor([[1, 0, 0]]).expand(30, 3)
+    steps, _ = play(env, actions)
+    ended = steps["next", "done"][:, :, 0]
+    first = int(ended[:, 0].nonzero()[0])
+    assert first < 20
+    assert steps["next", "outcome"][first, 0] == Outcome.OUT_OF_BOUNDS
+    assert steps["next", "terminated"][first, 0]
+    assert not steps["next", "truncated"].any()
+    seeds = steps["episode_seed"][:, :, 0]
+    assert not ended[first, 1:].any()
+    assert seeds[first + 1, 0] != seeds[first, 0]
+    assert (seeds[first + 1, 1:] == seeds[first, 1:]).all()
+    # The new episode's first picture is its own, and it has not ended.
+    assert steps["outcome"][first + 1, 0] == Outcome.RUNNING
+    alone = make(representations=["seg"], num_envs=1)
+    begun = alone.reset(options={"episode_seed": int(seeds[first + 1, 0])})
+    assert torch.equal(begun["seg"][0], steps["seg"][first + 1, 0])
+    # What the others see goes on from the step before.
+    assert torch.equal(steps["seg"][first + 1, 1:], steps["next", "seg"][first, 1:])
+
+
+def test_a_seed_gives_the_same_steps_in_one_process_and_in_two(make):
+    actions = actions_of(40, 2)
+    first, _ = play(make(representations=["ego", "obj"], num_envs=2, seed=7), actions)
+    again, _ = play(make(representations=["ego", "obj"], num_envs=2, seed=7), actions)
+    assert first["next", "done"].any()
+    assert_same(first, again)
+    # A process each: seeds are what set_seed hands on, so that each is asked for its own.
+    create = partial(make_env, representations=["ego", "obj"])
+    parallel = ParallelEnv(2, [partial(create, seed=7), partial(create, seed=8)])
+    steps, _ = play(parallel, actions[..., None])
+    parallel.close()
+    for key in first.keys(True, True):
+        assert torch.equal(first[key], steps[key].flatten(1, 2)), key
+
+
+def test_which_episodes_come_does_not_depend_on_the_policy(make):
+    def seeds(actions):
+        env = make(num_envs=2, seed=5)
+        steps, _ = play(env, actions)
+        return [steps["episode_seed"][:, i, 0].unique_consecutive()[:3].tolist() for i in (0, 1)]
+
+    turning = torch.ones(60, 2, dtype=torch.long)
+    assert seeds(turning) == seeds(torch.full_like(turning, 2))
+    assert seeds(turning)[0] != seeds(turning)[1]
+
+
+def test_states_take_an_env_back(make):
+    actions = actions_of(30, 2, seed=3)
+    env = make(representations=["ego"], num_envs=2, seed=0)
+    _, then = play(env, actions[:20])
+    states, then = get_states(env), then.clone()
+    expected, _ = play(env, actions[20:], then.clone())
+    other = make(representations=["ego"], num_envs=2, seed=99)
+    other.reset()
+    set_states(other, states)
+    resumed, _ = play(other, actions[20:], then)
+    assert_same(expected, resumed)

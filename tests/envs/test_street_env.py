@@ -1,0 +1,264 @@
+"""The gymnasium environment: its contract, the ends of its episodes, and that they come back."""
+
+import json
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from flowrep.envs.scene import Obstacle
+
+NO_OP, LEFT, RIGHT = 0, 1, 2
+
+
+def drive(env, action=NO_OP, **options):
+    """Returns the rewards of an episode with one action, and its last info."""
+    env.reset(seed=0, options=options)
+    rewards, ended = [], False
+    while not ended:
+        _, reward, ended, truncated, info = env.step(action)
+        assert not truncated
+        rewards.append(reward)
+    return rewards, info
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space.*")
+def test_gymnasiums_own_checks_pass():
+    env = gymnasium.make("flowrep/StraightRoad-v0", render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.close()
+
+
+def test_the_observation_has_what_was_asked_for(make_street, straight_road):
+    camera = replace(straight_road.camera, height_px=20, width_px=30)
+    sensors = ("rgb", "instance", "depth", "semantic", "instance_motion", "prev_from_curr")
+    env = make_street(replace(straight_road, camera=camera), sensors=sensors, render_mode=None)
+    observation, _ = env.reset(seed=0)
+    people = straight_road.num_pedestrians
+    kinds = {key: (value.shape, value.dtype.name) for key, value in observation.items()}
+    assert kinds == {
+        "rgb": ((3, 20, 30), "uint8"),
+        "instance": ((1, 20, 30), "uint8"),
+        "depth": ((1, 20, 30), "float32"),
+        "semantic": ((1, 20, 30), "uint8"),
+        "instance_motion": ((1 + people, 4, 4), "float32"),
+        "prev_from_curr": ((4, 4), "float32"),
+    }
+    assert tuple(observation) == sensors
+    assert env.K.shape == (3, 3)
+
+
+def test_maps_show_sky_road_sidewalk_houses_and_people(make_street):
+    env = make_street()
+    observation, _ = env.reset(seed=0)
+    depth, semantic = observation["depth"][0], observation["semantic"][0]
+    assert set(np.unique(semantic)) == {0, 1, 2, 3, 4}
+    # Sky is where nothing is: at infinity, and nowhere else.
+    np.testing.assert_array_equal(np.isinf(depth), semantic == 0)
+    # Instances are the people, numbered from 1.
+    np.testing.assert_array_equal(observation["instance"][0] > 0, semantic == 4)
+    assert semantic[-1, 42] == 1  # the road before the vehicle
+    # 50 rows down a ray meets the ground 5 m ahead, and 40 columns aside that is 4.75 m to the left.
+    assert semantic[50, 2] == 2
+    assert semantic[0, 0] == 3  # a house front
+    # The lowest row looks 45° below an axis that dips by 5°: camera height 1.5 m over
+    # sin(5°) + 0.988·cos(5°), where 0.988 = (83.5 - 41.5) / 42 less half a pixel's sampling.
+    y = (83.5 - env.K[1, 2]) / env.K[1, 1]
+    z = 1.5 / (math.sin(math.radians(5)) + y * math.cos(math.radians(5)))
+    assert depth[-1, 42] == pytest.approx(z, rel=1e-4)
+
+
+def test_the_vehicle_sees_nothing_of_itself(make_street, empty_road):
+    behind = replace(empty_road.camera, mount_forward_m=-3.0)
+    env = make_street(replace(empty_road, camera=behind))
+    observation, _ = env.reset(seed=0)
+    assert set(np.unique(observation["semantic"][0, 50:, 36:48])) == {1}
+
+
+@pytest.mark.parametrize("rate_hz", [12.0, 6.0])
+def test_the_ending_zone_is_reached_after_150_m(make_street, empty_road, rate_hz):
+    rewards, info = drive(make_street(empty_road, frame_rate_hz=rate_hz, sensors=()))
+    assert info["outcome"] == "success"
+    # 150 m at 10 m/s are 15 s; one step more where rounding leaves it on the edge.
+    assert len(rewards) in (round(15 * rate_hz), round(15 * rate_hz) + 1)
+    assert sum(rewards) == pytest.approx(5.0 + 0.01 * len(rewards))
+
+
+@pytest.mark.parametrize("action", [LEFT, RIGHT])
+def test_turning_all_the_time_leads_off_the_road(make_street, empty_road, action):
+    rewards, info = drive(make_street(empty_road, sensors=()), action)
+    assert (info["outcome"], info["hit"]) == ("out_of_bounds", "")
+    # Yaw grows as 35°/s² t²/2; y as its integral, 10·0.61·t³/6 = 1.02 t³: 3 m in about 1.4 s.
+    assert 14 <= len(rewards) <= 18
+    assert sum(rewards) == pytest.approx(-5.0 + 0.01 * len(rewards))
+
+
+@pytest.mark.parametrize(("rate_hz", "steps"), [(12.0, 200), (6.0, 100), (7.0, 117)])
+def test_the_time_limit_keeps_its_seconds(make_street, empty_road, rate_hz, steps):
+    # 200 steps at 12 Hz are 16.67 s; at 7 Hz these are 116.7 steps, so that the 117th is too late.
+    env = make_street(empty_road, frame_rate_hz=rate_hz, sensors=())
+    rewards, info = drive(env, vehicle_speed_mps=0.0)
+    assert info["outcome"] == "timeout"
+    assert len(rewards) == steps
+    assert sum(rewards) == pytest.approx(-5.0 + 0.01 * steps)
+
+
+@pytest.mark.parametrize("rate_hz", [12.0, 6.0, 3.0])
+def test_no_frame_rate_lets_the_vehicle_pass_through_a_person(make_street, one_stands, rate_hz):
+    rewards, info = drive(make_street(one_stands, frame_rate_hz=rate_hz, sensors=()))
+    assert (info["outcome"], info["hit"]) == ("collision", "pedestrian")
+    # The front, 0.5 m ahead, meets a cylinder of 0.25 m at x = 29.25: after 2.925 s.
+    assert len(rewards) == math.ceil(2.925 * rate_hz)
+    assert sum(rewards) == pytest.approx(-5.0 + 0.01 * len(rewards))
+
+
+def test_a_parked_car_is_hit_as_a_car(make_street, empty_road):
+    car = Obstacle("car", (40.0, 0.3), 0.0, (4.2, 1.8, 1.5))
+    scene = replace(empty_road, obstacles=(car,), categories=(*empty_road.categories, "car"))
+    rewards, info = drive(make_street(scene, sensors=()))
+    assert (info["outcome"], info["hit"]) == ("collision", "car")
+    # 40 - 2.1 - 0.5 = 37.4 m, 3.74 s.
+    assert len(rewards) == 45
+
+
+def test_low_and_high_speed_change_the_people_alone(make_street, straight_road):
+    def travelled(speed):
+        env = make_street(speed=speed, sensors=())
+        env.reset(seed=3)
+        crowd = env.episode.crowd
+        steps = np.hypot(*(crowd.positions(0.01) - crowd.positions(0.0)).T) / 0.01
+        return env.episode.seed, steps
+
+    for speed, (low, high) in straight_road.pedestrian_speed_mps.items():
+        seed, steps = travelled(speed)
+        assert seed == travelled("normal")[0]
+        assert (steps > low - 1e-6).all()
+        assert (steps < high + 1e-6).all()
+
+
+def test_a_group_walks_at_one_speed_in_one_direction(make_street):
+    env = make_street(sensors=())
+    env.reset(seed=3)
+    crowd = env.episode.crowd
+    # Members may turn about at different times, but the pace is the group's.
+    pace = np.abs(crowd.positions(0.01) - crowd.positions(0.0))[:, 1].reshape(-1, 4)
+    np.testing.assert_allclose(pace, np.repeat(pace[:, :1], 4, axis=1), rtol=1e-3)
+    assert len(np.unique(pace[:, 0].round(6))) == len(pace)
+
+
+def test_the_same_seed_gives_the_same_episodes_bit_for_bit(make_street):
+    first, second = make_street(), make_street()
+    other = make_street(sensors=())
+    actions = np.random.default_rng(1).integers(3, size=60)
+    observation, info = first.reset(seed=11)
+    again, info_again = second.reset(seed=11)
+    other.reset(seed=12)
+    assert info["episode_seed"] != other.episode.seed
+    assert same(observation, again)
+    for action in actions:
+        observation, reward, ended, _, info = first.step(action)
+        again, reward_again, ended_again, _, info_again = second.step(action)
+        assert same(observation, again)
+        assert (reward, ended, info) == (reward_again, ended_again, info_again)
+        if ended:
+            assert same(first.reset()[0], second.reset()[0])
+
+
+def test_what_is_rendered_changes_nothing_else(make_street):
+    seeing, blind = make_street(), make_street(sensors=())
+    for env in (seeing, blind):
+        env.reset(seed=5)
+    for _ in range(40):
+        assert seeing.step(NO_OP)[1:] == blind.step(NO_OP)[1:]
+        assert seeing.get_state()["now"] == blind.get_state()["now"]
+        if seeing.episode.outcome:
+            break
+
+
+def test_an_episodes_seed_names_it(make_street):
+    env = make_street()
+    env.reset(seed=0)
+    observation, info = env.reset()
+    other = make_street()
+    again, _ = other.reset(seed=99, options={"episode_seed": info["episode_seed"]})
+    assert same(observation, again)
+
+
+def test_a_state_written_as_json_goes_on_bit_for_bit(make_street):
+    env = make_street()
+    env.reset(seed=2)
+    actions = np.random.default_rng(0).integers(3, size=12)
+    for action in actions[:6]:
+        env.step(action)
+    before = env._observe()
+    state = json.loads(json.dumps(env.get_state()))
+    resumed = make_street()
+    observation, info = resumed.set_state(state)
+    assert same(observation, before)
+    assert info["episode_seed"] == env.episode.seed
+    for action in actions[6:]:
+        stepped, stepped_again = env.step(action), resumed.step(action)
+        assert same(stepped[0], stepped_again[0])
+        assert stepped[1:] == stepped_again[1:]
+    # The generator goes on too: the next episode is the same.
+    assert env.reset()[1] == resumed.reset()[1]
+
+
+def test_colour_pictures_come_in_both_layouts(make_street):
+    env = make_street(sensors=("rgb",), render_mode="rgb_array")
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), observation["rgb"].transpose(1, 2, 0))
+    assert len(np.unique(env.render().reshape(-1, 3), axis=0)) > 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"speed": "fast"}, r"unknown speed 'fast'; choose one of low, normal, high"),
+        ({"speed": (2.0, 1.0)}, r"lowest, highest"),
+        ({"frame_rate_hz": 0}, r"frame_rate_hz is 0.0; give a rate above 0"),
+        ({"sensors": ("depth", "lidar")}, r"unknown sensors \['lidar'\]; they are: depth, "),
+        ({"render_mode": "human"}, r"unknown render_mode 'human'"),
+    ],
+)
+def test_arguments_that_cannot_be_are_refused(arguments, message):
+    from flowrep.envs import StreetEnv
+
+    with pytest.raises(ValueError, match=message):
+        StreetEnv(**arguments)
+
+
+def test_calls_out_of_turn_say_what_to_call(make_street, one_stands):
+    env = make_street(one_stands, sensors=())
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.step(NO_OP)
+    drive(env)
+    with pytest.raises(RuntimeError, match=r"has ended \(collision\): call reset"):
+        env.step(NO_OP)
+    with pytest.raises(ValueError, match=r"unknown reset options \['start'\]"):
+        env.reset(options={"start": 3})
+    with pytest.raises(ValueError, match=r"unknown path 'left'; the scene has \['main'\]"):
+        env.reset(options={"path": "left"})
+
+
+def test_motion_between_two_steps_is_the_one_driven(make_street, empty_road):
+    env = make_street(empty_road, sensors=("prev_from_curr", "instance_motion"))
+    env.reset(seed=0)
+    observations = [env.step(NO_OP)[0] for _ in range(3)]
+    # Straight on, 10/12 m a step. The camera dips by 5°: forward is z cos 5° - y sin 5°.
+    forward = np.array([0.0, -math.sin(math.radians(5)), math.cos(math.radians(5))]) * 10 / 12
+    for observation in observations:
+        expected = np.eye(4)
+        expected[:3, 3] = forward
+        np.testing.assert_allclose(observation["prev_from_curr"], expected, atol=1e-6)
+        assert observation["instance_motion"].shape == (1, 4, 4)
+    for before, now in pairwise(observations):
+        np.testing.assert_allclose(before["prev_from_curr"], now["prev_from_curr"], atol=1e-6)
