@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,22 +41,26 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
     path = Path(path)
     tensors: dict[str, Tensor] = {}
     document = json.dumps(_without_tensors(state, "", tensors))
-    # one name a run, so that a writer that was killed leaves no pile of halves behind
+    # safetensors makes temporary files of its own: in a folder, so that a writer that was killed
+    # leaves one place to clear and not a pile of halves
     partial = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(_unshared(tensors), partial, metadata={"format": FORMAT, "state": document})
-        _flush(partial)
-        os.replace(partial, path)
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        file = partial / path.name
+        save_file(_unshared(tensors), file, metadata={"format": FORMAT, "state": document})
+        file.chmod(partial.stat().st_mode & 0o666)  # as any new file, not for the owner alone
+        _flush(file)
+        os.replace(file, path)
         _flush(path.parent)
     except (OSError, SafetensorError) as error:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
         kept = "; the previous checkpoint is untouched" if path.exists() else ""
         raise CheckpointError(
             f"cannot write the checkpoint {path}: {error}{kept}. Free some space or make the "
             "folder writable"
         ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -33,9 +33,9 @@ class NatureEncoder(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Returns `[N, 512]` of a decoded map `[N, 16 * channels, h, w]`."""
         kernel = self.codec.pack_weight(self.conv1.weight)
-        x = _convolve(image, kernel, self.conv1.bias, stride=1)
-        x = _convolve(x, self.conv2.weight, self.conv2.bias, stride=2)
-        x = _convolve(x, self.conv3.weight, self.conv3.bias, stride=1)
+        x = _convolve(image, kernel, self.conv1.bias, (1, 1))
+        x = _convolve(x, self.conv2.weight, self.conv2.bias, self.conv2.stride)
+        x = _convolve(x, self.conv3.weight, self.conv3.bias, self.conv3.stride)
         x = x.permute(0, 2, 3, 1).flatten(1)  # [N, rows * columns * 64]
         return F.leaky_relu_(linear(x, self.linear))
 
@@ -62,7 +62,7 @@ def linear(x: Tensor, layer: nn.Linear) -> Tensor:
     return F.linear(x, layer.weight.to(x.dtype), layer.bias.to(x.dtype))
 
 
-def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None, *, stride: int) -> Tensor:
+def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None, stride: tuple[int, ...]) -> Tensor:
     # channels-last weights keep the whole chain in that layout, without reorders in between
     weight = weight.to(x.dtype, memory_format=torch.channels_last)
     bias = None if bias is None else bias.to(x.dtype)

@@ -85,7 +85,6 @@ class ReplayMemory:
             {
                 "slot": slots,
                 "next": compact_maps(self.codecs, steps["next"]).to(self.device),
-                "done": (outcome["done"] | outcome["terminated"]).reshape(-1),
             },
             [times * width],
         )
@@ -106,17 +105,15 @@ class ReplayMemory:
         self._frames[slots.to(self.device)] = rows.to(self.device)
 
     def _link(self, latest: TensorDictBase, seen: TensorDictBase, width: int) -> None:
-        """Points each step to the one after it, where that one is its continuation."""
+        """Points each step to the one after it, where that one begins with what this one led to."""
         follower_slot = latest["slot"]
         if self._tail is not None and self._tail.batch_size[0] == width:
             latest = torch.cat([self._tail, latest])
         else:
             follower_slot, seen = follower_slot[width:], seen[width:]
         earlier = latest[:-width]
-        continues = ~earlier["done"]
-        for codec in self.codecs:
-            continues &= _same_rows(earlier["next", codec.key], seen[codec.key])
-        continues = continues.cpu()
+        same = [_same_rows(earlier["next", c.key], seen[c.key]) for c in self.codecs]
+        continues = torch.stack(same).all(0).cpu()
         self._next_slot[earlier["slot"][continues].cpu()] = follower_slot[continues]
 
     def sample(self) -> TensorDictBase:

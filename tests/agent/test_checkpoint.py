@@ -47,6 +47,12 @@ def test_every_kind_of_value_comes_back_as_it_was(tmp_path):
     assert os.listdir(tmp_path / "new folder") == ["c.safetensors"]
 
 
+def test_others_may_read_it_as_any_new_file(tmp_path):
+    (tmp_path / "plain").touch()
+    save_checkpoint(tmp_path / "c", {"a": torch.ones(1)})
+    assert (tmp_path / "c").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_names_that_collide_are_kept_apart(tmp_path):
     zero, one, two, three = torch.arange(4)
     state = {"a/b": zero, "a": {"b": one}, "": {"a": {"b": two}}, "a~1b": three}
@@ -179,5 +185,8 @@ def test_a_writer_killed_at_any_instant_leaves_a_whole_checkpoint(tmp_path):
     state = load_checkpoint(path)
     assert (state["a"] == state["version"]).all()
     assert versions == sorted(versions)
+    leftover = tmp_path / ".c.safetensors.partial"
+    leftover.mkdir(exist_ok=True)
+    (leftover / "half").write_bytes(b"of a checkpoint")
     save_checkpoint(path, {"version": -1})
     assert os.listdir(tmp_path) == ["c.safetensors"]
