@@ -139,7 +139,6 @@ def _check_names(scene: Scene, source: str) -> None:
         _known(source, f"zones.{zone.name}.road", [zone.road], roads)
     for path in scene.paths:
         _known(source, f"paths.{path.name}", [path.start, path.end], zones)
-        _known(source, f"paths.{path.name}.via", path.via, roads)
         closures = [closure.name for closure in scene.closures]
         _known(source, f"paths.{path.name}.closures", path.closures, closures)
     for key, items in (("building_rows", scene.building_rows), ("closures", scene.closures)):

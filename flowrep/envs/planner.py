@@ -28,7 +28,7 @@ _CELL = np.array([0.5, 0.5, 4.0, 6.0])
 
 
 class Planner:
-    """Chooses the action of a planned drive; plans again where an episode is not the planned one.
+    """Chooses the action of a planned drive; plans anew where its actions were not taken.
 
     Args:
         beams: how many drives are kept side by side; a broader beam is tried where all of a
@@ -41,16 +41,22 @@ class Planner:
         self._ways: dict[tuple[Rules, str], WayToGo] = {}
         self._plan: dict[int, int] = {}
         self._episode: Episode | None = None
+        self._yaw_rate_rps = 0.0  # of the vehicle, should the action be taken
 
     def __call__(self, env: StreetEnv) -> int:
         """Returns the action for the env's running episode."""
         episode = env.episode
-        is_planned = episode is self._episode and episode.steps in self._plan
-        if not is_planned:
+        state = episode.now.vehicle
+        is_followed = episode is self._episode and state.yaw_rate_rps == self._yaw_rate_rps
+        if not (is_followed and episode.steps in self._plan):
             self._episode = episode
             actions = self.search(episode)
             self._plan = {episode.steps + i: action for i, action in enumerate(actions)}
-        return self._plan.get(episode.steps, NO_OP)
+        action = self._plan.get(episode.steps, NO_OP)
+        rules = episode.rules
+        turned = turn(state, action, rules.dt_s, rules.layout.scene.vehicle)
+        self._yaw_rate_rps = turned.yaw_rate_rps
+        return action
 
     def search(self, episode: Episode) -> list[int]:
         """Returns the actions of a drive to the ending zone, else of the longest one found."""

@@ -49,12 +49,11 @@ class Zone:
 
 @dataclass(frozen=True)
 class Path:
-    """One task: from a start zone along `via` roads to an ending zone, with exits closed."""
+    """One task: from a start zone to an ending zone, with exits closed."""
 
     name: str
     start: str
     end: str
-    via: tuple[str, ...] = ()
     closures: tuple[str, ...] = ()
 
 

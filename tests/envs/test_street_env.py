@@ -66,7 +66,7 @@ def test_maps_show_sky_road_sidewalk_houses_and_people(make_street):
     # Instances are the people, numbered from 1.
     np.testing.assert_array_equal(observation["instance"][0] > 0, semantic == 4)
     assert semantic[-1, 42] == 1  # the road before the vehicle
-    # 50 rows down a ray meets the ground 5 m ahead, and 40 columns aside that is 4.75 m to the left.
+    # 50 rows down a ray meets the ground 5 m ahead; 40 columns aside that is 4.75 m left.
     assert semantic[50, 2] == 2
     assert semantic[0, 0] == 3  # a house front
     # The lowest row looks 45° below an axis that dips by 5°: camera height 1.5 m over

@@ -1,0 +1,61 @@
+"""Relative motion against points that are carried along by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from flowrep.envs.camera import CameraConfig, vehicle_from_camera
+from flowrep.envs.motion import CameraPose, instance_motion, planar, planar_change, relative_camera
+
+MOUNT = vehicle_from_camera(CameraConfig(48, 60, 70.0, 1.5, 0.4, -10.0, 0.2, 100.0))
+BEFORE = CameraPose(3.0, -1.0, 0.3, MOUNT)
+NOW = CameraPose(3.8, -0.7, 0.42, MOUNT)
+PREV_POSES = np.array([[10.0, 2.0, 0.1], [12.0, -3.0, 1.0], [8.0, 0.0, 3.0]])
+POSES = np.array([[10.1, 2.2, 0.4], [12.0, -3.0, 1.0], [7.9, 0.0, 3.0]])
+
+
+def test_a_camera_pose_is_its_inverses_inverse():
+    np.testing.assert_allclose(NOW.world_from_cam @ NOW.cam_from_world, np.eye(4), atol=1e-14)
+
+
+def test_a_point_of_the_world_is_seen_where_it_was():
+    point = np.array([9.0, 1.0, 0.5, 1.0])
+    seen_now, seen_before = NOW.cam_from_world @ point, BEFORE.cam_from_world @ point
+    np.testing.assert_allclose(relative_camera(BEFORE, NOW) @ seen_now, seen_before, atol=1e-12)
+
+
+def test_a_camera_that_stands_moves_by_the_exact_identity():
+    again = CameraPose(3.8, -0.7, 0.42, MOUNT)
+    assert np.array_equal(relative_camera(NOW, again), np.eye(4))
+    assert np.array_equal(instance_motion(NOW, again, POSES, POSES), np.tile(np.eye(4), (4, 1, 1)))
+
+
+def test_a_point_on_a_body_is_carried_back_with_it():
+    rows = instance_motion(BEFORE, NOW, PREV_POSES, POSES)
+    on_body = np.array([0.2, -0.3, 1.6, 1.0])
+    for i, (prev, pose) in enumerate(zip(PREV_POSES, POSES)):
+        seen_now = NOW.cam_from_world @ planar(*pose) @ on_body
+        seen_before = BEFORE.cam_from_world @ planar(*prev) @ on_body
+        np.testing.assert_allclose(rows[1 + i] @ seen_now, seen_before, atol=1e-12)
+
+
+def test_a_body_that_stands_has_row_zeros_very_numbers():
+    rows = instance_motion(BEFORE, NOW, PREV_POSES, POSES)
+    assert np.array_equal(rows[0], relative_camera(BEFORE, NOW))
+    assert np.array_equal(rows[2], rows[0])
+    assert not np.allclose(rows[1], rows[0])
+    assert not np.allclose(rows[3], rows[0])
+
+
+def test_planar_change_turns_about_the_body_and_not_the_origin():
+    # A quarter turn to the left on the spot: what is 1 m ahead at (5, 1) was at (6, 0).
+    change = planar_change(np.array([[5.0, 0.0, 0.0]]), np.array([[5.0, 0.0, math.pi / 2]]))[0]
+    np.testing.assert_allclose(change @ [5.0, 1.0, 0.7, 1.0], [6.0, 0.0, 0.7, 1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("far_m", [0.0, 10_000.0])
+def test_motion_far_from_the_origin_is_as_exact(far_m):
+    before, now = (CameraPose(far_m + x, far_m, 0.3, MOUNT) for x in (0.0, 0.8))
+    expected = relative_camera(CameraPose(0.0, 0.0, 0.3, MOUNT), CameraPose(0.8, 0.0, 0.3, MOUNT))
+    np.testing.assert_allclose(relative_camera(before, now), expected, atol=1e-11)
