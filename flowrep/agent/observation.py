@@ -83,11 +83,15 @@ class MapCodec:
         x = x.movedim((-4, -2), (-5, -4))  # [*B, h, w, C, 4, 4]
         return x.flatten(-3)
 
-    def compact(self, packed: Tensor) -> Tensor:
-        """Returns `packed` in `stored_dtype`; numbers beyond float16's range saturate."""
+    def compact(self, x: Tensor) -> Tensor:
+        """Returns `x` in `stored_dtype`; numbers beyond float16's range saturate."""
         if self.stored_dtype is torch.float16:
-            packed = packed.clamp(-_FLOAT16_MAX, _FLOAT16_MAX)
-        return packed.to(self.stored_dtype)
+            x = x.clamp(-_FLOAT16_MAX, _FLOAT16_MAX)
+        return x.to(self.stored_dtype)
+
+    def store(self, x: Tensor) -> Tensor:
+        """Returns a raw map `[*B, C, H, W]` as it is kept: compact and packed."""
+        return self.pack(self.compact(x))
 
     def decode(self, packed: Tensor) -> Tensor:
         """Returns `[N, network_channels * 16, h, w]`, channels last in memory, for the encoder."""
@@ -161,9 +165,9 @@ def decode_maps(codecs: Sequence[MapCodec], packed: TensorDictBase) -> tuple[Ten
     return tuple(codec.decode(packed[codec.key]) for codec in codecs)
 
 
-def compact_maps(codecs: Sequence[MapCodec], observation: TensorDictBase) -> TensorDictBase:
-    """Returns the observation's maps packed and in their stored dtype, and nothing else."""
+def store_maps(codecs: Sequence[MapCodec], observation: TensorDictBase) -> TensorDictBase:
+    """Returns the observation's maps as they are kept, and nothing else."""
     stored = observation.empty()
     for codec in codecs:
-        stored[codec.key] = codec.compact(codec.pack(observation[codec.key]))
+        stored[codec.key] = codec.store(observation[codec.key])
     return stored

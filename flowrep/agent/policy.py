@@ -28,11 +28,11 @@ class PolicyNetwork(nn.Module):
         self.encoder, self.head = encoder, head
 
     def forward(self, *maps: Tensor) -> Tensor:
-        """Returns the logits; the maps are packed, decoded and encoded on the way."""
+        """Returns the logits; the maps pass the form they are kept in, as in learning."""
         images = []
         for codec, x in zip(self.codecs, maps):
             batch = codec.batch_shape(x)
-            packed = codec.pack(x.reshape(-1, *x.shape[-3:]))
+            packed = codec.store(x.reshape(-1, *x.shape[-3:]))
             images.append(codec.decode(packed))
         return self.head(self.encoder(images)).reshape(*batch, -1)
 

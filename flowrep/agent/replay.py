@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-from flowrep.agent.observation import MapCodec, compact_maps
+from flowrep.agent.observation import MapCodec, store_maps
 
 
 class ReplayMemory:
@@ -49,7 +49,8 @@ class ReplayMemory:
         self._next_slot = torch.full((capacity,), -1)  # -1: the following frame is not stored
         self._cursor = 0
         self._size = 0
-        self._tail: TensorDictBase | None = None  # [N]: each environment's latest step
+        # each environment's latest step: its slot, and the maps it led to as they came
+        self._tail: dict[str, Any] | None = None
         self._usable = torch.empty(0, dtype=torch.long)
 
     def __len__(self) -> int:
@@ -76,22 +77,14 @@ class ReplayMemory:
             )
         slots = (self._cursor + torch.arange(times * width)) % self.capacity
         steps = steps.reshape(-1)
-        seen = compact_maps(self.codecs, steps).to(self.device)
-        outcome = steps["next"].select("reward", "done", "terminated").to(self.device)
-        self._write(slots, seen.clone(False).update({"action": steps["action"], **outcome}))
+        outcome = steps["next"].select("reward", "done", "terminated")
+        rows = store_maps(self.codecs, steps).update({"action": steps["action"], **outcome})
+        self._write(slots, rows)
         self._cursor = (self._cursor + times * width) % self.capacity
         self._size = min(self._size + times * width, self.capacity)
-        latest = TensorDict(
-            {
-                "slot": slots,
-                "next": compact_maps(self.codecs, steps["next"]).to(self.device),
-            },
-            [times * width],
-        )
         terminated = outcome["terminated"].reshape(-1).cpu()
         self._next_slot[slots] = torch.where(terminated, slots, -1)
-        self._link(latest, seen, width)
-        self._tail = latest[-width:].clone()
+        self._link(slots, steps, width)
         self._usable = (self._next_slot >= 0).nonzero().squeeze(-1)
 
     def _write(self, slots: Tensor, rows: TensorDictBase) -> None:
@@ -104,17 +97,17 @@ class ReplayMemory:
             )
         self._frames[slots.to(self.device)] = rows.to(self.device)
 
-    def _link(self, latest: TensorDictBase, seen: TensorDictBase, width: int) -> None:
+    def _link(self, slots: Tensor, steps: TensorDictBase, width: int) -> None:
         """Points each step to the one after it, where that one begins with what this one led to."""
-        follower_slot = latest["slot"]
-        if self._tail is not None and self._tail.batch_size[0] == width:
-            latest = torch.cat([self._tail, latest])
-        else:
-            follower_slot, seen = follower_slot[width:], seen[width:]
-        earlier = latest[:-width]
-        same = [_same_rows(earlier["next", c.key], seen[c.key]) for c in self.codecs]
-        continues = torch.stack(same).all(0).cpu()
-        self._next_slot[earlier["slot"][continues].cpu()] = follower_slot[continues]
+        keys = [codec.key for codec in self.codecs]
+        seen, led_to = steps.select(*keys), steps["next"].select(*keys)
+        tail = self._tail
+        if tail is not None and len(tail["slot"]) == width:
+            continues = _same_maps(tail["maps"], seen[:width], keys)
+            self._next_slot[tail["slot"][continues]] = slots[:width][continues]
+        continues = _same_maps(led_to[:-width], seen[width:], keys)
+        self._next_slot[slots[:-width][continues]] = slots[width:][continues]
+        self._tail = {"slot": slots[-width:].clone(), "maps": led_to[-width:].clone()}
 
     def sample(self) -> TensorDictBase:
         """Returns `batch_size` transitions, uniform with replacement, maps packed.
@@ -146,7 +139,7 @@ class ReplayMemory:
             "size": self._size,
             "next_slot": self._next_slot,
             "frames": None if frames is None else frames.to_dict(),
-            "tail": None if self._tail is None else self._tail.to_dict(),
+            "tail": self._tail and {**self._tail, "maps": self._tail["maps"].to_dict()},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -167,8 +160,9 @@ class ReplayMemory:
             frames = TensorDict(state["frames"], [self._size])
             self._write(torch.arange(self._size), frames)
         if state["tail"] is not None:
-            width = len(state["tail"]["slot"])
-            self._tail = TensorDict(state["tail"], [width]).to(self.device).clone()
+            slots = state["tail"]["slot"]
+            maps = TensorDict(state["tail"]["maps"], [len(slots)])
+            self._tail = {"slot": slots.clone(), "maps": maps.clone()}
         self._usable = (self._next_slot >= 0).nonzero().squeeze(-1)
 
 
@@ -183,9 +177,14 @@ def _time_first(frames: TensorDictBase) -> TensorDictBase:
     return frames.reshape(frames.shape[0], -1)
 
 
-def _same_rows(a: Tensor, b: Tensor) -> Tensor:
-    """Returns which rows of two tensors hold the same values; nan is nan, and -0 is 0."""
-    same = a == b
-    if a.dtype.is_floating_point:
-        same |= a.isnan() & b.isnan()
-    return same.flatten(1).all(1)
+def _same_maps(a: TensorDictBase, b: TensorDictBase, keys: Sequence[NestedKey]) -> Tensor:
+    """Returns which of N observations are the same, bit for bit, as `[N]` on the CPU."""
+    pairs = ((a[key].to(b[key].device), b[key]) for key in keys)
+    same = [(_bits(x) == _bits(y)).flatten(1).all(1) for x, y in pairs]
+    return torch.stack(same).all(0).cpu()
+
+
+def _bits(x: Tensor) -> Tensor:
+    """Returns floats as integers, so that nan is equal to itself."""
+    integers = {2: torch.int16, 4: torch.int32, 8: torch.int64}
+    return x.view(integers[x.element_size()]) if x.is_floating_point() else x

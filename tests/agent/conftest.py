@@ -3,7 +3,7 @@ import torch
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from flowrep.agent import DiscreteSAC
-from flowrep.agent.observation import compact_maps
+from flowrep.agent.observation import store_maps
 
 HEIGHT, WIDTH = 38, 45  # neither square nor a multiple of the first stride
 
@@ -84,9 +84,9 @@ def as_batch():
     """Turns steps into what `ReplayMemory.sample` returns of them."""
 
     def convert(agent, steps):
-        following = compact_maps(agent.codecs, steps["next"])
+        following = store_maps(agent.codecs, steps["next"])
         following.update(steps["next"].select("reward", "terminated", "done"))
-        batch = compact_maps(agent.codecs, steps)
+        batch = store_maps(agent.codecs, steps)
         return batch.update({"action": steps["action"], "next": following})
 
     return convert
