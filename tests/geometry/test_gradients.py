@@ -62,6 +62,19 @@ def test_masked_pixels_send_back_zero_not_nan():
     assert motion.grad[:3].abs().min() > 0
 
 
+def test_a_point_level_with_the_previous_camera_sends_back_zero_not_nan():
+    # 2 m ahead after backing off by 2 m: its previous depth is exactly 0, flow there 0/0.
+    level = torch.eye(4, dtype=torch.float64)
+    level[2, 3] = -2.0
+    depth = torch.tensor([[[2.0, 5.0]]], dtype=torch.float64, requires_grad=True)
+    K_leaf, motion = leaves(K, level)
+    ego_flow(depth, K_leaf, motion).flow.sum().backward()
+    assert depth.grad[0, 0, 0].item() == 0.0
+    assert depth.grad[0, 0, 1].item() != 0.0
+    assert K_leaf.grad.isfinite().all()
+    assert motion.grad.isfinite().all()
+
+
 def test_gradient_by_hand():
     # u = -fx * t / Z with fx = 4, t = 0.5, Z = 4: du/dZ = fx t / Z^2, du/dfx = -t/Z, du/dt = -fx/Z.
     camera, motion = leaves(torch.tensor([[4.0, 0.0, 0.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]),
