@@ -10,6 +10,7 @@ from flowrep.agent import CheckpointError, DiscreteSAC, load_checkpoint
 from flowrep.build import Config, build_agent, build_env
 from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
+from flowrep.envs.baselines import BASELINES
 from flowrep.experiment.comparison import compare, print_table, with_origin
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.recording import record_episode
@@ -24,7 +25,7 @@ def run(config: DictConfig) -> None:
     try:
         folder = RunFolder.existing(config.run)
         trained = folder.read_config() | {"device": config.device, "num_envs": config.num_envs}
-        speeds, rates, policies = check(config, trained)
+        speeds, rates, policies, baselines = check(config, trained)
         agent, frames = load_agent(trained, folder)
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
@@ -36,7 +37,7 @@ def run(config: DictConfig) -> None:
             fps=rates,
             episodes=config.episodes,
             seed=config.seed,
-            baselines=config.baselines,
+            baselines=baselines,
             should_stop=lambda: bool(stop),
         )
         folder.log_episodes(with_origin(rows, trained, frames))
@@ -46,25 +47,32 @@ def run(config: DictConfig) -> None:
             film(agent, trained, folder, config, speeds, rates)
 
 
-def check(config: DictConfig, trained: Config) -> tuple[list[str], list[float], list[str]]:
-    """Returns speeds, frame rates and policies as lists, after refusing what can't be run.
+def check(
+    config: DictConfig, trained: Config
+) -> tuple[list[str], list[float], list[str], list[str]]:
+    """Returns speeds, frame rates, policies, baselines as lists; refuses what can't be run.
 
     Raises:
         UsageError: naming the key, what came and what exists.
     """
-    speeds, rates, policies = (as_list(config[key]) for key in ("speed", "fps", "policy"))
-    known = list(trained["scene"]["pedestrian_speed_mps"])
-    for what, names, there_are in (("speed", speeds, known), ("policy", policies, POLICIES)):
+    named = {
+        "speed": list(trained["scene"]["pedestrian_speed_mps"]),
+        "policy": POLICIES,
+        "baselines": list(BASELINES),
+    }
+    speeds, policies, baselines = (as_list(config[key]) for key in named)
+    for (what, there_are), names in zip(named.items(), (speeds, policies, baselines)):
         for name in names:
             if name not in there_are:
                 raise UsageError(f"unknown {what} '{name}'; there are: {', '.join(there_are)}")
+    rates = as_list(config.fps)
     for rate in rates:
         if not isinstance(rate, int | float) or rate <= 0:
             raise UsageError(f"fps should be positive numbers of frames a second, not {rate!r}")
     for key in ("episodes", "num_envs"):
         if not isinstance(config[key], int) or config[key] < 1:
             raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
-    return speeds, [float(rate) for rate in rates], policies
+    return speeds, [float(rate) for rate in rates], policies, baselines
 
 
 def as_list(value: Any) -> list[Any]:

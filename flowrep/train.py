@@ -76,8 +76,12 @@ def check(config: Config) -> None:
     for key in ("total_frames", "num_envs", "log_every_frames", "checkpoint_every_frames"):
         if not isinstance(config[key], int) or config[key] < 1:
             raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
-    if not isinstance(config["seed"], int) or not 0 <= config["seed"] < EVALUATION_SEED:
-        raise UsageError(f"seed should be a whole number from 0 to {EVALUATION_SEED - 1}")
+    seed, num_envs = config["seed"], config["num_envs"]
+    if not isinstance(seed, int) or not 0 <= seed < EVALUATION_SEED // num_envs:
+        raise UsageError(
+            f"seed should be a whole number below {EVALUATION_SEED // num_envs}, not {seed!r}: "
+            "from there on its episodes are those of evaluations"
+        )
     if not config["representations"]:
         raise UsageError("representations is empty; name one at least, e.g. representations=[ego]")
     speeds = list(config["scene"]["pedestrian_speed_mps"])
@@ -109,7 +113,6 @@ def log_evaluation(training: Training, config: Config, frames: int) -> None:
             fps=[config["scene"]["frame_rate_hz"]],
             episodes=evaluation["episodes"],
             seed=EVALUATION_SEED,
-            baselines=False,
         )
     training.run.log_episodes(with_origin(rows, config, frames))
 
@@ -125,6 +128,7 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
         fps=[config["scene"]["frame_rate_hz"]],
         episodes=evaluation["final_episodes"],
         seed=seed,
+        baselines=evaluation["baselines"],
         should_stop=lambda: bool(stop),
     )
     if stop:

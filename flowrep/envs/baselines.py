@@ -40,8 +40,10 @@ class Drive:
     steps: int
 
 
-def drives(env: StreetEnv, driver: Driver, episodes: int, *, seed: int) -> Iterator[Drive]:
-    """Yields finished episodes, the same ones for every driver.
+def drives(
+    env: StreetEnv, driver: Driver, episodes: int, *, seed: int | None = None
+) -> Iterator[Drive]:
+    """Yields finished episodes, the same ones for every driver; `seed` None goes on in the env's.
 
     >>> env = StreetEnv("straight_road", sensors=())
     >>> [drive.outcome in ("success", "collision") for drive in drives(env, never_turn, 2, seed=0)]

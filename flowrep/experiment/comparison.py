@@ -1,34 +1,29 @@
 """An agent beside baselines on the same episodes: rows for evaluation.csv and a table to read."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import product
 from typing import Any
 
-import torch
 from rich import box
 from rich.console import Console
 from rich.table import Table
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import RandomPolicy
 from tqdm.auto import tqdm
 
+from flowrep.envs import StreetEnv, streets
+from flowrep.envs.baselines import BASELINES, drives
 from flowrep.experiment.evaluation import (
     OUTCOMES,
     Episode,
     Policy,
     outcome_shares,
+    quotas,
     run_episodes,
 )
 
 Row = dict[str, Any]
-BASELINES = ("never_turn", "random")
-
-
-def never_turn(tensordict: TensorDictBase) -> TensorDictBase:
-    """Writes the action NO_OP: drives on as at the start."""
-    shape = tensordict.batch_size
-    return tensordict.set("action", torch.zeros(shape, dtype=torch.long))
 
 
 def compare(
@@ -39,46 +34,65 @@ def compare(
     fps: Sequence[float],
     episodes: int,
     seed: int,
-    baselines: bool = True,
+    baselines: Sequence[str] = (),
     should_stop: Callable[[], bool] = lambda: False,
 ) -> list[Row]:
-    """Returns one row an episode, for every policy, speed and frame rate.
+    """Returns one row an episode, for every speed, frame rate and policy.
 
     Args:
         agents: "greedy" and / or "sampled" → the policy that is run in that way.
-        make_env: called with `speed`, `frame_rate_hz` and, for baselines, which see nothing,
-            `representations=()`.
+        make_env: called with `speed` and `frame_rate_hz`.
         speeds: pedestrians' speed modes.
         fps: frame rates in Hz.
         episodes: for each policy, speed and frame rate.
         seed: of the environments; the same for every policy, so that the episodes are too.
-        baselines: whether to run `never_turn` and random actions as well.
+        baselines: names in `flowrep.envs.baselines.BASELINES`, run on the same episodes.
         should_stop: asked between steps; the rows of unfinished policies are left out.
     """
     rows: list[Row] = []
-    names = [*agents, *(BASELINES if baselines else ())]
-    total = len(names) * len(speeds) * len(fps) * episodes
-    with tqdm(total=total, unit="episode", desc="evaluating") as bar:
-        for speed in speeds:
-            for rate in fps:
-                for name in names:
-                    blind = {} if name in agents else {"representations": ()}
-                    env = make_env(speed=speed, frame_rate_hz=rate, **blind)
-                    policy = agents.get(name) or _baseline(name, env, seed)
-                    env.set_seed(seed)
-                    finished = run_episodes(
-                        env,
-                        policy,
-                        episodes,
-                        greedy=name != "sampled",
-                        should_stop=should_stop,
-                        on_episode=bar.update,
-                    )
-                    env.close()
+    total = len(speeds) * len(fps) * (len(agents) + len(baselines)) * episodes
+    with tqdm(total=total, unit="episode", desc="evaluating", leave=False) as bar:
+        for speed, rate in product(speeds, fps):
+            env = make_env(speed=speed, frame_rate_hz=rate)
+            runs: dict[str, partial[Iterator[Episode]]] = {
+                name: partial(
+                    run_episodes, env, policy, episodes, seed=seed, greedy=name != "sampled"
+                )
+                for name, policy in agents.items()
+            } | {
+                name: partial(baseline_episodes, env, name, episodes, seed=seed)
+                for name in baselines
+            }
+            for name, run in runs.items():
+                finished = []
+                for episode in run():
+                    finished.append(_row(name, speed, rate, episode))
+                    bar.update()
                     if should_stop():
+                        env.close()
                         return rows
-                    rows += [_row(name, speed, rate, episode) for episode in finished]
+                rows += finished
+            env.close()
     return rows
+
+
+def baseline_episodes(env: EnvBase, name: str, episodes: int, *, seed: int) -> Iterator[Episode]:
+    """Yields the episodes that `run_episodes` runs, driven by a baseline, which sees no picture.
+
+    Args:
+        env: made by `make_env`; its streets' scene, speed and frame rate are driven through.
+        name: in `flowrep.envs.baselines.BASELINES`.
+        episodes: how many.
+        seed: of the environments.
+    """
+    shown = streets(env)
+    street = StreetEnv(shown[0].scene, shown[0].speed_mps, shown[0].frame_rate_hz, sensors=())
+    driver = BASELINES[name]()
+    for number, quota in enumerate(quotas(episodes, len(shown))):
+        street.reset(seed=seed + number)
+        for drive in drives(street, driver, quota):
+            yield Episode(drive.episode_seed, drive.outcome, drive.total_reward, drive.steps)
+    street.close()
 
 
 def with_origin(rows: Sequence[Row], config: Mapping[str, Any], frames: int) -> list[Row]:
@@ -90,13 +104,6 @@ def with_origin(rows: Sequence[Row], config: Mapping[str, Any], frames: int) -> 
         "frames": frames,
     }
     return [origin | row for row in rows]
-
-
-def _baseline(name: str, env: EnvBase, seed: int) -> Policy:
-    if name == "never_turn":
-        return never_turn
-    torch.manual_seed(seed)
-    return RandomPolicy(env.action_spec)
 
 
 def _row(policy: str, speed: str, fps: float, episode: Episode) -> Row:

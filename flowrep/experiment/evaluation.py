@@ -1,7 +1,7 @@
 """How well a policy drives: outcomes of whole episodes, with intervals."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -10,9 +10,11 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from flowrep.envs import Outcome
+
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
-OUTCOMES = ("running", "success", "collision", "out_of_bounds", "timeout")
+OUTCOMES = tuple(outcome.label for outcome in Outcome)
 """Names of the env's `outcome` codes; each one but the first ends an episode."""
 
 
@@ -26,56 +28,53 @@ class Episode:
     length: int
 
 
-@torch.no_grad()
-def run_episodes(
-    env: EnvBase,
-    policy: Policy,
-    episodes: int,
-    *,
-    greedy: bool = True,
-    should_stop: Callable[[], bool] = lambda: False,
-    on_episode: Callable[[], None] = lambda: None,
-) -> list[Episode]:
-    """Returns `episodes` finished episodes of `policy`, the same ones for every policy.
+def quotas(episodes: int, num_envs: int) -> list[int]:
+    """Returns how many episodes each environment runs, the first ones one more if need be.
 
-    Environment i of the batch runs its own first episodes, as many as any other (the first
-    environments one more where the numbers don't divide), so short episodes are not
-    overrepresented. Seed the env before to choose the episodes.
+    >>> quotas(5, 3)
+    [2, 2, 1]
+    """
+    return [episodes // num_envs + (i < episodes % num_envs) for i in range(num_envs)]
+
+
+def run_episodes(
+    env: EnvBase, policy: Policy, episodes: int, *, seed: int, greedy: bool = True
+) -> Iterator[Episode]:
+    """Yields `episodes` finished episodes of `policy`, as they end, the same for every policy.
+
+    Environment i of the batch, seeded by `seed + i`, runs its own first episodes, as many as any
+    other, so that short episodes are not overrepresented.
 
     Args:
         env: batched TorchRL env with `outcome` and `episode_seed` in its TensorDict.
         policy: writes `action`.
         episodes: how many episodes to run.
+        seed: of the environments.
         greedy: most probable action, else a sampled one.
-        should_stop: asked between steps; what has finished by then is returned.
-        on_episode: called after each finished episode.
     """
     num_envs = env.batch_size.numel()
-    quota = [episodes // num_envs + (i < episodes % num_envs) for i in range(num_envs)]
-    finished: list[list[Episode]] = [[] for _ in range(num_envs)]
+    left = quotas(episodes, num_envs)
     total_reward = torch.zeros(num_envs)
     length = torch.zeros(num_envs, dtype=torch.long)
     mode = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
+    env.set_seed(seed)
     tensordict = env.reset()
-    with set_exploration_type(mode):
-        while any(len(f) < q for f, q in zip(finished, quota)) and not should_stop():
+    while any(left):
+        with torch.no_grad(), set_exploration_type(mode):
             stepped, tensordict = env.step_and_maybe_reset(policy(tensordict))
-            after = stepped["next"]
-            total_reward += after["reward"].reshape(-1).cpu()
-            length += 1
-            for i in after["done"].reshape(-1).nonzero().flatten().tolist():
-                if len(finished[i]) < quota[i]:
-                    finished[i].append(
-                        Episode(
-                            int(after["episode_seed"].reshape(-1)[i]),
-                            OUTCOMES[int(after["outcome"].reshape(-1)[i])],
-                            float(total_reward[i]),
-                            int(length[i]),
-                        )
-                    )
-                    on_episode()
-                total_reward[i], length[i] = 0.0, 0
-    return [episode for of_env in finished for episode in of_env]
+        after = stepped["next"].cpu()
+        total_reward += after["reward"].reshape(-1)
+        length += 1
+        for i in after["done"].reshape(-1).nonzero().flatten().tolist():
+            if left[i]:
+                left[i] -= 1
+                yield Episode(
+                    int(after["episode_seed"].reshape(-1)[i]),
+                    OUTCOMES[int(after["outcome"].reshape(-1)[i])],
+                    float(total_reward[i]),
+                    int(length[i]),
+                )
+            total_reward[i], length[i] = 0.0, 0
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -103,10 +102,3 @@ def outcome_shares(outcomes: Iterable[str]) -> dict[str, tuple[float, float, flo
         name: (counts[name] / max(trials, 1), *wilson_interval(counts[name], trials))
         for name in OUTCOMES[1:]
     }
-
-
-def success_share(episodes: Sequence[Episode]) -> float:
-    """Returns the share of episodes that reached the ending zone; nan without episodes."""
-    if not episodes:
-        return float("nan")
-    return sum(episode.outcome == "success" for episode in episodes) / len(episodes)
