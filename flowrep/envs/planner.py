@@ -41,13 +41,16 @@ class Planner:
         self._ways: dict[tuple[Rules, str], WayToGo] = {}
         self._plan: dict[int, int] = {}
         self._episode: Episode | None = None
-        self._yaw_rate_rps = 0.0  # of the vehicle, should the action be taken
+        self._expected = (0, 0.0)  # steps and yaw rate, should the action be taken
 
     def __call__(self, env: StreetEnv) -> int:
         """Returns the action for the env's running episode."""
         episode = env.episode
         state = episode.now.vehicle
-        is_followed = episode is self._episode and state.yaw_rate_rps == self._yaw_rate_rps
+        is_followed = episode is self._episode and self._expected == (
+            episode.steps,
+            state.yaw_rate_rps,
+        )
         if not (is_followed and episode.steps in self._plan):
             self._episode = episode
             actions = self.search(episode)
@@ -55,7 +58,7 @@ class Planner:
         action = self._plan.get(episode.steps, NO_OP)
         rules = episode.rules
         turned = turn(state, action, rules.dt_s, rules.layout.scene.vehicle)
-        self._yaw_rate_rps = turned.yaw_rate_rps
+        self._expected = (episode.steps + 1, turned.yaw_rate_rps)
         return action
 
     def search(self, episode: Episode) -> list[int]:

@@ -3,11 +3,12 @@
 One DIRECT client a simulator, given back by `close()` or when the simulator is collected.
 """
 
+import functools
 import math
 import os
 import tempfile
 import weakref
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,11 @@ _LIGHT = {
     "renderer": pybullet.ER_TINY_RENDERER,
 }
 _HIDDEN_Z_M = -1000.0
+
+
+@functools.cache
+def _shared(value: Any) -> Any:
+    return value
 
 
 class Picture(NamedTuple):
@@ -80,15 +86,22 @@ class Simulator:
             cylinder_m: (radius, height) of a collision cylinder that stands on the ground.
             boxes_m: collision boxes (x, y, yaw, length, width, height) that stand on the ground.
         """
+        arrays = {
+            "vertices": [_shared(tuple(row)) for row in mesh.vertices],
+            "indices": [_shared(index) for index in mesh.indices],
+            "normals": [_shared(tuple(row)) for row in mesh.normals],
+            "uvs": [_shared(tuple(row)) for row in mesh.uvs],
+        }
         visual = pybullet.createVisualShape(
             pybullet.GEOM_MESH,
-            vertices=mesh.vertices,
-            indices=mesh.indices,
-            normals=mesh.normals,
-            uvs=mesh.uvs,
             rgbaColor=[1.0, 1.0, 1.0, 1.0],
             physicsClientId=self._client,
+            **arrays,
         )
+        # PyBullet never lets go of the lists it is given, nor of what is in them: these it keeps
+        # empty, and the numbers are the same objects for every client of the process.
+        for array in arrays.values():
+            array.clear()
         collision = self._collision_shape(cylinder_m, boxes_m)
         body = pybullet.createMultiBody(
             0.0, collision, visual, [0.0, 0.0, 0.0], physicsClientId=self._client
