@@ -13,6 +13,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
+from flowrep.envs.calm import CalmGround
 from flowrep.envs.layout import Layout
 from flowrep.envs.outcome import Outcome
 from flowrep.envs.pedestrians import Crowd, draw_crowd
@@ -23,7 +24,6 @@ from flowrep.envs.vehicle import VehicleState, footprint_corners, roll, turn
 Array = NDArray[Any]
 # Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't pass anyone by.
 _CHECKS_HZ = 24.0
-_POSES_KEPT = 16  # ticks whose poses are at hand: those of this step and of the one before
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,7 @@ class Rules:
         self.tick_numbers = np.arange(1, self.ticks_a_step + 1)
         self.tick_times_s = self.tick_numbers * self.tick_s
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
-        vehicle = layout.scene.vehicle
-        reach = math.hypot(vehicle.length_m, vehicle.width_m) / 2
-        self._surely_inside = layout.drivable.buffer(-reach)
-        shapely.prepare(self._surely_inside)
-
-    def is_surely_inside(self, states: VehicleState) -> Array:
-        """Returns where the footprint is on the road whichever way it points; fields [T]."""
-        return shapely.contains_xy(self._surely_inside, states.x_m, states.y_m)
+        self.is_calm = CalmGround(layout)
 
     def is_out_of_bounds(self, state: VehicleState) -> bool:
         """Returns whether any part of the footprint is off the road."""
@@ -90,47 +83,44 @@ class Episode:
         self.steps = 0
         self.outcome = Outcome.RUNNING
         self.hit = ""
-        self._poses: dict[int, Array] = {}
+        self.poses = self.poses_before = self.crowd.poses(0.0)
 
-    def pedestrian_poses(self, moment: Moment) -> Array:
-        """Returns where everyone is at a moment, planar poses [P, 3], not to be written to."""
-        if moment.ticks not in self._poses:
-            if len(self._poses) > _POSES_KEPT:
-                self._poses.clear()
-            self._poses[moment.ticks] = self.crowd.poses(moment.ticks * self.rules.tick_s)
-        return self._poses[moment.ticks]
+    def resume(self, before: Moment, now: Moment) -> None:
+        """Goes to a later step: where the vehicle was, where it is, and everyone else with it."""
+        self.before, self.now = before, now
+        self.poses_before, self.poses = (
+            self.crowd.poses(moment.ticks * self.rules.tick_s) for moment in (before, now)
+        )
 
     def step(self, action: int, street: Street) -> None:
         """Drives one step; it ends early where the episode does."""
         rules = self.rules
-        self.before = self.now
         state = turn(self.now.vehicle, action, rules.dt_s, rules.layout.scene.vehicle)
         states = roll(state, rules.tick_times_s, self.vehicle_speed_mps)  # fields [T]
         ticks = self.now.ticks + rules.tick_numbers
-        people = self.crowd.positions(ticks[:, None] * rules.tick_s)  # [T, P, 2]
-        is_safe = ~street.is_near(states, people) & rules.is_surely_inside(states)
-        has_arrived = shapely.contains_xy(self.goal, states.x_m, states.y_m)
-        for i in range(rules.ticks_a_step):
-            vehicle = VehicleState(
-                float(states.x_m[i]), float(states.y_m[i]), float(states.yaw_rad[i]), state[3]
-            )
-            if not is_safe[i]:
-                self._judge(vehicle, people[i], street)
-            if not self.outcome and has_arrived[i]:
-                self.outcome = Outcome.SUCCESS
+        poses = self.crowd.poses(ticks[:, None] * rules.tick_s)  # [T, P, 3]
+        is_near = street.is_anyone_near(states, poses).tolist()
+        track = zip(states.x_m.tolist(), states.y_m.tolist(), states.yaw_rad.tolist())
+        for i, (x_m, y_m, yaw_rad) in enumerate(track):
+            vehicle = VehicleState(x_m, y_m, yaw_rad, state.yaw_rate_rps)
+            if is_near[i] or not rules.is_calm(x_m, y_m):
+                self._judge(vehicle, poses[i], street)
             if self.outcome:
                 break
-        self.now = Moment(vehicle, int(ticks[i]))
+        self.before, self.now = self.now, Moment(vehicle, self.now.ticks + i + 1)
+        self.poses_before, self.poses = self.poses, poses[i]
         self.steps += 1
         if not self.outcome and self.steps >= rules.limit_steps:
             self.outcome = Outcome.TIMEOUT
 
-    def _judge(self, vehicle: VehicleState, people: Array, street: Street) -> None:
-        self.hit = street.hit(vehicle, people)
+    def _judge(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
+        self.hit = street.hit(vehicle, poses)
         if self.hit:
             self.outcome = Outcome.COLLISION
         elif self.rules.is_out_of_bounds(vehicle):
             self.outcome = Outcome.OUT_OF_BOUNDS
+        elif shapely.contains_xy(self.goal, vehicle.x_m, vehicle.y_m):
+            self.outcome = Outcome.SUCCESS
 
 
 def _path_named(paths: tuple[Path, ...], name: str) -> Path:

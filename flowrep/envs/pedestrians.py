@@ -37,6 +37,7 @@ class Crowd:
         self._length = self._marks[:, -1]
         self._there_and_back = 2 * self._length
         self._speeds = np.asarray(speeds_mps, dtype=np.float64)
+        self._turn_per_m = 1.0 / np.maximum(_TURN_S * self._speeds, 1e-9)
         self._start = np.asarray(phases, dtype=np.float64) * self._there_and_back
         self._people = np.arange(len(lines))
 
@@ -51,11 +52,14 @@ class Crowd:
         """
         return self._places(self._along(time_s))[0]
 
-    def poses(self, time_s: float) -> Array:
-        """Returns where everyone is and looks, planar poses [P, 3]."""
+    def poses(self, time_s: float | Array) -> Array:
+        """Returns where everyone is and looks, planar poses [P, 3], or [T, P, 3] for [T, 1]."""
         along = self._along(time_s)
         positions, headings = self._places(along)
-        return np.column_stack([positions, headings + self._facing(along)])
+        poses = np.empty((*along.shape, 3))
+        poses[..., :2] = positions
+        poses[..., 2] = headings + self._facing(along)
+        return poses
 
     def _along(self, time_s: float | Array) -> Array:
         # Metres walked since the near end, in [0, there and back).
@@ -77,13 +81,13 @@ class Crowd:
 
     def _facing(self, along: Array) -> Array:
         # 0 on the way there, π on the way back, turned evenly over _TURN_S around either end.
-        half_m = np.maximum(0.5 * _TURN_S * self._speeds, 1e-9)
-        to_far_end = along - self._length
-        past_near_end = np.where(to_far_end > 0, along - self._there_and_back, along)
-        turned_far = np.clip(0.5 + 0.5 * to_far_end / half_m, 0.0, 1.0)
-        turned_near = np.clip(0.5 + 0.5 * past_near_end / half_m, 0.0, 1.0)
-        is_near_far_end = np.abs(to_far_end) <= np.abs(past_near_end)
-        return math.pi * np.where(is_near_far_end, turned_far, 1.0 + turned_near)
+        past_far_end = along - self._length
+        is_back = past_far_end > 0
+        past_near_end = along - is_back * self._there_and_back
+        is_near_far_end = np.abs(past_far_end) <= np.abs(past_near_end)
+        past_end = np.where(is_near_far_end, past_far_end, past_near_end)
+        turned = np.minimum(np.maximum(0.5 + past_end * self._turn_per_m, 0.0), 1.0)
+        return math.pi * (turned + ~is_near_far_end)
 
 
 def draw_crowd(

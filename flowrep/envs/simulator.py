@@ -139,7 +139,7 @@ class Simulator:
         """Returns instance ids by body number; the last entry, which index -1 reads, is 0."""
         return np.array([*self._instance_of_body, 0], dtype=np.uint8)
 
-    def place(self, body: int, x_m: float, y_m: float, yaw_rad: float = 0.0) -> None:
+    def place(self, body: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Puts a body on the ground at a planar pose."""
         half = 0.5 * yaw_rad
         pybullet.resetBasePositionAndOrientation(
@@ -154,7 +154,7 @@ class Simulator:
         put, client = pybullet.resetBasePositionAndOrientation, self._client
         sines, cosines = np.sin(0.5 * poses[:, 2]).tolist(), np.cos(0.5 * poses[:, 2]).tolist()
         for body, (x, y, _), sine, cosine in zip(bodies, poses.tolist(), sines, cosines):
-            put(body, (x, y, 0.0), (0.0, 0.0, sine, cosine), physicsClientId=client)
+            put(body, (x, y, 0.0), (0.0, 0.0, sine, cosine), client)
 
     def hide(self, body: int) -> None:
         """Puts a body where neither the camera nor the vehicle meets it."""

@@ -33,6 +33,7 @@ class Street:
         vehicle = layout.scene.vehicle
         self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
         self._vehicle_reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
+        self._person_reach_m = self._vehicle_reach_m + meshes.PEDESTRIAN_RADIUS_M
         self._solids: list[Solid] = []
         self._add_ground(layout)
         self._add_solids(layout)
@@ -67,38 +68,33 @@ class Street:
         """Puts everyone at their planar pose [P, 3]."""
         self.simulator.place_all(self._pedestrians, poses)
 
-    def is_near(self, states: VehicleState, people: Array) -> Array:
-        """Returns where anything is near enough to be touched [T].
+    def is_anyone_near(self, states: VehicleState, poses: Array) -> Array:
+        """Returns where someone is near enough to be touched [T].
 
         Args:
             states: where the vehicle is, fields [T].
-            people: where everyone is then [T, P, 2].
+            poses: where everyone is then, planar poses [T, P, 3].
         """
-        states = VehicleState(*(np.asarray(value)[..., None] for value in states))
-        is_near = self._people_near(states, people).any(axis=-1)
-        return np.logical_or(is_near, self._boxes_near(states).any(axis=-1))
-
-    def _people_near(self, state: VehicleState, people: Array) -> Array:
-        gaps = np.hypot(people[..., 0] - state.x_m, people[..., 1] - state.y_m)
-        return gaps <= self._vehicle_reach_m + meshes.PEDESTRIAN_RADIUS_M
+        dx, dy = poses[..., 0] - states.x_m[:, None], poses[..., 1] - states.y_m[:, None]
+        return (dx * dx + dy * dy <= self._person_reach_m**2).any(axis=-1)
 
     def _boxes_near(self, state: VehicleState) -> Array:
         gaps = np.hypot(self._centres[:, 0] - state.x_m, self._centres[:, 1] - state.y_m)
         return gaps <= self._reaches
 
-    def hit(self, state: VehicleState, people: Array) -> str:
+    def hit(self, state: VehicleState, poses: Array) -> str:
         """Returns the category of what the vehicle overlaps, or "".
 
         Only what is near enough to be touched is put before the simulator's collision oracle.
 
         Args:
             state: where the vehicle is.
-            people: where everyone is [P, 2].
+            poses: where everyone is, planar poses [P, 3].
         """
         near = []
-        for i in np.flatnonzero(self._people_near(state, people)).tolist():
-            x_m, y_m = people[i].tolist()
-            self.simulator.place(self._pedestrians[i], x_m, y_m)
+        gaps = np.hypot(poses[:, 0] - state.x_m, poses[:, 1] - state.y_m)
+        for i in np.flatnonzero(gaps <= self._person_reach_m).tolist():
+            self.simulator.place(self._pedestrians[i], *poses[i].tolist())
             near.append((self._pedestrians[i], "pedestrian"))
         owners = (self._owners[i] for i in np.flatnonzero(self._boxes_near(state)).tolist())
         near += {solid.body: solid.category for solid in owners}.items()

@@ -171,7 +171,7 @@ class StreetEnv(gym.Env):
         episode = self.episode
         episode.steps, episode.hit = state["steps"], state["hit"]
         episode.outcome = Outcome[state["outcome"].upper()]
-        episode.now, episode.before = _moment(state["now"]), _moment(state["before"])
+        episode.resume(_moment(state["before"]), _moment(state["now"]))
         return self._observe(), self._info()
 
     def _begin(self, seed: int, path: str | None, vehicle_speed_mps: float | None) -> None:
@@ -203,7 +203,7 @@ class StreetEnv(gym.Env):
     def _look(self) -> Picture:
         if self._picture is None:
             now, camera = self.episode.now, self.scene.camera
-            self._street.place_pedestrians(self.episode.pedestrian_poses(now))
+            self._street.place_pedestrians(self.episode.poses)
             view = gl_view(self._camera_pose(now).cam_from_world)
             self._picture = self.simulator.look(
                 view, self._projection, camera.height_px, camera.width_px
@@ -242,8 +242,8 @@ class StreetEnv(gym.Env):
         episode = self.episode
         before, now = self._camera_pose(episode.before), self._camera_pose(episode.now)
         if "instance_motion" in self.sensors:
-            poses = [episode.pedestrian_poses(m) for m in (episode.before, episode.now)]
-            rows = instance_motion(before, now, *poses).astype(np.float32)
+            rows = instance_motion(before, now, episode.poses_before, episode.poses)
+            rows = rows.astype(np.float32)
             observation["instance_motion"] = rows
             observation["prev_from_curr"] = rows[0].copy()
         else:

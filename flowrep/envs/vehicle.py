@@ -43,9 +43,12 @@ def turn(state: VehicleState, action: Any, dt_s: float, vehicle: VehicleConfig) 
 def roll(state: VehicleState, dt_s: Any, speed_mps: float) -> VehicleState:
     """Returns the state after `dt_s` on the circular arc of its yaw rate, exactly."""
     angle = state.yaw_rate_rps * dt_s
-    # The chord of an arc of length d and angle a is d·sinc(a/2), along the mean heading.
-    chord = speed_mps * dt_s * np.sinc(angle / (2 * np.pi))
-    heading = state.yaw_rad + 0.5 * angle
+    half = 0.5 * angle
+    # The chord of an arc of length d and angle a is d·sin(a/2)/(a/2), along the mean heading. An
+    # angle this small stands for none: the quotient is 1 for it.
+    half_or_tiny = np.where(half == 0.0, 1e-20, half)
+    chord = speed_mps * dt_s * (np.sin(half_or_tiny) / half_or_tiny)
+    heading = state.yaw_rad + half
     return VehicleState(
         state.x_m + chord * np.cos(heading),
         state.y_m + chord * np.sin(heading),

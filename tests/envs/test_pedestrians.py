@@ -66,6 +66,8 @@ def test_many_times_at_once_are_many_calls(crowd):
     assert together.shape == (4, 3, 2)
     for time_s, places in zip(times, together):
         np.testing.assert_array_equal(places, crowd.positions(time_s))
+    for time_s, poses in zip(times, crowd.poses(times[:, None])):
+        np.testing.assert_array_equal(poses, crowd.poses(time_s))
 
 
 def test_a_scene_may_be_without_people():
