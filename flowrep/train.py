@@ -33,8 +33,14 @@ def run(config: DictConfig) -> None:
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
     print(f"run folder: {folder.path}")
+    if training.frames >= plain["total_frames"] and folder.is_evaluated(training.frames):
+        print(f"this run is complete; evaluate it with: flowrep.evaluate run={folder.path}")
+        return
     with StopRequest() as stop:
-        clock = train(training, plain, stop, partial(log_evaluation, training, plain))
+        try:
+            clock = train(training, plain, stop, partial(log_evaluation, training, plain, stop))
+        except (CheckpointError, OSError) as error:
+            exit_with(f"after {training.frames} frames: {error}")
         print(f"wall time: {clock.summary()}")
         print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
         if not stop:
@@ -102,7 +108,7 @@ def build(config: Config, folder: RunFolder) -> Training:
     return training
 
 
-def log_evaluation(training: Training, config: Config, frames: int) -> None:
+def log_evaluation(training: Training, config: Config, stop: StopRequest, frames: int) -> None:
     """Runs greedy episodes at the training speed and appends them to evaluation.csv."""
     evaluation = config["evaluation"]
     with torch.random.fork_rng(devices=[]):
@@ -113,6 +119,7 @@ def log_evaluation(training: Training, config: Config, frames: int) -> None:
             fps=[config["scene"]["frame_rate_hz"]],
             episodes=evaluation["episodes"],
             seed=EVALUATION_SEED,
+            should_stop=lambda: bool(stop),
         )
     training.run.log_episodes(with_origin(rows, config, frames))
 

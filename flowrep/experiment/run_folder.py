@@ -102,6 +102,16 @@ class RunFolder:
                 append_rows(shortened, rows)
                 shortened.replace(path) if rows else path.unlink()
 
+    def is_evaluated(self, frames: int) -> bool:
+        """Says whether the evaluation that ends a run of so many frames is in evaluation.csv."""
+        if not self.evaluation_path.is_file():
+            return False
+        with self.evaluation_path.open(newline="", encoding="utf-8") as file:
+            return any(
+                row["policy"] == "sampled" and int(row["frames"]) == frames
+                for row in csv.DictReader(file)
+            )
+
     def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Appends evaluated episodes to evaluation.csv."""
         append_rows(self.evaluation_path, rows, EVALUATION_COLUMNS)

@@ -55,6 +55,7 @@ class Training:
             "replay": self.agent.replay.state_dict(),
             "env": get_states(self.env),
             "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state_all(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -67,6 +68,8 @@ class Training:
         self.agent.replay.load_state_dict(state["replay"])
         set_states(self.env, state["env"])
         torch.set_rng_state(state["torch_rng"])
+        if len(state["cuda_rng"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state["cuda_rng"])
 
     def save(self) -> None:
         """Writes the checkpoint; the last one stays whole until the new one is."""
