@@ -19,7 +19,7 @@ from flowrep.envs.outcome import Outcome
 from flowrep.envs.pedestrians import Crowd, draw_crowd
 from flowrep.envs.scene import Path, Range
 from flowrep.envs.street import Street
-from flowrep.envs.vehicle import VehicleState, footprint_corners, roll, turn
+from flowrep.envs.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
 
 Array = NDArray[Any]
 # Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't pass anyone by.
@@ -44,7 +44,7 @@ class Rules:
         self.ticks_a_step = math.ceil(_CHECKS_HZ / frame_rate_hz - 1e-9)
         self.tick_s = self.dt_s / self.ticks_a_step
         self.tick_numbers = np.arange(1, self.ticks_a_step + 1)
-        self.tick_times_s = self.tick_numbers * self.tick_s
+        self.tick_times_s = (self.tick_numbers * self.tick_s).tolist()
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
         self.is_calm = CalmGround(layout)
 
@@ -95,15 +95,13 @@ class Episode:
     def step(self, action: int, street: Street) -> None:
         """Drives one step; it ends early where the episode does."""
         rules = self.rules
-        state = turn(self.now.vehicle, action, rules.dt_s, rules.layout.scene.vehicle)
-        states = roll(state, rules.tick_times_s, self.vehicle_speed_mps)  # fields [T]
+        turned = turn(self.now.vehicle, YAW_SIGN[action], rules.dt_s, rules.layout.scene.vehicle)
+        track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in rules.tick_times_s]
         ticks = self.now.ticks + rules.tick_numbers
         poses = self.crowd.poses(ticks[:, None] * rules.tick_s)  # [T, P, 3]
-        is_near = street.is_anyone_near(states, poses).tolist()
-        track = zip(states.x_m.tolist(), states.y_m.tolist(), states.yaw_rad.tolist())
-        for i, (x_m, y_m, yaw_rad) in enumerate(track):
-            vehicle = VehicleState(x_m, y_m, yaw_rad, state.yaw_rate_rps)
-            if is_near[i] or not rules.is_calm(x_m, y_m):
+        is_near = street.is_anyone_near(track, poses).tolist()
+        for i, vehicle in enumerate(track):
+            if is_near[i] or not rules.is_calm(vehicle.x_m, vehicle.y_m):
                 self._judge(vehicle, poses[i], street)
             if self.outcome:
                 break

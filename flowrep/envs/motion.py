@@ -72,11 +72,13 @@ def instance_motion(before: CameraPose, now: CameraPose, prev_poses: Array, pose
     """
     rows = np.empty((1 + len(poses), 4, 4))
     rows[:] = relative_camera(before, now)
-    moved = np.flatnonzero((poses != prev_poses).any(axis=-1))
-    if moved.size:
-        change = planar_change(prev_poses[moved], poses[moved])
+    moved = (poses != prev_poses).any(axis=-1)
+    if moved.any():
+        change = planar_change(prev_poses, poses)
         # Two products of long matrices instead of many of 4 × 4.
         side_by_side = change.transpose(1, 0, 2).reshape(4, -1)
         product = (before.cam_from_world @ side_by_side).reshape(-1, 4) @ now.world_from_cam
-        rows[1 + moved] = product.reshape(4, -1, 4).transpose(1, 0, 2)
+        np.copyto(
+            rows[1:], product.reshape(4, -1, 4).transpose(1, 0, 2), where=moved[:, None, None]
+        )
     return rows

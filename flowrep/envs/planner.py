@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flowrep.envs.episode import Episode, Rules
 from flowrep.envs.meshes import PEDESTRIAN_RADIUS_M
 from flowrep.envs.street_env import StreetEnv
-from flowrep.envs.vehicle import NO_OP, VehicleState, footprint_corners, roll, turn
+from flowrep.envs.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
 from flowrep.envs.way import WayToGo, free_ground
 
 Array = NDArray[Any]
@@ -57,7 +57,7 @@ class Planner:
             self._plan = {episode.steps + i: action for i, action in enumerate(actions)}
         action = self._plan.get(episode.steps, NO_OP)
         rules = episode.rules
-        turned = turn(state, action, rules.dt_s, rules.layout.scene.vehicle)
+        turned = turn(state, YAW_SIGN[action], rules.dt_s, rules.layout.scene.vehicle)
         self._expected = (episode.steps + 1, turned.yaw_rate_rps)
         return action
 
@@ -115,8 +115,9 @@ class _Search:
         """Returns the states after one decision, who is unharmed, and who has arrived."""
         alive = np.ones(actions.size, dtype=bool)
         arrived = np.zeros(actions.size, dtype=bool)
+        signs = np.array(YAW_SIGN)[actions]
         for _ in range(_HOLD_STEPS):
-            state = turn(state, actions, self.rules.dt_s, self.vehicle)
+            state = turn(state, signs, self.rules.dt_s, self.vehicle)
             for _ in range(self.rules.ticks_a_step):
                 state = roll(state, self.rules.tick_s, self.episode.vehicle_speed_mps)
                 ticks += 1

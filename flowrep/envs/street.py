@@ -1,7 +1,7 @@
 """A laid-out scene as bodies in the simulator: what the camera sees and the vehicle can hit."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,15 +68,16 @@ class Street:
         """Puts everyone at their planar pose [P, 3]."""
         self.simulator.place_all(self._pedestrians, poses)
 
-    def is_anyone_near(self, states: VehicleState, poses: Array) -> Array:
-        """Returns where someone is near enough to be touched [T].
+    def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
+        """Returns when someone is near enough to be touched [T].
 
         Args:
-            states: where the vehicle is, fields [T].
+            track: where the vehicle is, T times.
             poses: where everyone is then, planar poses [T, P, 3].
         """
-        dx, dy = poses[..., 0] - states.x_m[:, None], poses[..., 1] - states.y_m[:, None]
-        return (dx * dx + dy * dy <= self._person_reach_m**2).any(axis=-1)
+        centres = np.array([state[:2] for state in track])
+        gaps = poses[..., :2] - centres[:, None]
+        return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)
 
     def _boxes_near(self, state: VehicleState) -> Array:
         gaps = np.hypot(self._centres[:, 0] - state.x_m, self._centres[:, 1] - state.y_m)

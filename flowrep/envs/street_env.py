@@ -220,7 +220,7 @@ class StreetEnv(gym.Env):
         return self._camera_poses[moment]
 
     def _add_maps(self, observation: dict[str, Any], picture: Picture) -> None:
-        body = picture.body
+        body = picture.body.astype(np.intp)  # what take() wants
         if "depth" in self.sensors:
             camera = self.scene.camera
             depth = depth_from_zbuffer(picture.zbuffer, camera.near_m, camera.far_m)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NO_OP, TURN_LEFT, TURN_RIGHT = 0, 1, 2
-YAW_SIGN = np.array([0.0, 1.0, -1.0])  # by action; left is counter-clockwise
+YAW_SIGN = (0.0, 1.0, -1.0)  # by action; left is counter-clockwise
 
 
 @dataclass(frozen=True)
@@ -32,26 +32,33 @@ class VehicleState(NamedTuple):
     yaw_rate_rps: Any
 
 
-def turn(state: VehicleState, action: Any, dt_s: float, vehicle: VehicleConfig) -> VehicleState:
-    """Returns the state with its yaw rate changed by the action: plus or minus α·Δt, or nothing."""
+def turn(state: VehicleState, sign: Any, dt_s: float, vehicle: VehicleConfig) -> VehicleState:
+    """Returns the state with its yaw rate changed by `sign`·α·Δt, within its limit.
+
+    `sign` is `YAW_SIGN` of the action; where the state's fields are arrays, so is it.
+    """
     limit = math.radians(vehicle.max_yaw_rate_dps)
-    step = math.radians(vehicle.yaw_acceleration_dps2) * dt_s
-    rate = state.yaw_rate_rps + YAW_SIGN[action] * step
-    return state._replace(yaw_rate_rps=np.minimum(np.maximum(rate, -limit), limit))
+    rate = state.yaw_rate_rps + sign * (math.radians(vehicle.yaw_acceleration_dps2) * dt_s)
+    if isinstance(rate, np.ndarray):
+        rate = np.clip(rate, -limit, limit)
+    else:
+        rate = min(max(rate, -limit), limit)
+    return state._replace(yaw_rate_rps=rate)
 
 
-def roll(state: VehicleState, dt_s: Any, speed_mps: float) -> VehicleState:
+def roll(state: VehicleState, dt_s: float, speed_mps: float) -> VehicleState:
     """Returns the state after `dt_s` on the circular arc of its yaw rate, exactly."""
+    xp: Any = np if isinstance(state.yaw_rate_rps, np.ndarray) else math
     angle = state.yaw_rate_rps * dt_s
+    # The chord of an arc of length d and angle a is d·sin(a/2)/(a/2), along the mean heading. For
+    # no angle a tiny one stands in, whose quotient is 1.
     half = 0.5 * angle
-    # The chord of an arc of length d and angle a is d·sin(a/2)/(a/2), along the mean heading. An
-    # angle this small stands for none: the quotient is 1 for it.
-    half_or_tiny = np.where(half == 0.0, 1e-20, half)
-    chord = speed_mps * dt_s * (np.sin(half_or_tiny) / half_or_tiny)
+    half_or_tiny = half + (half == 0.0) * 1e-20
+    chord = speed_mps * dt_s * (xp.sin(half_or_tiny) / half_or_tiny)
     heading = state.yaw_rad + half
     return VehicleState(
-        state.x_m + chord * np.cos(heading),
-        state.y_m + chord * np.sin(heading),
+        state.x_m + chord * xp.cos(heading),
+        state.y_m + chord * xp.sin(heading),
         state.yaw_rad + angle,
         state.yaw_rate_rps,
     )

@@ -9,6 +9,7 @@ from flowrep.envs.vehicle import (
     NO_OP,
     TURN_LEFT,
     TURN_RIGHT,
+    YAW_SIGN,
     VehicleConfig,
     VehicleState,
     footprint_corners,
@@ -23,15 +24,19 @@ STATE = VehicleState(1.0, 2.0, 0.5, 0.1)
 def test_turning_changes_the_yaw_rate_by_alpha_times_dt():
     # 30°/s² for half a second: 15°/s, counter-clockwise to the left.
     step = math.radians(15.0)
-    assert turn(STATE, TURN_LEFT, 0.5, CAR) == pytest.approx((1.0, 2.0, 0.5, 0.1 + step))
-    assert turn(STATE, TURN_RIGHT, 0.5, CAR) == pytest.approx((1.0, 2.0, 0.5, 0.1 - step))
-    assert turn(STATE, NO_OP, 0.5, CAR) == STATE
+    assert turn(STATE, YAW_SIGN[TURN_LEFT], 0.5, CAR) == pytest.approx((1.0, 2.0, 0.5, 0.1 + step))
+    assert turn(STATE, YAW_SIGN[TURN_RIGHT], 0.5, CAR) == pytest.approx((1.0, 2.0, 0.5, 0.1 - step))
+    assert turn(STATE, YAW_SIGN[NO_OP], 0.5, CAR) == STATE
 
 
 def test_the_yaw_rate_stays_within_its_limit():
     # 30°/s² for 2 s would be 60°/s; the limit is 40.
-    assert turn(STATE, TURN_LEFT, 2.0, CAR).yaw_rate_rps == pytest.approx(math.radians(40))
-    assert turn(STATE, TURN_RIGHT, 9.0, CAR).yaw_rate_rps == pytest.approx(-math.radians(40))
+    assert turn(STATE, YAW_SIGN[TURN_LEFT], 2.0, CAR).yaw_rate_rps == pytest.approx(
+        math.radians(40)
+    )
+    assert turn(STATE, YAW_SIGN[TURN_RIGHT], 9.0, CAR).yaw_rate_rps == pytest.approx(
+        -math.radians(40)
+    )
 
 
 def test_a_turning_vehicle_stays_on_its_circle():
@@ -55,12 +60,15 @@ def test_a_vehicle_that_stands_keeps_its_very_numbers():
     assert roll(state, 1 / 24, 0.0) == state
 
 
-def test_arrays_are_rolled_as_numbers_are():
-    states = VehicleState(*(np.array([value, 2 * value]) for value in STATE))
-    rolled = roll(states, 0.3, 10.0)
-    twice = VehicleState(*(2 * value for value in STATE))
-    for i, state in enumerate((STATE, twice)):
-        assert [field[i] for field in rolled] == pytest.approx(roll(state, 0.3, 10.0))
+def test_arrays_are_driven_as_numbers_are():
+    both = (STATE, VehicleState(-1.0, 7.0, 3.0, 0.0), VehicleState(0.0, 0.0, 0.0, -0.6))
+    actions = [NO_OP, TURN_LEFT, TURN_RIGHT]
+    states = VehicleState(*(np.array(field) for field in zip(*both)))
+    turned = turn(states, np.array(YAW_SIGN)[actions], 0.5, CAR)
+    rolled = roll(turned, 0.3, 10.0)
+    for i, (state, action) in enumerate(zip(both, actions)):
+        one = roll(turn(state, YAW_SIGN[action], 0.5, CAR), 0.3, 10.0)
+        assert [field[i] for field in rolled] == pytest.approx(one)
 
 
 def test_footprint_corners_are_front_left_first_and_counter_clockwise():
