@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Any
 
 from flowrep.envs import StreetEnv, load_scene
-from flowrep.envs.camera import gl_projection, gl_view
 
 BOUND = 1.3
 
@@ -33,7 +32,7 @@ def main() -> None:
     for _ in range(args.steps):
         seconds, (*_, terminated, _, _) = timed(lambda: env.step(0))
         steps.append(seconds)
-        pictures.append(timed(bare_picture(env))[0])
+        pictures.append(timed(lambda: env.sensing.look(env.episode))[0])
         if terminated:
             env.reset()
     step, picture = statistics.median(steps), statistics.median(pictures)
@@ -43,15 +42,6 @@ def main() -> None:
     print(f"bare getCameraImage {1e3 * picture:.3f} ms  ({1 / picture:.0f} frames/s)")
     verdict = "ok" if step / picture <= BOUND else "TOO SLOW"
     print(f"ratio of medians {step / picture:.3f}, paired {paired:.3f}; bound {BOUND}: {verdict}")
-
-
-def bare_picture(env: StreetEnv) -> Callable[[], object]:
-    camera = env.scene.camera
-    size = (camera.height_px, camera.width_px)
-    focal = camera.focal_px
-    projection = gl_projection(focal, focal, *size, camera.near_m, camera.far_m)
-    view = gl_view(env.camera_pose().cam_from_world)
-    return lambda: env.simulator.look(view, projection, *size)
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:

@@ -16,7 +16,8 @@ from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 from flowrep.envs.loading import load_scene
 from flowrep.envs.outcome import Outcome
 from flowrep.envs.scene import Range, Scene, SpeedMode
-from flowrep.envs.street_env import SENSORS, StreetEnv
+from flowrep.envs.sensing import SENSORS
+from flowrep.envs.street_env import StreetEnv
 from flowrep.transforms import representation_stack
 
 _OUTCOME_CODE = {outcome.label: outcome.value for outcome in Outcome}

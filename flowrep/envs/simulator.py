@@ -3,11 +3,13 @@
 One DIRECT client a simulator, given back by `close()` or when the simulator is collected.
 """
 
+import contextlib
 import functools
 import math
 import os
 import tempfile
 import weakref
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,13 +18,22 @@ from numpy.typing import NDArray
 from flowrep.envs.meshes import Mesh
 from flowrep.envs.palette import CATEGORY_ID
 
-try:
+
+@contextlib.contextmanager
+def _without_greeting() -> Iterator[None]:
+    """Keeps stderr clean while PyBullet, whose import prints when it was built, is loaded."""
+    stderr = os.dup(2)
+    try:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+
+
+with _without_greeting():
     import pybullet
-except ImportError as error:
-    raise ImportError(
-        "flowrep.envs needs pybullet, which has wheels for CPython 3.10 and 3.11 only: "
-        "use such a Python and run: pip install 'flowrep[sim]'"
-    ) from error
 
 _LIGHT = {
     "lightDirection": [-4.0, 3.0, 9.0],

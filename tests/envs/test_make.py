@@ -68,9 +68,9 @@ def test_the_tensordict_has_the_representations_and_no_sensor(make):
 
 
 def test_only_what_is_read_is_rendered(make):
-    assert streets(make(representations=()))[0].sensors == ()
-    assert streets(make(representations=["seg"]))[0].sensors == ("semantic",)
-    assert streets(make(representations=["ego"]))[0].sensors == ("depth", "prev_from_curr")
+    assert streets(make(representations=()))[0].sensing.names == ()
+    assert streets(make(representations=["seg"]))[0].sensing.names == ("semantic",)
+    assert streets(make(representations=["ego"]))[0].sensing.names == ("depth", "prev_from_curr")
 
 
 def test_options_of_a_representation_reach_its_transform(make):

@@ -198,7 +198,7 @@ def test_a_state_written_as_json_goes_on_bit_for_bit(make_street):
     actions = np.random.default_rng(0).integers(3, size=12)
     for action in actions[:6]:
         env.step(action)
-    before = env._observe()
+    before = env.sensing.observe(env.episode)
     state = json.loads(json.dumps(env.get_state()))
     resumed = make_street()
     observation, info = resumed.set_state(state)

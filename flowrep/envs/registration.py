@@ -1,0 +1,13 @@
+"""The names under which `gymnasium.make` finds the streets."""
+
+import gymnasium
+
+SCENE_BY_ID = {"flowrep/StraightRoad-v0": "straight_road"}
+
+
+def register_environments() -> None:
+    """Registers every environment of the package with gymnasium."""
+    for name, scene in SCENE_BY_ID.items():
+        gymnasium.register(
+            name, entry_point="flowrep.envs.street_env:StreetEnv", kwargs={"scene": scene}
+        )
