@@ -153,9 +153,13 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
 def main() -> None:
     """Entry point; mistakes on the command line end in one line that lists what exists."""
     resumed = [a.removeprefix("resume=") for a in sys.argv[1:] if a.startswith("resume=")]
-    if resumed and not any(a.startswith("hydra.run.dir=") for a in sys.argv):
+    if resumed:
+        try:
+            folder = RunFolder.existing(resumed[-1])
+        except FileNotFoundError as error:
+            exit_with(str(error))
         # A resumed run stays in its folder, whose .hydra/ keeps telling how it was started.
-        sys.argv += [f"hydra.run.dir={resumed[-1]}", "hydra.output_subdir=null"]
+        sys.argv += [f"hydra.run.dir={folder.path}", "hydra.output_subdir=null"]
     run_command("train", run)
 
 

@@ -14,22 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
+from flowrep.palette import CLASS_COLOURS
 
-CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
-    "sky": (112, 178, 232),
-    "road": (84, 84, 92),
-    "sidewalk": (196, 176, 160),
-    "building": (150, 84, 60),
-    "pedestrian": (222, 40, 60),
-    "terrain": (112, 158, 74),
-    "crosswalk": (238, 234, 220),
-    "tree": (36, 104, 48),
-    "fence": (214, 148, 70),
-    "car": (46, 64, 196),
-    "traffic_light": (250, 214, 40),
-}
-"""Class name to colour; a class id is the name's place in this table."""
+Image = NDArray[np.uint8]
 
 FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 2.0}
 """Flow, in pixels, at which a representation's colour is full."""

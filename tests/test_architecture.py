@@ -15,13 +15,14 @@ FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry"},
     "transforms": {"transforms", "geometry"},
     "agent": {"agent"},
-    "envs": {"envs", "transforms", "geometry", "config_tree"},
-    "viz": {"viz"},
+    "envs": {"envs", "transforms", "geometry", "config_tree", "palette"},
+    "palette": set(),
+    "viz": {"palette"},
     "experiment": {"experiment", "envs", "agent", "transforms", "geometry", "viz"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"envs/simulator.py"},
-    "hydra": {"train.py", "evaluate.py", "command_line.py"},
+    "hydra": {"train.py", "evaluate.py", "command_line.py", "build.py"},
 }
 PACKAGES_LIMITED_TO = {
     "geometry": {"torch"},

@@ -80,12 +80,6 @@ def test_classes_take_their_colour_from_the_one_table():
     ]
 
 
-def test_class_colours_are_those_of_the_simulated_streets():
-    palette = pytest.importorskip("flowrep.envs.palette", exc_type=ImportError)
-    assert {category.name: category.rgb for category in palette.CATEGORIES} == CLASS_COLOURS
-    assert list(CLASS_COLOURS) == [category.name for category in palette.CATEGORIES]
-
-
 def test_depth_gets_darker_and_ends_in_black_where_nothing_is():
     depth = np.array([[[0.0, 1.0, 9.0, 99.0, 150.0, np.inf, np.nan]]], dtype=np.float32)
     near, *rest, far, further, sky, missing = depth_to_rgb(depth, range_m=99.0)[0].astype(int)

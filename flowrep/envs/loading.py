@@ -9,10 +9,10 @@ from shapely.geometry import LineString, Polygon
 
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs.layout import Layout, centrelines
-from flowrep.envs.palette import CATEGORY_ID
 from flowrep.envs.scene import Piece, Scene
 from flowrep.envs.schema import SceneError, build
 from flowrep.envs.vehicle import footprint_corners
+from flowrep.palette import CATEGORY_ID
 
 
 def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:

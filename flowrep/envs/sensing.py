@@ -16,10 +16,10 @@ from flowrep.envs.camera import (
 )
 from flowrep.envs.episode import Episode, Moment
 from flowrep.envs.motion import CameraPose, instance_motion, relative_camera
-from flowrep.envs.palette import PALETTE_RGB, num_classes
 from flowrep.envs.scene import Scene
 from flowrep.envs.simulator import Picture
 from flowrep.envs.street import Street
+from flowrep.palette import CLASS_COLOURS, num_classes
 
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb")
 _MAPS = frozenset({"depth", "semantic", "instance", "rgb"})
@@ -111,7 +111,7 @@ class Sensing:
 
     def _rgb(self, picture: Picture) -> NDArray[np.uint8]:
         rgb = picture.rgba[..., :3].copy()
-        rgb[picture.body < 0] = PALETTE_RGB[0]
+        rgb[picture.body < 0] = CLASS_COLOURS["sky"]
         return rgb
 
     def _add_motion(self, observation: dict[str, Any], episode: Episode) -> None:

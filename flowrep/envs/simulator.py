@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.envs.meshes import Mesh
-from flowrep.envs.palette import CATEGORY_ID
+from flowrep.palette import CATEGORY_ID
 
 
 @contextlib.contextmanager

@@ -11,11 +11,11 @@ from flowrep.envs.episode import Episode, Moment, Rules
 from flowrep.envs.layout import Layout
 from flowrep.envs.loading import load_scene
 from flowrep.envs.outcome import Outcome, reward
-from flowrep.envs.palette import num_classes
 from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.envs.street import Street
 from flowrep.envs.vehicle import VehicleState
+from flowrep.palette import num_classes
 
 
 class StreetEnv(gym.Env):
@@ -28,7 +28,7 @@ class StreetEnv(gym.Env):
     | key | shape | dtype | what |
     | --- | --- | --- | --- |
     | `depth` | [1, H, W] | float32 | metres along z; sky is inf |
-    | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.envs.palette` |
+    | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.palette` |
     | `instance` | [1, H, W] | uint8 | pedestrian's number from 1; 0 is the static world |
     | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
     | `instance_motion` | [1 + P, 4, 4] | float32 | the same by instance; row 0: static world |
