@@ -14,7 +14,7 @@ from flowrep.envs.paint import SHIRTS, Patch, front, swatch, wall
 
 Array = NDArray[np.float64]
 Point3 = tuple[float, float, float]
-PEDESTRIAN_RADIUS_M = 0.25
+PEDESTRIAN_RADIUS_M = 0.3
 PEDESTRIAN_HEIGHT_M = 1.75
 _CELL_M = 15.0  # ground is cut into cells: the renderer interpolates short triangles better
 _DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M, _DASH_RISE_M = 2.0, 6.0, 0.15, 0.004
@@ -97,13 +97,21 @@ class Mesh:
 
 
 def pedestrian_mesh(variant: int) -> Mesh:
-    """Returns a person who looks along x: two legs, torso, head; `variant` chooses the shirt."""
+    """Returns a person in mid-stride along x; `variant` chooses the shirt.
+
+    Seen from the side, as the vehicle sees who crosses, stride and swinging arms are what there is
+    to see: a person is some 0.6 m wide from there.
+    """
     mesh = Mesh()
     shirt = swatch(SHIRTS[variant % len(SHIRTS)])
-    for y in (-0.11, 0.11):
-        low, high = (-0.09, y - 0.08, 0.0), (0.09, y + 0.08, 0.82)
+    for side, step in ((-1, 1), (1, -1)):
+        leg, arm = 0.15 * step, -0.19 * step
+        y = 0.1 * side
+        low, high = (leg - 0.13, y - 0.08, 0.0), (leg + 0.13, y + 0.08, 0.82)
         mesh.box(low, high, swatch("trousers"), lid=False)
-    mesh.box((-0.13, -0.24, 0.8), (0.13, 0.24, 1.45), shirt)
+        y = 0.26 * side
+        mesh.box((arm - 0.11, y - 0.05, 0.85), (arm + 0.11, y + 0.05, 1.35), shirt)
+    mesh.box((-0.16, -0.21, 0.8), (0.16, 0.21, 1.47), shirt)
     mesh.box((-0.11, -0.1, 1.47), (0.12, 0.1, 1.75), swatch("skin"))
     return mesh
 

@@ -115,8 +115,8 @@ def test_the_time_limit_keeps_its_seconds(make_street, empty_road, rate_hz, step
 def test_no_frame_rate_lets_the_vehicle_pass_through_a_person(make_street, one_stands, rate_hz):
     rewards, info = drive(make_street(one_stands, frame_rate_hz=rate_hz, sensors=()))
     assert (info["outcome"], info["hit"]) == ("collision", "pedestrian")
-    # The front, 0.5 m ahead, meets a cylinder of 0.25 m at x = 29.25: after 2.925 s.
-    assert len(rewards) == math.ceil(2.925 * rate_hz)
+    # The front, 0.5 m ahead, meets a cylinder of 0.3 m at x = 29.2: after 2.92 s.
+    assert len(rewards) == math.ceil(2.92 * rate_hz)
     assert sum(rewards) == pytest.approx(-5.0 + 0.01 * len(rewards))
 
 

@@ -1,4 +1,4 @@
-"""conf/representations: one file a representation, its options and defaults those of the code."""
+"""conf/representations: one file a representation, its options those of the code."""
 
 from __future__ import annotations
 
@@ -24,7 +24,14 @@ def test_there_is_a_file_for_each_representation():
 def test_file_names_the_representation_and_spells_its_options(name):
     config = read(name)
     assert list(config) == [name]
-    assert list(config[name].items()) == list(representation_options(name).items())
+    assert list(config[name]) == list(representation_options(name))
+
+
+@pytest.mark.parametrize("name", REPRESENTATIONS)
+def test_an_experiment_changes_nothing_of_a_representation_but_its_scale(name):
+    options, defaults = read(name)[name], representation_options(name)
+    changed = {option for option in options if options[option] != defaults[option]}
+    assert changed <= {"scale"}
 
 
 def test_all_files_together_make_a_stack():
