@@ -109,7 +109,7 @@ def train(
     losses: TensorDictBase | None = None
     if t.carried is None:
         t.carried = t.env.reset()
-    with tqdm(total=total, initial=t.frames, unit="frame", unit_scale=True) as bar:
+    with tqdm(total=total, initial=t.frames, unit="frame", unit_scale=True, mininterval=0.5) as bar:
         while t.frames < total and not stop:
             with clock("policy"), torch.no_grad():
                 acted = t.agent.policy(t.carried)
