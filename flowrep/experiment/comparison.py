@@ -136,4 +136,4 @@ def print_table(rows: Sequence[Mapping[str, Any]], console: Console | None = Non
         shares = outcome_shares(outcomes).values()
         cells = [f"{100 * s:.0f} [{100 * low:.0f}–{100 * high:.0f}]" for s, low, high in shares]
         table.add_row(speed, f"{float(fps):g}", policy, str(len(outcomes)), *cells)
-    (console or Console(width=max(88, Console().width))).print(table)
+    (console or Console(width=max(100, Console().width))).print(table)
