@@ -17,7 +17,15 @@ def test_a_signal_asks_and_the_shell_gets_its_exit_code(number, code):
         assert stop.exit_code == code
 
 
-def test_a_second_ctrl_c_ends_at_once():
+@pytest.fixture
+def ctrl_c_raises():
+    """Python's own handler: a process started in the background may have SIGINT ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_second_ctrl_c_ends_at_once(ctrl_c_raises):
     with StopRequest():
         os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
