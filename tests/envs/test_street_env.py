@@ -151,7 +151,7 @@ def test_a_group_walks_at_one_speed_in_one_direction(make_street):
     # Members may turn about at different times, but the pace is the group's.
     members = env.scene.pedestrian_groups[0].count
     pace = np.abs(crowd.positions(0.01) - crowd.positions(0.0))[:, 1].reshape(-1, members)
-    np.testing.assert_allclose(pace, np.repeat(pace[:, :1], 4, axis=1), rtol=1e-3)
+    np.testing.assert_allclose(pace, np.repeat(pace[:, :1], members, axis=1), rtol=1e-3)
     assert len(np.unique(pace[:, 0].round(6))) == len(pace)
 
 
