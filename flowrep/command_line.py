@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.config_tree import CONF_DIR, config_groups, group_choices
 
 EXIT_USAGE = 2
 
@@ -70,7 +70,7 @@ def check_overrides(config_name: str, overrides: Sequence[str]) -> None:
             parsed += OverridesParser.create().parse_overrides([text])
         except HydraException as error:
             raise UsageError(f"can't read '{text}': {_first_line(error)}") from None
-    groups = {path.name for path in CONF_DIR.iterdir() if path.is_dir()}
+    groups = config_groups()
     chosen = [override for override in parsed if override.key_or_group in groups]
     for override in chosen:
         for choice in _choices(override):
@@ -121,6 +121,8 @@ def _check_key(key: str, config: DictConfig) -> None:
         if part == "hydra" and depth == 0:
             return
         known = [str(name) for name in node] if isinstance(node, DictConfig) else []
+        if not depth:
+            known += [group for group in config_groups() if group not in known]
         if part not in known:
             where = f" of '{'.'.join(parts[:depth])}'" if depth else ""
             there = f"there are: {', '.join(known)}" if known else "it has no keys"

@@ -11,3 +11,8 @@ CONF_DIR: Path = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
 def group_choices(group: str) -> list[str]:
     """Returns the names that a config group offers, sorted, e.g. `group_choices("scene")`."""
     return sorted(path.stem for path in (CONF_DIR / group).glob("*.yaml"))
+
+
+def config_groups() -> list[str]:
+    """Returns the names of the config groups, sorted: the folders of conf/."""
+    return sorted(path.name for path in CONF_DIR.iterdir() if path.is_dir())

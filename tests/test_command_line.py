@@ -16,7 +16,7 @@ pytest.importorskip("pybullet", reason="the commands need the simulator")
     [
         ("representations=[eggo]", ["unknown representations 'eggo'", "'ego'", "depth2", "seg"]),
         ("representations=[ego,eggo],[raw]", ["unknown representations 'eggo'"]),
-        ("sed=3", ["unknown key 'sed'", "did you mean 'seed'", "total_frames"]),
+        ("sed=3", ["unknown key 'sed'", "did you mean 'seed'", "total_frames", "preset"]),
         ("scene=straight", ["unknown scene 'straight'", "straight_road"]),
         ("preset=desktop", ["unknown preset 'desktop'", "laptop, paper"]),
         ("algorithm=dqm", ["unknown algorithm 'dqm'", "dsac"]),

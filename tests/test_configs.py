@@ -8,7 +8,7 @@ from hydra.utils import get_class
 from omegaconf import OmegaConf
 
 from flowrep.command_line import register_resolvers
-from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.config_tree import CONF_DIR, config_groups, group_choices
 
 pytest.importorskip("pybullet", reason="composed configs are built into environments")
 
@@ -20,12 +20,7 @@ def composed(*overrides, name="train"):
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=name == "train")
 
 
-GROUP_FILES = [
-    (group.name, name)
-    for group in sorted(CONF_DIR.iterdir())
-    if group.is_dir()
-    for name in group_choices(group.name)
-]
+GROUP_FILES = [(group, name) for group in config_groups() for name in group_choices(group)]
 
 
 @pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
