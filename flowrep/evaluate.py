@@ -1,9 +1,14 @@
 """Evaluates a trained agent: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
 
+import sys
 from functools import partial
 from typing import Any
 
-import hydra
+try:
+    import hydra
+except ImportError:
+    sys.exit("error: evaluation needs packages of an extra: pip install 'flowrep[train]'")
+
 from omegaconf import DictConfig, ListConfig
 
 from flowrep.agent import CheckpointError, DiscreteSAC, load_checkpoint

@@ -4,7 +4,11 @@ import sys
 from functools import partial
 from typing import Any
 
-import hydra
+try:
+    import hydra
+except ImportError:
+    sys.exit("error: training needs packages of an extra: pip install 'flowrep[train]'")
+
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
