@@ -13,7 +13,7 @@ from flowrep.experiment.recording import film_episode
 from flowrep.viz import representation_strip, write_png
 
 
-def main(path: str, seed: int = 7) -> None:
+def main(path: str, seed: int = 2) -> None:
     env = make_env("straight_road", ["rgb"], keep_sensor=True, seed=seed)
     street, planner = streets(env)[0], Planner()
 
