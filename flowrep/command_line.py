@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from flowrep.config_tree import CONF_DIR, config_groups, group_choices
 
 EXIT_USAGE = 2
+MULTIRUN = ("-m", "--multirun")
 
 
 class UsageError(Exception):
@@ -47,9 +48,6 @@ def run_command(config_name: str, command: Callable[[], Any]) -> None:
         except UsageError as error:
             exit_with(str(error))
     command()
-
-
-MULTIRUN = ("-m", "--multirun")
 
 
 def check_overrides(config_name: str, overrides: Sequence[str]) -> None:

@@ -77,6 +77,8 @@ def check(
     for key in ("episodes", "num_envs"):
         if not isinstance(config[key], int) or config[key] < 1:
             raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
+    if not isinstance(config.video, int) or config.video < 0:
+        raise UsageError(f"video should be a number of episodes, 0 for none, not {config.video!r}")
     return speeds, [float(rate) for rate in rates], policies, baselines
 
 

@@ -17,6 +17,7 @@ from flowrep.agent import CheckpointError, keep_freed_memory
 from flowrep.build import Config, build_agent, build_env
 from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
+from flowrep.envs.baselines import BASELINES
 from flowrep.experiment.comparison import compare, print_table, with_origin
 from flowrep.experiment.figures import draw_learning_curve
 from flowrep.experiment.interruption import StopRequest
@@ -94,10 +95,23 @@ def check(config: Config) -> None:
         )
     if not config["representations"]:
         raise UsageError("representations is empty; name one at least, e.g. representations=[ego]")
-    speeds = list(config["scene"]["pedestrian_speed_mps"])
-    for speed in [config["speed"], *config["evaluation"]["speeds"]]:
-        if speed not in speeds:
-            raise UsageError(f"unknown speed '{speed}'; the scene has: {', '.join(speeds)}")
+    evaluation = config["evaluation"]
+    for key in ("episodes", "final_episodes"):
+        if not isinstance(evaluation[key], int) or evaluation[key] < 1:
+            raise UsageError(
+                f"evaluation.{key} should be a positive whole number, not {evaluation[key]!r}"
+            )
+    for what, names, known in (
+        (
+            "speed",
+            [config["speed"], *evaluation["speeds"]],
+            config["scene"]["pedestrian_speed_mps"],
+        ),
+        ("baseline", evaluation["baselines"], BASELINES),
+    ):
+        for name in names:
+            if name not in known:
+                raise UsageError(f"unknown {what} '{name}'; there are: {', '.join(known)}")
 
 
 def build(config: Config, folder: RunFolder) -> Training:

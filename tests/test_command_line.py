@@ -69,10 +69,11 @@ def run_command(*arguments, cwd):
     [
         (["flowrep.train", "representations=[eggo]"], "unknown representations 'eggo'"),
         (["flowrep.train", "speed=fast", "debug=smoke"], "unknown speed 'fast'"),
+        (["flowrep.train", "evaluation.baselines=[never]"], "unknown baseline 'never'"),
         (["flowrep.train", "resume=nowhere"], "'nowhere' holds no run"),
         (["flowrep.evaluate", "run=nowhere"], "'nowhere' holds no run"),
     ],
-    ids=["typo", "value", "resume", "evaluate"],
+    ids=["typo", "value", "baseline", "resume", "evaluate"],
 )
 def test_the_commands_end_with_one_line_and_code_2(arguments, says, tmp_path):
     result = run_command(*arguments, cwd=tmp_path)

@@ -33,9 +33,6 @@ class RunFolder:
     evaluation.csv           a row for each evaluated episode
     videos/                  what the agent saw and did
     ```
-
-    Raises:
-        FileNotFoundError: from `config` and `existing`, when the folder holds no run.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -46,7 +43,11 @@ class RunFolder:
 
     @classmethod
     def existing(cls, path: str | Path) -> "RunFolder":
-        """Opens a folder that holds a run, and creates none."""
+        """Opens a folder that holds a run, and creates none.
+
+        Raises:
+            FileNotFoundError: there is no run at `path`.
+        """
         if not (Path(path) / "config.yaml").is_file():
             raise FileNotFoundError(
                 f"'{path}' holds no run: it has no config.yaml. Give the folder that a training "
