@@ -4,35 +4,57 @@ Convention: world metres, x forward at yaw 0, yaw counter-clockwise.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 import shapely.ops
 from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
+from shapely.geometry.base import BaseGeometry
 
-from flowrep.envs.scene import BuildingRow, Closure, Road, Scene, Walk, Zone
+from flowrep.envs.scene import (
+    CATEGORY_OF_KIND,
+    BuildingRow,
+    Closure,
+    Crosswalk,
+    Kind,
+    ObstacleRow,
+    Road,
+    Scene,
+    Walk,
+    Zone,
+)
 from flowrep.envs.vehicle import VehicleState
 
 Array = NDArray[np.float64]
 _ARC_STEP_DEG = 3.0
+_TOUCH_M = 0.05  # houses of a row stand wall to wall
+_PLOT_STEP_M = 0.5
 
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box on the ground: centre, heading, (length, width, height), a variant number.
+    """What stands upright on the ground and can be hit: kind, centre, heading, size, variant.
 
-    Convention: length runs along the heading. A house shows its front to its right.
+    Convention: `size_m` is (length, width, height), length runs along the heading. A house shows
+    its front to its right. The variant is any number; it chooses between looks.
     """
 
-    category: str
+    kind: Kind
     x_m: float
     y_m: float
     yaw_rad: float
     size_m: tuple[float, float, float]
     variant: int = 0
+
+    @property
+    def category(self) -> str:
+        """The class in the semantic map."""
+        return CATEGORY_OF_KIND[self.kind]
 
     @cached_property
     def footprint(self) -> Polygon:
@@ -45,6 +67,13 @@ class Box:
                 for u, v in ((forward, left), (-forward, left), (-forward, -left), (forward, -left))
             ]
         )
+
+
+class CrosswalkArea(NamedTuple):
+    """The ground of a crosswalk and the heading of the road that it crosses."""
+
+    polygon: Polygon
+    heading_rad: float
 
 
 def centreline(road: Road) -> LineString:
@@ -73,6 +102,11 @@ def centrelines(scene: Scene) -> dict[str, LineString]:
     return {road.name: centreline(road) for road in scene.roads}
 
 
+def _with_round_corners(ground: BaseGeometry, radius_m: float) -> BaseGeometry:
+    # Widening and narrowing again fills the corners that point inwards.
+    return ground.buffer(radius_m).buffer(-radius_m) if radius_m > 0 else ground
+
+
 def ribbon(line: LineString, half_width_m: float) -> Polygon:
     """Returns the ground within `half_width_m` of a line, cut square at its ends."""
     return line.buffer(half_width_m, cap_style="flat", join_style="mitre")
@@ -91,14 +125,22 @@ class Layout:
             ribbon(self.lines[road.name], road.width_m / 2 + road.sidewalk_m)
             for road in scene.roads
         ]
-        self.drivable = shapely.union_all(ribbons)
-        self.sidewalks = shapely.union_all(wide).difference(self.drivable)
+        radius = scene.corner_radius_m
+        self.drivable = _with_round_corners(shapely.union_all(ribbons), radius)
+        paved = shapely.union_all([*wide, _with_round_corners(shapely.union_all(wide), radius)])
+        self._paved = shapely.union(paved, self.drivable)
+        self.sidewalks = self._paved.difference(self.drivable)
+        self.terrain = self._terrain(scene.terrain_m)
+        self.crosswalks = tuple(self._crosswalk_area(crosswalk) for crosswalk in scene.crosswalks)
         self.zones = {zone.name: self._zone_polygon(zone) for zone in scene.zones}
         self.closures = {closure.name: self._closure_box(closure) for closure in scene.closures}
         self.buildings = self._buildings()
-        self.obstacles = tuple(
-            Box(o.category, *o.center_m, math.radians(o.yaw_deg), o.size_m) for o in scene.obstacles
-        )
+        single = [
+            Box(o.kind, *o.center_m, math.radians(o.yaw_deg), o.size_m, i)
+            for i, o in enumerate(scene.obstacles)
+        ]
+        rows = [self._obstacle_row(row) for row in scene.obstacle_rows]
+        self.obstacles = (*single, *(box for row in rows for box in row))
         shapely.prepare(self.drivable)
 
     def pose_at(self, road: str, at_m: float, offset_m: float = 0.0) -> tuple[float, float, float]:
@@ -150,33 +192,72 @@ class Layout:
         x, y, heading = self.pose_at(closure.road, closure.at_m)
         width = road.width_m + 2 * road.sidewalk_m
         size = (width, closure.depth_m, closure.height_m)
-        return Box("building", x, y, heading - math.pi / 2, size)
+        return Box("house", x, y, heading - math.pi / 2, size)
+
+    def _terrain(self, reach_m: float) -> BaseGeometry:
+        if reach_m <= 0:
+            return Polygon()
+        return shapely.box(*self._paved.bounds).buffer(reach_m).difference(self._paved)
+
+    def _crosswalk_area(self, crosswalk: Crosswalk) -> CrosswalkArea:
+        first, last = (crosswalk.at_m + side * crosswalk.depth_m / 2 for side in (-1, 1))
+        part = shapely.ops.substring(self.lines[crosswalk.road], first, last)
+        _, _, heading = self.pose_at(crosswalk.road, crosswalk.at_m)
+        return CrosswalkArea(ribbon(part, self._roads[crosswalk.road].width_m / 2), heading)
 
     def _buildings(self) -> tuple[Box, ...]:
         rng = np.random.default_rng(self.scene.layout_seed)
-        rows = [self._building_row(row, rng) for row in self.scene.building_rows]
-        return tuple(box for row in rows for box in row)
+        boxes: list[Box] = []
+        for row in self.scene.building_rows:
+            if row.side in ("start", "end"):
+                boxes.append(self._house_across(row, rng))
+            else:
+                self._add_building_row(row, rng, boxes)
+        return tuple(boxes)
 
-    def _building_row(self, row: BuildingRow, rng: np.random.Generator) -> list[Box]:
-        if row.side in ("start", "end"):
-            at = self.lines[row.road].length if row.side == "end" else 0.0
-            x, y, heading = self.pose_at(row.road, at)
-            depth, front = rng.uniform(*row.depth_m), rng.uniform(*row.front_m)
-            away = (row.setback_m + depth / 2) * (1 if row.side == "end" else -1)
-            x, y = x + away * math.cos(heading), y + away * math.sin(heading)
-            size = (front, depth, rng.uniform(*row.height_m))
-            facing = heading + math.pi / 2 * (-1 if row.side == "end" else 1)
-            return [Box("building", x, y, facing, size, int(rng.integers(1 << 16)))]
+    def _is_free(self, box: Box, houses: list[Box]) -> bool:
+        ground = box.footprint.buffer(-_TOUCH_M)
+        taken = (house.footprint for house in houses)
+        return not ground.intersects(self._paved) and not any(map(ground.intersects, taken))
+
+    def _house_across(self, row: BuildingRow, rng: np.random.Generator) -> Box:
+        at = self.lines[row.road].length if row.side == "end" else 0.0
+        x, y, heading = self.pose_at(row.road, at)
+        depth, front = rng.uniform(*row.depth_m), rng.uniform(*row.front_m)
+        away = (row.setback_m + depth / 2) * (1 if row.side == "end" else -1)
+        x, y = x + away * math.cos(heading), y + away * math.sin(heading)
+        size = (front, depth, rng.uniform(*row.height_m))
+        facing = heading + math.pi / 2 * (-1 if row.side == "end" else 1)
+        return Box("house", x, y, facing, size, int(rng.integers(1 << 16)))
+
+    def _add_building_row(
+        self, row: BuildingRow, rng: np.random.Generator, houses: list[Box]
+    ) -> None:
         side = 1.0 if row.side == "left" else -1.0
         edge = self._roads[row.road].width_m / 2 + row.setback_m
-        boxes, at = [], row.from_m
+        at = row.from_m
         while at < row.to_m:
             front, depth = rng.uniform(*row.front_m), rng.uniform(*row.depth_m)
             size = (front, depth, rng.uniform(*row.height_m))
-            jut = rng.uniform(0.0, 0.8)
-            offset = side * (edge + jut + depth / 2)
-            x, y, heading = self.pose_at(row.road, at + front / 2, offset)
-            facing = heading + (0.0 if row.side == "left" else math.pi)
-            boxes.append(Box("building", x, y, facing, size, int(rng.integers(1 << 16))))
-            at += front
-        return boxes
+            offset = side * (edge + rng.uniform(0.0, 0.8) + depth / 2)
+            variant = int(rng.integers(1 << 16))
+            while at < row.to_m:  # to the next place that is free
+                x, y, heading = self.pose_at(row.road, at + front / 2, offset)
+                facing = heading + (0.0 if row.side == "left" else math.pi)
+                house = Box("house", x, y, facing, size, variant)
+                if self._is_free(house, houses):
+                    houses.append(house)
+                    at += front
+                    break
+                at += _PLOT_STEP_M
+
+    def _obstacle_row(self, row: ObstacleRow) -> Iterator[Box]:
+        own = ribbon(self.lines[row.road], self._roads[row.road].width_m / 2)
+        taken = shapely.union_all(
+            [self.drivable.difference(own), *(box.footprint for box in self.buildings)]
+        )
+        for i, at in enumerate(np.arange(row.from_m, row.to_m, row.every_m).tolist()):
+            x, y, heading = self.pose_at(row.road, at, row.offset_m)
+            box = Box(row.kind, x, y, heading, row.size_m, i)
+            if not box.footprint.intersects(taken):
+                yield box

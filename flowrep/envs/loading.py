@@ -4,14 +4,17 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import shapely
 import yaml
-from shapely.geometry import LineString, Polygon
+from shapely.geometry import LineString, Point, Polygon
 
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs.layout import Layout, centrelines
-from flowrep.envs.scene import Piece, Scene
+from flowrep.envs.scene import CATEGORY_OF_KIND, Piece, Scene
+from flowrep.envs.scene import Path as ScenePath
 from flowrep.envs.schema import SceneError, build
 from flowrep.envs.vehicle import footprint_corners
+from flowrep.envs.way import free_ground
 from flowrep.palette import CATEGORY_ID
 
 
@@ -78,6 +81,13 @@ def _check_values(scene: Scene, source: str) -> None:
         **{f"vehicle.{k}": v for k, v in vars(scene.vehicle).items()},
         **{f"roads.{road.name}.width_m": road.width_m for road in scene.roads},
         **{f"pedestrian_groups.{g.name}.count": g.count for g in scene.pedestrian_groups},
+        **{f"obstacles[{i}].size_m": min(o.size_m) for i, o in enumerate(scene.obstacles)},
+        **{
+            f"obstacle_rows[{i}].{key}": value
+            for i, row in enumerate(scene.obstacle_rows)
+            for key, value in (("size_m", min(row.size_m)), ("every_m", row.every_m))
+        },
+        **{f"crosswalks[{i}].depth_m": c.depth_m for i, c in enumerate(scene.crosswalks)},
     }
     for key, value in positive.items():
         if value <= 0:
@@ -86,6 +96,9 @@ def _check_values(scene: Scene, source: str) -> None:
         raise SceneError(source, "camera.fov_deg", f"is {scene.camera.fov_deg}", "stay in (0, 180)")
     if scene.camera.far_m <= scene.camera.near_m:
         raise SceneError(source, "camera.far_m", "is not beyond near_m", "give a larger far_m")
+    for key in ("terrain_m", "corner_radius_m"):
+        if getattr(scene, key) < 0:
+            raise SceneError(source, key, f"is {getattr(scene, key)}", "give 0 or more")
     if scene.num_pedestrians > 255:
         problem = f"{scene.num_pedestrians} people, but instance ids are 8 bits"
         raise SceneError(source, "pedestrian_groups", problem, "keep to 255")
@@ -117,7 +130,13 @@ def _check_piece(piece: Piece, source: str, key: str) -> None:
 
 def _check_names(scene: Scene, source: str) -> None:
     _known(source, "categories", scene.categories, CATEGORY_ID)
-    used = {"obstacles": [o.category for o in scene.obstacles], "scene": ["sky", "road"]}
+    used = {
+        "scene": ["sky", "road"],
+        "obstacles": [CATEGORY_OF_KIND[o.kind] for o in scene.obstacles],
+        "obstacle_rows": [CATEGORY_OF_KIND[row.kind] for row in scene.obstacle_rows],
+        "crosswalks": ["crosswalk"] * bool(scene.crosswalks),
+        "terrain_m": ["terrain"] * (scene.terrain_m > 0),
+    }
     if any(road.sidewalk_m > 0 for road in scene.roads):
         used["roads"] = ["sidewalk"]
     if scene.pedestrian_groups:
@@ -141,8 +160,8 @@ def _check_names(scene: Scene, source: str) -> None:
         _known(source, f"paths.{path.name}", [path.start, path.end], zones)
         closures = [closure.name for closure in scene.closures]
         _known(source, f"paths.{path.name}.closures", path.closures, closures)
-    for key, items in (("building_rows", scene.building_rows), ("closures", scene.closures)):
-        _known(source, f"{key}.road", [item.road for item in items], roads)
+    for key in ("building_rows", "obstacle_rows", "closures", "crosswalks"):
+        _known(source, f"{key}.road", [item.road for item in getattr(scene, key)], roads)
     for group in scene.pedestrian_groups:
         key = f"pedestrian_groups.{group.name}.walk"
         needed = {
@@ -172,22 +191,48 @@ def _check_ground(scene: Scene, source: str) -> None:
             problem = f"[{zone.from_m}, {zone.to_m}] m is not on road {zone.road!r}"
             remedy = f"stay within 0 and {lengths[zone.road]:.1f}, from_m below to_m"
             raise SceneError(source, f"zones.{zone.name}", problem, remedy)
+    for i, crosswalk in enumerate(scene.crosswalks):
+        if not 0 <= crosswalk.at_m <= lengths[crosswalk.road]:
+            problem = f"{crosswalk.at_m} m is not on road {crosswalk.road!r}"
+            remedy = f"stay within 0 and {lengths[crosswalk.road]:.1f}"
+            raise SceneError(source, f"crosswalks[{i}].at_m", problem, remedy)
     layout = Layout(scene)
+    _check_paths(layout, source)
+    _check_walks(layout, source)
+
+
+def _check_paths(layout: Layout, source: str) -> None:
     solid = [*layout.buildings, *layout.obstacles]
-    for path in scene.paths:
+    for path in layout.scene.paths:
         key = f"paths.{path.name}"
         blocks = [*solid, *(layout.closures[name] for name in path.closures)]
-        footprint = Polygon(footprint_corners(layout.start_state(path.start), scene.vehicle))
+        footprint = Polygon(footprint_corners(layout.start_state(path.start), layout.scene.vehicle))
         if not layout.drivable.covers(footprint):
             raise SceneError(source, key, "starts off the road", "move or widen its start zone")
         if any(box.footprint.intersects(footprint) for box in blocks):
             raise SceneError(source, key, "its start collides", "move the start or what is in it")
         if any(box.footprint.intersects(layout.zones[path.end]) for box in blocks):
             raise SceneError(source, key, "its ending zone is built over", "move what is in it")
-    for group in scene.pedestrian_groups:
+        if not _is_open(layout, path):
+            problem = f"no free road leads from {path.start!r} to {path.end!r}"
+            raise SceneError(source, key, problem, "join the roads or open a closure")
+
+
+def _is_open(layout: Layout, path: ScenePath) -> bool:
+    # Some ground that the vehicle's narrower side fits on holds both the start and the end.
+    vehicle = layout.scene.vehicle
+    room = free_ground(layout, path).buffer(-min(vehicle.width_m, vehicle.length_m) / 2)
+    start = Point(layout.start_state(path.start)[:2])
+    parts = shapely.get_parts(room)
+    return any(part.covers(start) and part.intersects(layout.zones[path.end]) for part in parts)
+
+
+def _check_walks(layout: Layout, source: str) -> None:
+    solid = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
+    for group in layout.scene.pedestrian_groups:
+        key = f"pedestrian_groups.{group.name}.walk"
         line = LineString(layout.walk_line(group.walk))
         for box in solid:
             if box.footprint.intersects(line):
                 problem = f"goes through a {box.category} at ({box.x_m:.1f}, {box.y_m:.1f})"
-                key = f"pedestrian_groups.{group.name}.walk"
                 raise SceneError(source, key, problem, "move the walk or that box")

@@ -132,18 +132,16 @@ def house_mesh(box: Box, *, both_sides: bool = False) -> Mesh:
 def obstacle_mesh(box: Box) -> Mesh:
     """Returns a plain box painted as its category is."""
     paints = {
-        "building": "roof",
+        "house": "roof",
         "tree": "leaf",
         "fence": "wood",
         "car": "car_body",
         "traffic_light": "metal",
-        "pedestrian": "shirt_red",
-        "sidewalk": "paving",
     }
     length, width, height = box.size_m
     mesh = Mesh()
     low, high = (-length / 2, -width / 2, 0.0), (length / 2, width / 2, height)
-    mesh.box(low, high, swatch(paints.get(box.category, "metal")))
+    mesh.box(low, high, swatch(paints.get(box.kind, "metal")))
     return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
 
 

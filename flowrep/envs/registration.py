@@ -2,7 +2,12 @@
 
 import gymnasium
 
-SCENE_BY_ID = {"flowrep/StraightRoad-v0": "straight_road"}
+SCENE_BY_ID = {
+    "flowrep/StraightRoad-v0": "straight_road",
+    "flowrep/STurn-v0": "s_turn",
+    "flowrep/HShapedPathways-v0": "h_shaped_pathways",
+    "flowrep/ThreeWayJunction-v0": "three_way_junction",
+}
 
 
 def register_environments() -> None:

@@ -1,15 +1,26 @@
 """What a scene is: frozen data whose field names are the YAML's keys."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from flowrep.envs.camera import CameraConfig
 from flowrep.envs.vehicle import VehicleConfig
 
 SpeedMode = Literal["low", "normal", "high"]
+Kind = Literal["house", "tree", "fence", "car", "traffic_light", "lamp_post"]
 Point = tuple[float, float]
 Range = tuple[float, float]
+
+CATEGORY_OF_KIND: dict[Kind, str] = {
+    "house": "building",
+    "tree": "tree",
+    "fence": "fence",
+    "car": "car",
+    "traffic_light": "traffic_light",
+    "lamp_post": "building",
+}
+"""The class in the semantic map of what stands in a street; there is none for lamp posts alone."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +110,10 @@ class PedestrianGroup:
 
 @dataclass(frozen=True)
 class BuildingRow:
-    """House fronts along one side of a road, or one house across its start or end."""
+    """House fronts along one side of a road, or one house across its start or end.
+
+    A house of a row stands where no road, no sidewalk and no earlier house is.
+    """
 
     road: str
     side: Literal["left", "right", "start", "end"]
@@ -113,17 +127,50 @@ class BuildingRow:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A box that stands still: what it is, where, which way it faces, (length, width, height)."""
+    """Something that stands still: what it is, where, which way it faces.
 
-    category: str
+    `size_m` is (length, width, height); length runs along the heading. It is what a vehicle can
+    hit: of a tree its trunk, of a light its post, while crown, arm and head hang above.
+    """
+
+    kind: Kind
     center_m: Point
     yaw_deg: float
     size_m: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
+class ObstacleRow:
+    """Obstacles of one kind along a road, facing along it, `offset_m` to the left of its middle.
+
+    Whatever would stand on another road than its own, or in a house, is left out.
+    """
+
+    kind: Kind
+    road: str
+    offset_m: float
+    from_m: float
+    to_m: float
+    every_m: float
+    size_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Crosswalk:
+    """Stripes over the whole width of a road, `depth_m` along it."""
+
+    road: str
+    at_m: float
+    depth_m: float
+
+
+@dataclass(frozen=True)
 class Scene:
-    """A whole environment as data; `load_scene` reads and checks one."""
+    """A whole environment as data; `load_scene` reads and checks one.
+
+    `terrain_m` is how far grass reaches beyond roads and sidewalks; 0 for none. `corner_radius_m`
+    rounds the kerb where roads meet.
+    """
 
     name: str
     frame_rate_hz: float
@@ -139,7 +186,11 @@ class Scene:
     pedestrian_groups: tuple[PedestrianGroup, ...] = ()
     building_rows: tuple[BuildingRow, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
-    closures: tuple[Closure, ...] = field(default=())
+    obstacle_rows: tuple[ObstacleRow, ...] = ()
+    closures: tuple[Closure, ...] = ()
+    crosswalks: tuple[Crosswalk, ...] = ()
+    terrain_m: float = 0.0
+    corner_radius_m: float = 0.0
 
     @property
     def time_limit_s(self) -> float:

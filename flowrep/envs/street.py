@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from flowrep.envs import meshes, paint
@@ -106,26 +107,37 @@ class Street:
 
     def _add_ground(self, layout: Layout) -> None:
         road = meshes.Mesh()
-        road.ground(layout.drivable, 0.0, "asphalt")
+        striped = shapely.union_all([area.polygon for area in layout.crosswalks])
+        road.ground(layout.drivable.difference(striped), 0.0, "asphalt")
         for line in layout.lines.values():
             road.add(meshes.lane_marks(line))
         self.simulator.add_body(road, "road")
+        for ground, colour, category in (
+            (striped, "lane_mark", "crosswalk"),
+            (layout.terrain, "grass", "terrain"),
+        ):
+            if not ground.is_empty:
+                mesh = meshes.Mesh()
+                mesh.ground(ground, 0.0, colour)
+                self.simulator.add_body(mesh, category)
         if not layout.sidewalks.is_empty:
-            # The paving runs on under the houses, so that no gap opens between them.
+            paved = layout.sidewalks
+            if layout.terrain.is_empty:
+                # The paving runs on under the houses, so that no gap opens between them.
+                paved = paved.buffer(2.0).difference(layout.drivable)
             paving = meshes.Mesh()
-            paving.ground(layout.sidewalks.buffer(2.0).difference(layout.drivable), 0.0, "paving")
+            paving.ground(paved, 0.0, "paving")
             self.simulator.add_body(paving, "sidewalk")
 
     def _add_solids(self, layout: Layout) -> None:
         by_category: dict[str, list[Box]] = {}
         for box in (*layout.buildings, *layout.obstacles):
             by_category.setdefault(box.category, []).append(box)
-        houses = set(map(id, layout.buildings))
         for category, boxes in by_category.items():
             for first in range(0, len(boxes), _BOXES_A_BODY):
                 mesh, chunk = meshes.Mesh(), boxes[first : first + _BOXES_A_BODY]
                 for box in chunk:
-                    is_house = id(box) in houses
+                    is_house = box.kind == "house"
                     mesh.add(meshes.house_mesh(box) if is_house else meshes.obstacle_mesh(box))
                 self._solids.append(self._add_solid(mesh, category, chunk))
 
