@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 import yaml
 
 from flowrep.envs import Planner, SceneError, drives, load_scene
@@ -93,6 +94,56 @@ def test_the_planner_drives_a_scene_it_was_not_made_for(make_street):
     env = make_street(CROSSROADS, sensors=())
     outcomes = [drive.outcome for drive in drives(env, Planner(), 6, seed=0)]
     assert outcomes.count("success") >= 5
+
+
+def test_corners_are_rounded_where_roads_meet(data):
+    stem, east, north = data["roads"]
+    roads = [
+        stem,
+        east | {"pieces": [{"straight_m": 40.0}]},
+        north | {"heading_deg": 90.0, "pieces": [{"straight_m": 60.0}]},
+    ]
+    zones = [data["zones"][0], {"name": "east", "road": "to_left", "from_m": 30.0, "to_m": 38.0}]
+    data |= {"roads": roads, "zones": zones, "pedestrian_groups": [], "obstacles": []}
+    data |= {"paths": [{"name": "on", "start": "south", "end": "east"}], "closures": []}
+    square, rounded = (
+        Layout(load_scene(data | {"corner_radius_m": radius})).drivable for radius in (0.0, 4.0)
+    )
+    # The northern road's left edge x = 31.5 meets the eastern road's upper edge y = 3.5: the circle
+    # of radius 4 that touches both has its centre at (27.5, 7.5) and leaves (1 - π/4)·4² of ground;
+    # so it is on the other side.
+    assert rounded.area - square.area == pytest.approx(2 * (1 - math.pi / 4) * 16, rel=0.02)
+    assert rounded.contains(shapely.Point(31.0, 4.0))
+    assert not rounded.contains(shapely.Point(28.0, 7.0))
+
+
+def test_rows_leave_out_what_would_stand_in_the_way(data):
+    row = {"kind": "car", "road": "stem", "offset_m": 4.0, "from_m": 2.0, "to_m": 60.0}
+    row |= {"every_m": 10.0, "size_m": [4.0, 1.8, 1.5]}
+    layout = Layout(load_scene(data | {"obstacle_rows": [row], "obstacles": []}))
+    # At 2, 12, 22, 32, ...: the stem's 40 m and the arms that begin at 35 m leave the first four.
+    np.testing.assert_allclose([box.x_m for box in layout.obstacles], [2, 12, 22, 32])
+    assert {(box.kind, box.category, box.y_m) for box in layout.obstacles} == {("car", "car", 4.0)}
+
+
+def test_houses_keep_clear_of_roads_and_of_one_another():
+    for name in ("s_turn", "h_shaped_pathways", "three_way_junction"):
+        layout = Layout(load_scene(name))
+        for i, house in enumerate(layout.buildings):
+            ground = house.footprint.buffer(-0.06)
+            assert not ground.intersects(layout.drivable)
+            across = [row for row in layout.scene.building_rows if row.side in ("start", "end")]
+            clashes = [o for o in layout.buildings[:i] if ground.intersects(o.footprint)]
+            assert len(clashes) <= 2 * len(across)
+        assert len(layout.buildings) > 20
+
+
+def test_a_crosswalk_covers_its_stretch_of_road(data):
+    data["categories"].append("crosswalk")
+    crosswalk = {"road": "to_left", "at_m": 50.0, "depth_m": 3.0}
+    (area,) = Layout(load_scene(data | {"crosswalks": [crosswalk]})).crosswalks
+    assert area.polygon.area == pytest.approx(3.0 * 7.0)
+    assert area.heading_rad == pytest.approx(math.pi / 2)
 
 
 def refuse(data, **changes):
@@ -184,6 +235,30 @@ def refuse(data, **changes):
         (
             {"obstacles__0__center_m": [25.0, 0.0]},
             "pedestrian_groups.across.walk: goes through a car",
+        ),
+        (
+            {"pedestrian_groups__0__walk__to_m": 60.0},
+            "pedestrian_groups.along.walk: goes through a building at",
+        ),
+        (
+            {"paths__0__closures": ["left_arm"]},
+            "paths.left: no free road leads from 'south' to 'west'; join the roads or open",
+        ),
+        ({"obstacles__0__kind": "lorry"}, "obstacles[0].kind: unknown value 'lorry'; choose one"),
+        ({"obstacles__0__size_m": [4, 0, 1]}, "obstacles[0].size_m: is 0.0; give a number above"),
+        ({"terrain_m": 9.0}, "terrain_m: unknown name 'terrain'; choose from ['sky', "),
+        ({"terrain_m": -1.0}, "terrain_m: is -1.0; give 0 or more"),
+        ({"corner_radius_m": -1.0}, "corner_radius_m: is -1.0; give 0 or more"),
+        (
+            {"crosswalks": [{"road": "stem", "at_m": 20.0, "depth_m": 3.0}]},
+            "crosswalks: unknown name 'crosswalk'; choose from ['sky', ",
+        ),
+        (
+            {
+                "crosswalks": [{"road": "stem", "at_m": 50.0, "depth_m": 3.0}],
+                "categories": "sky road sidewalk building pedestrian car crosswalk".split(),
+            },
+            "crosswalks[0].at_m: 50.0 m is not on road 'stem'; stay within 0 and 40.0",
         ),
     ],
 )

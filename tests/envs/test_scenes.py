@@ -1,0 +1,118 @@
+"""The paper's four environments: Table I, their paths, what is seen there, that they are fair.
+
+Counts are small here; `benchmarks/scene_validity.py` runs hundreds of episodes a cell.
+"""
+
+import gymnasium
+import numpy as np
+import pytest
+import shapely
+from gymnasium.utils.env_checker import check_env
+
+from flowrep.envs import Planner, RandomDriver, drives, load_scene, never_turn, scene_names
+from flowrep.envs.layout import Layout
+from flowrep.envs.registration import SCENE_BY_ID
+from flowrep.envs.way import free_ground
+from flowrep.palette import CATEGORY_ID
+
+PEOPLE = {"across", "along", "standing"}
+# Paper, Table I: steps, paths, lane width factor, categories, kinds of pedestrians, α in °/s².
+TABLE_1 = {
+    "straight_road": (200, 1, 2.0, 5, {"across"}, 35.0),
+    "s_turn": (250, 2, 1.5, 6, {"across"}, 70.0),
+    "h_shaped_pathways": (300, 4, 2.0, 7, PEOPLE, 70.0),
+    "three_way_junction": (250, 2, 1.0, 11, {"along"}, 70.0),
+}
+LANE_M = 3.5  # one unit of the lane width factor
+TURNING = [name for name in TABLE_1 if name != "straight_road"]
+
+
+def kinds_of_people(scene):
+    kinds = set()
+    for group in scene.pedestrian_groups:
+        if group.standing:
+            kinds.add("standing")
+        if group.standing < group.count:
+            kinds.add(group.walk.kind)
+    return kinds
+
+
+@pytest.mark.parametrize("name", TABLE_1)
+def test_a_scene_has_the_numbers_of_the_paper(name):
+    steps, paths, lane, categories, people, alpha = TABLE_1[name]
+    scene = load_scene(name)
+    assert scene.time_limit_steps == steps
+    assert len(scene.paths) == paths
+    assert {road.width_m for road in scene.roads} == {lane * LANE_M}
+    assert len(scene.categories) == categories
+    assert kinds_of_people(scene) == people
+    assert scene.vehicle.yaw_acceleration_dps2 == alpha
+    assert (scene.vehicle.speed_mps, scene.frame_rate_hz) == (10.0, 12.0)
+    has_obstacles = bool(scene.obstacles or scene.obstacle_rows)
+    assert has_obstacles == (name == "three_way_junction")
+    speeds = {"low": (0.6, 1.0), "normal": (1.2, 1.8), "high": (2.0, 2.4)}
+    assert scene.pedestrian_speed_mps == speeds
+
+
+def test_the_four_scenes_are_those_of_the_paper():
+    assert set(scene_names()) == set(SCENE_BY_ID.values()) == set(TABLE_1)
+
+
+@pytest.mark.parametrize("env_id", SCENE_BY_ID)
+def test_gymnasium_makes_and_checks_every_scene(env_id):
+    env = gymnasium.make(env_id)
+    assert env.unwrapped.scene.name == SCENE_BY_ID[env_id]
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize("name", TURNING)
+def test_every_path_is_drawn_equally_often(make_street, name):
+    env = make_street(name, sensors=())
+    draws = 400
+    drawn = [env.reset(seed=5 if i == 0 else None)[1]["path"] for i in range(draws)]
+    expected = draws / len(env.scene.paths)
+    for path in env.scene.paths:
+        # Four standard deviations of a binomial count.
+        spread = 4 * (expected * (1 - 1 / len(env.scene.paths))) ** 0.5
+        assert abs(drawn.count(path.name) - expected) < spread
+
+
+@pytest.mark.parametrize("name", ["h_shaped_pathways", "three_way_junction"])
+def test_the_only_way_out_is_the_path_s_own_ending_zone(name):
+    layout = Layout(load_scene(name))
+    for path in layout.scene.paths:
+        start = shapely.Point(layout.start_state(path.start)[:2])
+        (reached,) = [
+            part for part in shapely.get_parts(free_ground(layout, path)) if part.covers(start)
+        ]
+        ends = {
+            other.end for other in layout.scene.paths if reached.intersects(layout.zones[other.end])
+        }
+        assert ends == {path.end}
+
+
+@pytest.mark.parametrize("name", TABLE_1)
+def test_every_category_is_seen_on_a_drive(make_street, name):
+    env = make_street(name, sensors=("semantic",))
+    planner, pixels = Planner(), np.zeros(len(CATEGORY_ID), dtype=int)
+    observation, _ = env.reset(seed=1)
+    ended = False
+    while not ended:
+        observation, _, ended, _, _ = env.step(planner(env))
+        pixels += np.bincount(observation["semantic"].ravel(), minlength=len(pixels))
+    seen = {category for category, number in CATEGORY_ID.items() if pixels[number]}
+    assert seen == set(env.scene.categories)
+
+
+@pytest.mark.parametrize("name", TURNING)
+@pytest.mark.parametrize("speed", ["low", "normal", "high"])
+def test_the_planner_arrives_and_habit_and_chance_do_not(make_street, name, speed):
+    env = make_street(name, speed=speed, sensors=())
+    planned = [drive.outcome for drive in drives(env, Planner(), 3, seed=0)]
+    assert planned == ["success"] * 3
+    # A bend ahead: straight on leads off the road or into somebody.
+    straight = [drive.outcome for drive in drives(env, never_turn, 20, seed=0)]
+    assert straight.count("success") == 0
+    by_chance = [drive.outcome for drive in drives(env, RandomDriver(0), 20, seed=0)]
+    assert by_chance.count("success") == 0
