@@ -75,3 +75,15 @@ def test_run_folders_are_named_by_scene_representations_and_seed():
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         config = compose("train", ["representations=[ego,obj]", "seed=3"], return_hydra_config=True)
     assert config.hydra.run.dir.endswith("_straight_road_ego+obj_s3")
+
+
+def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
+    from flowrep.build import build_env
+
+    crossroads = CONF_DIR.parent / "tests" / "envs" / "crossroads.yaml"
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "mine.yaml").write_text(crossroads.read_text())
+    config = composed(f"hydra.searchpath=[file://{tmp_path}]", "scene=mine", "num_envs=1")
+    env = build_env(config, device="cpu")
+    assert env.rollout(2)["ego"].shape == (1, 2, 2, 40, 60)
+    env.close()

@@ -13,6 +13,7 @@ from flowrep.envs import Planner, SceneError, drives, load_scene
 from flowrep.envs.layout import Layout
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
+CATEGORIES = ["sky", "road", "sidewalk", "building", "pedestrian", "car"]
 
 
 @pytest.fixture
@@ -256,7 +257,15 @@ def refuse(data, **changes):
         (
             {
                 "crosswalks": [{"road": "stem", "at_m": 50.0, "depth_m": 3.0}],
-                "categories": "sky road sidewalk building pedestrian car crosswalk".split(),
+                "categories": [
+                    "sky",
+                    "road",
+                    "sidewalk",
+                    "building",
+                    "pedestrian",
+                    "car",
+                    "crosswalk",
+                ],
             },
             "crosswalks[0].at_m: 50.0 m is not on road 'stem'; stay within 0 and 40.0",
         ),
