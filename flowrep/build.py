@@ -34,6 +34,7 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
     arguments = {
         "scene": config["scene"],
         "representations": config["representations"],
+        "flow": config.get("flow", "exact"),  # runs of before there was a choice have none
         "num_envs": config["num_envs"],
         "device": choose_device(config["device"]),
         "speed": config["speed"],

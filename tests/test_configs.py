@@ -87,3 +87,24 @@ def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
     env = build_env(config, device="cpu")
     assert env.rollout(2)["ego"].shape == (1, 2, 2, 40, 60)
     env.close()
+
+
+def test_flow_is_exact_unless_an_estimate_is_asked_for():
+    assert composed()["flow"] == {"source": "exact"}
+    estimated = composed("flow=estimated", "flow.preset=fast")["flow"]
+    assert estimated == {
+        "source": "estimated",
+        "estimator": "dis",
+        "weights": None,
+        "preset": "fast",
+        "min_side_px": 160,
+    }
+
+
+def test_estimated_flow_spells_out_the_transforms_defaults():
+    from flowrep.transforms import EstimatedFlow
+
+    options = composed("flow=estimated")["flow"]
+    del options["source"]
+    parameters = inspect.signature(EstimatedFlow).parameters
+    assert options == {name: parameters[name].default for name in options}

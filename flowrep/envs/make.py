@@ -88,6 +88,7 @@ def make_env(
     frame_rate_hz: float | None = None,
     seed: int | None = None,
     keep_sensor: bool = False,
+    flow: str | Mapping[str, Any] = "exact",
 ) -> TransformedEnv:
     """Returns a TorchRL env of streets stepped side by side, always of batch size [num_envs].
 
@@ -105,6 +106,8 @@ def make_env(
         frame_rate_hz: steps a second; the scene's own if None.
         seed: seeds the envs, which draw their episodes from it; None leaves that to `set_seed`.
         keep_sensor: whether all ("sensor", ...) keys stay beside the representations.
+        flow: "exact" or "estimated", where raw and obj come from; a mapping gives options, see
+            `flowrep.transforms.representation_stack`.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -122,6 +125,7 @@ def make_env(
             intrinsics=torch.from_numpy(probe.K),
             num_classes=probe.num_classes,
             dt_s=1.0 / probe.frame_rate_hz,
+            flow=flow,
         )
     probe.close()
     sensors = _sensors_read(transforms)

@@ -39,11 +39,14 @@ def film_episode(env: EnvBase, policy: Policy) -> tuple[list[Maps], str]:
 def maps_of(tensordict: TensorDictBase, intrinsics: Tensor) -> Maps:
     """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` of one street's step.
 
-    Flow is in px/step, whatever unit and scale the agent's own representations have.
+    Flow is in px/step, whatever unit and scale the agent's own representations have. Raw flow is
+    the estimate where the agent lives on one, the exact one otherwise.
     """
     sensor = tensordict["sensor"][0].cpu()
     depth = sensor["depth"]
-    raw, _ = rigid_flow(depth, sensor["instance"], intrinsics, sensor["instance_motion"])
+    raw = sensor.get("flow", None)
+    if raw is None:
+        raw, _ = rigid_flow(depth, sensor["instance"], intrinsics, sensor["instance_motion"])
     ego, obj, _ = factorize(raw, depth, intrinsics, sensor["prev_from_curr"])
     return {
         "rgb": sensor["rgb"],

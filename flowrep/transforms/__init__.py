@@ -1,8 +1,11 @@
 """TorchRL transforms that turn sensor maps into mid-level representations."""
 
 from flowrep.transforms.depth import Depth
+from flowrep.transforms.dis import DIS
+from flowrep.transforms.estimated_flow import EstimatedFlow
 from flowrep.transforms.flow_factorize import FlowFactorize
 from flowrep.transforms.frame_stack import FrameStack
+from flowrep.transforms.raft import RAFT
 from flowrep.transforms.raw_flow import RawFlow
 from flowrep.transforms.rgb import Rgb
 from flowrep.transforms.segmentation import Segmentation
@@ -13,8 +16,11 @@ from flowrep.transforms.stack import (
 )
 
 __all__ = [
+    "DIS",
+    "RAFT",
     "REPRESENTATIONS",
     "Depth",
+    "EstimatedFlow",
     "FlowFactorize",
     "FrameStack",
     "RawFlow",

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
-from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -168,3 +169,10 @@ def _is_kind(dtype: torch.dtype, kind: str) -> bool:
     if kind == "integer":
         return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
     return True
+
+
+def unknown_name(what: str, name: str, known: Sequence[str] | Mapping[str, Any]) -> str:
+    """Returns the sentence about a name that isn't known, with the closest of those that are."""
+    close = difflib.get_close_matches(str(name), list(known), n=1)
+    hint = f", did you mean {close[0]!r}?" if close else "."
+    return f"unknown {what} {name!r}{hint} There are {list(known)}"

@@ -20,7 +20,7 @@ class FlowTransform(MapTransform):
     """What flow transforms share: the intrinsics K, the outputs chosen and their unit.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps that are read, in pixels.
+        intrinsics: K `[3, 3]` of the maps that are read, in pixels; None where flow needs none.
         reads: as in `MapTransform`.
         outputs: which of the class's outputs are written, in this order.
         scale: factor on every flow, or one an output.
@@ -35,7 +35,7 @@ class FlowTransform(MapTransform):
 
     def __init__(
         self,
-        intrinsics: Intrinsics,
+        intrinsics: Intrinsics | None,
         reads: Sequence[Reads],
         *,
         outputs: Sequence[str],
@@ -58,7 +58,8 @@ class FlowTransform(MapTransform):
         units = _per_output("unit", unit, flows)
         self.factors = {name: _factor(scales[name], units[name], dt_s) for name in flows}
         self.compiled = bool(compiled)
-        self.register_buffer("K", _as_intrinsics(intrinsics), persistent=False)
+        if intrinsics is not None:
+            self.register_buffer("K", _as_intrinsics(intrinsics), persistent=False)
 
     def _in_unit(self, name: str, flow: Tensor) -> Tensor:
         factor = self.factors[name]

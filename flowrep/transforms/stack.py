@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
 from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
 
+from flowrep.transforms.base import unknown_name
 from flowrep.transforms.depth import Depth
 from flowrep.transforms.flow import Intrinsics
 from flowrep.transforms.flow_factorize import FlowFactorize
+from flowrep.transforms.flow_source import (
+    ESTIMATED_FLOW_KEY,
+    PICTURES_KEY,
+    estimated_flow_makers,
+    estimator_options,
+    exact_flow_makers,
+)
 from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.raw_flow import RawFlow
 from flowrep.transforms.rgb import Rgb
@@ -41,8 +47,6 @@ _WIRING = {
     "compiled",
 }  # fmt: skip
 
-_UNSCALED = "_raw"  # raw flow in px/step, nan where unknown: what FlowFactorize reads
-
 
 def representation_options(name: str) -> dict[str, Any]:
     """Returns a representation's options with their defaults, e.g. `range_m` of depth.
@@ -55,7 +59,7 @@ def representation_options(name: str) -> dict[str, Any]:
         {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
     if name not in _MADE_BY:
-        raise ValueError(_unknown("representation", name, REPRESENTATIONS))
+        raise ValueError(unknown_name("representation", name, REPRESENTATIONS))
     return {
         parameter.name: parameter.default
         for made_by in _MADE_BY[name]
@@ -71,19 +75,27 @@ def representation_stack(
     num_classes: int | None = None,
     dt_s: float | None = None,
     compiled: bool = False,
+    flow: str | Mapping[str, Any] = "exact",
 ) -> Compose:
     """Returns the transforms that write the representations at the root of the TensorDict.
 
     What several of them need is computed once: `["ego", "obj"]` factorises once, `["seg", "seg2"]`
-    encodes once. What is computed on the way and wasn't asked for is dropped again.
+    encodes once. What is computed on the way and wasn't asked for is dropped again, but for what
+    the next step needs (the pictures behind estimated flow) and `("sensor", "flow")`, estimated
+    flow in px/step.
 
     Args:
         representations: names, or a mapping from name to options (`representation_options`); a
             name is one of `REPRESENTATIONS`, its key in the TensorDict is the same.
-        intrinsics: K `[3, 3]` of the sensor maps in pixels; raw, ego and obj need it.
+        intrinsics: K `[3, 3]` of the sensor maps in pixels; raw, ego and obj need it, save for
+            estimated raw flow.
         num_classes: number of semantic classes; seg and seg2 need it.
         dt_s: seconds a step lasts; flow in `px_per_s` needs it.
         compiled: whether flow is computed through `torch.compile`.
+        flow: where raw flow, and with it obj, comes from: `"exact"` (`RawFlow`), `"estimated"`
+            (`EstimatedFlow`, from `("sensor", "rgb")`), or a mapping with one of them as
+            `source` and `EstimatedFlow`'s own options beside it. Ego flow is exact either way:
+            it takes depth and the camera's motion alone.
 
     Raises:
         ValueError: for an unknown or repeated name, an unknown option, or a missing argument.
@@ -97,14 +109,19 @@ def representation_stack(
     chosen = _with_options(representations)
     if num_classes is None and ("seg" in chosen or "seg2" in chosen):
         raise ValueError("representations seg and seg2 need num_classes=")
-    if intrinsics is None and any(name in chosen for name in _FLOWS):
+    estimator = estimator_options(flow)
+    flows = {name: chosen[name] for name in _FLOWS if name in chosen}
+    if intrinsics is None and flows and not (estimator is not None and set(flows) == {"raw"}):
         raise ValueError(f"representations {', '.join(_FLOWS)} need intrinsics=, the camera's K")
     makers = _frame_makers(chosen, num_classes)
-    if intrinsics is not None:
-        flows = {name: chosen[name] for name in _FLOWS if name in chosen}
-        makers += _flow_makers(flows, intrinsics, {"dt_s": dt_s, "compiled": compiled})
+    context = {"dt_s": dt_s, "compiled": compiled}
+    if estimator is not None:
+        makers += estimated_flow_makers(flows, estimator, intrinsics, context)
+    elif intrinsics is not None:
+        makers += exact_flow_makers(flows, intrinsics, context)
     written = [key for maker in makers for key in maker.out_keys]
-    hidden = [key for key in written if key not in chosen]
+    kept = [*chosen, PICTURES_KEY, ESTIMATED_FLOW_KEY]
+    hidden = [key for key in written if key not in kept]
     return Compose(*makers, *([DropKeys(*hidden)] if hidden else []))
 
 
@@ -136,18 +153,14 @@ def _with_options(
             raise ValueError(f"options of representation {name!r} are a mapping, got {own!r}")
         for option, value in own.items():
             if option not in options:
-                raise ValueError(_unknown(f"option of representation {name!r}:", option, options))
+                raise ValueError(
+                    unknown_name(f"option of representation {name!r}:", option, options)
+                )
             options[option] = value
         chosen[name] = options
     if not chosen:
         raise ValueError(f"no representation is named; there are {list(REPRESENTATIONS)}")
     return chosen
-
-
-def _unknown(what: str, name: str, known: Sequence[str] | Mapping[str, Any]) -> str:
-    close = difflib.get_close_matches(str(name), list(known), n=1)
-    hint = f", did you mean {close[0]!r}?" if close else "."
-    return f"unknown {what} {name!r}{hint} There are {list(known)}"
 
 
 def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) -> list[Transform]:
@@ -169,27 +182,3 @@ def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) ->
             frame_options["num_classes"] = num_classes
         makers.append(_MADE_BY[frame][-1](**frame_options, out_keys=key))
     return makers + stacks
-
-
-def _flow_makers(
-    flows: dict[str, dict[str, Any]], intrinsics: Intrinsics, context: dict[str, Any]
-) -> list[Transform]:
-    """Returns one RawFlow, if raw flow is needed, and one FlowFactorize, if a factor is."""
-    if "obj" in flows:
-        raw = RawFlow(intrinsics, invalid=math.nan, out_keys=_UNSCALED, **context)
-        raw.label = "'obj'"
-        factors = FlowFactorize(
-            intrinsics,
-            outputs=list(flows),
-            scale={name: options["scale"] for name, options in flows.items()},
-            unit={name: options["unit"] for name, options in flows.items()},
-            in_keys=[_UNSCALED, ("sensor", "depth"), ("sensor", "prev_from_curr")],
-            **context,
-        )
-        return [raw, factors]
-    makers: list[Transform] = []
-    if "raw" in flows:
-        makers.append(RawFlow(intrinsics, **flows["raw"], **context))
-    if "ego" in flows:
-        makers.append(FlowFactorize(intrinsics, outputs=["ego"], **flows["ego"], **context))
-    return makers

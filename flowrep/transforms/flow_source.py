@@ -1,0 +1,98 @@
+"""Where raw flow comes from: the transforms behind raw, ego and obj, by source."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from tensordict.utils import NestedKey
+from torchrl.envs.transforms import Transform
+
+from flowrep.transforms.base import unknown_name
+from flowrep.transforms.estimated_flow import EstimatedFlow
+from flowrep.transforms.flow import Intrinsics
+from flowrep.transforms.flow_factorize import FlowFactorize
+from flowrep.transforms.frame_stack import FrameStack
+from flowrep.transforms.raw_flow import RawFlow
+
+_UNSCALED = "_raw"  # raw flow in px/step, nan where unknown: what FlowFactorize reads
+PICTURES_KEY = "_rgb2"  # the previous picture and this one: stays, since the next step needs it
+ESTIMATED_FLOW_KEY = ("sensor", "flow")  # the same as _UNSCALED where raw flow is estimated
+
+FLOW_SOURCES = ("exact", "estimated")
+_ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px")
+
+
+def estimator_options(flow: str | Mapping[str, Any]) -> dict[str, Any] | None:
+    """Returns `EstimatedFlow`'s options, None where flow is exact."""
+    options: dict[str, Any] = {"source": flow} if isinstance(flow, str) else dict(flow)
+    source = options.pop("source", None)
+    if source not in FLOW_SOURCES:
+        raise ValueError(unknown_name("source of flow", source, FLOW_SOURCES))
+    known = _ESTIMATOR_OPTIONS if source == "estimated" else ()
+    for option in options:
+        if option not in known:
+            raise ValueError(unknown_name(f"option of {source} flow:", option, known))
+    return options if source == "estimated" else None
+
+
+def estimated_flow_makers(
+    flows: dict[str, dict[str, Any]],
+    estimator: dict[str, Any],
+    intrinsics: Intrinsics | None,
+    context: dict[str, Any],
+) -> list[Transform]:
+    """Returns what `exact_flow_makers` does, with raw flow from the pictures."""
+    makers: list[Transform] = []
+    factors = {name: options for name, options in flows.items() if name != "raw"}
+    if "raw" in flows or "obj" in flows:
+        raw_options = flows.get("raw", {})
+        raw = EstimatedFlow(
+            **estimator,
+            outputs=["unscaled", "raw"] if "raw" in flows else ["unscaled"],
+            **raw_options,
+            dt_s=context["dt_s"],
+            in_keys=PICTURES_KEY,
+            out_keys=[ESTIMATED_FLOW_KEY, "raw"] if "raw" in flows else [ESTIMATED_FLOW_KEY],
+        )
+        pictures = FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=[PICTURES_KEY])
+        pictures.label = raw.label = "raw and obj by estimated flow"
+        makers += [pictures, raw]
+    if factors and intrinsics is not None:
+        reads: list[NestedKey] = [("sensor", "depth"), ("sensor", "prev_from_curr")]
+        makers.append(
+            FlowFactorize(
+                intrinsics,
+                outputs=list(factors),
+                scale={name: options["scale"] for name, options in factors.items()},
+                unit={name: options["unit"] for name, options in factors.items()},
+                in_keys=[ESTIMATED_FLOW_KEY, *reads] if "obj" in factors else reads,
+                **context,
+            )
+        )
+    return makers
+
+
+def exact_flow_makers(
+    flows: dict[str, dict[str, Any]], intrinsics: Intrinsics, context: dict[str, Any]
+) -> list[Transform]:
+    """Returns one RawFlow, if raw flow is needed, and one FlowFactorize, if a factor is."""
+    if "obj" in flows:
+        raw = RawFlow(intrinsics, invalid=math.nan, out_keys=_UNSCALED, **context)
+        raw.label = "'obj'"
+        factors = FlowFactorize(
+            intrinsics,
+            outputs=list(flows),
+            scale={name: options["scale"] for name, options in flows.items()},
+            unit={name: options["unit"] for name, options in flows.items()},
+            in_keys=[_UNSCALED, ("sensor", "depth"), ("sensor", "prev_from_curr")],
+            **context,
+        )
+        return [raw, factors]
+    makers: list[Transform] = []
+    if "raw" in flows:
+        makers.append(RawFlow(intrinsics, **flows["raw"], **context))
+    if "ego" in flows:
+        makers.append(FlowFactorize(intrinsics, outputs=["ego"], **flows["ego"], **context))
+    return makers

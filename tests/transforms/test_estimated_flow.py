@@ -1,0 +1,243 @@
+"""Estimated flow: sign, grid, channel order, sizes and units, by textures shifted by hand."""
+
+from __future__ import annotations
+
+import functools
+import sys
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torch.nn import functional
+from torchrl.envs import ParallelEnv, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from flowrep.geometry import ego_flow
+from flowrep.transforms import DIS, EstimatedFlow, FrameStack, representation_stack
+from tests.transforms.contract import TransformContract
+from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
+
+PICTURES = {"in_keys": [("sensor", "rgb")], "out_keys": ["rgb2"]}
+
+
+def texture(height: int, width: int, seed: int = 0) -> Tensor:
+    """Returns smooth colour noise, uint8 [3, H, W], without symmetry or period."""
+    noise = torch.rand(1, 3, height // 4, width // 4, generator=torch.Generator().manual_seed(seed))
+    smooth = functional.interpolate(noise, size=(height, width), mode="bicubic")
+    return (255 * smooth[0].clamp(0, 1)).to(torch.uint8)
+
+
+def shifted_pair(height: int, width: int, right: int, down: int, seed: int = 0) -> Tensor:
+    """Returns previous and current picture: between them all went `right` and `down`."""
+    large = texture(height + 16, width + 16, seed)
+    window = (slice(8, 8 + height), slice(8, 8 + width))
+    now = large.roll((down, right), (-2, -1))[:, window[0], window[1]]
+    return torch.cat([large[:, window[0], window[1]], now])
+
+
+def pixel_steps(first: Tensor, second: Tensor) -> Tensor:
+    """An estimator worked by hand: by how much the first picture is brighter."""
+    return first[:, :2].float() - second[:, :2].float()
+
+
+class TestEstimatedFlow(TransformContract):
+    """FakeSensorEnv's pictures brighten by 1 a step, and the previous one is at hand."""
+
+    def oracles(self):
+        return {"raw": self.minus_one_but_at_resets}
+
+    @staticmethod
+    def minus_one_but_at_resets(sensor):
+        # pixel_steps(current, previous) = 1, negated; the pair swapped would give +1.
+        step = int(sensor["rgb"][0, 0, 0])
+        return torch.full((2, *sensor["rgb"].shape[-2:]), -1.0 if step else 0.0)
+
+    def make(self):
+        return EstimatedFlow(pixel_steps)
+
+    def before(self):
+        return [FrameStack(k=2, **PICTURES)]
+
+
+pytest.importorskip("cv2", reason="DIS is OpenCV's: pip install 'flowrep[flow]'")
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (84, 60), (180, 200)])
+def test_flow_is_now_minus_before_u_right_and_v_down(height, width):
+    pair = shifted_pair(height, width, right=3, down=-2)
+    flow = EstimatedFlow()(TensorDict({"rgb2": pair}))["raw"]
+    u, v = flow[:, 8:-8, 8:-8].flatten(1).median(-1).values
+    # Rivals: sign (-3, 2), channel order (-2, 3), flow of the enlarged picture (12, -8).
+    torch.testing.assert_close(torch.stack([u, v]), torch.tensor([3.0, -2.0]), atol=0.1, rtol=0)
+
+
+def test_the_estimator_runs_from_the_current_picture_to_the_previous_one():
+    pair = shifted_pair(6, 8, right=1, down=2)
+
+    def of_the_first_grid(first, second):
+        return 1000.0 * first[:, :2] + second[:, :2]
+
+    flow = EstimatedFlow(of_the_first_grid)(TensorDict({"rgb2": pair}))["raw"]
+    previous, current = pair.float().chunk(2)
+    # Rival: the flow from the previous to the current picture lies on the previous one's grid.
+    assert torch.equal(flow, -(1000.0 * current[:2] + previous[:2]))
+
+
+def test_flow_lies_where_a_body_is_now_not_where_it_was():
+    previous = texture(200, 264)
+    current = previous.clone()
+    body = texture(100, 100, seed=1)
+    previous[:, 50:150, 50:150] = body
+    current[:, 50:150, 60:160] = body  # 10 px to the right
+    u, v = EstimatedFlow()(TensorDict({"rgb2": torch.cat([previous, current])}))["raw"]
+    # These columns are the body's now, the background's before: on the wrong grid they stand still.
+    assert u[60:140, 151:157].median() == pytest.approx(10.0, abs=0.3)
+    assert v[60:140, 151:157].median() == pytest.approx(0.0, abs=0.3)
+    assert u[:40].abs().median() < 0.1
+
+
+def test_a_picture_that_stayed_the_same_has_exactly_no_flow():
+    def noisy(first, second):
+        return torch.ones(len(first), 2, *first.shape[-2:])
+
+    same, moved = texture(6, 8).repeat(2, 1, 1), shifted_pair(6, 8, 1, 0)
+    flow = EstimatedFlow(noisy)(TensorDict({"rgb2": torch.stack([same, moved])}, [2]))["raw"]
+    assert flow.flatten(1).tolist() == [[0.0] * 96, [-1.0] * 96]
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
+def test_a_batch_of_any_shape_equals_a_loop(batch):
+    count = max(1, torch.Size(batch).numel())
+    pairs = torch.stack([shifted_pair(24, 40, i, 1 - i, seed=i) for i in range(count)])
+    transform = EstimatedFlow()
+    want = torch.stack([transform.compute(pair)[0] for pair in pairs])
+    got = transform.compute(pairs.reshape(*batch, 6, 24, 40))[0]
+    assert torch.equal(got, want.reshape(*batch, 2, 24, 40))
+
+
+def test_threads_change_nothing():
+    pairs = torch.stack([shifted_pair(24, 40, i % 3, 1, seed=i) for i in range(5)])
+    threads = torch.get_num_threads()
+    flows = []
+    try:
+        for number in (1, 3):
+            torch.set_num_threads(number)
+            flows.append(EstimatedFlow().compute(pairs)[0])
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(*flows)
+
+
+def test_units_and_scale_are_rawflows():
+    td = TensorDict({"rgb2": shifted_pair(48, 64, 3, -2)})
+    plain = EstimatedFlow()(td.clone())["raw"]
+    made = EstimatedFlow(
+        outputs=["unscaled", "raw"], scale=0.125, unit="px_per_s", dt_s=0.5, out_keys=["px", "raw"]
+    )(td)
+    assert torch.equal(made["px"], plain)
+    assert torch.equal(made["raw"], plain * 0.25)  # an eighth of it, two steps a second
+
+
+def test_an_empty_batch_has_an_empty_flow():
+    empty = torch.zeros(0, 6, 10, 12, dtype=torch.uint8)
+    assert EstimatedFlow().compute(empty)[0].shape == (0, 2, 10, 12)
+
+
+def estimating(batch_size: tuple[int, ...], first_env: int = 0) -> TransformedEnv:
+    stack = representation_stack(["raw"], flow="estimated")
+    return TransformedEnv(FakeSensorEnv(batch_size, first_env), stack)
+
+
+def test_workers_forked_after_it_ran_here_estimate_too():
+    EstimatedFlow().compute(torch.stack([shifted_pair(24, 40, 1, 0)] * 4))
+    makers = [functools.partial(estimating, (), i) for i in (0, 1)]
+    workers = ParallelEnv(2, makers, mp_start_method="fork")
+    try:
+        apart = workers.rollout(3)["next", "raw"]
+    finally:
+        workers.close()
+    together = estimating((2,)).rollout(3)["next", "raw"]
+    assert torch.equal(apart, together)
+
+
+def test_offline_equals_online_to_the_last_bit():
+    stack = representation_stack(
+        ["raw", "obj"], intrinsics=torch.tensor(INTRINSICS), flow="estimated"
+    )
+    env = TransformedEnv(FakeSensorEnv((2,)), stack)
+    online = env.rollout(8, break_when_any_done=False)
+    made = ["raw", "obj", "_rgb2", ("sensor", "flow")]
+    bare = online.exclude(*made, *(("next", *(k if isinstance(k, tuple) else (k,))) for k in made))
+    offline = stack(bare)
+    for key in ("raw", "obj"):
+        assert torch.equal(offline[key], online[key])
+        assert torch.equal(offline["next", key], online["next", key])
+
+
+def test_estimated_raw_alone_reads_pictures_alone():
+    stack = representation_stack(["raw"], flow="estimated")
+    assert {key for transform in stack for key in transform.in_keys} == {("sensor", "rgb"), "_rgb2"}
+
+
+def test_object_flow_is_the_estimate_less_ego_flow():
+    options = {"raw": {"scale": 1.0}, "ego": {"scale": 2.0}, "obj": {"scale": 8.0}}
+    flow = {"source": "estimated", "estimator": pixel_steps}
+    stack = representation_stack(options, intrinsics=INTRINSICS, flow=flow)
+    td = TransformedEnv(FakeSensorEnv((2,)), stack).rollout(2)[:, 1]
+    sensor = td["sensor"]
+    K, motion = torch.tensor(INTRINSICS), sensor["prev_from_curr"]
+    ego, valid = ego_flow(sensor["depth"], K, motion)
+    assert (td["raw"] == -1.0).all()
+    assert torch.equal(sensor["flow"], td["raw"])
+    torch.testing.assert_close(td["ego"], 2 * ego)
+    torch.testing.assert_close(td["obj"], torch.where(valid, 8 * (-1.0 - ego), 0.0))
+
+
+def test_without_opencv_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(ImportError, match=r"needs OpenCV: pip install 'flowrep\[flow\]'"):
+        EstimatedFlow()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"estimator": "farneback"}, r"one of \['dis', 'raft_small', 'raft_large'\].*'farneback'"),
+        ({"estimator": "raft_small"}, "'raft_small' needs weights="),
+        ({"weights": "w.pth"}, "weights= are RAFT's; estimator 'dis' has none"),
+        ({"preset": "slow"}, r"preset is one of .*'medium'\], got 'slow'"),
+        ({"min_side_px": 0}, "min_side_px is at least 1, got 0"),
+        ({"outputs": ["valid"]}, r"some of \['raw', 'unscaled'\]"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        EstimatedFlow(**options)
+
+
+@pytest.mark.parametrize(
+    ("flow", "message"),
+    [
+        ("guessed", r"unknown source of flow 'guessed'.*\['exact', 'estimated'\]"),
+        ({"estimator": "dis"}, "unknown source of flow None"),
+        ({"source": "estimated", "presets": "fast"}, "did you mean 'preset'"),
+        ({"source": "exact", "preset": "fast"}, "unknown option of exact flow: 'preset'"),
+    ],
+)
+def test_a_source_of_flow_that_does_not_exist_is_refused(flow, message):
+    with pytest.raises(ValueError, match=message):
+        representation_stack(["raw"], intrinsics=INTRINSICS, flow=flow)
+
+
+def test_floats_are_no_pictures():
+    with pytest.raises(ValueError, match=r"'rgb2' should be integer \[\*B, 6, H, W\]"):
+        EstimatedFlow()(TensorDict({"rgb2": torch.rand(6, 8, 8)}))
+
+
+def test_the_transforms_survive_pickling():
+    import pickle
+
+    stack = Compose(FrameStack(k=2, **PICTURES), EstimatedFlow(DIS("fast", 96)))
+    again = pickle.loads(pickle.dumps(stack))
+    assert again[1].estimator == DIS("fast", 96)
