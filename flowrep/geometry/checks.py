@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from typing import Any, get_args
+
 import torch
 from torch import Tensor
 
@@ -61,3 +64,16 @@ def broadcast_batch(**batches: torch.Size) -> torch.Size:
         raise ValueError(
             f"leading batch dims do not broadcast: {listing}; give each the same batch, or none"
         ) from error
+
+
+def check_name(option: str, name: object, names: Any) -> None:
+    """Returns nothing; complains unless a name is one of a `Literal`'s.
+
+    Raises:
+        ValueError: it is not; the message lists those that are.
+    """
+    known = list(get_args(names))
+    if name not in known:
+        close = difflib.get_close_matches(str(name), known, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"{option} is one of {known}, got {name!r}{hint}")

@@ -36,7 +36,7 @@ def relative_motion(
 
     Convention: it takes a point in the current camera's frame into the previous camera's frame
     (R and T of equation 11 of the paper). A world kilometres wide costs no precision, since the
-    large coordinates cancel before the result is rounded.
+    large coordinates cancel before the result is rounded. Equal poses give exactly the identity.
 
     Args:
         world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world).
@@ -63,7 +63,103 @@ def relative_motion(
     baseline_world = world_from_curr[..., :3, 3:].double() - world_from_prev[..., :3, 3:].double()
     translation = rotation_prev_from_world @ baseline_world
     bottom = world_from_curr[..., 3:, :].double().expand(*rotation.shape[:-2], 1, 4)
-    return torch.cat([torch.cat([rotation, translation], -1), bottom], -2).to(dtype)
+    motion = torch.cat([torch.cat([rotation, translation], -1), bottom], -2).to(dtype)
+    # The product of a rotation and its transpose is the identity but for rounding.
+    still = (world_from_prev == world_from_curr).flatten(-2).all(-1)
+    identity = torch.eye(4, dtype=dtype, device=motion.device)
+    return torch.where(still[..., None, None], identity, motion)
+
+
+def instance_motion(
+    world_from_prev: Tensor,
+    world_from_curr: Tensor,
+    world_from_prev_body: Tensor,
+    world_from_curr_body: Tensor,
+    *,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Returns the motion of each body as its camera sees it, `[*B, 1 + N, 4, 4]`.
+
+    Convention: row 0 is the static world's, `prev_from_curr`; row 1 + i takes a point that rides on
+    body i from the current camera's frame to where it was in the previous camera's frame. Where a
+    body's pose has not changed, its row equals row 0 to the last bit. Composed in float64. A body's
+    own axes and origin do not matter, as long as they stay with it.
+
+    Args:
+        world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world).
+        world_from_curr: `[*B, 4, 4]`, pose of the current camera.
+        world_from_prev_body: `[*B, N, 4, 4]`, poses of the bodies at the previous frame.
+        world_from_curr_body: `[*B, N, 4, 4]`, the same bodies, in the same order, now.
+        dtype: of the result.
+
+    Raises:
+        ValueError: a shape does not fit.
+        TypeError: an argument is no float tensor.
+
+    >>> camera, before, now = torch.eye(4), torch.eye(4), torch.eye(4)
+    >>> now[0, 3] = 0.5  # the body went half a metre along x
+    >>> instance_motion(camera, camera, before[None], now[None])[:, 0, 3]
+    tensor([ 0.0000, -0.5000])
+    """
+    check_shape("world_from_prev_body", world_from_prev_body, ("N", 4, 4))
+    check_shape("world_from_curr_body", world_from_curr_body, ("N", 4, 4))
+    if world_from_prev_body.shape[-3] != world_from_curr_body.shape[-3]:
+        raise ValueError(
+            f"the same bodies are needed before and now, got {world_from_prev_body.shape[-3]} "
+            f"and {world_from_curr_body.shape[-3]}"
+        )
+    camera = relative_motion(world_from_prev, world_from_curr, dtype=dtype).unsqueeze(-3)
+    # Where each point was: prev_from_world, then what the body did in the world, backwards.
+    prev_body_from_prev = relative_motion(
+        world_from_prev_body, world_from_prev.unsqueeze(-3), dtype=torch.float64
+    )
+    curr_body_from_curr = relative_motion(
+        world_from_curr_body, world_from_curr.unsqueeze(-3), dtype=torch.float64
+    )
+    bodies = relative_motion(prev_body_from_prev, curr_body_from_curr, dtype=dtype)
+    still = (world_from_prev_body == world_from_curr_body).flatten(-2).all(-1)
+    bodies = torch.where(still[..., None, None], camera, bodies)
+    return torch.cat([camera.expand(*bodies.shape[:-3], 1, 4, 4), bodies], -3)
+
+
+def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None:
+    """Returns nothing; complains about the first transform that is no rotation and translation.
+
+    It reads the values: on a GPU it waits for them, so it has no place in a loop that must not.
+
+    Args:
+        name: the argument's name, for the message.
+        a_from_b: `[*B, 4, 4]`.
+        tolerance: on each element of R R^T - I and on the last row.
+
+    Raises:
+        ValueError: nan or inf, a last row that is not (0, 0, 0, 1), a scale or shear, or a
+            left-handed frame; with the index of the first such transform in the batch.
+        TypeError: no float tensor.
+
+    >>> check_rigid("pose", torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])))
+    Traceback (most recent call last):
+    ValueError: pose is left-handed (a mirror image, determinant -1): flip one axis ...
+    """
+    check_shape(name, a_from_b, (4, 4))
+    transform = a_from_b.detach().double()
+    rotation = transform[..., :3, :3]
+    identity = torch.eye(4, dtype=transform.dtype, device=transform.device)
+    last_row_off = (transform[..., 3, :] - identity[3]).abs().amax(-1) > tolerance
+    sheared = (rotation @ rotation.mT - identity[:3, :3]).abs().flatten(-2).amax(-1) > tolerance
+    complaints = {
+        "holds nan or inf": ~transform.isfinite().flatten(-2).all(-1),
+        "has a last row other than (0, 0, 0, 1): is it transposed?": last_row_off,
+        "is not rigid (its rotation has scale or shear): divide the scale out": sheared,
+        "is left-handed (a mirror image, determinant -1): flip one axis of the camera "
+        "and of the world alike": torch.linalg.det(rotation.nan_to_num(0.0, 0.0, 0.0)) < 0,
+    }
+    for complaint, wrong in complaints.items():
+        if bool(wrong.any()):
+            index = wrong.nonzero()[0].tolist()
+            where = f"{name}[{', '.join(map(str, index))}]" if index else name
+            shown = a_from_b[tuple(index)].tolist()
+            raise ValueError(f"{where} {complaint}; got {shown}")
 
 
 def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:

@@ -69,7 +69,7 @@ class MapTransform(Transform):
     output_specs: Callable[..., tuple[TensorSpec, ...]]
 
     def __init__(self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys) -> None:
-        super().__init__(in_keys=in_keys, out_keys=out_keys)
+        super().__init__(in_keys=as_keys(in_keys), out_keys=as_keys(out_keys))
         if len(self.in_keys) != len(reads):
             raise ValueError(
                 f"{type(self).__name__} reads {len(reads)} keys "
@@ -155,6 +155,24 @@ class MapTransform(Transform):
     def __repr__(self) -> str:
         """Returns the keys that are read and written."""
         return f"{type(self).__name__}({self.in_keys} -> {self.out_keys})"
+
+
+def as_keys(keys: Keys) -> list[NestedKey]:
+    """Returns a list of keys; a nested one may be a list itself, as YAML has no tuples."""
+    if isinstance(keys, (str, tuple)):
+        return [keys]
+    return [key if isinstance(key, str) else tuple(key) for key in keys]
+
+
+def check_own_keys(transform: MapTransform) -> None:
+    """Complains where a transform would overwrite what it reads, and read that the next time."""
+    shared = sorted({str(key) for key in transform.in_keys} & {str(k) for k in transform.out_keys})
+    if shared:
+        raise ValueError(
+            f"{type(transform).__name__} reads and writes {', '.join(shared)}: a second pass, in a "
+            "replay buffer for instance, would start from what the first one made; give out_keys= "
+            "names of their own"
+        )
 
 
 @functools.cache

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Categorical, TensorSpec, Unbounded
 
-from flowrep.transforms.base import DEPTH, Keys, MapTransform, Reads
+from flowrep.transforms.base import DEPTH, Keys, MapTransform, Reads, as_keys
 
 UNITS = ("px_per_step", "px_per_s")
 
-Intrinsics = Tensor | Sequence[Sequence[float]]
+CAMERA = Reads((3, 3), "float")
+
+# K itself, or the key under which the env gives it.
+Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 
 
 class FlowTransform(MapTransform):
     """What flow transforms share: the intrinsics K, the outputs chosen and their unit.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps that are read, in pixels; None where flow needs none.
+        intrinsics: K `[3, 3]` of the maps that are read, in pixels, or the key under which the
+            TensorDict holds it, `[*B, 3, 3]`: it is then read after all other keys. None where
+            flow needs none.
         reads: as in `MapTransform`.
         outputs: which of the class's outputs are written, in this order.
         scale: factor on every flow, or one an output.
@@ -31,7 +38,7 @@ class FlowTransform(MapTransform):
         out_keys: one key an output.
     """
 
-    K: Tensor
+    K: Tensor | None
 
     def __init__(
         self,
@@ -46,7 +53,13 @@ class FlowTransform(MapTransform):
         in_keys: Keys,
         out_keys: Keys | None,
     ) -> None:
-        super().__init__(reads, in_keys, list(outputs) if out_keys is None else out_keys)
+        key = None if intrinsics is None else intrinsics_key(intrinsics)
+        camera: list[NestedKey] = [] if key is None else [key]
+        super().__init__(
+            [*reads, *[CAMERA] * len(camera)],
+            [*as_keys(in_keys), *camera],
+            list(outputs) if out_keys is None else out_keys,
+        )
         if len(self.out_keys) != len(outputs):
             raise ValueError(
                 f"{type(self).__name__} writes {list(outputs)}: out_keys needs as many keys, "
@@ -58,20 +71,24 @@ class FlowTransform(MapTransform):
         units = _per_output("unit", unit, flows)
         self.factors = {name: _factor(scales[name], units[name], dt_s) for name in flows}
         self.compiled = bool(compiled)
-        if intrinsics is not None:
-            self.register_buffer("K", _as_intrinsics(intrinsics), persistent=False)
+        given = intrinsics is not None and key is None
+        self.register_buffer("K", as_intrinsics(intrinsics) if given else None, persistent=False)
+
+    def _with_camera(self, maps: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
+        """Returns the maps and K, which is the last of them unless the transform was given it."""
+        return ([*maps], self.K) if self.K is not None else ([*maps[:-1]], maps[-1])
 
     def _in_unit(self, name: str, flow: Tensor) -> Tensor:
         factor = self.factors[name]
         return flow if factor == 1.0 else flow * factor
 
-    def _at_one_precision(self, *maps: Tensor, depth: Tensor) -> list[Tensor]:
+    def _at_one_precision(self, *maps: Tensor, depth: Tensor, K: Tensor) -> list[Tensor]:
         """Returns the maps, depth and K in depth's float type, float32 at least.
 
         Raw flow and ego flow have to round alike: else obj were rounding noise where nothing moves.
         """
         dtype = torch.promote_types(depth.dtype, torch.float32)
-        return [tensor.to(dtype) for tensor in (*maps, depth, self.K)]
+        return [tensor.to(dtype) for tensor in (*maps, depth, K)]
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns an unbounded spec a flow and a boolean one for the mask."""
@@ -115,9 +132,22 @@ def _factor(scale: object, unit: object, dt_s: float | None) -> float:
     return factor / dt_s
 
 
-def _as_intrinsics(intrinsics: Intrinsics) -> Tensor:
+def intrinsics_key(intrinsics: Intrinsics) -> NestedKey | None:
+    """Returns the key that intrinsics name, or None where they are K itself."""
+    if isinstance(intrinsics, str):
+        return intrinsics
+    if isinstance(intrinsics, (tuple, list)) and all(isinstance(part, str) for part in intrinsics):
+        return tuple(intrinsics)
+    return None
+
+
+def as_intrinsics(intrinsics: Intrinsics) -> Tensor:
+    """Returns K as a float tensor `[3, 3]`."""
     K = torch.as_tensor(intrinsics)
     K = K.clone() if K.is_floating_point() else K.to(torch.get_default_dtype())
     if K.shape != (3, 3):
-        raise ValueError(f"intrinsics is K, [3, 3]; got {list(K.shape)}")
+        raise ValueError(
+            f"intrinsics is K, [3, 3], or the key of [*B, 3, 3] in the TensorDict; got "
+            f"{list(K.shape)}"
+        )
     return K

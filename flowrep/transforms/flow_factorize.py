@@ -33,7 +33,8 @@ class FlowFactorize(FlowTransform):
     stands still.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels.
+        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the key under
+            which the env gives it, `[*B, 3, 3]`.
         outputs: of `"ego"`, `"obj"`, `"raw"` (the raw flow itself, in the unit asked for, 0 where
             it isn't finite) and `"valid"`, those that are written. With ego alone raw flow isn't
             read at all.
@@ -94,9 +95,9 @@ class FlowFactorize(FlowTransform):
         )
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
-        """Returns the outputs asked for, from (raw,) depth and camera motion."""
-        *raw, depth, motion = maps
-        *raw, motion, depth, K = self._at_one_precision(*raw, motion, depth=depth)
+        """Returns the outputs asked for, from (raw,) depth and camera motion (and K)."""
+        (*raw, depth, motion), K = self._with_camera(maps)
+        *raw, motion, depth, K = self._at_one_precision(*raw, motion, depth=depth, K=K)
         made: dict[str, Tensor] = {}
         if raw:
             factors = geometry.factorize(raw[0], depth, K, motion)

@@ -36,7 +36,8 @@ class RawFlow(FlowTransform):
     remembered, and shuffled samples of a replay buffer give what the env gave.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels.
+        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the key under
+            which the env gives it, `[*B, 3, 3]`.
         outputs: of `"raw"` and `"valid"`, those that are written.
         scale: factor on the flow.
         unit: `"px_per_step"` or `"px_per_s"`.
@@ -95,11 +96,10 @@ class RawFlow(FlowTransform):
         )
         self.invalid = float(invalid)
 
-    def compute(
-        self, depth: Tensor, instance: Tensor, instance_motion: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Returns the outputs asked for."""
-        motions, depth, K = self._at_one_precision(instance_motion, depth=depth)
+    def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
+        """Returns the outputs asked for, from depth, instance ids and motions (and K)."""
+        (depth, instance, motions), K = self._with_camera(maps)
+        motions, depth, K = self._at_one_precision(motions, depth=depth, K=K)
         flow, valid = geometry.rigid_flow(depth, instance, K, motions)
         if self.invalid != 0.0:
             flow = torch.where(valid, flow, self.invalid)

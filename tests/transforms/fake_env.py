@@ -34,20 +34,43 @@ def frame(env: int, episode: int, step: int) -> dict[str, Tensor]:
     instance = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
     instance[2:4, 1:4] = WALKER
     instance[0, 5] = STATUE
-    prev_from_curr = camera_motion(step, env)
-    instance_motion = prev_from_curr.repeat(NUM_INSTANCES, 1, 1)
-    if step:
-        instance_motion[WALKER, 0, 3] += 0.3
-        instance_motion[WALKER, 1, 3] -= 0.1
+    world_from_cam, world_from_body = poses(env, episode, step)
     channel = torch.arange(3)[:, None, None]
     return {
         "depth": depth.unsqueeze(0),
         "semantic": ((column + 2 * row + step + env) % NUM_CLASSES).to(torch.uint8).unsqueeze(0),
         "instance": instance.unsqueeze(0),
-        "prev_from_curr": prev_from_curr,
-        "instance_motion": instance_motion,
+        "prev_from_curr": camera_motion(step, env),
+        "instance_motion": frame_motions(step, env),
+        "world_from_cam": world_from_cam,
+        "world_from_body": world_from_body,
+        "K": torch.tensor(INTRINSICS),
         "rgb": ((50 * channel + column + 7 * row + step) % 256).to(torch.uint8),
     }
+
+
+def poses(env: int, episode: int, step: int) -> tuple[Tensor, Tensor]:
+    """Returns where the camera `[4, 4]` and the bodies `[2, 4, 4]` are: float64, a wide world."""
+    world_from_cam = torch.eye(4, dtype=torch.float64)
+    world_from_cam[:3, 3] = torch.tensor([5000.3 + 100 * env, -7.7, 10.1 * episode])
+    statue, walker = torch.eye(4).double(), torch.eye(4).double()
+    statue[:3, 3] = torch.tensor([5003.1, -6.0, 4.0])
+    walker[:3, 3] = torch.tensor([4999.9, -5.0, 3.0])
+    for past in range(1, step + 1):
+        camera = frame_motions(past, env).double()
+        world_from_prev, world_from_cam = world_from_cam, world_from_cam @ camera[0]
+        # What takes a point from the current to the previous camera says where the body went.
+        walker = world_from_cam @ camera[WALKER].inverse() @ world_from_prev.inverse() @ walker
+    return world_from_cam, torch.stack([walker, statue])
+
+
+def frame_motions(step: int, env: int) -> Tensor:
+    """Returns `instance_motion` `[3, 4, 4]`: the walker moves by itself, the statue doesn't."""
+    motions = camera_motion(step, env).repeat(NUM_INSTANCES, 1, 1)
+    if step:
+        motions[WALKER, 0, 3] += 0.3
+        motions[WALKER, 1, 3] -= 0.1
+    return motions
 
 
 def camera_motion(step: int, env: int) -> Tensor:
@@ -84,6 +107,9 @@ class FakeSensorEnv(EnvBase):
                 instance=self._ids(NUM_INSTANCES),
                 prev_from_curr=Unbounded((*batch_size, 4, 4)),
                 instance_motion=Unbounded((*batch_size, NUM_INSTANCES, 4, 4)),
+                world_from_cam=Unbounded((*batch_size, 4, 4), dtype=torch.float64),
+                world_from_body=Unbounded((*batch_size, 2, 4, 4), dtype=torch.float64),
+                K=Unbounded((*batch_size, 3, 3)),
                 rgb=Bounded(0, 255, (*batch_size, 3, HEIGHT, WIDTH), dtype=torch.uint8),
                 shape=batch_size,
             ),

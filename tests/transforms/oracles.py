@@ -80,3 +80,42 @@ def stacked(of: str, sensor: dict[str, Tensor], k: int) -> Tensor:
     env, episode, step = moment(sensor["depth"])
     past = [max(step - age, 0) for age in range(k - 1, -1, -1)]
     return torch.cat([frame(env, episode, t)[of] for t in past], 0)
+
+
+def ray_length_to_z(sensor: dict[str, Tensor]) -> Tensor:
+    """Returns z, were the env's depth the length of rays."""
+    (fx, _, cx), (_, fy, cy), _ = INTRINSICS
+    out = sensor["depth"].clone()
+    for j in range(out.shape[-2]):
+        for i in range(out.shape[-1]):
+            x, y = (i + 0.5 - cx) / fx, (j + 0.5 - cy) / fy
+            out[0, j, i] /= math.sqrt(x * x + y * y + 1)
+    return out
+
+
+def opengl_pose(sensor: dict[str, Tensor]) -> Tensor:
+    """Returns the pose with OpenCV's axes, were the env's pose one with OpenGL's."""
+    flipped = sensor["world_from_cam"].clone()
+    flipped[:, 1] *= -1
+    flipped[:, 2] *= -1
+    return flipped
+
+
+def rows_backward(sensor: dict[str, Tensor]) -> Tensor:
+    """Returns flow, were the env's raw flow backward with rows first."""
+    return -raw(sensor)[[1, 0]]
+
+
+def rows_of_classes(sensor: dict[str, Tensor], bodies: list[int]) -> Tensor:
+    """Returns rows of bodies, were the env's classes segmentation ids."""
+    ids = sensor["semantic"].flatten().tolist()
+    rows = [1 + bodies.index(i) if i in bodies else 0 for i in ids]
+    return torch.tensor(rows, dtype=torch.uint8).reshape(sensor["semantic"].shape)
+
+
+def sensor_map(name: str, sensor: dict[str, Tensor]) -> Tensor:
+    return sensor[name]
+
+
+def hole(sensor: dict[str, Tensor]) -> Tensor:
+    return torch.full_like(sensor["depth"], math.nan)

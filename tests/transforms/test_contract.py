@@ -5,12 +5,19 @@ from __future__ import annotations
 import functools
 
 from flowrep.transforms import (
+    AdaptDepth,
+    AdaptFlow,
+    AdaptPose,
+    CameraMotion,
     Depth,
     FlowFactorize,
     FrameStack,
+    InstanceIds,
+    InstanceMotion,
     RawFlow,
     Rgb,
     Segmentation,
+    SensorNoise,
     representation_stack,
 )
 from tests.transforms import oracles
@@ -83,6 +90,84 @@ class TestFrameStack(TransformContract):
         # Single transitions can't tell their past: the root's stacks are stored with them.
         td = self.make()(self.inputs())
         return td.exclude(*(("next", *key) for key in self.oracles()))
+
+
+class TestAdaptDepth(TransformContract):
+    def oracles(self):
+        return {"z": oracles.ray_length_to_z}
+
+    def make(self):
+        depth = ("sensor", "depth")
+        return AdaptDepth("ray_length", intrinsics=INTRINSICS, in_keys=depth, out_keys="z")
+
+
+class TestAdaptPose(TransformContract):
+    def oracles(self):
+        return {("adapted", "pose"): oracles.opengl_pose}
+
+    def make(self):
+        keys = {"in_keys": ("sensor", "world_from_cam"), "out_keys": ("adapted", "pose")}
+        return AdaptPose(axes="opengl", **keys)
+
+
+class TestAdaptFlow(TransformContract):
+    def oracles(self):
+        return {"measured": oracles.rows_backward}
+
+    def make(self):
+        keys = {"in_keys": "raw", "out_keys": "measured"}
+        return AdaptFlow(direction="backward", grid="current", channels="row_column", **keys)
+
+    def before(self):
+        return [RawFlow(INTRINSICS)]
+
+
+class TestInstanceIds(TransformContract):
+    def oracles(self):
+        return {"rows": functools.partial(oracles.rows_of_classes, bodies=[3, 1])}
+
+    def make(self):
+        return InstanceIds([3, 1], in_keys=("sensor", "semantic"), out_keys="rows")
+
+
+class TestCameraMotion(TransformContract):
+    def oracles(self):
+        return {("own", "motion"): functools.partial(oracles.sensor_map, "prev_from_curr")}
+
+    def make(self):
+        return CameraMotion(out_keys=[("own", "motion")])
+
+    def replay_inputs(self):
+        # Single transitions can't tell their past: the root's motion is stored with them.
+        td = self.make()(self.inputs())
+        return td.exclude(*(("next", *key) for key in self.oracles()))
+
+
+class TestInstanceMotion(TestCameraMotion):
+    def oracles(self):
+        return {("own", "motions"): functools.partial(oracles.sensor_map, "instance_motion")}
+
+    def make(self):
+        return InstanceMotion(out_keys=[("own", "motions")])
+
+
+class TestSensorNoiseOff(TransformContract):
+    def oracles(self):
+        return {
+            "depth": functools.partial(oracles.sensor_map, "depth"),
+            "motion": functools.partial(oracles.sensor_map, "prev_from_curr"),
+        }
+
+    def make(self):
+        return SensorNoise(out_keys=list(self.oracles()))
+
+
+class TestSensorNoiseWithoutAnyEcho(TransformContract):
+    def oracles(self):
+        return {"depth": oracles.hole}
+
+    def make(self):
+        return SensorNoise(sensors=["depth"], depth_dropout=1.0, out_keys="depth")
 
 
 class TestRepresentationStack(TransformContract):

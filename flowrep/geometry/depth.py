@@ -1,0 +1,123 @@
+"""Depth as simulators and cameras give it, into depth along the optical axis."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+from flowrep.geometry.camera import centred_pixels
+from flowrep.geometry.checks import broadcast_batch, check_name, check_shape
+
+DepthKind: TypeAlias = Literal["z", "ray_length", "z_buffer"]
+
+
+def adapt_depth(
+    depth: Tensor,
+    kind: DepthKind,
+    *,
+    K: Tensor | None = None,
+    near_m: float | None = None,
+    far_m: float | None = None,
+) -> Tensor:
+    """Returns depth along the optical axis, `[*B, 1, H, W]`, metres.
+
+    Convention: `"z"` is that already; `"ray_length"` is the distance from the camera's centre to
+    the surface, metres (lidar, "distance to camera"); `"z_buffer"` is OpenGL's depth buffer in
+    [0, 1], 0 at `near_m` and 1 where nothing was drawn or at `far_m`. A reversed buffer is
+    `1 - depth` first. inf stays inf and nan stays nan.
+
+    Args:
+        depth: `[*B, 1, H, W]`, of that kind.
+        kind: `"z"`, `"ray_length"` or `"z_buffer"`.
+        K: `[*B, 3, 3]`, pixels; for `"ray_length"` alone.
+        near_m: the near plane; for `"z_buffer"` alone.
+        far_m: the far plane, `math.inf` if the projection has none; for `"z_buffer"` alone.
+
+    Raises:
+        ValueError: an unknown kind, a shape that does not fit, an argument that the kind needs and
+            lacks, or one that it does not read.
+        TypeError: no float tensor.
+
+    >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
+    tensor([[[1., 2., inf]]])
+    """
+    check_depth_options(kind, K is not None, near_m, far_m)
+    check_shape("depth", depth, (1, "H", "W"))
+    if kind == "ray_length":
+        assert K is not None
+        return z_from_ray_length(depth, K)
+    if kind == "z_buffer":
+        assert near_m is not None
+        assert far_m is not None
+        return z_from_z_buffer(depth, near_m=near_m, far_m=far_m)
+    return depth
+
+
+def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
+    """Returns depth along the optical axis from the length of each pixel's ray.
+
+    Args:
+        ray_length: `[*B, 1, H, W]`, metres from the camera's centre.
+        K: `[*B, 3, 3]`, pixels.
+
+    Raises:
+        ValueError: a shape does not fit.
+        TypeError: an argument is no float tensor.
+
+    >>> K = torch.tensor([[4.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]])
+    >>> z_from_ray_length(torch.full((1, 1, 1), 5.0), K)  # it looks along (0.75, 0, 1)
+    tensor([[[4.]]])
+    """
+    check_shape("ray_length", ray_length, (1, "H", "W"))
+    check_shape("K", K, (3, 3))
+    broadcast_batch(ray_length=ray_length.shape[:-3], K=K.shape[:-2])
+    K = K.to(torch.promote_types(ray_length.dtype, torch.float32))
+    x_px, y_px = centred_pixels(ray_length.shape[-2], ray_length.shape[-1], K)
+    K = K[..., None, None, :, :]
+    y = y_px / K[..., 1, 1]
+    x = (x_px - K[..., 0, 1] * y) / K[..., 0, 0]
+    per_z = (1.0 + x.square() + y.square()).sqrt()  # length of the ray that is 1 along z
+    return (ray_length / per_z.unsqueeze(-3)).to(ray_length.dtype)
+
+
+def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
+    """Returns depth along the optical axis from OpenGL's depth buffer of a perspective camera.
+
+    Where the buffer is 1 nothing was drawn: inf. Outside of [0, 1] there is no depth: nan.
+
+    Args:
+        z_buffer: `[*B, 1, H, W]`, 0 at the near plane, 1 at the far plane.
+        near_m: the near plane, metres.
+        far_m: the far plane, metres; may be inf.
+
+    Raises:
+        ValueError: a shape does not fit, or not 0 < near_m < far_m.
+        TypeError: no float tensor.
+
+    >>> z_from_z_buffer(torch.tensor([[[0.5]]]), near_m=0.5, far_m=torch.inf)
+    tensor([[[1.]]])
+    """
+    check_shape("z_buffer", z_buffer, (1, "H", "W"))
+    if not 0 < near_m < far_m:
+        raise ValueError(f"planes need 0 < near_m < far_m, got near_m={near_m}, far_m={far_m}")
+    # near * far / (far - b (far - near)), without a difference of large numbers near b = 1.
+    z = near_m / ((1.0 - z_buffer) + z_buffer * (near_m / far_m))
+    z = torch.where(z_buffer == 1.0, torch.inf, z)
+    return torch.where((z_buffer >= 0.0) & (z_buffer <= 1.0), z, torch.nan)
+
+
+def check_depth_options(
+    kind: str, has_camera: bool, near_m: float | None, far_m: float | None
+) -> None:
+    """Returns nothing; complains unless a kind of depth comes with just what it needs."""
+    check_name("kind", kind, DepthKind)
+    if has_camera != (kind == "ray_length"):
+        raise ValueError(f"'ray_length' needs K, the other kinds do not read it; kind is {kind!r}")
+    planes = (near_m is not None) + (far_m is not None)
+    if planes != (2 if kind == "z_buffer" else 0):
+        raise ValueError(
+            "'z_buffer' needs near_m and far_m, the other kinds do not read them; "
+            f"kind is {kind!r}, near_m={near_m}, far_m={far_m}"
+        )

@@ -1,0 +1,74 @@
+"""The intrinsics K from what a simulator or a calibration says about its camera."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+from flowrep.geometry.checks import check_name, check_shape
+
+FovAxis: TypeAlias = Literal["horizontal", "vertical"]
+
+
+def intrinsics_from_fov(
+    fov_deg: float,
+    *,
+    axis: FovAxis,
+    height: int,
+    width: int,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Returns K `[3, 3]` of a camera with square pixels and a centred principal point.
+
+    Convention: `axis` says across what `fov_deg` spans, from border to border of the picture:
+    `"horizontal"` its width (Habitat's hfov), `"vertical"` its height (MuJoCo's fovy, OpenGL's
+    perspective).
+
+    Args:
+        fov_deg: the whole angle, degrees, between 0 and 180.
+        axis: `"horizontal"` or `"vertical"`.
+        height: of the picture, pixels.
+        width: of the picture, pixels.
+        dtype: of the result.
+
+    Raises:
+        ValueError: an unknown axis, no angle of a pinhole camera, or no size.
+
+    >>> intrinsics_from_fov(90.0, axis="vertical", height=4, width=6)
+    tensor([[2., 0., 3.],
+            [0., 2., 2.],
+            [0., 0., 1.]])
+    """
+    check_name("axis", axis, FovAxis)
+    if not 0 < fov_deg < 180:
+        raise ValueError(f"fov_deg lies between 0 and 180 degrees, got {fov_deg}")
+    if height < 1 or width < 1:
+        raise ValueError(f"height and width are at least 1 pixel, got {height} and {width}")
+    half_size = (width if axis == "horizontal" else height) / 2
+    focal = half_size / math.tan(math.radians(fov_deg) / 2)
+    rows = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+    return torch.tensor(rows, dtype=torch.float64).to(dtype)
+
+
+def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
+    """Returns K with pixel (0, 0)'s centre at (0.5, 0.5), from a calibration that has it at (0, 0).
+
+    Args:
+        K_opencv: `[*B, 3, 3]`, as OpenCV's calibration and most data sets write it.
+
+    Raises:
+        ValueError: not `[*B, 3, 3]`.
+        TypeError: no float tensor.
+
+    >>> intrinsics_from_opencv(torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 2.0], [0.0, 0.0, 1.0]]))
+    tensor([[4.0000, 0.0000, 1.5000],
+            [0.0000, 8.0000, 2.5000],
+            [0.0000, 0.0000, 1.0000]])
+    """
+    check_shape("K_opencv", K_opencv, (3, 3))
+    half_pixel = torch.zeros(3, 3, dtype=K_opencv.dtype, device=K_opencv.device)
+    half_pixel[:2, 2] = 0.5
+    return K_opencv + half_pixel

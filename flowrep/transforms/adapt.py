@@ -1,0 +1,232 @@
+"""Sensor data as other simulators and robots give them, into what flowrep's transforms read."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor
+from torchrl.data import TensorSpec, Unbounded
+
+from flowrep import geometry
+from flowrep.geometry import checks
+from flowrep.geometry.depth import check_depth_options
+from flowrep.geometry.flow_layout import check_flow_options
+from flowrep.transforms.base import (
+    DEPTH,
+    FLOW,
+    MOTION,
+    Keys,
+    MapTransform,
+    Reads,
+    as_keys,
+    check_own_keys,
+)
+from flowrep.transforms.flow import CAMERA, Intrinsics, as_intrinsics, intrinsics_key
+
+VECTOR = Reads((7,), "float")
+
+
+class AdaptDepth(MapTransform):
+    """Depth of any kind as depth along the optical axis.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | depth of some `kind` | `("sensor", "depth")` | float `[*B, 1, H, W]` | > 0, inf, nan | m |
+    | K, if `intrinsics` names a key | | | | |
+
+    Convention: see `flowrep.geometry.adapt_depth`.
+
+    Args:
+        kind: `"z"`, `"ray_length"` or `"z_buffer"` (OpenGL's, in [0, 1]).
+        intrinsics: K `[3, 3]` in pixels or the key where it lies; for `"ray_length"` alone.
+        near_m: the near plane; for `"z_buffer"` alone.
+        far_m: the far plane; for `"z_buffer"` alone.
+        in_keys: where the env's depth lies.
+        out_keys: where depth in metres goes; another key, so that nothing is adapted twice.
+
+    Raises:
+        ValueError: for an unknown kind, or an argument that it lacks or doesn't read.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> metres = AdaptDepth("z_buffer", near_m=0.5, far_m=8.0, in_keys="zbuffer")
+        >>> metres(TensorDict(zbuffer=torch.tensor([[[0.0, 0.8]]])))["sensor", "depth"]
+        tensor([[[0.5000, 2.0000]]])
+    """
+
+    K: Tensor | None
+
+    def __init__(
+        self,
+        kind: geometry.DepthKind,
+        *,
+        intrinsics: Intrinsics | None = None,
+        near_m: float | None = None,
+        far_m: float | None = None,
+        in_keys: Keys = "depth",
+        out_keys: Keys = ("sensor", "depth"),
+    ) -> None:
+        check_depth_options(kind, intrinsics is not None, near_m, far_m)
+        key = None if intrinsics is None else intrinsics_key(intrinsics)
+        if key is None:
+            super().__init__([DEPTH], in_keys, out_keys)
+        else:
+            super().__init__([DEPTH, CAMERA], [*as_keys(in_keys), key], out_keys)
+        check_own_keys(self)
+        self.kind, self.near_m, self.far_m = kind, near_m, far_m
+        given = intrinsics is not None and key is None
+        self.register_buffer("K", as_intrinsics(intrinsics) if given else None, persistent=False)
+
+    def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:
+        """Returns depth along the optical axis."""
+        K = self.K if K is None else K
+        z = geometry.adapt_depth(depth, self.kind, K=K, near_m=self.near_m, far_m=self.far_m)
+        return (z,)
+
+    def output_specs(self, depth: TensorSpec, *camera: TensorSpec) -> tuple[TensorSpec]:
+        """Returns an unbounded spec of depth's shape."""
+        return (Unbounded(depth.shape, device=depth.device, dtype=depth.dtype),)
+
+
+class AdaptPose(MapTransform):
+    """Poses of any convention as `world_from_cam` of a camera with OpenCV's axes.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | a pose | `("sensor", "world_from_cam")` | float64 `[*B, 4, 4]` | rigid | m |
+
+    Convention: see `flowrep.geometry.adapt_pose`; what is read is `[*B, 4, 4]` or `[*B, 7]`. Poses
+    of bodies go through it too, `[*B, N, 7]` for instance, with `axes="opencv"`: a body's own axes
+    do not matter.
+
+    Args:
+        layout: `"matrix"`, `"xyz_xyzw"` or `"xyz_wxyz"`.
+        direction: `"camera_to_world"` or `"world_to_camera"`.
+        axes: `"opencv"`, `"opengl"` (Blender's), `"ned"` or `"x_forward_z_up"`.
+        check: whether ill-formed poses are refused at resets and on batches. Steps aren't checked,
+            and a check waits for a GPU: switch it off where resets or replay samples have to be
+            fast there.
+        in_keys: where the env's pose lies.
+        out_keys: where the pose goes; another key, so that nothing is adapted twice.
+
+    Raises:
+        ValueError: for an unknown name, and at resets for a pose that is not rigid.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> adapt = AdaptPose(layout="xyz_wxyz", axes="x_forward_z_up", in_keys="pose")
+        >>> td = adapt(TensorDict(pose=torch.tensor([5.0, 6.0, 7.0, 1.0, 0.0, 0.0, 0.0])))
+        >>> td["sensor", "world_from_cam"][:3, 2:]  # forward is the world's x; the position
+        tensor([[1., 5.],
+                [0., 6.],
+                [0., 7.]], dtype=torch.float64)
+    """
+
+    def __init__(
+        self,
+        *,
+        layout: geometry.PoseLayout = "matrix",
+        direction: geometry.PoseDirection = "camera_to_world",
+        axes: geometry.CameraAxes = "opencv",
+        check: bool = True,
+        in_keys: Keys = "pose",
+        out_keys: Keys = ("sensor", "world_from_cam"),
+    ) -> None:
+        checks.check_name("layout", layout, geometry.PoseLayout)
+        checks.check_name("direction", direction, geometry.PoseDirection)
+        checks.check_name("axes", axes, geometry.CameraAxes)
+        super().__init__([MOTION if layout == "matrix" else VECTOR], in_keys, out_keys)
+        check_own_keys(self)
+        self.layout, self.direction, self.axes = layout, direction, axes
+        self.check = bool(check)
+
+    def compute(self, pose: Tensor) -> tuple[Tensor]:
+        """Returns the pose, unchecked."""
+        return (self._adapted(pose, check=False),)
+
+    def _adapted(self, pose: Tensor, check: bool) -> Tensor:
+        return geometry.adapt_pose(
+            pose, layout=self.layout, direction=self.direction, axes=self.axes, check=check
+        )
+
+    def _refuse_ill_formed(self, *parts: TensorDictBase | None) -> None:
+        for part in parts if self.check else ():
+            pose = None if part is None else part.get(self.in_keys[0], None)
+            if pose is not None:
+                self._check_layout([pose])
+                self._adapted(pose, check=True)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self._refuse_ill_formed(tensordict_reset)
+        return super()._reset(tensordict, tensordict_reset)
+
+    @dispatch(source="in_keys", dest="out_keys")
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the poses of a batch of any shape, at its root and under `"next"`."""
+        self._refuse_ill_formed(tensordict, tensordict.get("next", None))
+        return super().forward(tensordict)
+
+    def output_specs(self, pose: TensorSpec) -> tuple[TensorSpec]:
+        """Returns an unbounded float64 spec."""
+        batch = pose.shape[: -len(self.reads[0].shape)]
+        return (Unbounded((*batch, 4, 4), device=pose.device, dtype=torch.float64),)
+
+
+class AdaptFlow(MapTransform):
+    """Measured flow of any convention as p_t − p_t' on the current frame's grid.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | flow | `"raw"` | float `[*B, 2, H, W]` | any | px/step |
+
+    Convention: see `flowrep.geometry.adapt_flow`. Flow on the previous frame's grid is refused: it
+    can't be brought onto the current one exactly.
+
+    Args:
+        direction: `"forward"` (p_t − p_t') or `"backward"` (p_t' − p_t).
+        grid: `"current"`; `"previous"` is refused with what to do instead.
+        channels: `"uv"` or `"row_column"`.
+        in_keys: where the env's flow lies.
+        out_keys: where raw flow goes; another key, so that nothing is adapted twice.
+
+    Raises:
+        ValueError: for an unknown name, and for flow on the previous frame's grid.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> backward = torch.tensor([-3.0, 1.0]).reshape(2, 1, 1)
+        >>> adapt = AdaptFlow(direction="backward", grid="current", in_keys="flow")
+        >>> adapt(TensorDict(flow=backward))["raw"].flatten()
+        tensor([ 3., -1.])
+    """
+
+    def __init__(
+        self,
+        *,
+        direction: geometry.Direction,
+        grid: geometry.Grid,
+        channels: geometry.Channels = "uv",
+        in_keys: Keys = "flow",
+        out_keys: Keys = "raw",
+    ) -> None:
+        check_flow_options(direction, grid, channels)
+        super().__init__([FLOW], in_keys, out_keys)
+        check_own_keys(self)
+        self.direction, self.grid, self.channels = direction, grid, channels
+
+    def compute(self, flow: Tensor) -> tuple[Tensor]:
+        """Returns flow in flowrep's convention."""
+        adapted = geometry.adapt_flow(
+            flow, direction=self.direction, grid=self.grid, channels=self.channels
+        )
+        return (adapted,)
+
+    def output_specs(self, flow: TensorSpec) -> tuple[TensorSpec]:
+        """Returns an unbounded spec of flow's shape."""
+        return (Unbounded(flow.shape, device=flow.device, dtype=flow.dtype),)

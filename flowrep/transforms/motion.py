@@ -1,0 +1,224 @@
+"""Poses of the camera and of bodies, at every step, to the motions that flow is computed from."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, expand_as_right
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+
+from flowrep import geometry
+from flowrep.transforms.base import MOTION, MOTIONS, Keys, MapTransform, MissingKey, Reads
+
+_CAMERA: NestedKey = ("sensor", "world_from_cam")
+_BODIES: NestedKey = ("sensor", "world_from_body")
+
+
+class PoseTransform(MapTransform):
+    """A motion between the poses of two steps.
+
+    The poses of the step before are read where they are: in the TensorDict that goes into `step`,
+    where the env declares them as part of its state. Nothing is remembered between calls, so that
+    episodes and envs can't mix. A subclass says what the motion between two sets of poses is.
+
+    Args:
+        reads: as in `MapTransform`.
+        in_keys: as in `MapTransform`.
+        out_keys: one key.
+    """
+
+    def __init__(self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys) -> None:
+        super().__init__(reads, in_keys, out_keys)
+        if len(self.out_keys) != 1:
+            raise ValueError(f"{type(self).__name__} writes 1 key, out_keys has {self.out_keys}")
+
+    @abstractmethod
+    def between(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> Tensor:
+        """Returns the motion, from the poses of the step before and those of now."""
+
+    def compute(self, *poses: Tensor) -> tuple[Tensor]:
+        """Returns the motion at an episode's first frame: none."""
+        return (self.between(poses, poses),)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        now = self._poses(next_tensordict)
+        before = [tensordict.get(key, None) for key in self.in_keys]
+        for key, pose in zip(self.in_keys, before):
+            if pose is None:
+                raise MissingKey(
+                    f"{self.label} needs {key!r} of the step before: give step the TensorDict of "
+                    f"reset or step_mdp, which holds {key!r}"
+                )
+        return next_tensordict.set(self.out_keys[0], self.between(before, now))
+
+    def _poses(self, tensordict: TensorDictBase) -> list[Tensor]:
+        poses = [tensordict.get(key, None) for key in self.in_keys]
+        for key, pose in zip(self.in_keys, poses):
+            if pose is None:
+                raise self._missing(key, tensordict)
+        self._check_layout(poses)
+        return poses
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        """Stops the motion in the envs that have just reset themselves."""
+        key = self.out_keys[0]
+        (first,) = self.compute(*self._poses(tensordict_reset))
+        mask = tensordict.get("_reset").reshape(tensordict.batch_size)
+        motion = tensordict_reset.get(key)
+        return tensordict_reset.set(key, torch.where(expand_as_right(mask, motion), first, motion))
+
+    @dispatch(source="in_keys", dest="out_keys")
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the motions of a replay batch, at its root and under `"next"`."""
+        key = self.out_keys[0]
+        now = self._poses(tensordict)
+        if tensordict.get(key, None) is None:
+            tensordict.set(key, self._along_trajectory(tensordict, now))
+        following = tensordict.get("next", None)
+        if following is not None and any(k in following.keys(True) for k in self.in_keys):
+            following.set(key, self.between(now, self._poses(following)))
+            tensordict.set("next", following)
+        return tensordict
+
+    def _along_trajectory(self, tensordict: TensorDictBase, now: Sequence[Tensor]) -> Tensor:
+        """Returns the motion into each step of a trajectory, none where an episode begins."""
+        done = tensordict.get(("next", "done"), None)
+        if done is None or "time" not in tensordict.names:
+            raise MissingKey(
+                f"{self.label} is not in the batch, and the step before can't be told: store "
+                f"{self.out_keys[0]!r}, or give a trajectory with ('next', 'done') and a dimension "
+                f"named 'time' (td.refine_names(..., 'time')); names are {tensordict.names}"
+            )
+        done = done.flatten(tensordict.ndim).any(-1) if done.ndim > tensordict.ndim else done
+        time = tensordict.names.index("time")
+        begins = torch.cat([torch.ones_like(done.narrow(time, 0, 1)), _but_last(done, time)], time)
+        before = [
+            torch.where(
+                expand_as_right(begins, pose),
+                pose,
+                torch.cat([pose.narrow(time, 0, 1), _but_last(pose, time)], time),
+            )
+            for pose in now
+        ]
+        return self.between(before, now)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Returns the specs of what `step` reads, with the poses of the step before added."""
+        input_spec = super().transform_input_spec(input_spec)
+        if self.parent is None:
+            return input_spec
+        for key in self.in_keys:
+            input_spec["full_state_spec"][key] = self.parent.observation_spec[key].clone()
+        return input_spec
+
+
+class CameraMotion(PoseTransform):
+    """The camera's motion, for envs that only say where the camera is.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "world_from_cam")` | `("sensor", "prev_from_curr")` | float32 `[*B, 4, 4]` | | m |
+
+    Convention: `prev_from_curr` takes a point in the current camera's frame into the previous
+    camera's (Eq. 11 of the paper). Poses are camera-to-world of a camera with OpenCV's axes
+    (`AdaptPose` makes them so), any float type, float64 where the world is wide: the motion is
+    composed in float64 and handed on in float32. After a reset it is exactly the identity.
+
+    The pose of the step before is read from the TensorDict that goes into `step`; nothing is
+    remembered between calls. In a replay buffer the stored root motion and the two poses give the
+    next motion, shuffled or not. A batch without a stored motion has to be a trajectory, with a
+    dimension named "time" and `("next", "done")`; its first frame counts as an episode's first.
+
+    Args:
+        in_keys: where the pose lies.
+        out_keys: where the motion goes.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> poses = torch.eye(4).repeat(3, 1, 1)
+        >>> poses[:, 0, 3] = torch.tensor([0.0, 2.0, 7.0])  # the third begins a new episode
+        >>> done = torch.tensor([[False], [True], [False]])
+        >>> td = TensorDict({"sensor": {"world_from_cam": poses}, "next": {"done": done}}, [3])
+        >>> td.names = ["time"]
+        >>> CameraMotion()(td)["sensor", "prev_from_curr"][:, 0, 3]
+        tensor([0., 2., 0.])
+    """
+
+    def __init__(
+        self,
+        *,
+        in_keys: Keys = ("sensor", "world_from_cam"),
+        out_keys: Keys = ("sensor", "prev_from_curr"),
+    ) -> None:
+        super().__init__([MOTION], in_keys, out_keys)
+
+    def between(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> Tensor:
+        """Returns `prev_from_curr`."""
+        return geometry.relative_motion(before[0], now[0])
+
+    def output_specs(self, pose: TensorSpec) -> tuple[TensorSpec]:
+        """Returns an unbounded float32 spec."""
+        return (Unbounded(pose.shape, device=pose.device, dtype=torch.float32),)
+
+
+class InstanceMotion(PoseTransform):
+    """The bodies' motions as the camera sees them, for simulators that know their bodies' poses.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "world_from_cam")` | `("sensor", "instance_motion")` | float32 | | m |
+    | `("sensor", "world_from_body")` | | `[*B, 1 + N, 4, 4]` | | |
+
+    Convention: row 0 is the static world's, the camera's own motion; row 1 + i takes a point that
+    rides on body i from the current camera's frame to where it was in the previous camera's. The
+    row of a body that stands still equals row 0 to the last bit. `InstanceIds` turns a simulator's
+    segmentation ids into these rows; the two are what `RawFlow` reads.
+
+    Where a body's own origin and axes lie does not matter. As `CameraMotion`, it reads the poses of
+    the step before from the TensorDict that goes into `step`, and remembers nothing.
+
+    Args:
+        in_keys: the camera's pose `[*B, 4, 4]`, the bodies' poses `[*B, N, 4, 4]`, metres.
+        out_keys: where the motions go.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> camera, body = torch.eye(4).repeat(2, 1, 1), torch.eye(4).repeat(2, 1, 1, 1)
+        >>> body[1, 0, 0, 3] = 0.5  # the only body went half a metre along x
+        >>> sensor = {"world_from_cam": camera, "world_from_body": body}
+        >>> td = TensorDict({"sensor": sensor, "next": {"done": torch.zeros(2, 1).bool()}}, [2])
+        >>> td.names = ["time"]
+        >>> InstanceMotion()(td)["sensor", "instance_motion"][..., 0, 3]
+        tensor([[ 0.0000,  0.0000],
+                [ 0.0000, -0.5000]])
+    """
+
+    def __init__(
+        self, *, in_keys: Keys | None = None, out_keys: Keys = ("sensor", "instance_motion")
+    ) -> None:
+        super().__init__(
+            [MOTION, MOTIONS], [_CAMERA, _BODIES] if in_keys is None else in_keys, out_keys
+        )
+
+    def between(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> Tensor:
+        """Returns `instance_motion`."""
+        return geometry.instance_motion(before[0], now[0], before[1], now[1])
+
+    def output_specs(self, camera: TensorSpec, bodies: TensorSpec) -> tuple[TensorSpec]:
+        """Returns an unbounded float32 spec."""
+        *batch, count, _, _ = bodies.shape
+        shape = (*batch, 1 + count, 4, 4)
+        return (Unbounded(shape, device=bodies.device, dtype=torch.float32),)
+
+
+def _but_last(values: Tensor, dim: int) -> Tensor:
+    return values.narrow(dim, 0, values.shape[dim] - 1)

@@ -1,0 +1,218 @@
+"""What real sensors do to depth, camera motion and flow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import TensorSpec, Unbounded
+
+from flowrep.transforms.base import DEPTH, FLOW, MOTION, Keys, MapTransform
+
+_READS = {"depth": DEPTH, "motion": MOTION, "flow": FLOW}
+_KEYS: dict[str, NestedKey] = {
+    "depth": ("sensor", "depth"),
+    "motion": ("sensor", "prev_from_curr"),
+    "flow": "raw",
+}
+_OPTIONS = {
+    "depth": ("depth_sigma_per_m", "depth_dropout"),
+    "motion": ("drift_m", "drift_rad"),
+    "flow": ("flow_sigma_px",),
+}
+
+
+class SensorNoise(MapTransform):
+    """Depth, camera motion and flow as a real sensor would give them; unchanged by default.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "depth")` | the same, noisy | float `[*B, 1, H, W]` | > 0, inf, nan | m |
+    | `("sensor", "prev_from_curr")` | the same, noisy | float `[*B, 4, 4]` | rigid | m |
+    | `"raw"` if asked for | the same, noisy | float `[*B, 2, H, W]` | any | px/step |
+
+    Convention: depth z gets a normal error of standard deviation `depth_sigma_per_m` · z², as
+    stereo and structured light have; what would not be in front of the camera becomes a hole
+    (`nan`), and so does each pixel with probability `depth_dropout`. Camera motion is followed by a
+    small rigid motion of the current camera, so that poses added up from it drift like odometry.
+    Each sensor with all of its options at 0 comes out bit for bit as it came in.
+
+    Put it into the env, after `RawFlow` and before `FlowFactorize`: stored samples then hold what
+    the agent saw. A call draws new noise each time, which on a replay buffer is augmentation: the
+    root and `"next"` get errors of their own. Resets get noise like any frame.
+
+    The generator is the transform's own, on the device of the maps; its state is part of
+    `state_dict`, so that a resumed run goes on in the same sequence. Workers of a `ParallelEnv`
+    that hold the transform need a seed each.
+
+    Args:
+        sensors: of `"depth"`, `"motion"` and `"flow"`, those that are read and written.
+        depth_sigma_per_m: standard deviation of depth over z², 1/m; a depth camera's is some 0.002.
+        depth_dropout: probability that a pixel's depth is missing.
+        drift_m: standard deviation of the motion's translation a step, along each axis, metres.
+        drift_rad: the same of its rotation, about each axis, radians.
+        flow_sigma_px: standard deviation of each flow channel, pixels a step.
+        seed: of the generator.
+        in_keys: one key a sensor; the table's by default.
+        out_keys: one key a sensor; `in_keys` by default.
+
+    Raises:
+        ValueError: for an unknown sensor, an option of a sensor that isn't read, or a negative one.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> depth = torch.tensor([[[1.0, 10.0, torch.inf]]])
+        >>> noise = SensorNoise(sensors=["depth"], depth_sigma_per_m=0.01)
+        >>> error = noise(TensorDict({"sensor": {"depth": depth}}))["sensor", "depth"] - depth
+        >>> bool(error[..., 0].abs() < 0.05), bool(error[..., 1].abs() < 5.0)
+        (True, True)
+    """
+
+    def __init__(
+        self,
+        *,
+        sensors: Sequence[str] = ("depth", "motion"),
+        depth_sigma_per_m: float = 0.0,
+        depth_dropout: float = 0.0,
+        drift_m: float = 0.0,
+        drift_rad: float = 0.0,
+        flow_sigma_px: float = 0.0,
+        seed: int = 0,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
+    ) -> None:
+        options = {
+            "depth_sigma_per_m": depth_sigma_per_m,
+            "depth_dropout": depth_dropout,
+            "drift_m": drift_m,
+            "drift_rad": drift_rad,
+            "flow_sigma_px": flow_sigma_px,
+        }
+        _check(sensors, options)
+        keys: Keys = [_KEYS[sensor] for sensor in sensors] if in_keys is None else in_keys
+        super().__init__(
+            [_READS[sensor] for sensor in sensors], keys, keys if out_keys is None else out_keys
+        )
+        if len(self.out_keys) != len(self.in_keys):
+            raise ValueError(
+                f"SensorNoise writes one key a sensor of {list(sensors)}, got {self.out_keys}"
+            )
+        self.sensors = tuple(sensors)
+        self.options = options
+        self.seed = int(seed)
+        self._state: Tensor | None = None  # of a generator that is yet to be made
+        self._generator: torch.Generator | None = None
+
+    def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
+        """Returns the sensors' maps with new noise."""
+        return tuple(self._noisy(sensor, value) for sensor, value in zip(self.sensors, maps))
+
+    def _noisy(self, sensor: str, value: Tensor) -> Tensor:
+        used = {name: self.options[name] for name in _OPTIONS[sensor]}
+        if not any(used.values()):
+            return value
+        if sensor == "depth":
+            normal, uniform = self._normal(value.shape, value), self._uniform(value)
+            sigma_per_m, dropout = used.values()
+            return noisy_depth(value, normal, uniform, sigma_per_m=sigma_per_m, dropout=dropout)
+        if sensor == "motion":
+            normal = self._normal((*value.shape[:-2], 6), value)
+            return drifted_motion(
+                value, normal, drift_m=used["drift_m"], drift_rad=used["drift_rad"]
+            )
+        return value + used["flow_sigma_px"] * self._normal(value.shape, value)
+
+    def _normal(self, shape: Sequence[int], like: Tensor) -> Tensor:
+        generator = self._generator_on(like.device)
+        return torch.randn(shape, generator=generator, device=like.device).to(like.dtype)
+
+    def _uniform(self, like: Tensor) -> Tensor:
+        return torch.rand(like.shape, generator=self._generator_on(like.device), device=like.device)
+
+    def _generator_on(self, device: torch.device) -> torch.Generator:
+        """Returns the generator, made at the first use on a device."""
+        if self._generator is None or self._generator.device != device:
+            self._generator = torch.Generator(device=device).manual_seed(self.seed)
+            if self._state is not None:
+                self._generator.set_state(self._state)
+                self._state = None
+        return self._generator
+
+    def get_extra_state(self) -> Tensor:
+        """Returns the generator's state for `state_dict`, empty before the first use."""
+        if self._generator is not None:
+            return self._generator.get_state()
+        return torch.empty(0, dtype=torch.uint8) if self._state is None else self._state.clone()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Goes on from a `state_dict` at the next use, on a device of the same kind."""
+        self._generator = None
+        self._state = state.clone().cpu() if len(state) else None
+
+    def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
+        """Returns unbounded specs: an error knows no bounds."""
+        return tuple(Unbounded(s.shape, device=s.device, dtype=s.dtype) for s in specs)
+
+
+def noisy_depth(
+    depth: Tensor, normal: Tensor, uniform: Tensor, *, sigma_per_m: float, dropout: float
+) -> Tensor:
+    """Returns depth with an error of sigma_per_m · z², and holes (nan).
+
+    Args:
+        depth: `[*B, 1, H, W]`, metres; inf stays inf unless it drops out.
+        normal: standard normal numbers of depth's shape.
+        uniform: uniform numbers in [0, 1) of depth's shape.
+        sigma_per_m: standard deviation over z², 1/m.
+        dropout: probability of a hole.
+    """
+    near = torch.where(depth.isinf(), 0.0, depth)
+    noisy = torch.where(depth.isinf(), depth, near + sigma_per_m * near.square() * normal)
+    return torch.where((noisy > 0.0) & (uniform >= dropout), noisy, math.nan)
+
+
+def drifted_motion(
+    prev_from_curr: Tensor, normal: Tensor, *, drift_m: float, drift_rad: float
+) -> Tensor:
+    """Returns a motion that starts from a slightly wrong current camera; it stays rigid.
+
+    Args:
+        prev_from_curr: `[*B, 4, 4]`.
+        normal: standard normal numbers `[*B, 6]`: translation, then rotation vector.
+        drift_m: standard deviation of the translation along each axis.
+        drift_rad: standard deviation of the rotation about each axis.
+    """
+    shift, turn = normal.double().split([3, 3], -1)
+    vector = drift_rad * turn
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    # Rodrigues: I + sin(a)/a [r] + (1 - cos(a))/a^2 [r]^2; torch.sinc(t) is sin(pi t)/(pi t).
+    turns = vector.norm(dim=-1)[..., None, None] / math.pi
+    identity = torch.eye(3, dtype=cross.dtype, device=cross.device)
+    rotation = identity + torch.sinc(turns) * cross
+    rotation = rotation + 0.5 * torch.sinc(turns / 2).square() * (cross @ cross)
+    motion = prev_from_curr.double()
+    turned = motion[..., :3, :3] @ rotation
+    moved = motion[..., :3, 3:] + motion[..., :3, :3] @ (drift_m * shift).unsqueeze(-1)
+    rigid = torch.cat([torch.cat([turned, moved], -1), motion[..., 3:, :]], -2)
+    return rigid.to(prev_from_curr.dtype)
+
+
+def _check(sensors: Sequence[str], options: dict[str, float]) -> None:
+    unknown = [sensor for sensor in sensors if sensor not in _READS]
+    if isinstance(sensors, str) or unknown or not sensors or len(set(sensors)) != len(sensors):
+        raise ValueError(f"sensors is a list of some of {list(_READS)}, each once; got {sensors!r}")
+    for name, value in options.items():
+        if not 0.0 <= value < math.inf:
+            raise ValueError(f"{name} is a number of at least 0, got {value}")
+    if options["depth_dropout"] > 1.0:
+        raise ValueError(f"depth_dropout is a probability, got {options['depth_dropout']}")
+    for sensor, names in _OPTIONS.items():
+        idle = [name for name in names if options[name] and sensor not in sensors]
+        if idle:
+            raise ValueError(f"{idle[0]} needs {sensor!r} among sensors, got {list(sensors)}")

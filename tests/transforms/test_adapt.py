@@ -1,0 +1,123 @@
+"""Adapters as transforms: what they hand to geometry, and what they refuse."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Categorical
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from flowrep.transforms import (
+    AdaptDepth,
+    AdaptFlow,
+    AdaptPose,
+    CameraMotion,
+    FlowFactorize,
+    InstanceIds,
+    InstanceMotion,
+    RawFlow,
+)
+from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
+
+POSE = ("sensor", "world_from_cam")
+
+
+def test_a_z_buffer_becomes_metres():
+    td = TensorDict({"b": torch.tensor([[[[0.0, 0.8, 1.0]]]])}, [1])
+    z = AdaptDepth("z_buffer", near_m=0.5, far_m=8.0, in_keys="b")(td)["sensor", "depth"]
+    torch.testing.assert_close(z, torch.tensor([[[[0.5, 2.0, math.inf]]]]))
+
+
+def test_intrinsics_of_each_sample_may_lie_under_a_key():
+    # fx = 3 and 4: the last pixel looks along x = 1 and 0.75, a ray of sqrt(2) and 1.25.
+    K = torch.tensor([[3.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
+    K[1, 0, 0] = 4.0
+    td = TensorDict({"ray": torch.full((2, 1, 1, 1), 5.0), "K": K}, [2])
+    for key in ("K", ["K"]):
+        z = AdaptDepth("ray_length", intrinsics=key, in_keys="ray")(td.clone())["sensor", "depth"]
+        torch.testing.assert_close(z.flatten(), torch.tensor([5.0 / math.sqrt(2), 4.0]))
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: AdaptDepth("metres"), r"\['z', 'ray_length', 'z_buffer'\], got 'metres'"),
+        (lambda: AdaptDepth("ray_length"), "needs K"),
+        (lambda: AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
+        (lambda: AdaptPose(axes="gl"), r"'x_forward_z_up'\], got 'gl'"),
+        (lambda: AdaptPose(layout="rpy"), "layout is one of"),
+        (lambda: AdaptPose(direction="inverse"), "direction is one of"),
+        (lambda: AdaptPose(in_keys=POSE), "reads and writes"),
+        (lambda: AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
+        (lambda: AdaptFlow(direction="forward", grid="current", out_keys="flow"), "second pass"),
+        (lambda: InstanceIds([3, 1, 3]), r"names each body once, got \[3, 1, 3\]"),
+    ],
+)
+def test_options_are_checked(make, expected):
+    with pytest.raises(ValueError, match=expected):
+        make()
+
+
+def test_an_ill_formed_pose_is_refused_at_a_reset_and_on_a_batch_but_not_in_a_step():
+    td = TensorDict({"pose": torch.eye(4).repeat(2, 1, 1)}, [2])
+    td["pose"][1, 0, 0] = -1.0
+    adapt = AdaptPose()
+    with pytest.raises(ValueError, match=r"pose\[1\] is left-handed"):
+        adapt(td.clone())
+    with pytest.raises(ValueError, match=r"pose\[1\] is left-handed"):
+        adapt._reset(td, td.clone())
+    assert POSE in adapt._step(td, td.clone()).keys(True)
+    assert POSE in AdaptPose(check=False)(td.clone()).keys(True)
+    good = td[:1].set("next", td[1:].clone())
+    with pytest.raises(ValueError, match="left-handed"):
+        adapt(good)
+
+
+def test_poses_of_several_bodies_at_once():
+    poses = torch.zeros(2, 3, 7)
+    poses[..., 3] = 1.0
+    poses[1, 2, :3] = torch.tensor([1.0, 2.0, 3.0])
+    adapt = AdaptPose(layout="xyz_wxyz", in_keys="bodies", out_keys="matrices")
+    matrices = adapt(TensorDict({"bodies": poses}, [2]))["matrices"]
+    assert matrices.shape == (2, 3, 4, 4)
+    assert matrices[1, 2, :3, 3].tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(ValueError, match=r"float \[\*B, 7\].*\[2, 3, 4, 4\]"):
+        AdaptPose(layout="xyz_wxyz", in_keys="matrices")(TensorDict({"matrices": matrices}, [2]))
+
+
+def test_rows_of_instances_are_categories():
+    env = TransformedEnv(
+        FakeSensorEnv((2,)), InstanceIds([1, 2, 3], in_keys=("sensor", "semantic"), out_keys="rows")
+    )
+    spec = env.observation_spec["rows"]
+    assert isinstance(spec, Categorical)
+    assert (spec.space.n, spec.dtype) == (4, torch.uint8)
+
+
+def test_a_simulator_that_knows_poses_alone_gets_the_flow_of_one_that_knows_motions():
+    keys = [("sensor", "depth"), ("sensor", "instance"), "motions"]
+    own = Compose(
+        CameraMotion(out_keys="motion"),
+        InstanceMotion(out_keys="motions"),
+        RawFlow(("sensor", "K"), in_keys=keys),
+        FlowFactorize(("sensor", "K"), in_keys=["raw", ("sensor", "depth"), "motion"]),
+    )
+    known = Compose(RawFlow(INTRINSICS), FlowFactorize(INTRINSICS))
+    got = TransformedEnv(FakeSensorEnv((3,)), own).rollout(6, break_when_any_done=False)
+    want = TransformedEnv(FakeSensorEnv((3,)), known).rollout(6, break_when_any_done=False)
+    for key in ("raw", "ego", "obj"):
+        torch.testing.assert_close(got[key], want[key], atol=2e-5, rtol=1e-5)
+    still = (got["sensor", "instance"] != 1).expand_as(got["obj"])
+    assert (got["obj"][still] == 0).all()  # exactly, though poses lie kilometres out
+    assert (got["obj"][:, 1:3][~still[:, 1:3]] != 0).any()
+
+
+def test_a_missing_camera_key_is_named():
+    td = FakeSensorEnv((2,)).rollout(2)
+    del td["sensor", "K"]
+    with pytest.raises(KeyError, match=r"'raw' needs key \('sensor', 'K'\)"):
+        RawFlow(("sensor", "K"))(td)

@@ -1,0 +1,172 @@
+"""Noise: its size, its holes, that motion stays rigid, and that a sequence can be had again."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.transforms import Compose
+
+from flowrep.geometry import check_rigid
+from flowrep.transforms import FlowFactorize, RawFlow, SensorNoise
+from flowrep.transforms.sensor_noise import drifted_motion, noisy_depth
+from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
+
+ALL = {
+    "sensors": ["depth", "motion", "flow"],
+    "depth_sigma_per_m": 0.01,
+    "depth_dropout": 0.1,
+    "drift_m": 0.02,
+    "drift_rad": 0.03,
+    "flow_sigma_px": 0.5,
+}
+
+
+def maps(count: int = 2) -> list[torch.Tensor]:
+    depth = torch.linspace(1.0, 20.0, 12).reshape(1, 3, 4).repeat(count, 1, 1, 1)
+    return [depth, torch.eye(4).repeat(count, 1, 1), torch.ones(count, 2, 3, 4)]
+
+
+def test_depth_s_error_grows_with_its_square_by_hand():
+    # z = 2 m and 10 m, 0.01 / m: 0.04 m and 1 m a standard deviation; 2 and -0.5 of them.
+    depth = torch.tensor([2.0, 10.0, 10.0, 10.0, math.inf, math.nan, 0.5]).reshape(1, 1, 7)
+    normal = torch.tensor([2.0, -0.5, 0.0, -11.0, 3.0, 0.0, -1.0]).reshape(1, 1, 7)
+    uniform = torch.tensor([0.9, 0.3, 0.29, 0.9, 0.9, 0.9, 0.9]).reshape(1, 1, 7)
+    noisy = noisy_depth(depth, normal, uniform, sigma_per_m=0.01, dropout=0.3).flatten()
+    torch.testing.assert_close(noisy[:2], torch.tensor([2.08, 9.5]))
+    assert noisy[2].isnan()  # dropped out: 0.29 < 0.3
+    assert noisy[3].isnan()  # it would lie behind the camera
+    assert noisy[4] == math.inf  # sky stays sky
+    assert noisy[5].isnan()
+    torch.testing.assert_close(noisy[6], torch.tensor(0.4975))
+
+
+def test_drift_follows_the_motion_by_hand():
+    # The current camera is taken for one 0.5 m ahead of it and turned by 90 degrees to the left
+    # (about -y). The true motion: a quarter turn about z, 3 m along x.
+    motion = torch.tensor([[0.0, -1, 0, 3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    normal = torch.tensor([0.0, 0.0, 5.0, 0.0, -1.0, 0.0])
+    drifted = drifted_motion(motion, normal, drift_m=0.1, drift_rad=math.pi / 2)
+    # Ahead (z) of the wrong camera is the true one's left, -x, which the motion turns to -y.
+    ahead = drifted @ torch.tensor([0.0, 0.0, 1.0, 0.0])
+    torch.testing.assert_close(ahead, torch.tensor([0.0, -1.0, 0.0, 0.0]), atol=1e-6, rtol=0)
+    origin = drifted @ torch.tensor([0.0, 0.0, 0.0, 1.0])
+    torch.testing.assert_close(origin, torch.tensor([3.0, 0.0, 0.5, 1.0]))
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.02, 3.0])
+def test_drifted_motion_stays_rigid(size):
+    motion = drifted_motion(
+        torch.eye(4).double().repeat(50, 1, 1),
+        torch.randn(50, 6, generator=torch.manual_seed(0)),
+        drift_m=size,
+        drift_rad=size,
+    )
+    check_rigid("motion", motion, tolerance=1e-12)
+    assert not torch.equal(motion[0], torch.eye(4).double())
+
+
+def test_noise_has_the_size_that_was_asked_for():
+    depth = torch.full((1, 200, 200), 10.0)
+    motion, flow = torch.eye(4).repeat(1, 1), torch.zeros(2, 200, 200)
+    noisy_z, _, noisy_flow = SensorNoise(**ALL).compute(depth, motion, flow)
+    error = noisy_z[~noisy_z.isnan()] - 10.0
+    assert abs(noisy_z.isnan().float().mean() - 0.1) < 0.01  # 40,000 pixels: 6 sigma
+    assert abs(error.std() - 1.0) < 0.03
+    assert abs(error.mean()) < 0.04
+    assert abs(noisy_flow.std() - 0.5) < 0.01
+    motions = SensorNoise(**ALL).compute(
+        maps(20_000)[0], torch.eye(4).repeat(20_000, 1, 1), maps(20_000)[2]
+    )[1]
+    assert abs(motions[:, :3, 3].std() - 0.02) < 0.001
+    assert abs(motions[:, 2, 1].std() - 0.03) < 0.001  # about x
+
+
+def test_off_is_exactly_off():
+    given = maps()
+    for got, want in zip(SensorNoise(sensors=ALL["sensors"]).compute(*given), given):
+        assert got is want
+
+
+def test_each_option_changes_its_own_sensor_alone():
+    for option, changed in [
+        ("depth_sigma_per_m", 0),
+        ("depth_dropout", 0),
+        ("drift_m", 1),
+        ("drift_rad", 1),
+        ("flow_sigma_px", 2),
+    ]:
+        noise = SensorNoise(sensors=ALL["sensors"], **{option: 0.3})
+        same = [torch.equal(got, want) for got, want in zip(noise.compute(*maps()), maps())]
+        assert [i for i, equal in enumerate(same) if not equal] == [changed], option
+
+
+def test_a_seed_gives_a_sequence_and_another_seed_another():
+    def sequence(seed: int) -> torch.Tensor:
+        noise = SensorNoise(**ALL, seed=seed)
+        return torch.stack([noise.compute(*maps())[2] for _ in range(3)])
+
+    torch.manual_seed(5)
+    first = sequence(1)
+    torch.manual_seed(6)  # the global generator has no part in it
+    assert torch.equal(sequence(1), first)
+    assert not torch.equal(sequence(2), first)
+    assert not torch.equal(first[0], first[1])
+
+
+@pytest.mark.parametrize("calls", [0, 3])
+def test_a_resumed_run_goes_on_in_the_same_sequence(calls):
+    noise = SensorNoise(**ALL, seed=1)
+    for _ in range(calls):
+        noise.compute(*maps())
+    saved = noise.state_dict()
+    copies = [copy.deepcopy(noise), pickle.loads(pickle.dumps(noise))]
+    want = [noise.compute(*maps())[2] for _ in range(2)]
+    resumed = SensorNoise(**ALL, seed=1)
+    resumed.compute(*maps())  # whatever it did before
+    resumed.load_state_dict(saved)
+    for again in (resumed, *copies):
+        assert all(torch.equal(again.compute(*maps())[2], w) for w in want)
+    unused = SensorNoise(**ALL, seed=1)
+    unused.load_state_dict(saved)
+    torch.testing.assert_close(unused.state_dict(), saved)  # loaded and saved again before use
+
+
+def test_what_noise_does_to_object_flow_on_what_stands_still():
+    td = FakeSensorEnv((2,)).rollout(3)
+    noise = SensorNoise(drift_rad=0.01)
+    noisy = Compose(RawFlow(INTRINSICS), noise, FlowFactorize(INTRINSICS))(td)
+    still = (noisy["sensor", "instance"] == 0) & ~noisy["sensor", "depth"].isnan()
+    obj = noisy["obj"][:, 1][still[:, 1].expand(-1, 2, -1, -1)]
+    assert (obj != 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"sensors": ["deep"]}, r"some of \['depth', 'motion', 'flow'\], each once"),
+        ({"sensors": "depth"}, "is a list"),
+        ({"sensors": []}, "is a list"),
+        ({"sensors": ["depth", "depth"]}, "each once"),
+        ({"depth_sigma_per_m": -0.1}, "depth_sigma_per_m is a number of at least 0, got -0.1"),
+        ({"drift_m": math.inf}, "drift_m is a number"),
+        ({"depth_dropout": 1.5}, r"depth_dropout is a probability, got 1\.5"),
+        ({"flow_sigma_px": 1.0}, "flow_sigma_px needs 'flow' among sensors"),
+        ({"out_keys": ["only"]}, "one key a sensor"),
+    ],
+)
+def test_options_are_checked(options, expected):
+    with pytest.raises(ValueError, match=expected):
+        SensorNoise(**options)
+
+
+def test_written_in_place_unless_told_otherwise():
+    depth, motion, flow = maps()
+    td = TensorDict({"sensor": {"depth": depth, "prev_from_curr": motion}, "raw": flow}, [2])
+    noisy = SensorNoise(**ALL)(td.clone())
+    assert set(noisy.keys(True, True)) == set(td.keys(True, True))
+    assert not torch.equal(noisy["raw"], flow)
