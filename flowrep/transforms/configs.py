@@ -1,0 +1,109 @@
+"""Hydra configs of the transforms, in TorchRL's own config group `transform`.
+
+Importing this module registers them, beside those of `torchrl.trainers.algorithms.configs`:
+
+```yaml
+defaults:
+  - transform@raw: raw_flow
+  - transform@split: flow_factorize
+  - transform@stack: compose  # TorchRL's
+  - _self_
+
+raw: {intrinsics: [sensor, K]}
+split: {intrinsics: [sensor, K], outputs: [obj]}
+stack: {transforms: ["${raw}", "${split}"]}
+```
+
+A nested key is a list inside of a list of keys, as in TorchRL's configs: `in_keys: [[a, b]]` is one
+key, `in_keys: [a, b]` are two. Names and defaults are those of the classes, read from their
+signatures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+from torchrl.trainers.algorithms.configs.transforms import TransformConfig
+
+from flowrep import transforms
+from flowrep.transforms.base import as_keys
+
+
+def config_class(transform: type) -> type[TransformConfig]:
+    """Returns the config of a transform: a dataclass with a field for each of its parameters.
+
+    >>> config_class(transforms.Depth)().range_m
+    100.0
+    """
+    fields: list[tuple[str, Any, Any]] = [
+        (name, Any, _field(name, parameter.default))
+        for name, parameter in inspect.signature(transform).parameters.items()
+    ]
+    target = f"{transforms.__name__}.{transform.__name__}"
+    # Lists and mappings reach the transforms as Python's own, not as OmegaConf's.
+    fields += [("_target_", str, target), ("_convert_", str, "all"), ("_partial_", bool, False)]
+    return dataclasses.make_dataclass(
+        f"{transform.__name__}Config",
+        fields,
+        bases=(TransformConfig,),
+        namespace={"__doc__": f"Configuration of `{target}`.", "__module__": __name__},
+    )
+
+
+def _field(name: str, default: Any) -> Any:
+    """Returns a dataclass field for a parameter's default."""
+    if default is inspect.Parameter.empty:
+        return MISSING
+    if name in ("in_keys", "out_keys") and default is not None:
+        default = [key if isinstance(key, str) else [*key] for key in as_keys(default)]
+    if isinstance(default, (tuple, list)):
+        return dataclasses.field(default_factory=lambda: [*default])
+    return default
+
+
+AdaptDepthConfig = config_class(transforms.AdaptDepth)
+AdaptFlowConfig = config_class(transforms.AdaptFlow)
+AdaptPoseConfig = config_class(transforms.AdaptPose)
+CameraMotionConfig = config_class(transforms.CameraMotion)
+DepthConfig = config_class(transforms.Depth)
+EstimatedFlowConfig = config_class(transforms.EstimatedFlow)
+FlowFactorizeConfig = config_class(transforms.FlowFactorize)
+FrameStackConfig = config_class(transforms.FrameStack)
+InstanceIdsConfig = config_class(transforms.InstanceIds)
+InstanceMotionConfig = config_class(transforms.InstanceMotion)
+RawFlowConfig = config_class(transforms.RawFlow)
+RgbConfig = config_class(transforms.Rgb)
+SegmentationConfig = config_class(transforms.Segmentation)
+SensorNoiseConfig = config_class(transforms.SensorNoise)
+
+# By name in the group `transform`.
+CONFIGS: dict[str, type[TransformConfig]] = {
+    "adapt_depth": AdaptDepthConfig,
+    "adapt_flow": AdaptFlowConfig,
+    "adapt_pose": AdaptPoseConfig,
+    "camera_motion": CameraMotionConfig,
+    "depth": DepthConfig,
+    "estimated_flow": EstimatedFlowConfig,
+    "flow_factorize": FlowFactorizeConfig,
+    "frame_stack": FrameStackConfig,
+    "instance_ids": InstanceIdsConfig,
+    "instance_motion": InstanceMotionConfig,
+    "raw_flow": RawFlowConfig,
+    "rgb": RgbConfig,
+    "segmentation": SegmentationConfig,
+    "sensor_noise": SensorNoiseConfig,
+}
+
+
+def register() -> None:
+    """Stores each config in the group `transform`; importing the module has done it already."""
+    store = ConfigStore.instance()
+    for name, config in CONFIGS.items():
+        store.store(group="transform", name=name, node=config, provider="flowrep")
+
+
+register()
