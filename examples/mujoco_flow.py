@@ -1,0 +1,210 @@
+"""Ego and object flow in a simulator that knows nothing of flowrep: MuJoCo.
+
+A camera rides through a yard in which a ball rolls, a door swings and a crate slides. MuJoCo draws
+depth and segmentation off-screen and tells where its bodies are; flowrep's transforms do the rest.
+
+    pip install 'flowrep[examples]'
+    apt-get install libegl1 libgl1-mesa-dri     # off-screen, on a CPU; or libosmesa6
+    MUJOCO_GL=egl python examples/mujoco_flow.py strip.png
+
+What MuJoCo's numbers mean, as tests/examples/test_mujoco_flow.py measures it:
+
+- depth is metres along the optical axis already; where there is no surface it holds the far plane;
+- pixels are sampled at their centres, so K has cx = W / 2, cy = H / 2 (with `offsamples="0"`);
+- camera axes are OpenGL's (x right, y up, z backward), poses are camera-to-world;
+- segmentation is (geom id, object type) a pixel, -1 for the sky.
+"""
+
+import math
+import os
+import sys
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+from torchrl.envs import Compose, GymWrapper, TransformedEnv
+
+from flowrep.geometry import invert_rigid, relative_motion
+from flowrep.transforms import FlowFactorize, RawFlow
+
+HEIGHT, WIDTH, FOV_DEG = 96, 144, 60.0
+STEP_S = 1 / 12
+FORWARD_MPS, YAW_RATE_RAD_S = 1.5, 0.3
+SCENE = f"""
+<mujoco>
+  <option timestep="{STEP_S / 20}"/>
+  <visual>
+    <headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/>
+    <quality offsamples="0"/>
+    <map znear="0.01" zfar="20"/>
+  </visual>
+  <statistic extent="5" center="0 0 1"/>
+  <asset>
+    <texture name="tiles" type="2d" builtin="checker" rgb1=".3 .4 .3" rgb2=".6 .6 .5" width="128" height="128"/>
+    <texture name="paint" type="cube" builtin="checker" rgb1=".9 .3 .2" rgb2=".9 .8 .3" width="64" height="64"/>
+    <material name="tiles" texture="tiles" texrepeat="1 1" texuniform="true"/>
+    <material name="paint" texture="paint"/>
+  </asset>
+  <worldbody>
+    <geom type="plane" size="30 30 .1" material="tiles"/>
+    <geom type="cylinder" size=".3 1" pos="-1.6 6 1" rgba=".5 .5 .6 1"/>
+    <body name="rig" mocap="true" pos="0 0 1.2">
+      <camera name="eye" fovy="{FOV_DEG}" xyaxes="1 0 0 0 .2 1"/>
+    </body>
+    <body name="ball" pos="1.8 4 .5">
+      <freejoint/>
+      <geom type="sphere" size=".4" material="paint"/>
+    </body>
+    <body name="door" pos="-1 4.5 .9">
+      <joint name="hinge" type="hinge" axis="0 0 1"/>
+      <geom type="box" size=".5 .04 .9" pos=".5 0 0" material="paint" contype="0" conaffinity="0"/>
+    </body>
+    <body name="crate" pos="1.5 7 .5">
+      <joint name="rail" type="slide" axis="1 0 0"/>
+      <geom type="box" size=".5 .5 .5" material="paint" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""  # noqa: E501
+START_VELOCITIES = {"ball": (-1.0, 0.4, 0.0), "hinge": -1.0, "rail": -1.2}
+CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
+
+
+class Yard(gym.Env):
+    """Drives ahead; actions 0, 1, 2 go straight, turn left, turn right."""
+
+    def __init__(self) -> None:
+        self.model = mujoco.MjModel.from_xml_string(SCENE)
+        self.data = mujoco.MjData(self.model)
+        self.renderer = mujoco.Renderer(self.model, HEIGHT, WIDTH)
+        focal = 0.5 * HEIGHT / math.tan(math.radians(FOV_DEG) / 2)
+        self.K = [[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]]
+        bodies, size = self.model.nbody, (HEIGHT, WIDTH)
+        self.action_space = spaces.Discrete(3)
+        self.observation_space = spaces.Dict(
+            sensor=spaces.Dict(
+                rgb=spaces.Box(0, 255, (3, *size), np.uint8),
+                depth=spaces.Box(0.0, np.inf, (1, *size), np.float32),
+                instance=spaces.Box(0, bodies - 1, (1, *size), np.uint8),
+                prev_from_curr=spaces.Box(-np.inf, np.inf, (4, 4), np.float32),
+                instance_motion=spaces.Box(-np.inf, np.inf, (bodies, 4, 4), np.float32),
+            )
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        ball = self.model.body("ball").dofadr[0]
+        self.data.qvel[ball : ball + 3] = START_VELOCITIES["ball"]
+        for joint in ("hinge", "rail"):
+            self.data.joint(joint).qvel[0] = START_VELOCITIES[joint]
+        self.yaw_rad = 0.0
+        mujoco.mj_forward(self.model, self.data)
+        self.poses = self.poses_now()
+        return self.observe(before=self.poses), {}  # nothing has moved yet
+
+    def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
+        before = self.poses
+        self.yaw_rad += (0, 1, -1)[int(action)] * YAW_RATE_RAD_S * STEP_S
+        sine, cosine = math.sin(self.yaw_rad), math.cos(self.yaw_rad)
+        self.data.mocap_pos[0] += FORWARD_MPS * STEP_S * np.array([-sine, cosine, 0.0])
+        half = self.yaw_rad / 2
+        self.data.mocap_quat[0] = math.cos(half), 0.0, 0.0, math.sin(half)
+        for _ in range(20):
+            mujoco.mj_step(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)  # poses that belong to the final positions
+        self.poses = self.poses_now()
+        return self.observe(before), 0.0, False, self.data.time > 2.0, {}
+
+    def poses_now(self) -> tuple[Tensor, Tensor]:
+        """Returns world_from_cam [4, 4] and world_from_body [bodies, 4, 4], float64."""
+        camera = self.data.camera("eye")
+        rotation = camera.xmat.reshape(3, 3) @ CV_FROM_GL
+        bodies = self.data.xmat.reshape(-1, 3, 3), self.data.xpos
+        return rigid(rotation, camera.xpos), rigid(*bodies)
+
+    def observe(self, before: tuple[Tensor, Tensor]) -> dict[str, dict[str, np.ndarray]]:
+        (world_from_prev_cam, world_from_prev_body), (world_from_cam, world_from_body) = (
+            before,
+            self.poses,
+        )
+        # Seen from a body, the camera moved from there to here; body 0 is the world itself.
+        motion = relative_motion(
+            invert_rigid(world_from_prev_body) @ world_from_prev_cam,
+            invert_rigid(world_from_body) @ world_from_cam,
+        )
+        rgb, depth, instance = self.pictures()
+        sensor = {
+            "rgb": np.ascontiguousarray(rgb.transpose(2, 0, 1)),
+            "depth": depth[None],
+            "instance": instance[None],
+            "prev_from_curr": motion[0].numpy(),
+            "instance_motion": motion.numpy(),
+        }
+        return {"sensor": sensor}
+
+    def pictures(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns RGB, depth in metres (inf for the sky) and the body that each pixel shows."""
+        renderer = self.renderer
+        renderer.update_scene(self.data, "eye")
+        rgb = renderer.render().copy()
+        renderer.enable_segmentation_rendering()
+        geom = renderer.render()[..., 0].copy()
+        renderer.disable_segmentation_rendering()
+        renderer.enable_depth_rendering()
+        depth = renderer.render().copy()
+        renderer.disable_depth_rendering()
+        sky = geom < 0
+        depth[sky] = np.inf
+        instance = np.where(sky, 0, self.model.geom_bodyid[geom]).astype(np.uint8)
+        return rgb, depth, instance
+
+    def close(self) -> None:
+        self.renderer.close()
+
+
+def rigid(rotation: np.ndarray, translation: np.ndarray) -> Tensor:
+    """Returns rotations [*B, 3, 3] and translations [*B, 3] as 4x4 matrices, copied."""
+    pose = torch.eye(4, dtype=torch.float64).repeat(*rotation.shape[:-2], 1, 1)
+    pose[..., :3, :3] = torch.tensor(rotation)
+    pose[..., :3, 3] = torch.tensor(translation)
+    return pose
+
+
+def make_env() -> TransformedEnv:
+    """Returns the yard as a TorchRL env that writes raw, ego and obj beside its sensors."""
+    yard = Yard()
+    transforms = Compose(RawFlow(yard.K), FlowFactorize(yard.K))
+    return TransformedEnv(GymWrapper(yard, categorical_action_encoding=True), transforms)
+
+
+def main(path: str | None = None) -> None:
+    env = make_env()
+    frames = env.rollout(12, policy=lambda td: td.set("action", torch.tensor(1)))["next"]
+    raw, ego, obj = (frames[name] for name in ("raw", "ego", "obj"))
+    moving = frames["sensor", "instance"] > 0
+    speed = obj.norm(dim=-3, keepdim=True)
+    print(f"{len(frames)} frames of {WIDTH} x {HEIGHT}, raw flow up to {raw.abs().max():.1f} px")
+    print(f"max |raw - ego - obj|      {(raw - ego - obj).abs().max():.1e} px")
+    print(f"max |obj| of what stands   {speed[~moving].max():.1e} px")
+    for name in ("ball", "door", "crate"):
+        body = frames["sensor", "instance"] == env.base_env.model.body(name).id
+        print(f"median |obj| of the {name:6} {speed[body].median():.2f} px")
+    if path is not None:
+        from flowrep.viz import representation_strip, write_png
+
+        frame = frames[len(frames) // 2]
+        maps = dict(frame["sensor"].items()) | {name: frame[name] for name in ("raw", "ego", "obj")}
+        write_png(path, representation_strip(maps, depth_range_m=20.0))
+        print(f"{path}: the {len(frames) // 2}th of them")
+    env.close()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2])
