@@ -1,7 +1,8 @@
 """Ego and object flow in a simulator that knows nothing of flowrep: MuJoCo.
 
 A camera rides through a yard in which a ball rolls, a door swings and a crate slides. MuJoCo draws
-depth and segmentation off-screen and tells where its bodies are; flowrep's transforms do the rest.
+depth and segmentation off-screen and says where camera and bodies are; flowrep's transforms make
+flow of that.
 
     pip install 'flowrep[examples]'
     apt-get install libegl1 libgl1-mesa-dri     # off-screen, on a CPU; or libosmesa6
@@ -12,6 +13,7 @@ What MuJoCo's numbers mean, as tests/examples/test_mujoco_flow.py measures it:
 - depth is metres along the optical axis already; where there is no surface it holds the far plane;
 - pixels are sampled at their centres, so K has cx = W / 2, cy = H / 2 (with `offsamples="0"`);
 - camera axes are OpenGL's (x right, y up, z backward), poses are camera-to-world;
+- a body's pose is a position and a quaternion (w, x, y, z);
 - segmentation is (geom id, object type) a pixel, -1 for the sky.
 """
 
@@ -27,18 +29,25 @@ import mujoco
 import numpy as np
 import torch
 from gymnasium import spaces
-from torch import Tensor
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
-from flowrep.geometry import invert_rigid, relative_motion
-from flowrep.transforms import FlowFactorize, RawFlow
+from flowrep.geometry import intrinsics_from_fov
+from flowrep.transforms import (
+    AdaptPose,
+    CameraMotion,
+    FlowFactorize,
+    InstanceIds,
+    InstanceMotion,
+    RawFlow,
+)
 
 HEIGHT, WIDTH, FOV_DEG = 96, 144, 60.0
-STEP_S = 1 / 12
+K = intrinsics_from_fov(FOV_DEG, axis="vertical", height=HEIGHT, width=WIDTH)
+STEP_S, SUBSTEPS = 1 / 12, 20
 FORWARD_MPS, YAW_RATE_RAD_S = 1.5, 0.3
 SCENE = f"""
 <mujoco>
-  <option timestep="{STEP_S / 20}"/>
+  <option timestep="{STEP_S / SUBSTEPS}"/>
   <visual>
     <headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/>
     <quality offsamples="0"/>
@@ -73,7 +82,7 @@ SCENE = f"""
 </mujoco>
 """  # noqa: E501
 START_VELOCITIES = {"ball": (-1.0, 0.4, 0.0), "hinge": -1.0, "rail": -1.2}
-CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
+BODIES = ("ball", "door", "crate")  # those that move; all the rest is the static world
 
 
 class Yard(gym.Env):
@@ -83,18 +92,17 @@ class Yard(gym.Env):
         self.model = mujoco.MjModel.from_xml_string(SCENE)
         self.data = mujoco.MjData(self.model)
         self.renderer = mujoco.Renderer(self.model, HEIGHT, WIDTH)
-        focal = 0.5 * HEIGHT / math.tan(math.radians(FOV_DEG) / 2)
-        self.K = [[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]]
-        bodies, size = self.model.nbody, (HEIGHT, WIDTH)
+        self.body_ids = [self.model.body(name).id for name in BODIES]
+        maps = {
+            "rgb": spaces.Box(0, 255, (3, HEIGHT, WIDTH), np.uint8),
+            "depth": spaces.Box(0.0, np.inf, (1, HEIGHT, WIDTH), np.float32),
+        }
         self.action_space = spaces.Discrete(3)
         self.observation_space = spaces.Dict(
-            sensor=spaces.Dict(
-                rgb=spaces.Box(0, 255, (3, *size), np.uint8),
-                depth=spaces.Box(0.0, np.inf, (1, *size), np.float32),
-                instance=spaces.Box(0, bodies - 1, (1, *size), np.uint8),
-                prev_from_curr=spaces.Box(-np.inf, np.inf, (4, 4), np.float32),
-                instance_motion=spaces.Box(-np.inf, np.inf, (bodies, 4, 4), np.float32),
-            )
+            sensor=spaces.Dict(maps),
+            segmentation=spaces.Box(-1, self.model.nbody - 1, (1, HEIGHT, WIDTH), np.int16),
+            camera_pose=spaces.Box(-np.inf, np.inf, (4, 4), np.float64),
+            body_poses=spaces.Box(-np.inf, np.inf, (len(BODIES), 7), np.float64),
         )
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
@@ -106,48 +114,31 @@ class Yard(gym.Env):
             self.data.joint(joint).qvel[0] = START_VELOCITIES[joint]
         self.yaw_rad = 0.0
         mujoco.mj_forward(self.model, self.data)
-        self.poses = self.poses_now()
-        return self.observe(before=self.poses), {}  # nothing has moved yet
+        return self.observe(), {}
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
-        before = self.poses
         self.yaw_rad += (0, 1, -1)[int(action)] * YAW_RATE_RAD_S * STEP_S
         sine, cosine = math.sin(self.yaw_rad), math.cos(self.yaw_rad)
         self.data.mocap_pos[0] += FORWARD_MPS * STEP_S * np.array([-sine, cosine, 0.0])
         half = self.yaw_rad / 2
         self.data.mocap_quat[0] = math.cos(half), 0.0, 0.0, math.sin(half)
-        for _ in range(20):
+        for _ in range(SUBSTEPS):
             mujoco.mj_step(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)  # poses that belong to the final positions
-        self.poses = self.poses_now()
-        return self.observe(before), 0.0, False, self.data.time > 2.0, {}
+        return self.observe(), 0.0, False, self.data.time > 2.0, {}
 
-    def poses_now(self) -> tuple[Tensor, Tensor]:
-        """Returns world_from_cam [4, 4] and world_from_body [bodies, 4, 4], float64."""
-        camera = self.data.camera("eye")
-        rotation = camera.xmat.reshape(3, 3) @ CV_FROM_GL
-        bodies = self.data.xmat.reshape(-1, 3, 3), self.data.xpos
-        return rigid(rotation, camera.xpos), rigid(*bodies)
-
-    def observe(self, before: tuple[Tensor, Tensor]) -> dict[str, dict[str, np.ndarray]]:
-        (world_from_prev_cam, world_from_prev_body), (world_from_cam, world_from_body) = (
-            before,
-            self.poses,
-        )
-        # Seen from a body, the camera moved from there to here; body 0 is the world itself.
-        motion = relative_motion(
-            invert_rigid(world_from_prev_body) @ world_from_prev_cam,
-            invert_rigid(world_from_body) @ world_from_cam,
-        )
-        rgb, depth, instance = self.pictures()
-        sensor = {
-            "rgb": np.ascontiguousarray(rgb.transpose(2, 0, 1)),
-            "depth": depth[None],
-            "instance": instance[None],
-            "prev_from_curr": motion[0].numpy(),
-            "instance_motion": motion.numpy(),
+    def observe(self) -> dict[str, Any]:
+        """Returns what MuJoCo knows, as it knows it."""
+        rgb, depth, body = self.pictures()
+        eye, moving = self.data.camera("eye"), self.body_ids
+        camera_pose = np.eye(4)
+        camera_pose[:3, :3], camera_pose[:3, 3] = eye.xmat.reshape(3, 3), eye.xpos
+        return {
+            "sensor": {"rgb": np.ascontiguousarray(rgb.transpose(2, 0, 1)), "depth": depth[None]},
+            "segmentation": body[None],
+            "camera_pose": camera_pose,
+            "body_poses": np.hstack([self.data.xpos[moving], self.data.xquat[moving]]),
         }
-        return {"sensor": sensor}
 
     def pictures(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns RGB, depth in metres (inf for the sky) and the body that each pixel shows."""
@@ -162,25 +153,24 @@ class Yard(gym.Env):
         renderer.disable_depth_rendering()
         sky = geom < 0
         depth[sky] = np.inf
-        instance = np.where(sky, 0, self.model.geom_bodyid[geom]).astype(np.uint8)
-        return rgb, depth, instance
+        return rgb, depth, np.where(sky, -1, self.model.geom_bodyid[geom]).astype(np.int16)
 
     def close(self) -> None:
         self.renderer.close()
 
 
-def rigid(rotation: np.ndarray, translation: np.ndarray) -> Tensor:
-    """Returns rotations [*B, 3, 3] and translations [*B, 3] as 4x4 matrices, copied."""
-    pose = torch.eye(4, dtype=torch.float64).repeat(*rotation.shape[:-2], 1, 1)
-    pose[..., :3, :3] = torch.tensor(rotation)
-    pose[..., :3, 3] = torch.tensor(translation)
-    return pose
-
-
 def make_env() -> TransformedEnv:
-    """Returns the yard as a TorchRL env that writes raw, ego and obj beside its sensors."""
+    """Returns the yard as a TorchRL env that writes raw, ego and obj beside what MuJoCo says."""
     yard = Yard()
-    transforms = Compose(RawFlow(yard.K), FlowFactorize(yard.K))
+    transforms = Compose(
+        AdaptPose(axes="opengl", in_keys="camera_pose"),
+        AdaptPose(layout="xyz_wxyz", in_keys="body_poses", out_keys=("sensor", "world_from_body")),
+        InstanceIds(yard.body_ids, in_keys="segmentation"),
+        CameraMotion(),
+        InstanceMotion(),
+        RawFlow(K),
+        FlowFactorize(K),
+    )
     return TransformedEnv(GymWrapper(yard, categorical_action_encoding=True), transforms)
 
 
@@ -193,8 +183,8 @@ def main(path: str | None = None) -> None:
     print(f"{len(frames)} frames of {WIDTH} x {HEIGHT}, raw flow up to {raw.abs().max():.1f} px")
     print(f"max |raw - ego - obj|      {(raw - ego - obj).abs().max():.1e} px")
     print(f"max |obj| of what stands   {speed[~moving].max():.1e} px")
-    for name in ("ball", "door", "crate"):
-        body = frames["sensor", "instance"] == env.base_env.model.body(name).id
+    for row, name in enumerate(BODIES, start=1):
+        body = frames["sensor", "instance"] == row
         print(f"median |obj| of the {name:6} {speed[body].median():.2f} px")
     if path is not None:
         from flowrep.viz import representation_strip, write_png
