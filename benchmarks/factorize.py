@@ -6,7 +6,11 @@ contenders take turns, so that all see the same machine; a ratio is the median o
 Freed memory is kept in the process for all of them, as training does: else page faults are what
 is measured.
 
+A table follows: factorize, compiled with a dynamic batch, at batch 1 to 4096 and both sizes, as far
+as memory reaches. `--device cuda` runs that table alone on a GPU.
+
 python benchmarks/factorize.py --rounds 40
+python benchmarks/factorize.py --device cuda
 """
 
 import argparse
@@ -14,6 +18,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from kornia.geometry import create_meshgrid
@@ -26,6 +31,8 @@ from flowrep.agent.allocator import keep_freed_memory
 from flowrep.geometry import factorize
 
 SIZES = [(64, 84, 84), (1, 720, 1280)]
+SWEEP_SIZES = [(84, 84), (720, 1280)]
+SWEEP_BATCHES = [1, 4, 16, 64, 256, 1024, 4096]
 BYTES_PER_PIXEL = 28
 KORNIA_BOUND, COPY_BOUND = 30.0, 0.7
 LARGE_COPY_BYTES = 512 * 2**20  # read and written together; past every cache
@@ -40,13 +47,92 @@ def main() -> None:
         action="store_true",
         help="one thread, and CPU seconds instead of the wall's: for a machine that is in use",
     )
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    parser.add_argument(
+        "--memory-gib", type=float, help="that the table may use; half of what is free by default"
+    )
     args = parser.parse_args()
+    torch.set_grad_enabled(False)
+    if args.device == "cuda":
+        sweep(torch.device("cuda"), args.memory_gib, args.rounds, cuda_clock)
+        return
     keep_freed_memory()
     torch.set_num_threads(1 if args.cpu_time else args.threads)
     clock = time.process_time if args.cpu_time else time.perf_counter
-    torch.set_grad_enabled(False)
     for batch, height, width in SIZES:
         compare(batch, height, width, args.rounds, clock)
+    sweep(torch.device("cpu"), args.memory_gib, args.rounds, clock)
+
+
+def cuda_clock() -> float:
+    """Returns seconds at which the GPU has done all that it was given."""
+    torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def sweep(
+    device: torch.device, memory_gib: float | None, rounds: int, clock: Callable[[], float]
+) -> None:
+    """Prints a row for each batch that fits into memory."""
+    limit = free_bytes(device) / 2 if memory_gib is None else memory_gib * 2**30
+    threads = f"{torch.get_num_threads()} CPU threads"
+    name = torch.cuda.get_device_name() if device.type == "cuda" else threads
+    print(f"\nfactorize, compiled with a dynamic batch, float32, {name}, medians of {rounds}")
+    print(f"{'height x width':>14} {'batch':>6} {'ms':>10} {'Mpx/s':>9} {'GB/s':>7} {'of copy':>8}")
+    compiled = torch.compile(factorize, fullgraph=True, dynamic=True)
+    large = min(LARGE_COPY_BYTES, int(limit) // 8 * 8)
+    copy = copier(large, device)
+    for height, width in SWEEP_SIZES:
+        for batch in SWEEP_BATCHES:
+            pixels = batch * height * width
+            # Inputs, outputs and the results of the call before, whose memory may not be free yet.
+            needed = pixels * (BYTES_PER_PIXEL + 20)
+            if needed > limit:
+                print(
+                    f"{f'{height} x {width}':>14} {batch:6d} left out: {needed / 2**30:.1f} GiB "
+                    f"of {limit / 2**30:.1f} GiB"
+                )
+                continue
+            row(compiled, copy, large, (batch, height, width), device, rounds, clock)
+
+
+def row(
+    compiled: Callable[..., object],
+    copy: Callable[[], object],
+    copied_bytes: int,
+    shape: tuple[int, int, int],
+    device: torch.device,
+    rounds: int,
+    clock: Callable[[], float],
+) -> None:
+    """Prints what one batch costs; the copy takes turns with it."""
+    batch, height, width = shape
+    given = [tensor.to(device) for tensor in inputs(batch, height, width)]
+    calls = {"factorize": lambda: compiled(*given), "copy": copy}
+    repeats = {name: repeats_for(call, clock) for name, call in calls.items()}
+    turns: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            turns[name].append(timed(call, repeats[name], clock))
+    moved = batch * height * width * BYTES_PER_PIXEL
+    seconds = statistics.median(turns["factorize"])
+    scale = moved / copied_bytes
+    share = median_ratio([scale * s for s in turns["copy"]], turns["factorize"])
+    print(
+        f"{f'{height} x {width}':>14} {batch:6d} {1e3 * seconds:10.3f} "
+        f"{batch * height * width / seconds / 1e6:9.1f} {moved / seconds / 1e9:7.1f} {share:8.0%}",
+        flush=True,
+    )
+
+
+def free_bytes(device: torch.device) -> int:
+    """Returns how much memory the device has to give."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info()[0]
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        if line.startswith("MemAvailable:"):
+            return 1024 * int(line.split()[1])
+    raise RuntimeError("no MemAvailable in /proc/meminfo; say --memory-gib")
 
 
 def compare(batch: int, height: int, width: int, rounds: int, clock: Callable[[], float]) -> None:
@@ -151,9 +237,9 @@ def check_equal(given: tuple[Tensor, ...], compiled: Callable[..., tuple[Tensor,
     assert factorize(*given).valid.all()
 
 
-def copier(moved_bytes: int) -> Callable[[], object]:
+def copier(moved_bytes: int, device: torch.device | str = "cpu") -> Callable[[], object]:
     """Returns a call that copies half of `moved_bytes`: each byte is read and written."""
-    source = torch.rand(moved_bytes // 8)
+    source = torch.rand(moved_bytes // 8, device=device)
     target = torch.empty_like(source)
     return lambda: target.copy_(source)
 
