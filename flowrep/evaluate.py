@@ -17,6 +17,7 @@ from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs.baselines import BASELINES
 from flowrep.experiment.comparison import compare, print_table, with_origin
+from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder
@@ -47,6 +48,8 @@ def run(config: DictConfig) -> None:
         )
         folder.log_episodes(with_origin(rows, trained, frames))
         print_table(rows)
+        print_failures(rows)
+        write_failures(folder.failures_path, folder.read_episodes())
         print(f"{len(rows)} episodes added to {folder.evaluation_path}")
         if not stop:
             film(agent, trained, folder, config, speeds, rates)

@@ -19,6 +19,7 @@ from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs.baselines import BASELINES
 from flowrep.experiment.comparison import compare, print_table, with_origin
+from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.figures import draw_learning_curve
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.recording import record_episode
@@ -160,6 +161,8 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
         return
     run.log_episodes(with_origin(rows, config, training.frames))
     print_table(rows)
+    print_failures(rows)
+    write_failures(run.failures_path, run.read_episodes())
     draw_learning_curve(run)
     if evaluation["video"]:
         path = run.video_path(f"episode_{config['speed']}")

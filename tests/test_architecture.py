@@ -18,7 +18,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "envs": {"envs", "transforms", "geometry", "config_tree", "palette"},
     "palette": set(),
     "viz": {"palette"},
-    "experiment": {"experiment", "envs", "agent", "transforms", "geometry", "viz"},
+    "experiment": {"experiment", "envs", "agent", "palette", "transforms", "geometry", "viz"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"envs/simulator.py"},

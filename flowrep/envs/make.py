@@ -18,18 +18,20 @@ from flowrep.envs.outcome import Outcome
 from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
+from flowrep.palette import CATEGORY_ID
 from flowrep.transforms import representation_stack
 
 _OUTCOME_CODE = {outcome.label: outcome.value for outcome in Outcome}
 
 
 class SensorObservation(gym.Wrapper):
-    """Nests the observation under "sensor" and puts the outcome and the episode's seed beside it.
+    """Nests the observation under "sensor" and puts beside it how the episode stands.
 
     | key | shape | dtype | what |
     | --- | --- | --- | --- |
     | `sensor` | | | the wrapped environment's observation |
     | `outcome` | [1] | uint8 | code of `flowrep.envs.Outcome`; 0 while the episode runs |
+    | `hit` | [1] | uint8 | class id of what was hit; 0, the sky's, for nothing |
     | `episode_seed` | [1] | int64 | names the episode, see `StreetEnv.reset` |
     """
 
@@ -38,6 +40,7 @@ class SensorObservation(gym.Wrapper):
         super().__init__(env)
         beside: dict[str, spaces.Space] = {
             "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
+            "hit": spaces.Box(0, len(CATEGORY_ID) - 1, (1,), np.uint8),
             "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
         }
         sensor = env.observation_space
@@ -61,6 +64,7 @@ class SensorObservation(gym.Wrapper):
         """Returns the observation as this wrapper gives it."""
         return dict.fromkeys(self._names, observation) | {
             "outcome": np.array([_OUTCOME_CODE[info["outcome"]]], dtype=np.uint8),
+            "hit": np.array([CATEGORY_ID[info["hit"] or "sky"]], dtype=np.uint8),
             "episode_seed": np.array([info["episode_seed"]], dtype=np.int64),
         }
 
@@ -93,8 +97,8 @@ def make_env(
     """Returns a TorchRL env of streets stepped side by side, always of batch size [num_envs].
 
     Reads action (categorical: 0 NO_OP, 1 TURN_LEFT, 2 TURN_RIGHT). Writes the representations,
-    `outcome` uint8 [1], `episode_seed` int64 [1], `reward` [1] and the done keys. Env i's k-th
-    episode is the same whatever the policy.
+    `outcome` and `hit` uint8 [1], `episode_seed` int64 [1], `reward` [1] and the done keys. Env
+    i's k-th episode is the same whatever the policy.
 
     Args:
         scene: a scene's name, file, mapping, or `Scene`.

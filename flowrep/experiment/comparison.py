@@ -91,7 +91,9 @@ def baseline_episodes(env: EnvBase, name: str, episodes: int, *, seed: int) -> I
     for number, quota in enumerate(quotas(episodes, len(shown))):
         street.reset(seed=seed + number)
         for drive in drives(street, driver, quota):
-            yield Episode(drive.episode_seed, drive.outcome, drive.total_reward, drive.steps)
+            yield Episode(
+                drive.episode_seed, drive.outcome, drive.hit, drive.total_reward, drive.steps
+            )
     street.close()
 
 
@@ -113,6 +115,7 @@ def _row(policy: str, speed: str, fps: float, episode: Episode) -> Row:
         "fps": fps,
         "episode_seed": episode.episode_seed,
         "outcome": episode.outcome,
+        "hit": episode.hit,
         "return": round(episode.total_reward, 4),
         "length": episode.length,
     }

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.envs import Outcome
+from flowrep.palette import CATEGORY_ID
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -18,14 +19,27 @@ OUTCOMES = tuple(outcome.label for outcome in Outcome)
 """Names of the env's `outcome` codes; each one but the first ends an episode."""
 
 
+_CATEGORIES = tuple(CATEGORY_ID)
+
+
 @dataclass(frozen=True)
 class Episode:
-    """One finished episode: which one it was, how it ended, its return and its length in steps."""
+    """One finished episode: which it was, how it ended, what was hit, return, length in steps."""
 
     episode_seed: int
     outcome: str
+    hit: str
     total_reward: float
     length: int
+
+
+def hit_name(code: int) -> str:
+    """Returns the category of an env's `hit`, "" for nothing.
+
+    >>> hit_name(4), hit_name(0)
+    ('pedestrian', '')
+    """
+    return _CATEGORIES[code] if code else ""
 
 
 def quotas(episodes: int, num_envs: int) -> list[int]:
@@ -46,7 +60,7 @@ def run_episodes(
     other, so that short episodes are not overrepresented.
 
     Args:
-        env: batched TorchRL env with `outcome` and `episode_seed` in its TensorDict.
+        env: batched TorchRL env with `outcome`, `hit` and `episode_seed` in its TensorDict.
         policy: writes `action`.
         episodes: how many episodes to run.
         seed: of the environments.
@@ -71,6 +85,7 @@ def run_episodes(
                 yield Episode(
                     int(after["episode_seed"].reshape(-1)[i]),
                     OUTCOMES[int(after["outcome"].reshape(-1)[i])],
+                    hit_name(int(after["hit"].reshape(-1)[i])),
                     float(total_reward[i]),
                     int(length[i]),
                 )

@@ -1,7 +1,7 @@
 """A run's folder: resolved config, metrics as CSV and TensorBoard, checkpoint, evaluation."""
 
 import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ EVALUATION_COLUMNS = (
     "fps",
     "episode_seed",
     "outcome",
+    "hit",
     "return",
     "length",
 )
@@ -31,6 +32,7 @@ class RunFolder:
     metrics.csv              a row for each logged step; tensorboard/ holds the same
     checkpoint/              what a resumed run continues from
     evaluation.csv           a row for each evaluated episode
+    failures.csv             why episodes failed, by policy and speed
     videos/                  what the agent saw and did
     ```
     """
@@ -64,6 +66,11 @@ class RunFolder:
     def evaluation_path(self) -> Path:
         """The table of evaluated episodes."""
         return self.path / "evaluation.csv"
+
+    @property
+    def failures_path(self) -> Path:
+        """The table of why episodes failed."""
+        return self.path / "failures.csv"
 
     @property
     def metrics_path(self) -> Path:
@@ -113,9 +120,35 @@ class RunFolder:
                 for row in csv.DictReader(file)
             )
 
+    def read_episodes(self) -> list[dict[str, str]]:
+        """Returns the rows of evaluation.csv, none where there is no such file."""
+        if not self.evaluation_path.is_file():
+            return []
+        with self.evaluation_path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
     def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Appends evaluated episodes to evaluation.csv."""
+        """Appends evaluated episodes to evaluation.csv, first giving an older one its new columns.
+
+        What an older table did not say stays empty.
+        """
+        add_columns(self.evaluation_path, EVALUATION_COLUMNS)
         append_rows(self.evaluation_path, rows, EVALUATION_COLUMNS)
+
+
+def add_columns(path: Path, columns: Sequence[str]) -> None:
+    """Rewrites a CSV table that lacks some of the columns with all of them, in their order."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        known, rows = reader.fieldnames or [], list(reader)
+    if set(columns) <= set(known):
+        return
+    longer = path.with_suffix(".tmp")
+    longer.unlink(missing_ok=True)
+    append_rows(longer, [dict.fromkeys(columns, "") | row for row in rows], columns)
+    longer.replace(path) if rows else path.unlink()
 
 
 def append_rows(

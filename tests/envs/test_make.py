@@ -8,6 +8,7 @@ from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 
 from flowrep.envs import Outcome, get_states, make_env, set_states, streets
+from flowrep.palette import CATEGORY_ID
 
 
 @pytest.fixture
@@ -59,7 +60,7 @@ def test_the_tensordict_has_the_representations_and_no_sensor(make):
     env = make(representations=["obj", "seg"], num_envs=2, seed=0)
     reset = env.reset()
     assert set(reset.keys(True, True)) == {
-        "obj", "seg", "outcome", "episode_seed", "done", "terminated", "truncated"
+        "obj", "seg", "outcome", "hit", "episode_seed", "done", "terminated", "truncated"
     }  # fmt: skip
     assert reset["obj"].shape == (2, 2, 84, 84)
     assert (reset["outcome"].dtype, reset["outcome"].shape) == (torch.uint8, (2, 1))
@@ -142,3 +143,14 @@ def test_states_take_an_env_back(make):
     set_states(other, states)
     resumed, _ = play(other, actions[20:], then)
     assert_same(expected, resumed)
+
+
+def test_what_was_hit_stands_beside_the_outcome(make):
+    env = make(representations=(), num_envs=3, seed=1)
+    steps, _ = play(env, torch.zeros(200, 3, dtype=torch.long))
+    outcome, hit = steps["next", "outcome"], steps["next", "hit"]
+    collided = outcome == Outcome.COLLISION
+    assert collided.any()
+    # Straight on, only people are in the way.
+    assert set(hit[collided].tolist()) == {CATEGORY_ID["pedestrian"]}
+    assert (hit[~collided] == 0).all()

@@ -2,7 +2,7 @@ import csv
 
 import pytest
 
-from flowrep.experiment.run_folder import RunFolder, append_rows
+from flowrep.experiment.run_folder import EVALUATION_COLUMNS, RunFolder, append_rows
 
 
 def rows_of(path):
@@ -49,3 +49,14 @@ def test_a_folder_without_a_run_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no run"):
         RunFolder.existing(tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
+
+
+def test_an_older_table_of_episodes_gains_the_columns_it_lacks(tmp_path):
+    run = RunFolder(tmp_path)
+    new = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"outcome": "collision", "hit": "car"}
+    old = {name: value for name, value in new.items() if name != "hit"}
+    append_rows(run.evaluation_path, [old])
+    run.log_episodes([new])
+    assert run.read_episodes() == [old | {"hit": ""}, new]
+    with run.evaluation_path.open(newline="") as file:
+        assert tuple(next(csv.reader(file))) == EVALUATION_COLUMNS

@@ -1,0 +1,76 @@
+"""Why episodes fail: the paper's Table III, as a table to read and one to compute with."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from flowrep.experiment.run_folder import append_rows
+
+CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
+_GROUP = ("scene", "representations", "policy", "speed", "fps")
+
+
+def cause_of(outcome: str, hit: str) -> str | None:
+    """Returns why an episode failed, None if it did not.
+
+    >>> cause_of("collision", "car"), cause_of("success", "")
+    ('collision: other', None)
+    """
+    if outcome == "success":
+        return None
+    if outcome == "collision":
+        return "collision: pedestrian" if hit == "pedestrian" else "collision: other"
+    return outcome.replace("_", " ")
+
+
+def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Returns for each scene, policy and speed how many episodes failed, and of what in %.
+
+    Shares are of the failures, as in the paper's Table III, and empty where nothing failed.
+
+    Args:
+        rows: of evaluation.csv.
+    """
+    groups: dict[tuple[str, ...], list[str | None]] = defaultdict(list)
+    for row in rows:
+        key = tuple(str(row.get(name, "")) for name in _GROUP)
+        groups[key].append(cause_of(row["outcome"], row.get("hit", "")))
+    table = []
+    for key, causes in groups.items():
+        counts = Counter(cause for cause in causes if cause is not None)
+        failures = counts.total()
+        shares = {c: round(100 * counts[c] / failures, 1) if failures else "" for c in CAUSES}
+        line = dict(zip(_GROUP, key)) | {"episodes": len(causes), "failures": failures} | shares
+        collisions = sum(counts[cause] for cause in CAUSES if cause.startswith("collision"))
+        ratio = round(counts["out of bounds"] / collisions, 3) if collisions else ""
+        table.append(line | {"out of bounds to collisions": ratio})
+    return table
+
+
+def print_failures(rows: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
+    """Prints the causes of failure by policy and speed."""
+    table = Table(title="Causes of failure in % of the failures", box=box.SIMPLE, pad_edge=False)
+    for heading in ("speed", "fps", "policy", "failures"):
+        table.add_column(heading, no_wrap=True)
+    for cause in CAUSES:
+        table.add_column(cause, justify="right", no_wrap=True)
+    for line in failure_causes(rows):
+        shares = ["" if line[cause] == "" else f"{line[cause]:.0f}" for cause in CAUSES]
+        failed = f"{line['failures']} of {line['episodes']}"
+        rate = f"{float(line['fps']):g}"
+        table.add_row(line["speed"], rate, line["policy"], failed, *shares)
+    (console or Console(width=max(100, Console().width))).print(table)
+
+
+def write_failures(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes the causes of failure as CSV, in place of an older table."""
+    fresh = path.with_suffix(".tmp")
+    fresh.unlink(missing_ok=True)
+    append_rows(fresh, failure_causes(rows))
+    if fresh.exists():
+        fresh.replace(path)
