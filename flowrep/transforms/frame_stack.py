@@ -25,8 +25,11 @@ class FrameStack(MapTransform):
     one episode or one env into another.
 
     In a replay buffer the stored root stack and the next frame give the next stack exactly,
-    shuffled or not. A batch without a stored stack has to be a trajectory, with a dimension named
-    "time" and `("next", "done")`; its first frame counts as an episode's first.
+    shuffled or not: leave `("next", out_key)` out of what is stored, and a transition costs k + 1
+    frames instead of 2 k. A batch without a stored stack has to be a trajectory, with a dimension
+    named "time" and `("next", "done")`; its first frame counts as an episode's first. A buffer may
+    thus store single frames (two a transition, or one where `next` is looked up) and sample slices
+    of an episode: from the k-th step of a slice on, stacks are exact, `batch[:, k - 1:]`.
 
     Args:
         k: number of frames, at least 1.

@@ -12,7 +12,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, Categorical, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torchrl.data import (
+    Bounded,
+    Categorical,
+    LazyTensorStorage,
+    SliceSampler,
+    TensorDictReplayBuffer,
+    Unbounded,
+)
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import step_mdp
@@ -203,6 +210,34 @@ def test_shuffled_transitions_keep_their_stacks():
     sample = buffer.sample()
     want = online["next", STACK][sample["index"]]
     assert torch.equal(sample["next", STACK].nan_to_num(), want.nan_to_num())
+
+
+def test_slices_of_single_frames_have_exact_stacks_from_the_kth_step_on():
+    online = stacked_single(1).rollout(16, break_when_any_done=False)  # 4 episodes of 4 steps
+    sampler = SliceSampler(slice_len=3, end_key=("next", "done"), strict_length=True)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(16), sampler=sampler, batch_size=3 * 20
+    )
+    buffer.extend(online.exclude(STACK, ("next", STACK)))
+    slices = buffer.sample().reshape(20, 3).refine_names(None, "time")
+    steps = {moment(depth)[2] for depth in slices[:, 0][KEY]}
+    assert steps == {0, 1}  # some slices begin in the middle of an episode
+    kept = stack_of_three()(slices)[:, 2:]
+    want = online[kept["index"].reshape(20, 1)]
+    assert torch.equal(kept[STACK].nan_to_num(), want[STACK].nan_to_num())
+    assert torch.equal(kept["next", STACK].nan_to_num(), want["next", STACK].nan_to_num())
+
+
+def test_what_a_stored_transition_costs():
+    # k frames at the root and the newest one under "next": 4 depth maps, not the 6 of two stacks.
+    env = TransformedEnv(FakeSensorEnv((2,)), stack_of_three())
+    online = env.rollout(4).select(STACK, ("next", STACK), ("next", *KEY))
+    lean = online.exclude(("next", STACK))
+    one_map = 4 * 5 * 7
+    assert (lean[STACK].nbytes + lean[("next", *KEY)].nbytes) == online.numel() * 4 * one_map
+    assert (online[STACK].nbytes + online["next", STACK].nbytes) == online.numel() * 6 * one_map
+    restored = stack_of_three()(lean)
+    assert torch.equal(restored["next", STACK].nan_to_num(), online["next", STACK].nan_to_num())
 
 
 def test_transitions_without_past_are_refused():
