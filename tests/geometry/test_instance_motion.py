@@ -46,6 +46,10 @@ def test_a_body_that_stands_still_has_the_camera_s_motion_to_the_last_bit():
     motions = instance_motion(PREV, CURR, far, far)
     assert motions.dtype == torch.float32
     assert torch.equal(motions, relative_motion(PREV, CURR).expand(3, 4, 4))
+    # In float64 no rounding hides that the bodies' rows went another way.
+    exact = instance_motion(PREV, CURR, far, far, dtype=torch.float64)
+    camera = relative_motion(PREV, CURR, dtype=torch.float64)
+    assert torch.equal(exact, camera.expand(3, 4, 4))
 
 
 def test_a_batch_equals_a_loop():
