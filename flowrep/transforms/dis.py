@@ -17,9 +17,10 @@ PRESETS = ("ultrafast", "fast", "medium")  # OpenCV's numbers 0, 1, 2
 class DIS:
     """Dense inverse search: flow in a few milliseconds a picture on a CPU, without weights.
 
-    Small pictures are enlarged by a whole factor and the flow is brought back to their pixels:
-    DIS matches patches of 8 px on pyramid levels of half or a quarter of the size, which a picture
-    of 48 px is too small for (`benchmarks/estimated_flow.py` shows how much that costs).
+    Small pictures are enlarged by a whole factor and the flow is brought back to their pixels: the
+    preset "medium" matches patches of 8 px at half of the size, too coarse for a picture of 48 px
+    (`benchmarks/estimated_flow.py` shows what that costs). The faster presets choose their scale by
+    the picture's width and gain less from it, or nothing.
 
     Pictures of a batch are shared out among as many threads as torch uses
     (`torch.set_num_threads`), since OpenCV runs outside of Python's lock. Pictures on another

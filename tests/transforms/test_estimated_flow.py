@@ -139,6 +139,14 @@ def test_units_and_scale_are_rawflows():
     assert torch.equal(made["raw"], plain * 0.25)  # an eighth of it, two steps a second
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_pictures_on_a_gpu_have_their_flow_there():
+    pair = shifted_pair(48, 64, 3, -2)
+    flow = EstimatedFlow().compute(pair.cuda())[0]
+    assert flow.device.type == "cuda"
+    torch.testing.assert_close(flow.cpu(), EstimatedFlow().compute(pair)[0])
+
+
 def test_an_empty_batch_has_an_empty_flow():
     empty = torch.zeros(0, 6, 10, 12, dtype=torch.uint8)
     assert EstimatedFlow().compute(empty)[0].shape == (0, 2, 10, 12)
@@ -181,15 +189,15 @@ def test_estimated_raw_alone_reads_pictures_alone():
 
 
 def test_object_flow_is_the_estimate_less_ego_flow():
-    options = {"raw": {"scale": 1.0}, "ego": {"scale": 2.0}, "obj": {"scale": 8.0}}
+    options = {"raw": {"scale": 4.0}, "ego": {"scale": 2.0}, "obj": {"scale": 8.0}}
     flow = {"source": "estimated", "estimator": pixel_steps}
     stack = representation_stack(options, intrinsics=INTRINSICS, flow=flow)
     td = TransformedEnv(FakeSensorEnv((2,)), stack).rollout(2)[:, 1]
     sensor = td["sensor"]
     K, motion = torch.tensor(INTRINSICS), sensor["prev_from_curr"]
     ego, valid = ego_flow(sensor["depth"], K, motion)
-    assert (td["raw"] == -1.0).all()
-    assert torch.equal(sensor["flow"], td["raw"])
+    assert (sensor["flow"] == -1.0).all()
+    assert (td["raw"] == -4.0).all()
     torch.testing.assert_close(td["ego"], 2 * ego)
     torch.testing.assert_close(td["obj"], torch.where(valid, 8 * (-1.0 - ego), 0.0))
 

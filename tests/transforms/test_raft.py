@@ -47,6 +47,17 @@ def test_small_pictures_are_enlarged_and_their_flow_scaled_back(weights):
     assert [picture.unique().tolist() for picture in estimator.network.shown] == [[-1.0], [1.0]]
 
 
+def test_what_is_padded_is_cut_off_again(weights):
+    # 129 x 140 is padded to 136 x 144 on the right and below: the first corner stays where it is.
+    picture = torch.zeros(1, 3, 129, 140, dtype=torch.uint8)
+    picture[..., 0, 0] = 255
+    estimator = RAFT(weights)
+    assert estimator(picture, picture).shape == (1, 2, 129, 140)
+    (shown, _) = estimator.network.shown
+    assert shown.shape == (1, 3, 136, 144)
+    assert (shown == 1).nonzero()[:, 2:].tolist() == [[0, 0]] * 3
+
+
 def test_large_pictures_keep_their_size(weights):
     pictures = torch.zeros(1, 3, 128, 136, dtype=torch.uint8)
     estimator = RAFT(weights)
