@@ -18,11 +18,20 @@ FLOWREP_IMPORTS_ALLOWED = {
     "envs": {"envs", "transforms", "geometry", "config_tree", "palette"},
     "palette": set(),
     "viz": {"palette"},
+    "plan_view": {"envs", "palette"},
+    "cockpit": {"envs", "experiment", "viz"},
     "experiment": {"experiment", "envs", "agent", "palette", "transforms", "geometry", "viz"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"envs/simulator.py"},
-    "hydra": {"train.py", "evaluate.py", "command_line.py", "build.py", "transforms/configs.py"},
+    "hydra": {
+        "train.py",
+        "evaluate.py",
+        "view.py",
+        "command_line.py",
+        "build.py",
+        "transforms/configs.py",
+    },
 }
 # Extras of the transforms: imported when one is made that needs them, never before.
 LAZILY = {

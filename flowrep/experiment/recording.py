@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -28,21 +27,20 @@ def film_episode(env: EnvBase, policy: Policy) -> tuple[list[Maps], str]:
     """
     intrinsics = torch.as_tensor(streets(env)[0].K)
     tensordict = env.reset()
-    frames = [maps_of(tensordict, intrinsics)]
+    frames = [maps_of(tensordict["sensor"][0].cpu(), intrinsics)]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while not tensordict["done"].any():
             tensordict = env.step(policy(tensordict))["next"]
-            frames.append(maps_of(tensordict, intrinsics))
+            frames.append(maps_of(tensordict["sensor"][0].cpu(), intrinsics))
     return frames, OUTCOMES[int(tensordict["outcome"])]
 
 
-def maps_of(tensordict: TensorDictBase, intrinsics: Tensor) -> Maps:
-    """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` of one street's step.
+def maps_of(sensor: Mapping[str, Any], intrinsics: Tensor) -> Maps:
+    """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` of what one street's sensors gave.
 
     Flow is in px/step, whatever unit and scale the agent's own representations have. Raw flow is
     the estimate where the agent lives on one, the exact one otherwise.
     """
-    sensor = tensordict["sensor"][0].cpu()
     depth = sensor["depth"]
     raw = sensor.get("flow", None)
     if raw is None:

@@ -1,0 +1,163 @@
+"""Looks at a scene: `python -m flowrep.view scene=s_turn`, or drives it: `interactive=true`."""
+
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+try:
+    import hydra
+except ImportError:
+    sys.exit("error: viewing needs packages of an extra: pip install 'flowrep[train]'")
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from tqdm.auto import tqdm
+
+from flowrep.cockpit import Cockpit, NoScreenError, drive_by_hand
+from flowrep.command_line import UsageError, exit_with, run_command
+from flowrep.config_tree import CONF_DIR
+from flowrep.envs import BASELINES, SceneError, StreetEnv
+from flowrep.envs.layout import Layout
+from flowrep.envs.sensing import SENSORS
+from flowrep.experiment.recording import Maps, maps_of
+from flowrep.experiment.run_folder import append_rows
+from flowrep.experiment.viewing import CategoryCount, Viewed, view_episode
+from flowrep.plan_view import Track, draw_plan
+from flowrep.viz import contact_sheet, representation_strip, write_png, write_video
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="view")
+def run(config: DictConfig) -> None:
+    """Writes pictures, a video and tables of the scene, or opens a window on it."""
+    try:
+        check(config)
+        scene = OmegaConf.to_container(config.scene, resolve=True)
+        street: dict[str, Any] = {
+            "scene": scene,
+            "speed": config.speed,
+            "frame_rate_hz": config.frame_rate_hz,
+        }
+        if config.interactive:
+            env = StreetEnv(**street, sensors=SENSORS)
+            drive_by_hand(Cockpit(env, seed=config.seed, path=config.path))
+        else:
+            look_at(config, street, Path(HydraConfig.get().runtime.output_dir))
+    except (UsageError, SceneError, NoScreenError, ValueError, OSError) as error:
+        exit_with(str(error))
+
+
+def check(config: DictConfig) -> None:
+    """Refuses what can't be, by name.
+
+    Raises:
+        UsageError: naming the key, what came and what exists.
+    """
+    paths = [path.name for path in config.scene.paths]
+    for key, known in (
+        ("driver", list(BASELINES)),
+        ("speed", list(config.scene.pedestrian_speed_mps)),
+        ("path", [*paths, None]),
+    ):
+        if config[key] not in known:
+            there = ", ".join(str(name) for name in known if name is not None)
+            raise UsageError(f"unknown {key} '{config[key]}'; there are: {there}")
+    for key in ("episodes", "sheet_rows"):
+        if not isinstance(config[key], int) or config[key] < 1:
+            raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
+
+
+def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
+    """Drives the episodes and writes all that there is to see of them."""
+    frames, first, counts, fps = film(config, street)
+    others = drive_on(config, street, config.episodes - 1)
+    episodes = [first, *others]
+    strips = [representation_strip(maps) for maps in tqdm(frames, desc="drawing", unit="frame")]
+    chosen = moments([moving_pixels(maps) for maps in frames], config.sheet_rows)
+    write_png(folder / "sheet.png", contact_sheet(strips[i] for i in chosen))
+    written = ["sheet.png", "plan.png", "episodes.csv", "categories.csv"]
+    if config.video:
+        write_video(folder / "episode.mp4", strips, fps=fps)
+        written.insert(1, "episode.mp4")
+    layout = Layout(StreetEnv(**street, sensors=()).scene)
+    tracks = [Track(episode.points_m, episode.outcome) for episode in episodes]
+    draw_plan(layout, tracks, path=config.path).savefig(folder / "plan.png", dpi=110)
+    for name, rows in (
+        ("episodes.csv", [episode.row() for episode in episodes]),
+        ("categories.csv", counts.rows()),
+    ):
+        (folder / name).unlink(missing_ok=True)
+        append_rows(folder / name, rows)
+        print_rows(name.removesuffix(".csv"), rows)
+    print(f"{folder}: {', '.join(written)}")
+
+
+def film(
+    config: DictConfig, street: dict[str, Any]
+) -> tuple[list[Maps], Viewed, CategoryCount, float]:
+    """Returns the first episode's maps, how it went, what was seen of it, and its frame rate."""
+    env = StreetEnv(**street, sensors=SENSORS)
+    intrinsics, frames = torch.as_tensor(env.K), []
+    counts = CategoryCount(env.scene.categories)
+    with tqdm(desc="driving", unit="frame") as bar:
+
+        def look(observation: Any) -> None:
+            counts(observation)
+            maps = {name: torch.as_tensor(value) for name, value in observation.items()}
+            frames.append(maps_of(maps, intrinsics))
+            bar.update()
+
+        driver = BASELINES[config.driver]()
+        first = view_episode(env, driver, look=look, seed=config.seed, path=config.path)
+    env.close()
+    return frames, first, counts, env.frame_rate_hz
+
+
+def drive_on(config: DictConfig, street: dict[str, Any], episodes: int) -> list[Viewed]:
+    """Returns the episodes after the first, driven without a picture."""
+    env, driver = StreetEnv(**street, sensors=()), BASELINES[config.driver]()
+    env.reset(seed=config.seed)
+    viewed = [
+        view_episode(env, driver, path=config.path)
+        for _ in tqdm(range(episodes), desc="driving on", unit="episode")
+    ]
+    env.close()
+    return viewed
+
+
+def moving_pixels(maps: Maps) -> int:
+    """Returns how many pixels move by themselves and are not right before the lens."""
+    return int(((maps["obj"] != 0).any(0) & (maps["depth"][0] > 4.0)).sum())
+
+
+def moments(motion: list[int], count: int) -> list[int]:
+    """Returns numbers of frames for a contact sheet: of each of `count` stretches the liveliest.
+
+    >>> moments([0, 0, 3, 1, 0, 0, 0, 2], 2)
+    [2, 7]
+    """
+    ends = [round(i * len(motion) / count) for i in range(count + 1)]
+    return [max(range(a, b), key=lambda i: motion[i]) for a, b in pairwise(ends) if b > a]
+
+
+def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
+    """Prints rows as a table."""
+    table = Table(title=title, box=box.SIMPLE, pad_edge=False)
+    for name in rows[0]:
+        table.add_column(name.replace("_", " "), no_wrap=True)
+    for row in rows:
+        table.add_row(*(str(value) for value in row.values()))
+    Console().print(table)
+
+
+def main() -> None:
+    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    run_command("view", run)
+
+
+if __name__ == "__main__":
+    main()

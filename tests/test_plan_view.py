@@ -1,0 +1,69 @@
+"""The plan of a scene: what is drawn where."""
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+pytest.importorskip("shapely", reason="plans are drawn of scenes")
+
+from flowrep.envs import Outcome, load_scene
+from flowrep.envs.layout import Layout
+from flowrep.plan_view import OUTCOME_COLOURS, Track, draw_plan
+
+
+@pytest.fixture(scope="module")
+def layout():
+    return Layout(load_scene("three_way_junction"))
+
+
+def labels(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_every_way_to_end_has_a_colour_of_its_own():
+    assert list(OUTCOME_COLOURS) == [outcome.label for outcome in Outcome if outcome]
+    assert len(set(OUTCOME_COLOURS.values())) == len(OUTCOME_COLOURS)
+
+
+def test_a_track_is_drawn_in_its_outcomes_colour_where_it_was_driven(layout):
+    points = np.array([[7.0, 0.0], [30.0, 0.5], [60.0, -1.0]])
+    figure = draw_plan(layout, [Track(points, "collision")])
+    (axes,) = figure.axes
+    drawn = [
+        line
+        for line in axes.lines
+        if to_hex(line.get_color()) == OUTCOME_COLOURS["collision"] and len(line.get_xdata()) == 3
+    ]
+    assert len(drawn) == 1
+    np.testing.assert_array_equal(np.stack(drawn[0].get_data(), -1), points)
+    assert "collision" in labels(figure)
+    assert "success" not in labels(figure)
+    # x to the right, y upwards, one metre as long on either axis.
+    assert axes.get_aspect() == 1.0
+    assert axes.get_xlim()[0] < axes.get_xlim()[1]
+    assert axes.get_ylim()[0] < axes.get_ylim()[1]
+    assert "x (m)" in axes.get_xlabel()
+
+
+def test_the_legend_names_what_the_scene_has(layout):
+    names = labels(draw_plan(layout))
+    for name in ("road", "crosswalk", "terrain", "tree", "fence", "car", "traffic_light"):
+        assert name in names
+    straight = labels(draw_plan(Layout(load_scene("straight_road"))))
+    assert "tree" not in straight
+    assert "closed exit" not in straight
+
+
+def test_a_path_shows_its_own_closures_alone(layout):
+    def closed(path):
+        figure = draw_plan(layout, path=path)
+        colour = (48 / 255, 48 / 255, 48 / 255)
+        return [
+            patch.get_path().vertices.mean(axis=0)
+            for patch in figure.axes[0].patches
+            if tuple(patch.get_facecolor()[:3]) == pytest.approx(colour)
+        ]
+
+    assert len(closed(None)) == 2
+    (only,) = closed("left")  # drives to the left, +y, with the right arm closed
+    assert only[1] < 0
