@@ -10,7 +10,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate test lint types format bench smoke docs wheel clean check-python
+.PHONY: help install train evaluate view gallery test lint types format bench smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -34,6 +34,20 @@ evaluate: $(INSTALLED)  ## Evaluate a run: make evaluate ARGS="run=outputs/..."
 
 smoke: $(INSTALLED)  ## A whole run in seconds
 	$(BIN)/python -m flowrep.train debug=smoke $(ARGS)
+
+view: $(INSTALLED)  ## Look at a scene: make view ARGS="scene=s_turn"
+	$(BIN)/python -m flowrep.view $(ARGS)
+
+SCENES = straight_road s_turn h_shaped_pathways three_way_junction
+
+gallery: $(INSTALLED)  ## Make the README's gallery anew
+	for scene in $(SCENES); do \
+	  $(BIN)/python -m flowrep.view scene=$$scene sheet_rows=2 video=false hydra.run.dir=outputs/gallery/$$scene || exit 1; \
+	  cp outputs/gallery/$$scene/sheet.png docs/images/gallery_$$scene.png; \
+	  cp outputs/gallery/$$scene/plan.png docs/images/plan_$$scene.png; \
+	done
+	$(BIN)/python examples/filmstrip.py docs/images/strip.png
+	$(BIN)/python examples/transform_pictures.py docs/images/transforms
 
 test: $(INSTALLED)  ## Run the tests
 	$(BIN)/python -m pytest $(ARGS)

@@ -94,7 +94,7 @@ def drive_by_hand(cockpit: Cockpit, show: Callable[[], None] | None = None) -> N
     import matplotlib.pyplot as plt
 
     # Matplotlib's own shortcuts (left: back, r: home, q: quit) give way to the driver's.
-    shortcuts = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
+    shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
     with plt.rc_context(shortcuts):
         figure = plt.figure(figsize=(15, 3.2))
         if type(figure.canvas).required_interactive_framework is None:

@@ -24,10 +24,11 @@ class UsageError(Exception):
 
 
 def register_resolvers() -> None:
-    """Adds `${run_name:scene,representations,seed}`, which run folders are named by."""
+    """Adds `${run_name:scene,representations,flow,seed}`, which run folders are named by."""
 
-    def run_name(scene: str, representations: Iterable[str], seed: int) -> str:
-        return f"{scene}_{'+'.join(representations)}_s{seed}"
+    def run_name(scene: str, representations: Iterable[str], flow: str, seed: int) -> str:
+        source = "" if flow == "exact" else f"_{flow}"
+        return f"{scene}_{'+'.join(representations)}{source}_s{seed}"
 
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 

@@ -50,7 +50,7 @@ def test_the_agent_and_the_film_see_one_estimate():
     for _ in range(2):
         tensordict = env.step(tensordict.set("action", action))["next"]
     K = torch.as_tensor(streets(env)[0].K).float()
-    maps = maps_of(tensordict, K)
+    maps = maps_of(tensordict["sensor"][0], K)
     env.close()
     sensor = tensordict["sensor"][0]
     exact, _ = rigid_flow(sensor["depth"], sensor["instance"], K, sensor["instance_motion"])

@@ -102,6 +102,7 @@ def with_origin(rows: Sequence[Row], config: Mapping[str, Any], frames: int) -> 
     origin = {
         "scene": config["scene"]["name"],
         "representations": "+".join(config["representations"]),
+        "flow": config.get("flow", {}).get("source", "exact"),
         "seed": config["seed"],
         "frames": frames,
     }

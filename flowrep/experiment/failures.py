@@ -12,7 +12,7 @@ from rich.table import Table
 from flowrep.experiment.run_folder import append_rows
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
-_GROUP = ("scene", "representations", "policy", "speed", "fps")
+_GROUP = ("scene", "representations", "flow", "policy", "speed", "fps")
 
 
 def cause_of(outcome: str, hit: str) -> str | None:

@@ -11,6 +11,7 @@ from torchrl.record.loggers import TensorboardLogger
 EVALUATION_COLUMNS = (
     "scene",
     "representations",
+    "flow",
     "seed",
     "frames",
     "policy",
