@@ -52,8 +52,8 @@ def flowrep_update(steps: TensorDict, encoder: str, precision: str) -> Callable[
         target_entropy_weight=0.2, gamma=0.99, tau=0.005, hidden_size=512, batch_size=batch,
         replay_capacity=2 * batch, frames_per_update=10, learning_starts=None,
     )  # fmt: skip
-    agent.replay.extend(steps)
-    sample = agent.replay.sample()
+    agent.memory.extend(steps)
+    sample = agent.memory.sample()
     return lambda: agent.update(sample)
 
 

@@ -7,7 +7,7 @@ import torch
 from hydra.utils import get_class
 from torchrl.envs import EnvBase
 
-from flowrep.agent import DiscreteSAC
+from flowrep.agent import Algorithm
 from flowrep.command_line import UsageError
 from flowrep.envs import make_env
 
@@ -42,7 +42,7 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
     return make_env(**(arguments | changes))
 
 
-def build_agent(config: Config, env: EnvBase) -> DiscreteSAC:
+def build_agent(config: Config, env: EnvBase) -> Algorithm:
     """Returns the config's algorithm, untrained, on what the env emits."""
     options = dict(config["algorithm"])
     algorithm = get_class(options.pop("_target_"))

@@ -11,7 +11,7 @@ except ImportError:
 
 from omegaconf import DictConfig, ListConfig
 
-from flowrep.agent import CheckpointError, DiscreteSAC, load_checkpoint
+from flowrep.agent import Algorithm, CheckpointError, load_checkpoint
 from flowrep.build import Config, build_agent, build_env
 from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
@@ -90,7 +90,7 @@ def as_list(value: Any) -> list[Any]:
     return list(value) if isinstance(value, ListConfig) else [value]
 
 
-def load_agent(trained: Config, folder: RunFolder) -> tuple[DiscreteSAC, int]:
+def load_agent(trained: Config, folder: RunFolder) -> tuple[Algorithm, int]:
     """Returns the run's agent and the number of frames that it was trained for."""
     state = load_checkpoint(folder.checkpoint_path)
     env = build_env(trained, num_envs=1)
@@ -101,7 +101,7 @@ def load_agent(trained: Config, folder: RunFolder) -> tuple[DiscreteSAC, int]:
 
 
 def film(
-    agent: DiscreteSAC,
+    agent: Algorithm,
     trained: Config,
     folder: RunFolder,
     config: DictConfig,

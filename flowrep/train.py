@@ -13,7 +13,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from flowrep.agent import CheckpointError, keep_freed_memory
+from flowrep.agent import CheckpointError, DivergenceError, keep_freed_memory
 from flowrep.build import Config, build_agent, build_env
 from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
@@ -45,7 +45,7 @@ def run(config: DictConfig) -> None:
     with StopRequest() as stop:
         try:
             clock = train(training, plain, stop, partial(log_evaluation, training, plain, stop))
-        except (CheckpointError, OSError) as error:
+        except (CheckpointError, DivergenceError, OSError) as error:
             exit_with(f"after {training.frames} frames: {error}")
         print(f"wall time: {clock.summary()}")
         print(f"outside gradient updates: {1 - clock.share('update'):.0%}")

@@ -28,7 +28,7 @@ def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
     from flowrep.build import build_agent, build_env
 
     choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
-    small = [] if group == "debug" else ["num_envs=1", "algorithm.replay_capacity=64"]
+    small = [] if group == "debug" else ["num_envs=1", "algorithm.batch_size=16"]
     config = composed(choice, *small, "device=cpu")
     env = build_env(config)
     agent = build_agent(config, env)

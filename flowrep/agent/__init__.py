@@ -1,13 +1,23 @@
-"""Networks and discrete SAC: sees specs and keys, never an environment or a representation."""
+"""Networks and algorithms: sees specs and keys, never an environment or a representation."""
 
+from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.allocator import keep_freed_memory
 from flowrep.agent.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from flowrep.agent.divergence import DivergenceError
+from flowrep.agent.dqn import DoubleDQN
 from flowrep.agent.dsac import DiscreteSAC
+from flowrep.agent.dsac_v import DiscreteSACWithValue
+from flowrep.agent.ppo import PPO
 from flowrep.agent.replay import ReplayMemory
 
 __all__ = [
+    "PPO",
+    "Algorithm",
     "CheckpointError",
     "DiscreteSAC",
+    "DiscreteSACWithValue",
+    "DivergenceError",
+    "DoubleDQN",
     "ReplayMemory",
     "keep_freed_memory",
     "load_checkpoint",

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-FORMAT = "flowrep checkpoint 1"
+FORMAT = "flowrep checkpoint 2"
 
 
 class CheckpointError(Exception):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -14,17 +13,18 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate, ValueEstimators
 
 from flowrep.agent.action import DiscreteActions
+from flowrep.agent.algorithm import move_targets, named_weights
 from flowrep.agent.encoder import Encoder
 from flowrep.agent.heads import Head
 from flowrep.agent.observation import decode_maps, map_codecs
+from flowrep.agent.off_policy import OffPolicy
 from flowrep.agent.policy import PolicyNetwork, stochastic_policy
 from flowrep.agent.precision import compute_dtype
-from flowrep.agent.replay import ReplayMemory
 
 ENCODERS = ("shared", "separate")
 
 
-class DiscreteSAC:
+class DiscreteSAC(OffPolicy):
     """Actor, two Q-functions and their targets, trained by discrete soft actor-critic.
 
     One gradient step minimises, over a batch and with π, Q1, Q2 from the embeddings of `s` and `s'`
@@ -60,6 +60,8 @@ class DiscreteSAC:
         learning_starts: frames before the first update; None: one batch.
     """
 
+    METRICS = ("q_loss", "actor_loss", "alpha_loss", "alpha", "entropy", "q_mean", "td_error")
+
     def __init__(
         self,
         observation_spec: Composite,
@@ -83,24 +85,10 @@ class DiscreteSAC:
     ) -> None:
         if encoder not in ENCODERS:
             raise ValueError(f"encoder={encoder!r}: expected one of {', '.join(ENCODERS)}")
-        self.device = torch.device(device)
-        self.dtype = compute_dtype(precision, self.device)
-        self.codecs = map_codecs(observation_spec, keys, self.dtype)
-        self.learning_rate = learning_rate
-        self.updates = 0
-        self.replay = ReplayMemory(
-            self.codecs,
-            capacity=replay_capacity,
-            batch_size=batch_size,
-            frames_per_update=frames_per_update,
-            learning_starts=batch_size if learning_starts is None else learning_starts,
-            device=self.device,
-        )
-        learning_frames = total_frames - self.replay.learning_starts
-        self.total_updates = max(1, learning_frames // frames_per_update)
-
+        device = torch.device(device)
+        self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
         actions = DiscreteActions.from_spec(action_spec)
-        with self.device:
+        with device:
             self.critic_encoder = Encoder(self.codecs)
             self.encoder_is_shared = encoder == "shared"
             self.actor_encoder = (
@@ -126,26 +114,26 @@ class DiscreteSAC:
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.tau = tau
         self._move_target_heads = SoftUpdate(self.loss, tau=tau)
-        self._weights = dict(self._named_weights())
-        self.trained = {n: w for n, w in self._weights.items() if w.requires_grad}
-        self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
+        super().__init__(
+            self._all_weights(),
+            self.codecs,
+            device,
+            total_frames=total_frames,
+            learning_rate=learning_rate,
+            batch_size=batch_size,
+            replay_capacity=replay_capacity,
+            frames_per_update=frames_per_update,
+            learning_starts=learning_starts,
+        )
 
-    def update(self, batch: TensorDictBase) -> TensorDictBase:
-        """Takes one gradient step on a batch from `replay.sample()`; returns detached metrics."""
-        learning_rate = self.learning_rate * max(0.0, 1 - self.updates / self.total_updates)
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate
-        self.optimizer.zero_grad(set_to_none=True)
-        losses = self.losses(batch)
-        (losses["q_loss"] + losses["actor_loss"] + losses["alpha_loss"]).backward()
-        self.optimizer.step()
-        self._move_targets()
-        self.updates += 1
-        metrics = TensorDict({name: value.detach() for name, value in losses.items()})
-        gradients = [w.grad for w in self.trained.values() if w.grad is not None]
-        metrics["grad_norm"] = torch.nn.utils.get_total_norm(gradients)
-        metrics["learning_rate"] = torch.tensor(learning_rate)
-        return metrics
+    def _all_weights(self) -> dict[str, Tensor]:
+        """Returns all that training changes: weights, target weights, log α."""
+        encoders = {"critic_encoder": self.critic_encoder, "target_encoder": self.target_encoder}
+        if not self.encoder_is_shared:
+            encoders["actor_encoder"] = self.actor_encoder
+        buffers = self.loss.named_buffers()
+        targets = {name: weight for name, weight in buffers if name.startswith("target_qvalue")}
+        return named_weights(**encoders) | dict(self.loss.named_parameters()) | targets
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Returns the three losses, with gradients, and what they were computed from, without."""
@@ -188,61 +176,8 @@ class DiscreteSAC:
             batch.batch_size,
         )
 
-    @torch.no_grad()
-    def _move_targets(self) -> None:
+    def after_update(self) -> None:
+        """Moves the targets by `tau` of their distance."""
         self._move_target_heads.step()
-        torch._foreach_lerp_(
-            list(self.target_encoder.parameters()), list(self.critic_encoder.parameters()), self.tau
-        )
-
-    def _named_weights(self) -> list[tuple[str, Tensor]]:
-        """Returns all that training changes: weights, target weights, log α."""
-        encoders = {"critic_encoder": self.critic_encoder, "target_encoder": self.target_encoder}
-        if not self.encoder_is_shared:
-            encoders["actor_encoder"] = self.actor_encoder
-        named = [
-            (f"{prefix}.{name}", weight)
-            for prefix, encoder in encoders.items()
-            for name, weight in encoder.named_parameters()
-        ]
-        buffers = self.loss.named_buffers()
-        targets = (item for item in buffers if item[0].startswith("target_qvalue"))
-        return [*named, *self.loss.named_parameters(), *targets]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns weights, targets, log α, Adam's moments and the schedule's position."""
-        moments = {n: dict(self.optimizer.state[w]) for n, w in self.trained.items()}
-        return {
-            "weights": {name: weight.detach() for name, weight in self._weights.items()},
-            "moments": moments if self.updates else {},
-            "updates": self.updates,
-        }
-
-    @torch.no_grad()
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`.
-
-        Raises:
-            ValueError: if it belongs to other maps, sizes or another `encoder`.
-        """
-        saved = state["weights"]
-        shapes = {name: tuple(weight.shape) for name, weight in self._weights.items()}
-        differing = [
-            f"{name}: {shapes.get(name, 'absent')} here, "
-            f"{tuple(saved[name].shape) if name in saved else 'absent'} there"
-            for name in sorted(shapes.keys() | saved.keys())
-            if name not in saved or shapes.get(name) != tuple(saved[name].shape)
-        ]
-        if differing:
-            raise ValueError(
-                f"the saved agent does not fit this one in {len(differing)} weights, first "
-                f"{differing[0]}; use the representations, image size and encoder it was made with"
-            )
-        for name, weight in self._weights.items():
-            weight.copy_(saved[name])
-        for name, moments in state["moments"].items():
-            weight = self.trained[name]
-            self.optimizer.state[weight] = {
-                key: value.to(weight.device, copy=True) for key, value in moments.items()
-            }
-        self.updates = state["updates"]
+        targets, online = self.target_encoder.parameters(), self.critic_encoder.parameters()
+        move_targets(targets, online, self.tau)

@@ -19,8 +19,33 @@ from flowrep.agent.heads import Head
 from flowrep.agent.observation import MapCodec
 
 
+class MapNetwork(nn.Module):
+    """Returns `[N, outputs]` float32 of decoded maps: an encoder a map, then a head."""
+
+    def __init__(self, codecs: Sequence[MapCodec], hidden_size: int, outputs: int) -> None:
+        super().__init__()
+        self.encoder = Encoder(codecs)
+        self.head = Head(self.encoder.embedding_size, hidden_size, outputs)
+
+    def forward(self, images: Sequence[Tensor]) -> Tensor:
+        """Returns one number an output."""
+        return self.head(self.encoder(images))
+
+
+class PackedNetwork(nn.Module):
+    """Returns what `network` does of packed maps `[N, h, w, C * 16]`, one argument a map."""
+
+    def __init__(self, codecs: Sequence[MapCodec], network: MapNetwork) -> None:
+        super().__init__()
+        self.codecs, self.network = tuple(codecs), network
+
+    def forward(self, *packed: Tensor) -> Tensor:
+        """Decodes the maps and passes them on."""
+        return self.network([codec.decode(x) for codec, x in zip(self.codecs, packed)])
+
+
 class PolicyNetwork(nn.Module):
-    """Returns action logits `[*B, n]` of raw maps `[*B, C, H, W]`, one argument a map."""
+    """Returns `[*B, n]`, one number an action, of raw maps `[*B, C, H, W]`, one argument a map."""
 
     def __init__(self, codecs: Sequence[MapCodec], encoder: Encoder, head: Head) -> None:
         super().__init__()
@@ -28,7 +53,7 @@ class PolicyNetwork(nn.Module):
         self.encoder, self.head = encoder, head
 
     def forward(self, *maps: Tensor) -> Tensor:
-        """Returns the logits; the maps pass the form they are kept in, as in learning."""
+        """Returns the head's output; the maps pass the form they are kept in, as in learning."""
         images = []
         for codec, x in zip(self.codecs, maps):
             batch = codec.batch_shape(x)

@@ -26,8 +26,6 @@ class ReplayMemory:
         codecs: the maps to keep; see `flowrep.agent.observation`.
         capacity: slots; the oldest transition is overwritten.
         batch_size: transitions a sample, drawn with replacement.
-        frames_per_update: environment frames for each gradient step, for the training loop.
-        learning_starts: frames before the first one, for the training loop.
         device: where frames are kept and samples appear.
     """
 
@@ -37,13 +35,10 @@ class ReplayMemory:
         *,
         capacity: int,
         batch_size: int,
-        frames_per_update: int,
-        learning_starts: int,
         device: torch.device | str,
     ) -> None:
         self.codecs = tuple(codecs)
         self.capacity, self.batch_size = capacity, batch_size
-        self.frames_per_update, self.learning_starts = frames_per_update, learning_starts
         self.device = torch.device(device)
         self._frames: TensorDictBase | None = None  # [capacity], allocated by the first extend
         self._next_slot = torch.full((capacity,), -1)  # -1: the following frame is not stored
@@ -67,7 +62,7 @@ class ReplayMemory:
         Raises:
             ValueError: if the steps, with the N before them, do not fit into the capacity.
         """
-        steps = _time_first(frames)  # [T, N]
+        steps = time_first(frames)  # [T, N]
         times, width = steps.batch_size
         if (times + 1) * width > self.capacity:
             raise ValueError(
@@ -166,7 +161,7 @@ class ReplayMemory:
         self._usable = (self._next_slot >= 0).nonzero().squeeze(-1)
 
 
-def _time_first(frames: TensorDictBase) -> TensorDictBase:
+def time_first(frames: TensorDictBase) -> TensorDictBase:
     """Returns the frames as `[T, N]`."""
     names = list(frames.names)
     time = names.index("time") if "time" in names else None

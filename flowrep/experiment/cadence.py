@@ -24,27 +24,3 @@ class Every:
             return False
         self.last = step
         return True
-
-
-@dataclass
-class UpdatesDue:
-    """Counts the gradient updates that are due after each collected batch.
-
-    Args:
-        frames_per_update: environment steps for one update (the paper's "steps per update").
-        learning_starts: frames that must be stored before the first update.
-
-    >>> updates_due = UpdatesDue(frames_per_update=10, learning_starts=30)
-    >>> [updates_due(frames) for frames in (8, 24, 40, 64)]
-    [0, 0, 1, 2]
-    """
-
-    frames_per_update: int
-    learning_starts: int
-    done: int = 0
-
-    def __call__(self, frames: int) -> int:
-        """Returns how many updates to do now that `frames` have been stored in all."""
-        total = max(0, frames - self.learning_starts) // self.frames_per_update
-        due, self.done = total - self.done, total
-        return due

@@ -8,21 +8,19 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
-from flowrep.agent import DiscreteSAC, load_checkpoint, save_checkpoint
+from flowrep.agent import Algorithm, DivergenceError, load_checkpoint, save_checkpoint
 from flowrep.envs import get_states, set_states
-from flowrep.experiment.cadence import Every, UpdatesDue
+from flowrep.experiment.cadence import Every
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.stopwatch import Stopwatch
 
 RECENT_EPISODES = 100
-LEARNING_METRICS = (
-    "q_loss", "actor_loss", "alpha_loss", "alpha", "entropy", "td_error", "learning_rate"
-)  # fmt: skip
 
 
 @dataclass
@@ -31,16 +29,16 @@ class Training:
 
     Args:
         env: batched TorchRL env.
-        agent: the algorithm, with its replay memory.
+        agent: the algorithm, with what it remembers.
         run: the folder that the run writes to.
     """
 
     env: EnvBase
-    agent: DiscreteSAC
+    agent: Algorithm
     run: RunFolder
     frames: int = 0
-    updates: int = 0
     carried: TensorDictBase | None = None
+    metrics: dict[str, Tensor] = field(default_factory=dict)
     recent: deque[int] = field(default_factory=lambda: deque(maxlen=RECENT_EPISODES))
 
     def state(self) -> dict[str, Any]:
@@ -48,11 +46,11 @@ class Training:
         assert self.carried is not None
         return {
             "frames": self.frames,
-            "updates": self.updates,
+            "metrics": self.metrics,
             "recent": list(self.recent),
             "carried": self.carried.to_dict(),
             "agent": self.agent.state_dict(),
-            "replay": self.agent.replay.state_dict(),
+            "memory": self.agent.memory.state_dict(),
             "env": get_states(self.env),
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all(),
@@ -61,19 +59,37 @@ class Training:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues where `state` was taken."""
         self.env.reset()
-        self.frames, self.updates = state["frames"], state["updates"]
+        self.frames, self.metrics = state["frames"], state["metrics"]
         self.recent.extend(state["recent"])
         self.carried = TensorDict(state["carried"], self.env.batch_size, device=self.env.device)
         self.agent.load_state_dict(state["agent"])
-        self.agent.replay.load_state_dict(state["replay"])
+        self.agent.memory.load_state_dict(state["memory"])
         set_states(self.env, state["env"])
         torch.set_rng_state(state["torch_rng"])
         if len(state["cuda_rng"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda_rng"])
 
     def save(self) -> None:
-        """Writes the checkpoint; the last one stays whole until the new one is."""
+        """Writes the checkpoint; the last one stays whole until the new one is.
+
+        Raises:
+            DivergenceError: as `check`; nothing is written then.
+        """
+        self.check()
         save_checkpoint(self.run.checkpoint_path, self.state())
+
+    def check(self) -> None:
+        """Looks whether the algorithm still learns.
+
+        Raises:
+            DivergenceError: a loss became nan or infinite; says where the last good state is.
+        """
+        try:
+            self.agent.divergence.check()
+        except DivergenceError as error:
+            path = self.run.checkpoint_path
+            good = f"the last good checkpoint is {path}" if path.exists() else "none was saved yet"
+            raise DivergenceError(f"{error}; {good}") from error
 
     def load(self) -> None:
         """Continues from the checkpoint, and forgets what was logged after it."""
@@ -103,10 +119,7 @@ def train(
     should_log = Every(config["log_every_frames"], t.frames)
     should_evaluate = Every(config["evaluation"]["every_frames"], t.frames)
     should_save = Every(config["checkpoint_every_frames"], t.frames)
-    replay = t.agent.replay
-    updates_due = UpdatesDue(replay.frames_per_update, replay.learning_starts, done=t.updates)
     total = config["total_frames"]
-    losses: TensorDictBase | None = None
     if t.carried is None:
         t.carried = t.env.reset()
     with tqdm(total=total, initial=t.frames, unit="frame", unit_scale=True, mininterval=0.5) as bar:
@@ -115,19 +128,19 @@ def train(
                 acted = t.agent.policy(t.carried)
             with clock("environment"):
                 stepped, t.carried = t.env.step_and_maybe_reset(acted)
-            with clock("replay"):
-                replay.extend(stepped)
+            with clock("memory"):
+                t.agent.remember(stepped)
             t.frames += stepped.numel()
             t.recent.extend(finished_outcomes(stepped))
-            for _ in range(updates_due(t.frames)):
-                with clock("replay"):
-                    batch = replay.sample()
+            for _ in range(t.agent.updates_due(t.frames)):
+                with clock("memory"):
+                    batch = t.agent.sample()
                 with clock("update"):
-                    losses = t.agent.update(batch)
-                t.updates += 1
+                    t.metrics = t.agent.update(batch)
             bar.update(t.frames - bar.n)
             if should_log(t.frames):
-                row = metrics_row(t, losses, bar.format_dict["rate"], clock)
+                t.check()
+                row = metrics_row(t, bar.format_dict["rate"], clock)
                 t.run.log_metrics(t.frames, row)
                 bar.set_postfix_str(progress_text(row))
             if should_evaluate(t.frames):
@@ -147,34 +160,29 @@ def finished_outcomes(stepped: TensorDictBase) -> list[int]:
     return after["outcome"][after["done"]].tolist()
 
 
-def metrics_row(
-    training: Training, losses: TensorDictBase | None, rate: float | None, clock: Stopwatch
-) -> dict[str, float]:
+def metrics_row(training: Training, rate: float | None, clock: Stopwatch) -> dict[str, float]:
     """Returns one row of metrics.csv; nan stands for what there is none of yet.
 
-    `success` and its siblings are shares of the last `RECENT_EPISODES` training episodes, which
-    sample their actions; the losses are those of the last update.
+    docs/metrics.md says what each column means.
     """
-    recent = training.recent
+    recent, agent = training.recent, training.agent
     row = {
         name: recent.count(code) / len(recent) if recent else math.nan
         for code, name in enumerate(OUTCOMES)
         if code
     }
-    row["updates"] = training.updates
+    row["updates"] = agent.updates
     row["frames_per_second"] = rate or math.nan
     row["share_outside_updates"] = 1 - clock.share("update")
-    values = losses.to_dict() if losses is not None else {}
-    return row | {name: float(values.get(name, math.nan)) for name in LEARNING_METRICS}
+    nothing = torch.tensor(math.nan)
+    return row | {n: float(training.metrics.get(n, nothing)) for n in agent.metric_names()}
 
 
 def progress_text(row: Mapping[str, float]) -> str:
     """Returns what stands at the end of the progress line; nothing stands for nan."""
-    shown = {
-        "success": f"{row['success']:.0%}",
-        "α": f"{row['alpha']:.3f}",
-        "entropy": f"{row['entropy']:.2f}",
-        "Q loss": f"{row['q_loss']:.3g}",
-        "policy loss": f"{row['actor_loss']:.3g}",
-    }
-    return ", ".join(f"{name} {text}" for name, text in shown.items() if "nan" not in text)
+    losses = [name for name in row if name.endswith("_loss")]
+    shown = {"success": f"{row['success']:.0%}"}
+    shown |= {name: f"{row[name]:.3g}" for name in ("alpha", "entropy", *losses) if name in row}
+    return ", ".join(
+        f"{name.replace('_', ' ')} {text}" for name, text in shown.items() if "nan" not in text
+    )

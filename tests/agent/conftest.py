@@ -1,10 +1,15 @@
 import pytest
 import torch
+import yaml
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
+import flowrep.agent
 from flowrep.agent import DiscreteSAC
 from flowrep.agent.observation import store_maps
+from flowrep.config_tree import CONF_DIR, group_choices
 
+ALGORITHMS = group_choices("algorithm")
+SMALL = {"precision": "fp32", "hidden_size": 32, "batch_size": 16, "replay_capacity": 100}
 HEIGHT, WIDTH = 38, 45  # neither square nor a multiple of the first stride
 
 
@@ -46,6 +51,25 @@ def make_agent(observation_spec):
         torch.manual_seed(seed)
         action_spec = Categorical(3) if action_spec is None else action_spec
         return DiscreteSAC(spec, action_spec, list(keys), **(settings | changes))
+
+    return make
+
+
+@pytest.fixture(params=ALGORITHMS)
+def make_any(request, observation_spec):
+    """Builds a small float32 agent of each algorithm in turn, as its YAML file has it."""
+    options = yaml.safe_load((CONF_DIR / "algorithm" / f"{request.param}.yaml").read_text())
+    algorithm = getattr(flowrep.agent, options.pop("_target_").removeprefix("flowrep.agent."))
+    small = {name: value for name, value in SMALL.items() if name in options}
+    if request.param == "ppo":
+        small["rollout_length"] = 8
+
+    def make(spec=observation_spec, keys=("flow", "seg"), action_spec=None, seed=0, **changes):
+        torch.manual_seed(seed)
+        action_spec = Categorical(3) if action_spec is None else action_spec
+        settings = {"total_frames": 1000, "device": "cpu"} | options | small
+        settings |= {name: value for name, value in changes.items() if name in settings}
+        return algorithm(spec, action_spec, list(keys), **settings)
 
     return make
 

@@ -100,22 +100,22 @@ def foreign(path):
 
 
 def broken_document(path):
-    metadata = {"format": "flowrep checkpoint 1", "state": '{"dict": {"a": {"tensor": "b"}}}'}
+    metadata = {"format": "flowrep checkpoint 2", "state": '{"dict": {"a": {"tensor": "b"}}}'}
     save_file({"a": torch.ones(2)}, path, metadata=metadata)
 
 
 def strange_document(path):
-    metadata = {"format": "flowrep checkpoint 1", "state": '{"x": 1, "y": 2}'}
+    metadata = {"format": "flowrep checkpoint 2", "state": '{"x": 1, "y": 2}'}
     save_file({"a": torch.ones(2)}, path, metadata=metadata)
 
 
 def deep_document(path):
-    metadata = {"format": "flowrep checkpoint 1", "state": "[" * 100_000}
+    metadata = {"format": "flowrep checkpoint 2", "state": "[" * 100_000}
     save_file({"a": torch.ones(2)}, path, metadata=metadata)
 
 
 def a_list(path):
-    save_file({}, path, metadata={"format": "flowrep checkpoint 1", "state": "[1]"})
+    save_file({}, path, metadata={"format": "flowrep checkpoint 2", "state": "[1]"})
 
 
 @pytest.mark.parametrize(

@@ -107,22 +107,22 @@ def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(
         torch.manual_seed(seed)
         metrics = []
         for _ in range(3):
-            agent.replay.extend(random_steps(12))
-            metrics += [agent.update(agent.replay.sample()) for _ in range(2)]
+            agent.memory.extend(random_steps(12))
+            metrics += [agent.update(agent.memory.sample()) for _ in range(2)]
         return metrics
 
     whole = make_agent(encoder=encoder, replay_capacity=40)
     learn(whole, seed=1)
     save_checkpoint(
         tmp_path / "c.safetensors",
-        {"agent": whole.state_dict(), "replay": whole.replay.state_dict()},
+        {"agent": whole.state_dict(), "replay": whole.memory.state_dict()},
     )
     expected = learn(whole, seed=2)
 
     resumed = make_agent(encoder=encoder, replay_capacity=40, seed=9)
     state = load_checkpoint(tmp_path / "c.safetensors")
     resumed.load_state_dict(state["agent"])
-    resumed.replay.load_state_dict(state["replay"])
+    resumed.memory.load_state_dict(state["replay"])
     actual = learn(resumed, seed=2)
 
     for a, b in zip(expected, actual):

@@ -1,10 +1,13 @@
-"""One gradient step against the same losses written plainly, in float64."""
+"""Gradient steps against the same losses written plainly, in float64."""
 
 import math
 
 import pytest
 import torch
 import torch.nn.functional as F
+from torchrl.data import Categorical
+
+from flowrep.agent import DiscreteSACWithValue
 
 LR, ALPHA, GAMMA, TAU, TARGET_ENTROPY = 3e-4, 0.5, 0.99, 0.005, 0.2 * math.log(3)
 
@@ -29,8 +32,9 @@ def head(weights, prefix, x, net=...):
     return F.linear(x * torch.sigmoid(x), w["output.weight"], w["output.bias"])
 
 
-def reference_losses(weights, separate, maps, next_maps, action, reward, terminated):
+def dsac_losses(weights, maps, next_maps, action, reward, terminated):
     """Losses of Q, actor and α."""
+    separate = "actor_encoder.encoders.0.conv1.weight" in weights
     actor, critic, target = (
         "actor_network_params.module.0.module",
         "qvalue_network_params.module",
@@ -54,16 +58,73 @@ def reference_losses(weights, separate, maps, next_maps, action, reward, termina
     actor_loss = (policy * (alpha * policy.log() - smaller)).sum(1).mean()
     negative_entropy = (policy * policy.log()).sum(1).detach()
     alpha_loss = (-weights["log_alpha"] * (negative_entropy + TARGET_ENTROPY)).mean()
-    return q_loss, actor_loss, alpha_loss
+    return {"q_loss": q_loss, "actor_loss": actor_loss, "alpha_loss": alpha_loss}
+
+
+def dsac_v_losses(weights, maps, next_maps, action, reward, terminated):
+    """Losses of Q, V, actor and α, of networks that share nothing."""
+
+    def network(name, maps):
+        return head(weights, f"{name}.head", encode(weights, f"{name}.encoder", maps))
+
+    rows, alpha = torch.arange(len(action)), weights["log_alpha"].exp().detach()
+    policy = network("actor", maps).softmax(1)
+    negative_entropy = (policy * policy.log()).sum(1)
+    q1, q2 = network("q1", maps), network("q2", maps)
+    y = reward + GAMMA * torch.where(terminated, 0.0, network("target_value", next_maps)[:, 0])
+    q_loss = (
+        (q1[rows, action] - y.detach()) ** 2 + (q2[rows, action] - y.detach()) ** 2
+    ).mean() / 2
+    expected = torch.minimum((policy * q1).sum(1), (policy * q2).sum(1))
+    value_target = (expected - alpha * negative_entropy).detach()
+    value_loss = ((network("value", maps)[:, 0] - value_target) ** 2).mean() / 2
+    actor_loss = (alpha * negative_entropy - (policy * q1.detach()).sum(1)).mean()
+    alpha_loss = (-weights["log_alpha"] * (negative_entropy.detach() + TARGET_ENTROPY)).mean()
+    return {
+        "q_loss": q_loss, "value_loss": value_loss, "actor_loss": actor_loss,
+        "alpha_loss": alpha_loss,
+    }  # fmt: skip
+
+
+def online_name(target):
+    """The weight that a target weight follows."""
+    name = target.replace("target_encoder", "critic_encoder")
+    return name.removeprefix("target_")
+
+
+@pytest.fixture
+def make_dsac_v(observation_spec):
+    def make():
+        torch.manual_seed(0)
+        return DiscreteSACWithValue(
+            observation_spec, Categorical(3), ["flow", "seg"], total_frames=1000, device="cpu",
+            precision="fp32", learning_rate=LR, initial_alpha=ALPHA, target_entropy_weight=0.2,
+            gamma=GAMMA, tau=TAU, hidden_size=32, batch_size=16, replay_capacity=100,
+            frames_per_update=10, learning_starts=None,
+        )  # fmt: skip
+
+    return make
 
 
 @pytest.mark.parametrize("encoder", ["shared", "separate"])
-def test_an_update_equals_the_plain_float64_one(make_agent, random_steps, as_batch, encoder):
+def test_three_updates_equal_the_plain_float64_ones(make_agent, random_steps, as_batch, encoder):
     agent = make_agent(encoder=encoder, initial_alpha=ALPHA, gamma=GAMMA, tau=TAU)
     steps = random_steps(16)
-    separate = encoder == "separate"
+    assert_follows(agent, as_batch(agent, steps), steps, dsac_losses)
+
+
+def test_the_papers_own_formulation_equals_the_plain_float64_one(
+    make_dsac_v, random_steps, as_batch
+):
+    agent, steps = make_dsac_v(), random_steps(16)
+    assert_follows(agent, as_batch(agent, steps), steps, dsac_v_losses)
+
+
+def assert_follows(agent, batch, steps, reference_losses):
+    """Three updates of `agent` on `batch` and of the reference on the same steps agree."""
     weights = {n: w.double().clone() for n, w in agent.state_dict()["weights"].items()}
     trained = [n for n, w in weights.items() if not n.startswith("target")]
+    assert sorted(trained) == sorted(agent.trained)
     for name in trained:
         weights[name].requires_grad_()
 
@@ -72,23 +133,21 @@ def test_an_update_equals_the_plain_float64_one(make_agent, random_steps, as_bat
         return maps["flow"].double(), one_hot.double()
 
     optimizer = torch.optim.Adam([weights[n] for n in trained], lr=LR)
-    batch = as_batch(agent, steps)
     for update in range(3):
         losses = reference_losses(
-            weights, separate, plain(steps), plain(steps["next"]), steps["action"],
+            weights, plain(steps), plain(steps["next"]), steps["action"],
             steps["next", "reward"].double().squeeze(1), steps["next", "terminated"].squeeze(1),
         )  # fmt: skip
         optimizer.zero_grad()
-        sum(losses).backward()
+        sum(losses.values()).backward()
         optimizer.param_groups[0]["lr"] = LR * (1 - update / agent.total_updates)
         optimizer.step()
         with torch.no_grad():
             for name in set(weights) - set(trained):
-                online = name.replace("target_encoder", "critic_encoder").removeprefix("target_")
-                weights[name] += TAU * (weights[online] - weights[name])
+                weights[name] += TAU * (weights[online_name(name)] - weights[name])
 
         metrics = agent.update(batch)
-        for name, loss in zip(("q_loss", "actor_loss", "alpha_loss"), losses):
+        for name, loss in losses.items():
             torch.testing.assert_close(metrics[name].double(), loss.detach(), rtol=1e-5, atol=1e-6)
         for name, weight in agent.state_dict()["weights"].items():
             # a step is 3e-4; where a gradient is near Adam's epsilon of 1e-8, float32 cannot fix it

@@ -110,12 +110,12 @@ def test_a_torchrl_collector_acts_with_it_and_the_replay_takes_its_frames(make_a
     )
     collector = Collector(env, agent.policy, frames_per_batch=9, total_frames=54)
     for frames in collector:
-        agent.replay.extend(frames)
+        agent.memory.extend(frames)
     collector.shutdown()
-    batch = agent.replay.sample()
+    batch = agent.memory.sample()
     now, later = batch["view"][:, 0, 0, 0], batch["next", "view"][:, 0, 0, 0]
     terminated = batch["next", "terminated"].squeeze(1)
-    assert len(agent.replay) == 54
+    assert len(agent.memory) == 54
     assert terminated.any()
     assert torch.equal(batch["next", "reward"].squeeze(1), now.float() + 1)
     assert torch.equal(later[~terminated], now[~terminated] + 1)

@@ -11,10 +11,7 @@ SPEC = Composite(view=Unbounded((1, 36, 36)))
 
 def memory(capacity=100, batch_size=400, dtype=torch.float32):
     codecs = map_codecs(SPEC, ["view"], dtype)
-    return ReplayMemory(
-        codecs, capacity=capacity, batch_size=batch_size, frames_per_update=1, learning_starts=1,
-        device="cpu",
-    )  # fmt: skip
+    return ReplayMemory(codecs, capacity=capacity, batch_size=batch_size, device="cpu")
 
 
 def view(numbers):

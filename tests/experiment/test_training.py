@@ -8,18 +8,22 @@ from tensordict import TensorDict
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
+from flowrep.config_tree import group_choices
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.training import Training, train
 from flowrep.train import build
 from tests.test_configs import composed
 
+SMALL = {"ppo": ["algorithm.rollout_length=16"]}
 
-def new_run(folder, *, resume=False) -> tuple[Training, dict]:
+
+def new_run(folder, *, resume=False, algorithm="dsac") -> tuple[Training, dict]:
+    small = SMALL.get(algorithm, ["algorithm.replay_capacity=64"])
     config = composed(
         "debug=smoke", "num_envs=2", "total_frames=120", "checkpoint_every_frames=60",
         "log_every_frames=20", "evaluation.every_frames=0", "algorithm.precision=fp32",
-        "algorithm.replay_capacity=64", "device=cpu", "seed=7",
+        "device=cpu", "seed=7", f"algorithm={algorithm}", *small,
     )  # fmt: skip
     config["resume"] = str(folder) if resume else None
     return build(config, RunFolder(folder)), config
@@ -36,13 +40,15 @@ class StopAfter(StopRequest):
         return self.training.frames >= self.frames
 
 
-def finish(folder, *stops: int) -> Training:
+def finish(folder, *stops: int, algorithm="dsac") -> Training:
     """Trains in as many sessions as there are stops, and one more."""
     for stop in stops:
-        training, config = new_run(folder, resume=(folder / "checkpoint").exists())
+        training, config = new_run(
+            folder, resume=(folder / "checkpoint").exists(), algorithm=algorithm
+        )
         train(training, config, StopAfter(training, stop), lambda frames: None)
         training.env.close()
-    training, config = new_run(folder, resume=bool(stops))
+    training, config = new_run(folder, resume=bool(stops), algorithm=algorithm)
     train(training, config, StopRequest(), lambda frames: None)
     training.env.close()
     return training
@@ -66,11 +72,22 @@ def differing(a, b, place="") -> list[str]:
     return [] if same else [place]
 
 
-def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path):
-    whole = finish(tmp_path / "whole")
-    pieces = finish(tmp_path / "pieces", 34, 78)
-    assert whole.updates == pieces.updates > 5
+def logged(training):
+    """What metrics.csv tells of the run, but not of the clock."""
+    with training.run.metrics_path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    clock = ("frames_per_second", "share_outside_updates")
+    return [{k: v for k, v in row.items() if k not in clock} for row in rows]
+
+
+@pytest.mark.parametrize("algorithm", group_choices("algorithm"))
+def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, algorithm):
+    whole = finish(tmp_path / "whole", algorithm=algorithm)
+    pieces = finish(tmp_path / "pieces", 34, 78, algorithm=algorithm)
+    assert whole.agent.updates == pieces.agent.updates > 5
     assert differing(whole.state(), pieces.state()) == []
+    assert logged(whole) == logged(pieces)
+    assert len(logged(whole)) == 6
 
 
 def test_a_killed_run_continues_from_its_last_checkpoint_and_drops_later_rows(tmp_path):
@@ -102,4 +119,4 @@ def test_a_killed_run_continues_from_its_last_checkpoint_and_drops_later_rows(tm
 
 def test_the_loop_updates_once_for_ten_frames_after_the_first_batch(tmp_path):
     training = finish(tmp_path)
-    assert training.updates == (120 - 16) // 10
+    assert training.agent.updates == (120 - 16) // 10

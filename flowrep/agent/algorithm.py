@@ -1,0 +1,184 @@
+"""What training asks of an algorithm, and what every algorithm here does in the same way."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from flowrep.agent.divergence import DivergenceWatch
+
+
+class Memory(Protocol):
+    """What an algorithm keeps of the frames that it has seen."""
+
+    def extend(self, frames: TensorDictBase) -> None:
+        """Stores steps of N environments."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that it holds."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from a `state_dict`."""
+
+
+class Algorithm(ABC):
+    """Acts by `policy`, keeps frames in `memory`, and takes gradient steps on samples of it.
+
+    ```
+    acted = algorithm.policy(observation)                   # writes `action`
+    algorithm.remember(steps)                               # with what the action brought
+    for _ in range(algorithm.updates_due(frames)):
+        metrics = algorithm.update(algorithm.sample())
+    ```
+
+    A subclass builds its networks, sets `policy` and `memory`, then calls this constructor with
+    all weights that training changes; it writes `sample`, `updates_due` and `losses`. Everything it
+    needs to continue then lies in those weights, the memory and Adam's state, which are saved.
+
+    Args:
+        weights: by name; those that require gradients are trained, the others (targets, an
+            exploration rate) only saved.
+        learning_rate: Adam's, falling linearly to 0 over `total_updates`.
+        total_updates: gradient steps of the whole training.
+        max_grad_norm: gradients of a larger norm, all weights together, are scaled down to it.
+    """
+
+    METRICS: ClassVar[tuple[str, ...]]
+    """The keys of `losses`; those that end in `_loss` are minimised, as a sum."""
+
+    policy: TensorDictModuleBase
+    memory: Memory
+
+    def __init__(
+        self,
+        weights: Mapping[str, Tensor],
+        *,
+        learning_rate: float,
+        total_updates: int,
+        max_grad_norm: float | None = None,
+    ) -> None:
+        self.weights = dict(weights)
+        self.trained = {n: w for n, w in self.weights.items() if w.requires_grad}
+        self.learning_rate, self.total_updates = learning_rate, max(1, total_updates)
+        self.max_grad_norm = max_grad_norm
+        self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
+        device = next(iter(self.trained.values())).device
+        losses = [name for name in self.METRICS if name.endswith("_loss")]
+        beside = [name for name in self.METRICS if name not in losses]
+        self.divergence = DivergenceWatch([*losses, "grad_norm"], beside, device)
+        self.updates = 0
+
+    @classmethod
+    def metric_names(cls) -> tuple[str, ...]:
+        """Returns the keys of what `update` returns."""
+        return (*cls.METRICS, "grad_norm", "learning_rate")
+
+    def remember(self, steps: TensorDictBase) -> None:
+        """Takes in steps of N environments: observations, actions and what they brought."""
+        self.memory.extend(steps)
+
+    @abstractmethod
+    def updates_due(self, frames: int) -> int:
+        """Returns how many updates to take, now that `frames` have been remembered in all."""
+
+    @abstractmethod
+    def sample(self) -> TensorDictBase:
+        """Returns the batch for one update."""
+
+    @abstractmethod
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Returns the scalars named in `METRICS`, the losses among them with gradients."""
+
+    def after_update(self) -> None:  # noqa: B027
+        """Follows each step of the optimizer; for target networks."""
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Takes one gradient step on a batch from `sample()`; returns detached metrics.
+
+        From the first update on in which a loss or a gradient is nan or infinite, the weights stay
+        as they are and `divergence.check()` raises.
+        """
+        learning_rate = self.learning_rate * max(0.0, 1 - self.updates / self.total_updates)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate
+        self.optimizer.zero_grad(set_to_none=True)
+        losses = self.losses(batch)
+        minimised = [loss for name, loss in losses.items() if name.endswith("_loss")]
+        torch.stack(minimised).sum().backward()
+        metrics = {name: value.detach() for name, value in losses.items()}
+        metrics["grad_norm"] = self._gradient_norm()
+        # the fused step takes no step where it is 1, and asks the device, not the host
+        self.optimizer.found_inf = self.divergence.look(metrics)  # type: ignore[attr-defined]
+        self.optimizer.step()
+        self.after_update()
+        self.updates += 1
+        metrics["learning_rate"] = torch.tensor(learning_rate)
+        return metrics
+
+    def _gradient_norm(self) -> Tensor:
+        """Returns the norm of all gradients, which it then scales down to `max_grad_norm`."""
+        trained = [w for w in self.trained.values() if w.grad is not None]
+        norm = torch.nn.utils.get_total_norm([w.grad for w in trained if w.grad is not None])
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grads_with_norm_(trained, self.max_grad_norm, norm)
+        return norm
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns weights, Adam's moments and the schedule's position; not the memory."""
+        moments = {n: dict(self.optimizer.state[w]) for n, w in self.trained.items()}
+        return {
+            "weights": {name: weight.detach() for name, weight in self.weights.items()},
+            "moments": moments if self.updates else {},
+            "updates": self.updates,
+        }
+
+    @torch.no_grad()
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from a `state_dict`.
+
+        Raises:
+            ValueError: if it belongs to another algorithm, or to other maps or sizes.
+        """
+        saved = state["weights"]
+        shapes = {name: tuple(weight.shape) for name, weight in self.weights.items()}
+        differing = [
+            f"{name}: {shapes.get(name, 'absent')} here, "
+            f"{tuple(saved[name].shape) if name in saved else 'absent'} there"
+            for name in sorted(shapes.keys() | saved.keys())
+            if name not in saved or shapes.get(name) != tuple(saved[name].shape)
+        ]
+        if differing:
+            raise ValueError(
+                f"the saved agent does not fit this one in {len(differing)} weights, first "
+                f"{differing[0]}; use the algorithm, representations, image size and encoder it "
+                "was made with"
+            )
+        for name, weight in self.weights.items():
+            weight.copy_(saved[name])
+        for name, moments in state["moments"].items():
+            weight = self.trained[name]
+            self.optimizer.state[weight] = {
+                key: value.to(weight.device, copy=True) for key, value in moments.items()
+            }
+        self.updates = state["updates"]
+
+
+def named_weights(**modules: torch.nn.Module) -> dict[str, Tensor]:
+    """Returns the parameters of several modules, each name after its module's."""
+    return {
+        f"{prefix}.{name}": weight
+        for prefix, module in modules.items()
+        for name, weight in module.named_parameters()
+    }
+
+
+@torch.no_grad()
+def move_targets(targets: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> None:
+    """Moves each target weight by `tau` of its distance to the online one."""
+    torch._foreach_lerp_(list(targets), list(online), tau)

@@ -1,0 +1,65 @@
+"""Notices a loss that stopped being a number, without making the device wait for the host."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+
+class DivergenceError(ArithmeticError):
+    """A loss, or what is logged beside it, became nan or infinite; the message says which."""
+
+
+class DivergenceWatch:
+    """Remembers, on the device, the metrics of the first update that went wrong.
+
+    Args:
+        watched: the metrics that have to be finite.
+        beside: those to tell with them.
+        device: where the metrics are.
+
+    >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
+    >>> for q_loss in (0.5, float("nan"), 0.25):
+    ...     _ = watch.look({"q_loss": torch.tensor(q_loss), "entropy": torch.tensor(1.0)})
+    >>> watch.check()
+    Traceback (most recent call last):
+    flowrep.agent.divergence.DivergenceError: q_loss became nan in update 2 (q_loss=nan, entropy=1)
+    """
+
+    def __init__(
+        self,
+        watched: Sequence[str],
+        beside: Sequence[str] = (),
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.watched, self.names = tuple(watched), (*watched, *beside)
+        self._values = torch.zeros(len(self.names), device=device)
+        self._good_updates = torch.zeros((), dtype=torch.long, device=device)
+
+    def look(self, metrics: Mapping[str, Tensor]) -> Tensor:
+        """Returns, on the device, 1.0 from the first bad update on and 0.0 before it."""
+        values = torch.stack([metrics[name].float() for name in self.names])
+        self._values = torch.where(self._is_good(), values, self._values)
+        is_good = self._is_good()
+        self._good_updates += is_good
+        return 1.0 - is_good.float()
+
+    def _is_good(self) -> Tensor:
+        return self._values[: len(self.watched)].isfinite().all()
+
+    def check(self) -> None:
+        """Waits for the device and says what went wrong, if anything has.
+
+        Raises:
+            DivergenceError: naming the first metric that is not finite, and all of that update's.
+        """
+        values = dict(zip(self.names, self._values.tolist()))
+        bad = [name for name in self.watched if not math.isfinite(values[name])]
+        if bad:
+            raise DivergenceError(
+                f"{bad[0]} became {values[bad[0]]:g} in update {int(self._good_updates) + 1} "
+                f"({', '.join(f'{name}={value:g}' for name, value in values.items())})"
+            )

@@ -1,0 +1,182 @@
+"""Proximal policy optimisation from maps, by TorchRL's clipped loss and its GAE."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from flowrep.agent.action import DiscreteActions
+from flowrep.agent.algorithm import Algorithm, named_weights
+from flowrep.agent.encoder import Encoder
+from flowrep.agent.heads import Head
+from flowrep.agent.observation import decode_maps, map_codecs
+from flowrep.agent.policy import PolicyNetwork, stochastic_policy
+from flowrep.agent.precision import compute_dtype
+from flowrep.agent.rollout import Rollout
+
+
+class PPO(Algorithm):
+    """Policy and state-value function on one set of encoders, learning from what just happened.
+
+    After every `rollout_length` steps of each environment, `epochs` passes are made over those
+    steps in shuffled batches, with advantages Â (generalised, then normalised over the batch) and
+    value targets R of the weights that acted. One gradient step minimises, over a batch and with
+    ρ = π(a|s) / π_acted(a|s),
+
+        L_π = -mean min(ρ Â, clip(ρ, 1 - clip, 1 + clip) Â)
+        L_V = value_weight · mean (V(s) - R)²
+        L_H = entropy_weight · mean Σ_a π(a|s) log π(a|s)
+
+    Args:
+        observation_spec: the environment's; its last three dims of each map are C, H, W, the
+            dims before them are the environments.
+        action_spec: `Categorical` or `OneHot`.
+        keys: the observation maps to read, in order.
+        total_frames: environment frames of the whole training; sets the learning rate's end.
+        device: where networks, rollout and updates live.
+        precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
+        learning_rate: Adam's, falling linearly to 0.
+        rollout_length: steps of each environment between two rounds of learning.
+        epochs: passes over them.
+        batch_size: steps an update; what does not fill a batch is left out of that pass.
+        gamma: discount a frame.
+        gae_lambda: GAE's λ: 0 trusts V, 1 the rewards.
+        clip: how far ρ pays to move from 1.
+        value_weight: of L_V.
+        entropy_weight: of L_H.
+        max_grad_norm: gradients of a larger norm are scaled down to it.
+        hidden_size: width of the one hidden layer after the embeddings.
+    """
+
+    METRICS = (
+        "policy_loss", "value_loss", "entropy_loss", "entropy", "kl", "clip_share",
+        "explained_variance",
+    )  # fmt: skip
+    memory: Rollout
+
+    def __init__(
+        self,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        keys: Sequence[NestedKey],
+        *,
+        total_frames: int,
+        device: torch.device | str,
+        precision: str,
+        learning_rate: float,
+        rollout_length: int,
+        epochs: int,
+        batch_size: int,
+        gamma: float,
+        gae_lambda: float,
+        clip: float,
+        value_weight: float,
+        entropy_weight: float,
+        max_grad_norm: float,
+        hidden_size: int,
+    ) -> None:
+        device = torch.device(device)
+        self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
+        actions = DiscreteActions.from_spec(action_spec)
+        num_envs = observation_spec.shape.numel()
+        self.rollout_length, self.epochs, self.batch_size = rollout_length, epochs, batch_size
+        frames_per_round = rollout_length * num_envs
+        if batch_size > frames_per_round:
+            raise ValueError(
+                f"batch_size={batch_size} is more than the {frames_per_round} frames of a rollout "
+                f"({rollout_length} steps of {num_envs} environments): raise rollout_length or "
+                "num_envs, or lower batch_size"
+            )
+        with device:
+            self.encoder = Encoder(self.codecs)
+            actor = Head(self.encoder.embedding_size, hidden_size, actions.count)
+            critic = Head(self.encoder.embedding_size, hidden_size, 1)
+        self.policy = stochastic_policy(
+            PolicyNetwork(self.codecs, self.encoder, actor), list(keys), actions
+        )
+        self._actor = stochastic_policy(actor, ["embedding"], actions)
+        self._critic = TensorDictModule(critic, ["embedding"], ["state_value"])
+        self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, device=device)
+        self.loss = ClipPPOLoss(
+            self._actor,
+            self._critic,
+            clip_epsilon=clip,
+            entropy_coeff=entropy_weight,
+            critic_coeff=value_weight,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+        )
+        self.memory = Rollout(self.codecs, device)
+        self._round: TensorDictBase = TensorDict()  # the steps that are being learnt from, [n]
+        self._batches: list[Tensor] = []  # rows of it, those to come
+        super().__init__(
+            named_weights(encoder=self.encoder) | dict(self.loss.named_parameters()),
+            learning_rate=learning_rate,
+            total_updates=total_frames // frames_per_round * self._updates_of(frames_per_round),
+            max_grad_norm=max_grad_norm,
+        )
+
+    def _updates_of(self, steps: int) -> int:
+        return self.epochs * (steps // self.batch_size)
+
+    def updates_due(self, frames: int) -> int:
+        """Returns the updates of one round where a rollout is complete, else 0."""
+        if len(self.memory) < self.rollout_length:
+            return 0
+        return self._updates_of(self.memory.steps().numel())
+
+    def sample(self) -> TensorDictBase:
+        """Returns the round's next batch; the first one begins the round and clears the memory."""
+        if not self._batches:
+            self._round = self._with_advantages(self.memory.steps()).reshape(-1)
+            self.memory.clear()
+            for _ in range(self.epochs):
+                rows = torch.randperm(len(self._round)).split(self.batch_size)
+                self._batches += [r for r in rows if len(r) == self.batch_size]
+        return self._round[self._batches.pop(0).to(self._round["action"].device)]
+
+    @torch.no_grad()
+    def _with_advantages(self, steps: TensorDictBase) -> TensorDictBase:
+        """Returns steps `[N, T]` with `advantage`, `value_target` and `action_log_prob`."""
+        judged = [self._judge(part) for part in steps.reshape(-1).split(self.batch_size)]
+        steps = steps.update(torch.cat(judged).reshape(steps.shape))
+        return self._advantage(steps)
+
+    def _judge(self, steps: TensorDictBase) -> TensorDictBase:
+        """Returns what the present weights say of steps: action's log-probability and V, V'."""
+        embedded = TensorDict(
+            {
+                "action": steps["action"],
+                "embedding": self.encoder(decode_maps(self.codecs, steps)),
+                "next": {"embedding": self.encoder(decode_maps(self.codecs, steps["next"]))},
+            },
+            steps.batch_size,
+        )
+        log_prob = self._actor.get_dist(embedded).log_prob(steps["action"])
+        value = self._critic(embedded)["state_value"]
+        next_value = self._critic(embedded["next"])["state_value"]
+        judged = steps.empty().update({"action_log_prob": log_prob, "state_value": value})
+        judged["next"] = steps["next"].empty().update({"state_value": next_value})
+        return judged
+
+    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Returns the three losses, with gradients, and what they were computed from, without."""
+        embedded = batch.select("action", "action_log_prob", "advantage", "value_target")
+        embedded["embedding"] = self.encoder(decode_maps(self.codecs, batch))
+        out = self.loss(embedded)
+        return {
+            "policy_loss": out["loss_objective"],
+            "value_loss": out["loss_critic"],
+            "entropy_loss": out["loss_entropy"],
+            "entropy": out["entropy"],
+            "kl": out["kl_approx"],
+            "clip_share": out["clip_fraction"],
+            "explained_variance": out["explained_variance"].squeeze(),
+        }

@@ -1,0 +1,139 @@
+"""What holds for every algorithm of conf/algorithm/."""
+
+import math
+
+import pytest
+import torch
+from torchrl.data import OneHot
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from flowrep.agent import DivergenceError, load_checkpoint, save_checkpoint
+
+ENVS = 5
+
+
+def learn(agent, random_steps, steps, frames=0):
+    """Takes in so many steps of five environments, with the updates that they bring."""
+    metrics = []
+    for _ in range(steps):
+        agent.remember(random_steps(ENVS))
+        frames += ENVS
+        metrics += [agent.update(agent.sample()) for _ in range(agent.updates_due(frames))]
+    return metrics
+
+
+def weights(agent):
+    return {name: w.clone() for name, w in agent.state_dict()["weights"].items()}
+
+
+def test_an_update_returns_what_it_says_it_does(make_any, random_steps):
+    agent = make_any()
+    (*_, last) = learn(agent, random_steps, 12)
+    assert tuple(sorted(last)) == tuple(sorted(agent.metric_names()))
+    assert all(value.shape == () and not value.requires_grad for value in last.values())
+    assert all(value.isfinite() for name, value in last.items() if name != "explained_variance")
+    assert agent.updates > 0
+
+
+def test_every_trained_weight_moves(make_any, random_steps):
+    agent = make_any()
+    before = weights(agent)
+    learn(agent, random_steps, 20)
+    still = [n for n, w in weights(agent).items() if torch.equal(w, before[n])]
+    assert still == []
+
+
+def test_the_learning_rate_ends_at_zero_with_the_frames(make_any, random_steps):
+    agent = make_any(total_frames=200, learning_rate=2**-10)
+    metrics = learn(agent, random_steps, 40)
+    rates = [m["learning_rate"].item() for m in metrics]
+    assert len(rates) == agent.total_updates
+    assert rates[0] == 2**-10
+    assert rates[-1] == pytest.approx(2**-10 / len(rates))
+
+
+@pytest.mark.parametrize(
+    ("name", "frames_before", "frames_after", "due"),
+    [
+        ("off-policy, in its first batch", 0, 16, 0),
+        ("one for each 10 frames after it", 0, 25, 0),
+        ("one for each 10 frames after it", 0, 26, 1),
+        ("counted beyond those taken", 40, 66, 3),
+    ],
+)
+def test_off_policy_updates_due(make_agent, name, frames_before, frames_after, due):
+    agent = make_agent(batch_size=16, frames_per_update=10)
+    agent.updates = agent.updates_due(frames_before)
+    assert agent.updates_due(frames_after) == due, name
+
+
+@pytest.mark.parametrize("steps", [5, 13])  # an on-policy rollout of 8 is cut in its middle
+def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(
+    make_any, random_steps, tmp_path, steps
+):
+    def go_on(agent):
+        torch.manual_seed(2)
+        return learn(agent, random_steps, 12, frames=steps * ENVS)
+
+    whole = make_any()
+    learn(whole, random_steps, steps)
+    saved = {"agent": whole.state_dict(), "memory": whole.memory.state_dict()}
+    save_checkpoint(tmp_path / "c", saved)
+    expected = go_on(whole)
+
+    resumed = make_any(seed=9)
+    state = load_checkpoint(tmp_path / "c")
+    resumed.load_state_dict(state["agent"])
+    resumed.memory.load_state_dict(state["memory"])
+    actual = go_on(resumed)
+    assert len(expected) == len(actual) > 0
+    for a, b in zip(expected, actual):
+        assert all(torch.equal(a[name].nan_to_num(7), b[name].nan_to_num(7)) for name in a)
+    a, b = weights(whole), weights(resumed)
+    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_loss_that_is_no_number_stops_the_weights_and_is_named(make_any, random_steps, bad):
+    agent = make_any()
+    learn(agent, random_steps, 12)
+    agent.divergence.check()
+    before, updates = weights(agent), agent.updates
+    rewards = random_steps(ENVS)
+    rewards["next", "reward"] = torch.full((ENVS, 1), bad)
+    rewards["next", "terminated"] = torch.ones(ENVS, 1, dtype=torch.bool)
+    for _ in range(16):
+        agent.remember(rewards)
+    for _ in range(3):
+        agent.update(agent.sample())
+    moved = {n for n, w in weights(agent).items() if not torch.equal(w, before[n])}
+    assert not moved & agent.trained.keys()
+    with pytest.raises(DivergenceError, match=rf"_loss became (nan|inf) in update {updates + 1} "):
+        agent.divergence.check()
+
+
+def test_acts_greedily_only_when_told_to(make_any, random_maps):
+    agent, maps = make_any(), random_maps(1).expand(300).contiguous()
+    with torch.no_grad():
+        drawn = agent.policy(maps.clone())["action"]
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            greedy = agent.policy(maps.clone())["action"]
+    assert len(drawn.unique()) == 3
+    assert len(greedy.unique()) == 1
+
+
+def test_one_hot_actions_are_learnt_from_as_well(make_any, random_steps):
+    agent = make_any(action_spec=OneHot(3))
+
+    def one_hot(size):
+        steps = random_steps(size)
+        steps["action"] = torch.nn.functional.one_hot(steps["action"], 3)
+        return steps
+
+    assert learn(agent, one_hot, 12)
+
+
+def test_a_state_of_other_maps_is_refused_by_name(make_any):
+    saved = make_any(keys=["flow"]).state_dict()
+    with pytest.raises(ValueError, match=r"does not fit this one in \d+ weights, first .* here, "):
+        make_any(keys=["flow", "seg"]).load_state_dict(saved)

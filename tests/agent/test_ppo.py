@@ -1,0 +1,122 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Categorical, Composite, Unbounded
+
+from flowrep.agent import PPO
+
+ENVS = 2
+SPEC = Composite(view=Unbounded((ENVS, 1, 36, 36)), shape=(ENVS,))
+
+
+def make_ppo(**changes):
+    settings = {
+        "total_frames": 600, "device": "cpu", "precision": "fp32", "learning_rate": 1e-3,
+        "rollout_length": 4, "epochs": 3, "batch_size": 3, "gamma": 0.5, "gae_lambda": 0.5,
+        "clip": 0.2, "value_weight": 0.5, "entropy_weight": 0.01, "max_grad_norm": 0.5,
+        "hidden_size": 16,
+    }  # fmt: skip
+    torch.manual_seed(0)
+    return PPO(SPEC, Categorical(3), ["view"], **(settings | changes))
+
+
+def step(now, later, reward, ended="--"):
+    """One step of two environments whose maps show a number; t(erminated), c(ut off) or -."""
+
+    def view(numbers):
+        return torch.tensor(numbers).view(-1, 1, 1, 1).expand(-1, 1, 36, 36).clone()
+
+    done = torch.tensor([e != "-" for e in ended]).unsqueeze(1)
+    outcome = {
+        "view": view(later),
+        "reward": torch.tensor(reward).unsqueeze(1),
+        "done": done,
+        "terminated": torch.tensor([e == "t" for e in ended]).unsqueeze(1),
+    }
+    action = torch.tensor([1, 2])
+    return TensorDict({"view": view(now), "action": action, "next": outcome}, [ENVS])
+
+
+STEPS = [
+    step([0.125, 1.0], [0.25, 1.125], [1.0, 2.0]),
+    step([0.25, 1.125], [0.375, 1.25], [3.0, 4.0], ended="t-"),
+    step([0.75, 1.25], [0.875, 1.5], [5.0, 6.0], ended="-c"),
+    step([0.875, 2.0], [4.0, 3.0], [7.0, 8.0]),
+]
+
+
+def worth(agent, number):
+    """V of a map that shows that number."""
+    codec = agent.codecs[0]
+    image = codec.decode(codec.store(torch.full((1, 1, 36, 36), number)))
+    with torch.no_grad():
+        return agent._critic(TensorDict({"embedding": agent.encoder([image])}, [1]))["state_value"]
+
+
+def test_a_round_is_due_when_the_rollout_is_complete_and_no_frame_is_learnt_from_twice():
+    agent = make_ppo()
+    for t, each in enumerate(STEPS):
+        assert agent.updates_due(ENVS * t) == 0
+        agent.remember(each)
+    # 8 frames make 2 batches of 3, in each of 3 epochs
+    assert agent.updates_due(8) == 6
+    seen = [agent.sample()["next", "reward"].flatten().tolist() for _ in range(6)]
+    for first, second in zip(seen[::2], seen[1::2]):
+        assert len({*first, *second}) == 6
+    assert len(agent.memory) == 0
+    assert agent.updates_due(8) == 0
+    assert agent.total_updates == 600 // 8 * 6
+
+
+def test_advantages_by_hand():
+    """Environment 0 terminates in its second step, environment 1 is cut off in its third."""
+    agent = make_ppo()
+    for each in STEPS:
+        agent.remember(each)
+    agent.weights["critic_network_params.module.output.weight"].data.mul_(10)
+    steps = agent._with_advantages(agent.memory.steps())
+    v = {
+        n: worth(agent, n).item()
+        for n in (0.125, 0.25, 0.75, 0.875, 4.0, 1.0, 1.125, 1.25, 1.5, 2.0, 3.0)
+    }
+    # delta = r + 0.5 V' - V; advantage = delta + 0.25 the next one's, within an episode
+    a1 = 3 - v[0.25]
+    a0 = 1 + 0.5 * v[0.25] - v[0.125] + 0.25 * a1
+    a3 = 7 + 0.5 * v[4.0] - v[0.875]
+    a2 = 5 + 0.5 * v[0.875] - v[0.75] + 0.25 * a3
+    b2 = 6 + 0.5 * v[1.5] - v[1.25]
+    b1 = 4 + 0.5 * v[1.25] - v[1.125] + 0.25 * b2
+    b0 = 2 + 0.5 * v[1.125] - v[1.0] + 0.25 * b1
+    b3 = 8 + 0.5 * v[3.0] - v[2.0]
+    expected = torch.tensor([[a0, a1, a2, a3], [b0, b1, b2, b3]])
+    advantage = steps["advantage"].squeeze(-1)
+    torch.testing.assert_close(advantage, expected)
+    target = advantage + steps["state_value"].squeeze(-1)
+    torch.testing.assert_close(steps["value_target"].squeeze(-1), target)
+
+
+def test_the_first_batch_is_judged_by_the_policy_that_acted():
+    agent = make_ppo(entropy_weight=0.5)
+    for each in STEPS:
+        agent.remember(each)
+    losses = agent.losses(agent.sample())
+    # rho = 1, so the loss is the mean of advantages that are normalised to 0
+    assert losses["policy_loss"].item() == pytest.approx(0, abs=1e-6)
+    assert losses["kl"].item() == pytest.approx(0, abs=1e-6)
+    assert losses["clip_share"] == 0
+    assert losses["entropy_loss"].item() == pytest.approx(-0.5 * losses["entropy"].item())
+
+
+def test_gradients_are_scaled_down_to_the_largest_norm():
+    agent = make_ppo(max_grad_norm=1e-3)
+    for each in STEPS:
+        agent.remember(each)
+    norm = agent.update(agent.sample())["grad_norm"]
+    gradients = torch.cat([w.grad.flatten() for w in agent.trained.values()])
+    assert norm > 0.01
+    assert gradients.norm().item() == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_a_batch_that_no_rollout_fills_is_refused():
+    with pytest.raises(ValueError, match=r"batch_size=9 is more than the 8 frames of a rollout"):
+        make_ppo(batch_size=9)
