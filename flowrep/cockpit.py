@@ -110,6 +110,8 @@ def drive_by_hand(cockpit: Cockpit, show: Callable[[], None] | None = None) -> N
 
 def run_window(figure: Any, cockpit: Cockpit) -> Any:
     """Connects a matplotlib figure to a cockpit; returns the timer that drives."""
+    import matplotlib.pyplot as plt
+
     axes = figure.add_axes((0, 0, 1, 0.92))
     axes.set_axis_off()
     image = axes.imshow(cockpit.picture(), interpolation="nearest")
@@ -117,13 +119,15 @@ def run_window(figure: Any, cockpit: Cockpit) -> Any:
     timer = figure.canvas.new_timer(interval=round(1000 / cockpit.env.frame_rate_hz))
 
     def tick() -> None:
+        if cockpit.is_over:
+            timer.stop()
+            # Not the manager's own destroy: pyplot would wait on for a window that is gone.
+            plt.close(figure)
+            return
         cockpit.step()
         image.set_data(cockpit.picture())
         title.set_text(cockpit.title)
         figure.canvas.draw_idle()
-        if cockpit.is_over:
-            timer.stop()
-            figure.canvas.manager.destroy()
 
     figure.canvas.mpl_connect("key_press_event", lambda event: cockpit.press(event.key))
     figure.canvas.mpl_connect("key_release_event", lambda event: cockpit.release(event.key))

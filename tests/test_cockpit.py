@@ -1,6 +1,7 @@
 """Driving by hand: keys to actions, and a window that is driven without a screen."""
 
 import matplotlib
+import matplotlib.pyplot as plt
 import pytest
 from matplotlib.backend_bases import KeyEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -76,3 +77,17 @@ def test_the_window_hears_the_keys_and_drives_at_each_tick(cockpit):
     assert (figure.axes[0].images[0].get_array() != before).any()
     canvas.callbacks.process("key_release_event", KeyEvent("key_release_event", canvas, "right"))
     assert cockpit.action == NO_OP
+
+
+def test_q_closes_the_window_and_leaves_pyplot_nothing_to_wait_for(cockpit):
+    with matplotlib.rc_context({"backend": "agg", "keymap.quit": []}):
+        figure = plt.figure()
+        timer = run_window(figure, cockpit)
+        ((tick, *_),) = timer.callbacks
+        tick()
+        event = KeyEvent("key_press_event", figure.canvas, "q")
+        figure.canvas.callbacks.process("key_press_event", event)
+        assert plt.fignum_exists(figure.number)
+        tick()
+        assert not plt.fignum_exists(figure.number)
+    assert cockpit.env.episode.steps == 1  # none after Q

@@ -14,11 +14,10 @@ from torchrl.data import Composite
 from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
 from flowrep.envs.loading import load_scene
-from flowrep.envs.outcome import Outcome
+from flowrep.envs.outcome import NOTHING_HIT, Outcome, hit_code
 from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
-from flowrep.palette import CATEGORY_ID
 from flowrep.transforms import representation_stack
 
 _OUTCOME_CODE = {outcome.label: outcome.value for outcome in Outcome}
@@ -31,7 +30,7 @@ class SensorObservation(gym.Wrapper):
     | --- | --- | --- | --- |
     | `sensor` | | | the wrapped environment's observation |
     | `outcome` | [1] | uint8 | code of `flowrep.envs.Outcome`; 0 while the episode runs |
-    | `hit` | [1] | uint8 | class id of what was hit; 0, the sky's, for nothing |
+    | `hit` | [1] | uint8 | class id of what was hit; 255 for nothing |
     | `episode_seed` | [1] | int64 | names the episode, see `StreetEnv.reset` |
     """
 
@@ -40,7 +39,7 @@ class SensorObservation(gym.Wrapper):
         super().__init__(env)
         beside: dict[str, spaces.Space] = {
             "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
-            "hit": spaces.Box(0, len(CATEGORY_ID) - 1, (1,), np.uint8),
+            "hit": spaces.Box(0, NOTHING_HIT, (1,), np.uint8),
             "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
         }
         sensor = env.observation_space
@@ -64,7 +63,7 @@ class SensorObservation(gym.Wrapper):
         """Returns the observation as this wrapper gives it."""
         return dict.fromkeys(self._names, observation) | {
             "outcome": np.array([_OUTCOME_CODE[info["outcome"]]], dtype=np.uint8),
-            "hit": np.array([CATEGORY_ID[info["hit"] or "sky"]], dtype=np.uint8),
+            "hit": np.array([hit_code(info["hit"])], dtype=np.uint8),
             "episode_seed": np.array([info["episode_seed"]], dtype=np.int64),
         }
 

@@ -1,6 +1,8 @@
-"""How an episode stands, and what a step is worth."""
+"""How an episode stands, what was hit, and what a step is worth."""
 
 from enum import IntEnum
+
+from flowrep.palette import CATEGORY_ID
 
 
 class Outcome(IntEnum):
@@ -17,6 +19,11 @@ class Outcome(IntEnum):
         """The name in `info`, tables and files."""
         return self.name.lower()
 
+
+NOTHING_HIT = 255
+"""The code of `hit` where nothing was hit: no class has this id."""
+
+_CATEGORIES = tuple(CATEGORY_ID)
 
 STEP_REWARD = 0.01
 END_REWARD = {
@@ -35,3 +42,21 @@ def reward(outcome: Outcome) -> float:
     (5.01, 0.01)
     """
     return STEP_REWARD + END_REWARD[outcome]
+
+
+def hit_code(category: str) -> int:
+    """Returns what the TensorDict carries for what was hit: its class id, `NOTHING_HIT` for "".
+
+    >>> hit_code("pedestrian"), hit_code("")
+    (4, 255)
+    """
+    return CATEGORY_ID[category] if category else NOTHING_HIT
+
+
+def hit_name(code: int) -> str:
+    """Returns the category that `hit_code` gave this code, "" for nothing.
+
+    >>> hit_name(4), hit_name(255)
+    ('pedestrian', '')
+    """
+    return "" if code == NOTHING_HIT else _CATEGORIES[code]

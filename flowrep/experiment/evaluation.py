@@ -11,15 +11,12 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.envs import Outcome
-from flowrep.palette import CATEGORY_ID
+from flowrep.envs.outcome import hit_name
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 OUTCOMES = tuple(outcome.label for outcome in Outcome)
 """Names of the env's `outcome` codes; each one but the first ends an episode."""
-
-
-_CATEGORIES = tuple(CATEGORY_ID)
 
 
 @dataclass(frozen=True)
@@ -31,15 +28,6 @@ class Episode:
     hit: str
     total_reward: float
     length: int
-
-
-def hit_name(code: int) -> str:
-    """Returns the category of an env's `hit`, "" for nothing.
-
-    >>> hit_name(4), hit_name(0)
-    ('pedestrian', '')
-    """
-    return _CATEGORIES[code] if code else ""
 
 
 def quotas(episodes: int, num_envs: int) -> list[int]:

@@ -11,8 +11,11 @@ from rich.table import Table
 
 from flowrep.experiment.run_folder import append_rows
 
-CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
-_GROUP = ("scene", "representations", "flow", "policy", "speed", "fps")
+UNRECORDED = "collision: unrecorded"
+"""A collision in a table of before it was recorded what was hit."""
+
+CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", UNRECORDED, "timeout")
+_GROUP = ("scene", "representations", "flow", "frames", "policy", "speed", "fps")
 
 
 def cause_of(outcome: str, hit: str) -> str | None:
@@ -24,6 +27,8 @@ def cause_of(outcome: str, hit: str) -> str | None:
     if outcome == "success":
         return None
     if outcome == "collision":
+        if not hit:
+            return UNRECORDED
         return "collision: pedestrian" if hit == "pedestrian" else "collision: other"
     return outcome.replace("_", " ")
 
@@ -32,6 +37,7 @@ def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Returns for each scene, policy and speed how many episodes failed, and of what in %.
 
     Shares are of the failures, as in the paper's Table III, and empty where nothing failed.
+    Evaluations after different numbers of training frames are kept apart.
 
     Args:
         rows: of evaluation.csv.
@@ -57,10 +63,12 @@ def print_failures(rows: Sequence[Mapping[str, Any]], console: Console | None = 
     table = Table(title="Causes of failure in % of the failures", box=box.SIMPLE, pad_edge=False)
     for heading in ("speed", "fps", "policy", "failures"):
         table.add_column(heading, no_wrap=True)
-    for cause in CAUSES:
+    lines = failure_causes(rows)
+    causes = [c for c in CAUSES if c != UNRECORDED or any(line[c] for line in lines)]
+    for cause in causes:
         table.add_column(cause, justify="right", no_wrap=True)
-    for line in failure_causes(rows):
-        shares = ["" if line[cause] == "" else f"{line[cause]:.0f}" for cause in CAUSES]
+    for line in lines:
+        shares = ["" if line[cause] == "" else f"{line[cause]:.0f}" for cause in causes]
         failed = f"{line['failures']} of {line['episodes']}"
         rate = f"{float(line['fps']):g}"
         table.add_row(line["speed"], rate, line["policy"], failed, *shares)

@@ -153,4 +153,4 @@ def test_what_was_hit_stands_beside_the_outcome(make):
     assert collided.any()
     # Straight on, only people are in the way.
     assert set(hit[collided].tolist()) == {CATEGORY_ID["pedestrian"]}
-    assert (hit[~collided] == 0).all()
+    assert (hit[~collided] == 255).all()

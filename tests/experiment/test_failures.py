@@ -43,8 +43,21 @@ def test_policies_are_told_apart_and_no_failure_has_no_shares():
     assert (planner["failures"], planner["timeout"]) == (0, "")
 
 
-def test_a_collision_of_which_an_older_table_says_no_more_is_no_pedestrian():
-    assert cause_of("collision", "") == "collision: other"
+def test_a_collision_of_which_an_older_table_says_no_more_is_unrecorded():
+    assert cause_of("collision", "") == "collision: unrecorded"
+    (line,) = failure_causes(rows(ends=[("collision", ""), ("collision", "car")]))
+    assert (line["collision: unrecorded"], line["collision: other"]) == (50.0, 50.0)
+    console = Console(record=True, width=140)
+    print_failures(rows(ends=[("collision", "")]), console)
+    assert "unrecorded" in console.export_text()
+
+
+def test_an_agent_is_not_mixed_with_what_it_was_earlier_in_training():
+    early = [row | {"frames": 1000} for row in rows(ends=[("out_of_bounds", "")] * 4)]
+    late = [row | {"frames": 9000} for row in rows(ends=[("collision", "pedestrian")] * 2)]
+    first, last = failure_causes(early + late)
+    assert (first["frames"], first["failures"], first["out of bounds"]) == ("1000", 4, 100.0)
+    assert (last["frames"], last["failures"], last["out of bounds"]) == ("9000", 2, 0.0)
 
 
 def test_the_table_is_printed_and_replaced(tmp_path):
@@ -53,6 +66,7 @@ def test_the_table_is_printed_and_replaced(tmp_path):
     text = console.export_text()
     assert "8 of 10" in text
     assert "collision: pedestrian" in text
+    assert "unrecorded" not in text
     path = tmp_path / "failures.csv"
     write_failures(path, rows() + rows("random"))
     write_failures(path, rows())
