@@ -66,9 +66,16 @@ def check(config: DictConfig) -> None:
         if config[key] not in known:
             there = ", ".join(str(name) for name in known if name is not None)
             raise UsageError(f"unknown {key} '{config[key]}'; there are: {there}")
-    for key in ("episodes", "sheet_rows"):
-        if not isinstance(config[key], int) or config[key] < 1:
-            raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
+    for key, least in (("episodes", 1), ("sheet_rows", 1), ("seed", 0)):
+        value = config[key]
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise UsageError(f"{key} should be a whole number from {least}, not {value!r}")
+    for key in ("video", "interactive"):
+        if not isinstance(config[key], bool):
+            raise UsageError(f"{key} should be true or false, not {config[key]!r}")
+    rate = config.frame_rate_hz
+    if rate is not None and (not isinstance(rate, int | float) or not rate > 0):
+        raise UsageError(f"frame_rate_hz should be a positive number or null, not {rate!r}")
 
 
 def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
@@ -85,7 +92,10 @@ def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
         written.insert(1, "episode.mp4")
     layout = Layout(StreetEnv(**street, sensors=()).scene)
     tracks = [Track(episode.points_m, episode.outcome) for episode in episodes]
-    draw_plan(layout, tracks, path=config.path).savefig(folder / "plan.png", dpi=110)
+    paths = {episode.path for episode in episodes}
+    # The exits closed on the one path that was driven; of several, none is everybody's.
+    path = paths.pop() if len(paths) == 1 else None
+    draw_plan(layout, tracks, path=path).savefig(folder / "plan.png", dpi=110)
     for name, rows in (
         ("episodes.csv", [episode.row() for episode in episodes]),
         ("categories.csv", counts.rows()),

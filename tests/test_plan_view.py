@@ -6,6 +6,8 @@ from matplotlib.colors import to_hex
 
 pytest.importorskip("shapely", reason="plans are drawn of scenes")
 
+from shapely.geometry import Point
+
 from flowrep.envs import Outcome, load_scene
 from flowrep.envs.layout import Layout
 from flowrep.plan_view import OUTCOME_COLOURS, Track, draw_plan
@@ -47,11 +49,39 @@ def test_a_track_is_drawn_in_its_outcomes_colour_where_it_was_driven(layout):
 
 def test_the_legend_names_what_the_scene_has(layout):
     names = labels(draw_plan(layout))
-    for name in ("road", "crosswalk", "terrain", "tree", "fence", "car", "traffic_light"):
+    for name in ("road", "crosswalk", "terrain", "tree", "fence", "car", "traffic light"):
         assert name in names
     straight = labels(draw_plan(Layout(load_scene("straight_road"))))
     assert "tree" not in straight
-    assert "closed exit" not in straight
+    assert "pedestrians who stand" not in straight  # everyone there walks
+    assert not any("exit" in name for name in straight)
+
+
+def test_nothing_that_stands_is_cut_off(layout):
+    (axes,) = draw_plan(layout).axes
+    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    for box in (*layout.buildings, *layout.obstacles):
+        left, lower, right, upper = box.footprint.bounds
+        assert x0 < left < right < x1
+        assert y0 < lower < upper < y1
+
+
+def test_every_zone_of_a_path_is_named_where_it_is(layout):
+    (axes,) = draw_plan(layout).axes
+    named = {text.get_text(): text.xy for text in axes.texts if text.get_text()}
+    assert set(named) == {"south", "west", "east"}
+    # The start lies about the first road's 7th metre, which runs along x from the origin.
+    assert named["south"] == pytest.approx((7.0, 0.0))
+    for name, place in named.items():
+        assert layout.zones[name].contains(Point(place))
+
+
+def test_where_a_place_is_start_and_end_both_names_can_be_read():
+    (axes,) = draw_plan(Layout(load_scene("s_turn"))).axes
+    offsets = {t.get_text(): t.xyann for t in axes.texts if t.get_text()}
+    # The western stretch runs along x: its start is named above it, its end below.
+    assert offsets["west"] == pytest.approx((0, 30), abs=1e-6)
+    assert offsets["west end"] == pytest.approx((0, -30), abs=1e-6)
 
 
 def test_a_path_shows_its_own_closures_alone(layout):
@@ -65,5 +95,7 @@ def test_a_path_shows_its_own_closures_alone(layout):
         ]
 
     assert len(closed(None)) == 2
+    assert "exit, closed on some paths" in labels(draw_plan(layout))
+    assert "closed exit" in labels(draw_plan(layout, path="left"))
     (only,) = closed("left")  # drives to the left, +y, with the right arm closed
     assert only[1] < 0

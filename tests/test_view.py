@@ -6,8 +6,14 @@ import sys
 
 import imageio.v3 as imageio
 import pytest
+import torch
+from hydra import compose, initialize_config_dir
 
 pytest.importorskip("pybullet", reason="the command needs the simulator")
+
+from flowrep.command_line import UsageError, check_overrides
+from flowrep.config_tree import CONF_DIR
+from flowrep.view import check, moments, moving_pixels
 
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
 
@@ -41,16 +47,52 @@ def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
-        ("scene=s_turm", "unknown scene 's_turm' (did you mean 's_turn'?)"),
         ("driver=pilot", "unknown driver 'pilot'; there are: planner, never_turn, random"),
         ("path=up", "unknown path 'up'; there are: main"),
-        ("episodes=0", "episodes should be a positive whole number, not 0"),
-        ("interactive=true", "interactive=true needs a screen"),
+        ("speed=fast", "unknown speed 'fast'; there are: low, normal, high"),
+        ("episodes=0", "episodes should be a whole number from 1, not 0"),
+        ("sheet_rows=true", "sheet_rows should be a whole number from 1, not True"),
+        ("seed=-1", "seed should be a whole number from 0, not -1"),
+        ("frame_rate_hz=0", "frame_rate_hz should be a positive number or null, not 0"),
+        ("frame_rate_hz=slow", "frame_rate_hz should be a positive number or null, not 'slow'"),
+        ("interactive=maybe", "interactive should be true or false, not 'maybe'"),
     ],
 )
-def test_a_mistake_ends_in_one_line(override, expected, tmp_path, monkeypatch):
+def test_what_cannot_be_is_named(override, expected):
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        config = compose("view", [override])
+    with pytest.raises(UsageError) as caught:
+        check(config)
+    assert str(caught.value) == expected
+
+
+def test_an_unknown_scene_is_named():
+    with pytest.raises(UsageError, match=r"unknown scene 's_turm' \(did you mean 's_turn'\?\)"):
+        check_overrides("view", ["scene=s_turm"])
+
+
+def test_without_a_screen_the_command_ends_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
-    done = view(override, f"hydra.run.dir={tmp_path}")
+    done = view("interactive=true", f"hydra.run.dir={tmp_path}")
     assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {expected}")
+    assert done.stderr.startswith("error: interactive=true needs a screen")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("motion", "rows", "expected"),
+    [
+        ([0, 0, 3, 1, 0, 0, 0, 2], 2, [2, 7]),
+        ([5, 1, 1], 1, [0]),
+        ([1, 2], 6, [0, 1]),  # an episode of fewer frames than rows: each of them once
+    ],
+)
+def test_a_sheet_shows_the_liveliest_moment_of_each_stretch(motion, rows, expected):
+    assert moments(motion, rows) == expected
+
+
+def test_what_is_right_before_the_lens_does_not_make_a_moment_lively():
+    obj = torch.zeros(2, 1, 4)
+    obj[1, 0, 1:] = 0.5  # v alone
+    depth = torch.tensor([[[9.0, 3.0, 9.0, torch.inf]]])
+    assert moving_pixels({"obj": obj, "depth": depth}) == 2
