@@ -98,7 +98,7 @@ class Episode:
         turned = turn(self.now.vehicle, YAW_SIGN[action], rules.dt_s, rules.layout.scene.vehicle)
         track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in rules.tick_times_s]
         ticks = self.now.ticks + rules.tick_numbers
-        poses = self.crowd.poses(ticks[:, None] * rules.tick_s)  # [T, P, 3]
+        poses = self.crowd.poses(ticks[:, None] * rules.tick_s)  # [T, P, 4]
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
             if is_near[i] or not rules.is_calm(vehicle.x_m, vehicle.y_m):

@@ -31,7 +31,7 @@ from flowrep.envs.scene import (
 from flowrep.envs.vehicle import VehicleState
 
 Array = NDArray[np.float64]
-_ARC_STEP_DEG = 3.0
+_ARC_STEP_DEG = 5.0
 _TOUCH_M = 0.05  # houses of a row stand wall to wall
 _PLOT_STEP_M = 0.5
 
@@ -120,13 +120,15 @@ class Layout:
         self.scene = scene
         self.lines = centrelines(scene)
         self._roads = {road.name: road for road in scene.roads}
-        ribbons = [ribbon(self.lines[road.name], road.width_m / 2) for road in scene.roads]
+        self.ribbons = {
+            road.name: ribbon(self.lines[road.name], road.width_m / 2) for road in scene.roads
+        }
         wide = [
             ribbon(self.lines[road.name], road.width_m / 2 + road.sidewalk_m)
             for road in scene.roads
         ]
         radius = scene.corner_radius_m
-        self.drivable = _with_round_corners(shapely.union_all(ribbons), radius)
+        self.drivable = _with_round_corners(shapely.union_all([*self.ribbons.values()]), radius)
         paved = shapely.union_all([*wide, _with_round_corners(shapely.union_all(wide), radius)])
         self._paved = shapely.union(paved, self.drivable)
         self.sidewalks = self._paved.difference(self.drivable)
@@ -156,6 +158,10 @@ class Layout:
             point.y + offset_m * math.cos(heading),
             heading,
         )
+
+    def width_m(self, road: str) -> float:
+        """Returns how wide a road is, without its sidewalks."""
+        return self._roads[road].width_m
 
     def start_state(self, zone_name: str) -> VehicleState:
         """Returns the vehicle at rest in its yaw, in the middle of a start zone."""
@@ -252,12 +258,15 @@ class Layout:
                 at += _PLOT_STEP_M
 
     def _obstacle_row(self, row: ObstacleRow) -> Iterator[Box]:
-        own = ribbon(self.lines[row.road], self._roads[row.road].width_m / 2)
         taken = shapely.union_all(
-            [self.drivable.difference(own), *(box.footprint for box in self.buildings)]
+            [
+                self.drivable.difference(self.ribbons[row.road]),
+                *(box.footprint for box in self.buildings),
+            ]
         )
+        facing = math.pi if row.offset_m > 0 else 0.0
         for i, at in enumerate(np.arange(row.from_m, row.to_m, row.every_m).tolist()):
             x, y, heading = self.pose_at(row.road, at, row.offset_m)
-            box = Box(row.kind, x, y, heading, row.size_m, i)
+            box = Box(row.kind, x, y, heading + facing, row.size_m, i)
             if not box.footprint.intersects(taken):
                 yield box

@@ -10,6 +10,7 @@ from shapely.geometry import LineString, Point, Polygon
 
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs.layout import Layout, centrelines
+from flowrep.envs.people import PARTS
 from flowrep.envs.scene import CATEGORY_OF_KIND, Piece, Scene
 from flowrep.envs.scene import Path as ScenePath
 from flowrep.envs.schema import SceneError, build
@@ -99,9 +100,11 @@ def _check_values(scene: Scene, source: str) -> None:
     for key in ("terrain_m", "corner_radius_m"):
         if getattr(scene, key) < 0:
             raise SceneError(source, key, f"is {getattr(scene, key)}", "give 0 or more")
-    if scene.num_pedestrians > 255:
-        problem = f"{scene.num_pedestrians} people, but instance ids are 8 bits"
-        raise SceneError(source, "pedestrian_groups", problem, "keep to 255")
+    if len(PARTS) * scene.num_pedestrians > 255:
+        problem = (
+            f"{scene.num_pedestrians} people, but their {len(PARTS)} parts each have 8-bit ids"
+        )
+        raise SceneError(source, "pedestrian_groups", problem, f"keep to {255 // len(PARTS)}")
     ranges: dict[str, Any] = {
         f"pedestrian_speed_mps.{k}": v for k, v in scene.pedestrian_speed_mps.items()
     } | {f"pedestrian_groups.{g.name}.speed_mps": g.speed_mps for g in scene.pedestrian_groups}

@@ -1,4 +1,4 @@
-"""Low-polygon shapes as flat-shaded triangles with a colour each, and the scene's own shapes."""
+"""Low-polygon shapes as flat-shaded triangles with a colour each, and what is on the ground."""
 
 import math
 from collections.abc import Sequence
@@ -6,18 +6,17 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry import LineString
+from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from flowrep.envs.layout import Box
-from flowrep.envs.paint import SHIRTS, Patch, front, swatch, wall
+from flowrep.envs.paint import Patch, swatch
 
 Array = NDArray[np.float64]
 Point3 = tuple[float, float, float]
-PEDESTRIAN_RADIUS_M = 0.3
-PEDESTRIAN_HEIGHT_M = 1.75
 _CELL_M = 15.0  # ground is cut into cells: the renderer interpolates short triangles better
-_DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M, _DASH_RISE_M = 2.0, 6.0, 0.15, 0.004
+_DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M = 2.0, 6.0, 0.15
+_STRIPE_M = 0.5
+_RISE_M = 0.004  # of what is painted on the ground
 
 
 class Mesh:
@@ -64,6 +63,34 @@ class Mesh:
                 corners = [(ax, ay, z0), (bx, by, z0), (bx, by, z1), (ax, ay, z1)]
                 self.quad(np.array(corners), patch)
 
+    def frustum(
+        self,
+        bottom: Array,
+        bottom_m: float,
+        top: Array,
+        top_m: float,
+        side: Patch,
+        lid: Patch,
+        *,
+        floor: Patch | None = None,
+    ) -> None:
+        """Adds a body between two level rings [M, 2], counter-clockwise from above, and its lid."""
+        low = np.column_stack([bottom, np.full(len(bottom), bottom_m)])
+        high = np.column_stack([top, np.full(len(top), top_m)])
+        for i in range(len(low)):
+            j = (i + 1) % len(low)
+            self.quad(np.array([low[i], low[j], high[j], high[i]]), side)
+        self.polygon(high, [list(lid[:2])] * len(high))
+        if floor is not None:
+            self.polygon(low[::-1], [list(floor[:2])] * len(low))
+
+    def disc(self, centre: Point3, normal: Point3, radius_m: float, patch: Patch) -> None:
+        """Adds an upright disc of eight sides that is seen from where its normal points."""
+        across = np.array([-normal[1], normal[0], 0.0])
+        angles = np.arange(8) * (math.pi / 4)
+        rim = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * np.array([0.0, 0.0, 1.0])
+        self.polygon(np.array(centre) + radius_m * rim, [list(patch[:2])] * len(rim))
+
     def ground(self, area: BaseGeometry, height_m: float, paint: str) -> None:
         """Adds an area of the plan, level, cut into cells."""
         if area.is_empty:
@@ -96,59 +123,33 @@ class Mesh:
         self.indices += [base + i for i in other.indices]
 
 
-def pedestrian_mesh(variant: int) -> Mesh:
-    """Returns a person in mid-stride along x; `variant` chooses the shirt.
+def lane_marks(line: LineString, clear_of: BaseGeometry) -> Mesh:
+    """Returns dashes along the middle of a road, a hair above it.
 
-    Seen from the side, as the vehicle sees who crosses, stride and swinging arms are what there is
-    to see: a person is some 0.6 m wide from there.
+    Args:
+        line: the road's centreline.
+        clear_of: ground without dashes: crosswalks, and where other roads meet this one.
     """
-    mesh = Mesh()
-    shirt = swatch(SHIRTS[variant % len(SHIRTS)])
-    for side, step in ((-1, 1), (1, -1)):
-        leg, arm = 0.15 * step, -0.19 * step
-        y = 0.1 * side
-        low, high = (leg - 0.13, y - 0.08, 0.0), (leg + 0.13, y + 0.08, 0.82)
-        mesh.box(low, high, swatch("trousers"), lid=False)
-        y = 0.26 * side
-        mesh.box((arm - 0.11, y - 0.05, 0.85), (arm + 0.11, y + 0.05, 1.35), shirt)
-    mesh.box((-0.16, -0.21, 0.8), (0.16, 0.21, 1.47), shirt)
-    mesh.box((-0.11, -0.1, 1.47), (0.12, 0.1, 1.75), swatch("skin"))
-    return mesh
-
-
-def house_mesh(box: Box, *, both_sides: bool = False) -> Mesh:
-    """Returns what a street shows of a house: a front of windows to its right, its side walls.
-
-    With `both_sides` there is a front to its left too. No one looks at its roof.
-    """
-    length, width, height = box.size_m
-    windows, plain = front(box.variant), wall(box.variant)
-    sides = (windows, plain, windows if both_sides else None, plain)
-    mesh = Mesh()
-    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
-    return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
-
-
-def obstacle_mesh(box: Box) -> Mesh:
-    """Returns a plain box painted as its category is."""
-    paints = {
-        "house": "roof",
-        "tree": "leaf",
-        "fence": "wood",
-        "car": "car_body",
-        "traffic_light": "metal",
-    }
-    length, width, height = box.size_m
-    mesh = Mesh()
-    low, high = (-length / 2, -width / 2, 0.0), (length / 2, width / 2, height)
-    mesh.box(low, high, swatch(paints.get(box.kind, "metal")))
-    return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
-
-
-def lane_marks(line: LineString) -> Mesh:
-    """Returns dashes along the middle of a road, a hair above it."""
     mesh = Mesh()
     for at in np.arange(0.0, line.length - _DASH_M, _DASH_PERIOD_M):
         dash = shapely.ops.substring(line, at, at + _DASH_M)
-        mesh.ground(dash.buffer(_DASH_WIDTH_M / 2, cap_style="flat"), _DASH_RISE_M, "lane_mark")
+        if not dash.intersects(clear_of):
+            area = dash.buffer(_DASH_WIDTH_M / 2, cap_style="flat")
+            mesh.ground(area, _RISE_M, "lane_mark")
+    return mesh
+
+
+def crosswalk(area: Polygon, heading_rad: float) -> Mesh:
+    """Returns a crosswalk: asphalt with stripes along the heading of the road that it crosses."""
+    mesh = Mesh()
+    mesh.ground(area, 0.0, "asphalt")
+    along = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    left = np.array([-along[1], along[0]])
+    corners = np.array(area.exterior.coords) - area.centroid.coords[0]
+    reach, depth = np.abs(corners @ left).max(), np.abs(corners @ along).max()
+    for at in np.arange(-reach + _STRIPE_M / 2, reach - _STRIPE_M / 2, 2 * _STRIPE_M):
+        middle = area.centroid.coords[0] + (at + _STRIPE_M / 2) * left
+        ends = [middle - depth * along, middle + depth * along]
+        stripe = LineString(ends).buffer(_STRIPE_M / 2, cap_style="flat").intersection(area)
+        mesh.ground(stripe, _RISE_M, "lane_mark")
     return mesh

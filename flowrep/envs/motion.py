@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def planar(x_m: float, y_m: float, yaw_rad: float) -> Array:
@@ -25,21 +24,14 @@ def planar(x_m: float, y_m: float, yaw_rad: float) -> Array:
     )
 
 
-def planar_change(prev_poses: Array, poses: Array) -> Array:
-    """Returns prev_from_curr in world axes [P, 4, 4] of bodies at planar poses [P, 3].
-
-    It takes a point that rides on a body from where it is now to where it was.
-    """
-    change = np.zeros((4, len(poses), 4)).transpose(1, 0, 2)  # rows of all bodies side by side
-    turn = prev_poses[:, 2] - poses[:, 2]
-    sine, cosine = np.sin(turn), np.cos(turn)
-    change[:, 0, 0] = change[:, 1, 1] = cosine
-    change[:, 1, 0] = sine
-    change[:, 0, 1] = -sine
-    change[:, 0, 3] = prev_poses[:, 0] - (cosine * poses[:, 0] - sine * poses[:, 1])
-    change[:, 1, 3] = prev_poses[:, 1] - (sine * poses[:, 0] + cosine * poses[:, 1])
-    change[:, 2, 2] = change[:, 3, 3] = 1.0
-    return change
+def rigid_inverse(transforms: Array) -> Array:
+    """Returns the inverses of rigid transforms [..., 4, 4]: of (R, t) it is (Rᵀ, -Rᵀt)."""
+    inverse = np.zeros_like(transforms)
+    rotation = transforms[..., :3, :3].swapaxes(-1, -2)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3:] = -(rotation @ transforms[..., :3, 3:])
+    inverse[..., 3, 3] = 1.0
+    return inverse
 
 
 class CameraPose:
@@ -49,11 +41,7 @@ class CameraPose:
         """Puts the mount, vehicle_from_cam [4, 4], on a vehicle at a planar pose."""
         self.planar = (x_m, y_m, yaw_rad)
         self.world_from_cam = planar(x_m, y_m, yaw_rad) @ mount
-        # The inverse of a rigid transform (R, t) is (Rᵀ, -Rᵀt).
-        inverse = self.world_from_cam.T.copy()
-        inverse[:3, 3] = -(inverse[:3, :3] @ self.world_from_cam[:3, 3])
-        inverse[3] = _LAST_ROW
-        self.cam_from_world = inverse
+        self.cam_from_world = rigid_inverse(self.world_from_cam)
 
 
 def relative_camera(before: CameraPose, now: CameraPose) -> Array:
@@ -63,22 +51,19 @@ def relative_camera(before: CameraPose, now: CameraPose) -> Array:
     return before.cam_from_world @ now.world_from_cam
 
 
-def instance_motion(before: CameraPose, now: CameraPose, prev_poses: Array, poses: Array) -> Array:
-    """Returns prev_from_curr by instance [1 + P, 4, 4] for bodies at planar poses [P, 3].
+def instance_motion(
+    before: CameraPose, now: CameraPose, prev_world_from_body: Array, world_from_body: Array
+) -> Array:
+    """Returns prev_from_curr by instance [1 + N, 4, 4] for bodies [N, 4, 4].
 
     Row 0 is the static world's. Row i takes a point that rides on body i, seen now in the current
     camera's frame, to where the previous camera saw it. A body that kept its pose has row 0's very
     numbers, so that its object flow is exactly zero.
     """
-    rows = np.empty((1 + len(poses), 4, 4))
+    rows = np.empty((1 + len(world_from_body), 4, 4))
     rows[:] = relative_camera(before, now)
-    moved = (poses != prev_poses).any(axis=-1)
-    if moved.any():
-        change = planar_change(prev_poses, poses)
-        # Two products of long matrices instead of many of 4 × 4.
-        side_by_side = change.transpose(1, 0, 2).reshape(4, -1)
-        product = (before.cam_from_world @ side_by_side).reshape(-1, 4) @ now.world_from_cam
-        np.copyto(
-            rows[1:], product.reshape(4, -1, 4).transpose(1, 0, 2), where=moved[:, None, None]
-        )
+    moved = np.flatnonzero((world_from_body != prev_world_from_body).any(axis=(-2, -1)))
+    if moved.size:
+        body_from_cam = rigid_inverse(world_from_body[moved]) @ now.world_from_cam
+        rows[1 + moved] = before.cam_from_world @ prev_world_from_body[moved] @ body_from_cam
     return rows

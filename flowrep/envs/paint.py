@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIZE_PX = 256
-_SWATCH_PX = 16
+_SWATCH_PX = 8
 _FRONT_PX = (60, 64)  # height, width of one house front in the picture
 _FLOORS = (2, 3, 4, 5)
 
@@ -25,6 +25,17 @@ PAINTS: dict[str, tuple[int, int, int]] = {
     "metal": (90, 94, 100),
     "car_body": (52, 84, 168),
     "glass": (60, 76, 92),
+    "hair": (66, 48, 36),
+    "shoe": (34, 30, 30),
+    "tyre": (30, 30, 34),
+    "car_red": (170, 44, 44),
+    "car_white": (222, 222, 218),
+    "car_grey": (120, 124, 130),
+    "leaf_light": (92, 146, 62),
+    "lamp_white": (250, 244, 214),
+    "lamp_red": (230, 48, 40),
+    "lamp_amber": (244, 176, 40),
+    "lamp_green": (60, 200, 96),
 }
 SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
 _WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))

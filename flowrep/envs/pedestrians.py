@@ -11,6 +11,9 @@ from flowrep.envs.scene import PedestrianGroup, Range
 
 Array = NDArray[Any]
 _TURN_S = 0.6  # about-turn at either end of a walk
+_STRIDE_M = 1.4  # a step with either leg
+_SWING_RAD = 0.38  # of a leg, either way: feet 0.6 m apart
+_OUT_OF_STEP_RAD = 2.4  # from person to person, so that a group does not march
 
 
 class Crowd:
@@ -40,6 +43,7 @@ class Crowd:
         self._turn_per_m = 1.0 / np.maximum(_TURN_S * self._speeds, 1e-9)
         self._start = np.asarray(phases, dtype=np.float64) * self._there_and_back
         self._people = np.arange(len(lines))
+        self._out_of_step = _OUT_OF_STEP_RAD * self._people
 
     def __len__(self) -> int:
         """How many people there are."""
@@ -53,12 +57,19 @@ class Crowd:
         return self._places(self._along(time_s))[0]
 
     def poses(self, time_s: float | Array) -> Array:
-        """Returns where everyone is and looks, planar poses [P, 3], or [T, P, 3] for [T, 1]."""
+        """Returns where everyone is, looks and steps: poses [P, 4] of `flowrep.envs.people`.
+
+        Times [T, 1] give poses [T, P, 4]. Legs swing with the distance walked; who stands has one
+        foot before the other.
+        """
         along = self._along(time_s)
         positions, headings = self._places(along)
-        poses = np.empty((*along.shape, 3))
+        poses = np.empty((*along.shape, 4))
         poses[..., :2] = positions
         poses[..., 2] = headings + self._facing(along)
+        walked = self._start + self._speeds * time_s
+        step = walked * (2 * math.pi / _STRIDE_M) + self._out_of_step
+        poses[..., 3] = _SWING_RAD * np.where(self._speeds > 0, np.sin(step), 1.0)
         return poses
 
     def _along(self, time_s: float | Array) -> Array:

@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from flowrep.envs.episode import Episode, Rules
-from flowrep.envs.meshes import PEDESTRIAN_RADIUS_M
+from flowrep.envs.people import RADIUS_M as PERSON_RADIUS_M
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
 from flowrep.envs.way import WayToGo, free_ground
@@ -153,7 +153,7 @@ class _Search:
         ahead = np.abs(cosine * dx + sine * dy) - self.vehicle.length_m / 2
         aside = np.abs(cosine * dy - sine * dx) - self.vehicle.width_m / 2
         gap = np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
-        return (gap < PEDESTRIAN_RADIUS_M + _MARGIN_M).any(axis=-1)
+        return (gap < PERSON_RADIUS_M + _MARGIN_M).any(axis=-1)
 
 
 def _trace(history: list[tuple[Array, Array]]) -> list[int]:

@@ -141,9 +141,10 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class ObstacleRow:
-    """Obstacles of one kind along a road, facing along it, `offset_m` to the left of its middle.
+    """Obstacles of one kind along a road, `offset_m` to the left of its middle.
 
-    Whatever would stand on another road than its own, or in a house, is left out.
+    They face as cars that keep right are parked: on the right along the road, on the left against
+    it. Whatever would stand on another road than its own, or in a house, is left out.
     """
 
     kind: Kind
@@ -199,5 +200,5 @@ class Scene:
 
     @property
     def num_pedestrians(self) -> int:
-        """How many people the scene holds: the largest instance id."""
+        """How many people the scene holds."""
         return sum(group.count for group in self.pedestrian_groups)

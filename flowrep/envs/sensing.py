@@ -16,6 +16,7 @@ from flowrep.envs.camera import (
 )
 from flowrep.envs.episode import Episode, Moment
 from flowrep.envs.motion import CameraPose, instance_motion, relative_camera
+from flowrep.envs.people import PARTS, world_from_parts
 from flowrep.envs.scene import Scene
 from flowrep.envs.simulator import Picture
 from flowrep.envs.street import Street
@@ -44,6 +45,7 @@ class Sensing:
         self._class_of_body = street.simulator.class_lookup()
         self._instance_of_body = street.simulator.instance_lookup()
         self._picture: Picture | None = None
+        self._latest_parts: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._camera_poses: dict[Moment, CameraPose] = {}
 
     def observe(self, episode: Episode) -> dict[str, Any]:
@@ -70,20 +72,21 @@ class Sensing:
     def space(self) -> spaces.Dict:
         """Returns the observation space."""
         size = (self._camera.height_px, self._camera.width_px)
-        people, classes = self._scene.num_pedestrians, num_classes(self._scene.categories)
+        parts = len(PARTS) * self._scene.num_pedestrians
+        classes = num_classes(self._scene.categories)
         every: dict[str, spaces.Space] = {
             "depth": spaces.Box(0.0, np.inf, (1, *size), np.float32),
             "semantic": spaces.Box(0, classes - 1, (1, *size), np.uint8),
-            "instance": spaces.Box(0, max(people, 1), (1, *size), np.uint8),
+            "instance": spaces.Box(0, max(parts, 1), (1, *size), np.uint8),
             "prev_from_curr": spaces.Box(-np.inf, np.inf, (4, 4), np.float32),
-            "instance_motion": spaces.Box(-np.inf, np.inf, (1 + people, 4, 4), np.float32),
+            "instance_motion": spaces.Box(-np.inf, np.inf, (1 + parts, 4, 4), np.float32),
             "rgb": spaces.Box(0, 255, (3, *size), np.uint8),
         }
         return spaces.Dict({name: every[name] for name in self.names})
 
     def _seen(self, episode: Episode) -> Picture:
         if self._picture is None:
-            self._street.place_pedestrians(episode.poses)
+            self._street.place_pedestrians(episode.poses, episode.now.vehicle)
             self._picture = self.look(episode)
         return self._picture
 
@@ -95,6 +98,15 @@ class Sensing:
                 self._camera_poses.pop(next(iter(self._camera_poses)))
             self._camera_poses[moment] = CameraPose(x_m, y_m, yaw_rad, self._vehicle_from_cam)
         return self._camera_poses[moment]
+
+    def _parts(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        # This step's poses are, as the very same array, the next one's poses of before.
+        for known, parts in self._latest_parts:
+            if known is poses:
+                return parts
+        parts = world_from_parts(poses)
+        self._latest_parts = [*self._latest_parts[-1:], (poses, parts)]
+        return parts
 
     def _add_maps(self, observation: dict[str, Any], picture: Picture) -> None:
         body = picture.body.astype(np.intp)  # what take() wants
@@ -117,7 +129,8 @@ class Sensing:
     def _add_motion(self, observation: dict[str, Any], episode: Episode) -> None:
         before, now = self._camera_pose(episode.before), self._camera_pose(episode.now)
         if "instance_motion" in self.names:
-            rows = instance_motion(before, now, episode.poses_before, episode.poses)
+            parts = [self._parts(poses) for poses in (episode.poses_before, episode.poses)]
+            rows = instance_motion(before, now, *parts)
             observation["instance_motion"] = rows.astype(np.float32)
             observation["prev_from_curr"] = observation["instance_motion"][0].copy()
         else:

@@ -85,7 +85,6 @@ class Simulator:
         category: str,
         *,
         instance: int = 0,
-        cylinder_m: tuple[float, float] | None = None,
         boxes_m: tuple[tuple[float, float, float, float, float, float], ...] = (),
     ) -> int:
         """Returns the number of a new body at the origin.
@@ -94,7 +93,6 @@ class Simulator:
             mesh: what is seen.
             category: its class in the semantic map.
             instance: its id in the instance map; 0 for the static world.
-            cylinder_m: (radius, height) of a collision cylinder that stands on the ground.
             boxes_m: collision boxes (x, y, yaw, length, width, height) that stand on the ground.
         """
         arrays = {
@@ -113,7 +111,7 @@ class Simulator:
         # empty, and the numbers are the same objects for every client of the process.
         for array in arrays.values():
             array.clear()
-        collision = self._collision_shape(cylinder_m, boxes_m)
+        collision = self._collision_shape(boxes_m)
         body = pybullet.createMultiBody(
             0.0, collision, visual, [0.0, 0.0, 0.0], physicsClientId=self._client
         )
@@ -129,6 +127,22 @@ class Simulator:
         collision = pybullet.createCollisionShape(
             pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._client
         )
+        self._vehicle = self._add_unseen(collision)
+        self._vehicle_half_height_m = height_m / 2
+
+    def add_cylinder(self, radius_m: float, height_m: float) -> int:
+        """Returns the number of an upright cylinder that collides and that no camera sees."""
+        return self._add_unseen(
+            pybullet.createCollisionShape(
+                pybullet.GEOM_CYLINDER,
+                radius=radius_m,
+                height=height_m,
+                collisionFramePosition=[0.0, 0.0, height_m / 2],
+                physicsClientId=self._client,
+            )
+        )
+
+    def _add_unseen(self, collision: int) -> int:
         # PyBullet draws the collision shape of a body without a visual one: give it a point.
         point = pybullet.createVisualShape(
             pybullet.GEOM_MESH,
@@ -136,11 +150,11 @@ class Simulator:
             indices=[0, 1, 2],
             physicsClientId=self._client,
         )
-        self._vehicle = pybullet.createMultiBody(
+        body = pybullet.createMultiBody(
             1.0, collision, point, [0.0, 0.0, 0.0], physicsClientId=self._client
         )
-        self._vehicle_half_height_m = height_m / 2
-        self._register(self._vehicle, "sky", 0)
+        self._register(body, "sky", 0)
+        return body
 
     def class_lookup(self) -> NDArray[np.uint8]:
         """Returns class ids by body number; the last entry, which index -1 reads, is the sky."""
@@ -160,12 +174,16 @@ class Simulator:
             physicsClientId=self._client,
         )
 
-    def place_all(self, bodies: list[int], poses: NDArray[np.float64]) -> None:
-        """Puts bodies on the ground at planar poses [P, 3]."""
+    def place_all(
+        self,
+        bodies: list[int],
+        positions: NDArray[np.float64],
+        quaternions_xyzw: NDArray[np.float64],
+    ) -> None:
+        """Puts N bodies at positions [N, 3] and orientations [N, 4]."""
         put, client = pybullet.resetBasePositionAndOrientation, self._client
-        sines, cosines = np.sin(0.5 * poses[:, 2]).tolist(), np.cos(0.5 * poses[:, 2]).tolist()
-        for body, (x, y, _), sine, cosine in zip(bodies, poses.tolist(), sines, cosines):
-            put(body, (x, y, 0.0), (0.0, 0.0, sine, cosine), client)
+        for body, position, turn in zip(bodies, positions.tolist(), quaternions_xyzw.tolist()):
+            put(body, position, turn, client)
 
     def hide(self, body: int) -> None:
         """Puts a body where neither the camera nor the vehicle meets it."""
@@ -204,19 +222,8 @@ class Simulator:
         )
 
     def _collision_shape(
-        self,
-        cylinder_m: tuple[float, float] | None,
-        boxes_m: tuple[tuple[float, float, float, float, float, float], ...],
+        self, boxes_m: tuple[tuple[float, float, float, float, float, float], ...]
     ) -> int:
-        if cylinder_m is not None:
-            radius, height = cylinder_m
-            return pybullet.createCollisionShape(
-                pybullet.GEOM_CYLINDER,
-                radius=radius,
-                height=height,
-                collisionFramePosition=[0.0, 0.0, height / 2],
-                physicsClientId=self._client,
-            )
         if not boxes_m:
             return -1
         return pybullet.createCollisionShapeArray(

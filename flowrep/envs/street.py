@@ -7,13 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
-from flowrep.envs import meshes, paint
+from flowrep.envs import furniture, meshes, paint, people
 from flowrep.envs.layout import Box, Layout
 from flowrep.envs.simulator import Simulator
 from flowrep.envs.vehicle import VehicleState
 
 Array = NDArray[Any]
+_BEHIND_M = 2.0  # behind the vehicle nobody is seen, wherever on it the camera is
+_TWO_LANES_M = 5.0  # a narrower road has no marks along its middle
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
@@ -34,20 +37,20 @@ class Street:
         vehicle = layout.scene.vehicle
         self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
         self._vehicle_reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
-        self._person_reach_m = self._vehicle_reach_m + meshes.PEDESTRIAN_RADIUS_M
+        self._person_reach_m = self._vehicle_reach_m + people.RADIUS_M
+        self._person = self.simulator.add_cylinder(people.RADIUS_M, people.HEIGHT_M)
         self._solids: list[Solid] = []
         self._add_ground(layout)
         self._add_solids(layout)
         self._closures = {name: self._add_closure(box) for name, box in layout.closures.items()}
-        self._pedestrians = [
-            self.simulator.add_body(
-                meshes.pedestrian_mesh(i),
-                "pedestrian",
-                instance=i + 1,
-                cylinder_m=(meshes.PEDESTRIAN_RADIUS_M, meshes.PEDESTRIAN_HEIGHT_M),
-            )
-            for i in range(layout.scene.num_pedestrians)
+        count = layout.scene.num_pedestrians
+        meshes_of_all = [mesh for i in range(count) for mesh in people.person_meshes(i)]
+        parts = [
+            self.simulator.add_body(mesh, "pedestrian", instance=number)
+            for number, mesh in enumerate(meshes_of_all, start=1)
         ]
+        self._parts = np.array(parts, dtype=int).reshape(count, len(people.PARTS))
+        self._placed = np.full((count, 4), np.nan)  # where everyone's parts were last put
         self.close_exits(())
 
     def close_exits(self, names: Iterable[str]) -> None:
@@ -65,16 +68,29 @@ class Street:
         reaches = [math.hypot(*box.size_m[:2]) / 2 for box in boxes]
         self._reaches = np.array(reaches) + self._vehicle_reach_m
 
-    def place_pedestrians(self, poses: Array) -> None:
-        """Puts everyone at their planar pose [P, 3]."""
-        self.simulator.place_all(self._pedestrians, poses)
+    def place_pedestrians(self, poses: Array, viewer: VehicleState) -> None:
+        """Puts everyone at their pose [P, 4] who has moved and is, or was last put, in view."""
+        ahead = np.array([math.cos(viewer.yaw_rad), math.sin(viewer.yaw_rad)])
+        eye = np.array([viewer.x_m, viewer.y_m])
+        behind = ((poses[:, :2] - eye) @ ahead < -_BEHIND_M) & (
+            (self._placed[:, :2] - eye) @ ahead < -_BEHIND_M
+        )
+        due = np.flatnonzero((poses != self._placed).any(axis=-1) & ~behind)
+        if due.size:
+            places = people.place_parts(poses[due])
+            self.simulator.place_all(
+                self._parts[due].ravel().tolist(),
+                places.positions.reshape(-1, 3),
+                places.quaternions_xyzw.reshape(-1, 4),
+            )
+            self._placed[due] = poses[due]
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
         """Returns when someone is near enough to be touched [T].
 
         Args:
             track: where the vehicle is, T times.
-            poses: where everyone is then, planar poses [T, P, 3].
+            poses: where everyone is then, poses [T, P, 4].
         """
         centres = np.array([state[:2] for state in track])
         gaps = poses[..., :2] - centres[:, None]
@@ -91,43 +107,48 @@ class Street:
 
         Args:
             state: where the vehicle is.
-            poses: where everyone is, planar poses [P, 3].
+            poses: where everyone is, poses [P, 4].
         """
-        near = []
+        self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)
         gaps = np.hypot(poses[:, 0] - state.x_m, poses[:, 1] - state.y_m)
         for i in np.flatnonzero(gaps <= self._person_reach_m).tolist():
-            self.simulator.place(self._pedestrians[i], *poses[i].tolist())
-            near.append((self._pedestrians[i], "pedestrian"))
+            self.simulator.place(self._person, *poses[i, :3].tolist())
+            if self.simulator.vehicle_touches(self._person):
+                return "pedestrian"
         owners = (self._owners[i] for i in np.flatnonzero(self._boxes_near(state)).tolist())
-        near += {solid.body: solid.category for solid in owners}.items()
-        if not near:
-            return ""
-        self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)
-        return next((name for body, name in near if self.simulator.vehicle_touches(body)), "")
+        near = {solid.body: solid.category for solid in owners}
+        touched = (name for body, name in near.items() if self.simulator.vehicle_touches(body))
+        return next(touched, "")
 
     def _add_ground(self, layout: Layout) -> None:
-        road = meshes.Mesh()
         striped = shapely.union_all([area.polygon for area in layout.crosswalks])
+        road, crosswalks = meshes.Mesh(), meshes.Mesh()
         road.ground(layout.drivable.difference(striped), 0.0, "asphalt")
-        for line in layout.lines.values():
-            road.add(meshes.lane_marks(line))
-        self.simulator.add_body(road, "road")
-        for ground, colour, category in (
-            (striped, "lane_mark", "crosswalk"),
-            (layout.terrain, "grass", "terrain"),
+        for name in layout.lines:
+            road.add(self._lane_marks(layout, name, striped))
+        for area in layout.crosswalks:
+            crosswalks.add(meshes.crosswalk(*area))
+        paved = layout.sidewalks
+        if layout.terrain.is_empty:
+            # The paving runs on under the houses, so that no gap opens between them.
+            paved = paved.buffer(2.0).difference(layout.drivable)
+        paving, grass = meshes.Mesh(), meshes.Mesh()
+        paving.ground(paved, 0.0, "paving")
+        grass.ground(layout.terrain, 0.0, "grass")
+        for mesh, category in (
+            (road, "road"),
+            (crosswalks, "crosswalk"),
+            (paving, "sidewalk"),
+            (grass, "terrain"),
         ):
-            if not ground.is_empty:
-                mesh = meshes.Mesh()
-                mesh.ground(ground, 0.0, colour)
+            if mesh.indices:
                 self.simulator.add_body(mesh, category)
-        if not layout.sidewalks.is_empty:
-            paved = layout.sidewalks
-            if layout.terrain.is_empty:
-                # The paving runs on under the houses, so that no gap opens between them.
-                paved = paved.buffer(2.0).difference(layout.drivable)
-            paving = meshes.Mesh()
-            paving.ground(paved, 0.0, "paving")
-            self.simulator.add_body(paving, "sidewalk")
+
+    def _lane_marks(self, layout: Layout, name: str, striped: BaseGeometry) -> meshes.Mesh:
+        if layout.width_m(name) < _TWO_LANES_M:
+            return meshes.Mesh()
+        others = [ground for other, ground in layout.ribbons.items() if other != name]
+        return meshes.lane_marks(layout.lines[name], shapely.union_all([*others, striped]))
 
     def _add_solids(self, layout: Layout) -> None:
         by_category: dict[str, list[Box]] = {}
@@ -137,12 +158,11 @@ class Street:
             for first in range(0, len(boxes), _BOXES_A_BODY):
                 mesh, chunk = meshes.Mesh(), boxes[first : first + _BOXES_A_BODY]
                 for box in chunk:
-                    is_house = box.kind == "house"
-                    mesh.add(meshes.house_mesh(box) if is_house else meshes.obstacle_mesh(box))
+                    mesh.add(furniture.mesh_of(box))
                 self._solids.append(self._add_solid(mesh, category, chunk))
 
     def _add_closure(self, box: Box) -> Solid:
-        return self._add_solid(meshes.house_mesh(box, both_sides=True), box.category, [box])
+        return self._add_solid(furniture.mesh_of(box, both_sides=True), box.category, [box])
 
     def _add_solid(self, mesh: meshes.Mesh, category: str, boxes: list[Box]) -> Solid:
         body = self.simulator.add_body(

@@ -29,9 +29,9 @@ class StreetEnv(gym.Env):
     | --- | --- | --- | --- |
     | `depth` | [1, H, W] | float32 | metres along z; sky is inf |
     | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.palette` |
-    | `instance` | [1, H, W] | uint8 | pedestrian's number from 1; 0 is the static world |
+    | `instance` | [1, H, W] | uint8 | 0: static world; 1, 2, 3: first person's body and legs, ... |
     | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
-    | `instance_motion` | [1 + P, 4, 4] | float32 | the same by instance; row 0: static world |
+    | `instance_motion` | [1 + 3·P, 4, 4] | float32 | the same by instance; row 0: static world |
     | `rgb` | [3, H, W] | uint8 | |
 
     At reset the previous pose is the current one. `info` holds `outcome`, `hit` (the category of

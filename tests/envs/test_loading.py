@@ -194,7 +194,10 @@ def refuse(data, **changes):
         ({"frame_rate_hz": 0}, "frame_rate_hz: is 0.0; give a number above 0"),
         ({"camera__fov_deg": 180}, "camera.fov_deg: is 180.0; stay in (0, 180)"),
         ({"camera__far_m": 0.1}, "camera.far_m: is not beyond near_m; give a larger far_m"),
-        ({"pedestrian_groups__0__count": 300}, "pedestrian_groups: 302 people, but instance ids"),
+        (
+            {"pedestrian_groups__0__count": 300},
+            "pedestrian_groups: 302 people, each of 3 parts with",
+        ),
         (
             {"pedestrian_groups__0__standing": 4},
             "pedestrian_groups.along.standing: is 4; stay in 0",

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from flowrep.envs.camera import CameraConfig, vehicle_from_camera
-from flowrep.envs.motion import CameraPose, instance_motion, planar, planar_change, relative_camera
+from flowrep.envs.motion import CameraPose, instance_motion, planar, relative_camera, rigid_inverse
 
 MOUNT = vehicle_from_camera(CameraConfig(48, 60, 70.0, 1.5, 0.4, -10.0, 0.2, 100.0))
 BEFORE = CameraPose(3.0, -1.0, 0.3, MOUNT)
 NOW = CameraPose(3.8, -0.7, 0.42, MOUNT)
-PREV_POSES = np.array([[10.0, 2.0, 0.1], [12.0, -3.0, 1.0], [8.0, 0.0, 3.0]])
-POSES = np.array([[10.1, 2.2, 0.4], [12.0, -3.0, 1.0], [7.9, 0.0, 3.0]])
+PREV_BODIES = np.stack([planar(10.0, 2.0, 0.1), planar(12.0, -3.0, 1.0), planar(8.0, 0.0, 3.0)])
+BODIES = np.stack([planar(10.1, 2.2, 0.4), planar(12.0, -3.0, 1.0), planar(7.9, 0.0, 3.0)])
 
 
 def test_a_camera_pose_is_its_inverses_inverse():
@@ -28,30 +28,41 @@ def test_a_point_of_the_world_is_seen_where_it_was():
 def test_a_camera_that_stands_moves_by_the_exact_identity():
     again = CameraPose(3.8, -0.7, 0.42, MOUNT)
     assert np.array_equal(relative_camera(NOW, again), np.eye(4))
-    assert np.array_equal(instance_motion(NOW, again, POSES, POSES), np.tile(np.eye(4), (4, 1, 1)))
+    assert np.array_equal(
+        instance_motion(NOW, again, BODIES, BODIES), np.tile(np.eye(4), (4, 1, 1))
+    )
 
 
 def test_a_point_on_a_body_is_carried_back_with_it():
-    rows = instance_motion(BEFORE, NOW, PREV_POSES, POSES)
+    rows = instance_motion(BEFORE, NOW, PREV_BODIES, BODIES)
     on_body = np.array([0.2, -0.3, 1.6, 1.0])
-    for i, (prev, pose) in enumerate(zip(PREV_POSES, POSES)):
-        seen_now = NOW.cam_from_world @ planar(*pose) @ on_body
-        seen_before = BEFORE.cam_from_world @ planar(*prev) @ on_body
+    for i, (prev, body) in enumerate(zip(PREV_BODIES, BODIES)):
+        seen_now = NOW.cam_from_world @ body @ on_body
+        seen_before = BEFORE.cam_from_world @ prev @ on_body
         np.testing.assert_allclose(rows[1 + i] @ seen_now, seen_before, atol=1e-12)
 
 
 def test_a_body_that_stands_has_row_zeros_very_numbers():
-    rows = instance_motion(BEFORE, NOW, PREV_POSES, POSES)
+    rows = instance_motion(BEFORE, NOW, PREV_BODIES, BODIES)
     assert np.array_equal(rows[0], relative_camera(BEFORE, NOW))
     assert np.array_equal(rows[2], rows[0])
     assert not np.allclose(rows[1], rows[0])
     assert not np.allclose(rows[3], rows[0])
 
 
-def test_planar_change_turns_about_the_body_and_not_the_origin():
+def test_a_body_turns_about_itself_and_not_the_origin():
     # A quarter turn to the left on the spot: what is 1 m ahead at (5, 1) was at (6, 0).
-    change = planar_change(np.array([[5.0, 0.0, 0.0]]), np.array([[5.0, 0.0, math.pi / 2]]))[0]
-    np.testing.assert_allclose(change @ [5.0, 1.0, 0.7, 1.0], [6.0, 0.0, 0.7, 1.0], atol=1e-12)
+    prev, now = planar(5.0, 0.0, 0.0)[None], planar(5.0, 0.0, math.pi / 2)[None]
+    row = instance_motion(NOW, NOW, prev, now)[1]
+    seen_now = NOW.cam_from_world @ [5.0, 1.0, 0.7, 1.0]
+    expected = NOW.cam_from_world @ [6.0, 0.0, 0.7, 1.0]
+    np.testing.assert_allclose(row @ seen_now, expected, atol=1e-12)
+
+
+def test_the_inverse_of_many_transforms_undoes_each():
+    np.testing.assert_allclose(
+        rigid_inverse(BODIES) @ BODIES, np.tile(np.eye(4), (3, 1, 1)), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("far_m", [0.0, 10_000.0])

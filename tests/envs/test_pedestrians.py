@@ -73,5 +73,19 @@ def test_many_times_at_once_are_many_calls(crowd):
 def test_a_scene_may_be_without_people():
     empty = Crowd([], np.zeros(0), np.zeros(0))
     assert len(empty) == 0
-    assert empty.poses(1.0).shape == (0, 3)
+    assert empty.poses(1.0).shape == (0, 4)
     assert empty.positions(np.ones((2, 1))).shape == (2, 0, 2)
+
+
+def test_legs_swing_with_the_distance_walked(crowd):
+    def swing(time_s, person):
+        return crowd.poses(time_s)[person, 3]
+
+    # A walks 1 m/s from phase 0, in step: a stride of 1.4 m takes 1.4 s, its widest at a quarter.
+    assert swing(0.0, 0) == pytest.approx(0.0)
+    assert swing(0.35, 0) == pytest.approx(0.38)
+    assert swing(1.05, 0) == pytest.approx(-0.38)
+    assert swing(1.4 * 7 + 0.35, 0) == pytest.approx(0.38)  # 10.15 m: on, past the about-turn
+    # B is 2.4 rad ahead of A and twice as fast; C stands with one foot before the other.
+    assert swing(0.35, 1) == pytest.approx(0.38 * math.sin(math.pi + 2.4))
+    assert swing(3.21, 2) == swing(0.0, 2) == pytest.approx(0.38)

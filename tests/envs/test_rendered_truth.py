@@ -17,8 +17,8 @@ ACTIONS = [LEFT, RIGHT, RIGHT, LEFT, NO_OP, RIGHT, LEFT, LEFT, RIGHT, NO_OP] * 3
 
 def street(name, speed):
     scene = load_scene(name)
-    # H and W differ, and the view is narrow, so that people are many pixels wide.
-    camera = replace(scene.camera, height_px=150, width_px=200, fov_deg=45.0)
+    # H and W differ, and the view is narrow, so that legs too are many pixels wide.
+    camera = replace(scene.camera, height_px=210, width_px=280, fov_deg=45.0)
     return StreetEnv(replace(scene, camera=camera), speed=speed)
 
 
@@ -171,4 +171,20 @@ def test_at_reset_nothing_has_moved():
     K = torch.from_numpy(env.unwrapped.K)
     ego = partial(ego_flow, frame["depth"], K)
     assert not ego(frame["prev_from_curr"]).flow.any()
+    env.close()
+
+
+def test_legs_have_a_motion_of_their_own():
+    env = street("straight_road", WALKING)
+    K, differ = torch.from_numpy(env.unwrapped.K), 0
+    for frame in frames(env, ACTIONS[:20]):
+        obj = flows(frame, K)[2][0]
+        instance = frame["instance"][0].long()
+        for person in range(env.scene.num_pedestrians):
+            body, left, right = (obj[instance == 3 * person + part] for part in (1, 2, 3))
+            if min(len(body), len(left), len(right)) > 60:
+                means = torch.stack([left.mean(), right.mean()]) - body.mean()
+                # One leg swings forwards while the other swings back.
+                differ += bool((means.sign().prod() < 0) & (means.abs() > 0.05).all())
+    assert differ > 3
     env.close()

@@ -42,14 +42,14 @@ def test_the_observation_has_what_was_asked_for(make_street, straight_road):
     sensors = ("rgb", "instance", "depth", "semantic", "instance_motion", "prev_from_curr")
     env = make_street(replace(straight_road, camera=camera), sensors=sensors, render_mode=None)
     observation, _ = env.reset(seed=0)
-    people = straight_road.num_pedestrians
+    parts = 3 * straight_road.num_pedestrians
     kinds = {key: (value.shape, value.dtype.name) for key, value in observation.items()}
     assert kinds == {
         "rgb": ((3, 20, 30), "uint8"),
         "instance": ((1, 20, 30), "uint8"),
         "depth": ((1, 20, 30), "float32"),
         "semantic": ((1, 20, 30), "uint8"),
-        "instance_motion": ((1 + people, 4, 4), "float32"),
+        "instance_motion": ((1 + parts, 4, 4), "float32"),
         "prev_from_curr": ((4, 4), "float32"),
     }
     assert tuple(observation) == sensors
@@ -63,7 +63,7 @@ def test_maps_show_sky_road_sidewalk_houses_and_people(make_street):
     assert set(np.unique(semantic)) == {0, 1, 2, 3, 4}
     # Sky is where nothing is: at infinity, and nowhere else.
     np.testing.assert_array_equal(np.isinf(depth), semantic == 0)
-    # Instances are the people, numbered from 1.
+    # Instances are the people's parts, numbered from 1.
     np.testing.assert_array_equal(observation["instance"][0] > 0, semantic == 4)
     assert semantic[-1, 42] == 1  # the road before the vehicle
     # 50 rows down a ray meets the ground 5 m ahead; 40 columns aside that is 4.75 m left.
