@@ -33,3 +33,21 @@ def test_the_readme_names_every_representation():
 
     text = README.read_text(encoding="utf-8")
     assert all(f"`{name}`" in text for name in REPRESENTATIONS)
+
+
+def test_every_picture_of_the_readme_is_there_and_small():
+    text = README.read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text) + re.findall(r'<img src="([^"]+)"', text)
+    scenes = [path.stem for path in (README.parent / "conf" / "scene").glob("*.yaml")]
+    assert {
+        f"docs/images/{kind}_{scene}.png" for kind in ("gallery", "plan") for scene in scenes
+    } <= {*pictures}
+    for picture in pictures:
+        assert (README.parent / picture).stat().st_size < 300_000, picture
+
+
+def test_make_gallery_makes_a_picture_of_every_scene():
+    makefile = (README.parent / "Makefile").read_text(encoding="utf-8")
+    (listed,) = re.findall(r"^SCENES = (.+)$", makefile, re.MULTILINE)
+    scenes = {path.stem for path in (README.parent / "conf" / "scene").glob("*.yaml")}
+    assert set(listed.split()) == scenes
