@@ -4,50 +4,122 @@ python examples/transform_pictures.py docs/images/transforms
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from flowrep.envs import Planner, make_env, streets
-from flowrep.experiment.recording import film_episode
-from flowrep.viz import FLOW_SCALE_PX, classes_to_rgb, depth_to_rgb, flow_to_rgb, write_png
+from flowrep.envs import Planner, StreetEnv, load_scene
+from flowrep.envs.sensing import SENSORS
+from flowrep.experiment.recording import maps_of
+from flowrep.experiment.viewing import view_episode
+from flowrep.geometry import ego_flow, unproject
+from flowrep.transforms import DIS
+from flowrep.viz import (
+    FLOW_SCALE_PX,
+    classes_to_rgb,
+    depth_to_rgb,
+    flow_to_rgb,
+    strip,
+    write_png,
+)
 
-SCENE, SEED, STEP = "h_shaped_pathways", 4, 24
+SCENE, SEED, SIZE_PX = "h_shaped_pathways", 4, 160
+PARTS = np.array([(235, 235, 235), (222, 40, 60), (46, 64, 196), (60, 160, 90)], dtype=np.uint8)
 
 
 def main(folder: str) -> None:
-    env = make_env(SCENE, ["rgb"], keep_sensor=True, seed=SEED)
-    street, planner = streets(env)[0], Planner()
+    scene = load_scene(SCENE)
+    camera = replace(scene.camera, height_px=SIZE_PX, width_px=SIZE_PX)
+    env = StreetEnv(replace(scene, camera=camera), sensors=SENSORS)
+    K, steps = torch.as_tensor(env.K), []
 
-    def drive(tensordict):
-        return tensordict.set("action", torch.tensor([planner(street)]))
+    def look(observation):
+        steps.append({name: torch.as_tensor(value) for name, value in observation.items()})
 
-    frames, _ = film_episode(env, drive)
+    view_episode(env, Planner(), look=look, seed=SEED)
     env.close()
-    before, now = frames[STEP - 1], frames[STEP]
-    pictures = {
-        "rgb": now["rgb"].numpy().transpose(1, 2, 0),
-        "seg": classes_to_rgb(now["semantic"]),
-        "depth": depth_to_rgb(now["depth"]),
-        "seg2": beside(classes_to_rgb(before["semantic"]), classes_to_rgb(now["semantic"])),
+    maps = [maps_of(step, K) for step in steps]
+    # The liveliest step, but nobody right before the lens.
+    motion = [int(((frame["obj"] != 0) & (frame["depth"] > 5)).sum()) for frame in maps]
+    at = max(range(1, len(maps)), key=lambda i: motion[i])
+    for name, images in pictures(steps[at - 1], steps[at], maps[at - 1], maps[at], K).items():
+        path = Path(folder) / f"{name}.png"
+        write_png(path, strip(images))
+        print(path)
+
+
+def pictures(step_before, step, before, now, K):
+    """Returns for each page its pictures by label."""
+    flows = {name: flow_to_rgb(now[name], scale) for name, scale in FLOW_SCALE_PX.items()}
+    rgb = now["rgb"].numpy().transpose(1, 2, 0)
+    return {
+        "rgb": {"rgb": rgb},
+        "segmentation": {"rgb": rgb, "seg": classes_to_rgb(now["semantic"])},
+        "depth": {"rgb": rgb, "depth": depth_to_rgb(now["depth"])},
+        "frame_stack": {
+            "seg2, first": classes_to_rgb(before["semantic"]),
+            "seg2, second": classes_to_rgb(now["semantic"]),
+        },
+        "raw_flow": {"rgb": rgb, "raw": flows["raw"]},
+        "flow_factorize": {name: flows[name] for name in ("raw", "ego", "obj")},
+        "camera_motion": of_camera_motions(now["depth"], K),
+        "instance_ids": {"rgb": rgb, "ids: body, left, right leg": of_parts(step["instance"])},
+        "instance_motion": {
+            "every row is row 0": flow_to_rgb(now["ego"], FLOW_SCALE_PX["raw"]),
+            "a row an instance": flows["raw"],
+            "their difference": flows["obj"],
+        },
+        "estimated_flow": of_estimates(step_before, step, now),
+        "adapt": of_depth_kinds(now["depth"], K),
     }
-    for name in ("raw", "ego", "obj"):
-        pictures[name] = flow_to_rgb(now[name], FLOW_SCALE_PX[name])
-    pictures["factors"] = beside(*(pictures[name] for name in ("raw", "ego", "obj")))
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    for name, picture in pictures.items():
-        write_png(Path(folder) / f"{name}.png", enlarged(picture))
-        print(Path(folder) / f"{name}.png")
 
 
-def beside(*pictures: np.ndarray) -> np.ndarray:
-    gap = np.full((pictures[0].shape[0], 2, 3), 255, dtype=np.uint8)
-    return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=1)
+def of_camera_motions(depth, K):
+    ahead, aside, turned = (torch.eye(4) for _ in range(3))
+    ahead[2, 3], aside[0, 3] = 0.8, 0.3
+    angle = torch.tensor(0.05)
+    turned[0, 0] = turned[2, 2] = angle.cos()
+    turned[0, 2], turned[2, 0] = angle.sin(), -angle.sin()
+    motions = {"0.8 m ahead": ahead, "0.3 m to the right": aside, "3° to the right": turned}
+    return {
+        label: flow_to_rgb(ego_flow(depth, K.float(), motion).flow, FLOW_SCALE_PX["ego"])
+        for label, motion in motions.items()
+    }
 
 
-def enlarged(picture: np.ndarray, factor: int = 3) -> np.ndarray:
-    return picture.repeat(factor, 0).repeat(factor, 1)
+def of_parts(instance):
+    ids = instance[0].long()
+    return PARTS[torch.where(ids > 0, (ids - 1) % 3 + 1, 0).numpy()]
+
+
+def of_estimates(step_before, step, now):
+    current, previous = step["rgb"][None], step_before["rgb"][None]
+    estimate = -DIS()(current, previous)[0]
+    return {
+        "raw, exact": flow_to_rgb(now["raw"], FLOW_SCALE_PX["raw"]),
+        "raw, estimated (DIS)": flow_to_rgb(estimate, FLOW_SCALE_PX["raw"]),
+        "obj from it": flow_to_rgb(estimate - now["ego"], FLOW_SCALE_PX["obj"]),
+    }
+
+
+def of_depth_kinds(depth, K):
+    points = unproject(depth.double(), K)
+    ray = points.norm(dim=-1)[None]
+    error = torch.where(depth.isinf(), 0.0, ray - depth.double())
+    near_m, far_m = 0.2, 300.0
+    z_buffer = far_m * (depth.double() - near_m) / (depth.double() * (far_m - near_m))
+    z_buffer = torch.where(depth.isinf(), 1.0, z_buffer)
+    return {
+        "z": depth_to_rgb(depth),
+        "ray length - z, to 10 m": grey(error / 10.0),
+        "z-buffer": grey(z_buffer),
+    }
+
+
+def grey(values):
+    return (255 * values[0].clamp(0, 1)).to(torch.uint8).numpy()[..., None].repeat(3, -1)
 
 
 if __name__ == "__main__":
