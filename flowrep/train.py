@@ -35,22 +35,35 @@ def run(config: DictConfig) -> None:
     try:
         folder, plain = open_run(config)
         check(plain)
-        training = build(plain, folder)
+    except (UsageError, OSError) as error:
+        exit_with(str(error))
+    carry_out(plain, folder)
+
+
+def carry_out(config: Config, folder: RunFolder) -> None:
+    """Does what is left to do of a run: training, evaluation, video."""
+    try:
+        training = build(config, folder)
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
     print(f"run folder: {folder.path}")
-    if training.frames >= plain["total_frames"] and folder.is_evaluated(training.frames):
+    if training.frames >= config["total_frames"] and folder.is_evaluated(training.frames):
         print(f"this run is complete; evaluate it with: flowrep.evaluate run={folder.path}")
         return
     with StopRequest() as stop:
         try:
-            clock = train(training, plain, stop, partial(log_evaluation, training, plain, stop))
-        except (CheckpointError, DivergenceError, OSError) as error:
+            clock = train(training, config, stop, partial(log_evaluation, training, config, stop))
+            print(f"wall time: {clock.summary()}")
+            print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
+            if not stop:
+                final_evaluation(training, config, stop)
+        except (CheckpointError, DivergenceError) as error:
             exit_with(f"after {training.frames} frames: {error}")
-        print(f"wall time: {clock.summary()}")
-        print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
-        if not stop:
-            final_evaluation(training, plain, stop)
+        except OSError as error:
+            exit_with(
+                f"after {training.frames} frames: {error}. Free some space or make the folder "
+                f"writable, then continue with resume={folder.path}"
+            )
     training.env.close()
     if stop:
         print(
@@ -122,8 +135,11 @@ def build(config: Config, folder: RunFolder) -> Training:
     env = build_env(config)
     env.set_seed(config["seed"] * config["num_envs"])
     training = Training(env, build_agent(config, env), folder)
-    if config["resume"] is not None and folder.checkpoint_path.exists():
-        training.load()
+    if config["resume"] is not None:
+        if folder.checkpoint_path.exists():
+            training.load()
+        else:
+            folder.forget_after(0)
     return training
 
 

@@ -25,7 +25,7 @@ from flowrep.envs import BASELINES, SceneError, StreetEnv
 from flowrep.envs.layout import Layout
 from flowrep.envs.sensing import SENSORS
 from flowrep.experiment.recording import Maps, maps_of
-from flowrep.experiment.run_folder import append_rows
+from flowrep.experiment.tables import append_rows
 from flowrep.experiment.viewing import CategoryCount, Viewed, view_episode
 from flowrep.plan_view import Track, draw_plan
 from flowrep.viz import contact_sheet, representation_strip, write_png, write_video

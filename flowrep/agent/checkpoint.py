@@ -51,7 +51,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
         save_file(_unshared(tensors), file, metadata={"format": FORMAT, "state": document})
         file.chmod(partial.stat().st_mode & 0o666)  # as any new file, not for the owner alone
         _flush(file)
-        os.replace(file, path)
+        _rename(file, path)
         _flush(path.parent)
     except (OSError, SafetensorError) as error:
         kept = "; the previous checkpoint is untouched" if path.exists() else ""
@@ -89,6 +89,11 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
             f"{path} is not a readable checkpoint ({error}): it is damaged or of another kind; "
             "delete it and start the run anew"
         ) from error
+
+
+def _rename(file: Path, path: Path) -> None:
+    """Puts a file in another's place, in one step."""
+    os.replace(file, path)
 
 
 def _flush(path: Path) -> None:

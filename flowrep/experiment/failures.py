@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from flowrep.experiment.run_folder import append_rows
+from flowrep.experiment.tables import append_rows
 
 UNRECORDED = "collision: unrecorded"
 """A collision in a table of before it was recorded what was hit."""

@@ -1,12 +1,13 @@
 """A run's folder: resolved config, metrics as CSV and TensorBoard, checkpoint, evaluation."""
 
-import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 from torchrl.record.loggers import TensorboardLogger
+
+from flowrep.experiment.tables import add_columns, append_rows, is_whole, read_rows, write_rows
 
 EVALUATION_COLUMNS = (
     "scene",
@@ -86,7 +87,9 @@ class RunFolder:
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Writes the resolved config."""
         text = yaml.safe_dump(dict(config), sort_keys=False)
-        (self.path / "config.yaml").write_text(text, encoding="utf-8")
+        whole = self.path / "config.yaml.tmp"
+        whole.write_text(text, encoding="utf-8")
+        whole.replace(self.path / "config.yaml")
 
     def read_config(self) -> dict[str, Any]:
         """Returns the resolved config that the run was started with."""
@@ -103,30 +106,21 @@ class RunFolder:
     def forget_after(self, frames: int) -> None:
         """Drops what was logged after `frames`: a resumed run writes those rows again."""
         for path in (self.metrics_path, self.evaluation_path):
-            if path.is_file():
-                with path.open(newline="", encoding="utf-8") as file:
-                    rows = [row for row in csv.DictReader(file) if int(row["frames"]) <= frames]
-                shortened = path.with_suffix(".tmp")
-                shortened.unlink(missing_ok=True)
-                append_rows(shortened, rows)
-                shortened.replace(path) if rows else path.unlink()
+            rows = read_rows(path)
+            kept = [row for row in rows if int(row["frames"]) <= frames]
+            if len(kept) < len(rows) or not is_whole(path):
+                write_rows(path, kept)
 
     def is_evaluated(self, frames: int) -> bool:
         """Says whether the evaluation that ends a run of so many frames is in evaluation.csv."""
-        if not self.evaluation_path.is_file():
-            return False
-        with self.evaluation_path.open(newline="", encoding="utf-8") as file:
-            return any(
-                row["policy"] == "sampled" and int(row["frames"]) == frames
-                for row in csv.DictReader(file)
-            )
+        return any(
+            row["policy"] == "sampled" and int(row["frames"]) == frames
+            for row in self.read_episodes()
+        )
 
     def read_episodes(self) -> list[dict[str, str]]:
         """Returns the rows of evaluation.csv, none where there is no such file."""
-        if not self.evaluation_path.is_file():
-            return []
-        with self.evaluation_path.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
+        return read_rows(self.evaluation_path)
 
     def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Appends evaluated episodes to evaluation.csv, first giving an older one its new columns.
@@ -135,42 +129,3 @@ class RunFolder:
         """
         add_columns(self.evaluation_path, EVALUATION_COLUMNS)
         append_rows(self.evaluation_path, rows, EVALUATION_COLUMNS)
-
-
-def add_columns(path: Path, columns: Sequence[str]) -> None:
-    """Rewrites a CSV table that lacks some of the columns with all of them, in their order."""
-    if not path.is_file() or path.stat().st_size == 0:
-        return
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        known, rows = reader.fieldnames or [], list(reader)
-    if set(columns) <= set(known):
-        return
-    longer = path.with_suffix(".tmp")
-    longer.unlink(missing_ok=True)
-    append_rows(longer, [dict.fromkeys(columns, "") | row for row in rows], columns)
-    longer.replace(path) if rows else path.unlink()
-
-
-def append_rows(
-    path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
-) -> None:
-    """Appends rows to a CSV table, writing its header first where the file is new.
-
-    Raises:
-        ValueError: a row's columns are not those of the table.
-    """
-    rows = list(rows)
-    if not rows:
-        return
-    is_new = not path.is_file() or path.stat().st_size == 0
-    if is_new:
-        names = list(columns or rows[0])
-    else:
-        with path.open(newline="", encoding="utf-8") as file:
-            names = next(csv.reader(file))
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names)
-        if is_new:
-            writer.writeheader()
-        writer.writerows(rows)

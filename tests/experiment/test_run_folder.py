@@ -2,7 +2,8 @@ import csv
 
 import pytest
 
-from flowrep.experiment.run_folder import EVALUATION_COLUMNS, RunFolder, append_rows
+from flowrep.experiment.run_folder import EVALUATION_COLUMNS, RunFolder
+from flowrep.experiment.tables import append_rows
 
 
 def rows_of(path):

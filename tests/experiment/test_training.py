@@ -1,6 +1,7 @@
 """A run that is stopped and resumed is the run that was not."""
 
 import csv
+import math
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from tensordict import TensorDict
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
+from flowrep.agent import DivergenceError
 from flowrep.config_tree import group_choices
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
@@ -120,3 +122,40 @@ def test_a_killed_run_continues_from_its_last_checkpoint_and_drops_later_rows(tm
 def test_the_loop_updates_once_for_ten_frames_after_the_first_batch(tmp_path):
     training = finish(tmp_path)
     assert training.agent.updates == (120 - 16) // 10
+
+
+def poison(training, updates):
+    """Makes Q infinite once so many updates were taken."""
+    losses = training.agent.losses
+
+    def poisoned(batch):
+        factor = math.inf if training.agent.updates == updates else 1.0
+        return losses(batch) | {"q_loss": losses(batch)["q_loss"] * factor}
+
+    training.agent.losses = poisoned
+
+
+@pytest.mark.parametrize("log_every", [20, 1000])
+def test_a_loss_that_is_no_number_ends_the_run_before_it_is_saved(tmp_path, log_every):
+    training, config = new_run(tmp_path)
+    poison(training, updates=7)  # after the checkpoint at 60 frames
+    config |= {"log_every_frames": log_every}
+    path = training.run.checkpoint_path
+    message = rf"^q_loss became inf in update 8 \(q_loss=inf, .*entropy=.*good checkpoint is {path}"
+    with pytest.raises(DivergenceError, match=message):
+        train(training, config, StopRequest(), lambda frames: None)
+    training.env.close()
+    resumed, config = new_run(tmp_path, resume=True)
+    assert resumed.frames == 60
+    train(resumed, config, StopRequest(), lambda frames: None)
+    resumed.env.close()
+    assert resumed.agent.updates == 10
+
+
+def test_a_loss_that_is_no_number_from_the_start_leaves_no_checkpoint(tmp_path):
+    training, config = new_run(tmp_path)
+    poison(training, updates=0)
+    with pytest.raises(DivergenceError, match=r"in update 1 .*; none was saved yet"):
+        train(training, config, StopAfter(training, 50), lambda frames: None)
+    training.env.close()
+    assert not training.run.checkpoint_path.exists()

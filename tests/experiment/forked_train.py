@@ -1,0 +1,118 @@
+"""`python -m flowrep.train resume=...` many times over: imported once, forked for each command.
+
+Reads one JSON object a line and answers with one. A request is
+
+    {"run": folder, "kill_after_s": 0.3, "kill_at": ["rename", 2], "largest_file": 100000,
+     "read_only": true}
+
+of which all but the first may be missing; the answer holds the exit code (minus the signal's number
+for a command that was killed) and what was printed.
+"""
+
+import errno
+import io
+import json
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+import matplotlib.pyplot  # noqa: F401  what a run would import late
+
+import flowrep.agent.checkpoint as checkpoint
+import flowrep.train
+from flowrep.experiment.run_folder import RunFolder
+
+
+def die(*_, **__):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def half_a_file(tensors, file, **_):
+    Path(file).write_bytes(bytes(1000))
+    die()
+
+
+def killed_at(stage: str, save: int) -> None:
+    """Arranges that the process kills itself in that stage of writing its nth checkpoint."""
+    steps = {"write": "save_file", "half": "save_file", "flush": "_flush"}
+    name, left = steps.get(stage, "_rename"), [save]
+    whole = getattr(checkpoint, name)
+
+    def counted(*arguments, **options):
+        left[0] -= 1
+        if left[0]:
+            return whole(*arguments, **options)
+        if stage == "renamed":
+            whole(*arguments, **options)
+        return half_a_file(*arguments) if stage == "half" else die()
+
+    setattr(checkpoint, name, counted)
+
+
+def read_only(folder: str) -> None:
+    """Makes every attempt to write below a folder fail as on a disk that is mounted read-only."""
+
+    def refusing(whole, writes):
+        def call(path, *arguments, **options):
+            is_inside = isinstance(path, str | os.PathLike) and str(path).startswith(folder)
+            if is_inside and writes(arguments):
+                raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+            return whole(path, *arguments, **options)
+
+        return call
+
+    io.open = refusing(io.open, lambda modes: set("wa") & set("".join(modes[:1])))
+    os.mkdir = refusing(os.mkdir, lambda _: True)
+
+
+def child(request: dict, output) -> None:
+    """Runs the command and ends the process as it would."""
+    code = 0
+    os.dup2(output.fileno(), 1)
+    os.dup2(output.fileno(), 2)
+    try:
+        if "kill_at" in request:
+            killed_at(*request["kill_at"])
+        if "read_only" in request:
+            read_only(request["run"])
+        if "largest_file" in request:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (request["largest_file"],) * 2)
+        folder = RunFolder.existing(request["run"])
+        flowrep.train.carry_out(folder.read_config() | {"resume": request["run"]}, folder)
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def answer(request: dict) -> dict:
+    """Runs one command in a process of its own; kills it when its time is over."""
+    with tempfile.TemporaryFile("w+") as output:
+        pid = os.fork()
+        if not pid:
+            child(request, output)
+        if "kill_after_s" in request:
+            time.sleep(request["kill_after_s"])
+            os.kill(pid, signal.SIGKILL)
+        _, status = os.waitpid(pid, 0)
+        output.seek(0)
+        return {"code": os.waitstatus_to_exitcode(status), "printed": output.read()}
+
+
+if __name__ == "__main__":
+    print("ready", flush=True)
+    for line in sys.stdin:
+        print(json.dumps(answer(json.loads(line))), flush=True)

@@ -1,0 +1,147 @@
+"""A run that is killed at any instant goes on, and ends as one that never was."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from random import Random
+
+import pytest
+
+pytest.importorskip("pybullet", reason="training drives the simulated street")
+
+from flowrep.agent import load_checkpoint
+from flowrep.config_tree import group_choices
+from flowrep.experiment.run_folder import RunFolder
+from tests.experiment.test_training import differing
+from tests.test_configs import composed
+
+KILLS = 13  # of each of four algorithms
+STAGES = ("write", "half", "flush", "rename", "renamed")
+SMALL = [
+    "debug=smoke", "num_envs=1", "algorithm.precision=fp32", "algorithm.hidden_size=16",
+    "total_frames=48", "checkpoint_every_frames=8", "log_every_frames=4", "device=cpu",
+    "evaluation.every_frames=0", "evaluation.final_episodes=1", "evaluation.speeds=[high]",
+    "evaluation.baselines=[]", "evaluation.video=false", "scene.time_limit_steps=30",
+]  # fmt: skip
+
+
+def new_run(path, algorithm="dsac"):
+    """A run folder in which nothing was done yet."""
+    often = "rollout_length=16" if algorithm == "ppo" else "frames_per_update=4"
+    config = composed(*SMALL, f"algorithm={algorithm}", f"algorithm.{often}")
+    run = RunFolder(path)
+    run.write_config(config)
+    return run
+
+
+@pytest.fixture(scope="module")
+def carry_on():
+    """Continues a run in a process of its own; see forked_train."""
+    command = [sys.executable, "-m", "tests.experiment.forked_train"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as server:
+        assert server.stdout.readline() == "ready\n"
+
+        def ask(run, **how):
+            server.stdin.write(json.dumps({"run": str(run.path)} | how) + "\n")
+            server.stdin.flush()
+            return json.loads(server.stdout.readline())
+
+        yield ask
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def without_clock(rows):
+    return [
+        {k: v for k, v in row.items() if k not in ("frames_per_second", "share_outside_updates")}
+        for row in rows
+    ]
+
+
+@pytest.mark.parametrize("algorithm", group_choices("algorithm"))
+def test_a_run_killed_again_and_again_ends_bit_for_bit_as_one_that_was_not(
+    tmp_path, carry_on, algorithm
+):
+    whole = new_run(tmp_path / "whole", algorithm)
+    start = time.monotonic()
+    assert carry_on(whole)["code"] == 0
+    duration = time.monotonic() - start
+    expected = load_checkpoint(whole.checkpoint_path)
+    random, kills = Random(algorithm), 0
+    while kills < KILLS:
+        run, frames, code = new_run(tmp_path / f"after {kills}", algorithm), 0, None
+        while code != 0:
+            how = {}
+            if kills < KILLS and kills % 2:
+                how = {"kill_at": [STAGES[kills // 2 % len(STAGES)], random.randint(1, 3)]}
+            elif kills < KILLS:
+                how = {"kill_after_s": random.uniform(0, duration)}
+            reply = carry_on(run, **how)
+            code = reply["code"]
+            assert code in (0, -signal.SIGKILL), reply["printed"]
+            kills += code != 0
+            if run.checkpoint_path.exists():
+                reached = load_checkpoint(run.checkpoint_path)["frames"]
+                assert reached >= frames
+                frames = reached
+        assert differing(expected, load_checkpoint(run.checkpoint_path)) == []
+        rows = rows_of(run.metrics_path)
+        assert without_clock(rows) == without_clock(rows_of(whole.metrics_path))
+        assert [int(row["frames"]) for row in rows] == list(range(4, 49, 4))
+        assert rows_of(run.evaluation_path) == rows_of(whole.evaluation_path)
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [({"largest_file": 200_000}, "File too large"), ({"read_only": True}, "Read-only file system")],
+    ids=["disk full", "read-only"],
+)
+def test_what_cannot_be_written_ends_in_one_line_and_leaves_the_last_checkpoint(
+    tmp_path, carry_on, how, reason
+):
+    run = new_run(tmp_path)
+    assert carry_on(run, kill_at=["flush", 4])["code"] == -signal.SIGKILL
+    before = load_checkpoint(run.checkpoint_path)
+    reply = carry_on(run, **how)
+    assert reply["code"] == 2
+    (line,) = [line for line in reply["printed"].splitlines() if "error" in line.lower()]
+    assert line.startswith("error: after ")
+    assert reason in line
+    assert "Free some space or make the folder writable" in line
+    assert "Traceback" not in reply["printed"]
+    assert differing(before, load_checkpoint(run.checkpoint_path)) == []
+    assert carry_on(run)["code"] == 0
+
+
+def test_the_command_itself_is_killed_and_resumed(tmp_path):
+    """As a person or a scheduler does it: twice, the second time while it writes a checkpoint."""
+    run = tmp_path / "run"
+    latest = run / "checkpoint" / "latest.safetensors"
+    start = [*SMALL, "total_frames=240", f"hydra.run.dir={run}"]
+    for arguments, seen in (
+        (start, latest),
+        ([f"resume={run}"], latest.with_name(".latest.safetensors.partial")),
+    ):
+        command = [sys.executable, "-m", "flowrep.train", *arguments]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 120
+        while not seen.exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.002)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        assert 0 < load_checkpoint(latest)["frames"] < 240
+    command = [sys.executable, "-m", "flowrep.train", f"resume={run}"]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert load_checkpoint(latest)["frames"] == 240
+    assert [int(row["frames"]) for row in rows_of(run / "metrics.csv")] == list(range(4, 241, 4))
