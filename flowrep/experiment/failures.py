@@ -66,7 +66,9 @@ def print_failures(rows: Sequence[Mapping[str, Any]], console: Console | None = 
     lines = failure_causes(rows)
     causes = [c for c in CAUSES if c != UNRECORDED or any(line[c] for line in lines)]
     for cause in causes:
-        table.add_column(cause, justify="right", no_wrap=True)
+        # In two lines, so that all fit into 100 columns.
+        heading = cause.replace(": ", ":\n").replace("of ", "of\n")
+        table.add_column(heading, justify="right", no_wrap=True)
     for line in lines:
         shares = ["" if line[cause] == "" else f"{line[cause]:.0f}" for cause in causes]
         failed = f"{line['failures']} of {line['episodes']}"

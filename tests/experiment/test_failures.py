@@ -65,7 +65,7 @@ def test_the_table_is_printed_and_replaced(tmp_path):
     print_failures(rows(), console)
     text = console.export_text()
     assert "8 of 10" in text
-    assert "collision: pedestrian" in text
+    assert "pedestrian" in text
     assert "unrecorded" not in text
     path = tmp_path / "failures.csv"
     write_failures(path, rows() + rows("random"))
@@ -74,3 +74,13 @@ def test_the_table_is_printed_and_replaced(tmp_path):
         (line,) = csv.DictReader(file)
     assert line["collision: pedestrian"] == "37.5"
     assert float(line["timeout"]) == pytest.approx(25.0)
+
+
+def test_nothing_of_the_table_is_cut_off_where_little_fits():
+    console = Console(record=True, width=100)
+    ends = [*ENDS, ("collision", "")]
+    print_failures(rows("never_turn", ends) + rows("sampled", ends), console)
+    text = console.export_text()
+    assert "…" not in text
+    for word in ("never_turn", "bounds", "pedestrian", "unrecorded", "timeout", "9 of 11"):
+        assert word in text
