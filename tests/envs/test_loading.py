@@ -196,7 +196,7 @@ def refuse(data, **changes):
         ({"camera__far_m": 0.1}, "camera.far_m: is not beyond near_m; give a larger far_m"),
         (
             {"pedestrian_groups__0__count": 300},
-            "pedestrian_groups: 302 people, each of 3 parts with",
+            "pedestrian_groups: 302 people, but their 3 parts",
         ),
         (
             {"pedestrian_groups__0__standing": 4},
