@@ -25,6 +25,7 @@ from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.training import Training, train
+from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
 
 EVALUATION_SEED = 1_000_000  # first of the evaluated episodes; training takes those below
 
@@ -44,6 +45,7 @@ def carry_out(config: Config, folder: RunFolder) -> None:
     """Does what is left to do of a run: training, evaluation, video."""
     try:
         training = build(config, folder)
+        folder.log_to_wandb(config.get("wandb", "off"), config)
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
     print(f"run folder: {folder.path}")
@@ -107,6 +109,8 @@ def check(config: Config) -> None:
             f"seed should be a whole number below {EVALUATION_SEED // num_envs}, not {seed!r}: "
             "from there on its episodes are those of evaluations"
         )
+    if config["wandb"] not in WANDB_MODES:
+        raise UsageError(f"wandb should be {' or '.join(WANDB_MODES)}, not {config['wandb']!r}")
     if not config["representations"]:
         raise UsageError("representations is empty; name one at least, e.g. representations=[ego]")
     evaluation = config["evaluation"]

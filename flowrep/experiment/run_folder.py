@@ -8,6 +8,7 @@ import yaml
 from torchrl.record.loggers import TensorboardLogger
 
 from flowrep.experiment.tables import add_columns, append_rows, is_whole, read_rows, write_rows
+from flowrep.experiment.weights_and_biases import open_wandb
 
 EVALUATION_COLUMNS = (
     "scene",
@@ -31,7 +32,7 @@ class RunFolder:
 
     ```
     config.yaml              the resolved config, enough to resume or evaluate
-    metrics.csv              a row for each logged step; tensorboard/ holds the same
+    metrics.csv              a row for each logged step; tensorboard/ and wandb/ hold the same
     checkpoint/              what a resumed run continues from
     evaluation.csv           a row for each evaluated episode
     failures.csv             why episodes failed, by policy and speed
@@ -43,7 +44,7 @@ class RunFolder:
         """Creates the folder where it is missing."""
         self.path = Path(path)
         self.path.mkdir(parents=True, exist_ok=True)
-        self._tensorboard: Any = None
+        self._loggers: list[Any] = []
 
     @classmethod
     def existing(cls, path: str | Path) -> "RunFolder":
@@ -96,12 +97,21 @@ class RunFolder:
         return yaml.safe_load((self.path / "config.yaml").read_text(encoding="utf-8"))
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
-        """Appends one row to metrics.csv and the same values to TensorBoard."""
+        """Appends one row to metrics.csv and gives the same values to TensorBoard and wandb."""
         append_rows(self.metrics_path, [{"frames": frames, **metrics}])
-        if self._tensorboard is None:
-            self._tensorboard = TensorboardLogger("tensorboard", str(self.path))
-        for name, value in metrics.items():
-            self._tensorboard.log_scalar(name, value, frames)
+        if not any(isinstance(logger, TensorboardLogger) for logger in self._loggers):
+            self._loggers.append(TensorboardLogger("tensorboard", str(self.path)))
+        for logger in self._loggers:
+            logger.log_metrics(dict(metrics), frames)
+
+    def log_to_wandb(self, mode: str, config: Mapping[str, Any]) -> None:
+        """Gives what is logged from now on to Weights & Biases as well, unless `mode` is "off".
+
+        Raises:
+            ImportError: wandb is not installed.
+        """
+        if mode != "off":
+            self._loggers.append(open_wandb(self.path, mode, config))
 
     def forget_after(self, frames: int) -> None:
         """Drops what was logged after `frames`: a resumed run writes those rows again."""
