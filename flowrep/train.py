@@ -17,6 +17,7 @@ from flowrep.agent import CheckpointError, DivergenceError, keep_freed_memory
 from flowrep.build import Config, build_agent, build_env
 from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
+from flowrep.envs import SceneError, load_scene
 from flowrep.envs.baselines import BASELINES
 from flowrep.experiment.comparison import compare, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
@@ -35,8 +36,9 @@ def run(config: DictConfig) -> None:
     """Trains, evaluates and films one agent, or continues a run with `resume=`."""
     try:
         folder, plain = open_run(config)
+        load_scene(plain["scene"])
         check(plain)
-    except (UsageError, OSError) as error:
+    except (UsageError, SceneError, OSError) as error:
         exit_with(str(error))
     carry_out(plain, folder)
 

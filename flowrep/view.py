@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 from flowrep.cockpit import Cockpit, NoScreenError, drive_by_hand
 from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import BASELINES, SceneError, StreetEnv
+from flowrep.envs import BASELINES, SceneError, StreetEnv, load_scene
 from flowrep.envs.layout import Layout
 from flowrep.envs.sensing import SENSORS
 from flowrep.experiment.recording import Maps, maps_of
@@ -56,12 +56,14 @@ def check(config: DictConfig) -> None:
 
     Raises:
         UsageError: naming the key, what came and what exists.
+        SceneError: the scene itself can't be.
     """
-    paths = [path.name for path in config.scene.paths]
+    plain: Any = OmegaConf.to_container(config.scene, resolve=True)
+    scene = load_scene(plain)
     for key, known in (
         ("driver", list(BASELINES)),
-        ("speed", list(config.scene.pedestrian_speed_mps)),
-        ("path", [*paths, None]),
+        ("speed", list(scene.pedestrian_speed_mps)),
+        ("path", [*(path.name for path in scene.paths), None]),
     ):
         if config[key] not in known:
             there = ", ".join(str(name) for name in known if name is not None)
@@ -74,7 +76,8 @@ def check(config: DictConfig) -> None:
         if not isinstance(config[key], bool):
             raise UsageError(f"{key} should be true or false, not {config[key]!r}")
     rate = config.frame_rate_hz
-    if rate is not None and (not isinstance(rate, int | float) or not rate > 0):
+    is_number = isinstance(rate, int | float) and not isinstance(rate, bool)
+    if rate is not None and not (is_number and rate > 0):
         raise UsageError(f"frame_rate_hz should be a positive number or null, not {rate!r}")
 
 

@@ -82,3 +82,15 @@ def test_the_commands_end_with_one_line_and_code_2(arguments, says, tmp_path):
     assert result.stderr.startswith("error: ")
     assert says in result.stderr
     assert not (tmp_path / "nowhere").exists()
+
+
+@pytest.mark.parametrize("command", ["train", "view"])
+def test_a_scene_of_ones_own_that_cannot_be_ends_in_one_line(command, tmp_path):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "half.yaml").write_text("name: half\nframe_rate_hz: 12.0\n")
+    arguments = ["--config-dir", str(tmp_path), "scene=half", f"hydra.run.dir={tmp_path / 'run'}"]
+    command = [sys.executable, "-m", f"flowrep.{command}", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2
+    expected = "scene 'half': time_limit_steps: missing key; add it, a whole number"
+    assert done.stderr == f"error: {expected}\n"
