@@ -69,9 +69,9 @@ def test_nothing_that_stands_is_cut_off(layout):
 def test_every_zone_of_a_path_is_named_where_it_is(layout):
     (axes,) = draw_plan(layout).axes
     named = {text.get_text(): text.xy for text in axes.texts if text.get_text()}
-    assert set(named) == {"south", "west", "east"}
+    assert set(named) == {"entry", "left end", "right end"}
     # The start lies about the first road's 7th metre, which runs along x from the origin.
-    assert named["south"] == pytest.approx((7.0, 0.0))
+    assert named["entry"] == pytest.approx((7.0, 0.0))
     for name, place in named.items():
         assert layout.zones[name].contains(Point(place))
 
