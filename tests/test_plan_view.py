@@ -73,7 +73,7 @@ def test_every_zone_of_a_path_is_named_where_it_is(layout):
     # The start lies about the first road's 7th metre, which runs along x from the origin.
     assert named["entry"] == pytest.approx((7.0, 0.0))
     for name, place in named.items():
-        assert layout.zones[name].contains(Point(place))
+        assert layout.zones[name.replace(" ", "_")].contains(Point(place))
 
 
 def test_where_a_place_is_start_and_end_both_names_can_be_read():
