@@ -10,7 +10,7 @@ from shapely.geometry import LineString, Point, Polygon
 
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs.layout import Layout, centrelines
-from flowrep.envs.people import PARTS
+from flowrep.envs.people import PARTS, RADIUS_M
 from flowrep.envs.scene import CATEGORY_OF_KIND, Piece, Scene
 from flowrep.envs.scene import Path as ScenePath
 from flowrep.envs.schema import SceneError, build
@@ -236,6 +236,6 @@ def _check_walks(layout: Layout, source: str) -> None:
         key = f"pedestrian_groups.{group.name}.walk"
         line = LineString(layout.walk_line(group.walk))
         for box in solid:
-            if box.footprint.intersects(line):
+            if box.footprint.distance(line) < RADIUS_M:
                 problem = f"goes through a {box.category} at ({box.x_m:.1f}, {box.y_m:.1f})"
                 raise SceneError(source, key, problem, "move the walk or that box")

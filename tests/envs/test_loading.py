@@ -248,6 +248,10 @@ def refuse(data, **changes):
             {"paths__0__closures": ["left_arm"]},
             "paths.left: no free road leads from 'south' to 'west'; join the roads or open",
         ),
+        (  # 0.2 m beside the walk: a person is 0.3 m to either side
+            {"obstacles__0__center_m": [22.8, 2.0], "obstacles__0__yaw_deg": 0.0},
+            "pedestrian_groups.across.walk: goes through a car at (22.8, 2.0)",
+        ),
         ({"obstacles__0__kind": "lorry"}, "obstacles[0].kind: unknown value 'lorry'; choose one"),
         ({"obstacles__0__size_m": [4, 0, 1]}, "obstacles[0].size_m: is 0.0; give a number above"),
         ({"terrain_m": 9.0}, "terrain_m: unknown name 'terrain'; choose from ['sky', "),
