@@ -125,6 +125,10 @@ def test_rows_leave_out_what_would_stand_in_the_way(data):
     # At 2, 12, 22, 32, ...: the stem's 40 m and the arms that begin at 35 m leave the first four.
     np.testing.assert_allclose([box.x_m for box in layout.obstacles], [2, 12, 22, 32])
     assert {(box.kind, box.category, box.y_m) for box in layout.obstacles} == {("car", "car", 4.0)}
+    # On the left of a road along x cars are parked against it, on the right along it.
+    assert {box.yaw_rad for box in layout.obstacles} == {math.pi}
+    right = Layout(load_scene(data | {"obstacle_rows": [row | {"offset_m": -4.0}]}))
+    assert {box.yaw_rad for box in right.obstacles if box.y_m == -4.0} == {0.0}
 
 
 def test_houses_keep_clear_of_roads_and_of_one_another():

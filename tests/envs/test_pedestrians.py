@@ -86,6 +86,8 @@ def test_legs_swing_with_the_distance_walked(crowd):
     assert swing(0.35, 0) == pytest.approx(0.38)
     assert swing(1.05, 0) == pytest.approx(-0.38)
     assert swing(1.4 * 7 + 0.35, 0) == pytest.approx(0.38)  # 10.15 m: on, past the about-turn
+    # Back at the start after 20 m the stride goes on: 0.75 m into the 15th one.
+    assert swing(20.35, 0) == pytest.approx(0.38 * math.sin(2 * math.pi * 0.75 / 1.4))
     # B is 2.4 rad ahead of A and twice as fast; C stands with one foot before the other.
     assert swing(0.35, 1) == pytest.approx(0.38 * math.sin(math.pi + 2.4))
     assert swing(3.21, 2) == swing(0.0, 2) == pytest.approx(0.38)

@@ -116,3 +116,15 @@ def test_the_planner_arrives_and_habit_and_chance_do_not(make_street, name, spee
     assert straight.count("success") == 0
     by_chance = [drive.outcome for drive in drives(env, RandomDriver(0), 20, seed=0)]
     assert by_chance.count("success") == 0
+
+
+def test_lane_marks_stop_where_crosswalks_and_other_roads_are(make_street):
+    env = make_street("h_shaped_pathways", sensors=())
+    layout = Layout(env.scene)
+    striped = shapely.union_all([area.polygon for area in layout.crosswalks])
+    marks = env._street._lane_marks(layout, "bar", striped)
+    points = shapely.points(np.array(marks.vertices)[:, :2])
+    # 70 m of bar less half a leg at either end and the crosswalk: ten dashes, six metres apart.
+    assert len(points) > 30
+    assert not shapely.intersects(points, striped).any()
+    assert not shapely.intersects(points, layout.ribbons["west"]).any()

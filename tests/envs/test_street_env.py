@@ -11,6 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from flowrep.envs.scene import Obstacle
+from flowrep.palette import CATEGORY_ID
 
 NO_OP, LEFT, RIGHT = 0, 1, 2
 
@@ -263,3 +264,21 @@ def test_motion_between_two_steps_is_the_one_driven(make_street, empty_road):
         assert observation["instance_motion"].shape == (1, 4, 4)
     for before, now in pairwise(observations):
         np.testing.assert_allclose(before["prev_from_curr"], now["prev_from_curr"], atol=1e-6)
+
+
+def test_nobody_is_left_standing_where_they_no_longer_are(make_street, one_stands):
+    env = make_street(one_stands, sensors=("semantic",))
+    env.reset(seed=0)
+    street, viewer = env._street, env.episode.now.vehicle
+    ahead, behind = np.array([[4.0, 0.0, 0.0, 0.0]]), np.array([[-4.0, 0.0, 0.0, 0.0]])
+
+    def people_seen(poses):
+        street.place_pedestrians(poses, viewer)
+        body = env.sensing.look(env.episode).body
+        return int((street.simulator.class_lookup()[body] == CATEGORY_ID["pedestrian"]).sum())
+
+    # Whoever goes from before the vehicle to behind it is out of sight, and back in it on return.
+    seen = people_seen(ahead)
+    assert seen > 20
+    assert people_seen(behind) == 0
+    assert people_seen(ahead) == seen
