@@ -169,7 +169,7 @@ class Crosswalk:
 class Scene:
     """A whole environment as data; `load_scene` reads and checks one.
 
-    `terrain_m` is how far grass reaches beyond roads and sidewalks; 0 for none. `corner_radius_m`
+    Grass lies between the roads and `terrain_m` beyond their bounds; 0 for none. `corner_radius_m`
     rounds the kerb where roads meet.
     """
 
