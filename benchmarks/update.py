@@ -12,7 +12,7 @@ busy with more, `--busy` runs on one thread and counts its processor time, not t
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict
@@ -43,17 +43,34 @@ def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
     return TensorDict({**maps(), "action": action, "next": following}, [batch], device=device)
 
 
-def flowrep_update(steps: TensorDict, encoder: str, precision: str) -> Callable[[], object]:
+def agent_for(
+    spec: Composite, actions: Categorical, keys: Sequence[str], **changes: object
+) -> DiscreteSAC:
+    """Discrete SAC with the paper's hyperparameters."""
+    options = {
+        "total_frames": 10**9, "device": "cpu", "encoder": "shared", "precision": "auto",
+        "learning_rate": 3e-4, "initial_alpha": 0.5, "target_entropy_weight": 0.2, "gamma": 0.99,
+        "tau": 0.005, "hidden_size": 512, "batch_size": 1024, "replay_capacity": 10_240,
+        "frames_per_update": 10, "learning_starts": None,
+    }  # fmt: skip
+    return DiscreteSAC(spec, actions, list(keys), **(options | changes))
+
+
+def flowrep_agent(steps: TensorDict, encoder: str, precision: str) -> DiscreteSAC:
+    """An agent that has seen these steps, and learns from all of them at once."""
     side, batch = steps["ego"].shape[-1], len(steps)
     spec = Composite({name: Unbounded((CHANNELS, side, side)) for name in MAPS})
-    agent = DiscreteSAC(
-        spec, Categorical(ACTIONS), list(MAPS), total_frames=10**9, device=steps.device,
-        encoder=encoder, precision=precision, learning_rate=3e-4, initial_alpha=0.5,
-        target_entropy_weight=0.2, gamma=0.99, tau=0.005, hidden_size=512, batch_size=batch,
-        replay_capacity=2 * batch, frames_per_update=10, learning_starts=None,
+    agent = agent_for(
+        spec, Categorical(ACTIONS), MAPS, device=steps.device, encoder=encoder,
+        precision=precision, batch_size=batch, replay_capacity=2 * batch,
     )  # fmt: skip
     agent.memory.extend(steps)
-    sample = agent.memory.sample()
+    return agent
+
+
+def flowrep_update(steps: TensorDict, encoder: str, precision: str) -> Callable[[], object]:
+    agent = flowrep_agent(steps, encoder, precision)
+    sample = agent.sample()
     return lambda: agent.update(sample)
 
 
