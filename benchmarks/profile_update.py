@@ -84,9 +84,7 @@ class OperationTimer(TorchDispatchMode):
         dtypes = [x.dtype for x in tensors if x.dtype in self.rates] or [torch.float32]
         cost.operations += operations
         cost.bytes += moved
-        cost.floor_seconds += max(
-            operations / self.rates[dtypes[0]], moved / self.bytes_per_second
-        )
+        cost.floor_seconds += max(operations / self.rates[dtypes[0]], moved / self.bytes_per_second)
         return out
 
 
