@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 from flowrep.agent import Algorithm
 from flowrep.command_line import UsageError
 from flowrep.envs import make_env
+from flowrep.envs.workers import available_cores
 
 Config = Mapping[str, Any]
 
@@ -29,17 +30,38 @@ def choose_device(name: str) -> torch.device:
         raise UsageError(f"device '{name}' can't be used: {reason}. Try device=cpu") from None
 
 
+def choose_workers(num_workers: Any, num_envs: int) -> int:
+    """Returns how many processes drive `num_envs` streets, for "auto" one a core if there are two.
+
+    Raises:
+        UsageError: it is no such number.
+    """
+    if num_workers == "auto":
+        cores = available_cores()
+        return min(cores, num_envs) if cores > 1 and num_envs > 1 else 0
+    if not isinstance(num_workers, int) or not 0 <= num_workers <= num_envs:
+        raise UsageError(
+            f"num_workers should be auto or a whole number up to num_envs={num_envs}, 0 for none, "
+            f"not {num_workers!r}"
+        )
+    return num_workers
+
+
 def build_env(config: Config, **changes: Any) -> EnvBase:
     """Returns the env that the config describes; `changes` go to `make_env` in its place."""
+    num_envs: int = changes.get("num_envs") or config["num_envs"]
+    # runs of before there were workers say nothing of them
+    num_workers = changes.get("num_workers", config.get("num_workers", "auto"))
     arguments = {
         "scene": config["scene"],
         "representations": config["representations"],
         "flow": config.get("flow", "exact"),  # runs of before there was a choice have none
-        "num_envs": config["num_envs"],
+        "num_envs": num_envs,
         "device": choose_device(config["device"]),
         "speed": config["speed"],
     }
-    return make_env(**(arguments | changes))
+    workers = {"num_workers": choose_workers(num_workers, num_envs)}
+    return make_env(**(arguments | changes | workers))
 
 
 def build_agent(config: Config, env: EnvBase) -> Algorithm:

@@ -12,7 +12,7 @@ except ImportError:
 from omegaconf import DictConfig, ListConfig
 
 from flowrep.agent import Algorithm, CheckpointError, load_checkpoint
-from flowrep.build import Config, build_agent, build_env
+from flowrep.build import Config, build_agent, build_env, choose_workers
 from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs.baselines import BASELINES
@@ -30,7 +30,9 @@ def run(config: DictConfig) -> None:
     """Runs episodes of a saved agent and of baselines, prints a table and keeps the rows."""
     try:
         folder = RunFolder.existing(config.run)
-        trained = folder.read_config() | {"device": config.device, "num_envs": config.num_envs}
+        here = {key: config[key] for key in ("device", "num_envs", "num_workers")}
+        trained = folder.read_config() | here
+        choose_workers(config.num_workers, config.num_envs)
         speeds, rates, policies, baselines = check(config, trained)
         agent, frames = load_agent(trained, folder)
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
@@ -93,7 +95,7 @@ def as_list(value: Any) -> list[Any]:
 def load_agent(trained: Config, folder: RunFolder) -> tuple[Algorithm, int]:
     """Returns the run's agent and the number of frames that it was trained for."""
     state = load_checkpoint(folder.checkpoint_path)
-    env = build_env(trained, num_envs=1)
+    env = build_env(trained, num_envs=1, num_workers=0)
     agent = build_agent(trained, env)
     env.close()
     agent.load_state_dict(state["agent"])

@@ -14,10 +14,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from flowrep.agent import CheckpointError, DivergenceError, keep_freed_memory
-from flowrep.build import Config, build_agent, build_env
+from flowrep.build import Config, build_agent, build_env, choose_workers
 from flowrep.command_line import UsageError, exit_with, run_command
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import SceneError, load_scene
+from flowrep.envs import SceneError, WorkerError, load_scene
 from flowrep.envs.baselines import BASELINES
 from flowrep.experiment.comparison import compare, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
@@ -28,6 +28,7 @@ from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.training import Training, train
 from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
 
+OF_THE_MACHINE = ("device", "num_workers")  # what a resumed run takes from its new command line
 EVALUATION_SEED = 1_000_000  # first of the evaluated episodes; training takes those below
 
 
@@ -63,6 +64,10 @@ def carry_out(config: Config, folder: RunFolder) -> None:
                 final_evaluation(training, config, stop)
         except (CheckpointError, DivergenceError) as error:
             exit_with(f"after {training.frames} frames: {error}")
+        except WorkerError as error:
+            exit_with(
+                f"after {training.frames} frames: {error}\nContinue with resume={folder.path}"
+            )
         except OSError as error:
             exit_with(
                 f"after {training.frames} frames: {error}. Free some space or make the folder "
@@ -85,15 +90,18 @@ def open_run(config: DictConfig) -> tuple[RunFolder, dict[str, Any]]:
         folder.write_config(plain)
         return folder, plain
     others = [
-        o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "device="))
+        o
+        for o in HydraConfig.get().overrides.task
+        if not o.startswith(("resume=", *(f"{key}=" for key in OF_THE_MACHINE)))
     ]
     if others:
         raise UsageError(
             f"resume= continues a run with its own config, so '{others[0]}' would be ignored; "
-            "leave it out (device= may be changed)"
+            "leave it out (device= and num_workers= may be changed)"
         )
     folder = RunFolder.existing(config.resume)
-    return folder, folder.read_config() | {"device": plain["device"], "resume": str(config.resume)}
+    here = {key: plain[key] for key in OF_THE_MACHINE}
+    return folder, folder.read_config() | here | {"resume": str(config.resume)}
 
 
 def check(config: Config) -> None:
@@ -106,6 +114,7 @@ def check(config: Config) -> None:
         if not isinstance(config[key], int) or config[key] < 1:
             raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
     seed, num_envs = config["seed"], config["num_envs"]
+    choose_workers(config["num_workers"], num_envs)
     if not isinstance(seed, int) or not 0 <= seed < EVALUATION_SEED // num_envs:
         raise UsageError(
             f"seed should be a whole number below {EVALUATION_SEED // num_envs}, not {seed!r}: "

@@ -68,7 +68,8 @@ def test_evaluate_adds_rows_for_what_was_asked(smoke_run):
     run, _ = smoke_run
     command = [
         sys.executable, "-m", "flowrep.evaluate", f"run={run}", "speed=high", "fps=[6,12]",
-        "episodes=2", "num_envs=2", "policy=sampled", "baselines=[never_turn]", "seed=77",
+        "episodes=2", "num_envs=2", "num_workers=2", "policy=sampled", "baselines=[never_turn]",
+        "seed=77",
     ]  # fmt: skip
     before = rows_of(run / "evaluation.csv")
     result = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, cwd=run)
@@ -85,15 +86,21 @@ def test_evaluate_adds_rows_for_what_was_asked(smoke_run):
 def test_an_interrupted_run_saves_and_says_how_to_go_on(number, code, tmp_path):
     command = [
         sys.executable, "-m", "flowrep.train", "debug=smoke", "total_frames=1000000",
-        "log_every_frames=16", "checkpoint_every_frames=1000000", f"hydra.run.dir={tmp_path}/run",
+        "log_every_frames=16", "checkpoint_every_frames=1000000", "num_workers=2",
+        f"hydra.run.dir={tmp_path}/run",
     ]  # fmt: skip
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=ENVIRONMENT
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=ENVIRONMENT,
+        start_new_session=True,
     )
     deadline = time.monotonic() + 120
     while not (tmp_path / "run" / "metrics.csv").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
-    process.send_signal(number)
+    os.killpg(process.pid, number)  # as terminals and schedulers do, the workers too
     printed, _ = process.communicate(timeout=120)
     assert process.returncode == code
     assert f"python -m flowrep.train resume={tmp_path}/run" in printed

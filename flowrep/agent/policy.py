@@ -63,9 +63,15 @@ class PolicyNetwork(nn.Module):
 
 
 def stochastic_policy(
-    network: nn.Module, in_keys: Sequence[NestedKey], actions: DiscreteActions
+    network: nn.Module,
+    in_keys: Sequence[NestedKey],
+    actions: DiscreteActions,
+    *,
+    writes_log_prob: bool = False,
 ) -> ProbabilisticTensorDictSequential:
     """Returns a module that writes `action`, drawn from the softmax of the network's logits.
+
+    With `writes_log_prob` it writes the action's `action_log_prob` too.
 
     It draws at random unless TorchRL's `set_exploration_type(ExplorationType.DETERMINISTIC)` is in
     force, under which it takes the likeliest action.
@@ -76,6 +82,9 @@ def stochastic_policy(
         distribution_class=actions.distribution,
         distribution_kwargs={"validate_args": False},
         default_interaction_type=InteractionType.RANDOM,
+        return_log_prob=writes_log_prob,
+        log_prob_key="action_log_prob",
     )
     logits = TensorDictModule(network, in_keys=list(in_keys), out_keys=["logits"])
-    return ProbabilisticTensorDictSequential(logits, draw).select_out_keys("action")
+    written = ["action", "action_log_prob"] if writes_log_prob else ["action"]
+    return ProbabilisticTensorDictSequential(logits, draw).select_out_keys(*written)

@@ -27,8 +27,8 @@ class PPO(Algorithm):
 
     After every `rollout_length` steps of each environment, `epochs` passes are made over those
     steps in shuffled batches, with advantages Â (generalised, then normalised over the batch) and
-    value targets R of the weights that acted. One gradient step minimises, over a batch and with
-    ρ = π(a|s) / π_acted(a|s),
+    value targets R of the weights at the round's beginning. One gradient step minimises, over a
+    batch and with ρ = π(a|s) / π_acted(a|s), where π_acted(a|s) was noted when a was drawn,
 
         L_π = -mean min(ρ Â, clip(ρ, 1 - clip, 1 + clip) Â)
         L_V = value_weight · mean (V(s) - R)²
@@ -99,7 +99,10 @@ class PPO(Algorithm):
             actor = Head(self.encoder.embedding_size, hidden_size, actions.count)
             critic = Head(self.encoder.embedding_size, hidden_size, 1)
         self.policy = stochastic_policy(
-            PolicyNetwork(self.codecs, self.encoder, actor), list(keys), actions
+            PolicyNetwork(self.codecs, self.encoder, actor),
+            list(keys),
+            actions,
+            writes_log_prob=True,
         )
         self._actor = stochastic_policy(actor, ["embedding"], actions)
         self._critic = TensorDictModule(critic, ["embedding"], ["state_value"])
@@ -113,7 +116,7 @@ class PPO(Algorithm):
             loss_critic_type="l2",
             normalize_advantage=True,
         )
-        self.memory = Rollout(self.codecs, device)
+        self.memory = Rollout(self.codecs, device, beside=["action_log_prob"])
         self._round: TensorDictBase = TensorDict()  # the steps that are being learnt from, [n]
         self._batches: list[Tensor] = []  # rows of it, those to come
         super().__init__(
@@ -144,27 +147,21 @@ class PPO(Algorithm):
 
     @torch.no_grad()
     def _with_advantages(self, steps: TensorDictBase) -> TensorDictBase:
-        """Returns steps `[N, T]` with `advantage`, `value_target` and `action_log_prob`."""
+        """Returns steps `[N, T]` with `advantage` and `value_target`."""
         judged = [self._judge(part) for part in steps.reshape(-1).split(self.batch_size)]
         steps = steps.update(torch.cat(judged).reshape(steps.shape))
         return self._advantage(steps)
 
     def _judge(self, steps: TensorDictBase) -> TensorDictBase:
-        """Returns what the present weights say of steps: action's log-probability and V, V'."""
-        embedded = TensorDict(
-            {
-                "action": steps["action"],
-                "embedding": self.encoder(decode_maps(self.codecs, steps)),
-                "next": {"embedding": self.encoder(decode_maps(self.codecs, steps["next"]))},
-            },
-            steps.batch_size,
-        )
-        log_prob = self._actor.get_dist(embedded).log_prob(steps["action"])
-        value = self._critic(embedded)["state_value"]
-        next_value = self._critic(embedded["next"])["state_value"]
-        judged = steps.empty().update({"action_log_prob": log_prob, "state_value": value})
-        judged["next"] = steps["next"].empty().update({"state_value": next_value})
+        """Returns what the present weights expect of steps: V and V'."""
+        judged = steps.empty().update({"state_value": self._worth(steps)})
+        judged["next"] = steps["next"].empty().update({"state_value": self._worth(steps["next"])})
         return judged
+
+    def _worth(self, maps: TensorDictBase) -> Tensor:
+        """Returns V `[n, 1]` of packed maps."""
+        embedding = self.encoder(decode_maps(self.codecs, maps))
+        return self._critic(TensorDict({"embedding": embedding}, maps.batch_size))["state_value"]
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Returns the three losses, with gradients, and what they were computed from, without."""

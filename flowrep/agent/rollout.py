@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 
 from flowrep.agent.observation import MapCodec, store_maps
 from flowrep.agent.replay import time_first
@@ -18,10 +18,17 @@ class Rollout:
     Args:
         codecs: the maps to keep; see `flowrep.agent.observation`.
         device: where they are kept.
+        beside: what else of each step is kept, beside maps, `action` and what the action brought.
     """
 
-    def __init__(self, codecs: Sequence[MapCodec], device: torch.device | str) -> None:
+    def __init__(
+        self,
+        codecs: Sequence[MapCodec],
+        device: torch.device | str,
+        beside: Sequence[NestedKey] = (),
+    ) -> None:
         self.codecs, self.device = tuple(codecs), torch.device(device)
+        self._keys = ("action", *beside)
         self._steps: list[TensorDictBase] = []
 
     def __len__(self) -> int:
@@ -32,11 +39,12 @@ class Rollout:
         """Stores steps of N environments: `[N]`, `[N, T]`, or as a TorchRL collector returns them.
 
         Args:
-            frames: with the maps, `action` and, under `next`, the maps, `reward`, `done` and
-                `terminated`. A dim named `time` is taken as such; without one, a single dim is N.
+            frames: with the maps, `action`, what is kept `beside` and, under `next`, the maps,
+                `reward`, `done` and `terminated`. A dim named `time` is taken as such; without
+                one, a single dim is N.
         """
         for step in time_first(frames).unbind(0):
-            kept = store_maps(self.codecs, step).update({"action": step["action"]})
+            kept = store_maps(self.codecs, step).update(step.select(*self._keys).detach())
             outcome = step["next"].select("reward", "done", "terminated")
             kept["next"] = store_maps(self.codecs, step["next"]).update(outcome)
             self._steps.append(kept.to(self.device))

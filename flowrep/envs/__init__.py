@@ -3,13 +3,14 @@
 from flowrep.envs import availability as availability  # before all that it speaks of
 from flowrep.envs.baselines import BASELINES, Drive, RandomDriver, drives, never_turn
 from flowrep.envs.loading import load_scene, scene_names
-from flowrep.envs.make import get_states, make_env, set_states, streets
+from flowrep.envs.make import begin_step, get_states, make_env, set_states, streets
 from flowrep.envs.outcome import Outcome
 from flowrep.envs.planner import Planner
 from flowrep.envs.registration import register_environments
 from flowrep.envs.scene import Scene
 from flowrep.envs.schema import SceneError
 from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.workers import WorkerError, WorkerVectorEnv
 
 register_environments()
 
@@ -22,6 +23,9 @@ __all__ = [
     "Scene",
     "SceneError",
     "StreetEnv",
+    "WorkerError",
+    "WorkerVectorEnv",
+    "begin_step",
     "drives",
     "get_states",
     "load_scene",

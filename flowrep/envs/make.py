@@ -1,71 +1,23 @@
 """The street as a TorchRL environment, with the transforms that write its representations."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
 import torch
-from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from tensordict import TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
 from flowrep.envs.loading import load_scene
-from flowrep.envs.outcome import NOTHING_HIT, Outcome, hit_code
 from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS
+from flowrep.envs.sensor_observation import SensorObservation
 from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.workers import WorkerVectorEnv
 from flowrep.transforms import representation_stack
-
-_OUTCOME_CODE = {outcome.label: outcome.value for outcome in Outcome}
-
-
-class SensorObservation(gym.Wrapper):
-    """Nests the observation under "sensor" and puts beside it how the episode stands.
-
-    | key | shape | dtype | what |
-    | --- | --- | --- | --- |
-    | `sensor` | | | the wrapped environment's observation |
-    | `outcome` | [1] | uint8 | code of `flowrep.envs.Outcome`; 0 while the episode runs |
-    | `hit` | [1] | uint8 | class id of what was hit; 255 for nothing |
-    | `episode_seed` | [1] | int64 | names the episode, see `StreetEnv.reset` |
-    """
-
-    def __init__(self, env: gym.Env) -> None:
-        """Wraps a `StreetEnv`."""
-        super().__init__(env)
-        beside: dict[str, spaces.Space] = {
-            "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
-            "hit": spaces.Box(0, NOTHING_HIT, (1,), np.uint8),
-            "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
-        }
-        sensor = env.observation_space
-        has_sensors = isinstance(sensor, spaces.Dict) and len(sensor.spaces) > 0
-        self._names = ("sensor",) if has_sensors else ()
-        self.observation_space = spaces.Dict(dict.fromkeys(self._names, sensor) | beside)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begins an episode."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self.arrange(observation, info), {}
-
-    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drives one step."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self.arrange(observation, info), float(reward), terminated, truncated, {}
-
-    def arrange(self, observation: dict[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the observation as this wrapper gives it."""
-        return dict.fromkeys(self._names, observation) | {
-            "outcome": np.array([_OUTCOME_CODE[info["outcome"]]], dtype=np.uint8),
-            "hit": np.array([hit_code(info["hit"])], dtype=np.uint8),
-            "episode_seed": np.array([info["episode_seed"]], dtype=np.int64),
-        }
 
 
 class DropSensor(ExcludeTransform):
@@ -86,6 +38,7 @@ def make_env(
     representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None] = (),
     *,
     num_envs: int = 1,
+    num_workers: int = 0,
     device: str | torch.device = "cpu",
     speed: SpeedMode | Range = "normal",
     frame_rate_hz: float | None = None,
@@ -104,6 +57,8 @@ def make_env(
         representations: names, or a mapping from name to options; only the sensors that they need
             are rendered, none for an empty list.
         num_envs: how many streets.
+        num_workers: how many processes drive them, see `WorkerVectorEnv`; 0: this one. What comes
+            out is the same.
         device: where the TensorDicts lie.
         speed: the pedestrians' speed mode, or their (lowest, highest) speed in m/s.
         frame_rate_hz: steps a second; the scene's own if None.
@@ -136,10 +91,12 @@ def make_env(
         sensors = [name for name in SENSORS if name in sensors or name != "rgb"]
     elif sensors:
         transforms.append(DropSensor())
-    vector = SyncVectorEnv(
-        [lambda: SensorObservation(street(sensors=sensors))] * num_envs,
-        autoreset_mode=AutoresetMode.DISABLED,
-    )
+    factories = [partial(_sensed, street, sensors)] * num_envs
+    vector: VectorEnv
+    if num_workers:
+        vector = WorkerVectorEnv(factories, num_workers)
+    else:
+        vector = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
     base = GymWrapper(vector, device=torch.device(device), categorical_action_encoding=True)
     env = TransformedEnv(base, transforms)
     if seed is not None:
@@ -147,21 +104,58 @@ def make_env(
     return env
 
 
+def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
+    """Lets the workers begin what `env.step(acted)` will ask for; without any, does nothing.
+
+    Args:
+        env: made by `make_env`.
+        acted: with `action`.
+    """
+    vector = _vector(env)
+    if isinstance(vector, WorkerVectorEnv):
+        vector.step_async(env.base_env.read_action(acted[env.action_key]))
+
+
 def streets(env: TransformedEnv) -> list[StreetEnv]:
-    """Returns the streets of an env that `make_env` made, in the order of its batch."""
-    return [street.unwrapped for street in env.base_env._env.envs]
+    """Returns the streets of an env that `make_env` made, in the order of its batch.
+
+    Raises:
+        ValueError: they are in worker processes.
+    """
+    vector = _vector(env)
+    if isinstance(vector, WorkerVectorEnv):
+        raise ValueError("the streets are in worker processes: make the env with num_workers=0")
+    return [street.unwrapped for street in vector.envs]
 
 
 def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
     """Returns the state of every street, plain data that JSON can hold."""
-    return [street.get_state() for street in streets(env)]
+    return list(_vector(env).call("get_state"))
 
 
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
-    """Takes every street back to a state of `get_states`; goes on from the TensorDict of then."""
+    """Takes every street back to a state of `get_states`; goes on from the TensorDict of then.
+
+    Raises:
+        ValueError: for another number of states than of streets.
+    """
     env.reset()
-    for street, state in zip(streets(env), states, strict=True):
-        street.set_state(state)
+    vector = _vector(env)
+    if len(states) != vector.num_envs:
+        raise ValueError(f"{len(states)} states for {vector.num_envs} streets; give one for each")
+    if isinstance(vector, WorkerVectorEnv):
+        vector.call_each("set_state", states)
+    else:
+        for street, state in zip(streets(env), states):
+            street.set_state(state)
+
+
+def _vector(env: TransformedEnv) -> Any:
+    return env.base_env._env
+
+
+def _sensed(street: Callable[..., StreetEnv], sensors: Sequence[str]) -> SensorObservation:
+    return SensorObservation(street(sensors=sensors))
 
 
 def _sensors_read(transforms: Iterable[Any]) -> list[str]:

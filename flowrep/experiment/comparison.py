@@ -41,7 +41,8 @@ def compare(
 
     Args:
         agents: "greedy" and / or "sampled" → the policy that is run in that way.
-        make_env: called with `speed` and `frame_rate_hz`.
+        make_env: called with `speed` and `frame_rate_hz`, and, for the street that baselines drive
+            through, `representations`, `num_envs` and `num_workers`.
         speeds: pedestrians' speed modes.
         fps: frame rates in Hz.
         episodes: for each policy, speed and frame rate.
@@ -53,14 +54,18 @@ def compare(
     total = len(speeds) * len(fps) * (len(agents) + len(baselines)) * episodes
     with tqdm(total=total, unit="episode", desc="evaluating", leave=False) as bar:
         for speed, rate in product(speeds, fps):
-            env = make_env(speed=speed, frame_rate_hz=rate)
+            conditions = {"speed": speed, "frame_rate_hz": rate}
+            env = make_env(**conditions)
+            split = quotas(episodes, env.batch_size.numel())
+            blind = make_env(**conditions, representations=(), num_envs=1, num_workers=0)
+            (street,) = streets(blind)
             runs: dict[str, partial[Iterator[Episode]]] = {
                 name: partial(
                     run_episodes, env, policy, episodes, seed=seed, greedy=name != "sampled"
                 )
                 for name, policy in agents.items()
             } | {
-                name: partial(baseline_episodes, env, name, episodes, seed=seed)
+                name: partial(baseline_episodes, street, name, split, seed=seed)
                 for name in baselines
             }
             for name, run in runs.items():
@@ -70,31 +75,32 @@ def compare(
                     bar.update()
                     if should_stop():
                         env.close()
+                        blind.close()
                         return rows
                 rows += finished
             env.close()
+            blind.close()
     return rows
 
 
-def baseline_episodes(env: EnvBase, name: str, episodes: int, *, seed: int) -> Iterator[Episode]:
+def baseline_episodes(
+    street: StreetEnv, name: str, split: Sequence[int], *, seed: int
+) -> Iterator[Episode]:
     """Yields the episodes that `run_episodes` runs, driven by a baseline, which sees no picture.
 
     Args:
-        env: made by `make_env`; its streets' scene, speed and frame rate are driven through.
+        street: is driven through, once for each environment of a batch.
         name: in `flowrep.envs.baselines.BASELINES`.
-        episodes: how many.
+        split: how many episodes each environment of the batch runs, see `quotas`.
         seed: of the environments.
     """
-    shown = streets(env)
-    street = StreetEnv(shown[0].scene, shown[0].speed_mps, shown[0].frame_rate_hz, sensors=())
     driver = BASELINES[name]()
-    for number, quota in enumerate(quotas(episodes, len(shown))):
+    for number, quota in enumerate(split):
         street.reset(seed=seed + number)
         for drive in drives(street, driver, quota):
             yield Episode(
                 drive.episode_seed, drive.outcome, drive.hit, drive.total_reward, drive.steps
             )
-    street.close()
 
 
 def with_origin(rows: Sequence[Row], config: Mapping[str, Any], frames: int) -> list[Row]:

@@ -67,15 +67,14 @@ def record_episode(
     """Writes the video of one greedy episode to `path`; returns how it ended.
 
     Args:
-        make_env: called with `representations`, `keep_sensor` and `num_envs`.
+        make_env: called with `representations`, `keep_sensor`, `num_envs` and `num_workers`.
         policy: writes `action`.
         representations: what the policy reads, a mapping from name to options.
         path: the mp4 file.
         seed: of the environment, which draws the episode.
     """
-    env = make_env(
-        representations=dict(representations) | {"rgb": {}}, keep_sensor=True, num_envs=1
-    )
+    seen = dict(representations) | {"rgb": {}}
+    env = make_env(representations=seen, keep_sensor=True, num_envs=1, num_workers=0)
     env.set_seed(seed)
     frames, outcome = film_episode(env, policy)
     fps = streets(env)[0].frame_rate_hz

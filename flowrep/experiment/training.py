@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
 from flowrep.agent import Algorithm, DivergenceError, load_checkpoint, save_checkpoint
-from flowrep.envs import get_states, set_states
+from flowrep.envs import begin_step, get_states, set_states
 from flowrep.experiment.cadence import Every
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.interruption import StopRequest
@@ -105,6 +105,10 @@ def train(
 ) -> Stopwatch:
     """Trains until `total_frames` or until a stop is asked for; the last state is saved.
 
+    Between acting and seeing what came of it, the updates are taken that the frames before allow:
+    where the environments have processes of their own, they drive meanwhile. The order, and so all
+    that comes out, is the same where they don't.
+
     Args:
         training: a new or a restored run.
         config: the resolved config.
@@ -127,16 +131,14 @@ def train(
             with clock("policy"), torch.no_grad():
                 acted = t.agent.policy(t.carried)
             with clock("environment"):
+                begin_step(t.env, acted)
+            learn(t, clock)
+            with clock("environment"):
                 stepped, t.carried = t.env.step_and_maybe_reset(acted)
             with clock("memory"):
                 t.agent.remember(stepped)
             t.frames += stepped.numel()
             t.recent.extend(finished_outcomes(stepped))
-            for _ in range(t.agent.updates_due(t.frames)):
-                with clock("memory"):
-                    batch = t.agent.sample()
-                with clock("update"):
-                    t.metrics = t.agent.update(batch)
             bar.update(t.frames - bar.n)
             if should_log(t.frames):
                 t.check()
@@ -149,9 +151,21 @@ def train(
             if should_save(t.frames):
                 with clock("checkpoint"):
                     t.save()
+    if t.frames >= total:
+        learn(t, clock)
     with clock("checkpoint"):
         t.save()
     return clock
+
+
+def learn(training: Training, clock: Stopwatch) -> None:
+    """Takes the updates that the frames so far allow."""
+    agent = training.agent
+    for _ in range(agent.updates_due(training.frames)):
+        with clock("memory"):
+            batch = agent.sample()
+        with clock("update"):
+            training.metrics = agent.update(batch)
 
 
 def finished_outcomes(stepped: TensorDictBase) -> list[int]:

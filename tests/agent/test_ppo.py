@@ -33,8 +33,10 @@ def step(now, later, reward, ended="--"):
         "done": done,
         "terminated": torch.tensor([e == "t" for e in ended]).unsqueeze(1),
     }
-    action = torch.tensor([1, 2])
-    return TensorDict({"view": view(now), "action": action, "next": outcome}, [ENVS])
+    action, log_prob = torch.tensor([1, 2]), torch.tensor([-0.5, -0.75])
+    return TensorDict(
+        {"view": view(now), "action": action, "action_log_prob": log_prob, "next": outcome}, [ENVS]
+    )
 
 
 STEPS = [
@@ -98,13 +100,30 @@ def test_advantages_by_hand():
 def test_the_first_batch_is_judged_by_the_policy_that_acted():
     agent = make_ppo(entropy_weight=0.5)
     for each in STEPS:
-        agent.remember(each)
+        agent.remember(agent.policy(each.clone()))
     losses = agent.losses(agent.sample())
     # rho = 1, so the loss is the mean of advantages that are normalised to 0
     assert losses["policy_loss"].item() == pytest.approx(0, abs=1e-6)
     assert losses["kl"].item() == pytest.approx(0, abs=1e-6)
     assert losses["clip_share"] == 0
     assert losses["entropy_loss"].item() == pytest.approx(-0.5 * losses["entropy"].item())
+
+
+def test_steps_that_earlier_weights_took_count_by_how_likely_they_then_were():
+    """The training loop begins the next rollout before it learns from the last one."""
+    agent = make_ppo(gamma=0.0, clip=0.9, batch_size=8, epochs=1)
+    for each in STEPS:
+        agent.remember(each)
+    batch = agent.sample()
+    with torch.no_grad():
+        image = agent.codecs[0].decode(batch["view"])
+        dist = agent._actor.get_dist(TensorDict({"embedding": agent.encoder([image])}, [8]))
+        now = dist.log_prob(batch["action"])
+    then = torch.where(batch["action"] == 1, -0.5, -0.75)
+    advantage = batch["advantage"].flatten()
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    expected = -((now - then).exp() * advantage).mean()
+    torch.testing.assert_close(agent.losses(batch)["policy_loss"], expected, rtol=1e-4, atol=1e-6)
 
 
 def test_gradients_are_scaled_down_to_the_largest_norm():

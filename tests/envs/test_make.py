@@ -7,7 +7,7 @@ import torch
 from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 
-from flowrep.envs import Outcome, get_states, make_env, set_states, streets
+from flowrep.envs import Outcome, begin_step, get_states, make_env, set_states, streets
 from flowrep.palette import CATEGORY_ID
 
 
@@ -119,6 +119,53 @@ def test_a_seed_gives_the_same_steps_in_one_process_and_in_two(make):
     parallel.close()
     for key in first.keys(True, True):
         assert torch.equal(first[key], steps[key].flatten(1, 2)), key
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_workers_give_what_one_process_gives(make, num_workers):
+    actions = actions_of(40, 3)
+    arguments = {"representations": ["ego", "obj"], "num_envs": 3, "keep_sensor": True}
+    alone, _ = play(make(**arguments, seed=7), actions)
+    env = make(**arguments, seed=7, num_workers=num_workers)
+    check_env_specs(env)
+    env.set_seed(7)
+    shared, _ = play(env, actions)
+    assert alone["next", "done"].any()
+    assert_same(alone, shared)
+
+
+def test_a_step_begun_early_is_the_step(make):
+    late, early = (make(num_envs=2, num_workers=w, seed=3) for w in (0, 2))
+    for env in (late, early):
+        begin_step(env, env.reset().set("action", torch.tensor([1, 2])))
+    begun = early.step(early.reset().set("action", torch.tensor([1, 2])))
+    assert_same(late.step(late.reset().set("action", torch.tensor([1, 2]))), begun)
+
+
+def test_states_pass_between_workers_and_one_process(make):
+    actions = actions_of(30, 3, seed=3)
+    alone = make(representations=["ego"], num_envs=3, seed=0)
+    _, then = play(alone, actions[:20])
+    states, then = get_states(alone), then.clone()
+    expected, _ = play(alone, actions[20:], then.clone())
+    shared = make(representations=["ego"], num_envs=3, seed=99, num_workers=2)
+    shared.reset()
+    set_states(shared, states)
+    assert get_states(shared) == states
+    resumed, _ = play(shared, actions[20:], then)
+    assert_same(expected, resumed)
+
+
+def test_states_of_another_number_of_streets_are_refused(make):
+    env = make(num_envs=2, seed=0)
+    env.reset()
+    with pytest.raises(ValueError, match="1 states for 2 streets"):
+        set_states(env, get_states(env)[:1])
+
+
+def test_streets_in_workers_are_out_of_reach(make):
+    with pytest.raises(ValueError, match="num_workers=0"):
+        streets(make(num_envs=2, num_workers=2))
 
 
 def test_which_episodes_come_does_not_depend_on_the_policy(make):

@@ -20,12 +20,12 @@ from tests.test_configs import composed
 SMALL = {"ppo": ["algorithm.rollout_length=16"]}
 
 
-def new_run(folder, *, resume=False, algorithm="dsac") -> tuple[Training, dict]:
+def new_run(folder, *, resume=False, algorithm="dsac", num_workers=0) -> tuple[Training, dict]:
     small = SMALL.get(algorithm, ["algorithm.replay_capacity=64"])
     config = composed(
         "debug=smoke", "num_envs=2", "total_frames=120", "checkpoint_every_frames=60",
         "log_every_frames=20", "evaluation.every_frames=0", "algorithm.precision=fp32",
-        "device=cpu", "seed=7", f"algorithm={algorithm}", *small,
+        "device=cpu", "seed=7", f"algorithm={algorithm}", f"num_workers={num_workers}", *small,
     )  # fmt: skip
     config["resume"] = str(folder) if resume else None
     return build(config, RunFolder(folder)), config
@@ -72,6 +72,17 @@ def differing(a, b, place="") -> list[str]:
         ]
     same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
     return [] if same else [place]
+
+
+def test_how_many_processes_drive_is_not_seen_in_what_comes_out(tmp_path):
+    alone = finish(tmp_path / "alone")
+    training, config = new_run(tmp_path / "two", num_workers=2)
+    train(training, config, StopAfter(training, 50), lambda frames: None)
+    training.env.close()
+    training, config = new_run(tmp_path / "two", resume=True, num_workers=1)
+    train(training, config, StopRequest(), lambda frames: None)
+    assert differing(alone.state(), training.state()) == []
+    training.env.close()
 
 
 def logged(training):

@@ -1,0 +1,198 @@
+"""Environments stepped side by side in several processes, several in each."""
+
+import atexit
+import multiprocessing
+import os
+import sys
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, create_shared_memory
+from numpy.typing import NDArray
+
+from flowrep.envs.worker_process import Arrays, EnvFactory, Worker, WorkerError, copied, views
+
+
+class WorkerVectorEnv(VectorEnv):
+    """Several environments in each of several processes, behind gymnasium's vector interface.
+
+    To its user it is a `SyncVectorEnv` with autoreset disabled: the same seeds and actions give the
+    same numbers, bit for bit, whatever the number of workers. Infos are not handed on.
+
+    Observations come back through shared memory, the rest through pipes. `step_async` begins a
+    step, so that the caller can do other work until it asks for the outcome with `step`.
+
+    Workers are forked from a server process that has imported what they need and nothing of the
+    caller's threads or CUDA state. They ignore SIGINT and SIGTERM, which terminals and schedulers
+    send to whole process groups: the caller decides, and they end when it closes or is gone. As
+    with all of Python's multiprocessing but fork, a script that makes one keeps its own work under
+    `if __name__ == "__main__":`.
+
+    Args:
+        env_factories: one for each environment; they can be pickled, and all have the same spaces,
+            a `Dict` of observations.
+        num_workers: how many processes, one environment each at least.
+
+    Raises:
+        ValueError: for fewer environments than workers.
+        WorkerError: a worker could not begin. Later, from any method, as it stops.
+    """
+
+    def __init__(self, env_factories: Sequence[EnvFactory], num_workers: int) -> None:
+        """Starts the workers and waits until they have built their environments."""
+        self._workers: list[Worker] = []
+        if not 1 <= num_workers <= len(env_factories):
+            raise ValueError(
+                f"num_workers is {num_workers} for {len(env_factories)} environments; "
+                "give one environment at least to each worker, and one worker at least"
+            )
+        self.num_envs = len(env_factories)
+        self.autoreset_mode = AutoresetMode.DISABLED
+        example = env_factories[0]()
+        self.metadata = example.metadata | {"autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = example.observation_space
+        self.single_action_space = example.action_space
+        example.close()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        context = _server()
+        memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
+        self._shared = views(self.single_observation_space, memory, self.num_envs)
+        self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
+        # processes that ignore signals would hold up an interpreter that waits for them
+        self._at_exit = partial(_call, weakref.WeakMethod(self._shut_down))
+        atexit.register(self._at_exit)
+        bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
+        for rows in map(slice, bounds, bounds[1:]):
+            self._workers.append(Worker(context, env_factories, rows, memory))
+        self._receive()
+
+    @property
+    def num_workers(self) -> int:
+        """How many processes there are."""
+        return len(self._workers)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Arrays, dict[str, Any]]:
+        """Begins episodes, in all environments or in those that `options["reset_mask"]` marks.
+
+        The outcome of a step that is under way is dropped.
+
+        Args:
+            seed: of the first environment, the next one's is one more; or one for each.
+            options: go to every environment's `reset`, but for `reset_mask`, bool [num_envs].
+        """
+        self.drop_step()
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if isinstance(seed, int):
+            seed = range(seed, seed + self.num_envs)
+        seeds = [None] * self.num_envs if seed is None else list(seed)
+        if mask.shape != (self.num_envs,) or len(seeds) != self.num_envs:
+            raise ValueError(
+                f"reset: seeds and reset_mask should be one for each of {self.num_envs} "
+                f"environments, got {len(seeds)} seeds and a mask {mask.shape}"
+            )
+        self._send("reset", lambda rows: (seeds[rows], mask[rows], options))
+        self._receive()
+        return copied(self._shared), {}
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Begins a step; `step` with the same actions waits for it and returns its outcome."""
+        if self._begun is not None:
+            raise RuntimeError("a step is under way: call step() for its outcome first")
+        actions = np.array(actions)
+        self._send("step", lambda rows: (actions[rows],))
+        self._begun = actions
+
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Takes a step, or returns the outcome of the one that `step_async` began."""
+        if self._begun is None:
+            self.step_async(actions)
+        elif not np.array_equal(self._begun, actions):
+            raise ValueError(f"step_async began a step with {self._begun}, step got {actions}")
+        self._begun = None
+        rewards, terminated, truncated = map(np.concatenate, zip(*self._receive()))
+        return copied(self._shared), rewards, terminated, truncated, {}
+
+    def drop_step(self) -> None:
+        """Waits for a step that is under way and forgets its outcome."""
+        if self._begun is not None:
+            self._begun = None
+            self._receive()
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Returns what each environment's method of that name returns, or its attribute."""
+        self.drop_step()
+        self._send("call", lambda rows: (name, args, kwargs))
+        return tuple(result for results in self._receive() for result in results)
+
+    def call_each(self, name: str, arguments: Sequence[Any]) -> tuple[Any, ...]:
+        """Returns what each environment's method returns for an argument of its own."""
+        self.drop_step()
+        self._send("call_each", lambda rows: (name, list(arguments[rows])))
+        return tuple(result for results in self._receive() for result in results)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Ends the workers."""
+        self._shut_down()
+
+    def _shut_down(self) -> None:
+        workers, self._workers = self._workers, []
+        for worker in workers:
+            worker.pipe.close()
+        for worker in workers:
+            worker.end()
+        if workers:
+            atexit.unregister(self._at_exit)
+
+    def _send(self, command: str, arguments: Callable[[slice], tuple[Any, ...]]) -> None:
+        if not self._workers:
+            raise WorkerError("the workers have ended, by close() or by a failure before")
+        with self._ending_with_a_failure():
+            for worker in self._workers:
+                worker.send(command, arguments(worker.rows))
+
+    def _receive(self) -> list[Any]:
+        with self._ending_with_a_failure():
+            return [worker.receive() for worker in self._workers]
+
+    @contextmanager
+    def _ending_with_a_failure(self) -> Iterator[None]:
+        # The others' answers are of no use without the failed one's.
+        try:
+            yield
+        except WorkerError:
+            self.close()
+            raise
+
+
+def available_cores() -> int:
+    """Returns how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _server() -> Any:
+    """Returns the context whose server has imported what workers need, once for all of them."""
+    context: Any = multiprocessing.get_context("forkserver")
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    # Each worker runs the main module's imports again, by name where it was started by name.
+    main = "__main__" if spec is None or spec.name.endswith("__main__") else spec.name
+    context.set_forkserver_preload([main, __name__])
+    return context
+
+
+def _call(method: weakref.WeakMethod[Any]) -> None:
+    if (alive := method()) is not None:
+        alive()

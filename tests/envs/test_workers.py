@@ -1,0 +1,245 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from flowrep.envs import WorkerError, WorkerVectorEnv
+
+
+class Counter(gym.Env):
+    """Counts on from its seed; an action of 9 ends the episode, one of 13 is a mistake."""
+
+    observation_space = spaces.Dict(
+        {
+            "count": spaces.Box(0, 1 << 30, (2,), np.int64),
+            "inner": spaces.Dict({"picture": spaces.Box(0, 255, (3, 4), np.uint8)}),
+        }
+    )
+    action_space = spaces.Discrete(20)
+
+    def __init__(self, number=0):
+        self.number, self.count = number, 0
+
+    def observation(self):
+        picture = np.full((3, 4), self.count % 251, np.uint8)
+        return {"count": np.array([self.number, self.count]), "inner": {"picture": picture}}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = int(self.np_random.integers(1000)) + (options or {}).get("add", 0)
+        return self.observation(), {}
+
+    def step(self, action):
+        if action == 13:
+            raise ZeroDivisionError(f"unlucky environment {self.number}")
+        if action == 17:
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.count += int(action)
+        return self.observation(), self.count / 4, action == 9, action == 8, {}
+
+    def get_state(self):
+        return self.count
+
+    def set_state(self, count):
+        self.count = count
+        return count + 1
+
+
+@pytest.fixture
+def make():
+    made = []
+
+    def build(num_envs, num_workers):
+        made.append(WorkerVectorEnv([partial(Counter, i) for i in range(num_envs)], num_workers))
+        return made[-1]
+
+    yield build
+    for env in made:
+        env.close()
+
+
+def in_process(num_envs):
+    factories = [partial(Counter, i) for i in range(num_envs)]
+    return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
+
+
+def leaves(observation):
+    return observation["count"], observation["inner"]["picture"]
+
+
+def assert_same(left, right):
+    for a, b in zip(left, right, strict=True):
+        if isinstance(a, dict):
+            assert_same(a.values(), b.values())
+        else:
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2, 3])
+def test_it_is_the_vector_env_of_one_process(make, num_workers):
+    ours, theirs = make(5, num_workers), in_process(5)
+    assert ours.num_workers == num_workers
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    both = (ours, theirs)
+    assert_same(*(env.reset(seed=3) for env in both))
+    assert_same(*(env.step(np.array([9, 1, 2, 8, 3])) for env in both))
+    masked = {"reset_mask": np.array([True, False, False, True, False]), "add": 5}
+    assert_same(*(env.reset(options=dict(masked)) for env in both))
+    assert_same(*(env.step(np.arange(5)) for env in both))
+    assert_same(*(env.reset(seed=[7, 7, 1, 2, 3]) for env in both))
+    assert_same(*(env.reset() for env in both))
+
+
+def test_what_was_returned_stays(make):
+    env = make(3, 2)
+    before, _ = env.reset(seed=0)
+    kept = [array.copy() for array in leaves(before)]
+    env.step(np.array([1, 2, 3]))
+    assert_same(leaves(before), kept)
+
+
+def test_a_step_can_be_begun_and_asked_for_later(make):
+    ours, theirs = make(4, 2), in_process(4)
+    for env in (ours, theirs):
+        env.reset(seed=0)
+    for actions in ([1, 2, 3, 4], [5, 6, 7, 0]):
+        ours.step_async(np.array(actions))
+        assert_same(ours.step(np.array(actions)), theirs.step(np.array(actions)))
+
+
+def test_a_step_that_was_begun_with_other_actions_is_not_passed_off(make):
+    env = make(2, 2)
+    env.reset(seed=0)
+    env.step_async(np.array([1, 2]))
+    with pytest.raises(RuntimeError, match="a step is under way"):
+        env.step_async(np.array([1, 2]))
+    with pytest.raises(ValueError, match=r"began a step with \[1 2\], step got \[2 1\]"):
+        env.step(np.array([2, 1]))
+
+
+def test_a_reset_drops_the_step_under_way(make):
+    env, other = make(3, 2), in_process(3)
+    env.reset(seed=0)
+    env.step_async(np.array([1, 2, 3]))
+    assert_same(env.reset(seed=4), other.reset(seed=4))
+    assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
+
+
+def test_every_environment_can_be_asked_and_told(make):
+    env = make(5, 2)
+    observation, _ = env.reset(seed=0)
+    assert env.call("get_state") == tuple(observation["count"][:, 1])
+    assert env.call_each("set_state", [10, 20, 30, 40, 50]) == (11, 21, 31, 41, 51)
+    after, *_ = env.step(np.array([1, 2, 3, 4, 5]))
+    assert after["count"].tolist() == [[0, 11], [1, 22], [2, 33], [3, 44], [4, 55]]
+
+
+@pytest.mark.parametrize("num_workers", [0, 4])
+def test_more_workers_than_environments_are_refused(make, num_workers):
+    with pytest.raises(ValueError, match=f"num_workers is {num_workers} for 3 environments"):
+        make(3, num_workers)
+
+
+def test_a_mask_or_seeds_of_another_length_are_refused(make):
+    env = make(3, 2)
+    with pytest.raises(ValueError, match="got 2 seeds"):
+        env.reset(seed=[1, 2])
+    with pytest.raises(ValueError, match=r"a mask \(2,\)"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+
+
+def test_a_mistake_in_an_environment_is_told_with_its_traceback(make):
+    env = make(4, 2)
+    env.reset(seed=0)
+    with pytest.raises(WorkerError, match=r"(?s)environments 2 to 3 failed.*unlucky environment 3"):
+        env.step(np.array([1, 1, 1, 13]))
+    with pytest.raises(WorkerError, match="the workers have ended"):
+        env.step(np.array([1, 1, 1, 1]))
+
+
+def test_a_worker_that_was_killed_is_told(make):
+    env = make(3, 2)
+    env.reset(seed=0)
+    with pytest.raises(WorkerError, match=r"environment 2 is gone \(SIGKILL\).*memory"):
+        env.step(np.array([1, 1, 17]))
+
+
+def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
+    env, other = make(3, 2), in_process(3)
+    for each in (env, other):
+        each.reset(seed=0)
+    for worker in env._workers:
+        os.kill(worker.process.pid, signal.SIGINT)
+        os.kill(worker.process.pid, signal.SIGTERM)
+    assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
+
+
+HOLDER = """
+import sys
+from functools import partial
+from tests.envs.test_workers import Counter
+from flowrep.envs import WorkerVectorEnv
+
+if __name__ == "__main__":
+    env = WorkerVectorEnv([Counter, Counter, Counter], 2)
+    env.reset(seed=0)
+    print(*(worker.process.pid for worker in env._workers), flush=True)
+    if "wait" in sys.argv:
+        input()
+"""
+
+
+def is_running(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks into /proc")
+@pytest.mark.parametrize("how", ["left open at the end", "killed"])
+def test_no_worker_outlives_its_caller(tmp_path, how):
+    script = tmp_path / "holder.py"
+    script.write_text(HOLDER)
+    command = [sys.executable, str(script), "wait" if how == "killed" else "end"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([".", *sys.path])}
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as holder:
+        try:
+            workers = [int(pid) for pid in holder.stdout.readline().split()]
+            assert len(workers) == 2
+            if how == "killed":
+                assert all(is_running(pid) for pid in workers)
+                holder.kill()
+            assert holder.wait(timeout=30) == (-signal.SIGKILL if how == "killed" else 0)
+        finally:
+            holder.kill()
+    deadline = time.monotonic() + 10
+    while any(is_running(pid) for pid in workers) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not any(is_running(pid) for pid in workers)
+
+
+def test_a_script_without_a_guard_is_told_of_it(tmp_path):
+    script = tmp_path / "unguarded.py"
+    guard = 'if __name__ == "__main__":'
+    script.write_text(HOLDER.replace(guard, "if True:"))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([".", *sys.path])}
+    result = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment
+    )
+    assert result.returncode != 0
+    assert guard in result.stderr
