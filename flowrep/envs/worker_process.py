@@ -76,7 +76,7 @@ class Worker:
             reason = signal.Signals(-code).name
         return WorkerError(
             f"the worker process of {self.name} is gone ({reason}): perhaps the system killed it "
-            "for want of memory, or the script that started it lacks an "
+            "for want of memory, or the script that defines its environments lacks an "
             '`if __name__ == "__main__":`'
         )
 

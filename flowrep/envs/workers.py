@@ -3,11 +3,13 @@
 import atexit
 import multiprocessing
 import os
+import pickle
 import sys
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -29,9 +31,9 @@ class WorkerVectorEnv(VectorEnv):
 
     Workers are forked from a server process that has imported what they need and nothing of the
     caller's threads or CUDA state. They ignore SIGINT and SIGTERM, which terminals and schedulers
-    send to whole process groups: the caller decides, and they end when it closes or is gone. As
-    with all of Python's multiprocessing but fork, a script that makes one keeps its own work under
-    `if __name__ == "__main__":`.
+    send to whole process groups: the caller decides, and they end when it closes or is gone. Only
+    a script that defines its own environments in itself, not in a module that can be imported, is
+    run again by each worker, and keeps its work under `if __name__ == "__main__":`.
 
     Args:
         env_factories: one for each environment; they can be pickled, and all have the same spaces,
@@ -68,8 +70,9 @@ class WorkerVectorEnv(VectorEnv):
         self._at_exit = partial(_call, weakref.WeakMethod(self._shut_down))
         atexit.register(self._at_exit)
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
-        for rows in map(slice, bounds, bounds[1:]):
-            self._workers.append(Worker(context, env_factories, rows, memory))
+        with nullcontext() if _need_main_module(env_factories) else _without_main_module():
+            for rows in map(slice, bounds, bounds[1:]):
+                self._workers.append(Worker(context, env_factories, rows, memory))
         self._receive()
 
     @property
@@ -186,11 +189,28 @@ def available_cores() -> int:
 def _server() -> Any:
     """Returns the context whose server has imported what workers need, once for all of them."""
     context: Any = multiprocessing.get_context("forkserver")
-    spec = getattr(sys.modules["__main__"], "__spec__", None)
-    # Each worker runs the main module's imports again, by name where it was started by name.
-    main = "__main__" if spec is None or spec.name.endswith("__main__") else spec.name
-    context.set_forkserver_preload([main, __name__])
+    context.set_forkserver_preload([__name__])
     return context
+
+
+@contextmanager
+def _without_main_module() -> Iterator[None]:
+    """Lets processes begin without running the main module again, which multiprocessing would."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+def _need_main_module(env_factories: Sequence[EnvFactory]) -> bool:
+    try:
+        with _without_main_module():
+            pickle.dumps(env_factories)
+    except (pickle.PicklingError, AttributeError):
+        return True
+    return False
 
 
 def _call(method: weakref.WeakMethod[Any]) -> None:

@@ -12,7 +12,7 @@ from rich.table import Table
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
-from flowrep.envs import StreetEnv, streets
+from flowrep.envs import streets
 from flowrep.envs.baselines import BASELINES, drives
 from flowrep.experiment.evaluation import (
     OUTCOMES,
@@ -54,19 +54,16 @@ def compare(
     total = len(speeds) * len(fps) * (len(agents) + len(baselines)) * episodes
     with tqdm(total=total, unit="episode", desc="evaluating", leave=False) as bar:
         for speed, rate in product(speeds, fps):
-            conditions = {"speed": speed, "frame_rate_hz": rate}
-            env = make_env(**conditions)
+            make = partial(make_env, speed=speed, frame_rate_hz=rate)
+            env = make()
             split = quotas(episodes, env.batch_size.numel())
-            blind = make_env(**conditions, representations=(), num_envs=1, num_workers=0)
-            (street,) = streets(blind)
             runs: dict[str, partial[Iterator[Episode]]] = {
                 name: partial(
                     run_episodes, env, policy, episodes, seed=seed, greedy=name != "sampled"
                 )
                 for name, policy in agents.items()
             } | {
-                name: partial(baseline_episodes, street, name, split, seed=seed)
-                for name in baselines
+                name: partial(baseline_episodes, make, name, split, seed=seed) for name in baselines
             }
             for name, run in runs.items():
                 finished = []
@@ -75,32 +72,33 @@ def compare(
                     bar.update()
                     if should_stop():
                         env.close()
-                        blind.close()
                         return rows
                 rows += finished
             env.close()
-            blind.close()
     return rows
 
 
 def baseline_episodes(
-    street: StreetEnv, name: str, split: Sequence[int], *, seed: int
+    make_env: Callable[..., EnvBase], name: str, split: Sequence[int], *, seed: int
 ) -> Iterator[Episode]:
     """Yields the episodes that `run_episodes` runs, driven by a baseline, which sees no picture.
 
     Args:
-        street: is driven through, once for each environment of a batch.
+        make_env: called with `representations`, `num_envs` and `num_workers`; its one street is
+            driven through, for each environment of the batch in turn.
         name: in `flowrep.envs.baselines.BASELINES`.
         split: how many episodes each environment of the batch runs, see `quotas`.
         seed: of the environments.
     """
-    driver = BASELINES[name]()
+    env = make_env(representations=(), num_envs=1, num_workers=0)
+    (street,), driver = streets(env), BASELINES[name]()
     for number, quota in enumerate(split):
         street.reset(seed=seed + number)
         for drive in drives(street, driver, quota):
             yield Episode(
                 drive.episode_seed, drive.outcome, drive.hit, drive.total_reward, drive.steps
             )
+    env.close()
 
 
 def with_origin(rows: Sequence[Row], config: Mapping[str, Any], frames: int) -> list[Row]:

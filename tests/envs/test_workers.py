@@ -233,13 +233,27 @@ def test_no_worker_outlives_its_caller(tmp_path, how):
     assert not any(is_running(pid) for pid in workers)
 
 
-def test_a_script_without_a_guard_is_told_of_it(tmp_path):
-    script = tmp_path / "unguarded.py"
-    guard = 'if __name__ == "__main__":'
-    script.write_text(HOLDER.replace(guard, "if True:"))
+GUARD = 'if __name__ == "__main__":'
+
+
+def run_script(tmp_path, text):
+    script = tmp_path / "script.py"
+    script.write_text(text)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([".", *sys.path])}
-    result = subprocess.run(
+    return subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment
     )
+
+
+def test_a_script_needs_a_guard_only_for_environments_of_its_own(tmp_path):
+    unguarded = HOLDER.replace(GUARD, "if True:")
+    result = run_script(tmp_path, unguarded)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    own = "class Own(Counter):\n    pass\n\n"
+    ours = HOLDER.replace("[Counter, ", "[Own, ").replace(GUARD, own + GUARD)
+    result = run_script(tmp_path, ours)
+    assert result.returncode == 0, result.stderr
+    result = run_script(tmp_path, ours.replace(GUARD, "if True:"))
     assert result.returncode != 0
-    assert guard in result.stderr
+    assert GUARD in result.stderr
