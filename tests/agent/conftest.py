@@ -94,7 +94,7 @@ def random_steps(random_maps):
     def draw(size):
         steps = random_maps(size)
         steps["action"] = torch.randint(3, (size,))
-        steps["action_log_prob"] = -torch.rand(size)
+        steps["action_log_prob"] = torch.full((size,), -1.0)
         steps["next"] = random_maps(size)
         steps["next", "reward"] = torch.randn(size, 1)
         steps["next", "terminated"] = torch.rand(size, 1) < 0.3
