@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Protocol
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from flowrep.agent.captured import captured
 from flowrep.agent.divergence import DivergenceWatch
 
 
@@ -52,6 +53,9 @@ class Algorithm(ABC):
     METRICS: ClassVar[tuple[str, ...]]
     """The keys of `losses`; those that end in `_loss` are minimised, as a sum."""
 
+    CAPTURABLE: ClassVar[bool] = True
+    """Whether `losses` and `after_update` can be part of a CUDA graph, see `captured`."""
+
     policy: TensorDictModuleBase
     memory: Memory
 
@@ -67,12 +71,25 @@ class Algorithm(ABC):
         self.trained = {n: w for n, w in self.weights.items() if w.requires_grad}
         self.learning_rate, self.total_updates = learning_rate, max(1, total_updates)
         self.max_grad_norm = max_grad_norm
-        self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
-        device = next(iter(self.trained.values())).device
+        self.device = next(iter(self.trained.values())).device
+        # a tensor, so that a captured step reads what it is set to
+        self._rate = torch.tensor(learning_rate, dtype=torch.float32, device=self.device)
+        self.optimizer = torch.optim.Adam(
+            self.trained.values(),
+            lr=self._rate,
+            fused=True,
+            capturable=self.device.type == "cuda",
+        )
         losses = [name for name in self.METRICS if name.endswith("_loss")]
         beside = [name for name in self.METRICS if name not in losses]
-        self.divergence = DivergenceWatch([*losses, "grad_norm"], beside, device)
+        self.divergence = DivergenceWatch([*losses, "grad_norm"], beside, self.device)
+        # the fused step takes no step where it is 1, and asks the device, not the host
+        self.optimizer.found_inf = self.divergence.is_bad  # type: ignore[attr-defined]
         self.updates = 0
+        self._capture()
+
+    def _capture(self) -> None:
+        self._step = captured(self._take_step, self.device) if self.CAPTURABLE else self._take_step
 
     @classmethod
     def metric_names(cls) -> tuple[str, ...]:
@@ -105,21 +122,23 @@ class Algorithm(ABC):
         as they are and `divergence.check()` raises.
         """
         learning_rate = self.learning_rate * max(0.0, 1 - self.updates / self.total_updates)
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate
+        self._rate.fill_(learning_rate)
+        metrics = dict(self._step(batch).items())
+        self.updates += 1
+        return metrics | {"learning_rate": torch.tensor(learning_rate)}
+
+    def _take_step(self, batch: TensorDictBase) -> TensorDictBase:
+        """Does on the device all that an update does; returns the metrics."""
         self.optimizer.zero_grad(set_to_none=True)
         losses = self.losses(batch)
         minimised = [loss for name, loss in losses.items() if name.endswith("_loss")]
         torch.stack(minimised).sum().backward()
         metrics = {name: value.detach() for name, value in losses.items()}
         metrics["grad_norm"] = self._gradient_norm()
-        # the fused step takes no step where it is 1, and asks the device, not the host
-        self.optimizer.found_inf = self.divergence.look(metrics)  # type: ignore[attr-defined]
+        self.divergence.look(metrics)
         self.optimizer.step()
         self.after_update()
-        self.updates += 1
-        metrics["learning_rate"] = torch.tensor(learning_rate)
-        return metrics
+        return TensorDict(metrics, [])
 
     def _gradient_norm(self) -> Tensor:
         """Returns the norm of all gradients, which it then scales down to `max_grad_norm`."""
@@ -167,6 +186,7 @@ class Algorithm(ABC):
                 key: value.to(weight.device, copy=True) for key, value in moments.items()
             }
         self.updates = state["updates"]
+        self._capture()  # Adam's moments lie elsewhere now
 
 
 def named_weights(**modules: torch.nn.Module) -> dict[str, Tensor]:

@@ -23,7 +23,7 @@ class DivergenceWatch:
 
     >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
     >>> for q_loss in (0.5, float("nan"), 0.25):
-    ...     _ = watch.look({"q_loss": torch.tensor(q_loss), "entropy": torch.tensor(1.0)})
+    ...     watch.look({"q_loss": torch.tensor(q_loss), "entropy": torch.tensor(1.0)})
     >>> watch.check()
     Traceback (most recent call last):
     flowrep.agent.divergence.DivergenceError: q_loss became nan in update 2 (q_loss=nan, entropy=1)
@@ -38,17 +38,16 @@ class DivergenceWatch:
         self.watched, self.names = tuple(watched), (*watched, *beside)
         self._values = torch.zeros(len(self.names), device=device)
         self._good_updates = torch.zeros((), dtype=torch.long, device=device)
+        self.is_bad = torch.zeros((), device=device)
+        """1.0 from the first bad update on and 0.0 before it, on the device."""
 
-    def look(self, metrics: Mapping[str, Tensor]) -> Tensor:
-        """Returns, on the device, 1.0 from the first bad update on and 0.0 before it."""
+    def look(self, metrics: Mapping[str, Tensor]) -> None:
+        """Takes in an update's metrics; all that it keeps is changed in place."""
         values = torch.stack([metrics[name].float() for name in self.names])
-        self._values = torch.where(self._is_good(), values, self._values)
-        is_good = self._is_good()
+        self._values.copy_(torch.where(self.is_bad.bool(), self._values, values))
+        is_good = self._values[: len(self.watched)].isfinite().all()
         self._good_updates += is_good
-        return 1.0 - is_good.float()
-
-    def _is_good(self) -> Tensor:
-        return self._values[: len(self.watched)].isfinite().all()
+        self.is_bad.copy_(~is_good)
 
     def check(self) -> None:
         """Waits for the device and says what went wrong, if anything has.

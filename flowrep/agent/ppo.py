@@ -59,6 +59,7 @@ class PPO(Algorithm):
         "policy_loss", "value_loss", "entropy_loss", "entropy", "kl", "clip_share",
         "explained_variance",
     )  # fmt: skip
+    CAPTURABLE = False  # TorchRL's loss asks the device whether the entropy is finite
     memory: Rollout
 
     def __init__(

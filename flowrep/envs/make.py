@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
@@ -18,6 +19,17 @@ from flowrep.envs.sensor_observation import SensorObservation
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.workers import WorkerVectorEnv
 from flowrep.transforms import representation_stack
+
+
+class VectorWrapper(GymWrapper):
+    """TorchRL's wrapper, with the marks of what to reset brought to where NumPy reads them.
+
+    TorchRL 0.14 hands them on from the device of the TensorDict, which fails on CUDA.
+    """
+
+    def _replace_reset(self, reset: Tensor, kwargs: dict[str, Any]) -> dict[str, Any]:
+        mask = {"reset_mask": reset.view(self.batch_size).cpu().numpy()}
+        return kwargs | {"options": {**(kwargs.get("options") or {}), **mask}}
 
 
 class DropSensor(ExcludeTransform):
@@ -97,7 +109,7 @@ def make_env(
         vector = WorkerVectorEnv(factories, num_workers)
     else:
         vector = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
-    base = GymWrapper(vector, device=torch.device(device), categorical_action_encoding=True)
+    base = VectorWrapper(vector, device=torch.device(device), categorical_action_encoding=True)
     env = TransformedEnv(base, transforms)
     if seed is not None:
         env.set_seed(seed)

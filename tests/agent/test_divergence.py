@@ -12,10 +12,13 @@ def metrics(**values):
 
 def test_the_first_bad_update_is_told_with_its_statistics():
     watch = DivergenceWatch(["q_loss", "actor_loss"], ["entropy"])
-    assert watch.look(metrics(q_loss=1.0, actor_loss=2.0, entropy=0.5)) == 0
+    watch.look(metrics(q_loss=1.0, actor_loss=2.0, entropy=0.5))
+    assert watch.is_bad == 0
     watch.check()
-    assert watch.look(metrics(q_loss=3.0, actor_loss=-math.inf, entropy=0.25)) == 1
-    assert watch.look(metrics(q_loss=math.nan, actor_loss=math.nan, entropy=9.0)) == 1
+    watch.look(metrics(q_loss=3.0, actor_loss=-math.inf, entropy=0.25))
+    assert watch.is_bad == 1
+    watch.look(metrics(q_loss=math.nan, actor_loss=math.nan, entropy=9.0))
+    assert watch.is_bad == 1
     message = r"^actor_loss became -inf in update 2 \(q_loss=3, actor_loss=-inf, entropy=0.25\)$"
     with pytest.raises(DivergenceError, match=message):
         watch.check()
@@ -23,7 +26,8 @@ def test_the_first_bad_update_is_told_with_its_statistics():
 
 def test_what_is_logged_beside_the_losses_may_be_undefined():
     watch = DivergenceWatch(["q_loss"], ["explained_variance"])
-    assert watch.look(metrics(q_loss=1.0, explained_variance=math.nan)) == 0
+    watch.look(metrics(q_loss=1.0, explained_variance=math.nan))
+    assert watch.is_bad == 0
     watch.check()
 
 

@@ -142,6 +142,20 @@ def test_a_step_begun_early_is_the_step(make):
     assert_same(late.step(late.reset().set("action", torch.tensor([1, 2]))), begun)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_a_street_on_cuda_is_the_street_on_the_cpu(make, num_workers):
+    actions = actions_of(40, 2)
+    arguments = {"representations": ["ego", "obj", "seg2"], "num_envs": 2, "seed": 1}
+    here, _ = play(make(**arguments), actions)
+    env = make(**arguments, device="cuda", num_workers=num_workers)
+    there, _ = play(env, actions.cuda())
+    assert here["next", "done"].any()
+    for key in here.keys(True, True):
+        assert there[key].is_cuda
+        torch.testing.assert_close(there[key].cpu(), here[key], rtol=1e-4, atol=1e-4)
+
+
 def test_states_pass_between_workers_and_one_process(make):
     actions = actions_of(30, 3, seed=3)
     alone = make(representations=["ego"], num_envs=3, seed=0)
