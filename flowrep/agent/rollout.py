@@ -65,9 +65,19 @@ class Rollout:
         return {"length": len(self._steps), "steps": stacked}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`."""
+        """Continues from a `state_dict`.
+
+        Raises:
+            ValueError: what this rollout keeps was not kept there.
+        """
         self.clear()
         if state["length"]:
+            missing = [key for key in self._keys if key not in state["steps"]]
+            if missing:
+                raise ValueError(
+                    f"the saved rollout lacks {missing[0]!r}: the checkpoint is of an older "
+                    "version, start the run anew"
+                )
             width = len(state["steps"]["action"][0])
             steps = TensorDict(state["steps"], [state["length"], width]).to(self.device)
             steps["next"].batch_size = steps.batch_size

@@ -1,5 +1,6 @@
 """A process that holds several environments and answers one command after the other."""
 
+import os
 import signal
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,7 @@ class Worker:
         self.process = context.Process(target=_work, args=arguments, daemon=True)
         self.process.start()
         theirs.close()
+        self._owes_answer = True
 
     @property
     def name(self) -> str:
@@ -44,16 +46,20 @@ class Worker:
         return f"environment {first}" if first == last else f"environments {first} to {last}"
 
     def send(self, command: str, arguments: tuple[Any, ...]) -> None:
-        """Hands a command on; its answer is to be received before the next one."""
+        """Hands a command on; an answer that nobody waited for to the end is dropped before."""
+        if self._owes_answer:
+            self.receive()
         try:
             self.pipe.send((command, arguments))
+            self._owes_answer = True
         except OSError as error:
             raise self._gone() from error
 
     def receive(self) -> Any:
-        """Waits for the answer to the last command; the first one comes when all is built."""
+        """Waits for the answer to the last command; the first one names the code that it runs."""
         try:
             failure, answer = self.pipe.recv()
+            self._owes_answer = False
         except (EOFError, OSError) as error:
             raise self._gone() from error
         if failure is not None:
@@ -91,7 +97,7 @@ def _work(
     try:
         vector = SyncVectorEnv(env_factories, copy=False, autoreset_mode=AutoresetMode.DISABLED)
         shared = sliced(views(vector.single_observation_space, memory, num_envs), rows)
-        pipe.send((None, None))
+        pipe.send((None, os.path.realpath(__file__)))
         while True:
             command, arguments = pipe.recv()
             pipe.send((None, _COMMANDS[command](vector, shared, *arguments)))

@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory
 from numpy.typing import NDArray
 
+from flowrep.envs import worker_process
 from flowrep.envs.worker_process import Arrays, EnvFactory, Worker, WorkerError, copied, views
 
 
@@ -73,7 +74,7 @@ class WorkerVectorEnv(VectorEnv):
         with nullcontext() if _need_main_module(env_factories) else _without_main_module():
             for rows in map(slice, bounds, bounds[1:]):
                 self._workers.append(Worker(context, env_factories, rows, memory))
-        self._receive()
+        self._check_code(self._receive())
 
     @property
     def num_workers(self) -> int:
@@ -159,6 +160,16 @@ class WorkerVectorEnv(VectorEnv):
             worker.end()
         if workers:
             atexit.unregister(self._at_exit)
+
+    def _check_code(self, files: Sequence[str]) -> None:
+        # The fork server looks for modules in the current folder first.
+        ours = os.path.realpath(worker_process.__file__)
+        if others := set(files) - {ours}:
+            self.close()
+            raise WorkerError(
+                f"workers found another copy of this package ({others.pop()}) than this process "
+                f"({ours}): start from another folder than {os.getcwd()}"
+            )
 
     def _send(self, command: str, arguments: Callable[[slice], tuple[Any, ...]]) -> None:
         if not self._workers:

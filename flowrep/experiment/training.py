@@ -139,6 +139,8 @@ def train(
                 t.agent.remember(stepped)
             t.frames += stepped.numel()
             t.recent.extend(finished_outcomes(stepped))
+            if t.frames >= total:
+                learn(t, clock)  # no next step is there to drive meanwhile
             bar.update(t.frames - bar.n)
             if should_log(t.frames):
                 t.check()
@@ -151,8 +153,6 @@ def train(
             if should_save(t.frames):
                 with clock("checkpoint"):
                     t.save()
-    if t.frames >= total:
-        learn(t, clock)
     with clock("checkpoint"):
         t.save()
     return clock

@@ -126,6 +126,15 @@ def test_steps_that_earlier_weights_took_count_by_how_likely_they_then_were():
     torch.testing.assert_close(agent.losses(batch)["policy_loss"], expected, rtol=1e-4, atol=1e-6)
 
 
+def test_a_rollout_of_before_probabilities_were_kept_is_refused():
+    agent, other = make_ppo(), make_ppo()
+    agent.remember(STEPS[0])
+    state = agent.memory.state_dict()
+    del state["steps"]["action_log_prob"]
+    with pytest.raises(ValueError, match=r"lacks 'action_log_prob'.*start the run anew"):
+        other.memory.load_state_dict(state)
+
+
 def test_gradients_are_scaled_down_to_the_largest_norm():
     agent = make_ppo(max_grad_norm=1e-3)
     for each in STEPS:

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
@@ -175,6 +176,26 @@ def test_a_worker_that_was_killed_is_told(make):
         env.step(np.array([1, 1, 17]))
 
 
+def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make):
+    env, other = make(3, 2), in_process(3)
+    for each in (env, other):
+        each.reset(seed=0)
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with patch.object(env._workers[1], "receive", interrupted), pytest.raises(KeyboardInterrupt):
+        env.step(np.array([1, 2, 3]))
+    assert_same(env.reset(seed=1), other.reset(seed=1))
+    assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
+
+
+def test_workers_that_run_another_copy_of_the_code_are_refused(make, monkeypatch):
+    monkeypatch.setattr("flowrep.envs.worker_process.__file__", "/elsewhere/worker_process.py")
+    with pytest.raises(WorkerError, match="another copy of this package"):
+        make(2, 1)
+
+
 def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
     env, other = make(3, 2), in_process(3)
     for each in (env, other):
@@ -188,6 +209,7 @@ def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
 HOLDER = """
 import sys
 from functools import partial
+from unittest.mock import patch
 from tests.envs.test_workers import Counter
 from flowrep.envs import WorkerVectorEnv
 

@@ -133,6 +133,7 @@ def test_a_killed_run_continues_from_its_last_checkpoint_and_drops_later_rows(tm
 def test_the_loop_updates_once_for_ten_frames_after_the_first_batch(tmp_path):
     training = finish(tmp_path)
     assert training.agent.updates == (120 - 16) // 10
+    assert int(float(logged(training)[-1]["updates"])) == training.agent.updates
 
 
 def poison(training, updates):
