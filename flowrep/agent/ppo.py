@@ -8,6 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torch.distributions import Distribution
 from torchrl.data import Composite, TensorSpec
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -20,6 +21,16 @@ from flowrep.agent.observation import decode_maps, map_codecs
 from flowrep.agent.policy import PolicyNetwork, stochastic_policy
 from flowrep.agent.precision import compute_dtype
 from flowrep.agent.rollout import Rollout
+
+
+class _ClipLoss(ClipPPOLoss):
+    """TorchRL's loss, without its question to the device whether the entropy is finite.
+
+    A policy whose entropy is not stops the run by name, see `Algorithm.update`.
+    """
+
+    def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
+        return dist.entropy().unsqueeze(-1)
 
 
 class PPO(Algorithm):
@@ -59,7 +70,6 @@ class PPO(Algorithm):
         "policy_loss", "value_loss", "entropy_loss", "entropy", "kl", "clip_share",
         "explained_variance",
     )  # fmt: skip
-    CAPTURABLE = False  # TorchRL's loss asks the device whether the entropy is finite
     memory: Rollout
 
     def __init__(
@@ -108,7 +118,7 @@ class PPO(Algorithm):
         self._actor = stochastic_policy(actor, ["embedding"], actions)
         self._critic = TensorDictModule(critic, ["embedding"], ["state_value"])
         self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, device=device)
-        self.loss = ClipPPOLoss(
+        self.loss = _ClipLoss(
             self._actor,
             self._critic,
             clip_epsilon=clip,
