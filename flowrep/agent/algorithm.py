@@ -86,10 +86,19 @@ class Algorithm(ABC):
         # the fused step takes no step where it is 1, and asks the device, not the host
         self.optimizer.found_inf = self.divergence.is_bad  # type: ignore[attr-defined]
         self.updates = 0
+        self._is_eager = not self.CAPTURABLE
+        self._capture()
+
+    def step_eagerly(self) -> None:
+        """Takes every further update operation by operation, never as a CUDA graph.
+
+        For debugging and for timing: the numbers are the same.
+        """
+        self._is_eager = True
         self._capture()
 
     def _capture(self) -> None:
-        self._step = captured(self._take_step, self.device) if self.CAPTURABLE else self._take_step
+        self._step = self._take_step if self._is_eager else captured(self._take_step, self.device)
 
     @classmethod
     def metric_names(cls) -> tuple[str, ...]:

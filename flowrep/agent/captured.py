@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -18,13 +19,48 @@ def captured(step: Step, device: torch.device) -> Step:
 
     The graph runs the same kernels on the same memory again and again: `step` may depend on what
     changes between two calls only through its argument and through tensors that are changed in
-    place; it asks the device for no number, and brings none to it. Every argument has the shapes of
-    the first. On any other device `step` itself is returned.
+    place; it asks the device for no number, and brings none to it. On any other device `step`
+    itself is returned.
 
     Args:
-        step: takes and returns a TensorDict.
+        step: takes and returns a TensorDict; on CUDA every one has the first one's keys, shapes and
+            dtypes, and ValueError is raised for another.
         device: where it computes.
     """
     if device.type != "cuda":
         return step
-    return CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device)
+    return OfOneShape(CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device))
+
+
+class OfOneShape:
+    """Passes batches on to `step`, and refuses those that are laid out unlike the first.
+
+    A graph copies each batch into the first one's memory, where a batch of one row would be spread
+    over all rows, numbers cast and a missing map left as it was, all in silence.
+    """
+
+    def __init__(self, step: Step) -> None:
+        self.step = step
+        self._expected: dict[Any, tuple[Any, ...]] | None = None
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Returns what `step` does.
+
+        Raises:
+            ValueError: naming the first entry that differs.
+        """
+        layout = {
+            key: (tuple(value.shape), value.dtype)
+            for key, value in batch.items(include_nested=True, leaves_only=True)
+        }
+        if self._expected is None:
+            self._expected = layout
+        # a loss may leave something of its own in a batch that then comes again
+        for key, expected in self._expected.items():
+            if layout.get(key) != expected:
+                raise ValueError(
+                    f"the update is a CUDA graph of batches with {key!r} {expected}, this one has "
+                    f"it {layout.get(key, 'absent')}: keep batches alike, or call step_eagerly() "
+                    "on the algorithm"
+                )
+        return self.step(batch)

@@ -4,9 +4,10 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
-from flowrep.agent.captured import WARM_UP, captured
+from flowrep.agent.captured import WARM_UP, OfOneShape, captured
 from tests.agent.tape import Foreign, Tape
 
 ENVS, BATCHES = 5, 7
@@ -101,10 +102,7 @@ def take_losses(agent, batch):
 def test_an_update_asks_the_device_for_no_number_and_brings_it_none(make_any, random_steps):
     batch = batches_of([make_any()], random_steps)[0].to("meta")
     agent = on_a_device_that_cannot_be_read(make_any)
-    if not agent.CAPTURABLE:
-        with pytest.raises(RuntimeError, match="cannot be called on meta tensors"):
-            take_losses(agent, batch)
-        return
+    assert agent.CAPTURABLE
     take_losses(agent, batch.copy())  # TorchRL brings its discount when it is first used
     with Foreign() as foreign:
         take_losses(agent, batch.copy())
@@ -115,11 +113,34 @@ def test_on_a_cpu_a_step_stays_what_it_is():
     assert captured(len, torch.device("cpu")) is len
 
 
+def test_an_algorithm_can_be_told_to_leave_graphs_alone(make_any):
+    with patch("flowrep.agent.algorithm.captured", return_value=len):  # as on CUDA
+        agent = make_any()
+        assert agent._step is len
+        agent.step_eagerly()
+        assert agent._step == agent._take_step
+        agent.load_state_dict(agent.state_dict())
+        assert agent._step == agent._take_step
+
+
+def test_a_batch_unlike_the_first_is_refused_by_name():
+    step = OfOneShape(lambda batch: batch)
+    first = TensorDict({"seen": torch.zeros(4, 2), "next": {"reward": torch.zeros(4, 1)}}, [4])
+    assert step(first) is first
+    step(first.clone().update({"td_error": torch.zeros(4)}))
+    with pytest.raises(ValueError, match=r"'seen' \(\(4, 2\).* has it \(\(1, 2\)"):
+        step(first[:1])
+    with pytest.raises(ValueError, match=r"reward.*float32.*float64"):
+        step(first.clone().update({"next": {"reward": torch.zeros(4, 1, dtype=torch.float64)}}))
+    with pytest.raises(ValueError, match=r"reward.*absent"):
+        step(first.exclude(("next", "reward")))
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_graph_on_cuda_equals_the_steps_it_replaces(make_any, random_steps):
     eager, graph = make_any(device="cuda"), make_any(device="cuda")
     batches = batches_of([eager, graph], random_steps)
-    eager._step = eager._take_step
+    eager.step_eagerly()
     for batch in batches:
         expected, actual = eager.update(batch.clone()), graph.update(batch.clone())
         for name, value in expected.items():
