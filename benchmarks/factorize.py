@@ -21,10 +21,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from kornia.geometry import create_meshgrid
-from kornia.geometry import depth as kornia_depth
-from kornia.geometry.camera import project_points
-from kornia.geometry.linalg import transform_points
 from torch import Tensor
 
 from flowrep.agent.allocator import keep_freed_memory
@@ -216,13 +212,18 @@ def kornia_factorize(
 
     Its pixel centres lie at whole numbers: K's principal point moves by half a pixel.
     """
+    from kornia.geometry import create_meshgrid
+    from kornia.geometry import depth as kornia_depth
+    from kornia.geometry.camera import project_points
+    from kornia.geometry.linalg import transform_points
+
     half = torch.zeros_like(K)
     half[:, :2, 2] = 0.5
     K = K - half
     height, width = depth.shape[-2:]
     points = kornia_depth.depth_to_3d_v2(depth[:, 0], K)  # [B, H, W, 3]
     previous = transform_points(prev_from_curr[:, None], points)
-    pixels = create_meshgrid(height, width, normalized_coordinates=False)
+    pixels = create_meshgrid(height, width, normalized_coordinates=False, device=depth.device)
     flow = pixels - project_points(previous, K[:, None, None])
     ego = flow.permute(0, 3, 1, 2)
     return ego, raw - ego

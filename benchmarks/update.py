@@ -24,6 +24,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory
+from flowrep.agent.captured import WARM_UP
 
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3
@@ -68,8 +69,12 @@ def flowrep_agent(steps: TensorDict, encoder: str, precision: str) -> DiscreteSA
     return agent
 
 
-def flowrep_update(steps: TensorDict, encoder: str, precision: str) -> Callable[[], object]:
+def flowrep_update(
+    steps: TensorDict, encoder: str, precision: str, *, eager: bool = False
+) -> Callable[[], object]:
     agent = flowrep_agent(steps, encoder, precision)
+    if eager:
+        agent.step_eagerly()
     sample = agent.sample()
     return lambda: agent.update(sample)
 
@@ -136,13 +141,13 @@ def interleaved(
 ) -> dict[str, float]:
     """Returns each action's median seconds over rounds in which all take turns."""
     seconds: dict[str, list[float]] = {name: [] for name in actions}
-    for turn in range(rounds + 2):
+    for turn in range(rounds + WARM_UP):
         for name, act in actions.items():
             start = clock()
             act()
             if device.type == "cuda":
                 torch.cuda.synchronize()
-            if turn >= 2:  # the first two warm up
+            if turn >= WARM_UP:
                 seconds[name].append(clock() - start)
     return {name: statistics.median(values) for name, values in seconds.items()}
 
@@ -180,6 +185,8 @@ def main() -> None:
         width = 8192 if args.device.type == "cuda" else 2048
         types = {"bf16": torch.bfloat16, "fp32": torch.float32}
         products = {n: matrix_product(t, args.device, width) for n, t in types.items()}
+        # counted first: what a CUDA graph does later can't be seen from here
+        counts = {n: None if "stock" in n else operations(u) for n, u in updates.items()}
         seconds = interleaved({**updates, **products}, args.rounds, args.device, clock)
         rates = {name: 2 * width**3 / seconds[name] for name in products}
         print(f"\n{size}: {side}x{side}, {len(MAPS)} maps of {CHANNELS} channels, batch {batch}")
@@ -187,8 +194,7 @@ def main() -> None:
         print("| update | s | GFLOP | bf16 floor, s | x floor | faster than stock |")
         print("| --- | --- | --- | --- | --- | --- |")
         stock = seconds["TorchRL stock, separate fp32"]
-        for name, update in updates.items():
-            count = None if "stock" in name else operations(update)
+        for name, count in counts.items():
             floor = count / rates["bf16"] if count else None
             columns = [
                 f"{seconds[name]:.4f}",
