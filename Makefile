@@ -10,7 +10,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate view gallery test lint types format bench smoke docs wheel clean check-python
+.PHONY: help install train evaluate view gallery test lint types format bench bench-gpu smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -63,12 +63,16 @@ format: $(INSTALLED)  ## Mend style and formatting
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Those against ML-Agents need an environment of its own.
-BENCHMARKS = $(filter-out %mlagents.py %mlagents_worker.py,$(wildcard benchmarks/*.py))
+# Those against ML-Agents need an environment of its own, those of a GPU a GPU.
+BENCHMARKS = $(filter-out %mlagents.py %mlagents_worker.py benchmarks/gpu%,$(wildcard benchmarks/*.py))
 
 bench: $(INSTALLED)  ## Run the benchmarks, one after the other
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[bench]"
 	for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+bench-gpu: $(INSTALLED)  ## Measure everything on a GPU into outputs/gpu/
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[bench]"
+	$(BIN)/python benchmarks/gpu.py $(ARGS)
 
 docs: $(INSTALLED)  ## Build the documentation into site/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"

@@ -1,0 +1,202 @@
+"""Measures on a GPU all that training waits for, and what the paper's run would take.
+
+    python benchmarks/gpu.py [--output outputs/gpu] [--rounds 20] [--parts update transforms ...]
+
+Four parts, each a table: an update (as a CUDA graph and eager, bf16 and fp32, against TorchRL's
+stock recipe and the floor at the measured rate of products), factorising flow (against kornia,
+where installed, and a copy), frames a second of the streets by number of worker processes, and a
+short training at the paper's size, from which the wall time of the whole one is projected. The
+report is printed, and written as report.md and report.json after every part. Without PyBullet, or
+with `--recorded`, made-up sensor maps stand in for the streets and the report says so. `--device
+cpu --quick` runs all of it in a tiny version, whose numbers mean nothing.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from factorize import BYTES_PER_PIXEL, copier, cuda_clock, inputs, kornia_factorize
+from factorize import repeats_for as repeats_for_a_turn
+from factorize import timed as seconds_of_a_call
+from gpu_run import RECORDED_NOTE, street_rates, training
+from update import SIZES as UPDATE_SIZES
+from update import (
+    flowrep_update,
+    interleaved,
+    matrix_product,
+    operations,
+    random_steps,
+    stock_update,
+)
+
+from flowrep.geometry import factorize
+
+FACTORIZE_SIZES = [(64, 84, 84), (1024, 84, 84), (1, 720, 1280)]
+QUICK_UPDATE_SIZES = {"tiny": (40, 8)}
+QUICK_FACTORIZE_SIZES = [(2, 12, 16)]
+PARTS = ("update", "transforms", "streets", "training")
+NO_GPU = 2  # the exit code
+STOCK = "TorchRL stock, separate fp32"
+
+
+@dataclass
+class Part:
+    """One table of the report, and what has to be said beside it."""
+
+    title: str
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def markdown(self) -> str:
+        lines = [f"## {self.title}", "", *(f"{note}\n" for note in self.notes)]
+        columns = list(dict.fromkeys(name for row in self.rows for name in row))
+        lines += [f"| {' | '.join(columns)} |", f"|{' --- |' * len(columns)}"]
+        for row in self.rows:
+            lines.append(f"| {' | '.join(text_of(row.get(name)) for name in columns)} |")
+        return "\n".join([*lines, ""])
+
+
+def text_of(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def updates(args: argparse.Namespace) -> Part:
+    """An update by size, encoder, precision and whether it is a graph."""
+    part = Part("An update of discrete SAC")
+    if args.device.type != "cuda":
+        part.notes.append("There are no graphs on a CPU: both kinds are eager here.")
+    for name, size in (QUICK_UPDATE_SIZES if args.quick else UPDATE_SIZES).items():
+        rows, rates = updates_of_a_size(args, *size)
+        part.rows += [{"size": name, **row} for row in rows]
+        measured = ", ".join(f"{n} {rate / 1e12:.4g} TFLOP/s" for n, rate in rates.items())
+        part.notes.append(f"{name}: {size[0]}x{size[0]}, batch {size[1]}; {measured}.")
+    return part
+
+
+def updates_of_a_size(
+    args: argparse.Namespace, side: int, batch: int
+) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    """Returns a row an update, and the measured rates of products in operations a second."""
+    torch.manual_seed(0)
+    steps = random_steps(side, batch, args.device)
+    variants = {
+        f"{encoder} {precision}, {kind}": flowrep_update(
+            steps, encoder, precision, eager=kind == "eager"
+        )
+        for encoder in ("shared", "separate")
+        for precision in ("bf16", "fp32")
+        for kind in ("graph", "eager")
+    }
+    # counted in the first call: what a graph does later can't be seen from here
+    counts = {variant: operations(update) for variant, update in variants.items()}
+    width = 256 if args.quick else 8192
+    types = {"bf16 products": torch.bfloat16, "fp32 products": torch.float32}
+    products = {n: matrix_product(dtype, args.device, width) for n, dtype in types.items()}
+    everything = {**variants, STOCK: stock_update(steps), **products}
+    seconds = interleaved(everything, args.rounds, args.device, time.perf_counter)
+    rates = {n: 2 * width**3 / seconds[n] for n in products}
+    rows = []
+    for variant in (*variants, STOCK):
+        row = {"update": variant, "ms": 1e3 * seconds[variant]}
+        if variant in counts:
+            floor = counts[variant] / rates["bf16 products"]
+            row |= {"bf16 floor, ms": 1e3 * floor, "x floor": seconds[variant] / floor}
+        rows.append(row | {"x faster than stock": seconds[STOCK] / seconds[variant]})
+    return rows, rates
+
+
+@torch.no_grad()
+def transforms(args: argparse.Namespace) -> Part:
+    """Factorising flow, beside kornia and a copy."""
+    part = Part("Factorising flow, float32")
+    clock = cuda_clock if args.device.type == "cuda" else time.perf_counter
+    copied_bytes = 2**20 if args.quick else 2**30
+    copy = copier(copied_bytes, args.device)
+    has_kornia = find_spec("kornia") is not None
+    if not has_kornia:
+        part.notes.append("kornia is not installed: pip install kornia for its column.")
+    if args.quick:
+        part.notes.append("Nothing is compiled in the quick version.")
+    for batch, height, width in QUICK_FACTORIZE_SIZES if args.quick else FACTORIZE_SIZES:
+        given = [tensor.to(args.device) for tensor in inputs(batch, height, width)]
+        compiled = torch.compile(factorize, backend="eager" if args.quick else "inductor")
+        calls: dict[str, Callable[..., Any]] = {"compiled": compiled, "eager": factorize}
+        if has_kornia:
+            calls["kornia"] = kornia_factorize
+        seconds = {n: seconds_of(partial(call, *given), clock) for n, call in calls.items()}
+        moved = batch * height * width * BYTES_PER_PIXEL
+        bandwidth = copied_bytes / seconds_of(copy, clock)
+        row = {"size": f"{batch} x {height} x {width}"}
+        row |= {f"{name}, ms": 1e3 * s for name, s in seconds.items()}
+        row |= {"copy, GB/s": bandwidth / 1e9, "of it": moved / seconds["compiled"] / bandwidth}
+        if has_kornia:
+            row["x kornia"] = seconds["kornia"] / seconds["compiled"]
+        part.rows.append(row)
+    return part
+
+
+def seconds_of(call: Callable[[], object], clock: Callable[[], float]) -> float:
+    call()  # compiles
+    return seconds_of_a_call(call, repeats_for_a_turn(call, clock), clock)
+
+
+def streets(args: argparse.Namespace) -> Part:
+    """Frames a second, by number of worker processes."""
+    rows = street_rates(args.device, recorded=args.recorded, quick=args.quick)
+    part = Part("Streets with ego and obj, random actions", rows)
+    part.notes += [RECORDED_NOTE] if args.recorded else []
+    return part
+
+
+def whole_training(args: argparse.Namespace) -> Part:
+    """What the paper's 2,000,000 frames would take, without evaluations."""
+    row, notes = training(args.device, recorded=args.recorded, quick=args.quick)
+    return Part("A training at the paper's size, projected", [row], notes)
+
+
+def write(folder: Path, machine: str, parts: dict[str, Part]) -> str:
+    """Writes the report as far as it has come; returns it as Markdown."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = "\n".join([f"# {machine}\n", *(part.markdown() for part in parts.values())])
+    (folder / "report.md").write_text(text, encoding="utf-8")
+    document = {"machine": machine, **{name: asdict(part) for name, part in parts.items()}}
+    (folder / "report.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    return text
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", type=torch.device, default=torch.device("cuda"))
+    parser.add_argument("--output", type=Path, default=Path("outputs/gpu"))
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--recorded", action="store_true", help="made-up maps, no simulator")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to try the script")
+    args = parser.parse_args(argv)
+    if args.device.type == "cuda" and not torch.cuda.is_available():
+        print("no CUDA device here; --device cpu --quick tries the script", file=sys.stderr)
+        sys.exit(NO_GPU)
+    args.recorded = args.recorded or find_spec("pybullet") is None
+    name = torch.cuda.get_device_name(args.device) if args.device.type == "cuda" else "CPU"
+    machine = f"{name}, {torch.get_num_threads()} CPU threads, torch {torch.__version__}"
+    makers = dict(zip(PARTS, (updates, transforms, streets, whole_training)))
+    parts: dict[str, Part] = {}
+    for part in args.parts:
+        print(f"measuring: {part}", file=sys.stderr, flush=True)
+        parts[part] = makers[part](args)
+        text = write(args.output, machine, parts)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
