@@ -168,10 +168,15 @@ def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, fl
         composed = compose("train", [*size, *cadence, f"device={device}"])
     config: Any = OmegaConf.to_container(composed, resolve=True)
     marks: list[tuple[int, float]] = []
+
+    def mark(frames: int) -> bool:
+        marks.append((frames, finish(device)))
+        return False
+
     with tempfile.TemporaryDirectory() as folder:
         run = build(config, RunFolder(Path(folder)))
         try:
-            clock = train(run, config, StopRequest(), lambda n: marks.append((n, finish(device))))
+            clock = train(run, config, StopRequest(), mark)
         finally:
             run.env.close()
     (frames, start), (last, end) = marks[0], marks[-1]

@@ -158,8 +158,8 @@ def build(config: Config, folder: RunFolder) -> Training:
     return training
 
 
-def log_evaluation(training: Training, config: Config, stop: StopRequest, frames: int) -> None:
-    """Runs greedy episodes at the training speed and appends them to evaluation.csv."""
+def log_evaluation(training: Training, config: Config, stop: StopRequest, frames: int) -> bool:
+    """Appends greedy episodes at the training speed to evaluation.csv; says if it was stopped."""
     evaluation = config["evaluation"]
     with torch.random.fork_rng(devices=[]):
         rows = compare(
@@ -172,6 +172,7 @@ def log_evaluation(training: Training, config: Config, stop: StopRequest, frames
             should_stop=lambda: bool(stop),
         )
     training.run.log_episodes(with_origin(rows, config, frames))
+    return not rows
 
 
 def final_evaluation(training: Training, config: Config, stop: StopRequest) -> None:

@@ -33,9 +33,9 @@ class Algorithm(ABC):
 
     ```
     acted = algorithm.policy(observation)                   # writes `action`
-    algorithm.remember(steps)                               # with what the action brought
     for _ in range(algorithm.updates_due(frames)):
         metrics = algorithm.update(algorithm.sample())
+    algorithm.remember(steps)                               # with what the action brought
     ```
 
     A subclass builds its networks, sets `policy` and `memory`, then calls this constructor with

@@ -37,6 +37,7 @@ class Training:
     agent: Algorithm
     run: RunFolder
     frames: int = 0
+    owes_evaluation: bool = False
     carried: TensorDictBase | None = None
     metrics: dict[str, Tensor] = field(default_factory=dict)
     recent: deque[int] = field(default_factory=lambda: deque(maxlen=RECENT_EPISODES))
@@ -46,6 +47,7 @@ class Training:
         assert self.carried is not None
         return {
             "frames": self.frames,
+            "owes_evaluation": self.owes_evaluation,
             "metrics": self.metrics,
             "recent": list(self.recent),
             "carried": self.carried.to_dict(),
@@ -60,6 +62,7 @@ class Training:
         """Continues where `state` was taken."""
         self.env.reset()
         self.frames, self.metrics = state["frames"], state["metrics"]
+        self.owes_evaluation = state["owes_evaluation"]
         self.recent.extend(state["recent"])
         self.carried = TensorDict(state["carried"], self.env.batch_size, device=self.env.device)
         self.agent.load_state_dict(state["agent"])
@@ -101,7 +104,7 @@ def train(
     training: Training,
     config: Mapping[str, Any],
     stop: StopRequest,
-    evaluate: Callable[[int], None],
+    evaluate: Callable[[int], bool],
 ) -> Stopwatch:
     """Trains until `total_frames` or until a stop is asked for; the last state is saved.
 
@@ -113,7 +116,8 @@ def train(
         training: a new or a restored run.
         config: the resolved config.
         stop: asked between two steps.
-        evaluate: gets the number of frames.
+        evaluate: gets the number of frames; says whether it was cut short, then it is asked again
+            when the run is resumed.
 
     Returns:
         Where the wall time went.
@@ -126,6 +130,9 @@ def train(
     total = config["total_frames"]
     if t.carried is None:
         t.carried = t.env.reset()
+    if t.owes_evaluation:
+        with clock("evaluation"):
+            t.owes_evaluation = evaluate(t.frames)
     with tqdm(total=total, initial=t.frames, unit="frame", unit_scale=True, mininterval=0.5) as bar:
         while t.frames < total and not stop:
             with clock("policy"), torch.no_grad():
@@ -149,7 +156,7 @@ def train(
                 bar.set_postfix_str(progress_text(row))
             if should_evaluate(t.frames):
                 with clock("evaluation"):
-                    evaluate(t.frames)
+                    t.owes_evaluation = evaluate(t.frames)
             if should_save(t.frames):
                 with clock("checkpoint"):
                     t.save()

@@ -39,7 +39,7 @@ def test_every_algorithm_has_its_section():
 def test_a_smoke_run_logs_what_is_explained(tmp_path, algorithm):
     config = composed("debug=smoke", f"algorithm={algorithm}", "device=cpu")
     training = build(config, RunFolder(tmp_path))
-    train(training, config, StopRequest(), lambda frames: None)
+    train(training, config, StopRequest(), lambda frames: False)
     training.env.close()
     with training.run.metrics_path.open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -48,10 +48,10 @@ def finish(folder, *stops: int, algorithm="dsac") -> Training:
         training, config = new_run(
             folder, resume=(folder / "checkpoint").exists(), algorithm=algorithm
         )
-        train(training, config, StopAfter(training, stop), lambda frames: None)
+        train(training, config, StopAfter(training, stop), lambda frames: False)
         training.env.close()
     training, config = new_run(folder, resume=bool(stops), algorithm=algorithm)
-    train(training, config, StopRequest(), lambda frames: None)
+    train(training, config, StopRequest(), lambda frames: False)
     training.env.close()
     return training
 
@@ -77,10 +77,10 @@ def differing(a, b, place="") -> list[str]:
 def test_how_many_processes_drive_is_not_seen_in_what_comes_out(tmp_path):
     alone = finish(tmp_path / "alone")
     training, config = new_run(tmp_path / "two", num_workers=2)
-    train(training, config, StopAfter(training, 50), lambda frames: None)
+    train(training, config, StopAfter(training, 50), lambda frames: False)
     training.env.close()
     training, config = new_run(tmp_path / "two", resume=True, num_workers=1)
-    train(training, config, StopRequest(), lambda frames: None)
+    train(training, config, StopRequest(), lambda frames: False)
     assert differing(alone.state(), training.state()) == []
     training.env.close()
 
@@ -118,16 +118,39 @@ def test_a_killed_run_continues_from_its_last_checkpoint_and_drops_later_rows(tm
 
     training.save = save_once
     with pytest.raises(Killed):
-        train(training, config, StopRequest(), lambda frames: None)
+        train(training, config, StopRequest(), lambda frames: False)
     training.env.close()
     resumed, config = new_run(tmp_path, resume=True)
     assert resumed.frames == saved[0] == 60
-    train(resumed, config, StopRequest(), lambda frames: None)
+    train(resumed, config, StopRequest(), lambda frames: False)
     resumed.env.close()
     with resumed.run.metrics_path.open(newline="") as file:
         logged = [int(row["frames"]) for row in csv.DictReader(file)]
     assert logged == sorted(set(logged))
     assert logged[-1] == 120
+
+
+def test_an_evaluation_that_was_cut_short_is_made_up_for_on_the_same_frames(tmp_path):
+    class Stop(StopRequest):
+        is_asked = False
+
+        def __bool__(self):
+            return self.is_asked
+
+    asked = []
+
+    def evaluate(frames):
+        asked.append(frames)
+        stop.is_asked = frames == 60 and asked.count(60) == 1
+        return stop.is_asked
+
+    for session in range(2):
+        training, config = new_run(tmp_path, resume=session > 0)
+        config["evaluation"]["every_frames"] = 30
+        stop = Stop()
+        train(training, config, stop, evaluate)
+        training.env.close()
+    assert asked == [30, 60, 60, 90, 120]
 
 
 def test_the_loop_updates_once_for_ten_frames_after_the_first_batch(tmp_path):
@@ -155,11 +178,11 @@ def test_a_loss_that_is_no_number_ends_the_run_before_it_is_saved(tmp_path, log_
     path = training.run.checkpoint_path
     message = rf"^q_loss became inf in update 8 \(q_loss=inf, .*entropy=.*good checkpoint is {path}"
     with pytest.raises(DivergenceError, match=message):
-        train(training, config, StopRequest(), lambda frames: None)
+        train(training, config, StopRequest(), lambda frames: False)
     training.env.close()
     resumed, config = new_run(tmp_path, resume=True)
     assert resumed.frames == 60
-    train(resumed, config, StopRequest(), lambda frames: None)
+    train(resumed, config, StopRequest(), lambda frames: False)
     resumed.env.close()
     assert resumed.agent.updates == 10
 
@@ -168,6 +191,6 @@ def test_a_loss_that_is_no_number_from_the_start_leaves_no_checkpoint(tmp_path):
     training, config = new_run(tmp_path)
     poison(training, updates=0)
     with pytest.raises(DivergenceError, match=r"in update 1 .*; none was saved yet"):
-        train(training, config, StopAfter(training, 50), lambda frames: None)
+        train(training, config, StopAfter(training, 50), lambda frames: False)
     training.env.close()
     assert not training.run.checkpoint_path.exists()
