@@ -3,7 +3,14 @@
 from flowrep.envs import availability as availability  # before all that it speaks of
 from flowrep.envs.baselines import BASELINES, Drive, RandomDriver, drives, never_turn
 from flowrep.envs.loading import load_scene, scene_names
-from flowrep.envs.make import begin_step, get_states, make_env, set_states, streets
+from flowrep.envs.make import (
+    begin_step,
+    get_states,
+    has_cores_beside,
+    make_env,
+    set_states,
+    streets,
+)
 from flowrep.envs.outcome import Outcome
 from flowrep.envs.planner import Planner
 from flowrep.envs.registration import register_environments
@@ -28,6 +35,7 @@ __all__ = [
     "begin_step",
     "drives",
     "get_states",
+    "has_cores_beside",
     "load_scene",
     "make_env",
     "never_turn",

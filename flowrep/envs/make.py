@@ -17,7 +17,7 @@ from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.sensor_observation import SensorObservation
 from flowrep.envs.street_env import StreetEnv
-from flowrep.envs.workers import WorkerVectorEnv
+from flowrep.envs.workers import WorkerVectorEnv, available_cores
 from flowrep.transforms import representation_stack
 
 
@@ -126,6 +126,17 @@ def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
     vector = _vector(env)
     if isinstance(vector, WorkerVectorEnv):
         vector.step_async(env.base_env.read_action(acted[env.action_key]))
+
+
+def has_cores_beside(env: TransformedEnv, threads: int) -> bool:
+    """Returns whether the env's workers and so many threads of the caller have a core each.
+
+    Where they don't, two kinds of work at once are slower than one after the other: threads that
+    wait for each other at every operation are held up by whatever takes a core from one of them.
+    """
+    vector = _vector(env)
+    workers = vector.num_workers if isinstance(vector, WorkerVectorEnv) else 0
+    return workers + threads <= available_cores()
 
 
 def streets(env: TransformedEnv) -> list[StreetEnv]:

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
 from flowrep.agent import Algorithm, DivergenceError, load_checkpoint, save_checkpoint
-from flowrep.envs import begin_step, get_states, set_states
+from flowrep.envs import begin_step, get_states, has_cores_beside, set_states
 from flowrep.experiment.cadence import Every
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.interruption import StopRequest
@@ -109,8 +109,8 @@ def train(
     """Trains until `total_frames` or until a stop is asked for; the last state is saved.
 
     Between acting and seeing what came of it, the updates are taken that the frames before allow:
-    where the environments have processes of their own, they drive meanwhile. The order, and so all
-    that comes out, is the same where they don't.
+    where the environments have processes and cores of their own, they drive meanwhile. The order,
+    and so all that comes out, is the same where they don't.
 
     Args:
         training: a new or a restored run.
@@ -128,6 +128,8 @@ def train(
     should_evaluate = Every(config["evaluation"]["every_frames"], t.frames)
     should_save = Every(config["checkpoint_every_frames"], t.frames)
     total = config["total_frames"]
+    is_on_gpu = t.agent.device.type == "cuda"
+    drives_meanwhile = is_on_gpu or has_cores_beside(t.env, torch.get_num_threads())
     if t.carried is None:
         t.carried = t.env.reset()
     if t.owes_evaluation:
@@ -137,7 +139,7 @@ def train(
         while t.frames < total and not stop:
             with clock("policy"), torch.no_grad():
                 acted = t.agent.policy(t.carried)
-            with clock("environment"):
+            if drives_meanwhile:
                 begin_step(t.env, acted)
             learn(t, clock)
             with clock("environment"):

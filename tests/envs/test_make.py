@@ -7,7 +7,15 @@ import torch
 from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 
-from flowrep.envs import Outcome, begin_step, get_states, make_env, set_states, streets
+from flowrep.envs import (
+    Outcome,
+    begin_step,
+    get_states,
+    has_cores_beside,
+    make_env,
+    set_states,
+    streets,
+)
 from flowrep.palette import CATEGORY_ID
 
 
@@ -154,6 +162,14 @@ def test_a_street_on_cuda_is_the_street_on_the_cpu(make, num_workers):
     for key in here.keys(True, True):
         assert there[key].is_cuda
         torch.testing.assert_close(there[key].cpu(), here[key], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("num_workers", "threads", "fits"), [(2, 2, True), (2, 3, False), (0, 4, True)]
+)
+def test_whether_cores_are_left_for_the_caller(make, monkeypatch, num_workers, threads, fits):
+    monkeypatch.setattr("flowrep.envs.make.available_cores", lambda: 4)
+    assert has_cores_beside(make(num_envs=2, num_workers=num_workers), threads) == fits
 
 
 def test_states_pass_between_workers_and_one_process(make):
