@@ -25,6 +25,7 @@ from flowrep.envs import Scene, StreetEnv, load_scene, make_env
 
 SENSORS = ("depth", "instance", "prev_from_curr", "instance_motion")  # what ego and obj read
 MAPS = ("ego", "obj")
+MOST_PROCESSES = 8  # of TorchRL's, each of which holds all of torch
 Stepper = Callable[[int], Any]  # takes so many frames
 
 
@@ -98,6 +99,7 @@ def layouts(scene: Scene, n: int) -> dict[str, tuple[Stepper, Callable[[], None]
     if n > 1:
         steppers["the same, 2 workers"] = torchrl_env(make(num_workers=2))
         steppers["the same in TorchRL's Collector"] = collector(make(num_workers=2), 16 * n)
+    if 1 < n <= MOST_PROCESSES:
         steppers["TorchRL's ParallelEnv, a process each"] = torchrl_env(ParallelEnv(n, single))
     return steppers
 
