@@ -45,8 +45,9 @@ class DiscreteSAC(OffPolicy):
         keys: the observation maps to read, in order.
         total_frames: environment frames of the whole training; sets the learning rate's end.
         device: where networks, replay and updates live.
-        encoder: `"shared"`: policy and Q-functions read one set of encoders, trained by L_Q alone;
-            `"separate"`: each its own.
+        encoder: `"shared"`: policy and Q-functions read one set of encoders, trained by L_Q alone,
+            and in y both read its target, so that each observation is encoded once; `"separate"`:
+            each its own, and π(·|s') in y reads the policy's.
         precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
         learning_rate: Adam's for all weights and log α, falling linearly to 0.
         initial_alpha: α before the first update.
@@ -157,15 +158,21 @@ class DiscreteSAC(OffPolicy):
         }
 
     def _embed(self, batch: TensorDictBase) -> TensorDict:
-        """Returns the batch with maps replaced by embeddings; each encoder reads each map once."""
+        """Returns the batch with maps replaced by embeddings.
+
+        A shared encoder reads each map once, its target those of `s'`; of separate ones both do.
+        """
         images = decode_maps(self.codecs, batch)
         critic = self.critic_encoder(images)
         actor = critic.detach() if self.encoder_is_shared else self.actor_encoder(images)
         with torch.no_grad():
             images = decode_maps(self.codecs, batch["next"])
             following = batch["next"].select("reward", "done", "terminated")
-            following["actor_embedding"] = self.actor_encoder(images)
-            following["critic_embedding"] = self.target_encoder(images)
+            target = self.target_encoder(images)
+            following["critic_embedding"] = target
+            following["actor_embedding"] = (
+                target if self.encoder_is_shared else self.actor_encoder(images)
+            )
         return TensorDict(
             {
                 "actor_embedding": actor,

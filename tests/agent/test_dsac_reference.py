@@ -41,10 +41,10 @@ def dsac_losses(weights, maps, next_maps, action, reward, terminated):
         "target_qvalue_network_params.module",
     )
     alpha = weights["log_alpha"].exp().detach()
-    actor_encoder = "actor_encoder" if separate else "critic_encoder"
     with torch.no_grad():
-        policy = head(weights, actor, encode(weights, actor_encoder, next_maps)).softmax(1)
         embedded = encode(weights, "target_encoder", next_maps)
+        seen = encode(weights, "actor_encoder", next_maps) if separate else embedded
+        policy = head(weights, actor, seen).softmax(1)
         q = torch.minimum(*(head(weights, target, embedded, net=i) for i in (0, 1)))
         value = (policy * (q - alpha * policy.log())).sum(1)
         y = reward + GAMMA * torch.where(terminated, 0.0, value)
