@@ -13,6 +13,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -88,11 +89,13 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 Learner = tuple[Policy, Callable[[TensorDictBase], object], Callable[[], object]]
 
 
-def flowrep_learner(env: EnvBase, frames: int, precision: str = "fp32") -> Learner:
+def flowrep_learner(
+    env: EnvBase, frames: int, precision: str = "fp32", encoder: str = "separate"
+) -> Learner:
     """Returns a policy, what takes in steps, and one update."""
     agent = DiscreteSAC(
         env.observation_spec, env.action_spec, ["view"], total_frames=frames, device="cpu",
-        encoder="separate", precision=precision, learning_rate=LEARNING_RATE, initial_alpha=ALPHA,
+        encoder=encoder, precision=precision, learning_rate=LEARNING_RATE, initial_alpha=ALPHA,
         target_entropy_weight=TARGET_ENTROPY_WEIGHT, gamma=GAMMA, tau=TAU, hidden_size=HIDDEN,
         batch_size=BATCH, replay_capacity=REPLAY, frames_per_update=FRAMES_PER_UPDATE,
         learning_starts=None,
@@ -168,7 +171,10 @@ def main() -> None:
     learners = {
         "TorchRL's stock recipe, fp32": stock_learner,
         "flowrep, fp32": flowrep_learner,
-        "flowrep, bf16": lambda env, frames: flowrep_learner(env, frames, "bf16"),
+        "flowrep, bf16": partial(flowrep_learner, precision="bf16"),
+        "flowrep, shared encoder, bf16": partial(
+            flowrep_learner, precision="bf16", encoder="shared"
+        ),
     }
     print(f"greedy return after {arguments.frames} frames; the best is {BEST:.2f}")
     for name, make_learner in learners.items():
