@@ -209,7 +209,6 @@ def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
 HOLDER = """
 import sys
 from functools import partial
-from unittest.mock import patch
 from tests.envs.test_workers import Counter
 from flowrep.envs import WorkerVectorEnv
 
