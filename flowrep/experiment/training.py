@@ -62,7 +62,7 @@ class Training:
         """Continues where `state` was taken."""
         self.env.reset()
         self.frames, self.metrics = state["frames"], state["metrics"]
-        self.owes_evaluation = state["owes_evaluation"]
+        self.owes_evaluation = state.get("owes_evaluation", False)  # older runs don't say
         self.recent.extend(state["recent"])
         self.carried = TensorDict(state["carried"], self.env.batch_size, device=self.env.device)
         self.agent.load_state_dict(state["agent"])
