@@ -38,6 +38,10 @@ def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
     assert (run / "checkpoint" / "latest.safetensors").stat().st_size > 1e6
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
+    assert {path.name for path in run.iterdir() if not path.name.startswith(".")} == {
+        "config.yaml", "metrics.csv", "tensorboard", "learning_curve.png", "checkpoint",
+        "evaluation.csv", "failures.csv", "videos",
+    }  # fmt: skip
 
 
 def test_a_run_is_evaluated_beside_baselines_at_every_speed(smoke_run):
