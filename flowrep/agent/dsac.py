@@ -160,7 +160,8 @@ class DiscreteSAC(OffPolicy):
     def _embed(self, batch: TensorDictBase) -> TensorDict:
         """Returns the batch with maps replaced by embeddings.
 
-        A shared encoder reads each map once, its target those of `s'`; of separate ones both do.
+        A shared encoder reads the maps of `s` and its target those of `s'`, for policy and
+        Q-functions; separate ones read them for each.
         """
         images = decode_maps(self.codecs, batch)
         critic = self.critic_encoder(images)
