@@ -173,13 +173,16 @@ def time_first(frames: TensorDictBase) -> TensorDictBase:
 
 
 def _same_maps(a: TensorDictBase, b: TensorDictBase, keys: Sequence[NestedKey]) -> Tensor:
-    """Returns which of N observations are the same, bit for bit, as `[N]` on the CPU."""
+    """Returns which of N observations are equal in value, as `[N]` on the CPU.
+
+    nan equals nan, and -0.0 equals 0.0: whoever copies a map may lose the sign of a zero, as
+    `TensorDict.clone` does where it adds 0.
+    """
     pairs = ((a[key].to(b[key].device), b[key]) for key in keys)
-    same = [(_bits(x) == _bits(y)).flatten(1).all(1) for x, y in pairs]
+    same = [_equal(x, y).flatten(1).all(1) for x, y in pairs]
     return torch.stack(same).all(0).cpu()
 
 
-def _bits(x: Tensor) -> Tensor:
-    """Returns floats as integers, so that nan is equal to itself."""
-    integers = {2: torch.int16, 4: torch.int32, 8: torch.int64}
-    return x.view(integers[x.element_size()]) if x.is_floating_point() else x
+def _equal(x: Tensor, y: Tensor) -> Tensor:
+    equal = x == y
+    return equal | (x.isnan() & y.isnan()) if x.is_floating_point() else equal

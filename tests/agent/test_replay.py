@@ -91,6 +91,21 @@ def test_a_restart_between_two_calls_does_not_join_two_episodes():
     assert transitions(replay) == [(0, 0, 1, 1, 0), (20, 20, 21, 21, 0), (21, 21, 22, 22, 0)]
 
 
+def copied_as_tensordict_does(steps):
+    """`TensorDict.clone` of one that has a device adds 0 to each float, and -0.0 + 0 is +0.0."""
+    return steps.apply(lambda x: x + 0 if x.is_floating_point() else x.clone())
+
+
+@pytest.mark.parametrize("value", [-0.0, float("nan"), float("inf"), -3.0])
+def test_a_step_is_joined_to_the_next_whatever_the_sign_of_its_zeros(value):
+    replay = memory()
+    replay.extend(step([value, 20], [value, 21], action=[0, 20]))
+    replay.extend(copied_as_tensordict_does(step([value, 21], [value, 22], action=[1, 21])))
+    replay.extend(step([value, 22], [value, 23], action=[2, 22]))
+    # comparing bits would leave out actions 0 and 1
+    assert replay.sample()["action"].unique().tolist() == [0, 1, 20, 21]
+
+
 def test_a_batch_of_steps_is_stored_as_the_steps_one_by_one():
     steps = [
         step([10, 20], [11, 21]),
