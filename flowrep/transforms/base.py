@@ -175,6 +175,25 @@ def check_own_keys(transform: MapTransform) -> None:
         )
 
 
+def refuse_n_step(tensordict: TensorDictBase, key: NestedKey) -> None:
+    """Complains about a batch whose next frame isn't the step after its root's.
+
+    TorchRL's `MultiStep` and `MultiStepTransform` say how many steps lie between in
+    `"steps_to_next_obs"`.
+
+    Args:
+        tensordict: a replay batch that lacks `("next", key)`.
+        key: what would be computed under `"next"` from two consecutive steps.
+    """
+    steps = tensordict.get("steps_to_next_obs", None)
+    if steps is not None and bool((steps != 1).any()):
+        raise MissingKey(
+            f"('next', {key!r}) is not in the batch, and can't be computed: its next frames lie up "
+            f"to {int(steps.max())} steps ahead ('steps_to_next_obs'). Store ('next', {key!r}) as "
+            f"the env gave it, before MultiStepTransform moves it"
+        )
+
+
 @functools.cache
 def _compiled(compute: Callable[..., tuple[Tensor, ...]]) -> Callable[..., tuple[Tensor, ...]]:
     """Returns a class's compiled `compute`, kept outside of instances: those stay picklable."""

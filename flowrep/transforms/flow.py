@@ -92,7 +92,7 @@ class FlowTransform(MapTransform):
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns an unbounded spec a flow and a boolean one for the mask."""
-        depth = next(spec for spec, reads in zip(specs, self.reads) if reads is DEPTH)
+        depth = next(spec for spec, reads in zip(specs, self.reads) if reads == DEPTH)
         batch, size, device = depth.shape[:-3], depth.shape[-2:], depth.device
         dtype = torch.promote_types(depth.dtype, torch.float32)
         return tuple(

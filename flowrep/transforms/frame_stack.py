@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
-from flowrep.transforms.base import Keys, MapTransform, MissingKey, Reads
+from flowrep.transforms.base import Keys, MapTransform, MissingKey, Reads, refuse_n_step
 
 
 class FrameStack(MapTransform):
@@ -26,10 +26,13 @@ class FrameStack(MapTransform):
 
     In a replay buffer the stored root stack and the next frame give the next stack exactly,
     shuffled or not: leave `("next", out_key)` out of what is stored, and a transition costs k + 1
-    frames instead of 2 k. A batch without a stored stack has to be a trajectory, with a dimension
-    named "time" and `("next", "done")`; its first frame counts as an episode's first. A buffer may
-    thus store single frames (two a transition, or one where `next` is looked up) and sample slices
-    of an episode: from the k-th step of a slice on, stacks are exact, `batch[:, k - 1:]`.
+    frames instead of 2 k. A stack that is stored under `"next"` stays as it is; n-step returns
+    need it stored, since their next frame is several steps ahead.
+
+    A batch without a stored stack has to be a trajectory, with a dimension named "time" and
+    `("next", "done")`; its first frame counts as an episode's first. A buffer may thus store single
+    frames (two a transition, or one where `next` is looked up) and sample slices of an episode:
+    from the k-th step of a slice on, stacks are exact, `batch[:, k - 1:]`.
 
     Args:
         k: number of frames, at least 1.
@@ -104,8 +107,11 @@ class FrameStack(MapTransform):
             if stack is None:
                 stack = self._stack_from_trajectory(tensordict, frame_key, stack_key)
                 tensordict.set(stack_key, stack)
-            frame = None if following is None else following.get(frame_key, None)
+            if following is None or following.get(stack_key, None) is not None:
+                continue  # stored: right even where the next frame is several steps ahead
+            frame = following.get(frame_key, None)
             if frame is not None:
+                refuse_n_step(tensordict, stack_key)
                 tensordict.set(_under_next(stack_key), push_frame(stack, frame))
         return tensordict
 

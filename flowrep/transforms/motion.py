@@ -13,7 +13,15 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.transforms.base import MOTION, MOTIONS, Keys, MapTransform, MissingKey, Reads
+from flowrep.transforms.base import (
+    MOTION,
+    MOTIONS,
+    Keys,
+    MapTransform,
+    MissingKey,
+    Reads,
+    refuse_n_step,
+)
 
 _CAMERA: NestedKey = ("sensor", "world_from_cam")
 _BODIES: NestedKey = ("sensor", "world_from_body")
@@ -82,7 +90,10 @@ class PoseTransform(MapTransform):
         if tensordict.get(key, None) is None:
             tensordict.set(key, self._along_trajectory(tensordict, now))
         following = tensordict.get("next", None)
-        if following is not None and any(k in following.keys(True) for k in self.in_keys):
+        if following is None or following.get(key, None) is not None:
+            return tensordict  # stored: right even where the next frame is several steps ahead
+        if any(k in following.keys(True) for k in self.in_keys):
+            refuse_n_step(tensordict, key)
             following.set(key, self.between(now, self._poses(following)))
             tensordict.set("next", following)
         return tensordict
@@ -133,7 +144,8 @@ class CameraMotion(PoseTransform):
 
     The pose of the step before is read from the TensorDict that goes into `step`; nothing is
     remembered between calls. In a replay buffer the stored root motion and the two poses give the
-    next motion, shuffled or not. A batch without a stored motion has to be a trajectory, with a
+    next motion, shuffled or not; one that is stored under `"next"` stays as it is, and n-step
+    returns need it stored. A batch without a stored motion has to be a trajectory, with a
     dimension named "time" and `("next", "done")`; its first frame counts as an episode's first.
 
     Args:

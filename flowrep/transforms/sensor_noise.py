@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
+import zlib
 from collections.abc import Sequence
 
 import torch
@@ -45,8 +47,8 @@ class SensorNoise(MapTransform):
     root and `"next"` get errors of their own. Resets get noise like any frame.
 
     The generator is the transform's own, on the device of the maps; its state is part of
-    `state_dict`, so that a resumed run goes on in the same sequence. Workers of a `ParallelEnv`
-    that hold the transform need a seed each.
+    `state_dict`, so that a resumed run goes on in the same sequence. Each env of a `SerialEnv` or
+    `ParallelEnv` draws noise of its own unless all are given one seed.
 
     Args:
         sensors: of `"depth"`, `"motion"` and `"flow"`, those that are read and written.
@@ -55,7 +57,9 @@ class SensorNoise(MapTransform):
         drift_m: standard deviation of the motion's translation a step, along each axis, metres.
         drift_rad: the same of its rotation, about each axis, radians.
         flow_sigma_px: standard deviation of each flow channel, pixels a step.
-        seed: of the generator.
+        seed: of the generator: envs with the same seed have the same noise. None draws one from
+            torch's global generator (`torch.manual_seed` makes it reproducible) and the name of
+            the worker process.
         in_keys: one key a sensor; the table's by default.
         out_keys: one key a sensor; `in_keys` by default.
 
@@ -81,7 +85,7 @@ class SensorNoise(MapTransform):
         drift_m: float = 0.0,
         drift_rad: float = 0.0,
         flow_sigma_px: float = 0.0,
-        seed: int = 0,
+        seed: int | None = None,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
@@ -103,7 +107,7 @@ class SensorNoise(MapTransform):
             )
         self.sensors = tuple(sensors)
         self.options = options
-        self.seed = int(seed)
+        self.seed = None if seed is None else int(seed)
         self._state: Tensor | None = None  # of a generator that is yet to be made
         self._generator: torch.Generator | None = None
 
@@ -136,10 +140,12 @@ class SensorNoise(MapTransform):
     def _generator_on(self, device: torch.device) -> torch.Generator:
         """Returns the generator, made at the first use on a device."""
         if self._generator is None or self._generator.device != device:
-            self._generator = torch.Generator(device=device).manual_seed(self.seed)
+            self._generator = torch.Generator(device=device)
             if self._state is not None:
                 self._generator.set_state(self._state)
                 self._state = None
+            else:
+                self._generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
         return self._generator
 
     def get_extra_state(self) -> Tensor:
@@ -156,6 +162,16 @@ class SensorNoise(MapTransform):
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns unbounded specs: an error knows no bounds."""
         return tuple(Unbounded(s.shape, device=s.device, dtype=s.dtype) for s in specs)
+
+
+def _drawn_seed() -> int:
+    """Returns a seed that differs between envs in one process and between worker processes.
+
+    Forked workers share the state of torch's generator, spawned ones its default seed: their names
+    tell them apart.
+    """
+    drawn = int(torch.randint(2**62, ()))
+    return drawn ^ zlib.crc32(multiprocessing.current_process().name.encode())
 
 
 def noisy_depth(

@@ -21,7 +21,7 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import EnvBase, GymWrapper, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import Compose
+from torchrl.envs.transforms import Compose, MultiStepTransform
 from torchrl.envs.utils import step_mdp
 
 from flowrep.transforms import Depth, FrameStack, Segmentation
@@ -238,6 +238,34 @@ def test_what_a_stored_transition_costs():
     assert (online[STACK].nbytes + online["next", STACK].nbytes) == online.numel() * 6 * one_map
     restored = stack_of_three()(lean)
     assert torch.equal(restored["next", STACK].nan_to_num(), online["next", STACK].nan_to_num())
+
+
+def n_step_sample(n_steps: int, *left_out):
+    """Returns shuffled transitions of n steps, and what the env gave with them."""
+    online = stacked_single(1).rollout(12, break_when_any_done=False)  # 3 episodes of 4 steps
+    online.refine_names("time")
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(16), batch_size=64)
+    buffer.append_transform(stack_of_three())
+    buffer.append_transform(MultiStepTransform(n_steps=n_steps, gamma=0.9))
+    buffer.extend(online.exclude(*left_out))
+    return buffer.sample(), online
+
+
+def test_n_step_returns_keep_the_stack_that_was_stored():
+    sample, online = n_step_sample(3)
+    first = sample["index"]
+    assert (sample["steps_to_next_obs"] == 3).any()
+    last = first + sample["steps_to_next_obs"].flatten() - 1
+    want = online["next", STACK][last]
+    assert torch.equal(sample["next", STACK].nan_to_num(), want.nan_to_num())
+
+
+def test_n_step_returns_without_stored_stacks_are_refused():
+    with pytest.raises(KeyError, match=r"up to 3 steps ahead.*Store \('next', 'depth3'\)"):
+        n_step_sample(3, ("next", STACK))
+    sample, online = n_step_sample(1, ("next", STACK))  # the step after, as ever
+    want = online["next", STACK][sample["index"]]
+    assert torch.equal(sample["next", STACK].nan_to_num(), want.nan_to_num())
 
 
 def test_transitions_without_past_are_refused():

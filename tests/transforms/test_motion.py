@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
@@ -107,6 +107,18 @@ def test_shuffled_transitions_keep_their_motion():
     sample = buffer.sample()
     assert torch.equal(sample["next", MOTION], online["next", MOTION][sample["index"]])
     assert torch.equal(sample[MOTION], online[MOTION][sample["index"]])
+
+
+@pytest.mark.parametrize("transform", [CameraMotion, InstanceMotion])
+def test_n_step_returns_keep_the_motion_that_was_stored(transform):
+    env = TransformedEnv(FakeSensorEnv((2,)), transform(out_keys=[MOTION]))
+    online = env.rollout(9, break_when_any_done=False)
+    td = MultiStep(gamma=0.9, n_steps=3)(online.clone()).reshape(-1)
+    assert (td["steps_to_next_obs"] == 3).any()
+    stored = td["next", MOTION].clone()
+    assert torch.equal(transform(out_keys=[MOTION])(td)["next", MOTION], stored)
+    with pytest.raises(KeyError, match=r"up to 3 steps ahead.*Store \('next', 'motion'\)"):
+        transform(out_keys=[MOTION])(td.exclude(("next", MOTION)))
 
 
 def test_transitions_without_past_are_refused():

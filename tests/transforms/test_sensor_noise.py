@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 import pickle
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from flowrep.geometry import check_rigid
@@ -24,6 +26,9 @@ ALL = {
     "drift_rad": 0.03,
     "flow_sigma_px": 0.5,
 }
+
+
+FORK = {"mp_start_method": "fork"}
 
 
 def maps(count: int = 2) -> list[torch.Tensor]:
@@ -170,3 +175,29 @@ def test_written_in_place_unless_told_otherwise():
     noisy = SensorNoise(**ALL)(td.clone())
     assert set(noisy.keys(True, True)) == set(td.keys(True, True))
     assert not torch.equal(noisy["raw"], flow)
+
+
+def noisy_env() -> TransformedEnv:
+    return TransformedEnv(FakeSensorEnv(), SensorNoise(drift_m=0.5))
+
+
+@pytest.mark.parametrize("batched", [SerialEnv, functools.partial(ParallelEnv, **FORK)])
+def test_envs_of_one_function_draw_noise_of_their_own(batched):
+    # Env 0 twice: what differs between the two is the noise alone.
+    env = batched(2, noisy_env)
+    try:
+        motion = env.rollout(2)["sensor", "prev_from_curr"][:, :, :3, 3]
+    finally:
+        env.close()
+    assert ((motion[0] - motion[1]).abs() > 1e-4).all()
+
+
+def test_torch_s_seed_decides_over_noise_without_a_seed():
+    def first() -> torch.Tensor:
+        return SensorNoise(**ALL).compute(*maps())[2]
+
+    torch.manual_seed(5)
+    five, next_one = first(), first()
+    torch.manual_seed(5)
+    assert torch.equal(first(), five)
+    assert not torch.equal(five, next_one)
