@@ -29,6 +29,7 @@ from flowrep.envs.scene import (
     Zone,
 )
 from flowrep.envs.vehicle import VehicleState
+from flowrep.envs.walks import parallel, without_repeats
 
 Array = NDArray[np.float64]
 _ARC_STEP_DEG = 5.0
@@ -120,6 +121,7 @@ class Layout:
         self.scene = scene
         self.lines = centrelines(scene)
         self._roads = {road.name: road for road in scene.roads}
+        self._walks: dict[Walk, Array] = {}
         self.ribbons = {
             road.name: ribbon(self.lines[road.name], road.width_m / 2) for road in scene.roads
         }
@@ -171,22 +173,25 @@ class Layout:
 
     def walk_line(self, walk: Walk, lateral_m: float = 0.0) -> Array:
         """Returns the points [M, 2] of a walk, moved `lateral_m` to the left of its direction."""
+        if walk not in self._walks:
+            self._walks[walk] = without_repeats(self._walk_points(walk))
+        return parallel(self._walks[walk], lateral_m)
+
+    def _walk_points(self, walk: Walk) -> Array:
         if walk.kind == "points":
-            line = LineString(walk.points_m)
-            moved = line.offset_curve(lateral_m) if lateral_m else line
-            return np.array(moved.coords)
+            return np.array(walk.points_m)
         assert walk.road is not None
         if walk.kind == "along":
             assert walk.from_m is not None
             assert walk.to_m is not None
             part = shapely.ops.substring(self.lines[walk.road], walk.from_m, walk.to_m)
-            return np.array(part.offset_curve(walk.offset_m + lateral_m).coords)
+            return parallel(without_repeats(np.array(part.coords)), walk.offset_m)
         assert walk.at_m is not None
         road = self._roads[walk.road]
         # A stride is kept from the house fronts.
         reach = road.width_m / 2 + road.sidewalk_m - 0.5
         # From the right-hand sidewalk to the left-hand one: its left is back along the road.
-        ends = [self.pose_at(walk.road, walk.at_m - lateral_m, side * reach) for side in (-1, 1)]
+        ends = [self.pose_at(walk.road, walk.at_m, side * reach) for side in (-1, 1)]
         return np.array([end[:2] for end in ends])
 
     def _zone_polygon(self, zone: Zone) -> Polygon:

@@ -6,15 +6,16 @@ from typing import Any
 
 import shapely
 import yaml
-from shapely.geometry import LineString, Point, Polygon
+from shapely.geometry import Point, Polygon
 
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs.layout import Layout, centrelines
-from flowrep.envs.people import PARTS, RADIUS_M
+from flowrep.envs.people import PARTS
 from flowrep.envs.scene import CATEGORY_OF_KIND, Piece, Scene
 from flowrep.envs.scene import Path as ScenePath
 from flowrep.envs.schema import SceneError, build
 from flowrep.envs.vehicle import footprint_corners
+from flowrep.envs.walk_checks import check_walks
 from flowrep.envs.way import free_ground
 from flowrep.palette import CATEGORY_ID
 
@@ -201,7 +202,7 @@ def _check_ground(scene: Scene, source: str) -> None:
             raise SceneError(source, f"crosswalks[{i}].at_m", problem, remedy)
     layout = Layout(scene)
     _check_paths(layout, source)
-    _check_walks(layout, source)
+    check_walks(layout, source)
 
 
 def _check_paths(layout: Layout, source: str) -> None:
@@ -228,14 +229,3 @@ def _is_open(layout: Layout, path: ScenePath) -> bool:
     start = Point(layout.start_state(path.start)[:2])
     parts = shapely.get_parts(room)
     return any(part.covers(start) and part.intersects(layout.zones[path.end]) for part in parts)
-
-
-def _check_walks(layout: Layout, source: str) -> None:
-    solid = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
-    for group in layout.scene.pedestrian_groups:
-        key = f"pedestrian_groups.{group.name}.walk"
-        line = LineString(layout.walk_line(group.walk))
-        for box in solid:
-            if box.footprint.distance(line) < RADIUS_M:
-                problem = f"goes through a {box.category} at ({box.x_m:.1f}, {box.y_m:.1f})"
-                raise SceneError(source, key, problem, "move the walk or that box")

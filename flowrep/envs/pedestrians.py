@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from flowrep.envs.layout import Layout
 from flowrep.envs.scene import PedestrianGroup, Range
+from flowrep.envs.walks import draw_lanes
 
 Array = NDArray[Any]
 _TURN_S = 0.6  # about-turn at either end of a walk
@@ -114,7 +115,7 @@ def draw_crowd(
         # A uniform phase over the way there and back draws the direction too.
         phase = np.resize(rng.uniform(0.0, 1.0, draws), group.count)
         speed = np.resize(rng.uniform(low, high, draws), group.count)
-        lateral = rng.uniform(-0.5, 0.5, group.count) * group.spread_m
+        lateral = draw_lanes(group.count, group.spread_m, rng)
         ahead = rng.uniform(-0.5, 0.5, group.count) * group.spread_m
         for i in range(group.count):
             line = layout.walk_line(group.walk, float(lateral[i]))
