@@ -59,6 +59,8 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
         "num_envs": num_envs,
         "device": choose_device(config["device"]),
         "speed": config["speed"],
+        # runs of before there was another were drawn by PyBullet
+        "renderer": config.get("renderer", "pybullet"),
     }
     workers = {"num_workers": choose_workers(num_workers, num_envs)}
     return make_env(**(arguments | changes | workers))

@@ -15,7 +15,8 @@ FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry"},
     "transforms": {"transforms", "geometry"},
     "agent": {"agent"},
-    "envs": {"envs", "transforms", "geometry", "config_tree", "palette"},
+    "simulator": {"simulator"},
+    "envs": {"envs", "simulator", "transforms", "geometry", "config_tree", "palette"},
     "palette": set(),
     "viz": {"palette"},
     "plan_view": {"envs", "palette"},
@@ -24,6 +25,7 @@ FLOWREP_IMPORTS_ALLOWED = {
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"envs/simulator.py"},
+    "numba": {"simulator/rasteriser.py"},
     "hydra": {
         "train.py",
         "evaluate.py",
@@ -42,6 +44,7 @@ PACKAGES_LIMITED_TO = {
     "geometry": {"torch"},
     "transforms": {"torch", "tensordict", "torchrl"},
     "agent": {"torch", "tensordict", "torchrl", "safetensors", "numpy"},
+    "simulator": {"numpy", "numba"},
 }
 
 # Nothing of flowrep imports this one: whoever has Hydra does.

@@ -18,6 +18,7 @@ from flowrep.envs.sensing import SENSORS
 from flowrep.envs.sensor_observation import SensorObservation
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
+from flowrep.simulator.renderer import choose_renderer
 from flowrep.transforms import representation_stack
 
 
@@ -57,6 +58,7 @@ def make_env(
     seed: int | None = None,
     keep_sensor: bool = False,
     flow: str | Mapping[str, Any] = "exact",
+    renderer: str = "auto",
 ) -> TransformedEnv:
     """Returns a TorchRL env of streets stepped side by side, always of batch size [num_envs].
 
@@ -78,6 +80,7 @@ def make_env(
         keep_sensor: whether all ("sensor", ...) keys stay beside the representations.
         flow: "exact" or "estimated", where raw and obj come from; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
+        renderer: who draws depth, classes and ids, see `StreetEnv`.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -85,7 +88,13 @@ def make_env(
     >>> env.close()
     """
     loaded = load_scene(scene)
-    street = partial(StreetEnv, loaded, speed=speed, frame_rate_hz=frame_rate_hz)
+    street = partial(
+        StreetEnv,
+        loaded,
+        speed=speed,
+        frame_rate_hz=frame_rate_hz,
+        renderer=choose_renderer(renderer),
+    )
     # A street that renders nothing is asked for what the transforms need to know.
     probe = street(sensors=())
     transforms = Compose()

@@ -21,16 +21,20 @@ from flowrep.envs.scene import Scene
 from flowrep.envs.simulator import Picture
 from flowrep.envs.street import Street
 from flowrep.palette import CLASS_COLOURS, num_classes
+from flowrep.simulator.renderer import choose_renderer
+from flowrep.simulator.triangles import gather
 
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb")
-_MAPS = frozenset({"depth", "semantic", "instance", "rgb"})
+_MAPS = frozenset({"depth", "semantic", "instance"})
 _MOTIONS = frozenset({"prev_from_curr", "instance_motion"})
 
 
 class Sensing:
     """The camera of one street and the sensors that were asked for."""
 
-    def __init__(self, scene: Scene, street: Street, sensors: Sequence[str]) -> None:
+    def __init__(
+        self, scene: Scene, street: Street, sensors: Sequence[str], renderer: str = "auto"
+    ) -> None:
         """Computes what stays the same from picture to picture."""
         unknown = [name for name in sensors if name not in SENSORS]
         if unknown:
@@ -44,6 +48,12 @@ class Sensing:
         self._vehicle_from_cam = vehicle_from_camera(camera)
         self._class_of_body = street.simulator.class_lookup()
         self._instance_of_body = street.simulator.instance_lookup()
+        self._rasterise: Any = None
+        if not _MAPS.isdisjoint(sensors) and choose_renderer(renderer) == "rasteriser":
+            from flowrep.simulator.rasteriser import Rasteriser
+
+            range_m = camera.near_m, camera.far_m
+            self._rasterise = Rasteriser(gather(street.bodies), self.K, size, range_m)
         self._picture: Picture | None = None
         self._latest_parts: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
         self._camera_poses: dict[Moment, CameraPose] = {}
@@ -53,7 +63,11 @@ class Sensing:
         self._picture = None
         observation: dict[str, Any] = {}
         if not _MAPS.isdisjoint(self.names):
-            self._add_maps(observation, self._seen(episode))
+            draw = self._add_pictured_maps if self._rasterise is None else self._add_maps
+            draw(observation, episode)
+        if "rgb" in self.names:
+            rgb = self._rgb(self._seen(episode))
+            observation["rgb"] = np.ascontiguousarray(rgb.transpose(2, 0, 1))
         if not _MOTIONS.isdisjoint(self.names):
             self._add_motion(observation, episode)
         return {name: observation[name] for name in self.names}
@@ -108,7 +122,13 @@ class Sensing:
         self._latest_parts = [*self._latest_parts[-1:], (poses, parts)]
         return parts
 
-    def _add_maps(self, observation: dict[str, Any], picture: Picture) -> None:
+    def _add_maps(self, observation: dict[str, Any], episode: Episode) -> None:
+        cam_from_world = self._camera_pose(episode.now).cam_from_world
+        views = cam_from_world, self._parts(episode.poses), self._street.is_shown
+        observation.update(self._rasterise(*(array[None] for array in views))._asdict())
+
+    def _add_pictured_maps(self, observation: dict[str, Any], episode: Episode) -> None:
+        picture = self._seen(episode)
         body = picture.body.astype(np.intp)  # what take() wants
         if "depth" in self.names:
             depth = depth_from_zbuffer(picture.zbuffer, self._camera.near_m, self._camera.far_m)
@@ -118,8 +138,6 @@ class Sensing:
             observation["semantic"] = self._class_of_body.take(body)[None]
         if "instance" in self.names:
             observation["instance"] = self._instance_of_body.take(body)[None]
-        if "rgb" in self.names:
-            observation["rgb"] = np.ascontiguousarray(self._rgb(picture).transpose(2, 0, 1))
 
     def _rgb(self, picture: Picture) -> NDArray[np.uint8]:
         rgb = picture.rgba[..., :3].copy()

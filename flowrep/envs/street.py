@@ -13,6 +13,8 @@ from flowrep.envs import furniture, meshes, paint, people
 from flowrep.envs.layout import Box, Layout
 from flowrep.envs.simulator import Simulator
 from flowrep.envs.vehicle import VehicleState
+from flowrep.palette import CATEGORY_ID
+from flowrep.simulator.triangles import Body
 
 Array = NDArray[Any]
 _BEHIND_M = 2.0  # behind the vehicle nobody is seen, wherever on it the camera is
@@ -26,6 +28,7 @@ class Solid(NamedTuple):
     body: int
     category: str
     boxes: tuple[Box, ...]
+    number: int  # of `Street.bodies`
 
 
 class Street:
@@ -34,6 +37,7 @@ class Street:
     def __init__(self, layout: Layout) -> None:
         """Builds every body of the scene in a simulator of its own."""
         self.simulator = Simulator(paint.picture())
+        self.bodies: list[Body] = []
         vehicle = layout.scene.vehicle
         self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
         self._vehicle_reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
@@ -46,7 +50,7 @@ class Street:
         count = layout.scene.num_pedestrians
         meshes_of_all = [mesh for i in range(count) for mesh in people.person_meshes(i)]
         parts = [
-            self.simulator.add_body(mesh, "pedestrian", instance=number)
+            self._add_body(mesh, "pedestrian", instance=number)
             for number, mesh in enumerate(meshes_of_all, start=1)
         ]
         self._parts = np.array(parts, dtype=int).reshape(count, len(people.PARTS))
@@ -56,11 +60,13 @@ class Street:
     def close_exits(self, names: Iterable[str]) -> None:
         """Puts up the closures that are named and takes away all others."""
         self._closed = [name for name in self._closures if name in set(names)]
+        self.is_shown = np.ones(len(self.bodies), dtype=bool)
         for name, solid in self._closures.items():
             if name in self._closed:
                 self.simulator.place(solid.body, 0.0, 0.0, 0.0)
             else:
                 self.simulator.hide(solid.body)
+                self.is_shown[solid.number] = False
         solids = [*self._solids, *(self._closures[name] for name in self._closed)]
         self._owners = [solid for solid in solids for _ in solid.boxes]
         boxes = [box for solid in solids for box in solid.boxes]
@@ -142,7 +148,7 @@ class Street:
             (grass, "terrain"),
         ):
             if mesh.indices:
-                self.simulator.add_body(mesh, category)
+                self._add_body(mesh, category)
 
     def _lane_marks(self, layout: Layout, name: str, striped: BaseGeometry) -> meshes.Mesh:
         if layout.width_m(name) < _TWO_LANES_M:
@@ -165,9 +171,18 @@ class Street:
         return self._add_solid(furniture.mesh_of(box, both_sides=True), box.category, [box])
 
     def _add_solid(self, mesh: meshes.Mesh, category: str, boxes: list[Box]) -> Solid:
-        body = self.simulator.add_body(
+        body = self._add_body(
             mesh,
             category,
             boxes_m=tuple((box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes),
         )
-        return Solid(body, category, tuple(boxes))
+        return Solid(body, category, tuple(boxes), len(self.bodies) - 1)
+
+    def _add_body(
+        self, mesh: meshes.Mesh, category: str, *, instance: int = 0, **options: Any
+    ) -> int:
+        vertices = np.array(mesh.vertices, dtype=np.float64)
+        triangles = np.array(mesh.indices).reshape(-1, 3)
+        seen_as = CATEGORY_ID[category], instance
+        self.bodies.append(Body(vertices, triangles, *seen_as, moves=instance > 0))
+        return self.simulator.add_body(mesh, category, instance=instance, **options)

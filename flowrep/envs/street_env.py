@@ -43,6 +43,8 @@ class StreetEnv(gym.Env):
         frame_rate_hz: steps a second; the scene's own if None. The time limit keeps its seconds.
         sensors: the keys of the observation; with none nothing is rendered.
         render_mode: "rgb_array" or None.
+        renderer: who draws depth, classes and ids: "rasteriser", "pybullet", or "auto", the
+            rasteriser where numba is installed. Colours are PyBullet's.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - gymnasium declares it so
@@ -57,6 +59,7 @@ class StreetEnv(gym.Env):
         frame_rate_hz: float | None = None,
         sensors: Sequence[str] = SENSORS[:5],
         render_mode: str | None = None,
+        renderer: str = "auto",
     ) -> None:
         """Builds the street; the first `reset` begins an episode."""
         self.scene = load_scene(scene)
@@ -67,7 +70,7 @@ class StreetEnv(gym.Env):
         self.num_classes = num_classes(self.scene.categories)
         self._rules = Rules(Layout(self.scene), self.frame_rate_hz)
         self._street = Street(self._rules.layout)
-        self.sensing = Sensing(self.scene, self._street, sensors)
+        self.sensing = Sensing(self.scene, self._street, sensors, renderer)
         self.K = self.sensing.K
         self._episode: Episode | None = None
         self.action_space = spaces.Discrete(3)

@@ -1,0 +1,100 @@
+"""The rasteriser and PyBullet see the same street."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flowrep.envs import StreetEnv, load_scene, scene_names
+from flowrep.envs.scene import PedestrianGroup, Walk
+from flowrep.palette import CATEGORY_ID
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "rasterise.py"
+CROSSROADS = Path(__file__).parent / "crossroads.yaml"
+
+
+@pytest.fixture(scope="module")
+def Pair():
+    spec = importlib.util.spec_from_file_location("rasterise", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.Pair
+
+
+def compare(pair, count):
+    found = [pair.difference() for _ in pair.views(count)]
+    camera = pair.scene.camera
+    pair.close()
+    pixels = count * camera.height_px * camera.width_px
+    assert sum(view.ids for view in found) <= 1e-3 * pixels
+    assert not any(view.inside for view in found)
+    assert np.median([view.depth for view in found]) <= 1e-5
+    return set.union(*(view.seen for view in found))
+
+
+@pytest.mark.parametrize("scene", [*scene_names(), CROSSROADS], ids=lambda name: Path(name).stem)
+def test_views_of_a_scene(Pair, scene):
+    seen = compare(Pair(scene), 40)
+    assert seen == {CATEGORY_ID[name] for name in load_scene(scene).categories}
+
+
+@pytest.mark.parametrize("name", ["straight_road", "three_way_junction"])
+def test_views_between_near_and_far_planes_that_cut_through_everything(Pair, name):
+    scene = load_scene(name)
+    # H != W; people are cut open at 1.5 m, houses and trees end at 30 m.
+    camera = replace(scene.camera, height_px=50, width_px=70, near_m=1.5, far_m=30.0, pitch_deg=20)
+    compare(Pair(replace(scene, camera=camera)), 30)
+
+
+@pytest.mark.parametrize("renderer", ["rasteriser", "pybullet"])
+@pytest.mark.parametrize(("path", "is_closed_left"), [("left", False), ("right", True)])
+def test_the_exits_that_an_episode_closes_are_seen(make_street, renderer, path, is_closed_left):
+    env = make_street(CROSSROADS, renderer=renderer)
+    env.reset(options={"path": path, "episode_seed": 1})
+    building = env.step(0)[0]["semantic"][0] == CATEGORY_ID["building"]
+    left, right = int(building[:, :30].sum()), int(building[:, 30:].sum())
+    closed_side, open_side = (left, right) if is_closed_left else (right, left)
+    assert closed_side > 5
+    assert open_side == 0
+
+
+def test_a_person_fills_the_picture_and_is_cut_by_the_near_plane(make_street, straight_road):
+    walk = Walk("points", points_m=((4.0, -0.01), (4.0, 0.01)))
+    person = PedestrianGroup("one", 1, 0.0, walk, standing=1)
+    scene = replace(straight_road, pedestrian_groups=(person,))
+    maps = []
+    for renderer in ("pybullet", "rasteriser"):
+        env = make_street(scene, renderer=renderer)
+        env.reset(seed=0)
+        observations = []
+        while not env.episode.outcome:
+            observations.append(env.step(0)[0])
+        maps.append(observations[-1])
+    pictured, drawn = maps
+    assert (drawn["semantic"] == CATEGORY_ID["pedestrian"]).mean() > 0.3
+    assert (drawn["instance"] == pictured["instance"]).mean() > 0.999
+    seen = np.isfinite(drawn["depth"]) & np.isfinite(pictured["depth"])
+    ratio = drawn["depth"][seen] / pictured["depth"][seen]
+    np.testing.assert_allclose(np.median(ratio), 1.0, rtol=1e-5)
+
+
+def test_maps_do_not_depend_on_whether_colours_are_asked_for(make_street):
+    alone, with_colours = (
+        make_street("three_way_junction", sensors=sensors)
+        for sensors in (("depth", "instance"), ("depth", "instance", "rgb"))
+    )
+    for env in (alone, with_colours):
+        env.reset(seed=4)
+    a, b = (env.step(1)[0] for env in (alone, with_colours))
+    for name in ("depth", "instance"):
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_pybullet_draws_everything_where_it_is_asked_to(make_street):
+    env = make_street(renderer="pybullet")
+    assert isinstance(env, StreetEnv)
+    env.sensing.look = None  # the one way to a picture
+    with pytest.raises(TypeError):
+        env.reset(seed=0)

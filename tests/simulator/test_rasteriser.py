@@ -1,0 +1,178 @@
+"""Depth and ids of single triangles, worked by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from flowrep.simulator.rasteriser import Rasteriser
+from flowrep.simulator.triangles import Body, gather
+
+# Nothing is square and nothing centred, so that no two numbers can be swapped.
+HEIGHT, WIDTH = 6, 9
+K = np.array([[5.0, 0.0, 3.5], [0.0, 4.0, 2.0], [0.0, 0.0, 1.0]])
+NEAR_M, FAR_M = 0.5, 100.0
+WALL, BALL = (3, 0), (4, 7)  # class, instance
+
+
+def quad(corners, ids=WALL, moves=False):
+    """A body of one quadrangle, counter-clockwise seen from its outside."""
+    triangles = np.array([(0, 1, 2), (0, 2, 3)])
+    return Body(np.array(corners, dtype=float), triangles, *ids, moves=moves)
+
+
+def facing(z, x0, x1, y0, y1, ids=WALL, moves=False):
+    """A rectangle across the optical axis that looks at the camera; y points down."""
+    return quad([(x0, y1, z), (x1, y1, z), (x1, y0, z), (x0, y0, z)], ids, moves)
+
+
+def see(*bodies, cam_from_world=None, poses=(), is_shown=None):
+    rasterise = Rasteriser(gather(bodies), K, (HEIGHT, WIDTH), (NEAR_M, FAR_M))
+    maps = rasterise(
+        np.eye(4)[None] if cam_from_world is None else cam_from_world[None],
+        np.array(poses, dtype=float).reshape(1, -1, 4, 4),
+        np.ones((1, len(bodies)), dtype=bool) if is_shown is None else np.array([is_shown]),
+    )
+    return [array[0] for array in maps]
+
+
+def shifted(x, y, z):
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def test_a_rectangle_covers_the_pixels_whose_centres_lie_in_it():
+    # At z = 2 it reaches from u = 5·0.3/2 + 3.5 = 4.25 to 5·1.3/2 + 3.5 = 6.75 and from
+    # v = 4·(-0.7)/2 + 2 = 0.6 to 4·0.6/2 + 2 = 3.2: centres 4.5 to 6.5 and 1.5 to 2.5. A camera
+    # that samples corners would see columns 5 and 6, rows 1 to 3.
+    depth, semantic, instance = see(facing(2.0, 0.3, 1.3, -0.7, 0.6, BALL))
+    covered = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    covered[1:3, 4:7] = True
+    np.testing.assert_array_equal(semantic, np.where(covered, 4, 0))
+    np.testing.assert_array_equal(instance, np.where(covered, 7, 0))
+    np.testing.assert_array_equal(depth, np.where(covered, 2.0, np.inf))
+    assert [array.dtype.name for array in (depth, semantic, instance)] == [
+        "float32", "uint8", "uint8"
+    ]  # fmt: skip
+
+
+def test_depth_on_a_slanted_plane_is_the_rays():
+    # z = 6 + 0.6 x - 0.5 y. On the ray (a, b, 1) z that is z = 6 / (1 - 0.6 a + 0.5 b).
+    corners = [(x, y, 6 + 0.6 * x - 0.5 * y) for x, y in ((-5, 5), (5, 5), (5, -5), (-5, -5))]
+    depth, *_ = see(quad(corners))
+    a = (np.arange(WIDTH) + 0.5 - 3.5) / 5.0
+    b = (np.arange(HEIGHT)[:, None] + 0.5 - 2.0) / 4.0
+    seen = np.isfinite(depth)
+    assert seen.sum() > 30
+    np.testing.assert_allclose(depth[seen], (6.0 / (1 - 0.6 * a + 0.5 * b))[seen], rtol=1e-6)
+
+
+def test_the_nearer_one_hides_the_farther_whatever_their_order():
+    near, far = facing(2.0, -9, 0.1, -9, 9, BALL), facing(4.0, -9, 9, -9, 9, WALL)
+    # The near one ends at u = 5·0.1/2 + 3.5 = 3.75: columns 0 to 3.
+    for bodies in ((near, far), (far, near)):
+        depth, semantic, _ = see(*bodies)
+        np.testing.assert_array_equal(depth[2], [2.0] * 4 + [4.0] * 5)
+        np.testing.assert_array_equal(semantic[2], [4] * 4 + [3] * 5)
+
+
+def test_nothing_is_seen_from_behind():
+    corners = [(-9, 9, 2.0), (9, 9, 2.0), (9, -9, 2.0), (-9, -9, 2.0)]
+    assert np.isfinite(see(quad(corners))[0]).all()
+    assert not np.isfinite(see(quad(corners[::-1]))[0]).any()
+
+
+def test_a_floor_that_runs_on_behind_the_camera_is_cut_at_the_near_plane():
+    # 1 m below the camera, from 50 m behind it to 50 m ahead: row j sees it at
+    # z = 1 / b, b = (j + 0.5 - 2) / 4, where that is from 0.5 to 50 m: rows 2 (8 m) to 5 (1.14 m).
+    floor = quad([(-80, 1, -50), (80, 1, -50), (80, 1, 50), (-80, 1, 50)])
+    depth, semantic, _ = see(floor)
+    expected = [math.inf, math.inf, 8.0, 8 / 3, 1.6, 8 / 7]
+    np.testing.assert_allclose(depth, np.repeat(np.array(expected)[:, None], WIDTH, 1), rtol=1e-6)
+    np.testing.assert_array_equal(semantic > 0, np.isfinite(depth))
+    # 0.3 m below: row 5 would see it at 0.34 m, before the near plane.
+    low = quad([(-80, 0.3, -50), (80, 0.3, -50), (80, 0.3, 50), (-80, 0.3, 50)])
+    np.testing.assert_allclose(see(low)[0][2:, 0], [2.4, 0.8, math.inf, math.inf], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("z", "is_seen"), [(0.49, 0), (0.51, 1), (99.0, 1), (101.0, 0)])
+def test_only_what_lies_between_the_two_planes_is_seen(z, is_seen):
+    assert np.isfinite(see(facing(z, -200, 200, -200, 200))[0]).all() == is_seen
+
+
+def test_a_wall_that_runs_into_the_distance_ends_at_the_far_plane():
+    # 2 m to the right, from 1 m to 500 m ahead: column i sees it at z = 2 · 5 / (i + 0.5 - 3.5).
+    wall = quad([(2, 600, 1), (2, 600, 500), (2, -600, 500), (2, -600, 1)][::-1])
+    depth, *_ = see(wall)
+    # Columns 0 to 2 look left, column 3 straight on.
+    np.testing.assert_array_equal(depth[:, :4], np.inf)
+    np.testing.assert_allclose(depth[3, 4:], [10.0, 5.0, 10 / 3, 2.5, 2.0], rtol=1e-6)
+
+
+def test_bodies_move_with_their_poses_and_the_camera_with_its_own():
+    ball, wall = facing(0.0, -0.2, 0.2, -0.2, 0.2, BALL, moves=True), facing(8.0, -9, 9, -9, 9)
+    # The camera stands at (1, 0, -1), so that the ball at (1.2, 0.3, 3) is seen from 4 m, at
+    # u = 5·0.2/4 + 3.5 = 3.75, v = 4·0.3/4 + 2 = 2.3; it reaches 0.25 px and 0.2 px around: from
+    # (3.5, 2.1) to (4.0, 2.5), whose rim the centre (3.5, 2.5) of column 3, row 2 is on.
+    depth, _, instance = see(
+        ball, wall, cam_from_world=shifted(-1, 0, 1), poses=[shifted(1.21, 0.31, 3)]
+    )
+    assert np.argwhere(instance == 7).tolist() == []
+    depth, _, instance = see(
+        ball, wall, cam_from_world=shifted(-1, 0, 1), poses=[shifted(1.19, 0.31, 3)]
+    )
+    assert np.argwhere(instance == 7).tolist() == [[2, 3]]
+    assert depth[2, 3] == 4.0
+    assert depth[2, 4] == 9.0
+
+
+def test_a_body_that_is_not_there_hides_nothing():
+    near, far = facing(2.0, -9, 9, -9, 9, BALL), facing(4.0, -9, 9, -9, 9)
+    np.testing.assert_array_equal(see(near, far, is_shown=[False, True])[0], 4.0)
+    np.testing.assert_array_equal(see(near, far, is_shown=[True, True])[0], 2.0)
+
+
+def test_neighbouring_triangles_leave_no_gap():
+    # A fan of thin triangles around a point that is no pixel's centre covers everything.
+    angles = np.linspace(0, 2 * math.pi, 61)[:-1]
+    rim = np.stack([50 * np.cos(angles), 50 * np.sin(angles), np.full(60, 3.0)], axis=1)
+    vertices = np.concatenate([[(0.123, -0.077, 3.0)], rim])
+    around = 1 + np.arange(60)
+    triangles = np.stack([np.zeros(60, int), np.roll(around, -1), around], axis=1)
+    assert np.isfinite(see(Body(vertices, triangles, *WALL))[0]).all()
+
+
+def test_many_views_are_each_the_one_alone():
+    ball, wall = facing(0.0, -0.5, 0.5, -0.5, 0.5, BALL, moves=True), facing(8.0, -9, 9, -9, 9)
+    rasterise = Rasteriser(gather([ball, wall]), K, (HEIGHT, WIDTH), (NEAR_M, FAR_M))
+    cameras = np.stack([shifted(0.1 * n, 0, 0.3 * n) for n in range(4)])
+    poses = np.stack([shifted(0, 0.1 * n, 3)[None] for n in range(4)])
+    is_shown = np.array([[True, True], [True, False], [False, True], [True, True]])
+    together = rasterise(cameras, poses, is_shown)
+    for n in range(4):
+        alone = rasterise(cameras[n : n + 1], poses[n : n + 1], is_shown[n : n + 1])
+        for one, all_of_them in zip(alone, together):
+            np.testing.assert_array_equal(one[0], all_of_them[n])
+
+
+def test_a_world_without_bodies_is_sky():
+    depth, semantic, instance = see()
+    assert np.isinf(depth).all()
+    assert not semantic.any()
+    assert not instance.any()
+
+
+def test_chunks_hold_every_triangle_once():
+    rng = np.random.default_rng(0)
+    vertices, corners = rng.normal(size=(300, 3)), rng.integers(300, size=(200, 3))
+    triangles = gather([Body(vertices, corners, *WALL)])
+    assert len(triangles.bodies) > 4
+    regained = []
+    for c in range(len(triangles.bodies)):
+        points = triangles.points[triangles.point_bounds[c] : triangles.point_bounds[c + 1]]
+        own = triangles.corners[triangles.corner_bounds[c] : triangles.corner_bounds[c + 1]]
+        regained += points[own].tolist()
+        distances = np.linalg.norm(points - triangles.centres[c], axis=1)
+        assert distances.max() <= triangles.radii[c] * (1 + 1e-12)
+    assert sorted(regained) == sorted(vertices[corners].tolist())

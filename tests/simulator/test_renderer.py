@@ -1,0 +1,58 @@
+"""Which renderer is taken, and what is said where numba is missing."""
+
+import sys
+import warnings
+
+import pytest
+
+from flowrep.simulator import renderer
+from flowrep.simulator.renderer import choose_renderer
+
+
+def without_numba(monkeypatch):
+    monkeypatch.setattr(renderer, "find_spec", lambda name: None)
+
+
+@pytest.mark.parametrize(
+    ("asked", "taken"),
+    [("auto", "rasteriser"), ("rasteriser", "rasteriser"), ("pybullet", "pybullet")],
+)
+def test_the_rasteriser_is_taken_where_numba_is(asked, taken):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert choose_renderer(asked) == taken
+
+
+def test_without_numba_pybullet_draws_and_its_price_is_told(monkeypatch):
+    without_numba(monkeypatch)
+    with pytest.warns(UserWarning, match=r"about 2 ms instead of 0\.2; run: pip install"):
+        assert choose_renderer("auto") == "pybullet"
+
+
+def test_without_numba_who_asks_for_pybullet_hears_nothing(monkeypatch):
+    without_numba(monkeypatch)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert choose_renderer("pybullet") == "pybullet"
+
+
+def test_without_numba_the_rasteriser_is_refused(monkeypatch):
+    without_numba(monkeypatch)
+    with pytest.raises(ImportError, match=r"needs numba; run: pip install 'flowrep\[sim\]'"):
+        choose_renderer("rasteriser")
+
+
+def test_an_unknown_renderer_is_refused():
+    with pytest.raises(ValueError, match="unknown renderer 'opengl'; choose one of auto, raster"):
+        choose_renderer("opengl")
+
+
+def test_numba_is_imported_where_something_is_drawn_and_not_before(monkeypatch):
+    from flowrep.envs import StreetEnv
+
+    # None is what Python finds where a module can't be imported.
+    monkeypatch.setitem(sys.modules, "flowrep.simulator.rasteriser", None)
+    StreetEnv(sensors=("prev_from_curr", "rgb")).close()
+    StreetEnv(renderer="pybullet").close()
+    with pytest.raises(ImportError):
+        StreetEnv()
