@@ -48,6 +48,7 @@ class Algorithm(ABC):
         learning_rate: Adam's, falling linearly to 0 over `total_updates`.
         total_updates: gradient steps of the whole training.
         max_grad_norm: gradients of a larger norm, all weights together, are scaled down to it.
+        rate_factors: by the name of a trained weight, by how much its learning rate differs.
     """
 
     METRICS: ClassVar[tuple[str, ...]]
@@ -66,17 +67,15 @@ class Algorithm(ABC):
         learning_rate: float,
         total_updates: int,
         max_grad_norm: float | None = None,
+        rate_factors: Mapping[str, float] | None = None,
     ) -> None:
         self.weights = dict(weights)
         self.trained = {n: w for n, w in self.weights.items() if w.requires_grad}
         self.learning_rate, self.total_updates = learning_rate, max(1, total_updates)
         self.max_grad_norm = max_grad_norm
         self.device = next(iter(self.trained.values())).device
-        # a tensor, so that a captured step reads what it is set to
-        self._rate = torch.tensor(learning_rate, dtype=torch.float32, device=self.device)
         self.optimizer = torch.optim.Adam(
-            self.trained.values(),
-            lr=self._rate,
+            self._parameter_groups(rate_factors or {}),
             fused=True,
             capturable=self.device.type == "cuda",
         )
@@ -88,6 +87,24 @@ class Algorithm(ABC):
         self.updates = 0
         self._is_eager = not self.CAPTURABLE
         self._capture()
+
+    def _parameter_groups(self, rate_factors: Mapping[str, float]) -> list[dict[str, Any]]:
+        """Returns Adam's groups: the weights that share a learning rate."""
+        unknown = rate_factors.keys() - self.trained.keys()
+        if unknown:
+            raise ValueError(f"rate_factors names {sorted(unknown)}, which training doesn't change")
+        groups: dict[float, list[Tensor]] = {}
+        for name, weight in self.trained.items():
+            groups.setdefault(rate_factors.get(name, 1.0), []).append(weight)
+        # rates are tensors, so that a captured step reads what they are set to
+        return [
+            {
+                "params": weights,
+                "factor": factor,
+                "lr": torch.tensor(self.learning_rate * factor, device=self.device),
+            }
+            for factor, weights in groups.items()
+        ]
 
     def step_eagerly(self) -> None:
         """Takes every further update operation by operation, never as a CUDA graph.
@@ -131,7 +148,8 @@ class Algorithm(ABC):
         as they are and `divergence.check()` raises.
         """
         learning_rate = self.learning_rate * max(0.0, 1 - self.updates / self.total_updates)
-        self._rate.fill_(learning_rate)
+        for group in self.optimizer.param_groups:
+            group["lr"].fill_(learning_rate * group["factor"])
         metrics = dict(self._step(batch).items())
         self.updates += 1
         return metrics | {"learning_rate": torch.tensor(learning_rate)}

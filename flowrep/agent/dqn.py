@@ -47,6 +47,9 @@ class DoubleDQN(OffPolicy):
         replay_capacity: transitions kept.
         frames_per_update: environment frames for each gradient step.
         learning_starts: frames before the first update; None: one batch.
+        n_steps: frames that a transition spans: r becomes the discounted sum of its rewards,
+            without the entropy bonus on the way, and γ becomes γ to that power.
+        layer_norm: normalise each map's embedding, see `Encoder`.
     """
 
     METRICS = ("q_loss", "td_error", "epsilon")
@@ -71,12 +74,14 @@ class DoubleDQN(OffPolicy):
         replay_capacity: int,
         frames_per_update: int,
         learning_starts: int | None,
+        n_steps: int = 1,
+        layer_norm: bool = False,
     ) -> None:
         device = torch.device(device)
         self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
         actions = DiscreteActions.from_spec(action_spec)
         with device:
-            network = MapNetwork(self.codecs, hidden_size, actions.count)
+            network = MapNetwork(self.codecs, hidden_size, actions.count, layer_norm=layer_norm)
         best = QValueModule(action_space=actions.space)
         self.exploration = EGreedyModule(
             action_spec,
@@ -113,6 +118,8 @@ class DoubleDQN(OffPolicy):
             replay_capacity=replay_capacity,
             frames_per_update=frames_per_update,
             learning_starts=learning_starts,
+            gamma=gamma,
+            n_steps=n_steps,
         )
 
     def remember(self, steps: TensorDictBase) -> None:

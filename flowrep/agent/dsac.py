@@ -59,6 +59,10 @@ class DiscreteSAC(OffPolicy):
         replay_capacity: transitions kept.
         frames_per_update: environment frames for each gradient step.
         learning_starts: frames before the first update; None: one batch.
+        n_steps: frames that a transition spans: r becomes the discounted sum of its rewards,
+            without the entropy bonus on the way, and γ becomes γ to that power.
+        layer_norm: normalise each map's embedding, see `Encoder`.
+        alpha_rate_factor: the learning rate of log α is so many times that of the weights.
     """
 
     METRICS = ("q_loss", "actor_loss", "alpha_loss", "alpha", "entropy", "q_mean", "td_error")
@@ -83,6 +87,9 @@ class DiscreteSAC(OffPolicy):
         replay_capacity: int,
         frames_per_update: int,
         learning_starts: int | None,
+        n_steps: int = 1,
+        layer_norm: bool = False,
+        alpha_rate_factor: float = 1.0,
     ) -> None:
         if encoder not in ENCODERS:
             raise ValueError(f"encoder={encoder!r}: expected one of {', '.join(ENCODERS)}")
@@ -90,11 +97,10 @@ class DiscreteSAC(OffPolicy):
         self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
         actions = DiscreteActions.from_spec(action_spec)
         with device:
-            self.critic_encoder = Encoder(self.codecs)
             self.encoder_is_shared = encoder == "shared"
-            self.actor_encoder = (
-                self.critic_encoder if self.encoder_is_shared else Encoder(self.codecs)
-            )
+            self.critic_encoder = self.actor_encoder = Encoder(self.codecs, layer_norm=layer_norm)
+            if not self.encoder_is_shared:
+                self.actor_encoder = Encoder(self.codecs, layer_norm=layer_norm)
             sizes = (self.critic_encoder.embedding_size, hidden_size, actions.count)
             actor_head, critic_head = Head(*sizes), Head(*sizes)
         self.target_encoder = copy.deepcopy(self.critic_encoder).requires_grad_(False)
@@ -125,6 +131,9 @@ class DiscreteSAC(OffPolicy):
             replay_capacity=replay_capacity,
             frames_per_update=frames_per_update,
             learning_starts=learning_starts,
+            gamma=gamma,
+            n_steps=n_steps,
+            rate_factors={"log_alpha": alpha_rate_factor},
         )
 
     def _all_weights(self) -> dict[str, Tensor]:
@@ -179,6 +188,7 @@ class DiscreteSAC(OffPolicy):
                 "actor_embedding": actor,
                 "critic_embedding": critic,
                 "action": batch["action"],
+                "steps_to_next_obs": batch["steps_to_next_obs"],
                 "next": following,
             },
             batch.batch_size,

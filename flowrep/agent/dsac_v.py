@@ -52,6 +52,10 @@ class DiscreteSACWithValue(OffPolicy):
         replay_capacity: transitions kept.
         frames_per_update: environment frames for each gradient step.
         learning_starts: frames before the first update; None: one batch.
+        n_steps: frames that a transition spans: r becomes the discounted sum of its rewards,
+            without the entropy bonus on the way, and γ becomes γ to that power.
+        layer_norm: normalise each map's embedding, see `Encoder`.
+        alpha_rate_factor: the learning rate of log α is so many times that of the weights.
     """
 
     METRICS = (
@@ -78,6 +82,9 @@ class DiscreteSACWithValue(OffPolicy):
         replay_capacity: int,
         frames_per_update: int,
         learning_starts: int | None,
+        n_steps: int = 1,
+        layer_norm: bool = False,
+        alpha_rate_factor: float = 1.0,
     ) -> None:
         device = torch.device(device)
         self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
@@ -87,9 +94,10 @@ class DiscreteSACWithValue(OffPolicy):
         self.target_entropy = target_entropy_weight * math.log(actions.count)
         with device:
             self.actor, self.q1, self.q2 = (
-                MapNetwork(self.codecs, hidden_size, actions.count) for _ in range(3)
+                MapNetwork(self.codecs, hidden_size, actions.count, layer_norm=layer_norm)
+                for _ in range(3)
             )
-            self.value = MapNetwork(self.codecs, hidden_size, 1)
+            self.value = MapNetwork(self.codecs, hidden_size, 1, layer_norm=layer_norm)
             self.log_alpha = torch.nn.Parameter(torch.tensor(math.log(initial_alpha)))
         self.target_value = copy.deepcopy(self.value).requires_grad_(False)
         network = PolicyNetwork(self.codecs, self.actor.encoder, self.actor.head)
@@ -111,6 +119,9 @@ class DiscreteSACWithValue(OffPolicy):
             replay_capacity=replay_capacity,
             frames_per_update=frames_per_update,
             learning_starts=learning_starts,
+            gamma=gamma,
+            n_steps=n_steps,
+            rate_factors={"log_alpha": alpha_rate_factor},
         )
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -130,7 +141,8 @@ class DiscreteSACWithValue(OffPolicy):
             following = self.target_value(decode_maps(self.codecs, outcome))
             # a masked value, not a product: what lies after an end may be anything
             following = following.masked_fill(outcome["terminated"], 0.0)
-            y = (outcome["reward"] + self.gamma * following).squeeze(-1)
+            discount = self.gamma ** batch["steps_to_next_obs"]
+            y = (outcome["reward"] + discount * following).squeeze(-1)
             expected_q = torch.minimum((policy * q1).sum(-1), (policy * q2).sum(-1))
             value_target = expected_q - alpha * negative_entropy
         chosen = (q.gather(-1, action.unsqueeze(-1)).squeeze(-1) for q in (q1, q2))

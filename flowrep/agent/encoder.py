@@ -41,10 +41,17 @@ class NatureEncoder(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Returns the concatenated embeddings of several maps, each through its own `NatureEncoder`."""
+    """Returns the concatenated embeddings of several maps, each through its own `NatureEncoder`.
 
-    def __init__(self, codecs: Sequence[MapCodec]) -> None:
+    Args:
+        codecs: the maps.
+        layer_norm: bring each embedding to mean 0 and variance 1 (without weights of its own), so
+            that no map is louder than another and the head's input keeps its scale.
+    """
+
+    def __init__(self, codecs: Sequence[MapCodec], *, layer_norm: bool = False) -> None:
         super().__init__()
+        self.layer_norm = layer_norm
         self.encoders = nn.ModuleList(NatureEncoder(codec) for codec in codecs)
 
     @property
@@ -54,7 +61,10 @@ class Encoder(nn.Module):
 
     def forward(self, images: Sequence[Tensor]) -> Tensor:
         """Returns `[N, 512 * maps]` of decoded maps, in the maps' order."""
-        return torch.cat([encode(x) for encode, x in zip(self.encoders, images)], dim=-1)
+        embeddings = [encode(x) for encode, x in zip(self.encoders, images)]
+        if self.layer_norm:
+            embeddings = [F.layer_norm(x, x.shape[-1:]) for x in embeddings]
+        return torch.cat(embeddings, dim=-1)
 
 
 def linear(x: Tensor, layer: nn.Linear) -> Tensor:

@@ -26,6 +26,9 @@ class OffPolicy(Algorithm):
         replay_capacity: transitions kept.
         frames_per_update: environment frames for each gradient step.
         learning_starts: frames before the first update; None: one batch.
+        gamma: discount a frame, of the rewards within a sampled transition.
+        n_steps: frames that a sampled transition spans; see `ReplayMemory`.
+        rate_factors: as `Algorithm` takes them.
     """
 
     memory: ReplayMemory
@@ -42,6 +45,9 @@ class OffPolicy(Algorithm):
         replay_capacity: int,
         frames_per_update: int,
         learning_starts: int | None,
+        gamma: float = 1.0,
+        n_steps: int = 1,
+        rate_factors: Mapping[str, float] | None = None,
     ) -> None:
         self.frames_per_update = frames_per_update
         self.learning_starts = batch_size if learning_starts is None else learning_starts
@@ -49,9 +55,15 @@ class OffPolicy(Algorithm):
             weights,
             learning_rate=learning_rate,
             total_updates=(total_frames - self.learning_starts) // frames_per_update,
+            rate_factors=rate_factors,
         )
         self.memory = ReplayMemory(
-            codecs, capacity=replay_capacity, batch_size=batch_size, device=device
+            codecs,
+            capacity=replay_capacity,
+            batch_size=batch_size,
+            device=device,
+            n_steps=n_steps,
+            gamma=gamma,
         )
 
     def updates_due(self, frames: int) -> int:

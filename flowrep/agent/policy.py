@@ -22,9 +22,16 @@ from flowrep.agent.observation import MapCodec
 class MapNetwork(nn.Module):
     """Returns `[N, outputs]` float32 of decoded maps: an encoder a map, then a head."""
 
-    def __init__(self, codecs: Sequence[MapCodec], hidden_size: int, outputs: int) -> None:
+    def __init__(
+        self,
+        codecs: Sequence[MapCodec],
+        hidden_size: int,
+        outputs: int,
+        *,
+        layer_norm: bool = False,
+    ) -> None:
         super().__init__()
-        self.encoder = Encoder(codecs)
+        self.encoder = Encoder(codecs, layer_norm=layer_norm)
         self.head = Head(self.encoder.embedding_size, hidden_size, outputs)
 
     def forward(self, images: Sequence[Tensor]) -> Tensor:

@@ -27,6 +27,12 @@ class ReplayMemory:
         capacity: slots; the oldest transition is overwritten.
         batch_size: transitions a sample, drawn with replacement.
         device: where frames are kept and samples appear.
+        n_steps: steps that a sampled transition spans at most; it ends earlier where its episode
+            does, or where the frame that follows is not stored.
+        gamma: discount a step of the rewards within it.
+
+    Raises:
+        ValueError: if n_steps is below 1.
     """
 
     def __init__(
@@ -36,9 +42,14 @@ class ReplayMemory:
         capacity: int,
         batch_size: int,
         device: torch.device | str,
+        n_steps: int = 1,
+        gamma: float = 1.0,
     ) -> None:
+        if n_steps < 1:
+            raise ValueError(f"n_steps is {n_steps}: a transition spans at least 1 step")
         self.codecs = tuple(codecs)
         self.capacity, self.batch_size = capacity, batch_size
+        self.n_steps, self.gamma = n_steps, gamma
         self.device = torch.device(device)
         self._frames: TensorDictBase | None = None  # [capacity], allocated by the first extend
         self._next_slot = torch.full((capacity,), -1)  # -1: the following frame is not stored
@@ -107,23 +118,48 @@ class ReplayMemory:
     def sample(self) -> TensorDictBase:
         """Returns `batch_size` transitions, uniform with replacement, maps packed.
 
+        `("next", "reward")` is the discounted sum of the rewards on the way to `next`, and
+        `steps_to_next_obs` `[batch_size, 1]` how many steps that are, as TorchRL's value estimators
+        read it.
+
         Raises:
             RuntimeError: if no transition is complete yet.
         """
         if self._frames is None or not len(self._usable):
             raise RuntimeError("nothing to sample: extend the replay memory by two steps first")
-        chosen = self._usable[torch.randint(len(self._usable), (self.batch_size,))]
-        following = self._next_slot[chosen].to(self.device)
-        chosen = chosen.to(self.device)
-        frames = self._frames
+        first = self._usable[torch.randint(len(self._usable), (self.batch_size,))]
+        last, reward, steps = self._look_ahead(self._frames["reward"], first)
+        following = self._next_slot[last].to(self.device)
+        first, last = first.to(self.device), last.to(self.device)
         batch = TensorDict({}, [self.batch_size])
-        batch["action"] = frames["action"].index_select(0, chosen)
+        batch["action"] = self._frames["action"].index_select(0, first)
         for codec in self.codecs:
-            batch[codec.key] = frames[codec.key].index_select(0, chosen)
-            batch["next", codec.key] = frames[codec.key].index_select(0, following)
-        for name in ("reward", "done", "terminated"):
-            batch["next", name] = frames[name].index_select(0, chosen)
+            batch[codec.key] = self._frames[codec.key].index_select(0, first)
+            batch["next", codec.key] = self._frames[codec.key].index_select(0, following)
+        batch["next", "reward"] = reward
+        for name in ("done", "terminated"):
+            batch["next", name] = self._frames[name].index_select(0, last)
+        batch["steps_to_next_obs"] = steps.to(self.device)
         return batch
+
+    def _look_ahead(self, rewards: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns where transitions that begin in slots `first` [N] end.
+
+        Returns:
+            The slots of their last steps [N], the discounted sums of `rewards` [N, 1], and how many
+            steps they span [N, 1].
+        """
+        last, steps = first, torch.ones(len(first), 1)
+        reward = rewards.index_select(0, first.to(self.device))
+        for _ in range(self.n_steps - 1):
+            ahead = self._next_slot[last]
+            # a terminal step is its own successor, and one without a successor can't be the last
+            goes_on = (ahead != last) & (self._next_slot[ahead] >= 0)
+            last = torch.where(goes_on, ahead, last)
+            weight = (self.gamma**steps * goes_on[:, None]).to(self.device)
+            reward = reward + weight * rewards.index_select(0, last.to(self.device))
+            steps = steps + goes_on[:, None]
+        return last, reward, steps
 
     def state_dict(self) -> dict[str, Any]:
         """Returns everything that sampling and extending depend on, tensors uncopied."""

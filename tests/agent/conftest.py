@@ -112,6 +112,7 @@ def as_batch():
         following = store_maps(agent.codecs, steps["next"])
         following.update(steps["next"].select("reward", "terminated", "done"))
         batch = store_maps(agent.codecs, steps)
+        batch["steps_to_next_obs"] = torch.ones(*steps.batch_size, 1)
         return batch.update({"action": steps["action"], "next": following})
 
     return convert

@@ -43,6 +43,18 @@ def test_every_trained_weight_moves(make_any, random_steps):
     assert still == []
 
 
+def test_a_transition_of_three_steps_is_discounted_three_times(make_any, random_steps, as_batch):
+    agent, cubed = make_any(gamma=0.5), make_any(gamma=0.5**3)
+    if not hasattr(agent, "frames_per_update"):
+        pytest.skip("learns from whole rollouts")
+    steps = random_steps(16)
+    batch, once = as_batch(agent, steps), as_batch(agent, steps)
+    batch["steps_to_next_obs"] = torch.full((16, 1), 3.0)
+    loss, expected = agent.losses(batch)["q_loss"], cubed.losses(once)["q_loss"]
+    torch.testing.assert_close(loss, expected)
+    assert not torch.isclose(loss, agent.losses(once)["q_loss"])
+
+
 def test_the_learning_rate_ends_at_zero_with_the_frames(make_any, random_steps):
     agent = make_any(total_frames=200, learning_rate=2**-10)
     metrics = learn(agent, random_steps, 40)

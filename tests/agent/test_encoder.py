@@ -61,3 +61,15 @@ def test_embeddings_stand_side_by_side_in_the_maps_order():
     assert embedding.shape == (2, encoder.embedding_size) == (2, 1024)
     assert torch.equal(embedding[:, :512], encoder.encoders[0](images[0]))
     assert torch.equal(embedding[:, 512:], encoder.encoders[1](images[1]))
+
+
+def test_a_normalised_embedding_has_mean_0_and_variance_1_whatever_the_scale_of_its_map():
+    torch.manual_seed(3)
+    two = codecs((2, 40, 44), (1, 40, 44))
+    encoder = Encoder(two, layer_norm=True)
+    images = [c.decode(c.pack(torch.randn(5, *s))) for c, s in zip(two, [(2, 40, 44), (1, 40, 44)])]
+    embedding = encoder([images[0] * 1000, images[1]]).reshape(5, 2, 512)
+    torch.testing.assert_close(embedding.mean(-1), torch.zeros(5, 2), atol=1e-5, rtol=0)
+    # of 512 numbers, 1e-5 added to the variance, which is small for the second map
+    torch.testing.assert_close(embedding.var(-1, correction=0), torch.ones(5, 2), atol=0.1, rtol=0)
+    assert len(list(encoder.parameters())) == len(list(Encoder(two).parameters()))

@@ -9,9 +9,9 @@ from flowrep.agent.replay import ReplayMemory
 SPEC = Composite(view=Unbounded((1, 36, 36)))
 
 
-def memory(capacity=100, batch_size=400, dtype=torch.float32):
+def memory(capacity=100, batch_size=400, dtype=torch.float32, **options):
     codecs = map_codecs(SPEC, ["view"], dtype)
-    return ReplayMemory(codecs, capacity=capacity, batch_size=batch_size, device="cpu")
+    return ReplayMemory(codecs, capacity=capacity, batch_size=batch_size, device="cpu", **options)
 
 
 def view(numbers):
@@ -145,6 +145,53 @@ def test_the_oldest_are_overwritten():
     assert transitions(replay) == [
         (i, i, i + 1, i + 1, 0) for i in (6, 7)] + [(i, i, i + 1, i + 1, 0) for i in (105, 106, 107)
     ]  # fmt: skip
+
+
+def n_step_transitions(replay):
+    """The distinct (seen, action, steps, reward, next, terminated) among a large sample, sorted."""
+    batch = replay.sample()
+    columns = [
+        batch["view"][:, 0, 0, 0], batch["action"], batch["steps_to_next_obs"][:, 0],
+        batch["next", "reward"][:, 0], batch["next", "view"][:, 0, 0, 0],
+        batch["next", "terminated"][:, 0],
+    ]  # fmt: skip
+    rows = torch.stack([column.double() for column in columns], 1)
+    return [tuple(row.tolist()) for row in rows.unique(dim=0)]
+
+
+def test_a_transition_of_three_steps_sums_discounted_rewards_and_looks_three_frames_ahead():
+    replay = memory(n_steps=3, gamma=0.5)
+    for seen in range(10, 15):  # the reward of the step to 11 is 11
+        replay.extend(step([seen], [seen + 1]))
+    # from 10: 11 + 12 / 2 + 13 / 4 = 20.25 and 13; undiscounted it would be 36. From 12 on, what
+    # follows the third step is not stored: transitions are shorter
+    assert n_step_transitions(replay) == [
+        (10, 10, 3, 20.25, 13, 0),
+        (11, 11, 3, 22.0, 14, 0),
+        (12, 12, 2, 20.0, 14, 0),
+        (13, 13, 1, 14.0, 14, 0),
+    ]
+
+
+def test_a_transition_of_three_steps_ends_with_its_episode():
+    replay = memory(n_steps=3, gamma=0.5)
+    replay.extend(step([10, 20], [11, 21]))
+    replay.extend(step([11, 21], [12, 22], ended="tc"))
+    replay.extend(step([50, 60], [51, 61]))
+    replay.extend(step([51, 61], [52, 62]))
+    # 10 ends at the terminal step, whose own map stands in; 20 before the one that was cut off
+    assert n_step_transitions(replay) == [
+        (10, 10, 2, 17.0, 11, 1),
+        (11, 11, 1, 12.0, 11, 1),
+        (20, 20, 1, 21.0, 21, 0),
+        (50, 50, 1, 51.0, 51, 0),
+        (60, 60, 1, 61.0, 61, 0),
+    ]
+
+
+def test_transitions_of_no_steps_are_refused():
+    with pytest.raises(ValueError, match="n_steps is 0: a transition spans at least 1 step"):
+        memory(n_steps=0)
 
 
 def test_sampling_is_uniform_with_replacement():
