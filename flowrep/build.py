@@ -8,7 +8,7 @@ from hydra.utils import get_class
 from torchrl.envs import EnvBase
 
 from flowrep.agent import Algorithm
-from flowrep.command_line import UsageError
+from flowrep.config import UsageError
 from flowrep.envs import make_env
 from flowrep.envs.workers import available_cores
 

@@ -7,20 +7,18 @@ from typing import Any, NoReturn
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from flowrep.config import Section, UsageError, validated
 from flowrep.config_tree import CONF_DIR, config_groups, group_choices
 
 EXIT_USAGE = 2
 MULTIRUN = ("-m", "--multirun")
-
-
-class UsageError(Exception):
-    """A mistake of the person who typed the command; its text is all they need to read."""
 
 
 def register_resolvers() -> None:
@@ -34,34 +32,68 @@ def register_resolvers() -> None:
 
 
 def exit_with(message: str) -> NoReturn:
-    """Ends the process with one line and the exit code of a wrong command."""
-    print(f"error: {message}", file=sys.stderr)
+    """Ends the process with the exit code of a wrong command, each line saying what is wrong."""
+    for line in message.splitlines():
+        print(f"error: {line}", file=sys.stderr)
     sys.exit(EXIT_USAGE)
 
 
-def run_command(config_name: str, command: Callable[[], Any]) -> None:
-    """Runs a Hydra entry point after checking its overrides, so that mistakes read well."""
+def plain_config(config: DictConfig) -> dict[str, Any]:
+    """Returns a composed config as plain data, interpolations resolved, `???` left as it is.
+
+    Raises:
+        UsageError: an interpolation leads nowhere.
+    """
+    try:
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:
+        raise UsageError(_first_line(error)) from None
+    return plain
+
+
+def own_keys() -> set[str]:
+    """Returns the top level's keys that were added to the running job's config: `+note=pilot`."""
+    return keys_added(OverridesParser.create().parse_overrides(HydraConfig.get().overrides.task))
+
+
+def keys_added(overrides: Iterable[Override]) -> set[str]:
+    """Returns the top level's keys that overrides add."""
+    return {o.key_or_group.split(".")[0].split("@")[0] for o in overrides if o.is_add()}
+
+
+def run_command(config_name: str, command: Callable[[], Any], schema: type[Section]) -> None:
+    """Runs a Hydra entry point after checking its overrides, so that mistakes read well.
+
+    Args:
+        config_name: a file of conf/, without its ending.
+        command: the entry point.
+        schema: what the composed config may hold.
+    """
     register_resolvers()
     arguments = sys.argv[1:]
     if not any(argument.startswith("-") and argument not in MULTIRUN for argument in arguments):
         try:
-            check_overrides(config_name, [a for a in arguments if a not in MULTIRUN])
+            check_overrides(config_name, [a for a in arguments if a not in MULTIRUN], schema)
         except UsageError as error:
             exit_with(str(error))
     command()
 
 
-def check_overrides(config_name: str, overrides: Sequence[str]) -> None:
-    """Refuses overrides that name what doesn't exist.
+def check_overrides(
+    config_name: str, overrides: Sequence[str], schema: type[Section] | None = None
+) -> None:
+    """Refuses overrides that name what doesn't exist, or give what can't be.
 
     Every value of a sweep is looked at, before any of its jobs starts.
 
     Args:
         config_name: a file of conf/, without its ending.
         overrides: as typed, e.g. `["representations=[ego]", "seed=1"]`.
+        schema: what the composed config may hold.
 
     Raises:
-        UsageError: an unknown group choice, an unknown key, or text that Hydra can't read.
+        UsageError: an unknown group choice, an unknown key, text that Hydra can't read, or a value
+            that the schema refuses.
     """
     parsed = []
     for text in overrides:
@@ -78,9 +110,9 @@ def check_overrides(config_name: str, overrides: Sequence[str]) -> None:
     for override in parsed:
         if override.type is OverrideType.CHANGE and override not in chosen:
             _check_key(override.key_or_group, config)
-    missing = OmegaConf.missing_keys(_compose(config_name, [_one_value(o) for o in parsed]))
-    if missing:
-        raise UsageError(f"'{min(missing)}' needs a value: {min(missing)}=...")
+    composed = _compose(config_name, [_one_value(o) for o in parsed])
+    if schema is not None:
+        validated(schema, plain_config(composed), keys_added(parsed))
 
 
 def _choices(override: Override) -> list[str]:

@@ -12,28 +12,31 @@ except ImportError:
 from omegaconf import DictConfig, ListConfig
 
 from flowrep.agent import Algorithm, CheckpointError, load_checkpoint
-from flowrep.build import Config, build_agent, build_env, choose_workers
-from flowrep.command_line import UsageError, exit_with, run_command
+from flowrep.build import Config, build_agent, build_env
+from flowrep.command_line import exit_with, own_keys, plain_config, run_command
+from flowrep.config import UsageError, validated
+from flowrep.config.evaluating import EvaluateConfig
+from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs.baselines import BASELINES
 from flowrep.experiment.comparison import compare, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder
 
-POLICIES = ("greedy", "sampled")
-
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="evaluate")
 def run(config: DictConfig) -> None:
     """Runs episodes of a saved agent and of baselines, prints a table and keeps the rows."""
     try:
+        validated(EvaluateConfig, plain_config(config), own_keys())
         folder = RunFolder.existing(config.run)
         here = {key: config[key] for key in ("device", "num_envs", "num_workers")}
-        trained = folder.read_config() | here
-        choose_workers(config.num_workers, config.num_envs)
-        speeds, rates, policies, baselines = check(config, trained)
+        trained = validated_run(folder.read_config(), f"{folder.path}/config.yaml") | here
+        speeds, policies, baselines = (
+            as_list(config[key]) for key in ("speed", "policy", "baselines")
+        )
+        rates = [float(rate) for rate in as_list(config.fps)]
         agent, frames = load_agent(trained, folder)
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
@@ -55,36 +58,6 @@ def run(config: DictConfig) -> None:
         print(f"{len(rows)} episodes added to {folder.evaluation_path}")
         if not stop:
             film(agent, trained, folder, config, speeds, rates)
-
-
-def check(
-    config: DictConfig, trained: Config
-) -> tuple[list[str], list[float], list[str], list[str]]:
-    """Returns speeds, frame rates, policies, baselines as lists; refuses what can't be run.
-
-    Raises:
-        UsageError: naming the key, what came and what exists.
-    """
-    named = {
-        "speed": list(trained["scene"]["pedestrian_speed_mps"]),
-        "policy": POLICIES,
-        "baselines": list(BASELINES),
-    }
-    speeds, policies, baselines = (as_list(config[key]) for key in named)
-    for (what, there_are), names in zip(named.items(), (speeds, policies, baselines)):
-        for name in names:
-            if name not in there_are:
-                raise UsageError(f"unknown {what} '{name}'; there are: {', '.join(there_are)}")
-    rates = as_list(config.fps)
-    for rate in rates:
-        if not isinstance(rate, int | float) or rate <= 0:
-            raise UsageError(f"fps should be positive numbers of frames a second, not {rate!r}")
-    for key in ("episodes", "num_envs"):
-        if not isinstance(config[key], int) or config[key] < 1:
-            raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
-    if not isinstance(config.video, int) or config.video < 0:
-        raise UsageError(f"video should be a number of episodes, 0 for none, not {config.video!r}")
-    return speeds, [float(rate) for rate in rates], policies, baselines
 
 
 def as_list(value: Any) -> list[Any]:
@@ -123,7 +96,7 @@ def film(
 
 def main() -> None:
     """Entry point; mistakes on the command line end in one line that lists what exists."""
-    run_command("evaluate", run)
+    run_command("evaluate", run, EvaluateConfig)
 
 
 if __name__ == "__main__":

@@ -11,14 +11,15 @@ except ImportError:
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from flowrep.agent import CheckpointError, DivergenceError, keep_freed_memory
-from flowrep.build import Config, build_agent, build_env, choose_workers
-from flowrep.command_line import UsageError, exit_with, run_command
+from flowrep.build import Config, build_agent, build_env
+from flowrep.command_line import exit_with, own_keys, plain_config, run_command
+from flowrep.config import UsageError, validated
+from flowrep.config.training import EVALUATION_SEED, TrainConfig, validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import SceneError, WorkerError, load_scene
-from flowrep.envs.baselines import BASELINES
 from flowrep.experiment.comparison import compare, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.figures import draw_learning_curve
@@ -26,10 +27,8 @@ from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.training import Training, train
-from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
 
 OF_THE_MACHINE = ("device", "num_workers")  # what a resumed run takes from its new command line
-EVALUATION_SEED = 1_000_000  # first of the evaluated episodes; training takes those below
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="train")
@@ -37,8 +36,6 @@ def run(config: DictConfig) -> None:
     """Trains, evaluates and films one agent, or continues a run with `resume=`."""
     try:
         folder, plain = open_run(config)
-        load_scene(plain["scene"])
-        check(plain)
     except (UsageError, SceneError, OSError) as error:
         exit_with(str(error))
     carry_out(plain, folder)
@@ -84,8 +81,10 @@ def carry_out(config: Config, folder: RunFolder) -> None:
 
 def open_run(config: DictConfig) -> tuple[RunFolder, dict[str, Any]]:
     """Returns the run's folder and its config: a new one, or that of the run to resume."""
-    plain: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
-    if config.resume is None:
+    plain = plain_config(config)
+    validated(TrainConfig, plain, own_keys())
+    if plain["resume"] is None:
+        load_scene(plain["scene"])
         folder = RunFolder(HydraConfig.get().runtime.output_dir)
         folder.write_config(plain)
         return folder, plain
@@ -99,48 +98,9 @@ def open_run(config: DictConfig) -> tuple[RunFolder, dict[str, Any]]:
             f"resume= continues a run with its own config, so '{others[0]}' would be ignored; "
             "leave it out (device= and num_workers= may be changed)"
         )
-    folder = RunFolder.existing(config.resume)
-    here = {key: plain[key] for key in OF_THE_MACHINE}
-    return folder, folder.read_config() | here | {"resume": str(config.resume)}
-
-
-def check(config: Config) -> None:
-    """Refuses numbers that can't be, by name.
-
-    Raises:
-        UsageError: naming the key, what it should be and what it is.
-    """
-    for key in ("total_frames", "num_envs", "log_every_frames", "checkpoint_every_frames"):
-        if not isinstance(config[key], int) or config[key] < 1:
-            raise UsageError(f"{key} should be a positive whole number, not {config[key]!r}")
-    seed, num_envs = config["seed"], config["num_envs"]
-    choose_workers(config["num_workers"], num_envs)
-    if not isinstance(seed, int) or not 0 <= seed < EVALUATION_SEED // num_envs:
-        raise UsageError(
-            f"seed should be a whole number below {EVALUATION_SEED // num_envs}, not {seed!r}: "
-            "from there on its episodes are those of evaluations"
-        )
-    if config["wandb"] not in WANDB_MODES:
-        raise UsageError(f"wandb should be {' or '.join(WANDB_MODES)}, not {config['wandb']!r}")
-    if not config["representations"]:
-        raise UsageError("representations is empty; name one at least, e.g. representations=[ego]")
-    evaluation = config["evaluation"]
-    for key in ("episodes", "final_episodes"):
-        if not isinstance(evaluation[key], int) or evaluation[key] < 1:
-            raise UsageError(
-                f"evaluation.{key} should be a positive whole number, not {evaluation[key]!r}"
-            )
-    for what, names, known in (
-        (
-            "speed",
-            [config["speed"], *evaluation["speeds"]],
-            config["scene"]["pedestrian_speed_mps"],
-        ),
-        ("baseline", evaluation["baselines"], BASELINES),
-    ):
-        for name in names:
-            if name not in known:
-                raise UsageError(f"unknown {what} '{name}'; there are: {', '.join(known)}")
+    folder = RunFolder.existing(plain["resume"])
+    stored = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
+    return folder, stored | {key: plain[key] for key in (*OF_THE_MACHINE, "resume")}
 
 
 def build(config: Config, folder: RunFolder) -> Training:
@@ -213,7 +173,7 @@ def main() -> None:
             exit_with(str(error))
         # A resumed run stays in its folder, whose .hydra/ keeps telling how it was started.
         sys.argv += [f"hydra.run.dir={folder.path}", "hydra.output_subdir=null"]
-    run_command("train", run)
+    run_command("train", run, TrainConfig)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,9 @@ from rich.table import Table
 from tqdm.auto import tqdm
 
 from flowrep.cockpit import Cockpit, NoScreenError, drive_by_hand
-from flowrep.command_line import UsageError, exit_with, run_command
+from flowrep.command_line import exit_with, own_keys, plain_config, run_command
+from flowrep.config import UsageError, validated
+from flowrep.config.viewing import ViewConfig
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import BASELINES, SceneError, StreetEnv, load_scene
 from flowrep.envs.layout import Layout
@@ -58,27 +60,11 @@ def check(config: DictConfig) -> None:
         UsageError: naming the key, what came and what exists.
         SceneError: the scene itself can't be.
     """
-    plain: Any = OmegaConf.to_container(config.scene, resolve=True)
-    scene = load_scene(plain)
-    for key, known in (
-        ("driver", list(BASELINES)),
-        ("speed", list(scene.pedestrian_speed_mps)),
-        ("path", [*(path.name for path in scene.paths), None]),
-    ):
-        if config[key] not in known:
-            there = ", ".join(str(name) for name in known if name is not None)
-            raise UsageError(f"unknown {key} '{config[key]}'; there are: {there}")
-    for key, least in (("episodes", 1), ("sheet_rows", 1), ("seed", 0)):
-        value = config[key]
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise UsageError(f"{key} should be a whole number from {least}, not {value!r}")
-    for key in ("video", "interactive"):
-        if not isinstance(config[key], bool):
-            raise UsageError(f"{key} should be true or false, not {config[key]!r}")
-    rate = config.frame_rate_hz
-    is_number = isinstance(rate, int | float) and not isinstance(rate, bool)
-    if rate is not None and not (is_number and rate > 0):
-        raise UsageError(f"frame_rate_hz should be a positive number or null, not {rate!r}")
+    plain = plain_config(config)
+    validated(ViewConfig, plain, own_keys())
+    paths = [path.name for path in load_scene(plain["scene"]).paths]
+    if plain["path"] not in (*paths, None):
+        raise UsageError(f"path should be {', '.join(paths)} or null, not '{plain['path']}'")
 
 
 def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
@@ -169,7 +155,7 @@ def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     """Entry point; mistakes on the command line end in one line that lists what exists."""
-    run_command("view", run)
+    run_command("view", run, ViewConfig)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "viz": {"palette"},
     "plan_view": {"envs", "palette"},
     "cockpit": {"envs", "experiment", "viz"},
+    "config": {"config", "agent", "envs", "experiment", "simulator", "transforms"},
     "experiment": {"experiment", "envs", "agent", "palette", "transforms", "geometry", "viz"},
 }
 THIRD_PARTY_ONLY_IN = {

@@ -49,11 +49,6 @@ def test_what_is_right_passes(overrides):
     check_overrides("train", overrides)
 
 
-def test_a_missing_value_is_asked_for():
-    with pytest.raises(UsageError, match="'run' needs a value: run="):
-        check_overrides("evaluate", [])
-
-
 def run_command(*arguments, cwd):
     return subprocess.run(
         [sys.executable, "-m", *arguments],
@@ -68,8 +63,14 @@ def run_command(*arguments, cwd):
     ("arguments", "says"),
     [
         (["flowrep.train", "representations=[eggo]"], "unknown representations 'eggo'"),
-        (["flowrep.train", "speed=fast", "debug=smoke"], "unknown speed 'fast'"),
-        (["flowrep.train", "evaluation.baselines=[never]"], "unknown baseline 'never'"),
+        (
+            ["flowrep.train", "speed=fast", "debug=smoke"],
+            "speed should be low, normal or high, not 'fast'",
+        ),
+        (
+            ["flowrep.train", "evaluation.baselines=[never]"],
+            "evaluation.baselines should be a list of different values",
+        ),
         (["flowrep.train", "resume=nowhere"], "'nowhere' holds no run"),
         (["flowrep.evaluate", "run=nowhere"], "'nowhere' holds no run"),
     ],

@@ -1,0 +1,6 @@
+"""What the commands' configs may hold; see `flowrep.config.section` and docs/configs.md."""
+
+from flowrep.config.section import Section, validated
+from flowrep.config.violations import UsageError
+
+__all__ = ["Section", "UsageError", "validated"]

@@ -1,0 +1,117 @@
+"""The sections `representations` and `flow`: the options of each map, and where flow comes from."""
+
+from typing import Annotated, Any
+
+from pydantic import GetCoreSchemaHandler, model_validator
+from pydantic_core import CoreSchema, core_schema
+
+from flowrep.config.expectations import Count, Factor, OneOf, Positive, Share, Text
+from flowrep.config.section import Section
+from flowrep.config.violations import broken_rule
+from flowrep.transforms.dis import PRESETS
+from flowrep.transforms.flow import UNITS
+from flowrep.transforms.flow_source import FLOW_SOURCES
+from flowrep.transforms.raft import NETWORKS
+from flowrep.transforms.segmentation import ENCODINGS
+
+NOT_CHOSEN: Any = None
+
+
+class Rgb(Section):
+    """The picture, which has no options."""
+
+
+class Segmentation(Section):
+    """A class id a pixel."""
+
+    encoding: Annotated[str, OneOf(ENCODINGS)]
+
+
+class Depth(Section):
+    """Distances."""
+
+    range_m: Positive
+    missing: Share
+
+
+class Flow(Section):
+    """Raw, ego or object flow."""
+
+    scale: Annotated[float, Factor()]
+    unit: Annotated[str, OneOf(UNITS)]
+
+
+class SegmentationStack(Segmentation):
+    """The last `k` frames of it."""
+
+    k: Count
+
+
+class DepthStack(Depth):
+    """The last `k` frames of it."""
+
+    k: Count
+
+
+class Representations(Section):
+    """What the agent sees: one or more, by name."""
+
+    rgb: Rgb = NOT_CHOSEN
+    seg: Segmentation = NOT_CHOSEN
+    depth: Depth = NOT_CHOSEN
+    raw: Flow = NOT_CHOSEN
+    ego: Flow = NOT_CHOSEN
+    obj: Flow = NOT_CHOSEN
+    seg2: SegmentationStack = NOT_CHOSEN
+    depth2: DepthStack = NOT_CHOSEN
+
+    @model_validator(mode="after")
+    def _is_not_empty(self) -> "Representations":
+        if not self.model_fields_set:
+            raise broken_rule("", "is empty; name one at least: representations=[ego,obj]")
+        return self
+
+
+class ExactFlow(Section):
+    """`flow=exact`."""
+
+    source: Annotated[str, OneOf(FLOW_SOURCES)]
+
+
+class EstimatedFlow(ExactFlow):
+    """`flow=estimated`."""
+
+    estimator: Annotated[str, OneOf(("dis", *NETWORKS))]
+    weights: Annotated[str | None, Text("a file of RAFT's weights", also=(None,))]
+    preset: Annotated[str, OneOf(tuple(PRESETS))]
+    min_side_px: Count
+
+    @model_validator(mode="after")
+    def _weights_are_rafts(self) -> "EstimatedFlow":
+        if (self.estimator in NETWORKS) != (self.weights is not None):
+            raise broken_rule(
+                "weights",
+                f"should be null with estimator={self.estimator}, not {self.weights!r}"
+                if self.weights
+                else f"is missing: estimator={self.estimator} needs flow.weights=<file>",
+            )
+        return self
+
+
+class BySource:
+    """The section that `source` chooses, for a field's annotation."""
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Returns a union of both, told apart by `source`."""
+        choices = {
+            "@exact": handler.generate_schema(ExactFlow),
+            "@estimated": handler.generate_schema(EstimatedFlow),
+        }
+        return core_schema.tagged_union_schema(choices, discriminator=_choice)
+
+
+def _choice(value: Any) -> str:
+    is_estimated = isinstance(value, dict) and value.get("source") == "estimated"
+    return "@estimated" if is_estimated else "@exact"

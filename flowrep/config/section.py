@@ -1,0 +1,72 @@
+"""What every section of a config has in common: its keys are known, and none is missing."""
+
+from collections.abc import Collection, Mapping
+from typing import Any, TypeVar
+
+from omegaconf import MISSING
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, model_validator
+from pydantic_core import PydanticCustomError
+
+from flowrep.config.violations import (
+    ABSENT,
+    UNKNOWN,
+    UsageError,
+    broken_rule,
+    closest,
+    lines_of,
+    shown,
+)
+
+S = TypeVar("S", bound="Section")
+
+
+class Section(BaseModel):
+    """Keys of a config; a subclass annotates each with what its value may be.
+
+    Nothing has a default here: defaults lie in conf/.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, validate_default=False)
+
+    @classmethod
+    def keys(cls) -> list[str]:
+        """Returns the keys as they are written in a config."""
+        return [field.alias or name for name, field in cls.model_fields.items()]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_its_keys(cls, value: Any, info: ValidationInfo) -> Any:
+        known = cls.keys()
+        if not isinstance(value, Mapping):
+            keys = f"a section with the keys {', '.join(known)}" if known else "a section: {}"
+            raise broken_rule("", f"should be {keys}, not {shown(value)}")
+        for key in value:
+            if key not in known and cls.model_config["extra"] == "forbid":
+                there = f"there are: {', '.join(known)}" if known else "it has none"
+                remedy = f"{closest(str(key), known)}; {there}"
+                raise PydanticCustomError(UNKNOWN, "{remedy}", {"key": key, "remedy": remedy})
+        for name, field in cls.model_fields.items():
+            key = field.alias or name
+            if field.is_required() and (key not in value or value[key] == MISSING):
+                example = (field.examples or ["..."])[0]
+                raise PydanticCustomError(ABSENT, "{example}", {"key": key, "example": example})
+        return value
+
+
+def validated(schema: type[S], config: Mapping[str, Any], own_keys: Collection[str] = ()) -> S:
+    """Returns the config as its schema, once everything in it is found right.
+
+    Args:
+        schema: of the whole config.
+        config: resolved, as plain data.
+        own_keys: the top level's keys that a user added for themselves (`+note=pilot`).
+
+    Raises:
+        UsageError: a line for each key that is unknown, missing, or not what it should be.
+    """
+    if own_keys:
+        config = {key: value for key, value in config.items() if key not in own_keys}
+    try:
+        return schema.model_validate(config)
+    except ValidationError as error:
+        raise UsageError("\n".join(lines_of(error))) from None

@@ -1,0 +1,118 @@
+"""The config of `flowrep.train`, as conf/train.yaml and its groups compose it."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, get_args
+
+from pydantic import ConfigDict, Field, model_validator
+
+from flowrep.config.algorithms import AnyAlgorithm, ByTarget
+from flowrep.config.expectations import Count, ListOf, OneOf, Seed, Switch, Text, Whole
+from flowrep.config.representations import BySource, Representations
+from flowrep.config.section import Section, validated
+from flowrep.config.violations import UsageError, broken_rule
+from flowrep.envs.baselines import BASELINES
+from flowrep.envs.scene import SpeedMode
+from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
+from flowrep.simulator.renderer import RENDERERS
+
+EVALUATION_SEED = 1_000_000
+"""First of the evaluated episodes of a training; what it learns from are those below."""
+
+SPEEDS: tuple[str, ...] = get_args(SpeedMode)
+
+Speed = Annotated[str, OneOf(SPEEDS)]
+Device = Annotated[str, Text("auto, cpu, cuda or cuda:<number>", r"^(auto|cpu|cuda(:\d+)?)$")]
+Workers = Annotated[int | str, Whole(0, also=("auto",))]
+Path = Annotated[str | None, Text("a folder", also=(None,))]
+
+
+class Evaluation(Section):
+    """How the agent is evaluated while it learns and at the end."""
+
+    every_frames: Count
+    episodes: Count
+    final_episodes: Count
+    speeds: Annotated[list[str], ListOf(OneOf(SPEEDS))]
+    baselines: Annotated[list[str], ListOf(OneOf(tuple(BASELINES)), least=0)]
+    video: Switch
+
+
+class SceneSection(Section):
+    """A scene; what it holds is for `flowrep.envs.load_scene` to check."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class TrainConfig(Section):
+    """The whole config of a training."""
+
+    seed: Seed = Field(examples=[0])
+    device: Device
+    speed: Speed
+    total_frames: Count
+    num_envs: Count
+    num_workers: Workers
+    renderer: Annotated[str, OneOf(RENDERERS)]
+    log_every_frames: Count
+    checkpoint_every_frames: Count
+    wandb: Annotated[str, OneOf(WANDB_MODES)]
+    resume: Path
+    evaluation: Evaluation
+    representations: Representations = Field(examples=["[ego,obj]"])
+    flow: Annotated[Any, BySource()] = Field(examples=["exact"])
+    scene: SceneSection = Field(examples=["straight_road"])
+    algorithm: Annotated[AnyAlgorithm, ByTarget()] = Field(examples=["dsac"])
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "TrainConfig":
+        check_workers(self.num_workers, self.num_envs)
+        most = EVALUATION_SEED // self.num_envs - 1
+        if self.seed > most:
+            raise broken_rule(
+                "seed",
+                f"should be at most {most} with num_envs={self.num_envs}, not {self.seed}: from "
+                "there on its episodes are those of evaluations",
+            )
+        self.algorithm.check_with(self)
+        return self
+
+
+ABSENT_BEFORE: dict[str, Any] = {
+    "flow": {"source": "exact"},
+    "num_workers": "auto",
+    "renderer": "pybullet",
+    "wandb": "off",
+}
+"""What runs did of before there were these keys."""
+
+
+def validated_run(config: Any, source: str) -> dict[str, Any]:
+    """Returns the config that a run folder holds, once it is found to be one.
+
+    Args:
+        config: what was read from the folder.
+        source: the file, for messages.
+
+    Raises:
+        UsageError: it is none; a line for each key that is not what it should be.
+    """
+    whole: Any = {**ABSENT_BEFORE, **config} if isinstance(config, Mapping) else config
+    own_keys = config.keys() - TrainConfig.keys() if isinstance(config, Mapping) else ()
+    try:
+        validated(TrainConfig, whole, own_keys)
+    except UsageError as error:
+        lines = str(error).splitlines()
+        raise UsageError("\n".join(f"{source}: {line}" for line in lines)) from None
+    return whole
+
+
+def check_workers(num_workers: int | str, num_envs: int) -> None:
+    """Checks that each process has an environment to drive.
+
+    Raises:
+        PydanticCustomError: from `broken_rule`.
+    """
+    if isinstance(num_workers, int) and num_workers > num_envs:
+        raise broken_rule(
+            "num_workers", f"should be at most num_envs={num_envs}, or auto, not {num_workers}"
+        )

@@ -1,0 +1,65 @@
+"""Every key of conf/ is in the schema, every key of the schema in conf/, and neither repeats."""
+
+import pytest
+from omegaconf import OmegaConf
+
+pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
+
+from flowrep.config import validated
+from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.evaluating import EvaluateConfig
+from flowrep.config.representations import EstimatedFlow, ExactFlow, Representations
+from flowrep.config.training import Evaluation, TrainConfig
+from flowrep.config.viewing import ViewConfig
+from flowrep.config_tree import CONF_DIR, config_groups, group_choices
+from tests.config.composing import plain
+
+GROUP_FILES = [(group, name) for group in config_groups() for name in group_choices(group)]
+
+
+@pytest.mark.parametrize(
+    ("name", "schema", "given"),
+    [("train", TrainConfig, []), ("evaluate", EvaluateConfig, ["run=x"]), ("view", ViewConfig, [])],
+    ids=["train", "evaluate", "view"],
+)
+def test_a_command_has_the_keys_of_its_schema(name, schema, given):
+    config = plain(name, *given)
+    assert sorted(config) == sorted(schema.keys())
+    validated(schema, config)
+
+
+@pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
+def test_every_choice_of_every_group_is_right(group, name):
+    choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
+    given = ["flow.weights=file"] if name == "raft" else []
+    validated(TrainConfig, plain("train", choice, *given))
+
+
+def keys_of(*place):
+    return sorted(OmegaConf.load(CONF_DIR.joinpath(*place).with_suffix(".yaml")))
+
+
+@pytest.mark.parametrize("name", group_choices("algorithm"))
+def test_an_algorithm_has_the_keys_of_its_section(name):
+    target = OmegaConf.load(CONF_DIR / "algorithm" / f"{name}.yaml")["_target_"]
+    assert keys_of("algorithm", name) == sorted(ALGORITHMS[target].keys())
+
+
+def test_every_section_has_its_file():
+    targets = {
+        OmegaConf.load(CONF_DIR / "algorithm" / f"{name}.yaml")["_target_"]
+        for name in group_choices("algorithm")
+    }
+    assert targets == set(ALGORITHMS)
+    assert group_choices("representations") == sorted(Representations.keys())
+
+
+def test_the_other_sections_have_the_keys_of_their_files():
+    assert keys_of("flow", "exact") == sorted(ExactFlow.keys())
+    assert keys_of("flow", "estimated") == sorted(EstimatedFlow.keys())
+    assert sorted(plain("train")["evaluation"]) == sorted(Evaluation.keys())
+    for name in group_choices("representations"):
+        section = Representations.model_fields[name].annotation
+        assert sorted(plain("train", f"representations=[{name}]")["representations"][name]) == (
+            sorted(section.keys())
+        )
