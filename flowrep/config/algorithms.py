@@ -15,11 +15,15 @@ from flowrep.config.expectations import (
     Positive,
     PositiveShare,
     Share,
+    Switch,
     Text,
     Whole,
 )
 from flowrep.config.section import Section
 from flowrep.config.violations import broken_rule
+
+OFF_BEFORE: Any = None
+"""Marks options that runs of before do not have; what their class does without them is as then."""
 
 
 class Run(Protocol):
@@ -67,12 +71,15 @@ class OffPolicy(Learner):
     replay_capacity: Count
     frames_per_update: Count
     learning_starts: Annotated[int | None, Whole(1, also=(None,))]
+    n_steps: Count = OFF_BEFORE
+    layer_norm: Switch = OFF_BEFORE
 
     def check_with(self, run: Run) -> None:
         """Checks that the memory holds what is asked of it, and that there is time to learn."""
+        steps = (self.n_steps or 1) + 1
         for name, least in (
             (f"batch_size={self.batch_size}", self.batch_size),
-            (f"two steps of num_envs={run.num_envs}", 2 * run.num_envs),
+            (f"{steps} steps of num_envs={run.num_envs}", steps * run.num_envs),
         ):
             if self.replay_capacity < least:
                 raise broken_rule(
@@ -104,6 +111,7 @@ class DiscreteSAC(OffPolicy):
     encoder: Annotated[str, OneOf(ENCODERS)]
     initial_alpha: Positive
     target_entropy_weight: Share
+    alpha_rate_factor: NotNegative = OFF_BEFORE
 
 
 class DiscreteSACWithValue(OffPolicy):
@@ -111,6 +119,7 @@ class DiscreteSACWithValue(OffPolicy):
 
     initial_alpha: Positive
     target_entropy_weight: Share
+    alpha_rate_factor: NotNegative = OFF_BEFORE
 
 
 class DoubleDQN(OffPolicy):

@@ -24,6 +24,8 @@ def refusal(command, schema, line):
         ("algorithm.gamma=-1", "algorithm.gamma should be a number from 0 to 1, not -1"),
         ("algorithm.gamma=true", "algorithm.gamma should be a number from 0 to 1, not true"),
         ("algorithm.gamma=nan", "algorithm.gamma should be a number from 0 to 1, not nan"),
+        ("algorithm.n_steps=0", "algorithm.n_steps should be a positive whole number, not 0"),
+        ("algorithm.layer_norm=1", "algorithm.layer_norm should be true or false, not 1"),
         ("algorithm.tau=0", "algorithm.tau should be a number above 0 and up to 1, not 0"),
         ("algorithm.tau=5", "algorithm.tau should be a number above 0 and up to 1, not 5"),
         ("algorithm.learning_rate=0", "algorithm.learning_rate should be a number above 0, not 0"),
@@ -167,8 +169,13 @@ def test_a_value_that_can_not_be_is_named_with_what_could(line, expected):
         ),
         (
             "algorithm.replay_capacity=63 algorithm.batch_size=40",
-            "algorithm.replay_capacity should hold at least two steps of num_envs=32, 64 "
+            "algorithm.replay_capacity should hold at least 2 steps of num_envs=32, 64 "
             "transitions, not 63; raise it or lower the other",
+        ),
+        (
+            "algorithm.n_steps=3 algorithm.replay_capacity=127 algorithm.batch_size=40",
+            "algorithm.replay_capacity should hold at least 4 steps of num_envs=32, 128 "
+            "transitions, not 127; raise it or lower the other",
         ),
         (
             "total_frames=5000 algorithm.learning_starts=4991",
@@ -297,6 +304,18 @@ def test_an_evaluation_takes_one_value_or_a_list(line):
 )
 def test_a_look_that_can_not_be_is_refused(line, expected):
     assert refusal("view", ViewConfig, line) == expected
+
+
+def test_a_run_of_before_there_was_an_option_is_still_one():
+    config = plain("train")
+    for key in ("n_steps", "layer_norm", "alpha_rate_factor"):
+        del config["algorithm"][key]
+    for key in ("renderer", "wandb"):
+        del config[key]
+    assert validated_run(config, "config.yaml") == config | {"renderer": "pybullet", "wandb": "off"}
+    config["algorithm"]["n_steps"] = 0
+    with pytest.raises(UsageError, match=r"^config.yaml: algorithm.n_steps should be a positive"):
+        validated_run(config, "config.yaml")
 
 
 @pytest.mark.parametrize("config", [None, [], "text", 3])
