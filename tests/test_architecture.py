@@ -22,6 +22,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "plan_view": {"envs", "palette"},
     "cockpit": {"envs", "experiment", "viz"},
     "config": {"config", "agent", "envs", "experiment", "simulator", "transforms"},
+    "sequences": {"sequences", "experiment", "transforms", "geometry", "viz"},
     "experiment": {"experiment", "envs", "agent", "palette", "transforms", "geometry", "viz"},
 }
 THIRD_PARTY_ONLY_IN = {
@@ -33,6 +34,7 @@ THIRD_PARTY_ONLY_IN = {
         "view.py",
         "command_line.py",
         "build.py",
+        "factorize.py",
         "transforms/configs.py",
     },
 }

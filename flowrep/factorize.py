@@ -1,0 +1,158 @@
+"""Factorises recorded video: `python -m flowrep.factorize input=... format=tum output=...`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+try:
+    import cv2
+    import hydra
+    import imageio  # noqa: F401
+    import tqdm  # noqa: F401
+except ImportError:
+    sys.exit("error: factorising needs packages of an extra: pip install 'flowrep[factorize]'")
+
+from hydra.utils import get_class
+from omegaconf import DictConfig, OmegaConf
+
+from flowrep.command_line import UsageError, exit_with, run_command
+from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.sequences import EstimatedFlowSource, Recording, SequenceError, Stream, recorded_flow
+from flowrep.sequences.factorization import FlowSource
+from flowrep.sequences.job import Job, JobOptions, as_settings
+from flowrep.sequences.output import FLOW_FORMATS, FLOW_NAMES, OutputOptions
+from flowrep.sequences.output_folder import OutputFolder
+from flowrep.transforms import EstimatedFlow
+
+MISTAKES = (UsageError, SequenceError, ValueError, ImportError, OSError)
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="factorize")
+def run(config: DictConfig) -> None:
+    """Writes raw, ego and object flow of a recording."""
+    # OpenCV's own words about broken files would stand beside the one line that matters.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        settings: Any = OmegaConf.to_container(config, resolve=True)
+        code = factorize_recording(settings)
+    except MISTAKES as error:
+        exit_with(" ".join(str(error).split()))
+    sys.exit(code)
+
+
+def factorize_recording(settings: dict[str, Any]) -> int:
+    """Runs the job that a config asks for; returns the exit code.
+
+    Raises:
+        UsageError: a value that can't be.
+        SequenceError: a file that can't be read.
+    """
+    options = job_options(settings)
+    stream = open_stream(settings)
+    flow_source = open_flow_source(settings, stream)
+    if settings["resume"] and not isinstance(stream, Recording):
+        raise UsageError("a camera can't be resumed: what it saw is gone")
+    for note in stream.notes:
+        print(f"note: {note}")
+    folder = OutputFolder(settings["output"], as_settings(settings), resume=settings["resume"])
+    job = Job(stream, flow_source, folder, options)
+    try:
+        diagnosis = job.run()
+    except BaseException:
+        folder.discard_if_empty()
+        raise
+    if diagnosis is None:
+        print(f"stopped after {job.done} frames; resume=true continues {folder.partial}")
+        return 130
+    if not job.done:
+        folder.discard_if_empty()
+        raise SequenceError(settings["input"], "has no two frames in a row")
+    folder.finish(job.summary())
+    warning = "warning: " if diagnosis.suspects else ""
+    print(f"{warning}{diagnosis.words}")
+    print(f"{job.done} frames in {folder.path}; time: {job.clock.summary()}")
+    return 0
+
+
+def job_options(settings: dict[str, Any]) -> JobOptions:
+    """Returns the options of a job; refuses what can't be, by name."""
+    least = {"start": 0, "stride": 1, "pictures_every": 0}
+    for key, smallest in least.items():
+        _check_whole(settings, key, smallest)
+    if settings["stop"] is not None:
+        _check_whole(settings, "stop", settings["start"] + 2)
+    for key in ("resume", "check_consistency", "video", "rerun"):
+        if not isinstance(settings[key], bool):
+            raise UsageError(f"{key} should be true or false, not {settings[key]!r}")
+    for key in ("moving_px", "video_fps", "depth_range_m"):
+        _check_positive(key, settings[key])
+    for name in FLOW_NAMES:
+        _check_positive(f"scale_px.{name}", settings["scale_px"][name])
+    files = settings["flow_files"]
+    if not isinstance(files, list) or not set(files) <= set(FLOW_FORMATS):
+        raise UsageError(f"flow_files are of {list(FLOW_FORMATS)}, not {files!r}")
+    return JobOptions(
+        start=settings["start"],
+        stop=settings["stop"],
+        stride=settings["stride"],
+        moving_px=settings["moving_px"],
+        video_fps=settings["video_fps"] if settings["video"] else None,
+        rerun=settings["rerun"],
+        output=OutputOptions(
+            flow_files=files,
+            pictures_every=settings["pictures_every"],
+            scale_px=settings["scale_px"],
+            depth_range_m=settings["depth_range_m"],
+        ),
+    )
+
+
+def open_stream(settings: dict[str, Any]) -> Stream:
+    """Returns the recording or camera that `input` and `format` name."""
+    format_options = dict(settings["format"])
+    target = get_class(format_options.pop("_target_"))
+    source = str(settings["input"])
+    if issubclass(target, Recording) and not Path(source).is_dir():
+        raise SequenceError(source, "no such folder")
+    return target(source, **format_options)
+
+
+def open_flow_source(settings: dict[str, Any], stream: Stream) -> FlowSource:
+    """Returns where raw flow comes from."""
+    options = dict(settings["flow"])
+    if options.pop("source") == "exact":
+        if not stream.has_flow:
+            raise UsageError(
+                f"flow=exact: {settings['input']} brings no flow on the current frame's grid; "
+                "use flow=estimated, or where the format has it format.backwards=true"
+            )
+        return recorded_flow
+    estimator = EstimatedFlow(**options).estimator
+    return EstimatedFlowSource(estimator, check_consistency=settings["check_consistency"])
+
+
+def _check_whole(settings: dict[str, Any], key: str, least: int) -> None:
+    value = settings[key]
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise UsageError(f"{key} should be a whole number from {least}, not {value!r}")
+
+
+def _check_positive(key: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e9:
+        raise UsageError(f"{key} should be a positive number, not {value!r}")
+
+
+def main() -> None:
+    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    typed = sys.argv[1:]
+    if not any(word.startswith(("-", "format=")) for word in typed):
+        exit_with(
+            f"'format' needs a value: format=...; there are: {', '.join(group_choices('format'))}"
+        )
+    run_command("factorize", run)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""Depth maps as files hold them, into metres with nan for missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.sequences.arrays import read_npy
+from flowrep.sequences.pictures import read_png16
+
+DEPTH_FILES = (".png", ".npy")
+
+
+def depth_from_integers(
+    values: NDArray[np.uint16],
+    unit_m: float,
+    *,
+    missing: Iterable[int] = (),
+    no_surface: int | None = None,
+) -> NDArray[np.float32]:
+    """Returns depth in metres.
+
+    Args:
+        values: `[H, W]`, as stored.
+        unit_m: what 1 stands for, metres.
+        missing: values that stand for "not measured": nan.
+        no_surface: the value that stands for "nothing there": inf.
+
+    >>> stored = np.array([[0, 1500, 65535]], np.uint16)
+    >>> depth_from_integers(stored, 0.001, missing=(0, 65535))
+    array([[nan, 1.5, nan]], dtype=float32)
+    """
+    depth = values * np.float32(unit_m)
+    for value in missing:
+        depth[values == value] = np.nan
+    if no_surface is not None:
+        depth[values == no_surface] = np.inf
+    return depth
+
+
+def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
+    """Returns a depth map in metres: 16 bits (0 and 65535 missing) times a unit, or floats.
+
+    Args:
+        path: a .png, or a .npy of float metres, in which nan is missing and inf no surface.
+        unit_m: of the .png.
+    """
+    if path.suffix.lower() == ".npy":
+        return read_npy(path)
+    return depth_from_integers(read_png16(path), unit_m, missing=(0, 65535))

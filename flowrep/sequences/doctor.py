@@ -1,0 +1,197 @@
+"""The convention doctor: finds out that poses, depth or flow are not what they are taken for.
+
+A wrong convention runs without any error and gives wrong flow. In most recordings most of what is
+seen stands still, and there raw flow is ego flow, so that the median of |raw - ego| is small. Where
+it is not, the doctor computes ego flow again under each of the usual mistakes, and names the one
+that would make most of the rest go away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flowrep.geometry import ego_flow, relative_motion
+from flowrep.sequences.mistakes import MISTAKES, on_command_line
+
+# Below this nothing is to be complained about: rounding of pixels, of estimators, of poses.
+_SMALL_PX, _SMALL_SHARE = 0.05, 0.05
+_SHRINKS = 0.5
+_LEAST_RAW_PX = 0.25  # what hardly moves tells nothing
+_SAMPLED_PIXELS = 6000
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the doctor found.
+
+    Attributes:
+        pairs: pairs of frames that moved enough to be looked at.
+        raw_px: median length of raw flow, the mean over the pairs.
+        residual_px: median of |raw - ego|, the mean over the pairs.
+        rivals_px: the same under each of `MISTAKES`.
+        suspects: the mistakes that would shrink the residual by half, the likeliest first, and
+            others that would do as well.
+    """
+
+    pairs: int
+    raw_px: float
+    residual_px: float
+    rivals_px: dict[str, float]
+    suspects: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        """The diagnosis in a sentence or two."""
+        if not self.pairs:
+            return "conventions could not be checked: hardly anything moves"
+        share = f"{self.residual_px:.2f} px of {self.raw_px:.2f} px are left over (medians)"
+        if not self.suspects:
+            if self.residual_px > _SHRINKS * self.raw_px:
+                return (
+                    f"ego flow does not explain the raw flow: {share}. No usual mistake of "
+                    "conventions would halve that: are intrinsics, poses and pictures of one "
+                    "recording, and does most of the picture stand still?"
+                )
+            return f"conventions look right: {share}"
+        told = "; or if ".join(
+            f"{MISTAKES[name].says}, {self.rivals_px[name]:.2f} px "
+            f"(frames: {on_command_line(name)})"
+            for name in self.suspects
+        )
+        return f"a convention looks wrong: {share}. It would be less if {told}"
+
+
+@dataclass
+class Doctor:
+    """Looks at pairs of frames, one after the other, and says what it thinks.
+
+    >>> depth = torch.full((1, 8, 10), 4.0)
+    >>> K = torch.tensor([[20.0, 0.0, 5.0], [0.0, 20.0, 4.0], [0.0, 0.0, 1.0]])
+    >>> before, now = torch.eye(4).double(), torch.eye(4).double()
+    >>> now[0, 3] = 0.5  # the camera went to the right: all streams by 20 * 0.5 / 4 to the left
+    >>> raw = torch.tensor([2.5, 0.0]).reshape(2, 1, 1).expand(2, 8, 10)  # but this says right
+    >>> doctor = Doctor()
+    >>> doctor.look(raw, depth, K, before, now)
+    >>> "flow_sign" in doctor.diagnosis().suspects
+    True
+    """
+
+    _residuals: list[Tensor] = field(default_factory=list)
+    _raw_px: list[float] = field(default_factory=list)
+
+    @property
+    def pairs(self) -> int:
+        """Returns how many pairs moved enough to be looked at."""
+        return len(self._raw_px)
+
+    @torch.no_grad()
+    def look(
+        self,
+        raw: Tensor,
+        depth: Tensor,
+        K: Tensor,
+        world_from_prev: Tensor,
+        world_from_curr: Tensor,
+        *,
+        static: Tensor | None = None,
+    ) -> None:
+        """Takes a pair of frames into account, unless hardly anything moves in it.
+
+        Args:
+            raw: `[2, H, W]`, pixels a step, taken for p_t - p_t' on the current grid; nan unknown.
+            depth: `[1, H, W]`, of the current frame, taken for z in metres.
+            K: `[3, 3]`, pixels.
+            world_from_prev: `[4, 4]`, taken for camera-to-world with OpenCV's axes.
+            world_from_curr: `[4, 4]`, the same of the current frame.
+            static: `[1, H, W]` bool, what is known to stand still; without it most of the picture
+                has to.
+        """
+        raw, depth, K, known, step = _sampled(raw, depth, K, static)
+        raw_px = step * _median_length(raw, known)
+        if not raw_px >= _LEAST_RAW_PX:
+            return
+        poses = world_from_prev.double(), world_from_curr.double()
+        self._raw_px.append(raw_px)
+        self._residuals.append(step * _residuals(raw, depth, K, poses, known))
+
+    def diagnosis(self) -> Diagnosis:
+        """Returns what all pairs so far say together."""
+        if not self.pairs:
+            return Diagnosis(0, float("nan"), float("nan"), {}, ())
+        residual, *rivals = torch.stack(self._residuals).mean(0).tolist()
+        raw_px = float(np.mean(self._raw_px))
+        rivals_px = dict(zip(MISTAKES, rivals))
+        suspects: tuple[str, ...] = ()
+        if residual > max(_SMALL_PX, _SMALL_SHARE * raw_px):
+            least = min(rivals)
+            if least <= _SHRINKS * residual:
+                as_good = 1.2 * least + 0.01
+                ranked = sorted(rivals_px, key=lambda name: rivals_px[name])
+                suspects = tuple(name for name in ranked if rivals_px[name] <= as_good)
+        return Diagnosis(self.pairs, raw_px, residual, rivals_px, suspects)
+
+
+def diagnose(
+    raw: Tensor,
+    depth: Tensor,
+    K: Tensor,
+    world_from_prev: Tensor,
+    world_from_curr: Tensor,
+    *,
+    static: Tensor | None = None,
+) -> Diagnosis:
+    """Returns what one pair of frames says about its conventions, see `Doctor.look`."""
+    doctor = Doctor()
+    doctor.look(raw, depth, K, world_from_prev, world_from_curr, static=static)
+    return doctor.diagnosis()
+
+
+def _residuals(
+    raw: Tensor, depth: Tensor, K: Tensor, poses: tuple[Tensor, Tensor], known: Tensor
+) -> Tensor:
+    """Returns the median of |raw - ego| as things are, then under each mistake."""
+    residuals = []
+    for mistake in (None, *MISTAKES.values()):
+        there, z, flow = poses, depth, raw
+        if mistake is not None and mistake.poses:
+            there = mistake.poses(poses[0]), mistake.poses(poses[1])
+        if mistake is not None and mistake.depth:
+            z = mistake.depth(depth, K)
+        if mistake is not None and mistake.flow:
+            flow = mistake.flow(raw)
+        ego, valid = ego_flow(z, K, relative_motion(*there))
+        # What a convention puts behind the camera it does not explain.
+        left = torch.where(valid, flow - ego, torch.inf)
+        residuals.append(_median_length(left, known))
+    return torch.tensor(residuals, dtype=torch.float64).clamp(max=1e6)
+
+
+def _sampled(
+    raw: Tensor, depth: Tensor, K: Tensor, static: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+    """Returns the maps and K on a grid coarser by a step, where all is known, and the step.
+
+    Pixel j of the coarser grid is pixel s j + o of the finer one. The centre of that one,
+    s j + o + 0.5, is to lie at j + 0.5: u' = (u - o - 0.5) / s + 0.5. Flow is in coarse pixels.
+    """
+    height, width = depth.shape[-2:]
+    step = max(1, int((height * width / _SAMPLED_PIXELS) ** 0.5))
+    offset = step // 2
+    every = (..., slice(offset, None, step), slice(offset, None, step))
+    raw, depth = raw[every].float() / step, depth[every].float()
+    coarse = K.double().clone()
+    coarse[:2, 2] -= offset + 0.5 - step / 2
+    coarse[:2] /= step
+    known = raw.isfinite().all(0, keepdim=True) & (depth > 0)
+    if static is not None:
+        known &= static[every]
+    return raw, depth, coarse.float(), known, step
+
+
+def _median_length(flow: Tensor, where: Tensor) -> float:
+    lengths = flow.square().sum(0, keepdim=True).sqrt()[where]
+    return float(lengths.nan_to_num(nan=torch.inf).median()) if lengths.numel() else float("nan")

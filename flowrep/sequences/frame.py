@@ -1,0 +1,134 @@
+"""What a recording is made of: frames in flowrep's conventions, read one at a time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from flowrep.geometry import check_rigid
+
+
+class SequenceError(Exception):
+    """A recording that can't be read, in one line that names the file and the cause."""
+
+    def __init__(self, path: object, cause: str) -> None:
+        super().__init__(f"{path}: {cause}")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One moment of a recording.
+
+    Convention: CONVENTIONS.md's. The camera's axes are OpenCV's, K puts the centre of pixel (0, 0)
+    at (0.5, 0.5), depth is z in metres (nan: missing, inf: no surface), all on one pixel grid.
+
+    Attributes:
+        name: unique in the recording; what is written of the frame is named by it.
+        source: the file that errors about the frame name.
+        world_from_cam: `[4, 4]` float64, the camera's pose.
+        K: `[3, 3]` float64, pixels.
+        depth: `[H, W]` float32, metres.
+        rgb: `[H, W, 3]` uint8, None where the recording has no pictures.
+        timestamp_s: seconds, None where the recording has no clock.
+        raw: `[2, H, W]` float32, p_t - p_t' as the recording itself knows it, t' the frame before
+            in the recording's order; nan where unknown; None where it has none for this frame.
+        raw_since: name of the frame t' that `raw` is measured from.
+        starts_clip: whether what came before belongs to another shot.
+    """
+
+    name: str
+    source: Path
+    world_from_cam: NDArray[np.float64]
+    K: NDArray[np.float64]
+    depth: NDArray[np.float32]
+    rgb: NDArray[np.uint8] | None = None
+    timestamp_s: float | None = None
+    raw: NDArray[np.float32] | None = None
+    raw_since: str | None = None
+    starts_clip: bool = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        height, width = self.depth.shape
+        return height, width
+
+
+class Recording(ABC):
+    """Frames on a disk. They are read when they are asked for, and none is kept.
+
+    Attributes:
+        has_flow: whether frames may bring flow of their own.
+        notes: what a user should know about this recording, a sentence each.
+        one_size: whether all frames must have one size.
+    """
+
+    has_flow: bool = False
+    notes: tuple[str, ...] = ()
+    one_size: bool = True
+    _size: tuple[int, int] | None = None
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Returns how many frames there are."""
+
+    @abstractmethod
+    def _read(self, index: int) -> Frame:
+        """Returns a frame, unchecked."""
+
+    def __getitem__(self, index: int) -> Frame:
+        """Returns one frame.
+
+        Raises:
+            IndexError: there is no such frame.
+            SequenceError: it can't be read, or does not fit the others.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        frame = self._read(index)
+        check_frame(frame)
+        if self._size is None:
+            self._size = frame.size
+        if self.one_size and frame.size != self._size:
+            raise SequenceError(
+                frame.source,
+                f"is {_size_text(frame.size)}, other frames are {_size_text(self._size)}",
+            )
+        return frame
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yields the frames in order."""
+        return (self[index] for index in range(len(self)))
+
+
+def check_frame(frame: Frame) -> None:
+    """Returns nothing; complains about a frame whose parts do not fit one another.
+
+    Raises:
+        SequenceError: pictures of differing sizes, a pose that is not rigid, a K that is none.
+    """
+    sizes = {"depth": frame.size}
+    if frame.rgb is not None:
+        sizes["colour"] = (frame.rgb.shape[0], frame.rgb.shape[1])
+    if frame.raw is not None:
+        sizes["flow"] = (frame.raw.shape[1], frame.raw.shape[2])
+    if len(set(sizes.values())) > 1:
+        listing = ", ".join(f"{name} {_size_text(size)}" for name, size in sizes.items())
+        raise SequenceError(frame.source, f"pictures of one frame differ in size: {listing}")
+    try:
+        check_rigid("pose", torch.from_numpy(frame.world_from_cam))
+    except ValueError as error:
+        raise SequenceError(frame.source, str(error)) from None
+    focal = np.diag(frame.K)[:2]
+    if not (np.isfinite(frame.K).all() and (focal > 0).all()):
+        raise SequenceError(frame.source, f"no intrinsics: {frame.K.tolist()}")
+
+
+def _size_text(size: tuple[int, int]) -> str:
+    return f"{size[1]} x {size[0]}"

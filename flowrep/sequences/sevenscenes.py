@@ -1,0 +1,89 @@
+"""7-Scenes (Microsoft Research): a Kinect, whose depth is not registered to its colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flowrep.sequences.calibration import four_intrinsics, intrinsics
+from flowrep.sequences.depth_maps import depth_from_integers
+from flowrep.sequences.files import list_files, read_matrix
+from flowrep.sequences.frame import Frame, Recording, SequenceError
+from flowrep.sequences.pictures import read_png16, read_rgb
+from flowrep.sequences.poses import as_pose
+from flowrep.sequences.registration import Registration
+
+DEPTH_UNIT_M = 0.001
+_COLOUR = (".color.png", ".color.jpg")
+
+
+class SevenScenes(Recording):
+    """A folder with `frame-000000.color.png`, `.depth.png` and `.pose.txt`.
+
+    Depth is registered to the colour camera, whose intrinsics the data set does not say: those of
+    an uncalibrated Kinect by default. The poses are the depth camera's.
+
+    Args:
+        folder: of one sequence, e.g. `chess/seq-01`.
+        depth_intrinsics: fx, fy, cx, cy of the depth camera, pixel (0, 0)'s centre at (0.5, 0.5).
+        colour_intrinsics: those of the colour camera.
+        colour_from_depth_m: where a point lies in the colour camera's frame less where it lies in
+            the depth camera's: x, y, z in metres. The data set does not say it either.
+
+    Raises:
+        SequenceError: naming the file and what is wrong with it.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        *,
+        depth_intrinsics: Sequence[float] = (585.0, 585.0, 320.0, 240.0),
+        colour_intrinsics: Sequence[float] = (525.0, 525.0, 320.0, 240.0),
+        colour_from_depth_m: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self.folder = Path(folder)
+        self._K_depth = intrinsics(*four_intrinsics("depth_intrinsics", depth_intrinsics))
+        self.K = intrinsics(*four_intrinsics("colour_intrinsics", colour_intrinsics))
+        self._colour_from_depth = np.eye(4)
+        if len(colour_from_depth_m) != 3:
+            raise SequenceError(
+                "colour_from_depth_m", f"should be [x, y, z], not {list(colour_from_depth_m)}"
+            )
+        self._colour_from_depth[:3, 3] = colour_from_depth_m
+        self._colours = [
+            path
+            for path in list_files(self.folder, (".png", ".jpg"), "frame-")
+            if path.name.endswith(_COLOUR)
+        ]
+        if not self._colours:
+            raise SequenceError(self.folder, "holds no frame-*.color.png or .color.jpg")
+        self._registration: Registration | None = None
+
+    def __len__(self) -> int:
+        """Returns how many colour pictures there are."""
+        return len(self._colours)
+
+    def _read(self, index: int) -> Frame:
+        colour = self._colours[index]
+        name = colour.name.split(".")[0]
+        pose_path = self.folder / f"{name}.pose.txt"
+        world_from_depth = as_pose(read_matrix(pose_path, 4, 4), pose_path)
+        rgb = read_rgb(colour)
+        stored = read_png16(self.folder / f"{name}.depth.png")
+        register = self._registered_to((rgb.shape[0], rgb.shape[1]))
+        return Frame(
+            name=name,
+            source=colour,
+            world_from_cam=world_from_depth @ register.depth_from_colour,
+            K=self.K,
+            depth=register(depth_from_integers(stored, DEPTH_UNIT_M, missing=(0, 65535))),
+            rgb=rgb,
+        )
+
+    def _registered_to(self, size: tuple[int, int]) -> Registration:
+        if self._registration is None or self._registration.size != size:
+            self._registration = Registration(self._K_depth, self.K, self._colour_from_depth, size)
+        return self._registration

@@ -1,0 +1,101 @@
+"""MPI Sintel: rendered film with depth, camera and flow."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.sequences.files import list_files, read_bytes
+from flowrep.sequences.flow_files import FLO_TAG, read_flo, read_tagged_floats
+from flowrep.sequences.frame import Frame, Recording, SequenceError
+from flowrep.sequences.pictures import read_mask, read_rgb
+from flowrep.sequences.poses import as_pose
+
+
+class Sintel(Recording):
+    """One scene of the `training` folder, with depth and camera data unpacked into it.
+
+    Its flow leads from each frame to the next, on the frame's own grid. Read from the last frame
+    to the first (`backwards`), the next frame is the one seen before, and flow is exact; forwards
+    it would lie on the wrong grid and is not used.
+
+    Args:
+        folder: `training`, with `final/`, `depth/`, `camdata_left/` and `flow/`.
+        scene: e.g. `alley_1`.
+        render: `"final"` or `"clean"`, the pass that pictures are taken from.
+        backwards: whether time runs backwards.
+
+    Raises:
+        SequenceError: naming the file and what is wrong with it.
+    """
+
+    def __init__(
+        self, folder: str | Path, *, scene: str, render: str = "final", backwards: bool = False
+    ) -> None:
+        self.folder, self.scene = Path(folder), scene
+        if not scene or Path(scene).name != scene or scene in (".", ".."):
+            raise SequenceError(self.folder, f"scene is the name of a folder, not {scene!r}")
+        self._pictures = list_files(self.folder / render / scene, (".png",), "frame_")
+        if backwards:
+            self._pictures.reverse()
+        self.has_flow = bool(backwards) and (self.folder / "flow" / scene).is_dir()
+
+    def __len__(self) -> int:
+        """Returns how many pictures there are."""
+        return len(self._pictures)
+
+    def _read(self, index: int) -> Frame:
+        picture = self._pictures[index]
+        K, pose = read_cam(self._file("camdata_left", picture, ".cam"))
+        with_flow = self.has_flow and index > 0
+        return Frame(
+            name=picture.stem,
+            source=picture,
+            world_from_cam=pose,
+            K=K,
+            depth=read_dpt(self._file("depth", picture, ".dpt")),
+            rgb=read_rgb(picture),
+            raw=self._flow(picture) if with_flow else None,
+            raw_since=_next_name(picture) if with_flow else None,
+        )
+
+    def _file(self, kind: str, picture: Path, suffix: str) -> Path:
+        return self.folder / kind / self.scene / f"{picture.stem}{suffix}"
+
+    def _flow(self, picture: Path) -> NDArray[np.float32]:
+        """Returns p_t - p_t+1, nan where the data set calls its flow invalid."""
+        flow = -read_flo(self._file("flow", picture, ".flo"))
+        invalid = self._file("invalid", picture, ".png")
+        if invalid.is_file():
+            mask = read_mask(invalid)
+            if mask.shape != flow.shape[1:]:
+                raise SequenceError(invalid, "differs in size from its flow")
+            flow[:, mask] = np.nan
+        return flow
+
+
+def _next_name(picture: Path) -> str:
+    number = picture.stem.removeprefix("frame_")
+    if not number.isdecimal():
+        raise SequenceError(picture, "is not named frame_<number>")
+    return f"frame_{int(number) + 1:0{len(number)}d}"
+
+
+def read_dpt(path: Path) -> NDArray[np.float32]:
+    """Returns the depth `[H, W]` of a .dpt file, metres."""
+    width, height, values = read_tagged_floats(path, channels=1)
+    return values.reshape(height, width)
+
+
+def read_cam(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns K in flowrep's convention and `world_from_cam` of a .cam file."""
+    data = read_bytes(path, limit=4096)
+    if len(data) != 4 + 8 * (9 + 12) or struct.unpack_from("<f", data)[0] != FLO_TAG:
+        raise SequenceError(path, f"is no .cam file: {FLO_TAG}, 9 and 12 doubles")
+    K = np.frombuffer(data, "<f8", 9, offset=4).reshape(3, 3).copy()
+    K[:2, 2] += 0.5
+    extrinsics = np.frombuffer(data, "<f8", 12, offset=4 + 8 * 9)
+    return K, as_pose(extrinsics, path, direction="world_to_camera")

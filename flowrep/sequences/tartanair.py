@@ -1,0 +1,78 @@
+"""TartanAir (version 1): simulated flights with depth, poses and the flow of a static world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.sequences.arrays import read_npy, read_npy_mask
+from flowrep.sequences.calibration import intrinsics
+from flowrep.sequences.files import list_files
+from flowrep.sequences.frame import Frame, Recording, SequenceError
+from flowrep.sequences.pictures import read_rgb
+from flowrep.sequences.poses import as_pose, read_pose_lines
+
+
+class TartanAir(Recording):
+    """A trajectory's folder, e.g. `abandonedfactory/Easy/P000`.
+
+    Its flow leads from each frame to the next and is the camera's alone, even where things moved.
+    Read from the last frame to the first (`backwards`) it lies on the right grid and is used;
+    forwards it is not.
+
+    Args:
+        folder: holds `image_left/`, `depth_left/`, `pose_left.txt` and, for flow, `flow/`.
+        backwards: whether time runs backwards.
+
+    Raises:
+        SequenceError: naming the file and what is wrong with it.
+    """
+
+    def __init__(self, folder: str | Path, *, backwards: bool = False) -> None:
+        self.folder, self.backwards = Path(folder), bool(backwards)
+        self._pictures = list_files(self.folder / "image_left", (".png",))
+        self._poses_path = self.folder / "pose_left.txt"
+        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw", len(self._pictures))
+        self.has_flow = self.backwards and (self.folder / "flow").is_dir()
+
+    def __len__(self) -> int:
+        """Returns how many pictures there are."""
+        return len(self._pictures)
+
+    def _read(self, index: int) -> Frame:
+        place = len(self) - 1 - index if self.backwards else index
+        picture = self._pictures[place]
+        number, with_flow = self._number(place), self.has_flow and index > 0
+        depth = read_npy(self.folder / "depth_left" / f"{number}_left_depth.npy")
+        height, width = depth.shape
+        return Frame(
+            name=number,
+            source=picture,
+            world_from_cam=as_pose(
+                self._poses[place], self._poses_path, layout="xyz_xyzw", axes="ned"
+            ),
+            # 90 degrees across the width and a centred axis: 320, 320, 320, 240 at 640 x 480.
+            K=intrinsics(width / 2, width / 2, width / 2, height / 2),
+            depth=depth,
+            rgb=read_rgb(picture),
+            raw=self._flow(place) if with_flow else None,
+            raw_since=self._number(place + 1) if with_flow else None,
+        )
+
+    def _number(self, place: int) -> str:
+        return self._pictures[place].stem.removesuffix("_left")
+
+    def _flow(self, place: int) -> NDArray[np.float32]:
+        """Returns p_t - p_t+1, nan where the next frame does not see the point."""
+        pair = f"{self._number(place)}_{self._number(place + 1)}"
+        path = self.folder / "flow" / f"{pair}_flow.npy"
+        flow = -read_npy(path, channels=2).transpose(2, 0, 1)
+        mask_path = path.with_name(path.name.replace("_flow", "_mask"))
+        if mask_path.is_file():
+            mask = read_npy_mask(mask_path)
+            if mask.shape != flow.shape[1:]:
+                raise SequenceError(mask_path, "differs in size from its flow")
+            flow[:, mask != 0] = np.nan
+        return flow

@@ -1,0 +1,84 @@
+"""A webcam or a video file of a camera that stands still: no pose sensor, no depth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from flowrep.sequences.frame import Frame, SequenceError, check_frame
+from flowrep.sequences.pictures import check_pixels
+
+
+class StillVideo:
+    """Frames of a camera that does not move: all flow in them is object flow.
+
+    A camera that moves needs its poses and depth to tell its own flow apart, which neither a
+    webcam nor a video file gives. Standing still has to be said, so that nobody is misled.
+
+    Args:
+        source: a camera's number (`0`), or a video file that OpenCV reads.
+        still: whether the camera stands still.
+
+    Raises:
+        SequenceError: it is not said to stand still, or can't be opened.
+    """
+
+    has_flow = False
+    notes: tuple[str, ...] = ()
+
+    def __init__(self, source: str | Path | int, *, still: bool = False) -> None:
+        self.source = Path(str(source))
+        if not still:
+            raise SequenceError(
+                source,
+                "a video gives neither poses nor depth, without which flow can't be factorised; "
+                "if the camera stands still say format.still=true, else record with a format that "
+                "brings both: tum, sevenscenes, zed, zed_live, frames",
+            )
+        self._is_camera = str(source).isdecimal()
+        if not self._is_camera and not self.source.is_file():
+            raise SequenceError(source, "no such file; give a video file or a camera's number")
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yields frames until the file ends, or for ever from a camera."""
+        capture: Any = cv2.VideoCapture(
+            int(str(self.source)) if self._is_camera else str(self.source)
+        )
+        try:
+            if not capture.isOpened():
+                raise SequenceError(self.source, "OpenCV can't open it as a video")
+            width, height = (
+                int(capture.get(key))
+                for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+            )
+            check_pixels(self.source, width, height)
+            number = 0
+            while True:
+                found, picture = capture.read()
+                if not found:
+                    break
+                yield self._frame(number, picture)
+                number += 1
+            if number == 0:
+                raise SequenceError(self.source, "gives no picture")
+        finally:
+            capture.release()
+
+    def _frame(self, number: int, picture: Any) -> Frame:
+        height, width = picture.shape[:2]
+        # Neither matters to a camera that stands still: any depth, any K, no ego flow.
+        K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float64)
+        frame = Frame(
+            name=f"{number:06d}",
+            source=self.source,
+            world_from_cam=np.eye(4),
+            K=K,
+            depth=np.full((height, width), np.inf, dtype=np.float32),
+            rgb=cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False),
+        )
+        check_frame(frame)
+        return frame

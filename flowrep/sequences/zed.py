@@ -1,0 +1,80 @@
+"""A folder exported from a ZED's SVO recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.geometry import CameraAxes
+from flowrep.geometry.checks import check_name
+from flowrep.sequences.calibration import read_cameras
+from flowrep.sequences.depth_maps import DEPTH_FILES, read_depth
+from flowrep.sequences.files import list_files
+from flowrep.sequences.frame import Frame, Recording, SequenceError
+from flowrep.sequences.pictures import PICTURES, read_rgb
+from flowrep.sequences.poses import as_pose, read_pose_lines
+
+DEPTH_UNIT_M = 0.001
+
+
+class Zed(Recording):
+    """A folder with `left000000.png`, `depth000000.png` (or `.npy`), and two files beside them.
+
+    `poses.txt` has a line for each picture, `tx ty tz qx qy qz qw`, the left camera in the world;
+    `intrinsics.json` is that of the rectified left camera, as in `frames`.
+
+    Args:
+        folder: of the export.
+        pose_axes: the coordinate system that poses were exported in: `"opencv"` for the SDK's
+            IMAGE, `"opengl"` for RIGHT_HANDED_Y_UP, `"x_forward_z_up"` for RIGHT_HANDED_Z_UP_X_FWD.
+
+    Raises:
+        SequenceError: naming the file and what is wrong with it.
+        ValueError: for unknown axes.
+    """
+
+    def __init__(self, folder: str | Path, *, pose_axes: CameraAxes = "opencv") -> None:
+        check_name("pose_axes", pose_axes, CameraAxes)
+        self.folder, self.pose_axes = Path(folder), pose_axes
+        self._pictures = list_files(self.folder, PICTURES, "left")
+        depths = list_files(self.folder, DEPTH_FILES, "depth")
+        self._depths = {path.stem.removeprefix("depth"): path for path in depths}
+        self._poses_path = self.folder / "poses.txt"
+        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw", len(self._pictures))
+        camera, other, _ = read_cameras(self.folder / "intrinsics.json")
+        if other is not None:
+            raise SequenceError(
+                self.folder / "intrinsics.json",
+                "names a colour camera; a ZED's depth belongs to the left picture already",
+            )
+        self.K = camera.K
+
+    def __len__(self) -> int:
+        """Returns how many left pictures there are."""
+        return len(self._pictures)
+
+    def _read(self, index: int) -> Frame:
+        picture = self._pictures[index]
+        number = picture.stem.removeprefix("left")
+        if number not in self._depths:
+            raise SequenceError(self.folder, f"lacks depth{number} for {picture.name}")
+        return Frame(
+            name=number,
+            source=picture,
+            world_from_cam=as_pose(
+                self._poses[index], self._poses_path, layout="xyz_xyzw", axes=self.pose_axes
+            ),
+            K=self.K,
+            depth=measured(read_depth(self._depths[number], DEPTH_UNIT_M)),
+            rgb=read_rgb(picture),
+        )
+
+
+def measured(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Returns depth with nan where the SDK has none: nan, -inf (too near) and inf (too far).
+
+    Too far is not the sky: the surface is somewhere beyond the range, and nobody knows where.
+    """
+    return np.where(np.isfinite(depth), depth, np.float32(np.nan))

@@ -1,0 +1,106 @@
+"""A ZED camera, or an SVO file, through Stereolabs' SDK."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from flowrep.sequences.calibration import opencv_intrinsics
+from flowrep.sequences.frame import Frame, SequenceError, check_frame
+from flowrep.sequences.zed import measured
+
+
+class ZedLive:
+    """Frames of a ZED as they come, with depth and poses from the SDK (`pyzed`).
+
+    Where tracking is lost frames are left out, and the next one starts a clip of its own.
+
+    Args:
+        source: `"live"` for a connected camera, or an .svo or .svo2 file.
+
+    Raises:
+        SequenceError: the SDK is not installed, or the camera or file can't be opened.
+    """
+
+    has_flow = False
+    notes: tuple[str, ...] = ()
+
+    def __init__(self, source: str | Path) -> None:
+        self.source = Path(source)
+        self._sl = _sdk()
+        if str(source) != "live" and not self.source.is_file():
+            raise SequenceError(source, "no such file; give an .svo file, or live for the camera")
+        self._is_live = str(source) == "live"
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yields frames until the file ends, or for ever from a camera."""
+        sl = self._sl
+        camera = sl.Camera()
+        options = sl.InitParameters()
+        options.coordinate_system = sl.COORDINATE_SYSTEM.IMAGE
+        options.coordinate_units = sl.UNIT.METER
+        if not self._is_live:
+            options.set_from_svo_file(str(self.source))
+            options.svo_real_time_mode = False
+        self._check(camera.open(options), "can't be opened")
+        try:
+            self._check(
+                camera.enable_positional_tracking(sl.PositionalTrackingParameters()),
+                "has no positional tracking",
+            )
+            yield from self._grab(camera)
+        finally:
+            camera.close()
+
+    def _grab(self, camera: Any) -> Iterator[Frame]:
+        sl = self._sl
+        runtime, picture, depth, pose = sl.RuntimeParameters(), sl.Mat(), sl.Mat(), sl.Pose()
+        left = camera.get_camera_information().camera_configuration.calibration_parameters.left_cam
+        K = opencv_intrinsics([left.fx, left.fy, left.cx, left.cy])
+        number, lost = 0, True
+        while True:
+            error = camera.grab(runtime)
+            if error == sl.ERROR_CODE.END_OF_SVOFILE_REACHED:
+                return
+            self._check(error, "stopped giving pictures")
+            state = camera.get_position(pose, sl.REFERENCE_FRAME.WORLD)
+            if state != sl.POSITIONAL_TRACKING_STATE.OK:
+                lost = True
+                continue
+            camera.retrieve_image(picture, sl.VIEW.LEFT)
+            camera.retrieve_measure(depth, sl.MEASURE.DEPTH)
+            frame = Frame(
+                name=f"{number:06d}",
+                source=self.source,
+                world_from_cam=np.array(pose.pose_data(sl.Transform()).m, dtype=np.float64),
+                K=K,
+                depth=measured(np.asarray(depth.get_data(), dtype=np.float32)),
+                rgb=cv2.cvtColor(picture.get_data(), cv2.COLOR_BGRA2RGB).astype(
+                    np.uint8, copy=False
+                ),
+                timestamp_s=camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds() / 1e9,
+                starts_clip=lost,
+            )
+            check_frame(frame)
+            yield frame
+            number, lost = number + 1, False
+
+    def _check(self, error: Any, what: str) -> None:
+        if error != self._sl.ERROR_CODE.SUCCESS:
+            raise SequenceError(self.source, f"{what}: the ZED SDK says {error}")
+
+
+def _sdk() -> Any:
+    try:
+        from pyzed import sl
+    except ImportError:
+        raise SequenceError(
+            "format=zed_live",
+            "needs Stereolabs' ZED SDK and its Python package pyzed, which comes with it; "
+            "a folder exported from a recording is read without them: format=zed",
+        ) from None
+    return sl

@@ -1,0 +1,283 @@
+"""Recordings whose flow is known exactly, written in each format as its data set writes it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from flowrep.geometry import ego_flow, relative_motion, rigid_flow
+from tests.geometry.scenes import rigid
+
+HEIGHT, WIDTH, FRAMES = 24, 40, 3
+K = np.array([[31.0, 0.0, 18.5], [0.0, 27.0, 13.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A frame, and its flow since the frame before (since the one after, if time runs back)."""
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    world_from_cam: np.ndarray
+    raw: np.ndarray
+    obj: np.ndarray
+
+
+def pose(index: int) -> np.ndarray:
+    """A camera that flies on a curve and turns about all its axes, far from the world's origin."""
+    place = (3.0 + 0.3 * index, -2.0 + 0.1 * index**2, 5.0 - 0.2 * index)
+    return rigid((0.4 + 0.01 * index, -0.7 + 0.02 * index, 1.1 - 0.015 * index), place).numpy()
+
+
+def make_moments(*, unit_m: float, K=K, backwards=False, body=True, poses=pose) -> list[Moment]:
+    """Returns frames whose depth is a whole number of units, as a 16-bit file keeps it."""
+    random = np.random.default_rng(3)
+    moments = []
+    for index in range(FRAMES):
+        depth = 2.0 + 6.0 * random.random((HEIGHT, WIDTH))
+        depth = (np.rint(depth / unit_m) * unit_m).astype(np.float32)
+        rgb = random.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        other = index + 1 if backwards else index - 1
+        motion = relative_motion(*map(torch.from_numpy, (poses(other), poses(index))))
+        raw, obj = flow_of(depth, K, motion, body)
+        moments.append(Moment(rgb, depth, poses(index), raw, obj))
+    return moments
+
+
+def flow_of(depth, K, prev_from_curr, body):
+    """Returns raw and object flow; a rectangle moves by itself."""
+    instance = torch.zeros(1, *depth.shape, dtype=torch.uint8)
+    instance[0, 5:14, 8:20] = int(body)
+    own = torch.eye(4)
+    own[:3, 3] = torch.tensor([0.11, -0.06, 0.2])
+    motions = torch.stack([prev_from_curr, prev_from_curr @ own])
+    camera = torch.from_numpy(K).float()
+    raw = rigid_flow(torch.from_numpy(depth)[None], instance, camera, motions).flow
+    ego = ego_flow(torch.from_numpy(depth)[None], camera, prev_from_curr).flow
+    return raw.numpy(), (raw - ego).numpy()
+
+
+def png(path: Path, picture: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    turned = picture[..., ::-1] if picture.ndim == 3 else picture
+    assert cv2.imwrite(str(path), turned)
+
+
+def stored(depth: np.ndarray, unit_m: float) -> np.ndarray:
+    return np.rint(depth / unit_m).astype(np.uint16)
+
+
+def text(path: Path, lines) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(f"{line}\n" for line in lines))
+
+
+def numbers(values) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def quaternion_line(world_from_cam: np.ndarray) -> str:
+    """Returns tx ty tz qx qy qz qw."""
+    axis_angle = cv2.Rodrigues(world_from_cam[:3, :3])[0].ravel()
+    angle = np.linalg.norm(axis_angle)
+    xyz = np.sin(angle / 2) * axis_angle / angle if angle else np.zeros(3)
+    return numbers([*world_from_cam[:3, 3], *xyz, np.cos(angle / 2)])
+
+
+def write_flo(path: Path, flow: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pairs = np.ascontiguousarray(flow.transpose(1, 2, 0), dtype="<f4")
+    size = struct.pack("<fii", 202021.25, flow.shape[2], flow.shape[1])
+    path.write_bytes(size + pairs.tobytes())
+
+
+def camera_json(K=K, height=HEIGHT, width=WIDTH) -> dict:
+    return {
+        "width": width, "height": height, "fx": K[0, 0], "fy": K[1, 1],
+        "cx": K[0, 2], "cy": K[1, 2], "first_pixel_centre": 0.5,
+    }  # fmt: skip
+
+
+def write_frames(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.001)
+    for i, moment in enumerate(moments):
+        png(folder / f"rgb/{i:04d}.png", moment.rgb)
+        png(folder / f"depth/{i:04d}.png", stored(moment.depth, 0.001))
+        if i > 0:
+            write_flo(folder / f"flow/{i:04d}.flo", moment.raw)
+    text(folder / "poses.txt", [numbers(m.world_from_cam) for m in moments])
+    text(folder / "timestamps.txt", [f"{0.1 * i}" for i in range(FRAMES)])
+    text(folder / "intrinsics.json", [json.dumps(camera_json())])
+    return moments
+
+
+def write_tum(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=1 / 5000)
+    index: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for i, moment in enumerate(moments):
+        rgb_s, depth_s, pose_s = 100 + 0.1 * i, 100 + 0.1 * i + 0.012, 100 + 0.1 * i - 0.004
+        png(folder / f"rgb/{rgb_s:.6f}.png", moment.rgb)
+        png(folder / f"depth/{depth_s:.6f}.png", stored(moment.depth, 1 / 5000))
+        index["rgb"].append(f"{rgb_s:.6f} rgb/{rgb_s:.6f}.png")
+        index["depth"].append(f"{depth_s:.6f} depth/{depth_s:.6f}.png")
+        index["groundtruth"].append(f"{pose_s:.6f} {quaternion_line(moment.world_from_cam)}")
+    for name, lines in index.items():
+        text(folder / f"{name}.txt", ["# a comment", *lines])
+    return moments
+
+
+TUM_INTRINSICS = (31.0, 27.0, 18.0, 12.5)  # K, with pixel (0, 0)'s centre at (0, 0)
+
+
+def write_sevenscenes(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.001)
+    for i, moment in enumerate(moments):
+        png(folder / f"frame-{i:06d}.color.png", moment.rgb)
+        png(folder / f"frame-{i:06d}.depth.png", stored(moment.depth, 0.001))
+        text(folder / f"frame-{i:06d}.pose.txt", map(numbers, moment.world_from_cam))
+    return moments
+
+
+def write_vkitti2(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.01)
+    extrinsics = ["frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"]
+    intrinsics = ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
+    for i, moment in enumerate(moments):
+        frames = folder / "frames"
+        png(frames / f"rgb/Camera_0/rgb_{i:05d}.png", moment.rgb)
+        png(frames / f"depth/Camera_0/depth_{i:05d}.png", stored(moment.depth, 0.01))
+        if i > 0:
+            flow = vkitti_flow(-moment.raw)
+            png(frames / f"backwardFlow/Camera_0/backwardFlow_{i:05d}.png", flow)
+        cam_from_world = np.linalg.inv(moment.world_from_cam)
+        for camera, shift in ((0, 0.0), (1, -0.5)):
+            other = cam_from_world.copy()
+            other[0, 3] += shift
+            extrinsics.append(f"{i} {camera} {numbers(other)}")
+            intrinsics.append(f"{i} {camera} {numbers(TUM_INTRINSICS)}")
+    text(folder / "extrinsic.txt", extrinsics)
+    text(folder / "intrinsic.txt", intrinsics)
+    return moments
+
+
+def vkitti_flow(flow: np.ndarray) -> np.ndarray:
+    """Returns red, green, blue: 2 I / 65535 - 1 times width - 1 and height - 1."""
+    size = np.array([WIDTH - 1, HEIGHT - 1])[:, None, None]
+    red, green = np.rint((flow / size + 1) / 2 * 65535)
+    return np.stack([red, green, np.full_like(red, 65535)], -1).astype(np.uint16)
+
+
+def write_sintel(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=1e-6, backwards=True)
+    for i, moment in enumerate(moments):
+        stem = f"cave/frame_{i + 1:04d}"
+        png(folder / f"final/{stem}.png", moment.rgb)
+        for kind in ("depth", "camdata_left"):
+            (folder / kind / "cave").mkdir(parents=True, exist_ok=True)
+        head = struct.pack("<fii", 202021.25, WIDTH, HEIGHT)
+        (folder / f"depth/{stem}.dpt").write_bytes(head + moment.depth.astype("<f4").tobytes())
+        opencv = K.copy()
+        opencv[:2, 2] -= 0.5
+        cam_from_world = np.linalg.inv(moment.world_from_cam)[:3]
+        cam = struct.pack("<f", 202021.25) + opencv.tobytes() + cam_from_world.tobytes()
+        (folder / f"camdata_left/{stem}.cam").write_bytes(cam)
+        if i + 1 < FRAMES:
+            write_flo(folder / f"flow/{stem}.flo", -moment.raw)
+    return moments
+
+
+TARTANAIR_K = np.array([[20.0, 0.0, 20.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]])
+# The columns are OpenCV's right, down and forward in north-east-down axes of the camera.
+NED_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+def write_tartanair(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=1e-6, K=TARTANAIR_K, backwards=True, body=False)
+    for kind in ("depth_left", "flow"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    for i, moment in enumerate(moments):
+        png(folder / f"image_left/{i:06d}_left.png", moment.rgb)
+        np.save(folder / f"depth_left/{i:06d}_left_depth.npy", moment.depth)
+        if i + 1 < FRAMES:
+            pair = f"{i:06d}_{i + 1:06d}"
+            np.save(folder / f"flow/{pair}_flow.npy", -moment.raw.transpose(1, 2, 0))
+            np.save(folder / f"flow/{pair}_mask.npy", np.zeros((HEIGHT, WIDTH), np.uint8))
+    poses = [moment.world_from_cam @ NED_FROM_OPENCV.T for moment in moments]
+    text(folder / "pose_left.txt", map(quaternion_line, poses))
+    return moments
+
+
+def write_zed(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.001)
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, moment in enumerate(moments):
+        png(folder / f"left{i:06d}.png", moment.rgb)
+        if i % 2:
+            np.save(folder / f"depth{i:06d}.npy", moment.depth)
+        else:
+            png(folder / f"depth{i:06d}.png", stored(moment.depth, 0.001))
+    text(folder / "poses.txt", [quaternion_line(m.world_from_cam) for m in moments])
+    text(folder / "intrinsics.json", [json.dumps(camera_json())])
+    return moments
+
+
+KITTI_BASELINE_M = 0.5
+KITTI_CAM_FROM_VELO = rigid((1.5, -1.6, 0.1), (0.01, -0.07, -0.3)).numpy()
+KITTI_VELO_FROM_IMU = rigid((0.01, 0.0, 0.02), (-0.8, 0.3, -0.8)).numpy()
+EARTH_M = 6378137.0
+
+
+def kitti_pose(moment: int) -> tuple[np.ndarray, list[float]]:
+    """Returns world_from_imu and the packet that says so, around 49 degrees north."""
+    latitude, longitude, altitude = 49.0 + 4e-6 * moment, 8.4 + 9e-6 * moment, 115 + 0.02 * moment
+    roll, pitch, yaw = 0.02, -0.01 + 0.003 * moment, 0.9 + 0.01 * moment
+    scale = np.cos(np.radians(49.0)) * EARTH_M
+    north = scale * np.log(np.tan(np.radians((90 + latitude) / 2)))
+    pose = rigid((roll, pitch, yaw), (scale * np.radians(longitude), north, altitude)).numpy()
+    return pose, [latitude, longitude, altitude, roll, pitch, yaw, *[0.0] * 24]
+
+
+def write_kitti(folder: Path) -> list[Moment]:
+    """One pair; its two moments in the order they are read in, the later picture first."""
+    training, raw = folder / "training", folder / "raw"
+    imu_from_cam = np.linalg.inv(KITTI_CAM_FROM_VELO @ KITTI_VELO_FROM_IMU)
+    imu_from_cam[:3, 3] += imu_from_cam[:3, :3] @ [-0.06, 0.0, 0.0]  # the colour camera's offset
+    poses = [kitti_pose(i)[0] @ imu_from_cam for i in range(2)]
+    random = np.random.default_rng(4)
+    rgb = random.integers(0, 256, (2, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    disparity = random.integers(300, 900, (HEIGHT, WIDTH)).astype(np.uint16)
+    disparity[0, :3] = 0
+    measured = np.where(disparity == 0, np.nan, disparity / 256)
+    depth = (31.0 * KITTI_BASELINE_M / measured).astype(np.float32)
+    motion = relative_motion(torch.from_numpy(poses[1]), torch.from_numpy(poses[0]))
+    camera = np.array([[31.0, 0.0, 18.5], [0.0, 31.0, 13.0], [0.0, 0.0, 1.0]])
+    raw_flow, obj = flow_of(depth, camera, motion, body=True)
+    for i, name in enumerate(("10", "11")):
+        png(training / f"image_2/000000_{name}.png", rgb[i])
+    png(training / "disp_occ_0/000000_10.png", disparity)
+    u, v = np.rint(-raw_flow * 64) + 2**15
+    png(training / "flow_occ/000000_10.png", np.stack([u, v, u * 0 + 1], -1).astype(np.uint16))
+    projection = np.hstack([camera - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros((3, 1))])
+    left, right = projection.copy(), projection.copy()
+    left[0, 3], right[0, 3] = 31.0 * 0.06, 31.0 * (0.06 - KITTI_BASELINE_M)
+    lines = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {numbers(np.eye(3))}"]
+    lines += [f"P_rect_02: {numbers(left)}", f"P_rect_03: {numbers(right)}"]
+    text(training / "calib_cam_to_cam/000000.txt", lines)
+    for kind, transform in (
+        ("velo_to_cam", KITTI_CAM_FROM_VELO), ("imu_to_velo", KITTI_VELO_FROM_IMU)
+    ):  # fmt: skip
+        rows = [f"R: {numbers(transform[:3, :3])}", f"T: {numbers(transform[:3, 3])}"]
+        text(training / f"calib_{kind}/000000.txt", rows)
+    drive = "2011_09_26/2011_09_26_drive_0005_sync"
+    text(folder / "train_mapping.txt", [drive.replace("/", " ") + " 0000000059"])
+    for i in range(2):
+        text(raw / f"{drive}/oxts/data/{59 + i:010d}.txt", [numbers(kitti_pose(i)[1])])
+    nothing = np.zeros_like(obj)
+    later = Moment(rgb[1], np.full_like(depth, np.nan), poses[1], nothing, nothing)
+    return [later, Moment(rgb[0], depth, poses[0], raw_flow, obj)]

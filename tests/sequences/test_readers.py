@@ -1,0 +1,192 @@
+"""Every format gives back what was written in it, and object flow equals the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2", reason="recordings need OpenCV")
+
+from flowrep.sequences import (
+    Frames,
+    Kitti,
+    SevenScenes,
+    Sintel,
+    TartanAir,
+    Tum,
+    VKitti2,
+    Zed,
+    factorize_frames,
+    recorded_flow,
+)
+from tests.sequences import synthetic
+from tests.sequences.synthetic import HEIGHT, TUM_INTRINSICS, WIDTH
+
+
+def open_kitti(folder):
+    return Kitti(folder / "training", raw_data=folder / "raw", mapping=folder / "train_mapping.txt")
+
+
+def open_sevenscenes(folder):
+    one_camera = {"depth_intrinsics": (31, 27, 18.5, 13), "colour_intrinsics": (31, 27, 18.5, 13)}
+    return SevenScenes(folder, **one_camera)
+
+
+# Format: how it is written, how it is opened, whether it has flow of its own, whether time runs
+# backwards in it, and how far flow may be from the truth: half a step of the format's own.
+FORMATS = {
+    "frames": (synthetic.write_frames, Frames, True, False, 0),
+    "tum": (synthetic.write_tum, lambda f: Tum(f, intrinsics=TUM_INTRINSICS), False, False, 0),
+    "sevenscenes": (synthetic.write_sevenscenes, open_sevenscenes, False, False, 0),
+    "vkitti2": (synthetic.write_vkitti2, VKitti2, True, False, (WIDTH - 1) / 65535),
+    "sintel": (
+        synthetic.write_sintel,
+        lambda f: Sintel(f, scene="cave", backwards=True),
+        True,
+        True,
+        0,
+    ),
+    "tartanair": (
+        synthetic.write_tartanair, lambda f: TartanAir(f, backwards=True), True, True, 0
+    ),
+    "kitti": (synthetic.write_kitti, open_kitti, True, False, 0.5 / 64),
+    "zed": (synthetic.write_zed, Zed, False, False, 0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_what_was_written_is_read(name, tmp_path):
+    write, open_it, has_flow, backwards, _ = FORMATS[name]
+    moments = write(tmp_path)
+    recording = open_it(tmp_path)
+    assert recording.has_flow == has_flow
+    assert len(recording) == len(moments)
+    for frame, moment in zip(recording, reversed(moments) if backwards else moments):
+        assert frame.size == (HEIGHT, WIDTH)
+        assert frame.depth.dtype == np.float32
+        np.testing.assert_array_equal(frame.rgb, moment.rgb)
+        np.testing.assert_allclose(frame.depth, moment.depth, rtol=1e-6)
+        assert frame.world_from_cam.dtype == np.float64
+        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-7)
+    assert len({frame.name for frame in recording}) == len(recording)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_object_flow_equals_the_truth(name, tmp_path):
+    write, open_it, has_flow, backwards, step_px = FORMATS[name]
+    moments = write(tmp_path)
+    recording = open_it(tmp_path)
+    ordered = moments[::-1] if backwards else moments
+    truth = iter(ordered[1:])
+    source = recorded_flow if has_flow else lambda previous, current: next(truth).raw
+    first, *others = factorize_frames(recording, source)
+    assert first is None
+    assert len(others) == len(moments) - 1
+    for made, moment in zip(others, ordered[1:]):
+        known = np.isfinite(moment.depth)
+        np.testing.assert_array_equal(made.valid, known)
+        error = np.abs(made.obj - moment.obj)[:, known]
+        assert error.max() <= step_px + 2e-4
+        if name != "tartanair":  # whose flow is the camera's alone
+            assert np.abs(moment.obj).max() > 0.5
+
+
+def test_intrinsics_are_brought_to_pixel_centres_at_halves(tmp_path):
+    # OpenCV's cx = 18 is the centre of column 18, which lies at 18.5.
+    synthetic.write_vkitti2(tmp_path / "v")
+    synthetic.write_sintel(tmp_path / "s")
+    synthetic.write_tum(tmp_path / "t")
+    expected = [[31.0, 0.0, 18.5], [0.0, 27.0, 13.0], [0.0, 0.0, 1.0]]
+    assert VKitti2(tmp_path / "v")[0].K.tolist() == expected
+    assert Sintel(tmp_path / "s", scene="cave")[0].K.tolist() == expected
+    assert Tum(tmp_path / "t", intrinsics=TUM_INTRINSICS)[0].K.tolist() == expected
+
+
+def test_tartanair_has_a_right_angle_across_its_width(tmp_path):
+    synthetic.write_tartanair(tmp_path)
+    assert TartanAir(tmp_path)[0].K.tolist() == [[20, 0, 20], [0, 20, 12], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("write", "open_it"),
+    [
+        (synthetic.write_sintel, lambda f: Sintel(f, scene="cave")),
+        (synthetic.write_tartanair, TartanAir),
+    ],
+    ids=["sintel", "tartanair"],
+)
+def test_forwards_flow_to_the_next_frame_is_not_used(write, open_it, tmp_path):
+    write(tmp_path)
+    recording = open_it(tmp_path)
+    assert not recording.has_flow
+    assert all(frame.raw is None for frame in recording)
+
+
+def test_virtual_kittis_second_camera_and_sky(tmp_path):
+    synthetic.write_vkitti2(tmp_path)
+    for kind in ("rgb", "depth"):
+        (tmp_path / f"frames/{kind}/Camera_0").rename(tmp_path / f"frames/{kind}/Camera_1")
+    path = tmp_path / "frames/depth/Camera_1/depth_00001.png"
+    depth = np.full((HEIGHT, WIDTH), 1234, np.uint16)
+    depth[2, 3] = 65535
+    synthetic.png(path, depth)
+    recording = VKitti2(tmp_path, camera=1)
+    frame = recording[1]
+    assert not recording.has_flow
+    assert frame.depth[2, 3] == np.inf
+    assert frame.depth[2, 4] == pytest.approx(12.34)
+    # The right camera is half a metre to the right: x of the world in it is 0.5 less.
+    right = synthetic.pose(1)[:3, 3] + 0.5 * synthetic.pose(1)[:3, 0]
+    np.testing.assert_allclose(frame.world_from_cam[:3, 3], right, atol=1e-9)
+
+
+def test_what_tartanair_masks_is_unknown(tmp_path):
+    synthetic.write_tartanair(tmp_path)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[4, 5] = 100  # out of the picture
+    np.save(tmp_path / "flow/000000_000001_mask.npy", mask)
+    raw = TartanAir(tmp_path, backwards=True)[2].raw
+    assert np.isnan(raw[:, 4, 5]).all()
+    assert np.isnan(raw).sum() == 2
+
+
+def test_what_sintel_calls_invalid_is_unknown(tmp_path):
+    synthetic.write_sintel(tmp_path)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[4, 5] = 255
+    synthetic.png(tmp_path / "invalid/cave/frame_0001.png", mask)
+    raw = Sintel(tmp_path, scene="cave", backwards=True)[2].raw
+    assert np.isnan(raw[:, 4, 5]).all()
+    assert np.isnan(raw).sum() == 2
+
+
+def test_a_kitti_pair_without_a_raw_recording_is_left_out(tmp_path):
+    synthetic.write_kitti(tmp_path)
+    picture = tmp_path / "training/image_2/000000_10.png"
+    (tmp_path / "training/image_2/000001_10.png").write_bytes(picture.read_bytes())
+    recording = open_kitti(tmp_path)
+    assert [frame.name for frame in recording] == ["000000_11", "000000_10"]
+    assert recording.notes == ("1 of 2 pairs have no raw recording, so no poses",)
+
+
+def test_zed_depth_beyond_its_range_is_missing(tmp_path):
+    synthetic.write_zed(tmp_path)
+    depth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
+    depth[0, :3] = np.nan, np.inf, -np.inf
+    np.save(tmp_path / "depth000001.npy", depth)
+    assert np.isnan(Zed(tmp_path)[1].depth[0, :4]).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("axes", "given_from_opencv"),
+    [
+        ("opengl", np.diag([1.0, -1, -1, 1])),
+        ("x_forward_z_up", np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])),
+    ],
+)
+def test_zed_poses_in_other_coordinate_systems(axes, given_from_opencv, tmp_path):
+    moments = synthetic.write_zed(tmp_path)
+    poses = [moment.world_from_cam @ given_from_opencv.T for moment in moments]
+    synthetic.text(tmp_path / "poses.txt", map(synthetic.quaternion_line, poses))
+    for frame, moment in zip(Zed(tmp_path, pose_axes=axes), moments):
+        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-7)
