@@ -15,18 +15,20 @@ except ImportError:
     sys.exit("error: factorising needs packages of an extra: pip install 'flowrep[factorize]'")
 
 from hydra.utils import get_class
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from flowrep.command_line import UsageError, exit_with, run_command
+from flowrep.command_line import exit_with, own_keys, plain_config, run_command
+from flowrep.config import UsageError, validated
+from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config_tree import CONF_DIR, group_choices
 from flowrep.sequences import EstimatedFlowSource, Recording, SequenceError, Stream, recorded_flow
 from flowrep.sequences.factorization import FlowSource
 from flowrep.sequences.job import Job, JobOptions, as_settings
-from flowrep.sequences.output import FLOW_FORMATS, FLOW_NAMES, OutputOptions
+from flowrep.sequences.output import OutputOptions
 from flowrep.sequences.output_folder import OutputFolder
 from flowrep.transforms import EstimatedFlow
 
-MISTAKES = (UsageError, SequenceError, ValueError, ImportError, OSError)
+MISTAKES = (SequenceError, ValueError, ImportError, OSError)
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="factorize")
@@ -35,8 +37,11 @@ def run(config: DictConfig) -> None:
     # OpenCV's own words about broken files would stand beside the one line that matters.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        settings: Any = OmegaConf.to_container(config, resolve=True)
+        settings = plain_config(config)
+        validated(FactorizeConfig, settings, own_keys())
         code = factorize_recording(settings)
+    except UsageError as error:
+        exit_with(str(error))
     except MISTAKES as error:
         exit_with(" ".join(str(error).split()))
     sys.exit(code)
@@ -77,22 +82,7 @@ def factorize_recording(settings: dict[str, Any]) -> int:
 
 
 def job_options(settings: dict[str, Any]) -> JobOptions:
-    """Returns the options of a job; refuses what can't be, by name."""
-    least = {"start": 0, "stride": 1, "pictures_every": 0}
-    for key, smallest in least.items():
-        _check_whole(settings, key, smallest)
-    if settings["stop"] is not None:
-        _check_whole(settings, "stop", settings["start"] + 2)
-    for key in ("resume", "check_consistency", "video", "rerun"):
-        if not isinstance(settings[key], bool):
-            raise UsageError(f"{key} should be true or false, not {settings[key]!r}")
-    for key in ("moving_px", "video_fps", "depth_range_m"):
-        _check_positive(key, settings[key])
-    for name in FLOW_NAMES:
-        _check_positive(f"scale_px.{name}", settings["scale_px"][name])
-    files = settings["flow_files"]
-    if not isinstance(files, list) or not set(files) <= set(FLOW_FORMATS):
-        raise UsageError(f"flow_files are of {list(FLOW_FORMATS)}, not {files!r}")
+    """Returns the options of a job."""
     return JobOptions(
         start=settings["start"],
         stop=settings["stop"],
@@ -101,7 +91,7 @@ def job_options(settings: dict[str, Any]) -> JobOptions:
         video_fps=settings["video_fps"] if settings["video"] else None,
         rerun=settings["rerun"],
         output=OutputOptions(
-            flow_files=files,
+            flow_files=settings["flow_files"],
             pictures_every=settings["pictures_every"],
             scale_px=settings["scale_px"],
             depth_range_m=settings["depth_range_m"],
@@ -133,17 +123,6 @@ def open_flow_source(settings: dict[str, Any], stream: Stream) -> FlowSource:
     return EstimatedFlowSource(estimator, check_consistency=settings["check_consistency"])
 
 
-def _check_whole(settings: dict[str, Any], key: str, least: int) -> None:
-    value = settings[key]
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise UsageError(f"{key} should be a whole number from {least}, not {value!r}")
-
-
-def _check_positive(key: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e9:
-        raise UsageError(f"{key} should be a positive number, not {value!r}")
-
-
 def main() -> None:
     """Entry point; mistakes on the command line end in one line that lists what exists."""
     typed = sys.argv[1:]
@@ -151,7 +130,7 @@ def main() -> None:
         exit_with(
             f"'format' needs a value: format=...; there are: {', '.join(group_choices('format'))}"
         )
-    run_command("factorize", run)
+    run_command("factorize", run, FactorizeConfig)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,16 @@ FLOWREP_IMPORTS_ALLOWED = {
     "viz": {"palette"},
     "plan_view": {"envs", "palette"},
     "cockpit": {"envs", "experiment", "viz"},
-    "config": {"config", "agent", "envs", "experiment", "simulator", "transforms"},
+    "config": {
+        "config",
+        "agent",
+        "envs",
+        "experiment",
+        "geometry",
+        "sequences",
+        "simulator",
+        "transforms",
+    },  # fmt: skip,
     "sequences": {"sequences", "experiment", "transforms", "geometry", "viz"},
     "experiment": {"experiment", "envs", "agent", "palette", "transforms", "geometry", "viz"},
 }

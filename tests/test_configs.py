@@ -20,7 +20,7 @@ def composed(*overrides, name="train"):
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=name == "train")
 
 
-# Those of a training; `format` is the recordings', see tests/test_factorize.py.
+# Those of a training: `format` is of recordings, see tests/test_factorize.py.
 GROUPS = [group for group in config_groups() if group != "format"]
 GROUP_FILES = [(group, name) for group in GROUPS for name in group_choices(group)]
 

@@ -19,7 +19,9 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 import cv2
 import imageio.v3 as imageio
 
-from flowrep.command_line import UsageError, check_overrides
+from flowrep.command_line import check_overrides
+from flowrep.config import UsageError, validated
+from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config_tree import CONF_DIR, group_choices
 from flowrep.factorize import factorize_recording, main
 from flowrep.sequences import RECORDINGS, STREAMS, SequenceError, read_flo, read_kitti_flow
@@ -36,7 +38,9 @@ needs_7scenes = pytest.mark.skipif(
 def settings(*overrides) -> dict:
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         config = compose("factorize", list(overrides))
-    return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    made = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    validated(FactorizeConfig, made)
+    return made
 
 
 def factorize(tmp_path, *overrides, source="in", format="frames"):
@@ -220,31 +224,54 @@ def test_exact_flow_where_there_is_none(tmp_path):
 @pytest.mark.parametrize(
     ("override", "says"),
     [
-        ("stride=0", "stride should be a whole number from 1, not 0"),
+        ("stride=0", "stride should be a positive whole number, not 0"),
         ("start=-1", "start should be a whole number from 0, not -1"),
-        ("stop=1", "stop should be a whole number from 2, not 1"),
+        ("stop=1", "stop should be at least 2 for a pair, not 1"),
         ("pictures_every=often", "pictures_every should be a whole number from 0, not 'often'"),
         ("video=maybe", "video should be true or false, not 'maybe'"),
-        ("moving_px=0", "moving_px should be a positive number, not 0"),
-        ("video_fps=inf", "video_fps should be a positive number, not inf"),
-        ("scale_px.obj=-2", "scale_px.obj should be a positive number, not -2"),
-        ("flow_files=[flo,exr]", "flow_files are of ['flo', 'kitti', 'npz'], not ['flo', 'exr']"),
-        ("format.pose_axes=blender", "pose_axes is one of"),
-        ("format.depth_kind=z_buffer", "'z_buffer' needs near_m and far_m"),
-        ("format.flow_grid=previous", "on the previous frame's grid cannot be turned"),
-        ("flow.preset=best", "preset is one of"),
+        ("moving_px=0", "moving_px should be a number above 0, not 0"),
+        ("video_fps=inf", "video_fps should be a number above 0, not inf"),
+        ("scale_px.obj=-2", "scale_px.obj should be a number above 0, not -2"),
+        ("flow_files=[flo,exr]", "each flo, kitti or npz, not ['flo', 'exr']"),
+        ("format.pose_axes=blender", "format.pose_axes should be opencv, opengl, ned or x_forward"),
+        ("format.depth_kind=z_buffer", "format.near_m should be a number with depth_kind=z_buffer"),
+        ("format.depth_unit_m=0", "format.depth_unit_m should be a number above 0, not 0"),
+        ("format.scale=2", "unknown key 'scale' of 'format'"),
+        ("flow.preset=best", "flow.preset should be ultrafast, fast or medium, not 'best'"),
     ],
 )
-def test_what_cannot_be_is_named(override, says, moments, tmp_path):
-    with pytest.raises((UsageError, ValueError)) as caught:
-        factorize(tmp_path, override)
+def test_what_cannot_be_is_named(override, says):
+    with pytest.raises(UsageError) as caught:
+        check_overrides(
+            "factorize", ["input=a", "output=b", "format=frames", override], FactorizeConfig
+        )
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("format.intrinsics=[1,2,3]", "format.intrinsics should be [fx, fy, cx, cy] in pixels"),
+        ("format.tolerance_s=-1", "format.tolerance_s should be a number from 0, not -1"),
+    ],
+)
+def test_what_cannot_be_of_a_format_is_named(override, says):
+    with pytest.raises(UsageError) as caught:
+        check_overrides(
+            "factorize", ["input=a", "output=b", "format=tum", override], FactorizeConfig
+        )
+    assert says in str(caught.value)
+
+
+def test_flow_on_the_other_grid_is_refused(moments, tmp_path):
+    with pytest.raises(ValueError, match="previous frame's grid cannot be turned"):
+        factorize(tmp_path, "format.flow_grid=previous")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 
 
 def test_unknown_formats_are_refused_and_the_known_ones_listed():
     with pytest.raises(UsageError, match=r"unknown format 'tumm' \(did you mean 'tum'"):
-        check_overrides("factorize", ["input=a", "output=b", "format=tumm"])
+        check_overrides("factorize", ["input=a", "output=b", "format=tumm"], FactorizeConfig)
     assert set(group_choices("format")) == {*RECORDINGS, *STREAMS}
 
 

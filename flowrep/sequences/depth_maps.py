@@ -33,7 +33,7 @@ def depth_from_integers(
     >>> depth_from_integers(stored, 0.001, missing=(0, 65535))
     array([[nan, 1.5, nan]], dtype=float32)
     """
-    depth = values * np.float32(unit_m)
+    depth = (values * np.float64(unit_m)).astype(np.float32)
     for value in missing:
         depth[values == value] = np.nan
     if no_surface is not None:

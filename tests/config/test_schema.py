@@ -8,19 +8,27 @@ pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
 from flowrep.config import validated
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.evaluating import EvaluateConfig
+from flowrep.config.factorizing import FactorizeConfig
+from flowrep.config.recordings import READERS
 from flowrep.config.representations import EstimatedFlow, ExactFlow, Representations
 from flowrep.config.training import Evaluation, TrainConfig
 from flowrep.config.viewing import ViewConfig
 from flowrep.config_tree import CONF_DIR, config_groups, group_choices
 from tests.config.composing import plain
 
-GROUP_FILES = [(group, name) for group in config_groups() for name in group_choices(group)]
+OF_TRAINING = [group for group in config_groups() if group != "format"]
+GROUP_FILES = [(group, name) for group in OF_TRAINING for name in group_choices(group)]
 
 
 @pytest.mark.parametrize(
     ("name", "schema", "given"),
-    [("train", TrainConfig, []), ("evaluate", EvaluateConfig, ["run=x"]), ("view", ViewConfig, [])],
-    ids=["train", "evaluate", "view"],
+    [
+        ("train", TrainConfig, []),
+        ("evaluate", EvaluateConfig, ["run=x"]),
+        ("view", ViewConfig, []),
+        ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
+    ],
+    ids=["train", "evaluate", "view", "factorize"],
 )
 def test_a_command_has_the_keys_of_its_schema(name, schema, given):
     config = plain(name, *given)
@@ -45,7 +53,18 @@ def test_an_algorithm_has_the_keys_of_its_section(name):
     assert keys_of("algorithm", name) == sorted(ALGORITHMS[target].keys())
 
 
+@pytest.mark.parametrize("name", group_choices("format"))
+def test_a_format_has_the_keys_of_its_section(name):
+    target = OmegaConf.load(CONF_DIR / "format" / f"{name}.yaml")["_target_"]
+    assert keys_of("format", name) == sorted(READERS[target].keys())
+
+
 def test_every_section_has_its_file():
+    formats = {
+        OmegaConf.load(CONF_DIR / "format" / f"{name}.yaml")["_target_"]
+        for name in group_choices("format")
+    }
+    assert formats == set(READERS)
     targets = {
         OmegaConf.load(CONF_DIR / "algorithm" / f"{name}.yaml")["_target_"]
         for name in group_choices("algorithm")
