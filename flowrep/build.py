@@ -50,17 +50,15 @@ def choose_workers(num_workers: Any, num_envs: int) -> int:
 def build_env(config: Config, **changes: Any) -> EnvBase:
     """Returns the env that the config describes; `changes` go to `make_env` in its place."""
     num_envs: int = changes.get("num_envs") or config["num_envs"]
-    # runs of before there were workers say nothing of them
-    num_workers = changes.get("num_workers", config.get("num_workers", "auto"))
+    num_workers = changes.get("num_workers", config["num_workers"])
     arguments = {
         "scene": config["scene"],
         "representations": config["representations"],
-        "flow": config.get("flow", "exact"),  # runs of before there was a choice have none
+        "flow": config["flow"],
         "num_envs": num_envs,
         "device": choose_device(config["device"]),
         "speed": config["speed"],
-        # runs of before there was another were drawn by PyBullet
-        "renderer": config.get("renderer", "pybullet"),
+        "renderer": config["renderer"],
     }
     workers = {"num_workers": choose_workers(num_workers, num_envs)}
     return make_env(**(arguments | changes | workers))
@@ -68,13 +66,20 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
 
 def build_agent(config: Config, env: EnvBase) -> Algorithm:
     """Returns the config's algorithm, untrained, on what the env emits."""
+    algorithm, arguments, options = _algorithm(config, env)
+    return algorithm(*arguments, **options)
+
+
+def build_policy(config: Config, env: EnvBase) -> Any:
+    """Returns the acting side of the config's algorithm alone, untrained."""
+    algorithm, arguments, options = _algorithm(config, env)
+    return algorithm.build_policy(*arguments, **options)
+
+
+def _algorithm(config: Config, env: EnvBase) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
+    """Returns the algorithm's class and its arguments, by position and by name."""
     options = dict(config["algorithm"])
     algorithm = get_class(options.pop("_target_"))
-    return algorithm(
-        env.observation_spec,
-        env.action_spec,
-        list(config["representations"]),
-        total_frames=config["total_frames"],
-        device=choose_device(config["device"]),
-        **options,
-    )
+    specs = env.observation_spec, env.action_spec, list(config["representations"])
+    device = choose_device(config["device"])
+    return algorithm, specs, {"total_frames": config["total_frames"], "device": device} | options

@@ -1,6 +1,7 @@
 """Evaluates a trained agent: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
 
 import sys
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -11,16 +12,19 @@ except ImportError:
 
 from omegaconf import DictConfig, ListConfig
 
-from flowrep.agent import Algorithm, CheckpointError, load_checkpoint
-from flowrep.build import Config, build_agent, build_env
+from flowrep.agent import CheckpointError, load_checkpoint
+from flowrep.build import Config, build_env, build_policy
 from flowrep.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config import UsageError, validated
 from flowrep.config.evaluating import EvaluateConfig
 from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
+from flowrep.envs import WorkerError
 from flowrep.experiment.comparison import compare, print_table, with_origin
+from flowrep.experiment.evaluation import Policy
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
+from flowrep.experiment.origin import check_origin, origin_of
 from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder
 
@@ -31,18 +35,23 @@ def run(config: DictConfig) -> None:
     try:
         validated(EvaluateConfig, plain_config(config), own_keys())
         folder = RunFolder.existing(config.run)
-        here = {key: config[key] for key in ("device", "num_envs", "num_workers")}
-        trained = validated_run(folder.read_config(), f"{folder.path}/config.yaml") | here
-        speeds, policies, baselines = (
-            as_list(config[key]) for key in ("speed", "policy", "baselines")
-        )
-        rates = [float(rate) for rate in as_list(config.fps)]
-        agent, frames = load_agent(trained, folder)
-    except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
+        with folder.held("evaluating"):
+            evaluate(config, folder)
+    except (UsageError, CheckpointError, WorkerError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
+
+
+def evaluate(config: DictConfig, folder: RunFolder) -> None:
+    """Does what `run` says, for an agent in a folder that is held."""
+    own = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
+    trained = own | {key: config[key] for key in ("device", "num_envs", "num_workers")}
+    speeds, policies, baselines = (as_list(config[key]) for key in ("speed", "policy", "baselines"))
+    rates = [float(rate) for rate in as_list(config.fps)]
+    folder.read_episodes()  # a table that can't be added to is better known before than after
+    policy, frames = load_policy(trained, folder, origin_of(own))
     with StopRequest() as stop:
         rows = compare(
-            dict.fromkeys(policies, agent.policy),
+            dict.fromkeys(policies, policy),
             partial(build_env, trained),
             speeds=speeds,
             fps=rates,
@@ -51,13 +60,15 @@ def run(config: DictConfig) -> None:
             baselines=baselines,
             should_stop=lambda: bool(stop),
         )
-        folder.log_episodes(with_origin(rows, trained, frames))
         print_table(rows)
         print_failures(rows)
+        folder.log_episodes(with_origin(rows, trained, frames, "evaluate"))
         write_failures(folder.failures_path, folder.read_episodes())
-        print(f"{len(rows)} episodes added to {folder.evaluation_path}")
+        print(f"{len(rows)} episodes are in {folder.evaluation_path}")
         if not stop:
-            film(agent, trained, folder, config, speeds, rates)
+            film(policy, trained, folder, config, speeds, rates)
+    if stop:
+        sys.exit(stop.exit_code)
 
 
 def as_list(value: Any) -> list[Any]:
@@ -65,18 +76,26 @@ def as_list(value: Any) -> list[Any]:
     return list(value) if isinstance(value, ListConfig) else [value]
 
 
-def load_agent(trained: Config, folder: RunFolder) -> tuple[Algorithm, int]:
-    """Returns the run's agent and the number of frames that it was trained for."""
-    state = load_checkpoint(folder.checkpoint_path)
+def load_policy(
+    trained: Config, folder: RunFolder, origin: Mapping[str, Any]
+) -> tuple[Policy, int]:
+    """Returns the run's policy and the number of frames that it was trained for.
+
+    Raises:
+        CheckpointError: there is no checkpoint, it is damaged, or belongs to another run.
+    """
+    path = folder.checkpoint_path
+    state = load_checkpoint(path, ["origin", "frames", "policy"])
+    check_origin(state["origin"], origin, path)
     env = build_env(trained, num_envs=1, num_workers=0)
-    agent = build_agent(trained, env)
+    policy = build_policy(trained, env)
     env.close()
-    agent.load_state_dict(state["agent"])
-    return agent, state["frames"]
+    policy.load_state_dict(state["policy"])
+    return policy, state["frames"]
 
 
 def film(
-    agent: Algorithm,
+    policy: Policy,
     trained: Config,
     folder: RunFolder,
     config: DictConfig,
@@ -90,7 +109,7 @@ def film(
                 path = folder.video_path(f"{speed}_{rate:g}fps_{number}")
                 make = partial(build_env, trained, speed=speed, frame_rate_hz=rate)
                 seen = trained["representations"]
-                record_episode(make, agent.policy, seen, path, seed=config.seed + number)
+                record_episode(make, policy, seen, path, seed=config.seed + number)
                 print(f"video: {path}")
 
 

@@ -24,32 +24,50 @@ from flowrep.experiment.comparison import compare, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.figures import draw_learning_curve
 from flowrep.experiment.interruption import StopRequest
+from flowrep.experiment.origin import origin_of
 from flowrep.experiment.recording import record_episode
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run_folder import RunFolder, RunFolderError
+from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import Training, train
 
 OF_THE_MACHINE = ("device", "num_workers")  # what a resumed run takes from its new command line
+FINAL_POLICIES = ("greedy", "sampled")  # of the agent, beside the baselines
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="train")
 def run(config: DictConfig) -> None:
     """Trains, evaluates and films one agent, or continues a run with `resume=`."""
     try:
-        folder, plain = open_run(config)
-    except (UsageError, SceneError, OSError) as error:
+        plain = plain_config(config)
+        validated(TrainConfig, plain, own_keys())
+        is_new = plain["resume"] is None
+        if is_new:
+            load_scene(plain["scene"])
+        hydra = HydraConfig.get()
+        new = hydra.runtime.output_dir
+        folder = RunFolder(new) if is_new else RunFolder.existing(plain["resume"])
+        with folder.held("training"):
+            if is_new:
+                folder.check_is_new()
+                folder.write_config(plain, hydra.overrides.task)
+            else:
+                plain = resumed_config(plain, folder)
+            carry_out(plain, folder)
+    except (UsageError, SceneError, RunFolderError, TableError, OSError) as error:
         exit_with(str(error))
-    carry_out(plain, folder)
 
 
 def carry_out(config: Config, folder: RunFolder) -> None:
     """Does what is left to do of a run: training, evaluation, video."""
     try:
         training = build(config, folder)
-        folder.log_to_wandb(config.get("wandb", "off"), config)
+        folder.log_to_wandb(config["wandb"], config)
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
     print(f"run folder: {folder.path}")
-    if training.frames >= config["total_frames"] and folder.is_evaluated(training.frames):
+    if training.frames >= config["total_frames"] and folder.is_evaluated(
+        training.frames, final_episodes(config)
+    ):
         print(f"this run is complete; evaluate it with: flowrep.evaluate run={folder.path}")
         return
     with StopRequest() as stop:
@@ -79,15 +97,8 @@ def carry_out(config: Config, folder: RunFolder) -> None:
         sys.exit(stop.exit_code)
 
 
-def open_run(config: DictConfig) -> tuple[RunFolder, dict[str, Any]]:
-    """Returns the run's folder and its config: a new one, or that of the run to resume."""
-    plain = plain_config(config)
-    validated(TrainConfig, plain, own_keys())
-    if plain["resume"] is None:
-        load_scene(plain["scene"])
-        folder = RunFolder(HydraConfig.get().runtime.output_dir)
-        folder.write_config(plain)
-        return folder, plain
+def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
+    """Returns the config of the run to resume, on this machine."""
     others = [
         o
         for o in HydraConfig.get().overrides.task
@@ -98,9 +109,8 @@ def open_run(config: DictConfig) -> tuple[RunFolder, dict[str, Any]]:
             f"resume= continues a run with its own config, so '{others[0]}' would be ignored; "
             "leave it out (device= and num_workers= may be changed)"
         )
-    folder = RunFolder.existing(plain["resume"])
     stored = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
-    return folder, stored | {key: plain[key] for key in (*OF_THE_MACHINE, "resume")}
+    return stored | {key: plain[key] for key in (*OF_THE_MACHINE, "resume")}
 
 
 def build(config: Config, folder: RunFolder) -> Training:
@@ -109,7 +119,7 @@ def build(config: Config, folder: RunFolder) -> Training:
     torch.manual_seed(config["seed"])
     env = build_env(config)
     env.set_seed(config["seed"] * config["num_envs"])
-    training = Training(env, build_agent(config, env), folder)
+    training = Training(env, build_agent(config, env), folder, origin_of(config))
     if config["resume"] is not None:
         if folder.checkpoint_path.exists():
             training.load()
@@ -131,8 +141,15 @@ def log_evaluation(training: Training, config: Config, stop: StopRequest, frames
             seed=EVALUATION_SEED,
             should_stop=lambda: bool(stop),
         )
-    training.run.log_episodes(with_origin(rows, config, frames))
+    training.run.log_episodes(with_origin(rows, config, frames, "training"))
     return not rows
+
+
+def final_episodes(config: Config) -> int:
+    """Returns how many episodes the evaluation that ends a run has."""
+    evaluation = config["evaluation"]
+    policies = len(FINAL_POLICIES) + len(evaluation["baselines"])
+    return len(evaluation["speeds"]) * policies * evaluation["final_episodes"]
 
 
 def final_evaluation(training: Training, config: Config, stop: StopRequest) -> None:
@@ -140,7 +157,7 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
     evaluation, run = config["evaluation"], training.run
     seed = EVALUATION_SEED + config["num_envs"]
     rows = compare(
-        {"greedy": training.agent.policy, "sampled": training.agent.policy},
+        dict.fromkeys(FINAL_POLICIES, training.agent.policy),
         partial(build_env, config),
         speeds=evaluation["speeds"],
         fps=[config["scene"]["frame_rate_hz"]],
@@ -151,9 +168,9 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
     )
     if stop:
         return
-    run.log_episodes(with_origin(rows, config, training.frames))
     print_table(rows)
     print_failures(rows)
+    run.log_episodes(with_origin(rows, config, training.frames, "final"))
     write_failures(run.failures_path, run.read_episodes())
     draw_learning_curve(run)
     if evaluation["video"]:
@@ -169,10 +186,9 @@ def main() -> None:
     if resumed:
         try:
             folder = RunFolder.existing(resumed[-1])
-        except FileNotFoundError as error:
+        except RunFolderError as error:
             exit_with(str(error))
-        # A resumed run stays in its folder, whose .hydra/ keeps telling how it was started.
-        sys.argv += [f"hydra.run.dir={folder.path}", "hydra.output_subdir=null"]
+        sys.argv.append(f"hydra.run.dir={folder.path}")
     run_command("train", run, TrainConfig)
 
 

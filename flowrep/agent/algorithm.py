@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite, TensorSpec
 
+from flowrep.agent.action import DiscreteActions
 from flowrep.agent.captured import captured
 from flowrep.agent.divergence import DivergenceWatch
+from flowrep.agent.policy import acting_network, stochastic_policy
 
 
 class Memory(Protocol):
@@ -38,9 +40,10 @@ class Algorithm(ABC):
     algorithm.remember(steps)                               # with what the action brought
     ```
 
-    A subclass builds its networks, sets `policy` and `memory`, then calls this constructor with
-    all weights that training changes; it writes `sample`, `updates_due` and `losses`. Everything it
-    needs to continue then lies in those weights, the memory and Adam's state, which are saved.
+    A subclass builds its networks, sets `policy` (by `build_policy`, which makes it for evaluation
+    too) and `memory`, then calls this constructor with all weights that training changes; it writes
+    `sample`, `updates_due` and `losses`. Everything it needs to continue then lies in those
+    weights, the memory and Adam's state, which are saved.
 
     Args:
         weights: by name; those that require gradients are trained, the others (targets, an
@@ -57,7 +60,10 @@ class Algorithm(ABC):
     CAPTURABLE: ClassVar[bool] = True
     """Whether `losses` and `after_update` can be part of a CUDA graph, see `captured`."""
 
-    policy: TensorDictModuleBase
+    WRITES_LOG_PROB: ClassVar[bool] = False
+    """Whether `policy` writes `action_log_prob` beside `action`."""
+
+    policy: Any
     memory: Memory
 
     def __init__(
@@ -105,6 +111,40 @@ class Algorithm(ABC):
             }
             for factor, weights in groups.items()
         ]
+
+    @classmethod
+    def build_policy(
+        cls,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        keys: Sequence[NestedKey],
+        *,
+        device: torch.device | str,
+        **options: Any,
+    ) -> Any:
+        """Returns the acting side alone, untrained: what an agent needs that learns no more.
+
+        Its `state_dict` is that of `policy`, and the weights of the one fit the other.
+
+        Args:
+            observation_spec: the environment's.
+            action_spec: `Categorical` or `OneHot`.
+            keys: the observation maps to read, in order.
+            device: where its networks live.
+            options: those of the constructor, `precision` and `hidden_size` among them; what acting
+                doesn't depend on is not looked at.
+        """
+        network = acting_network(
+            observation_spec,
+            action_spec,
+            keys,
+            device=torch.device(device),
+            precision=options["precision"],
+            hidden_size=options["hidden_size"],
+            layer_norm=options.get("layer_norm", False),  # not every algorithm has the choice
+        )
+        actions = DiscreteActions.from_spec(action_spec)
+        return stochastic_policy(network, list(keys), actions, writes_log_prob=cls.WRITES_LOG_PROB)
 
     def step_eagerly(self) -> None:
         """Takes every further update operation by operation, never as a CUDA graph.

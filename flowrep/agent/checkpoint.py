@@ -1,7 +1,8 @@
 """One file that a run continues from: tensors and plain data, written whole or not at all.
 
 The file is a safetensors file. Its header's metadata carry one JSON document that mirrors the
-nested state, in which a tensor is `{"tensor": name}`. Nothing in it can run code.
+nested state, in which a tensor is `{"tensor": name, "crc32": checksum}`, and the document's own
+checksum: a byte that was changed is noticed. Nothing in the file can run code.
 """
 
 from __future__ import annotations
@@ -10,15 +11,17 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Mapping
+import zlib
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-FORMAT = "flowrep checkpoint 2"
+FORMAT = "flowrep checkpoint 3"
 
 
 class CheckpointError(Exception):
@@ -48,7 +51,9 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         file = partial / path.name
-        save_file(_unshared(tensors), file, metadata={"format": FORMAT, "state": document})
+        checksum = str(zlib.crc32(document.encode()))
+        metadata = {"format": FORMAT, "state": document, "state_crc32": checksum}
+        save_file(_unshared(tensors), file, metadata=metadata)
         file.chmod(partial.stat().st_mode & 0o666)  # as any new file, not for the owner alone
         _flush(file)
         _rename(file, path)
@@ -63,8 +68,15 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
+def load_checkpoint(
+    path: str | os.PathLike[str], parts: Collection[str] | None = None
+) -> dict[str, Any]:
     """Returns the state that `save_checkpoint` wrote, tensors on the CPU.
+
+    Args:
+        path: the file.
+        parts: the keys of the outermost dict to read, which is quick where they are small; None
+            for all.
 
     Raises:
         CheckpointError: if there is none, or it is damaged or something else.
@@ -80,10 +92,14 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
                     f"{path} is a safetensors file but not a flowrep checkpoint of this version "
                     f"({FORMAT!r}); start the run anew"
                 )
-            state = _with_tensors(json.loads(metadata["state"]), file.get_tensor)
-            if not isinstance(state, dict):
-                raise TypeError(f"it holds a {type(state).__name__}, not a dict")
-            return state
+            _check(zlib.crc32(metadata["state"].encode()), int(metadata["state_crc32"]), "document")
+            document = json.loads(metadata["state"])
+            if not isinstance(document, dict):
+                raise TypeError(f"it holds a {type(document).__name__}, not a dict")
+            wanted = document["dict"]
+            if parts is not None:
+                wanted = {name: wanted[name] for name in parts}
+            return {name: _with_tensors(value, file.get_tensor) for name, value in wanted.items()}
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise CheckpointError(
             f"{path} is not a readable checkpoint ({error}): it is damaged or of another kind; "
@@ -109,7 +125,7 @@ def _without_tensors(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
     """Returns `value` as JSON data; moves its tensors to `tensors`, named by their place."""
     if isinstance(value, Tensor):
         tensors[place] = value.detach().cpu().contiguous()
-        return {"tensor": place}
+        return {"tensor": place, "crc32": _checksum(tensors[place])}
     if isinstance(value, Mapping):
         bad = [key for key in value if not isinstance(key, str)]
         if bad:
@@ -149,8 +165,24 @@ def _with_tensors(value: Any, get_tensor: Any) -> Any:
     if isinstance(value, list):
         return [_with_tensors(item, get_tensor) for item in value]
     if isinstance(value, dict):
+        if "tensor" in value:
+            tensor = get_tensor(value["tensor"])
+            _check(_checksum(tensor), value["crc32"], value["tensor"])
+            return tensor
         ((kind, content),) = value.items()
         if kind == "dict":
             return {key: _with_tensors(item, get_tensor) for key, item in content.items()}
-        return get_tensor(content) if kind == "tensor" else float(content)
+        return float(content)
     return value
+
+
+def _checksum(tensor: Tensor) -> int:
+    """Returns the CRC-32 of a contiguous tensor's type, shape and bytes."""
+    kind = zlib.crc32(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
+    data: Any = tensor.reshape(-1).view(torch.uint8).numpy()
+    return zlib.crc32(data, kind)
+
+
+def _check(found: int, expected: int, what: str) -> None:
+    if found != expected:
+        raise ValueError(f"{what} is not as it was written, its checksum differs")

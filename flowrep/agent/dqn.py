@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
+from torch.distributions import Distribution
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
@@ -15,8 +17,35 @@ from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 from flowrep.agent.action import DiscreteActions
 from flowrep.agent.observation import map_codecs
 from flowrep.agent.off_policy import OffPolicy
-from flowrep.agent.policy import MapNetwork, PackedNetwork, PolicyNetwork
+from flowrep.agent.policy import PackedNetwork, PolicyNetwork, acting_network
 from flowrep.agent.precision import compute_dtype
+
+
+class EpsilonGreedyPolicy(TensorDictSequential):
+    """Writes the action of the largest value, or, with probability ε, one drawn evenly."""
+
+    def __init__(
+        self,
+        network: PolicyNetwork,
+        keys: Sequence[NestedKey],
+        actions: DiscreteActions,
+        exploration: EGreedyModule,
+    ) -> None:
+        super().__init__(
+            TensorDictModule(network, keys, ["action_value"]),
+            QValueModule(action_space=actions.space),
+            exploration,
+        )
+        self.distribution_class: Any = actions.distribution
+        self.select_out_keys("action")
+
+    def get_dist(self, tensordict: TensorDictBase) -> Distribution:
+        """Returns the distribution that actions are drawn from, as other policies do."""
+        acting, _, exploration = self
+        values = acting(tensordict.copy())["action_value"]
+        best = torch.nn.functional.one_hot(values.argmax(-1), values.shape[-1])
+        epsilon = exploration.eps
+        return self.distribution_class(probs=epsilon / values.shape[-1] + (1 - epsilon) * best)
 
 
 class DoubleDQN(OffPolicy):
@@ -80,22 +109,22 @@ class DoubleDQN(OffPolicy):
         device = torch.device(device)
         self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
         actions = DiscreteActions.from_spec(action_spec)
-        with device:
-            network = MapNetwork(self.codecs, hidden_size, actions.count, layer_norm=layer_norm)
-        best = QValueModule(action_space=actions.space)
-        self.exploration = EGreedyModule(
+        self.policy = self.build_policy(
+            observation_spec,
             action_spec,
-            float(initial_epsilon),
-            float(final_epsilon),
-            max(1, int(exploration_share * total_frames)),
+            keys,
             device=device,
+            precision=precision,
+            hidden_size=hidden_size,
+            layer_norm=layer_norm,
+            initial_epsilon=initial_epsilon,
+            final_epsilon=final_epsilon,
+            exploration_share=exploration_share,
+            total_frames=total_frames,
         )
-        acting = PolicyNetwork(self.codecs, network.encoder, network.head)
-        self.policy = TensorDictSequential(
-            TensorDictModule(acting, list(keys), ["action_value"]), best, self.exploration
-        ).select_out_keys("action")
+        acting, best, self.exploration = self.policy
         learning = TensorDictModule(
-            PackedNetwork(self.codecs, network), list(keys), ["action_value"]
+            PackedNetwork(self.codecs, acting.module.network), list(keys), ["action_value"]
         )
         self.loss = DQNLoss(
             TensorDictSequential(learning, best),
@@ -120,6 +149,38 @@ class DoubleDQN(OffPolicy):
             learning_starts=learning_starts,
             gamma=gamma,
             n_steps=n_steps,
+        )
+
+    @classmethod
+    def build_policy(
+        cls,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        keys: Sequence[NestedKey],
+        *,
+        device: torch.device | str,
+        **options: Any,
+    ) -> EpsilonGreedyPolicy:
+        """Returns the acting side alone, see `Algorithm.build_policy`; ε lies in its state."""
+        device = torch.device(device)
+        network = acting_network(
+            observation_spec,
+            action_spec,
+            keys,
+            device=device,
+            precision=options["precision"],
+            hidden_size=options["hidden_size"],
+            layer_norm=options["layer_norm"],
+        )
+        exploration = EGreedyModule(
+            action_spec,
+            float(options["initial_epsilon"]),
+            float(options["final_epsilon"]),
+            max(1, int(options["exploration_share"] * options["total_frames"])),
+            device=device,
+        )
+        return EpsilonGreedyPolicy(
+            network, list(keys), DiscreteActions.from_spec(action_spec), exploration
         )
 
     def remember(self, steps: TensorDictBase) -> None:

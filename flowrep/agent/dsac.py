@@ -18,7 +18,7 @@ from flowrep.agent.encoder import Encoder
 from flowrep.agent.heads import Head
 from flowrep.agent.observation import decode_maps, map_codecs
 from flowrep.agent.off_policy import OffPolicy
-from flowrep.agent.policy import PolicyNetwork, stochastic_policy
+from flowrep.agent.policy import stochastic_policy
 from flowrep.agent.precision import compute_dtype
 
 ENCODERS = ("shared", "separate")
@@ -96,16 +96,26 @@ class DiscreteSAC(OffPolicy):
         device = torch.device(device)
         self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
         actions = DiscreteActions.from_spec(action_spec)
+        self.policy = self.build_policy(
+            observation_spec,
+            action_spec,
+            keys,
+            device=device,
+            precision=precision,
+            hidden_size=hidden_size,
+            layer_norm=layer_norm,
+        )
+        actor = self.policy[0].module.network
+        self.actor_encoder, actor_head = actor.encoder, actor.head
         with device:
             self.encoder_is_shared = encoder == "shared"
-            self.critic_encoder = self.actor_encoder = Encoder(self.codecs, layer_norm=layer_norm)
-            if not self.encoder_is_shared:
-                self.actor_encoder = Encoder(self.codecs, layer_norm=layer_norm)
-            sizes = (self.critic_encoder.embedding_size, hidden_size, actions.count)
-            actor_head, critic_head = Head(*sizes), Head(*sizes)
+            self.critic_encoder = (
+                self.actor_encoder
+                if self.encoder_is_shared
+                else Encoder(self.codecs, layer_norm=layer_norm)
+            )
+            critic_head = Head(self.critic_encoder.embedding_size, hidden_size, actions.count)
         self.target_encoder = copy.deepcopy(self.critic_encoder).requires_grad_(False)
-        network = PolicyNetwork(self.codecs, self.actor_encoder, actor_head)
-        self.policy = stochastic_policy(network, list(keys), actions)
         self.loss = DiscreteSACLoss(
             stochastic_policy(actor_head, ["actor_embedding"], actions),
             TensorDictModule(critic_head, ["critic_embedding"], ["action_value"]),

@@ -16,7 +16,7 @@ from flowrep.agent.action import DiscreteActions
 from flowrep.agent.algorithm import move_targets, named_weights
 from flowrep.agent.observation import decode_maps, map_codecs
 from flowrep.agent.off_policy import OffPolicy
-from flowrep.agent.policy import MapNetwork, PolicyNetwork, stochastic_policy
+from flowrep.agent.policy import MapNetwork
 from flowrep.agent.precision import compute_dtype
 
 
@@ -92,16 +92,24 @@ class DiscreteSACWithValue(OffPolicy):
         self.actions_are_one_hot = isinstance(action_spec, OneHot)
         self.gamma, self.tau = gamma, tau
         self.target_entropy = target_entropy_weight * math.log(actions.count)
+        self.policy = self.build_policy(
+            observation_spec,
+            action_spec,
+            keys,
+            device=device,
+            precision=precision,
+            hidden_size=hidden_size,
+            layer_norm=layer_norm,
+        )
+        self.actor = self.policy[0].module.network
         with device:
-            self.actor, self.q1, self.q2 = (
+            self.q1, self.q2 = (
                 MapNetwork(self.codecs, hidden_size, actions.count, layer_norm=layer_norm)
-                for _ in range(3)
+                for _ in range(2)
             )
             self.value = MapNetwork(self.codecs, hidden_size, 1, layer_norm=layer_norm)
             self.log_alpha = torch.nn.Parameter(torch.tensor(math.log(initial_alpha)))
         self.target_value = copy.deepcopy(self.value).requires_grad_(False)
-        network = PolicyNetwork(self.codecs, self.actor.encoder, self.actor.head)
-        self.policy = stochastic_policy(network, list(keys), actions)
         super().__init__(
             named_weights(
                 actor=self.actor,

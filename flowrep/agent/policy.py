@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from tensordict import NestedKey
 from tensordict.nn import (
     InteractionType,
@@ -12,11 +13,13 @@ from tensordict.nn import (
     TensorDictModule,
 )
 from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
 
 from flowrep.agent.action import DiscreteActions
 from flowrep.agent.encoder import Encoder
 from flowrep.agent.heads import Head
-from flowrep.agent.observation import MapCodec
+from flowrep.agent.observation import MapCodec, map_codecs
+from flowrep.agent.precision import compute_dtype
 
 
 class MapNetwork(nn.Module):
@@ -54,19 +57,36 @@ class PackedNetwork(nn.Module):
 class PolicyNetwork(nn.Module):
     """Returns `[*B, n]`, one number an action, of raw maps `[*B, C, H, W]`, one argument a map."""
 
-    def __init__(self, codecs: Sequence[MapCodec], encoder: Encoder, head: Head) -> None:
+    def __init__(self, codecs: Sequence[MapCodec], network: MapNetwork) -> None:
         super().__init__()
-        self.codecs = tuple(codecs)
-        self.encoder, self.head = encoder, head
+        self.codecs, self.network = tuple(codecs), network
 
     def forward(self, *maps: Tensor) -> Tensor:
-        """Returns the head's output; the maps pass the form they are kept in, as in learning."""
+        """Returns the network's output; the maps pass the form they are kept in, as in learning."""
         images = []
         for codec, x in zip(self.codecs, maps):
             batch = codec.batch_shape(x)
             packed = codec.store(x.reshape(-1, *x.shape[-3:]))
             images.append(codec.decode(packed))
-        return self.head(self.encoder(images)).reshape(*batch, -1)
+        return self.network(images).reshape(*batch, -1)
+
+
+def acting_network(
+    observation_spec: Composite,
+    action_spec: TensorSpec,
+    keys: Sequence[NestedKey],
+    *,
+    device: torch.device,
+    precision: str,
+    hidden_size: int,
+    layer_norm: bool = False,
+) -> PolicyNetwork:
+    """Returns the untrained network of a policy: an encoder a map, then a head."""
+    codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
+    actions = DiscreteActions.from_spec(action_spec)
+    with device:
+        network = MapNetwork(codecs, hidden_size, actions.count, layer_norm=layer_norm)
+    return PolicyNetwork(codecs, network)
 
 
 def stochastic_policy(

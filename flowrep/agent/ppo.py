@@ -15,10 +15,9 @@ from torchrl.objectives.value import GAE
 
 from flowrep.agent.action import DiscreteActions
 from flowrep.agent.algorithm import Algorithm, named_weights
-from flowrep.agent.encoder import Encoder
 from flowrep.agent.heads import Head
 from flowrep.agent.observation import decode_maps, map_codecs
-from flowrep.agent.policy import PolicyNetwork, stochastic_policy
+from flowrep.agent.policy import stochastic_policy
 from flowrep.agent.precision import compute_dtype
 from flowrep.agent.rollout import Rollout
 
@@ -66,6 +65,7 @@ class PPO(Algorithm):
         hidden_size: width of the one hidden layer after the embeddings.
     """
 
+    WRITES_LOG_PROB = True
     METRICS = (
         "policy_loss", "value_loss", "entropy_loss", "entropy", "kl", "clip_share",
         "explained_variance",
@@ -105,16 +105,18 @@ class PPO(Algorithm):
                 f"({rollout_length} steps of {num_envs} environments): raise rollout_length or "
                 "num_envs, or lower batch_size"
             )
-        with device:
-            self.encoder = Encoder(self.codecs)
-            actor = Head(self.encoder.embedding_size, hidden_size, actions.count)
-            critic = Head(self.encoder.embedding_size, hidden_size, 1)
-        self.policy = stochastic_policy(
-            PolicyNetwork(self.codecs, self.encoder, actor),
-            list(keys),
-            actions,
-            writes_log_prob=True,
+        self.policy = self.build_policy(
+            observation_spec,
+            action_spec,
+            keys,
+            device=device,
+            precision=precision,
+            hidden_size=hidden_size,
         )
+        acting = self.policy[0].module.network
+        self.encoder, actor = acting.encoder, acting.head
+        with device:
+            critic = Head(self.encoder.embedding_size, hidden_size, 1)
         self._actor = stochastic_policy(actor, ["embedding"], actions)
         self._critic = TensorDictModule(critic, ["embedding"], ["state_value"])
         self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, device=device)

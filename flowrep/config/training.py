@@ -77,15 +77,6 @@ class TrainConfig(Section):
         return self
 
 
-ABSENT_BEFORE: dict[str, Any] = {
-    "flow": {"source": "exact"},
-    "num_workers": "auto",
-    "renderer": "pybullet",
-    "wandb": "off",
-}
-"""What runs did of before there were these keys."""
-
-
 def validated_run(config: Any, source: str) -> dict[str, Any]:
     """Returns the config that a run folder holds, once it is found to be one.
 
@@ -96,14 +87,13 @@ def validated_run(config: Any, source: str) -> dict[str, Any]:
     Raises:
         UsageError: it is none; a line for each key that is not what it should be.
     """
-    whole: Any = {**ABSENT_BEFORE, **config} if isinstance(config, Mapping) else config
     own_keys = config.keys() - TrainConfig.keys() if isinstance(config, Mapping) else ()
     try:
-        validated(TrainConfig, whole, own_keys)
+        validated(TrainConfig, config, own_keys)
     except UsageError as error:
         lines = str(error).splitlines()
         raise UsageError("\n".join(f"{source}: {line}" for line in lines)) from None
-    return whole
+    return config
 
 
 def check_workers(num_workers: int | str, num_envs: int) -> None:

@@ -101,14 +101,24 @@ def baseline_episodes(
     env.close()
 
 
-def with_origin(rows: Sequence[Row], config: Mapping[str, Any], frames: int) -> list[Row]:
-    """Returns the rows with the columns that say whose they are, in evaluation.csv's order."""
+def with_origin(
+    rows: Sequence[Row], config: Mapping[str, Any], frames: int, evaluation: str
+) -> list[Row]:
+    """Returns the rows with the columns that say whose they are, in evaluation.csv's order.
+
+    Args:
+        rows: from `compare`.
+        config: of the run whose agent was evaluated.
+        frames: that it had been trained for.
+        evaluation: "training", "final" or "evaluate".
+    """
     origin = {
         "scene": config["scene"]["name"],
         "representations": "+".join(config["representations"]),
-        "flow": config.get("flow", {}).get("source", "exact"),
+        "flow": config["flow"]["source"],
         "seed": config["seed"],
         "frames": frames,
+        "evaluation": evaluation,
     }
     return [origin | row for row in rows]
 

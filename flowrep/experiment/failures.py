@@ -9,13 +9,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from flowrep.experiment.tables import append_rows
+from flowrep.experiment.tables import write_rows
 
-UNRECORDED = "collision: unrecorded"
-"""A collision in a table of before it was recorded what was hit."""
-
-CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", UNRECORDED, "timeout")
-_GROUP = ("scene", "representations", "flow", "frames", "policy", "speed", "fps")
+CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
+_GROUP = ("scene", "representations", "flow", "frames", "evaluation", "policy", "speed", "fps")
 
 
 def cause_of(outcome: str, hit: str) -> str | None:
@@ -27,8 +24,6 @@ def cause_of(outcome: str, hit: str) -> str | None:
     if outcome == "success":
         return None
     if outcome == "collision":
-        if not hit:
-            return UNRECORDED
         return "collision: pedestrian" if hit == "pedestrian" else "collision: other"
     return outcome.replace("_", " ")
 
@@ -64,13 +59,12 @@ def print_failures(rows: Sequence[Mapping[str, Any]], console: Console | None = 
     for heading in ("speed", "fps", "policy", "failures"):
         table.add_column(heading, no_wrap=True)
     lines = failure_causes(rows)
-    causes = [c for c in CAUSES if c != UNRECORDED or any(line[c] for line in lines)]
-    for cause in causes:
+    for cause in CAUSES:
         # In two lines, so that all fit into 100 columns.
         heading = cause.replace(": ", ":\n").replace("of ", "of\n")
         table.add_column(heading, justify="right", no_wrap=True)
     for line in lines:
-        shares = ["" if line[cause] == "" else f"{line[cause]:.0f}" for cause in causes]
+        shares = ["" if line[cause] == "" else f"{line[cause]:.0f}" for cause in CAUSES]
         failed = f"{line['failures']} of {line['episodes']}"
         rate = f"{float(line['fps']):g}"
         table.add_row(line["speed"], rate, line["policy"], failed, *shares)
@@ -79,8 +73,4 @@ def print_failures(rows: Sequence[Mapping[str, Any]], console: Console | None = 
 
 def write_failures(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Writes the causes of failure as CSV, in place of an older table."""
-    fresh = path.with_suffix(".tmp")
-    fresh.unlink(missing_ok=True)
-    append_rows(fresh, failure_causes(rows))
-    if fresh.exists():
-        fresh.replace(path)
+    write_rows(path, failure_causes(rows))

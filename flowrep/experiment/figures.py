@@ -1,6 +1,5 @@
 """Pictures of a run, drawn from its tables."""
 
-import csv
 from collections import defaultdict
 
 from matplotlib.figure import Figure
@@ -13,9 +12,9 @@ def draw_learning_curve(run: RunFolder) -> None:
     """Draws success over frames into learning_curve.png, from metrics.csv and evaluation.csv.
 
     The line is the share of the last training episodes (sampled actions); the points are greedy
-    evaluations at the training speed, with 95 % Wilson intervals.
+    evaluations at the training speed and frame rate, with 95 % Wilson intervals.
     """
-    metrics = _read(run.metrics_path)
+    metrics = run.read_metrics()
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.add_subplot(
         xlabel="environment frames", ylabel="share of episodes that succeed", ylim=(0, 1)
@@ -38,21 +37,18 @@ def draw_learning_curve(run: RunFolder) -> None:
 
 
 def _evaluated(run: RunFolder) -> list[tuple[int, float, float, float]]:
-    """Frames, lower end, share of success, upper end for each greedy evaluation while training."""
+    """Frames, lower end, share of success, upper end for each of the run's greedy evaluations.
+
+    What flowrep.evaluate added, at whatever frame rate and in whatever scene, is left out.
+    """
     speed = run.read_config()["speed"]
     outcomes = defaultdict(list)
-    for row in _read(run.evaluation_path):
-        if row["policy"] == "greedy" and row["speed"] == speed:
+    for row in run.read_episodes():
+        is_own = row["evaluation"] in ("training", "final")
+        if is_own and row["policy"] == "greedy" and row["speed"] == speed:
             outcomes[int(row["frames"])].append(row["outcome"])
     points = []
     for frames, names in sorted(outcomes.items()):
         share, low, high = outcome_shares(names)["success"]
         points.append((frames, low, share, high))
     return points
-
-
-def _read(path) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))

@@ -1,13 +1,16 @@
 """A run's folder: resolved config, metrics as CSV and TensorBoard, checkpoint, evaluation."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import yaml
 from torchrl.record.loggers import TensorboardLogger
 
-from flowrep.experiment.tables import add_columns, append_rows, is_whole, read_rows, write_rows
+from flowrep.experiment.evaluation import OUTCOMES
+from flowrep.experiment.folder_lock import folder_lock
+from flowrep.experiment.tables import TableError, append_rows, is_whole, read_rows, write_rows
 from flowrep.experiment.weights_and_biases import open_wandb
 
 EVALUATION_COLUMNS = (
@@ -16,6 +19,7 @@ EVALUATION_COLUMNS = (
     "flow",
     "seed",
     "frames",
+    "evaluation",
     "policy",
     "speed",
     "fps",
@@ -25,6 +29,15 @@ EVALUATION_COLUMNS = (
     "return",
     "length",
 )
+_EPISODE = ("scene", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
+"""The columns that tell which episode of which policy a row is of."""
+
+_NEEDED = ("scene", "representations", "flow", "algorithm", "seed", "total_frames", "num_envs")
+"""The keys without which a config is none."""
+
+
+class RunFolderError(ValueError):
+    """A folder is not what a run leaves, or holds one where none is wanted."""
 
 
 class RunFolder:
@@ -34,7 +47,8 @@ class RunFolder:
     config.yaml              the resolved config, enough to resume or evaluate
     metrics.csv              a row for each logged step; tensorboard/ and wandb/ hold the same
     checkpoint/              what a resumed run continues from
-    evaluation.csv           a row for each evaluated episode
+    evaluation.csv           a row for each evaluated episode; `evaluation` says whether it was run
+                             while training, at the end of it ("final"), or by flowrep.evaluate
     failures.csv             why episodes failed, by policy and speed
     videos/                  what the agent saw and did
     ```
@@ -51,14 +65,34 @@ class RunFolder:
         """Opens a folder that holds a run, and creates none.
 
         Raises:
-            FileNotFoundError: there is no run at `path`.
+            RunFolderError: there is no run at `path`.
         """
         if not (Path(path) / "config.yaml").is_file():
-            raise FileNotFoundError(
+            raise RunFolderError(
                 f"'{path}' holds no run: it has no config.yaml. Give the folder that a training "
                 "printed as its run folder"
             )
         return cls(path)
+
+    def check_is_new(self) -> None:
+        """Looks whether a run can begin here.
+
+        Raises:
+            RunFolderError: the folder holds one, or what is left of one.
+        """
+        config, checkpoint = self.path / "config.yaml", self.checkpoint_path
+        files = (config, self.metrics_path, self.evaluation_path, checkpoint)
+        found = [file for file in files if file.exists()]
+        if found:
+            how = f"continue it with resume={self.path}, or " if found[0] == config else ""
+            raise RunFolderError(
+                f"'{self.path}' holds a run already ({found[0].name}): {how}give the new one a "
+                "folder of its own by hydra.run.dir="
+            )
+
+    def held(self, doing: str) -> AbstractContextManager[None]:
+        """Holds the folder against other processes; see `folder_lock`."""
+        return folder_lock(self.path, doing)
 
     @property
     def checkpoint_path(self) -> Path:
@@ -85,16 +119,36 @@ class RunFolder:
         (self.path / "videos").mkdir(exist_ok=True)
         return self.path / "videos" / f"{name}.mp4"
 
-    def write_config(self, config: Mapping[str, Any]) -> None:
-        """Writes the resolved config."""
+    def write_config(self, config: Mapping[str, Any], overrides: Iterable[str] = ()) -> None:
+        """Writes the resolved config, and what was typed beside it, where Hydra has it."""
+        (self.path / ".hydra").mkdir(exist_ok=True)
+        typed = yaml.safe_dump(list(overrides), allow_unicode=True)
+        (self.path / ".hydra" / "overrides.yaml").write_text(typed, encoding="utf-8")
         text = yaml.safe_dump(dict(config), sort_keys=False)
         whole = self.path / "config.yaml.tmp"
         whole.write_text(text, encoding="utf-8")
         whole.replace(self.path / "config.yaml")
 
     def read_config(self) -> dict[str, Any]:
-        """Returns the resolved config that the run was started with."""
-        return yaml.safe_load((self.path / "config.yaml").read_text(encoding="utf-8"))
+        """Returns the resolved config that the run was started with.
+
+        Raises:
+            RunFolderError: the file is damaged; names what is missing.
+        """
+        path = self.path / "config.yaml"
+        remedy = "put back the file that the run was started with"
+        try:
+            config = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            reason = " ".join(str(error).split())
+            raise RunFolderError(f"{path} can't be read: {reason}; {remedy}") from error
+        if not isinstance(config, dict):
+            kind = "is empty" if config is None else f"holds a {type(config).__name__}"
+            raise RunFolderError(f"{path} {kind}, where a run's config should be; {remedy}")
+        missing = [key for key in _NEEDED if config.get(key) is None]
+        if missing:
+            raise RunFolderError(f"{path} has no {missing[0]}; {remedy}")
+        return config
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
         """Appends one row to metrics.csv and gives the same values to TensorBoard and wandb."""
@@ -115,27 +169,77 @@ class RunFolder:
 
     def forget_after(self, frames: int) -> None:
         """Drops what was logged after `frames`: a resumed run writes those rows again."""
-        for path in (self.metrics_path, self.evaluation_path):
-            rows = read_rows(path)
+        for path, rows, columns in (
+            (self.metrics_path, self.read_metrics(), None),
+            (self.evaluation_path, self.read_episodes(), EVALUATION_COLUMNS),
+        ):
             kept = [row for row in rows if int(row["frames"]) <= frames]
             if len(kept) < len(rows) or not is_whole(path):
-                write_rows(path, kept)
+                write_rows(path, kept, columns)
 
-    def is_evaluated(self, frames: int) -> bool:
-        """Says whether the evaluation that ends a run of so many frames is in evaluation.csv."""
-        return any(
-            row["policy"] == "sampled" and int(row["frames"]) == frames
+    def is_evaluated(self, frames: int, episodes: int) -> bool:
+        """Says whether the evaluation that ends a run is in evaluation.csv.
+
+        Args:
+            frames: that the run was trained for.
+            episodes: that this evaluation has, of all policies and speeds together.
+        """
+        final = [
+            row
             for row in self.read_episodes()
-        )
+            if row["evaluation"] == "final" and int(row["frames"]) == frames
+        ]
+        return len(final) >= episodes
+
+    def read_metrics(self) -> list[dict[str, str]]:
+        """Returns the rows of metrics.csv, none where there is no such file.
+
+        Raises:
+            TableError: the table was changed by something else.
+        """
+        rows = read_rows(self.metrics_path)
+        for number, row in enumerate(rows, start=2):
+            _check_cell(self.metrics_path, number, row, "frames", int)
+        return rows
 
     def read_episodes(self) -> list[dict[str, str]]:
-        """Returns the rows of evaluation.csv, none where there is no such file."""
-        return read_rows(self.evaluation_path)
+        """Returns the rows of evaluation.csv, none where there is no such file.
+
+        Raises:
+            TableError: the table was changed by something else, or is of another version.
+        """
+        path = self.evaluation_path
+        rows = read_rows(path, EVALUATION_COLUMNS)
+        for number, row in enumerate(rows, start=2):
+            for column, kind in (("frames", int), ("fps", float), ("episode_seed", int)):
+                _check_cell(path, number, row, column, kind)
+            _check_cell(path, number, row, "outcome", OUTCOMES.index)
+        return rows
 
     def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Appends evaluated episodes to evaluation.csv, first giving an older one its new columns.
+        """Adds evaluated episodes to evaluation.csv.
 
-        What an older table did not say stays empty.
+        An episode that is there already, of the same policy after as many frames, speed and frame
+        rate, is replaced in its place: evaluated again, it leaves the table as it was.
+
+        Raises:
+            TableError: as `read_episodes`; nothing is written then.
         """
-        add_columns(self.evaluation_path, EVALUATION_COLUMNS)
-        append_rows(self.evaluation_path, rows, EVALUATION_COLUMNS)
+        rows = [{name: str(row[name]) for name in EVALUATION_COLUMNS} for row in rows]
+        table = {
+            tuple(row[name] for name in _EPISODE): row for row in (*self.read_episodes(), *rows)
+        }
+        write_rows(self.evaluation_path, table.values(), EVALUATION_COLUMNS)
+
+
+def _check_cell(
+    path: Path, line: int, row: Mapping[str, str], column: str, read: Callable[[str], Any]
+) -> None:
+    try:
+        read(row[column])
+    except KeyError:
+        raise TableError(f"{path} has no column {column}; put back what was there") from None
+    except ValueError:
+        raise TableError(
+            f"{path}, line {line}: {column} can't be {row[column]!r}; mend or delete the line"
+        ) from None

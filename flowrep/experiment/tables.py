@@ -2,18 +2,61 @@
 
 import csv
 import io
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Returns a table's rows, none where there is no file; half a last line is left out."""
+class TableError(ValueError):
+    """A table is not what was written; the message says where, and what to do."""
+
+
+def read_rows(path: Path, columns: Sequence[str] | None = None) -> list[dict[str, str]]:
+    """Returns a table's rows, none where there is no file; half a last line is left out.
+
+    Args:
+        path: the table, as `append_rows` writes it.
+        columns: those that it has to have, and no other, in any order; None for any.
+
+    Raises:
+        TableError: it was changed by something else, such as a spreadsheet.
+    """
     if not path.is_file():
         return []
     data = path.read_bytes()
-    whole = data[: data.rfind(b"\n") + 1].decode("utf-8")
-    return list(csv.DictReader(io.StringIO(whole, newline="")))
+    try:
+        text = data[: data.rfind(b"\n") + 1].decode("utf-8-sig")
+        lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+        names = next(lines, None)
+        if names is None:
+            return []
+        _check_columns(path, names, columns)
+        rows = []
+        for cells in lines:
+            if len(cells) != len(names):
+                raise TableError(
+                    f"{path}, line {lines.line_num}: {len(cells)} cells in a table of "
+                    f"{len(names)} columns; mend or delete the line"
+                )
+            rows.append(dict(zip(names, cells)))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise TableError(f"{path} is no CSV table in UTF-8 ({error}); {_ASIDE}") from error
+    return rows
+
+
+_ASIDE = "move it aside, or export it again with commas"
+
+
+def _check_columns(path: Path, names: Sequence[str], columns: Sequence[str] | None) -> None:
+    if columns is None or sorted(names) == sorted(columns):
+        return
+    missing, unknown = set(columns) - set(names), set(names) - set(columns)
+    what = f"lacks the columns {', '.join(sorted(missing))}" if missing else ""
+    if unknown or not missing:
+        what += " and " if what else ""
+        what += f"has unexpected ones: {', '.join(sorted(unknown) or names)}"
+    raise TableError(f"{path} {what}. Perhaps another program or version wrote it; {_ASIDE}")
 
 
 def is_whole(path: Path) -> bool:
@@ -24,15 +67,23 @@ def is_whole(path: Path) -> bool:
 def write_rows(
     path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:
-    """Replaces a table as a whole; without rows, there is none."""
+    """Replaces a table as a whole; without rows, there is none.
+
+    Whatever happens on the way, the file is the old table or the new one.
+    """
     rows = list(rows)
     if not rows:
         path.unlink(missing_ok=True)
         return
     fresh = path.with_suffix(".tmp")
     fresh.unlink(missing_ok=True)
-    append_rows(fresh, rows, columns)
-    fresh.replace(path)
+    try:
+        append_rows(fresh, rows, columns)
+        with fresh.open("rb") as file:
+            os.fsync(file.fileno())
+        fresh.replace(path)
+    finally:
+        fresh.unlink(missing_ok=True)
 
 
 def append_rows(
@@ -52,7 +103,7 @@ def append_rows(
     if is_new:
         names = list(columns or rows[0])
     else:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             names = next(csv.reader(file))
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, names)
@@ -64,13 +115,3 @@ def append_rows(
         written = raw.write(data)
         while written < len(data):  # a disk that is nearly full takes a part, then says so
             written += raw.write(data[written:])
-
-
-def add_columns(path: Path, columns: Sequence[str]) -> None:
-    """Rewrites a table that lacks some of the columns with all of them, in their order.
-
-    What the older table did not say stays empty.
-    """
-    rows = read_rows(path)
-    if rows and not set(columns) <= set(rows[0]):
-        write_rows(path, [dict.fromkeys(columns, "") | row for row in rows], columns)

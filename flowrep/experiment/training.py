@@ -17,6 +17,7 @@ from flowrep.envs import begin_step, get_states, has_cores_beside, set_states
 from flowrep.experiment.cadence import Every
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.interruption import StopRequest
+from flowrep.experiment.origin import check_origin
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.stopwatch import Stopwatch
 
@@ -31,11 +32,13 @@ class Training:
         env: batched TorchRL env.
         agent: the algorithm, with what it remembers.
         run: the folder that the run writes to.
+        origin: what its checkpoints belong to, see `origin_of`.
     """
 
     env: EnvBase
     agent: Algorithm
     run: RunFolder
+    origin: Mapping[str, Any]
     frames: int = 0
     owes_evaluation: bool = False
     carried: TensorDictBase | None = None
@@ -46,11 +49,13 @@ class Training:
         """Returns all that the rest of the run depends on, as nested plain data and tensors."""
         assert self.carried is not None
         return {
+            "origin": self.origin,
             "frames": self.frames,
             "owes_evaluation": self.owes_evaluation,
             "metrics": self.metrics,
             "recent": list(self.recent),
             "carried": self.carried.to_dict(),
+            "policy": dict(self.agent.policy.state_dict()),
             "agent": self.agent.state_dict(),
             "memory": self.agent.memory.state_dict(),
             "env": get_states(self.env),
@@ -62,7 +67,7 @@ class Training:
         """Continues where `state` was taken."""
         self.env.reset()
         self.frames, self.metrics = state["frames"], state["metrics"]
-        self.owes_evaluation = state.get("owes_evaluation", False)  # older runs don't say
+        self.owes_evaluation = state["owes_evaluation"]
         self.recent.extend(state["recent"])
         self.carried = TensorDict(state["carried"], self.env.batch_size, device=self.env.device)
         self.agent.load_state_dict(state["agent"])
@@ -95,8 +100,14 @@ class Training:
             raise DivergenceError(f"{error}; {good}") from error
 
     def load(self) -> None:
-        """Continues from the checkpoint, and forgets what was logged after it."""
-        self.restore(load_checkpoint(self.run.checkpoint_path))
+        """Continues from the checkpoint, and forgets what was logged after it.
+
+        Raises:
+            CheckpointError: it can't be read, or belongs to another run.
+        """
+        path = self.run.checkpoint_path
+        check_origin(load_checkpoint(path, ["origin"])["origin"], self.origin, path)
+        self.restore(load_checkpoint(path))
         self.run.forget_after(self.frames)
 
 

@@ -71,6 +71,7 @@ def make_any(request, observation_spec):
         settings |= {name: value for name, value in changes.items() if name in settings}
         return algorithm(spec, action_spec, list(keys), **settings)
 
+    make.options = options | small
     return make
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from torchrl.data import OneHot
+from torchrl.data import Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.agent import DivergenceError, load_checkpoint, save_checkpoint
@@ -149,3 +149,40 @@ def test_a_state_of_other_maps_is_refused_by_name(make_any):
     saved = make_any(keys=["flow"]).state_dict()
     with pytest.raises(ValueError, match=r"does not fit this one in \d+ weights, first .* here, "):
         make_any(keys=["flow", "seg"]).load_state_dict(saved)
+
+
+@pytest.mark.parametrize("changes", [{}, {"layer_norm": True}], ids=["as is", "layer norm"])
+def test_a_policy_is_built_and_loaded_without_its_learner(
+    make_any, observation_spec, random_steps, random_maps, tmp_path, changes
+):
+    """Of one environment, too, where a rollout would be less than a batch of PPO's."""
+    agent = make_any(**changes)
+    learn(agent, random_steps, 12)
+    save_checkpoint(tmp_path / "c", {"policy": dict(agent.policy.state_dict())})
+    options = make_any.options | {"total_frames": 1000}
+    options |= {name: value for name, value in changes.items() if name in options}
+    policy = type(agent).build_policy(
+        observation_spec[:1], Categorical(3), ["flow", "seg"], device="cpu", **options
+    )
+    maps = random_maps(20)
+    with torch.no_grad():
+        expected = agent.policy.get_dist(maps.clone()).probs
+        assert not torch.equal(policy.get_dist(maps.clone()).probs, expected)
+        policy.load_state_dict(load_checkpoint(tmp_path / "c")["policy"])
+        assert torch.equal(policy.get_dist(maps.clone()).probs, expected)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            greedy = agent.policy(maps.clone())["action"]
+            assert torch.equal(policy(maps.clone())["action"], greedy)
+        assert torch.equal(expected.argmax(-1), greedy)
+
+
+def test_actions_are_drawn_as_the_distribution_says(make_any, random_steps, random_maps):
+    agent = make_any()
+    learn(agent, random_steps, 12)
+    maps = random_maps(1)
+    with torch.no_grad():
+        expected = agent.policy.get_dist(maps.clone()).probs[0]
+        drawn = agent.policy(maps.expand(3000).contiguous())["action"]
+    # three standard deviations of a share are 0.027
+    shares = torch.bincount(drawn, minlength=3) / 3000
+    torch.testing.assert_close(shares, expected, atol=0.03, rtol=0)

@@ -4,6 +4,7 @@ import resource
 import signal
 import subprocess
 import sys
+import zlib
 
 import pytest
 import torch
@@ -99,37 +100,76 @@ def foreign(path):
     save_file({"a": torch.ones(2)}, path)
 
 
-def broken_document(path):
-    metadata = {"format": "flowrep checkpoint 2", "state": '{"dict": {"a": {"tensor": "b"}}}'}
+def document(state):
+    """Writes a file whose document is what it should not be, under a checksum that is right."""
+
+    def damage(path):
+        checksum = str(zlib.crc32(state.encode()))
+        metadata = {"format": "flowrep checkpoint 3", "state": state, "state_crc32": checksum}
+        save_file({"a": torch.ones(2)}, path, metadata=metadata)
+
+    return damage
+
+
+def of_another_version(path):
+    metadata = {"format": "flowrep checkpoint 2", "state": '{"dict": {}}'}
     save_file({"a": torch.ones(2)}, path, metadata=metadata)
 
 
-def strange_document(path):
-    metadata = {"format": "flowrep checkpoint 2", "state": '{"x": 1, "y": 2}'}
-    save_file({"a": torch.ones(2)}, path, metadata=metadata)
+DAMAGES = {
+    "truncated": truncated,
+    "empty": empty,
+    "pickle": a_pickle,
+    "torch file": a_torch_file,
+    "header of terabytes": a_header_of_terabytes,
+    "foreign": foreign,
+    "other version": of_another_version,
+    "no such tensor": document('{"dict": {"a": {"tensor": "b", "crc32": 0}}}'),
+    "strange": document('{"x": 1, "y": 2}'),
+    "deep": document("[" * 100_000),
+    "list": document("[1]"),
+}
 
 
-def deep_document(path):
-    metadata = {"format": "flowrep checkpoint 2", "state": "[" * 100_000}
-    save_file({"a": torch.ones(2)}, path, metadata=metadata)
-
-
-def a_list(path):
-    save_file({}, path, metadata={"format": "flowrep checkpoint 2", "state": "[1]"})
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        truncated, empty, a_pickle, a_torch_file, a_header_of_terabytes, foreign, broken_document,
-        strange_document, deep_document, a_list,
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES.keys())
 def test_a_file_that_is_no_checkpoint_is_named_with_a_way_out(tmp_path, damage):
     path = tmp_path / "c.safetensors"
     damage(path)
     with pytest.raises(CheckpointError, match=r"c\.safetensors.* start the run anew"):
         load_checkpoint(path)
+
+
+STATE = {"weights": {"w": torch.arange(6.0).reshape(2, 3)}, "flags": torch.ones(3, dtype=bool)}
+
+
+@pytest.mark.parametrize("what", [b"\x00\x00\x80\x3f", b'"shape":[2,3]', b'"frames', b"crc32"])
+def test_a_byte_that_was_changed_is_noticed(tmp_path, what):
+    """A weight, the shape of it, a plain value, a checksum: each in the file's own spelling."""
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, STATE | {"frames": 1234})
+    data = path.read_bytes()
+    assert data.count(what) >= 1
+    replacement = {b'"shape":[2,3]': b'"shape":[3,2]', b'"frames': b'"framez'}.get(
+        what, what[:-1] + b"@"
+    )
+    path.write_bytes(data.replace(what, replacement, 1))
+    with pytest.raises(CheckpointError, match=r"c\.safetensors is not a readable checkpoint"):
+        load_checkpoint(path)
+
+
+def test_parts_are_read_alone_and_checked_alone(tmp_path):
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, STATE | {"frames": 1234})
+    assert same(
+        load_checkpoint(path, ["frames", "flags"]), {"frames": 1234, "flags": STATE["flags"]}
+    )
+    with pytest.raises(CheckpointError, match="'policy'"):
+        load_checkpoint(path, ["policy"])
+    data = path.read_bytes()
+    path.write_bytes(data.replace(torch.tensor(5.0).numpy().tobytes(), b"\0\0\0\0"))
+    assert load_checkpoint(path, ["frames"]) == {"frames": 1234}
+    with pytest.raises(CheckpointError, match="/weights/w is not as it was written"):
+        load_checkpoint(path, ["weights"])
 
 
 def test_a_missing_checkpoint_is_named(tmp_path):

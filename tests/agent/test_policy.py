@@ -36,7 +36,7 @@ def test_deterministic_exploration_takes_the_likeliest_action(make_agent, random
 
 def test_otherwise_actions_are_drawn_from_the_policy(make_agent, random_maps):
     agent, maps = make_agent(), random_maps(1)
-    agent.policy[0].module.head.output.bias.data = torch.tensor([0.0, 1.0, -1.0])
+    agent.policy[0].module.network.head.output.bias.data = torch.tensor([0.0, 1.0, -1.0])
     expected = probabilities(agent, maps)[0]
     actions = acting(agent, maps.expand(3000).contiguous())
     shares = torch.bincount(actions, minlength=3) / 3000

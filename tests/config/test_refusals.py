@@ -306,15 +306,15 @@ def test_a_look_that_can_not_be_is_refused(line, expected):
     assert refusal("view", ViewConfig, line) == expected
 
 
-def test_a_run_of_before_there_was_an_option_is_still_one():
+def test_what_is_wrong_in_a_run_folder_is_named_with_the_file():
     config = plain("train")
-    for key in ("n_steps", "layer_norm", "alpha_rate_factor"):
-        del config["algorithm"][key]
-    for key in ("renderer", "wandb"):
-        del config[key]
-    assert validated_run(config, "config.yaml") == config | {"renderer": "pybullet", "wandb": "off"}
+    assert validated_run(config, "config.yaml") == config
     config["algorithm"]["n_steps"] = 0
     with pytest.raises(UsageError, match=r"^config.yaml: algorithm.n_steps should be a positive"):
+        validated_run(config, "config.yaml")
+    config = plain("train")
+    del config["renderer"]
+    with pytest.raises(UsageError, match=r"^config.yaml: 'renderer' needs a value"):
         validated_run(config, "config.yaml")
 
 

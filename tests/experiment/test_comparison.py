@@ -63,9 +63,10 @@ def test_rows_have_the_columns_of_evaluation_csv(rows):
     config = {
         "scene": {"name": "straight_road"},
         "representations": {"ego": {}, "obj": {}},
+        "flow": {"source": "exact"},
         "seed": 4,
     }
-    (row, *_) = with_origin(rows, config, frames=100)
+    (row, *_) = with_origin(rows, config, frames=100, evaluation="final")
     assert set(row) == set(EVALUATION_COLUMNS)
     assert row["representations"] == "ego+obj"
 

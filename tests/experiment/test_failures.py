@@ -5,7 +5,7 @@ import csv
 import pytest
 from rich.console import Console
 
-from flowrep.experiment.failures import cause_of, failure_causes, print_failures, write_failures
+from flowrep.experiment.failures import failure_causes, print_failures, write_failures
 
 ENDS = [
     ("success", ""),
@@ -43,15 +43,6 @@ def test_policies_are_told_apart_and_no_failure_has_no_shares():
     assert (planner["failures"], planner["timeout"]) == (0, "")
 
 
-def test_a_collision_of_which_an_older_table_says_no_more_is_unrecorded():
-    assert cause_of("collision", "") == "collision: unrecorded"
-    (line,) = failure_causes(rows(ends=[("collision", ""), ("collision", "car")]))
-    assert (line["collision: unrecorded"], line["collision: other"]) == (50.0, 50.0)
-    console = Console(record=True, width=140)
-    print_failures(rows(ends=[("collision", "")]), console)
-    assert "unrecorded" in console.export_text()
-
-
 def test_an_agent_is_not_mixed_with_what_it_was_earlier_in_training():
     early = [row | {"frames": 1000} for row in rows(ends=[("out_of_bounds", "")] * 4)]
     late = [row | {"frames": 9000} for row in rows(ends=[("collision", "pedestrian")] * 2)]
@@ -66,7 +57,6 @@ def test_the_table_is_printed_and_replaced(tmp_path):
     text = console.export_text()
     assert "8 of 10" in text
     assert "pedestrian" in text
-    assert "unrecorded" not in text
     path = tmp_path / "failures.csv"
     write_failures(path, rows() + rows("random"))
     write_failures(path, rows())
@@ -78,9 +68,8 @@ def test_the_table_is_printed_and_replaced(tmp_path):
 
 def test_nothing_of_the_table_is_cut_off_where_little_fits():
     console = Console(record=True, width=100)
-    ends = [*ENDS, ("collision", "")]
-    print_failures(rows("never_turn", ends) + rows("sampled", ends), console)
+    print_failures(rows("never_turn") + rows("sampled"), console)
     text = console.export_text()
     assert "…" not in text
-    for word in ("never_turn", "bounds", "pedestrian", "unrecorded", "timeout", "9 of 11"):
+    for word in ("never_turn", "bounds", "pedestrian", "timeout", "8 of 10"):
         assert word in text

@@ -2,8 +2,18 @@ import csv
 
 import pytest
 
-from flowrep.experiment.run_folder import EVALUATION_COLUMNS, RunFolder
-from flowrep.experiment.tables import append_rows
+from flowrep.experiment.run_folder import EVALUATION_COLUMNS, RunFolder, RunFolderError
+from flowrep.experiment.tables import TableError, append_rows
+
+CONFIG = {
+    "scene": {"camera": {"height_px": 48}},
+    "representations": {"ego": None},
+    "flow": {"source": "exact"},
+    "algorithm": {"gamma": 0.5},
+    "seed": 3,
+    "num_envs": 2,
+    "total_frames": 10,
+}
 
 
 def rows_of(path):
@@ -40,24 +50,124 @@ def test_a_column_that_the_table_lacks_is_refused(tmp_path):
 
 
 def test_config_comes_back_as_written(tmp_path):
-    config = {"scene": {"camera": {"height_px": 48}}, "representations": {"ego": None}, "seed": 3}
     run = RunFolder(tmp_path)
-    run.write_config(config)
-    assert RunFolder.existing(tmp_path).read_config() == config
+    run.write_config(CONFIG, ["seed=3"])
+    assert RunFolder.existing(tmp_path).read_config() == CONFIG
+    assert (tmp_path / ".hydra" / "overrides.yaml").read_text() == "- seed=3\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "is empty"),
+        ("- 1\n- 2\n", "holds a list"),
+        ("seed: [1", "can't be read"),
+        ("\x00", "can't be read"),
+        ("seed: 0\nscene: {name: s}\n", "has no representations"),
+        ("seed:\n", "has no scene"),
+    ],
+    ids=["empty", "list", "half", "binary", "a key is missing", "a value is missing"],
+)
+def test_a_damaged_config_is_named(tmp_path, text, says):
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(RunFolderError, match=rf"config\.yaml {says}.*; put back the file"):
+        RunFolder.existing(tmp_path).read_config()
 
 
 def test_a_folder_without_a_run_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="holds no run"):
+    with pytest.raises(RunFolderError, match="holds no run"):
         RunFolder.existing(tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
 
 
-def test_an_older_table_of_episodes_gains_the_columns_it_lacks(tmp_path):
+def episode(seed, outcome="collision", **changes):
+    row = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"outcome": outcome, "episode_seed": str(seed)}
+    return row | changes
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "evaluation.csv"])
+def test_a_folder_that_holds_a_run_is_no_place_for_a_new_one(tmp_path, name):
     run = RunFolder(tmp_path)
-    new = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"outcome": "collision", "hit": "car"}
-    old = {name: value for name, value in new.items() if name != "hit"}
-    append_rows(run.evaluation_path, [old])
-    run.log_episodes([new])
-    assert run.read_episodes() == [old | {"hit": ""}, new]
-    with run.evaluation_path.open(newline="") as file:
-        assert tuple(next(csv.reader(file))) == EVALUATION_COLUMNS
+    run.check_is_new()
+    (tmp_path / name).write_text("something")
+    with pytest.raises(RunFolderError, match=rf"holds a run already \({name}\).*hydra.run.dir="):
+        run.check_is_new()
+
+
+def test_a_folder_with_a_config_is_to_be_resumed(tmp_path):
+    RunFolder(tmp_path).write_config(CONFIG)
+    with pytest.raises(RunFolderError, match=f"continue it with resume={tmp_path}"):
+        RunFolder(tmp_path).check_is_new()
+
+
+def test_an_episode_that_is_evaluated_again_takes_its_place(tmp_path):
+    run = RunFolder(tmp_path)
+    run.log_episodes([episode(7), episode(8), episode(9)])
+    before = run.evaluation_path.read_bytes()
+    run.log_episodes([episode(8), episode(9)])
+    assert run.evaluation_path.read_bytes() == before
+    run.log_episodes([episode(8, "timeout"), episode(8, evaluation="final")])
+    assert [(row["episode_seed"], row["outcome"]) for row in run.read_episodes()] == [
+        ("7", "collision"), ("8", "timeout"), ("9", "collision"), ("8", "collision"),
+    ]  # fmt: skip
+
+
+def test_a_run_is_evaluated_by_its_own_final_evaluation_alone(tmp_path):
+    run = RunFolder(tmp_path)
+    asked = [episode(i, frames="100", evaluation="evaluate", policy="sampled") for i in range(5)]
+    run.log_episodes(asked)
+    assert not run.is_evaluated(100, 2)
+    run.log_episodes([episode(1, frames="100", evaluation="final")])
+    assert not run.is_evaluated(100, 2)
+    run.log_episodes([episode(2, frames="100", evaluation="final")])
+    assert run.is_evaluated(100, 2)
+    assert not run.is_evaluated(90, 2)
+
+
+HEADER = ",".join(EVALUATION_COLUMNS)
+ROW = ",".join(episode(1).values())
+DAMAGED = {
+    "semicolons": (f"{HEADER}\n{ROW}\n".replace(",", ";"), "lacks the columns"),
+    "another column": (f"{HEADER},note\n{ROW},mine\n", "has unexpected ones: note"),
+    "a column less": (f"{HEADER.replace(',hit', '')}\n", "lacks the columns hit"),
+    "of before the column": (f"{HEADER.replace(',evaluation', '')}\n", "lacks.* evaluation"),
+    "a short row": (f"{HEADER}\n{ROW}\n{ROW.rpartition(',')[0]}\n", "line 3: 13 cells"),
+    "no number": (f"{HEADER}\n{ROW.replace('1', 'x', 1).replace(',1', ',x')}\n", "frames can't"),
+    "no outcome": (f"{HEADER}\n{ROW.replace('collision', 'crash')}\n", "outcome can't be 'crash'"),
+    "binary": ("\udcff\n", "no CSV table"),
+}
+
+
+@pytest.mark.parametrize(("text", "says"), DAMAGED.values(), ids=DAMAGED.keys())
+def test_a_damaged_table_is_refused_and_stays_as_it_is(tmp_path, text, says):
+    run = RunFolder(tmp_path)
+    run.evaluation_path.write_text(text, errors="surrogateescape")
+    before = run.evaluation_path.read_bytes()
+    for touch in (run.read_episodes, lambda: run.log_episodes([episode(5)])):
+        with pytest.raises(TableError, match=rf"evaluation\.csv.*{says}"):
+            touch()
+    with pytest.raises(TableError):
+        run.forget_after(0)
+    assert run.evaluation_path.read_bytes() == before
+
+
+@pytest.mark.parametrize("text", ["\ufeff" + f"{HEADER}\n{ROW}\n", f"{HEADER}\n{ROW}\n{ROW[:9]}"])
+def test_a_mark_at_its_beginning_and_half_a_line_at_its_end_are_no_damage(tmp_path, text):
+    run = RunFolder(tmp_path)
+    run.evaluation_path.write_text(text)
+    run.log_episodes([episode(5)])
+    assert run.read_episodes() == [episode(1), episode(5)]
+
+
+def test_a_table_that_can_not_be_replaced_stays(tmp_path, monkeypatch):
+    run = RunFolder(tmp_path)
+    run.log_episodes([episode(1)])
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("flowrep.experiment.tables.os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        run.log_episodes([episode(2)])
+    assert run.read_episodes() == [episode(1)]
+    assert [path.name for path in tmp_path.iterdir()] == ["evaluation.csv"]

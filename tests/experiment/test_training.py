@@ -155,18 +155,6 @@ def test_an_evaluation_that_was_cut_short_is_made_up_for_on_the_same_frames(tmp_
     assert asked == [30, 60, 60, 90, 120]
 
 
-def test_a_run_of_before_evaluations_were_owed_goes_on(tmp_path):
-    training, config = new_run(tmp_path / "older")
-    train(training, config, StopAfter(training, 20), lambda frames: False)
-    state = training.state()
-    training.env.close()
-    del state["owes_evaluation"]
-    resumed, _ = new_run(tmp_path / "newer")
-    resumed.restore(state)
-    resumed.env.close()
-    assert (resumed.frames, resumed.owes_evaluation) == (training.frames, False)
-
-
 def test_the_loop_updates_once_for_ten_frames_after_the_first_batch(tmp_path):
     training = finish(tmp_path)
     assert training.agent.updates == (120 - 16) // 10

@@ -1,0 +1,62 @@
+"""One process at a time works in a run's folder."""
+
+import errno
+import fcntl
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of some network file systems
+
+
+class FolderInUseError(OSError):
+    """Another process works in the folder; the message says which."""
+
+
+@contextmanager
+def folder_lock(folder: Path, doing: str) -> Iterator[None]:
+    """Holds a folder, so that no other process that asks for it gets it meanwhile.
+
+    The lock lies with the process: however it ends, the folder is free again.
+
+    Args:
+        folder: exists; `.lock` in it is made and kept.
+        doing: what is done in it, for those who are refused, e.g. "training".
+
+    Raises:
+        FolderInUseError: another process holds the folder; says which, where and since when.
+    """
+    with (folder / ".lock").open("a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FolderInUseError(
+                f"'{folder}' is in use: {_holder(file.name)}. Wait until it has ended, or stop it"
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            print(f"warning: no locks on the disk of '{folder}' ({error})", file=sys.stderr)
+        file.truncate(0)
+        now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+        holder = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
+        json.dump(holder, file)
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)
+
+
+def _holder(lock: str) -> str:
+    """Returns in words who wrote into a lock file."""
+    try:
+        holder = json.loads(Path(lock).read_text(encoding="utf-8"))
+        return "process {pid} on {host} has been {doing} in it since {since}".format(**holder)
+    except (ValueError, KeyError, TypeError):  # it has begun, and not yet written who it is
+        return "another process has just begun in it"

@@ -1,0 +1,63 @@
+"""What a checkpoint belongs to, so that it is not taken for another run's."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from flowrep import __version__
+from flowrep.agent import CheckpointError
+
+_IDENTITY = (
+    "scene",
+    "representations",
+    "flow",
+    "algorithm",
+    "speed",
+    "seed",
+    "num_envs",
+    "total_frames",
+)
+"""The parts of a config that its weights are a function of."""
+
+_ABSENT = "absent"
+
+
+def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what a run's checkpoint belongs to: this version, and what the run is defined by."""
+    parts = {key: config[key] for key in _IDENTITY}
+    return {"flowrep": __version__} | json.loads(json.dumps(parts))
+
+
+def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
+    """Refuses a checkpoint that belongs to something else.
+
+    Args:
+        saved: the origin that the checkpoint carries.
+        expected: that of the config which it lies beside.
+        path: the checkpoint, for the message.
+
+    Raises:
+        CheckpointError: naming the first difference.
+    """
+    if saved.get("flowrep") != expected["flowrep"]:
+        raise CheckpointError(
+            f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
+            "install that version, or start the run anew"
+        )
+    for place, there, here in _differences(saved, expected):
+        raise CheckpointError(
+            f"{path} belongs to a run with {place}={there}, the config.yaml of its folder says "
+            f"{place}={here}: put back the file that was there, or start a run of its own"
+        )
+
+
+def _differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yields the dotted key of each difference with the two values."""
+    if not (isinstance(saved, Mapping) and isinstance(expected, Mapping)):
+        if saved != expected:
+            yield place, saved, expected
+        return
+    for key in dict.fromkeys([*saved, *expected]):
+        there, here = saved.get(key, _ABSENT), expected.get(key, _ABSENT)
+        yield from _differences(there, here, f"{place}.{key}" if place else key)
