@@ -27,7 +27,7 @@ def test_the_same_run_on_another_machine_is_the_same(config):
     [
         ("scene.camera.fov_deg", 60.0, r"scene.camera.fov_deg=90.0, the config.yaml .*=60.0"),
         ("scene.name", "s_turn", "scene.name=straight_road, "),
-        ("representations.ego.scale", 1.0, "representations.ego.scale=0.125"),
+        ("representations.ego.scale", 0.3, "representations.ego.scale=.* says .*=0.3"),
         ("representations.seg", {}, "representations.seg=absent"),
         ("algorithm.gamma", 0.5, "algorithm.gamma=0.99"),
         ("seed", 1, "seed=0"),
