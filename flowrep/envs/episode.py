@@ -24,6 +24,7 @@ from flowrep.envs.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll
 Array = NDArray[Any]
 # Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't pass anyone by.
 _CHECKS_HZ = 24.0
+_STEPS_FORESEEN = 16  # people do not mind the vehicle: where they will be is computed at one go
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,7 @@ class Rules:
         self.dt_s = 1.0 / frame_rate_hz
         self.ticks_a_step = math.ceil(_CHECKS_HZ / frame_rate_hz - 1e-9)
         self.tick_s = self.dt_s / self.ticks_a_step
-        self.tick_numbers = np.arange(1, self.ticks_a_step + 1)
-        self.tick_times_s = (self.tick_numbers * self.tick_s).tolist()
+        self.tick_times_s = [(1 + i) * self.tick_s for i in range(self.ticks_a_step)]
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
         self.is_calm = CalmGround(layout)
 
@@ -84,6 +84,10 @@ class Episode:
         self.outcome = Outcome.RUNNING
         self.hit = ""
         self.poses = self.poses_before = self.crowd.poses(0.0)
+        self._foreseen = np.empty(
+            (0, len(self.crowd), 4)
+        )  # poses at the ticks from the next one on
+        self._foreseen_from = 0
 
     def resume(self, before: Moment, now: Moment) -> None:
         """Goes to a later step: where the vehicle was, where it is, and everyone else with it."""
@@ -97,8 +101,7 @@ class Episode:
         rules = self.rules
         turned = turn(self.now.vehicle, YAW_SIGN[action], rules.dt_s, rules.layout.scene.vehicle)
         track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in rules.tick_times_s]
-        ticks = self.now.ticks + rules.tick_numbers
-        poses = self.crowd.poses(ticks[:, None] * rules.tick_s)  # [T, P, 4]
+        poses = self._poses_ahead()
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
             if is_near[i] or not rules.is_calm(vehicle.x_m, vehicle.y_m):
@@ -110,6 +113,16 @@ class Episode:
         self.steps += 1
         if not self.outcome and self.steps >= rules.limit_steps:
             self.outcome = Outcome.TIMEOUT
+
+    def _poses_ahead(self) -> Array:
+        """Returns where everyone is at the checks of the step to come, poses [T, P, 4]."""
+        count, first = self.rules.ticks_a_step, self.now.ticks + 1
+        at = first - self._foreseen_from
+        if not 0 <= at <= len(self._foreseen) - count:
+            ticks = first + np.arange(count * _STEPS_FORESEEN)
+            self._foreseen = self.crowd.poses(ticks[:, None] * self.rules.tick_s)
+            self._foreseen_from, at = first, 0
+        return self._foreseen[at : at + count]
 
     def _judge(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
         self.hit = street.hit(vehicle, poses)

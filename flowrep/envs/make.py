@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import VectorEnv
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
@@ -17,6 +17,7 @@ from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.sensor_observation import SensorObservation
 from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.street_vector import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
 from flowrep.simulator.renderer import choose_renderer
 from flowrep.transforms import representation_stack
@@ -115,9 +116,9 @@ def make_env(
     factories = [partial(_sensed, street, sensors)] * num_envs
     vector: VectorEnv
     if num_workers:
-        vector = WorkerVectorEnv(factories, num_workers)
+        vector = WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)
     else:
-        vector = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
+        vector = StreetVectorEnv(factories)
     base = VectorWrapper(vector, device=torch.device(device), categorical_action_encoding=True)
     env = TransformedEnv(base, transforms)
     if seed is not None:

@@ -1,6 +1,6 @@
-"""What the street's camera observes: maps from one picture, motion from two poses."""
+"""What the street's camera observes: maps of what it sees, motion from two poses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,9 @@ from flowrep.envs.simulator import Picture
 from flowrep.envs.street import Street
 from flowrep.palette import CLASS_COLOURS, num_classes
 from flowrep.simulator.renderer import choose_renderer
-from flowrep.simulator.triangles import gather
 
+Array = NDArray[Any]
+Arrays = dict[str, Array]
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb")
 _MAPS = frozenset({"depth", "semantic", "instance"})
 _MOTIONS = frozenset({"prev_from_curr", "instance_motion"})
@@ -48,39 +49,30 @@ class Sensing:
         self._vehicle_from_cam = vehicle_from_camera(camera)
         self._class_of_body = street.simulator.class_lookup()
         self._instance_of_body = street.simulator.instance_lookup()
-        self._rasterise: Any = None
+        self._rasterise: Callable[..., Any] | None = None
         if not _MAPS.isdisjoint(sensors) and choose_renderer(renderer) == "rasteriser":
             from flowrep.simulator.rasteriser import Rasteriser
 
             range_m = camera.near_m, camera.far_m
-            self._rasterise = Rasteriser(gather(street.bodies), self.K, size, range_m)
+            self._rasterise = Rasteriser(street.triangles, self.K, size, range_m)
         self._picture: Picture | None = None
-        self._latest_parts: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
-        self._camera_poses: dict[Moment, CameraPose] = {}
 
     def observe(self, episode: Episode) -> dict[str, Any]:
         """Returns the observation of an episode's present; nothing is rendered for no map."""
-        self._picture = None
-        observation: dict[str, Any] = {}
-        if not _MAPS.isdisjoint(self.names):
-            draw = self._add_pictured_maps if self._rasterise is None else self._add_maps
-            draw(observation, episode)
-        if "rgb" in self.names:
-            rgb = self._rgb(self._seen(episode))
-            observation["rgb"] = np.ascontiguousarray(rgb.transpose(2, 0, 1))
-        if not _MOTIONS.isdisjoint(self.names):
-            self._add_motion(observation, episode)
-        return {name: observation[name] for name in self.names}
+        return {name: stack[0] for name, stack in observe_together([self], [episode]).items()}
 
     def rgb(self, episode: Episode) -> NDArray[np.uint8]:
         """Returns the colour picture [H, W, 3] of an episode's present, last observed."""
-        return self._rgb(self._seen(episode))
+        picture = self._seen(episode)
+        rgb = picture.rgba[..., :3].copy()
+        rgb[picture.body < 0] = CLASS_COLOURS["sky"]
+        return rgb
 
     def look(self, episode: Episode) -> Picture:
         """Returns a picture of an episode's present, with everyone where they were last put."""
-        camera, view = self._camera, gl_view(self._camera_pose(episode.now).cam_from_world)
+        camera, pose = self._camera, self._camera_poses([episode.now])
         return self._street.simulator.look(
-            view, self._projection, camera.height_px, camera.width_px
+            gl_view(pose.cam_from_world[0]), self._projection, camera.height_px, camera.width_px
         )
 
     def space(self) -> spaces.Dict:
@@ -104,52 +96,63 @@ class Sensing:
             self._picture = self.look(episode)
         return self._picture
 
-    def _camera_pose(self, moment: Moment) -> CameraPose:
-        # The poses of this step and of the one before are at hand.
-        if moment not in self._camera_poses:
-            x_m, y_m, yaw_rad, _ = moment.vehicle
-            if len(self._camera_poses) > 1:
-                self._camera_poses.pop(next(iter(self._camera_poses)))
-            self._camera_poses[moment] = CameraPose(x_m, y_m, yaw_rad, self._vehicle_from_cam)
-        return self._camera_poses[moment]
+    def _camera_poses(self, moments: Sequence[Moment]) -> CameraPose:
+        x_m, y_m, yaw_rad, _ = np.array([moment.vehicle for moment in moments]).T
+        return CameraPose(x_m, y_m, yaw_rad, self._vehicle_from_cam)
 
-    def _parts(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        # This step's poses are, as the very same array, the next one's poses of before.
-        for known, parts in self._latest_parts:
-            if known is poses:
-                return parts
-        parts = world_from_parts(poses)
-        self._latest_parts = [*self._latest_parts[-1:], (poses, parts)]
-        return parts
-
-    def _add_maps(self, observation: dict[str, Any], episode: Episode) -> None:
-        cam_from_world = self._camera_pose(episode.now).cam_from_world
-        views = cam_from_world, self._parts(episode.poses), self._street.is_shown
-        observation.update(self._rasterise(*(array[None] for array in views))._asdict())
-
-    def _add_pictured_maps(self, observation: dict[str, Any], episode: Episode) -> None:
+    def _pictured(self, episode: Episode) -> Arrays:
         picture = self._seen(episode)
+        maps: Arrays = {}
         body = picture.body.astype(np.intp)  # what take() wants
         if "depth" in self.names:
             depth = depth_from_zbuffer(picture.zbuffer, self._camera.near_m, self._camera.far_m)
             np.putmask(depth, body < 0, np.inf)
-            observation["depth"] = depth[None]
+            maps["depth"] = depth[None]
         if "semantic" in self.names:
-            observation["semantic"] = self._class_of_body.take(body)[None]
+            maps["semantic"] = self._class_of_body.take(body)[None]
         if "instance" in self.names:
-            observation["instance"] = self._instance_of_body.take(body)[None]
+            maps["instance"] = self._instance_of_body.take(body)[None]
+        return maps
 
-    def _rgb(self, picture: Picture) -> NDArray[np.uint8]:
-        rgb = picture.rgba[..., :3].copy()
-        rgb[picture.body < 0] = CLASS_COLOURS["sky"]
-        return rgb
 
-    def _add_motion(self, observation: dict[str, Any], episode: Episode) -> None:
-        before, now = self._camera_pose(episode.before), self._camera_pose(episode.now)
-        if "instance_motion" in self.names:
-            parts = [self._parts(poses) for poses in (episode.poses_before, episode.poses)]
-            rows = instance_motion(before, now, *parts)
-            observation["instance_motion"] = rows.astype(np.float32)
-            observation["prev_from_curr"] = observation["instance_motion"][0].copy()
+def observe_together(sensings: Sequence[Sensing], episodes: Sequence[Episode]) -> Arrays:
+    """Returns the observations of the presents of N episodes on streets of one scene, [N, ...].
+
+    Each is what its street observes alone, to the last bit.
+    """
+    for sensing in sensings:
+        sensing._picture = None
+    first = sensings[0]
+    observation: Arrays = {}
+    names = frozenset(first.names)
+    now = first._camera_poses([episode.now for episode in episodes])
+    parts = _parts([episode.poses for episode in episodes])
+    if not names.isdisjoint(_MAPS):
+        if first._rasterise is None:
+            pictured = [s._pictured(episode) for s, episode in zip(sensings, episodes)]
+            observation |= {
+                name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]
+            }
+        else:
+            is_shown = np.stack([sensing._street.is_shown for sensing in sensings])
+            drawn = first._rasterise(now.cam_from_world, parts, is_shown)
+            observation |= {name: maps[:, None] for name, maps in drawn._asdict().items()}
+    if not names.isdisjoint(_MOTIONS):
+        before = first._camera_poses([episode.before for episode in episodes])
+        if "instance_motion" in names:
+            parts_before = _parts([episode.poses_before for episode in episodes])
+            rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
+            observation["instance_motion"] = rows
+            observation["prev_from_curr"] = rows[:, 0].copy()
         else:
             observation["prev_from_curr"] = relative_camera(before, now).astype(np.float32)
+    if "rgb" in names:
+        colours = [s.rgb(episode) for s, episode in zip(sensings, episodes)]
+        observation["rgb"] = np.ascontiguousarray(np.stack(colours).transpose(0, 3, 1, 2))
+    return {name: observation[name] for name in first.names}
+
+
+def _parts(poses: Sequence[Array]) -> Array:
+    """Returns the transforms [N, M, 4, 4] of people's parts for poses [P, 4], N times."""
+    stacked = np.stack(poses)
+    return world_from_parts(stacked.reshape(-1, 4)).reshape(len(poses), -1, 4, 4)

@@ -1,6 +1,6 @@
 """The street's observation as `make_env` hands it on, with how the episode stands beside it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -50,8 +50,15 @@ class SensorObservation(gym.Wrapper):
 
     def arrange(self, observation: dict[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
         """Returns the observation as this wrapper gives it."""
-        return dict.fromkeys(self._names, observation) | {
-            "outcome": np.array([_OUTCOME_CODE[info["outcome"]]], dtype=np.uint8),
-            "hit": np.array([hit_code(info["hit"])], dtype=np.uint8),
-            "episode_seed": np.array([info["episode_seed"]], dtype=np.int64),
-        }
+        code = _OUTCOME_CODE[info["outcome"]]
+        beside = standing([code], [info["hit"]], [info["episode_seed"]])
+        return dict.fromkeys(self._names, observation) | {k: v[0] for k, v in beside.items()}
+
+
+def standing(codes: Sequence[int], hits: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:
+    """Returns what stands beside N observations, [N, 1] each: outcomes, hits, episodes' seeds."""
+    return {
+        "outcome": np.array(codes, dtype=np.uint8)[:, None],
+        "hit": np.array([hit_code(hit) for hit in hits], dtype=np.uint8)[:, None],
+        "episode_seed": np.array(seeds, dtype=np.int64)[:, None],
+    }

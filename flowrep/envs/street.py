@@ -14,7 +14,7 @@ from flowrep.envs.layout import Box, Layout
 from flowrep.envs.simulator import Simulator
 from flowrep.envs.vehicle import VehicleState
 from flowrep.palette import CATEGORY_ID
-from flowrep.simulator.triangles import Body
+from flowrep.simulator.triangles import Body, gather
 
 Array = NDArray[Any]
 _BEHIND_M = 2.0  # behind the vehicle nobody is seen, wherever on it the camera is
@@ -55,6 +55,7 @@ class Street:
         ]
         self._parts = np.array(parts, dtype=int).reshape(count, len(people.PARTS))
         self._placed = np.full((count, 4), np.nan)  # where everyone's parts were last put
+        self.triangles = gather(self.bodies)
         self.close_exits(())
 
     def close_exits(self, names: Iterable[str]) -> None:

@@ -93,6 +93,11 @@ class StreetEnv(gym.Env):
             options: `episode_seed` (int) names the episode, `path` (str) its path,
                 `vehicle_speed_mps` (float) another speed than the scene's: 0 holds the camera.
         """
+        self.begin(seed=seed, options=options)
+        return self.sensing.observe(self.episode), self._info()
+
+    def begin(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Begins an episode as `reset` does, and does not look at it."""
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(1 << 31))
         options = dict(options or {})
@@ -101,17 +106,20 @@ class StreetEnv(gym.Env):
         if options:
             known = "episode_seed, path, vehicle_speed_mps"
             raise ValueError(f"unknown reset options {sorted(options)}; they are: {known}")
-        return self.sensing.observe(self.episode), self._info()
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drives one step. Every end of an episode is `terminated`, the time-out too."""
+        outcome = self.drive(int(action))
+        observation = self.sensing.observe(self.episode)
+        return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
+
+    def drive(self, action: int) -> Outcome:
+        """Drives one step as `step` does, and does not look at it."""
         if self.episode.outcome:
             label = self.episode.outcome.label
             raise RuntimeError(f"the episode has ended ({label}): call reset() first")
-        self.episode.step(int(action), self._street)
-        outcome = self.episode.outcome
-        observation = self.sensing.observe(self.episode)
-        return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
+        self.episode.step(action, self._street)
+        return self.episode.outcome
 
     def render(self) -> Any:
         """Returns what the camera sees, [H, W, 3] uint8, if the render mode is "rgb_array"."""

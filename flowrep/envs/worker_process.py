@@ -9,11 +9,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 from gymnasium.vector.utils import read_from_shared_memory
 from numpy.typing import NDArray
 
 EnvFactory = Callable[[], gym.Env]
+VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 Arrays = dict[str, Any]  # arrays, or such dicts of them, as a Dict space holds them
 
 
@@ -30,10 +31,11 @@ class Worker:
         env_factories: Sequence[EnvFactory],
         rows: slice,
         memory: Any,
+        in_each: VectorFactory,
     ) -> None:
         self.rows = rows
         self.pipe, theirs = context.Pipe()
-        arguments = (theirs, list(env_factories[rows]), rows, memory, len(env_factories))
+        arguments = (theirs, list(env_factories[rows]), rows, memory, len(env_factories), in_each)
         self.process = context.Process(target=_work, args=arguments, daemon=True)
         self.process.start()
         theirs.close()
@@ -88,14 +90,19 @@ class Worker:
 
 
 def _work(
-    pipe: Connection, env_factories: list[EnvFactory], rows: slice, memory: Any, num_envs: int
+    pipe: Connection,
+    env_factories: list[EnvFactory],
+    rows: slice,
+    memory: Any,
+    num_envs: int,
+    in_each: VectorFactory,
 ) -> None:
     """Answers commands until the other end of the pipe is closed."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     vector = None
     try:
-        vector = SyncVectorEnv(env_factories, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+        vector = in_each(env_factories)
         shared = sliced(views(vector.single_observation_space, memory, num_envs), rows)
         pipe.send((None, os.path.realpath(__file__)))
         while True:

@@ -13,12 +13,22 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory
 from numpy.typing import NDArray
 
 from flowrep.envs import worker_process
-from flowrep.envs.worker_process import Arrays, EnvFactory, Worker, WorkerError, copied, views
+from flowrep.envs.worker_process import (
+    Arrays,
+    EnvFactory,
+    VectorFactory,
+    Worker,
+    WorkerError,
+    copied,
+    views,
+)
+
+_SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
 
 class WorkerVectorEnv(VectorEnv):
@@ -40,13 +50,19 @@ class WorkerVectorEnv(VectorEnv):
         env_factories: one for each environment; they can be pickled, and all have the same spaces,
             a `Dict` of observations.
         num_workers: how many processes, one environment each at least.
+        in_each: makes a vector without autoreset of the environments of one worker.
 
     Raises:
         ValueError: for fewer environments than workers.
         WorkerError: a worker could not begin. Later, from any method, as it stops.
     """
 
-    def __init__(self, env_factories: Sequence[EnvFactory], num_workers: int) -> None:
+    def __init__(
+        self,
+        env_factories: Sequence[EnvFactory],
+        num_workers: int,
+        in_each: VectorFactory = _SIDE_BY_SIDE,
+    ) -> None:
         """Starts the workers and waits until they have built their environments."""
         self._workers: list[Worker] = []
         if not 1 <= num_workers <= len(env_factories):
@@ -73,7 +89,7 @@ class WorkerVectorEnv(VectorEnv):
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
         with nullcontext() if _need_main_module(env_factories) else _without_main_module():
             for rows in map(slice, bounds, bounds[1:]):
-                self._workers.append(Worker(context, env_factories, rows, memory))
+                self._workers.append(Worker(context, env_factories, rows, memory, in_each))
         self._check_code(self._receive())
 
     @property
