@@ -8,6 +8,12 @@ With x~ = p - c the pixel from the principal point, K' the intrinsics without it
 so that with q = A x~ + e / Z the flow p - p' is (x~ qz - qx, y~ qz - qy) / (1 + qz). Nothing
 large is subtracted from anything large: float32 stays an order of magnitude nearer to float64
 than p - p' by the homography K R K^-1 does, and no motion gives exactly 0.
+
+1 + qz is the point's depth in the previous camera over that in the current one. As it falls to 0
+flow grows without bound, so a pixel counts as seen before only where it is above `MIN_DEPTH_RATIO`.
+
+Valid flow is finite, at no cost a pixel: what could overflow in float32 on the way from the inputs
+to flow is taken out before, by the bounds below (in the worst case 3e34 is reached).
 """
 
 from __future__ import annotations
@@ -19,21 +25,37 @@ from torch import Tensor
 
 from flowrep.geometry.camera import centred_pixels
 
+# Of the depth in the previous camera over the depth in the current one.
+MIN_DEPTH_RATIO = 0.01
+
+LARGEST = 1e8  # of an entry of K, A and e, in pixels, metres and their products
+SMALLEST = 1e-8  # of depth in metres, and of dt
+
 Planes = tuple[Tensor, Tensor, Tensor]  # u, v, valid: [*B, H, W] each
 
 
 def camera_planes(
-    depth: Tensor, K: Tensor, prev_from_curr: Tensor, dt: float | Tensor, dtype: torch.dtype
+    depth: Tensor,
+    K: Tensor,
+    prev_from_curr: Tensor,
+    dt: float | Tensor,
+    dtypes: tuple[torch.dtype, torch.dtype],
 ) -> Planes:
-    """Returns the flow planes of one motion for the whole image."""
-    by_motion = _coefficients(K, prev_from_curr, dtype)[..., None, None, :]  # [*B, 1, 1, 12]
+    """Returns the flow planes of one motion for the whole image.
+
+    `dtypes` are those of the result and of the computation.
+    """
+    dtype, compute = dtypes
+    K, dt, known = _known_camera(K.to(compute), dt)
+    coefficients = _coefficients(K, prev_from_curr.to(compute), known)
+    by_motion = coefficients[..., None, None, :]  # [*B, 1, 1, 12]
     axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = by_motion.unbind(-1)
-    x, y = centred_pixels(depth.shape[-2], depth.shape[-1], K.to(dtype))
+    x, y = centred_pixels(depth.shape[-2], depth.shape[-1], K)
     # A x~ is a column's share plus a row's. Tables of them leave each pixel an addition.
     x, *columns = _table(x, axx * x, ayx * x, azx * x)
     y, *rows = _table(y, axy * y + ax, ayy * y + ay, azy * y + az)
     q_far = [column + row for column, row in zip(columns, rows)]
-    return _planes(depth, x, y, q_far, e, dt)
+    return _planes(depth, x, y, q_far, e, dt, dtype)
 
 
 def body_planes(
@@ -42,33 +64,59 @@ def body_planes(
     K: Tensor,
     prev_from_curr_by_instance: Tensor,
     dt: float | Tensor,
-    dtype: torch.dtype,
+    dtypes: tuple[torch.dtype, torch.dtype],
 ) -> Planes:
     """Returns the flow planes of a motion for each instance, `depth` and `instance` in batch."""
+    dtype, compute = dtypes
+    K, dt, known = _known_camera(K.to(compute), dt)
+    motions = prev_from_curr_by_instance.to(compute)
     *batch, _, height, width = depth.shape
     row_of_pixel = instance.long().flatten(-3)  # [*B, H * W]
-    by_instance = _coefficients(K.unsqueeze(-3), prev_from_curr_by_instance, dtype)  # [*B, N, 12]
+    by_instance = _coefficients(K.unsqueeze(-3), motions, known.unsqueeze(-1))  # [*B, N, 12]
     axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = (
         rows.expand(*batch, -1).gather(-1, row_of_pixel).unflatten(-1, (height, width))
         for rows in by_instance.unbind(-1)
     )
-    x, y = centred_pixels(height, width, K.to(dtype))
+    x, y = centred_pixels(height, width, K)
     # The same operations in the same order as camera_planes: equal motions give equal bits.
     q_far = [
         axx * x + (axy * y + ax),
         ayx * x + (ayy * y + ay),
         azx * x + (azy * y + az),
     ]
-    return _planes(depth, x, y, q_far, e, dt)
+    return _planes(depth, x, y, q_far, e, dt, dtype)
 
 
-def _coefficients(K: Tensor, prev_from_curr: Tensor, dtype: torch.dtype) -> Tensor:
+def _known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor, Tensor]:
+    """Returns K and dt with what makes no sense replaced, and where they made sense, `[*B]`.
+
+    Replaced and not only masked: else gradients would meet nan.
+    """
+    known = _within_bounds(K, (-2, -1)) & (K[..., 0, 0] != 0) & (K[..., 1, 1] != 0)
+    K = torch.where(known[..., None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
+    if isinstance(dt, Tensor):
+        dt = dt.to(K.dtype)
+        runs = dt.isfinite() & (dt >= SMALLEST)
+        dt, known = torch.where(runs, dt, 1.0), known & runs
+    return K, dt, known
+
+
+def _within_bounds(tensor: Tensor, dims: tuple[int, ...]) -> Tensor:
+    """Returns where all entries along some dims are finite and small enough to compute with."""
+    return (tensor.abs() <= LARGEST).all(dims)  # nan compares False
+
+
+def _coefficients(K: Tensor, prev_from_curr: Tensor, known: Tensor) -> Tensor:
     """Returns A (row by row) and e, `[*B, 12]`.
+
+    Where something isn't known they send every point behind the previous camera, so that no pixel
+    is valid, without a look at it.
 
     Written out instead of multiplied as matrices: a batched product may round differently from a
     single one, and then a body that stands still would not have the camera's flow exactly.
     """
-    K, motion = K.to(dtype), prev_from_curr.to(dtype)
+    bounded = _within_bounds(prev_from_curr, (-2, -1))
+    motion = torch.where(bounded[..., None, None], prev_from_curr, 0.0)
     fx, skew, fy = K[..., 0, 0], K[..., 0, 1], K[..., 1, 1]
     d = [[motion[..., i, j] - float(i == j) for j in range(3)] for i in range(3)]  # R - I
     tx, ty, tz = motion[..., 0, 3], motion[..., 1, 3], motion[..., 2, 3]
@@ -82,7 +130,12 @@ def _coefficients(K: Tensor, prev_from_curr: Tensor, dtype: torch.dtype) -> Tens
         a_x = in_x / fx
         a += [a_x, (in_y - skew * a_x) / fy, constant]
     e = [fx * tx + skew * ty, fy * ty, tz]
-    return torch.stack(torch.broadcast_tensors(*a, *e), -1)
+    coefficients = torch.stack(torch.broadcast_tensors(*a, *e), -1)
+    known = (known & bounded & _within_bounds(coefficients, (-1,))).unsqueeze(-1)
+    behind = (0.0, -2.0, 0.0)  # 1 + qz = -1
+    # Joined again, which makes inductor keep the result instead of choosing again at every pixel.
+    parts = zip(coefficients.split([8, 1, 3], -1), behind)
+    return torch.cat([torch.where(known, part, otherwise) for part, otherwise in parts], -1)
 
 
 def _table(*entries: Tensor) -> tuple[Tensor, ...]:
@@ -97,23 +150,27 @@ def _planes(
     q_far: Sequence[Tensor],
     e: Sequence[Tensor],
     dt: float | Tensor,
+    dtype: torch.dtype,
 ) -> Planes:
     """Returns u, v and valid, from depth `[*B, 1, H, W]`; q is `q_far` at infinity."""
-    depth = depth.squeeze(-3)
-    has_depth = depth > 0  # nan compares False
+    depth = depth.squeeze(-3).to(x.dtype)
+    has_depth = depth >= SMALLEST  # nan compares False
     # Masked before and after each division, so that no gradient meets a nan.
-    inverse_depth = torch.where(has_depth, depth, 1.0).to(x.dtype).reciprocal()  # 0 at infinity
+    inverse_depth = torch.where(has_depth, depth, 1.0).reciprocal()  # 0 at infinity
     qx, qy, qz = (far + near * inverse_depth for far, near in zip(q_far, e))
     z_ratio = 1.0 + qz  # depth in the previous camera over depth in the current one
-    valid = has_depth & (z_ratio > 0)
-    per_z = torch.where(valid, z_ratio, 1.0).reciprocal()
+    in_front = has_depth & (z_ratio > MIN_DEPTH_RATIO)
+    per_z = torch.where(in_front, z_ratio, 1.0).reciprocal()
     if isinstance(dt, Tensor):
-        per_z = per_z / dt.to(x.dtype)[..., None, None]
+        per_z = per_z / dt[..., None, None]
     elif dt != 1.0:
         per_z = per_z / dt
-    u = torch.where(valid, (x * qz - qx) * per_z, 0.0)
-    v = torch.where(valid, (y * qz - qy) * per_z, 0.0)
-    return u, v, valid
+    u = ((x * qz - qx) * per_z).to(dtype)
+    v = ((y * qz - qy) * per_z).to(dtype)
+    valid = in_front
+    if torch.finfo(dtype).max < torch.finfo(x.dtype).max:  # float16 ends at 65,504
+        valid = valid & u.isfinite() & v.isfinite()
+    return torch.where(valid, u, 0.0), torch.where(valid, v, 0.0), valid
 
 
 def stack_planes(u: Tensor, v: Tensor) -> Tensor:

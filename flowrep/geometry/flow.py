@@ -43,8 +43,10 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
 
     Convention: (p_t - p_t') / dt on the current frame's grid, t' the previous frame; u right,
     v down, pixels. A camera that drives forward sees the world stream outwards. Depth inf moves
-    by rotation only. Invalid (flow 0): depth nan or <= 0, and points that were not in front of
-    the previous camera.
+    by rotation only. Invalid (flow 0): depth nan or <= 0; points that were not in front of the
+    previous camera, at a hundredth of their depth now at least (closer to it flow grows without
+    bound); everything where K, the motion or a tensor `dt` isn't finite, `dt` isn't positive or an
+    entry is beyond 1e8. Valid flow is finite.
 
     Equations 7 to 11 of the paper. Floats narrower than float32 are computed in float32.
 
@@ -67,10 +69,10 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
     (tensor([[-0.5000, -0.5000]]), tensor([[True, True]]))
     """
     batch = _check(depth, K, prev_from_curr, dt)
-    dtype, compute = _dtypes(depth, K, prev_from_curr)
+    dtypes = _dtypes(depth, K, prev_from_curr)
     depth = depth.expand(*batch, -1, -1, -1)
-    u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, compute)
-    return Flow(closed_form.stack_planes(u, v).to(dtype), closed_form.mask_channel(valid))
+    u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, dtypes)
+    return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
 def rigid_flow(
@@ -86,7 +88,8 @@ def rigid_flow(
     Convention: as `ego_flow`, with a motion of its own for each pixel. Row i of
     `prev_from_curr_by_instance` takes a point that rides on instance i from the current camera's
     frame to where it was in the previous camera's frame; row 0 is the static world's. Where a
-    pixel's row equals `prev_from_curr`, the result is `ego_flow`'s to the last bit.
+    pixel's row equals `prev_from_curr`, the result is `ego_flow`'s to the last bit. A row that
+    isn't known makes the pixels of its own instance invalid.
 
     Args:
         depth: `[*B, 1, H, W]`, metres along the optical axis.
@@ -116,10 +119,10 @@ def rigid_flow(
     batch = _check(depth, K, motions[..., 0, :, :], dt)
     _check_same_size("instance", instance, depth)
     batch = broadcast_batch(others=batch, instance=instance.shape[:-3])
-    dtype, compute = _dtypes(depth, K, motions)
+    dtypes = _dtypes(depth, K, motions)
     depth, instance = (image.expand(*batch, -1, -1, -1) for image in (depth, instance))
-    u, v, valid = closed_form.body_planes(depth, instance, K, motions, dt, compute)
-    return Flow(closed_form.stack_planes(u, v).to(dtype), closed_form.mask_channel(valid))
+    u, v, valid = closed_form.body_planes(depth, instance, K, motions, dt, dtypes)
+    return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
 def factorize(
@@ -130,7 +133,7 @@ def factorize(
     Convention: raw = ego + obj, all (p_t - p_t') / dt on the current frame's grid. A raw flow
     that an estimator gives from the current to the previous frame has to be negated first; one
     from the previous to the current frame lies on the wrong grid. Invalid (obj 0): where ego
-    flow is invalid, and where raw is not finite.
+    flow is invalid, and where raw is not finite. The factors have the widest of all float types.
 
     Equation 6 of the paper.
 
@@ -158,16 +161,23 @@ def factorize(
     batch = _check(depth, K, prev_from_curr, dt)
     _check_same_size("raw", raw, depth)
     batch = broadcast_batch(others=batch, raw=raw.shape[:-3])
-    dtype, compute = _dtypes(depth, K, prev_from_curr)
+    # Raw flow doesn't change how ego flow is rounded: widened, it still leaves exactly no obj.
+    own, compute = _dtypes(depth, K, prev_from_curr)
+    dtype = torch.promote_types(own, raw.dtype)
     depth = depth.expand(*batch, -1, -1, -1)
-    u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, compute)
+    u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, (own, compute))
+    raw_u, raw_v = raw.to(dtype).expand(*batch, -1, -1, -1).unbind(-3)
     u, v = u.to(dtype), v.to(dtype)
-    raw_u, raw_v = raw.expand(*batch, -1, -1, -1).unbind(-3)
-    measured = raw_u.abs() + raw_v.abs() < math.inf
+    obj_u, obj_v = raw_u - u, raw_v - v
+    # Finite, and small enough for the difference to be so.
+    largest = torch.finfo(compute).max / 4
+    measured = raw_u.to(compute).abs() + raw_v.to(compute).abs() < largest
+    if torch.finfo(dtype).max < torch.finfo(compute).max:
+        measured = measured & obj_u.isfinite() & obj_v.isfinite()
     # Two masks in turn, not their conjunction: inductor would spill that one to memory.
     obj_u, obj_v = (
         torch.where(valid, torch.where(measured, difference, 0.0), 0.0)
-        for difference in (raw_u - u, raw_v - v)
+        for difference in (obj_u, obj_v)
     )
     ego, obj = closed_form.stack_planes(u, v), closed_form.stack_planes(obj_u, obj_v)
     return Factors(ego, obj, closed_form.mask_channel(valid & measured))
@@ -181,8 +191,11 @@ def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torc
     batches = {"depth": depth.shape[:-3], "K": K.shape[:-2], "prev_from_curr": motion.shape[:-2]}
     if isinstance(dt, Tensor):
         batches["dt"] = dt.shape
-    elif not dt > 0:
-        raise ValueError(f"dt must be positive (current time minus previous time), got {dt}")
+    elif not closed_form.SMALLEST <= dt < math.inf:
+        raise ValueError(
+            "dt must be positive (current time minus previous time), at least "
+            f"{closed_form.SMALLEST:g} and finite; got {dt}"
+        )
     return broadcast_batch(**batches)
 
 

@@ -19,15 +19,14 @@ from flowrep.transforms.base import (
     Keys,
     MapTransform,
     Reads,
-    as_keys,
     check_own_keys,
 )
-from flowrep.transforms.flow import CAMERA, Intrinsics, as_intrinsics, intrinsics_key
+from flowrep.transforms.flow import CameraTransform, Intrinsics
 
 VECTOR = Reads((7,), "float")
 
 
-class AdaptDepth(MapTransform):
+class AdaptDepth(CameraTransform):
     """Depth of any kind as depth along the optical axis.
 
     | reads | writes | shape | range | unit |
@@ -56,8 +55,6 @@ class AdaptDepth(MapTransform):
         tensor([[[0.5000, 2.0000]]])
     """
 
-    K: Tensor | None
-
     def __init__(
         self,
         kind: geometry.DepthKind,
@@ -69,15 +66,9 @@ class AdaptDepth(MapTransform):
         out_keys: Keys = ("sensor", "depth"),
     ) -> None:
         check_depth_options(kind, intrinsics is not None, near_m, far_m)
-        key = None if intrinsics is None else intrinsics_key(intrinsics)
-        if key is None:
-            super().__init__([DEPTH], in_keys, out_keys)
-        else:
-            super().__init__([DEPTH, CAMERA], [*as_keys(in_keys), key], out_keys)
+        super().__init__(intrinsics, [DEPTH], in_keys, out_keys)
         check_own_keys(self)
         self.kind, self.near_m, self.far_m = kind, near_m, far_m
-        given = intrinsics is not None and key is None
-        self.register_buffer("K", as_intrinsics(intrinsics) if given else None, persistent=False)
 
     def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:
         """Returns depth along the optical axis."""

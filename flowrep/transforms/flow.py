@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
 import torch
@@ -21,7 +21,42 @@ CAMERA = Reads((3, 3), "float")
 Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 
 
-class FlowTransform(MapTransform):
+class CameraTransform(MapTransform):
+    """Holds K, in the float type it was given in, whatever the transform is cast to.
+
+    Args:
+        intrinsics: K `[3, 3]`, the key under which the TensorDict holds it, `[*B, 3, 3]`, or None
+            where K isn't needed. With a key, K is read after all other keys.
+        reads: as in `MapTransform`.
+        in_keys: as in `MapTransform`.
+        out_keys: as in `MapTransform`.
+    """
+
+    K: Tensor | None
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics | None,
+        reads: Sequence[Reads],
+        in_keys: Keys,
+        out_keys: Keys,
+    ) -> None:
+        key = None if intrinsics is None else intrinsics_key(intrinsics)
+        camera: list[NestedKey] = [] if key is None else [key]
+        super().__init__([*reads, *[CAMERA] * len(camera)], [*as_keys(in_keys), *camera], out_keys)
+        given = intrinsics is not None and key is None
+        self.register_buffer("K", as_intrinsics(intrinsics) if given else None, persistent=False)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CameraTransform:
+        """Moves K between devices, but leaves its type: in bfloat16, 319.5 px would be 320."""
+        exact = self.K
+        super()._apply(fn, recurse)
+        if exact is not None and self.K is not None:
+            self.K = exact.to(self.K.device)
+        return self
+
+
+class FlowTransform(CameraTransform):
     """What flow transforms share: the intrinsics K, the outputs chosen and their unit.
 
     Args:
@@ -38,8 +73,6 @@ class FlowTransform(MapTransform):
         out_keys: one key an output.
     """
 
-    K: Tensor | None
-
     def __init__(
         self,
         intrinsics: Intrinsics | None,
@@ -53,12 +86,8 @@ class FlowTransform(MapTransform):
         in_keys: Keys,
         out_keys: Keys | None,
     ) -> None:
-        key = None if intrinsics is None else intrinsics_key(intrinsics)
-        camera: list[NestedKey] = [] if key is None else [key]
         super().__init__(
-            [*reads, *[CAMERA] * len(camera)],
-            [*as_keys(in_keys), *camera],
-            list(outputs) if out_keys is None else out_keys,
+            intrinsics, reads, in_keys, list(outputs) if out_keys is None else out_keys
         )
         if len(self.out_keys) != len(outputs):
             raise ValueError(
@@ -71,8 +100,6 @@ class FlowTransform(MapTransform):
         units = _per_output("unit", unit, flows)
         self.factors = {name: _factor(scales[name], units[name], dt_s) for name in flows}
         self.compiled = bool(compiled)
-        given = intrinsics is not None and key is None
-        self.register_buffer("K", as_intrinsics(intrinsics) if given else None, persistent=False)
 
     def _with_camera(self, maps: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
         """Returns the maps and K, which is the last of them unless the transform was given it."""

@@ -28,9 +28,9 @@ class FlowFactorize(FlowTransform):
     Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the
     paper), obj = raw − ego is what moves by itself (Eq. 6), both p_t − p_t' on the current frame's
     grid, channels (u right, v down). `prev_from_curr` `[*B, 4, 4]` takes a point in the current
-    camera's frame into the previous camera's. Where depth is `nan`, a point was behind the previous
-    camera or raw isn't finite, flow is 0. With the simulator's raw flow obj is exactly 0 on what
-    stands still.
+    camera's frame into the previous camera's. Where flow isn't known it is 0: depth `nan`, a point
+    that was not in front of the previous camera, a motion or K that isn't finite, such a raw flow.
+    With the simulator's raw flow obj is exactly 0 on what stands still.
 
     Args:
         intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the key under

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec
 
@@ -23,6 +24,9 @@ class Segmentation(MapTransform):
     `Categorical` that knows n, which is all that a network needs to expand them. An id outside
     0 … n − 1 is a pixel of no class: all zeros in the one-hot encoding.
 
+    Ids of a wider type, or a signed one, are looked at before they become uint8, at each call,
+    which waits for a GPU: give uint8 where that counts.
+
     Args:
         num_classes: number n of classes, 1 to 256.
         encoding: `"ids"` or `"onehot"`.
@@ -30,7 +34,8 @@ class Segmentation(MapTransform):
         out_keys: where the representation goes.
 
     Raises:
-        ValueError: for an unknown encoding or a number of classes that uint8 can't hold.
+        ValueError: for an unknown encoding or a number of classes that uint8 can't hold, and at
+            each call for ids that it can't.
 
     Example:
         >>> import torch
@@ -59,6 +64,13 @@ class Segmentation(MapTransform):
         self.num_classes = int(num_classes)
         self.encoding = encoding
 
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        ids = next_tensordict.get(self.in_keys[0], None)
+        if self.encoding == "ids" and ids is not None:
+            self._check_layout([ids])
+            _check_fits_uint8(self.in_keys[0], ids)
+        return super()._call(next_tensordict)
+
     def compute(self, ids: Tensor) -> tuple[Tensor]:
         """Returns the classes, encoded as asked for."""
         if self.encoding == "ids":
@@ -75,3 +87,16 @@ class Segmentation(MapTransform):
             return (spec,)
         shape = (*ids.shape[:-3], self.num_classes, *ids.shape[-2:])
         return (Bounded(0.0, 1.0, shape=shape, device=ids.device, dtype=torch.float32),)
+
+
+def _check_fits_uint8(key: object, ids: Tensor) -> None:
+    """Complains about ids that uint8 would wrap: 300 would become 44."""
+    if ids.dtype is torch.uint8 or not ids.numel():
+        return
+    least, most = (int(bound) for bound in ids.aminmax())
+    if least < 0 or most > 255:
+        raise ValueError(
+            f"{key!r} holds class ids from {least} to {most}, uint8 those "
+            "from 0 to 255; give pixels of no class an id in that range, e.g. "
+            "ids.where((ids >= 0) & (ids < num_classes), 255), or take encoding='onehot'"
+        )

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.transforms import Compose
 
-from flowrep.transforms import FlowFactorize, RawFlow, representation_stack
+from flowrep.transforms import AdaptDepth, FlowFactorize, RawFlow, representation_stack
 from tests.transforms.fake_env import INTRINSICS, STATUE, WALKER, FakeSensorEnv, frame
 
 # fx = 40, fy = 20, cx = 2, cy = 1: pixel (column 1, row 0) sits at x~ = -0.5, y~ = -0.5.
@@ -180,3 +180,16 @@ def test_options_are_checked(options, expected):
 def test_raw_flow_offers_no_factors():
     with pytest.raises(ValueError, match=r"\['raw', 'valid'\]"):
         RawFlow(K, outputs=["obj"])
+
+
+@pytest.mark.parametrize("cast", [lambda t: t.to(torch.bfloat16), lambda t: t.half()])
+@pytest.mark.parametrize("given", [torch.float32, torch.float64])
+def test_k_keeps_its_type_whatever_the_transform_is_cast_to(cast, given):
+    # In bfloat16 a principal point at 319.5 would be at 320.
+    K = torch.tensor([[517.3, 0.0, 319.5], [0.0, 516.5, 255.3], [0.0, 0.0, 1.0]], dtype=given)
+    keys = {"in_keys": ("sensor", "depth"), "out_keys": "z"}
+    for transform in (RawFlow(K), FlowFactorize(K), AdaptDepth("ray_length", intrinsics=K, **keys)):
+        cast(transform)
+        assert transform.K.dtype == given
+        assert torch.equal(transform.K, K)
+        assert transform.to("meta").K.is_meta  # devices it follows

@@ -37,6 +37,21 @@ def test_wider_ids_become_uint8():
     assert read(Segmentation(3), "semantic", IDS.to(torch.int16)).dtype == torch.uint8
 
 
+@pytest.mark.parametrize(
+    ("ids", "said"),
+    [
+        (torch.tensor([0, 300, 7], dtype=torch.int32), "from 0 to 300"),  # 300 would be 44
+        (torch.tensor([2, -1, 1], dtype=torch.int8), "from -1 to 2"),  # -1 would be 255
+    ],
+)
+def test_ids_that_uint8_can_not_hold_are_refused(ids, said):
+    ids = ids.reshape(1, 1, 3)
+    with pytest.raises(ValueError, match=rf"'semantic'\) holds class ids {said}.*to 255"):
+        read(Segmentation(3), "semantic", ids)
+    onehot = read(Segmentation(3, encoding="onehot"), "semantic", ids)  # narrows nothing
+    assert onehot[:, 0, 1].tolist() == [0, 0, 0]
+
+
 def test_onehot_has_a_map_a_class():
     got = read(Segmentation(4, encoding="onehot"), "semantic", IDS)
     assert got.tolist() == [
