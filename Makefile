@@ -10,7 +10,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate view gallery test lint types format bench bench-gpu smoke docs wheel clean check-python
+.PHONY: help install train evaluate view gallery test fuzz schema lint types format bench bench-gpu smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -51,6 +51,12 @@ gallery: $(INSTALLED)  ## Make the README's gallery anew
 
 test: $(INSTALLED)  ## Run the tests
 	$(BIN)/python -m pytest $(ARGS)
+
+fuzz: $(INSTALLED)  ## Throw odd inputs at every part: make fuzz ARGS="--parts scenes --mutations 10000"
+	$(BIN)/python -m tests.fuzz $(ARGS)
+
+schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
+	$(BIN)/python -c 'from flowrep.envs.schema import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
 
 lint: $(INSTALLED)  ## Check style and formatting
 	$(BIN)/ruff check .

@@ -10,22 +10,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep.envs.fields import FieldOfView, Length, Part, Pitch, Pixels, Place, Size
+
 Matrix = NDArray[np.float64]
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
-class CameraConfig:
+class CameraConfig(Part):
     """A camera on the vehicle: `fov_deg` is vertical, `pitch_deg` is positive upwards."""
 
-    height_px: int
-    width_px: int
-    fov_deg: float
-    mount_height_m: float
-    mount_forward_m: float
-    pitch_deg: float
-    near_m: float
-    far_m: float
+    height_px: Pixels
+    width_px: Pixels
+    fov_deg: FieldOfView
+    mount_height_m: Size
+    mount_forward_m: Place
+    pitch_deg: Pitch
+    near_m: Length
+    far_m: Length
 
     @property
     def focal_px(self) -> float:

@@ -228,8 +228,8 @@ class Layout:
 
     def _is_free(self, box: Box, houses: list[Box]) -> bool:
         ground = box.footprint.buffer(-_TOUCH_M)
-        taken = (house.footprint for house in houses)
-        return not ground.intersects(self._paved) and not any(map(ground.intersects, taken))
+        taken = [self._paved, *(house.footprint for house in houses)]
+        return not shapely.intersects(ground, taken).any()
 
     def _house_across(self, row: BuildingRow, rng: np.random.Generator) -> Box:
         at = self.lines[row.road].length if row.side == "end" else 0.0
@@ -263,15 +263,13 @@ class Layout:
                 at += _PLOT_STEP_M
 
     def _obstacle_row(self, row: ObstacleRow) -> Iterator[Box]:
-        taken = shapely.union_all(
-            [
-                self.drivable.difference(self.ribbons[row.road]),
-                *(box.footprint for box in self.buildings),
-            ]
-        )
+        taken = [
+            self.drivable.difference(self.ribbons[row.road]),
+            *(box.footprint for box in self.buildings),
+        ]
         facing = math.pi if row.offset_m > 0 else 0.0
         for i, at in enumerate(np.arange(row.from_m, row.to_m, row.every_m).tolist()):
             x, y, heading = self.pose_at(row.road, at, row.offset_m)
             box = Box(row.kind, x, y, heading + facing, row.size_m, i)
-            if not box.footprint.intersects(taken):
+            if not shapely.intersects(box.footprint, taken).any():
                 yield box

@@ -1,16 +1,48 @@
 """What a scene is: frozen data whose field names are the YAML's keys."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal, get_args
+
+from pydantic import AfterValidator
 
 from flowrep.envs.camera import CameraConfig
+from flowrep.envs.fields import (
+    MOST_PARTS,
+    Angle,
+    FileName,
+    Flag,
+    FrameRate,
+    Gap,
+    HouseRange,
+    Length,
+    Name,
+    Part,
+    People,
+    Place,
+    Point,
+    Seed,
+    Size,
+    SpeedRange,
+    Standing,
+    Steps,
+    Stride,
+    Width,
+    up_to,
+)
 from flowrep.envs.vehicle import VehicleConfig
 
 SpeedMode = Literal["low", "normal", "high"]
 Kind = Literal["house", "tree", "fence", "car", "traffic_light", "lamp_post"]
-Point = tuple[float, float]
 Range = tuple[float, float]
+
+
+def _all_modes(ranges: dict[SpeedMode, SpeedRange]) -> dict[SpeedMode, SpeedRange]:
+    if set(ranges) != set(get_args(SpeedMode)):
+        raise ValueError(f"give all of {', '.join(get_args(SpeedMode))}")
+    return ranges
+
+
+SpeedRanges = Annotated[dict[SpeedMode, SpeedRange], AfterValidator(_all_modes)]
 
 CATEGORY_OF_KIND: dict[Kind, str] = {
     "house": "building",
@@ -24,109 +56,109 @@ CATEGORY_OF_KIND: dict[Kind, str] = {
 
 
 @dataclass(frozen=True)
-class Piece:
+class Piece(Part):
     """One stretch of centreline: straight, or an arc (positive degrees turn left)."""
 
-    straight_m: float | None = None
-    arc_radius_m: float | None = None
-    arc_deg: float | None = None
+    straight_m: Length | None = None
+    arc_radius_m: Length | None = None
+    arc_deg: Angle | None = None
 
 
 @dataclass(frozen=True)
-class Road:
+class Road(Part):
     """A drivable ribbon along a centreline, with a sidewalk on either side."""
 
-    name: str
+    name: Name
     start_m: Point
-    heading_deg: float
-    width_m: float
-    sidewalk_m: float
-    pieces: tuple[Piece, ...]
+    heading_deg: Angle
+    width_m: Width
+    sidewalk_m: Gap
+    pieces: Annotated[tuple[Piece, ...], up_to(MOST_PARTS, least=1)]
 
 
 @dataclass(frozen=True)
-class Zone:
+class Zone(Part):
     """The whole width of a road between two distances from its start.
 
     A vehicle that starts here stands in its middle, along the road, or against it if `reverse`.
     """
 
-    name: str
-    road: str
-    from_m: float
-    to_m: float
-    reverse: bool = False
+    name: Name
+    road: Name
+    from_m: Place
+    to_m: Place
+    reverse: Flag = False
 
 
 @dataclass(frozen=True)
-class Path:
+class Path(Part):
     """One task: from a start zone to an ending zone, with exits closed."""
 
-    name: str
-    start: str
-    end: str
-    closures: tuple[str, ...] = ()
+    name: Name
+    start: Name
+    end: Name
+    closures: Annotated[tuple[Name, ...], up_to(MOST_PARTS)] = ()
 
 
 @dataclass(frozen=True)
-class Closure:
+class Closure(Part):
     """A building across a road, there in the episodes whose path names it."""
 
-    name: str
-    road: str
-    at_m: float
-    depth_m: float
-    height_m: float
+    name: Name
+    road: Name
+    at_m: Place
+    depth_m: Size
+    height_m: Size
 
 
 @dataclass(frozen=True)
-class Walk:
+class Walk(Part):
     """Where a group walks back and forth: across a road, along it, or through given points."""
 
     kind: Literal["across", "along", "points"]
-    road: str | None = None
-    at_m: float | None = None
-    from_m: float | None = None
-    to_m: float | None = None
-    offset_m: float = 0.0
-    points_m: tuple[Point, ...] = ()
+    road: Name | None = None
+    at_m: Place | None = None
+    from_m: Place | None = None
+    to_m: Place | None = None
+    offset_m: Place = 0.0
+    points_m: Annotated[tuple[Point, ...], up_to(MOST_PARTS)] = ()
 
 
 @dataclass(frozen=True)
-class PedestrianGroup:
+class PedestrianGroup(Part):
     """People on one walk; `standing` of them never move.
 
     `draw` says whether speed, phase and direction are drawn once for the group or for each person.
     """
 
-    name: str
-    count: int
-    spread_m: float
+    name: Name
+    count: People
+    spread_m: Gap
     walk: Walk
-    standing: int = 0
+    standing: Standing = 0
     draw: Literal["group", "pedestrian"] = "group"
-    speed_mps: Range | None = None
+    speed_mps: SpeedRange | None = None
 
 
 @dataclass(frozen=True)
-class BuildingRow:
+class BuildingRow(Part):
     """House fronts along one side of a road, or one house across its start or end.
 
     A house of a row stands where no road, no sidewalk and no earlier house is.
     """
 
-    road: str
+    road: Name
     side: Literal["left", "right", "start", "end"]
-    from_m: float
-    to_m: float
-    setback_m: float
-    front_m: Range
-    depth_m: Range
-    height_m: Range
+    from_m: Place
+    to_m: Place
+    setback_m: Gap
+    front_m: HouseRange
+    depth_m: HouseRange
+    height_m: HouseRange
 
 
 @dataclass(frozen=True)
-class Obstacle:
+class Obstacle(Part):
     """Something that stands still: what it is, where, which way it faces.
 
     `size_m` is (length, width, height); length runs along the heading. It is what a vehicle can
@@ -135,12 +167,12 @@ class Obstacle:
 
     kind: Kind
     center_m: Point
-    yaw_deg: float
-    size_m: tuple[float, float, float]
+    yaw_deg: Angle
+    size_m: tuple[Size, Size, Size]
 
 
 @dataclass(frozen=True)
-class ObstacleRow:
+class ObstacleRow(Part):
     """Obstacles of one kind along a road, `offset_m` to the left of its middle.
 
     They face as cars that keep right are parked: on the right along the road, on the left against
@@ -148,50 +180,50 @@ class ObstacleRow:
     """
 
     kind: Kind
-    road: str
-    offset_m: float
-    from_m: float
-    to_m: float
-    every_m: float
-    size_m: tuple[float, float, float]
+    road: Name
+    offset_m: Place
+    from_m: Place
+    to_m: Place
+    every_m: Stride
+    size_m: tuple[Size, Size, Size]
 
 
 @dataclass(frozen=True)
-class Crosswalk:
+class Crosswalk(Part):
     """Stripes over the whole width of a road, `depth_m` along it."""
 
-    road: str
-    at_m: float
-    depth_m: float
+    road: Name
+    at_m: Place
+    depth_m: Size
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Part):
     """A whole environment as data; `load_scene` reads and checks one.
 
     Grass lies between the roads and `terrain_m` beyond their bounds; 0 for none. `corner_radius_m`
     rounds the kerb where roads meet.
     """
 
-    name: str
-    frame_rate_hz: float
-    time_limit_steps: int
-    categories: tuple[str, ...]
-    layout_seed: int
+    name: FileName
+    frame_rate_hz: FrameRate
+    time_limit_steps: Steps
+    categories: Annotated[tuple[Name, ...], up_to(MOST_PARTS)]
+    layout_seed: Seed
     camera: CameraConfig
     vehicle: VehicleConfig
-    roads: tuple[Road, ...]
-    zones: tuple[Zone, ...]
-    paths: tuple[Path, ...]
-    pedestrian_speed_mps: Mapping[SpeedMode, Range]
-    pedestrian_groups: tuple[PedestrianGroup, ...] = ()
-    building_rows: tuple[BuildingRow, ...] = ()
-    obstacles: tuple[Obstacle, ...] = ()
-    obstacle_rows: tuple[ObstacleRow, ...] = ()
-    closures: tuple[Closure, ...] = ()
-    crosswalks: tuple[Crosswalk, ...] = ()
-    terrain_m: float = 0.0
-    corner_radius_m: float = 0.0
+    roads: Annotated[tuple[Road, ...], up_to(MOST_PARTS, least=1)]
+    zones: Annotated[tuple[Zone, ...], up_to(MOST_PARTS, least=1)]
+    paths: Annotated[tuple[Path, ...], up_to(MOST_PARTS // 2, least=1)]
+    pedestrian_speed_mps: SpeedRanges
+    pedestrian_groups: Annotated[tuple[PedestrianGroup, ...], up_to(MOST_PARTS)] = ()
+    building_rows: Annotated[tuple[BuildingRow, ...], up_to(MOST_PARTS)] = ()
+    obstacles: Annotated[tuple[Obstacle, ...], up_to(5 * MOST_PARTS)] = ()
+    obstacle_rows: Annotated[tuple[ObstacleRow, ...], up_to(MOST_PARTS)] = ()
+    closures: Annotated[tuple[Closure, ...], up_to(MOST_PARTS)] = ()
+    crosswalks: Annotated[tuple[Crosswalk, ...], up_to(MOST_PARTS)] = ()
+    terrain_m: Gap = 0.0
+    corner_radius_m: Gap = 0.0
 
     @property
     def time_limit_s(self) -> float:

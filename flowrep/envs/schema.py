@@ -1,12 +1,15 @@
-"""Builds frozen dataclasses from plain data, refusing what their fields do not say."""
+"""What a scene file may say: `Scene` and its parts as a pydantic schema, also for editors."""
 
 import dataclasses
-import types
-import typing
+import json
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from functools import cache
+from typing import Any, get_args, get_type_hints
 
-T = TypeVar("T")
+from pydantic import TypeAdapter, ValidationError
+
+from flowrep.envs.plain_data import PlainDataError, join, plain, shortened
+from flowrep.envs.scene import Scene
 
 
 class SceneError(ValueError):
@@ -17,102 +20,96 @@ class SceneError(ValueError):
         super().__init__(f"{source}: {key or 'the scene'}: {problem}; {remedy}")
 
 
-def build(cls: type[T], data: Any, *, source: str, key: str = "") -> T:
-    """Returns `cls` filled from a mapping whose keys are exactly its fields.
+@cache
+def _adapter() -> TypeAdapter[Scene]:
+    return TypeAdapter(Scene)
+
+
+def build_scene(data: Any, *, source: str) -> Scene:
+    """Returns a scene from a mapping whose keys are exactly a scene's.
 
     Args:
-        cls: a dataclass.
-        data: the mapping, nested as the fields' types are.
+        data: nested mappings, lists and values.
         source: the file, for messages.
-        key: where in the file the mapping lies, for messages.
 
     Raises:
-        SceneError: a key is unknown or missing, or a value is of another type.
+        SceneError: a key is unknown or missing, or a value is of another kind or out of range.
     """
-    if not isinstance(data, Mapping):
-        raise SceneError(source, key, f"expected a mapping, got {data!r}", "write its keys")
-    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    for name in data:
-        if name not in fields:
-            known = ", ".join(fields)
-            raise SceneError(source, _join(key, name), "unknown key", f"the keys are: {known}")
-    hints = get_type_hints(cls)
-    values = {}
-    for name, f in fields.items():
-        if name in data:
-            values[name] = _convert(hints[name], data[name], source, _join(key, name))
-        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
-            kind = _describe(hints[name])
-            raise SceneError(source, _join(key, name), "missing key", f"add it, {kind}")
-    return cls(**values)
+    try:
+        content = plain(data)
+    except PlainDataError as error:
+        raise SceneError(source, error.key, str(error), "write plain keys and values") from error
+    except RecursionError as error:
+        raise SceneError(source, "", "is nested too deep", "write plain keys") from error
+    if not isinstance(content, Mapping):
+        problem = f"expected a mapping, got {shortened(repr(content))}"
+        raise SceneError(source, "", problem, "write a scene's keys")
+    try:
+        return _adapter().validate_python(content)
+    except ValidationError as error:
+        # A key with a typo is also missing by its right name: the typo tells more.
+        told = sorted(error.errors(include_url=False), key=lambda each: each["type"] != _UNKNOWN)
+        raise SceneError(source, *_told(told[0])) from error
 
 
-def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
-    origin, args = get_origin(hint), get_args(hint)
+def json_schema() -> str:
+    """Returns the JSON schema of a scene file, as text."""
+    schema = _adapter().json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    return json.dumps(schema, indent=1) + "\n"
+
+
+_UNKNOWN = "unexpected_keyword_argument"
+_OUR_WORDS = {
+    "Value error, give": "give",
+    "Input should be": "it should be",
+    "Tuple should have": "it should have",
+    "String should have": "it should have",
+    " after validation": "",
+    "greater than or equal to": "at least",
+    "less than or equal to": "at most",
+    "a valid number": "a number",
+    "a valid integer": "a whole number",
+    "a valid tuple": "a list",
+    "a valid dictionary": "a mapping",
+    "a valid string": "text",
+    "a valid boolean": "true or false",
+}
+
+
+def _told(error: Any) -> tuple[str, str, str]:
+    """Returns the key, the problem and the remedy of one of pydantic's errors."""
+    *parents, last = error["loc"]
+    key = ""
+    for part in (*parents, last):
+        key = f"{key}[{part}]" if isinstance(part, int) else join(key, part)
+    kind, message = error["type"], error["msg"]
+    if kind == _UNKNOWN:
+        return key, "unknown key", f"the keys are: {', '.join(_keys_at(parents))}"
+    if kind == "missing":
+        what = "value" if isinstance(last, int) else "key"
+        return key, f"missing {what}", "add it"
+    problem = f"got {shortened(repr(error['input']))}"
+    if kind == "string_pattern_mismatch":
+        letters = "letters, digits, - and _" if key == "name" else "text with no space at its ends"
+        return key, problem, f"give a name: {letters}"
+    if kind == "dataclass_type":
+        return key, problem, "it should be a mapping: write its keys"
+    for theirs, ours in _OUR_WORDS.items():
+        message = message.replace(theirs, ours)
+    return key, problem, message
+
+
+def _keys_at(location: Sequence[str | int]) -> list[str]:
+    """Returns the keys of the part of a scene that lies at a location."""
+    part: Any = Scene
+    for name in location:
+        if isinstance(name, str):
+            part = _dataclass_in(get_type_hints(part)[name])
+    return [field.name for field in dataclasses.fields(part)]
+
+
+def _dataclass_in(hint: Any) -> Any:
     if dataclasses.is_dataclass(hint):
-        return build(typing.cast(type, hint), value, source=source, key=key)
-    if origin in (Union, types.UnionType):
-        if value is None:
-            return None
-        (inner,) = [arg for arg in args if arg is not type(None)]
-        return _convert(inner, value, source, key)
-    if origin is Literal:
-        if value not in args:
-            raise SceneError(source, key, f"unknown value {value!r}", f"choose one of {list(args)}")
-        return value
-    if origin is tuple:
-        return _convert_tuple(hint, value, source, key)
-    if origin is not None and issubclass(origin, Mapping):
-        return _convert_mapping(args, value, source, key)
-    return _convert_scalar(hint, value, source, key)
-
-
-def _convert_tuple(hint: Any, value: Any, source: str, key: str) -> tuple:
-    args = get_args(hint)
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise SceneError(source, key, f"expected a list, got {value!r}", _describe(hint))
-    kinds = (args[0],) * len(value) if args[-1] is Ellipsis else args
-    if len(kinds) != len(value):
-        raise SceneError(
-            source, key, f"expected {len(kinds)} values, got {len(value)}", _describe(hint)
-        )
-    return tuple(
-        _convert(kind, item, source, f"{key}[{i}]")
-        for i, (kind, item) in enumerate(zip(kinds, value))
-    )
-
-
-def _convert_mapping(args: tuple, value: Any, source: str, key: str) -> dict:
-    if not isinstance(value, Mapping):
-        raise SceneError(source, key, f"expected a mapping, got {value!r}", "write its keys")
-    names = get_args(args[0])
-    if set(value) != set(names):
-        raise SceneError(source, key, f"has keys {sorted(value)}", f"give exactly {list(names)}")
-    return {name: _convert(args[1], value[name], source, _join(key, name)) for name in names}
-
-
-def _convert_scalar(hint: Any, value: Any, source: str, key: str) -> Any:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if hint is float and is_number:
-        return float(value)
-    if isinstance(value, hint) and isinstance(value, bool) == (hint is bool):
-        return value
-    raise SceneError(source, key, f"got {value!r}", f"give {_describe(hint)}")
-
-
-def _describe(hint: Any) -> str:
-    if hint in (float, int):
-        return "a number" if hint is float else "a whole number"
-    if hint is str:
-        return "a name"
-    if hint is bool:
-        return "true or false"
-    if get_origin(hint) is tuple and get_args(hint)[-1] is not Ellipsis:
-        return f"a list of {len(get_args(hint))} values"
-    if get_origin(hint) is tuple:
-        return "a list"
-    return "a mapping" if dataclasses.is_dataclass(hint) else f"as {hint}"
-
-
-def _join(key: str, name: Any) -> str:
-    return f"{key}.{name}" if key else str(name)
+        return hint
+    return next(filter(None, map(_dataclass_in, get_args(hint))), None)

@@ -7,20 +7,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep.envs.fields import Part, TurnRate, VehicleSize, VehicleSpeed
+
 NO_OP, TURN_LEFT, TURN_RIGHT = 0, 1, 2
 YAW_SIGN = (0.0, 1.0, -1.0)  # by action; left is counter-clockwise
 
 
 @dataclass(frozen=True)
-class VehicleConfig:
+class VehicleConfig(Part):
     """Footprint, speed and turning of the vehicle."""
 
-    length_m: float
-    width_m: float
-    height_m: float
-    speed_mps: float
-    yaw_acceleration_dps2: float
-    max_yaw_rate_dps: float
+    length_m: VehicleSize
+    width_m: VehicleSize
+    height_m: VehicleSize
+    speed_mps: VehicleSpeed
+    yaw_acceleration_dps2: TurnRate
+    max_yaw_rate_dps: TurnRate
 
 
 class VehicleState(NamedTuple):

@@ -2,6 +2,7 @@
 
 from itertools import combinations
 
+import shapely
 from shapely.geometry.base import BaseGeometry
 
 from flowrep.envs.layout import Layout
@@ -26,8 +27,15 @@ def check_walks(layout: Layout, source: str) -> None:
     """
     groups = layout.scene.pedestrian_groups
     grounds = [_ground(layout, group, source) for group in groups]
+    boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
+    tree = shapely.STRtree([box.footprint for box in boxes])
     for group, ground in zip(groups, grounds):
-        _check_clear_of_boxes(layout, group, ground, source)
+        near = tree.query(ground, predicate="dwithin", distance=RADIUS_M)[1]
+        if near.size:
+            box = boxes[near.min()]
+            problem = f"goes through a {box.category} at ({box.x_m:.1f}, {box.y_m:.1f})"
+            remedy = "move the walk or that box, or narrow spread_m"
+            raise SceneError(source, f"{_key(group)}.walk", problem, remedy)
     for (one, ground), (other, other_ground) in combinations(zip(groups, grounds), 2):
         gap = gap_m(ground, other_ground)
         if gap < APART_M:
@@ -52,16 +60,6 @@ def _ground(layout: Layout, group: PedestrianGroup, source: str) -> list[BaseGeo
         remedy = "stretch or straighten the walk, or give fewer people and a smaller spread_m"
         raise SceneError(source, f"{key}.walk", problem, remedy)
     return covered_ground(line, spread)
-
-
-def _check_clear_of_boxes(
-    layout: Layout, group: PedestrianGroup, ground: list[BaseGeometry], source: str
-) -> None:
-    for box in (*layout.buildings, *layout.obstacles, *layout.closures.values()):
-        if gap_m(ground, [box.footprint]) < RADIUS_M:
-            problem = f"goes through a {box.category} at ({box.x_m:.1f}, {box.y_m:.1f})"
-            remedy = "move the walk or that box, or narrow spread_m"
-            raise SceneError(source, f"{_key(group)}.walk", problem, remedy)
 
 
 def _key(group: PedestrianGroup) -> str:

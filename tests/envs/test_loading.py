@@ -178,50 +178,56 @@ def refuse(data, **changes):
             {"camera__fov": 90},
             "camera.fov: unknown key; the keys are: height_px, width_px, fov_deg",
         ),
-        ({"vehicle__speed_mps": KeyError}, "vehicle.speed_mps: missing key; add it, a number"),
-        ({"vehicle__speed_mps": "fast"}, "vehicle.speed_mps: got 'fast'; give a number"),
-        ({"time_limit_steps": 1.5}, "time_limit_steps: got 1.5; give a whole number"),
-        ({"time_limit_steps": True}, "time_limit_steps: got True; give a whole number"),
-        ({"camera": 3}, "camera: expected a mapping, got 3; write its keys"),
-        ({"roads__0__start_m": [1.0]}, "roads[0].start_m: expected 2 values, got 1; a list of 2"),
-        ({"roads": "stem"}, "roads: expected a list, got 'stem'; a list"),
+        ({"vehicle__speed_mps": KeyError}, "vehicle.speed_mps: missing key; add it"),
+        ({"vehicle__speed_mps": "fast"}, "vehicle.speed_mps: got 'fast'; it should be a number"),
+        ({"time_limit_steps": 1.5}, "time_limit_steps: got 1.5; it should be a whole number"),
+        ({"time_limit_steps": True}, "time_limit_steps: got True; it should be a whole number"),
+        ({"camera": 3}, "camera: got 3; it should be a mapping: write its keys"),
+        ({"roads__0__start_m": [1.0]}, "roads[0].start_m[1]: missing value; add it"),
+        ({"roads": "stem"}, "roads: got 'stem'; it should be a list"),
         (
             {"pedestrian_groups__0__draw": "each"},
-            "pedestrian_groups[0].draw: unknown value 'each'; choose one of ['group', ",
+            "pedestrian_groups[0].draw: got 'each'; it should be 'group' or 'pedestrian'",
         ),
         (
             {"pedestrian_speed_mps__low": KeyError},
-            "pedestrian_speed_mps: has keys ['high', 'normal']",
+            "pedestrian_speed_mps: got {'normal': [1.2, 1.8], 'high': [2.0, 2.4]}; give all",
         ),
-        ({"pedestrian_speed_mps": 2}, "pedestrian_speed_mps: expected a mapping, got 2"),
-        ({"pedestrian_speed_mps__low": [2, 1]}, "pedestrian_speed_mps.low: is [2.0, 1.0]; give"),
-        ({"frame_rate_hz": 0}, "frame_rate_hz: is 0.0; give a number above 0"),
-        ({"camera__fov_deg": 180}, "camera.fov_deg: is 180.0; stay in (0, 180)"),
+        ({"pedestrian_speed_mps": 2}, "pedestrian_speed_mps: got 2; it should be a mapping"),
+        (
+            {"pedestrian_speed_mps__low": [2, 1]},
+            "pedestrian_speed_mps.low: got [2, 1]; give",
+        ),
+        ({"frame_rate_hz": 0}, "frame_rate_hz: got 0; it should be at least 0.5"),
+        ({"camera__fov_deg": 180}, "camera.fov_deg: got 180; it should be at most 179"),
         ({"camera__far_m": 0.1}, "camera.far_m: is not beyond near_m; give a larger far_m"),
         (
-            {"pedestrian_groups__0__count": 300},
-            "pedestrian_groups: 302 people, but their 3 parts",
+            {"pedestrian_groups__0__count": 84},
+            "pedestrian_groups: 86 people, but their 3 parts each have 8-bit ids; keep to 85",
         ),
         (
             {"pedestrian_groups__0__standing": 4},
             "pedestrian_groups.along.standing: is 4; stay in 0",
         ),
         ({"roads__0__pieces__0": {}}, "roads.stem.pieces[0]: neither a straight piece nor an arc"),
-        ({"roads__0__pieces__0": {"straight_m": -1}}, "roads.stem.pieces[0]: has no length; give"),
+        (
+            {"roads__0__pieces__0": {"straight_m": -1}},
+            "roads[0].pieces[0].straight_m: got -1; it should",
+        ),
         ({"categories__0": "heaven"}, "categories: unknown name 'heaven'; choose from ['sky', "),
         (
             {"categories": ["sky", "road"]},
             "obstacles: unknown name 'car'; choose from ['sky', 'road",
         ),
         ({"zones__1__name": "south"}, "zones: two are named 'south'; rename one of them"),
-        ({"paths": []}, "paths: is empty; name a start zone and an ending zone"),
+        ({"paths": []}, "paths: got []; it should have at least 1 item, not 0"),
         (
             {"zones__0__road": "stam"},
             "zones.south.road: unknown name 'stam'; choose from ['stem', ",
         ),
         ({"paths__0__end": "north"}, "paths.left: unknown name 'north'; choose from ['south', "),
         ({"paths__0__closures": ["up"]}, "paths.left.closures: unknown name 'up'; choose from"),
-        ({"closures__0__road": "up"}, "closures.road: unknown name 'up'; choose from ['stem', "),
+        ({"closures__0__road": "up"}, "closures[0].road: unknown name 'up'; choose from ['stem', "),
         (
             {"pedestrian_groups__1__walk__at_m": KeyError},
             "pedestrian_groups.across.walk.at_m: missing key; a walk of kind 'across' needs road",
@@ -229,7 +235,7 @@ def refuse(data, **changes):
         ({"pedestrian_groups__1__walk__road": "up"}, "pedestrian_groups.across.walk.road: unknown"),
         (
             {"zones__1__to_m": 99.0},
-            "zones.west: [60.0, 99.0] m is not on road 'to_left'; stay within",
+            "zones.west: 60 to 99 m is not on road 'to_left'; stay within 0 and 71.4",
         ),
         (
             {"vehicle__width_m": 9.0},
@@ -256,11 +262,14 @@ def refuse(data, **changes):
             {"obstacles__0__center_m": [22.8, 2.0], "obstacles__0__yaw_deg": 0.0},
             "pedestrian_groups.across.walk: goes through a car at (22.8, 2.0)",
         ),
-        ({"obstacles__0__kind": "lorry"}, "obstacles[0].kind: unknown value 'lorry'; choose one"),
-        ({"obstacles__0__size_m": [4, 0, 1]}, "obstacles[0].size_m: is 0.0; give a number above"),
+        ({"obstacles__0__kind": "lorry"}, "obstacles[0].kind: got 'lorry'; it should be 'house',"),
+        (
+            {"obstacles__0__size_m": [4, 0, 1]},
+            "obstacles[0].size_m[1]: got 0; it should be at",
+        ),
         ({"terrain_m": 9.0}, "terrain_m: unknown name 'terrain'; choose from ['sky', "),
-        ({"terrain_m": -1.0}, "terrain_m: is -1.0; give 0 or more"),
-        ({"corner_radius_m": -1.0}, "corner_radius_m: is -1.0; give 0 or more"),
+        ({"terrain_m": -1.0}, "terrain_m: got -1.0; it should be at least 0"),
+        ({"corner_radius_m": -1.0}, "corner_radius_m: got -1.0; it should be at least 0"),
         (
             {"crosswalks": [{"road": "stem", "at_m": 20.0, "depth_m": 3.0}]},
             "crosswalks: unknown name 'crosswalk'; choose from ['sky', ",
@@ -278,7 +287,7 @@ def refuse(data, **changes):
                     "crosswalk",
                 ],
             },
-            "crosswalks[0].at_m: 50.0 m is not on road 'stem'; stay within 0 and 40.0",
+            "crosswalks[0].at_m: 50 m is not on road 'stem'; stay within 0 and 40.0",
         ),
     ],
 )
@@ -294,7 +303,7 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
         load_scene(missing)
     broken = tmp_path / "broken.yaml"
     broken.write_text("name: [1\n")
-    with pytest.raises(SceneError, match=r"broken.yaml: .*not YAML"):
+    with pytest.raises(SceneError, match=r"broken.yaml: .*is not YAML"):
         load_scene(broken)
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text(CROSSROADS.read_text().replace("layout_seed: 3", "layout_sed: 3"))
