@@ -14,6 +14,7 @@ from flowrep.envs.make import (
 from flowrep.envs.outcome import Outcome
 from flowrep.envs.planner import Planner
 from flowrep.envs.registration import register_environments
+from flowrep.envs.represented import NumericInfo, RepresentationObservation
 from flowrep.envs.scene import Scene
 from flowrep.envs.schema import SceneError
 from flowrep.envs.street_env import StreetEnv
@@ -24,9 +25,11 @@ register_environments()
 __all__ = [
     "BASELINES",
     "Drive",
+    "NumericInfo",
     "Outcome",
     "Planner",
     "RandomDriver",
+    "RepresentationObservation",
     "Scene",
     "SceneError",
     "StreetEnv",

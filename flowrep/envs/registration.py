@@ -14,5 +14,5 @@ def register_environments() -> None:
     """Registers every environment of the package with gymnasium."""
     for name, scene in SCENE_BY_ID.items():
         gymnasium.register(
-            name, entry_point="flowrep.envs.street_env:StreetEnv", kwargs={"scene": scene}
+            name, entry_point="flowrep.envs.represented:make_street", kwargs={"scene": scene}
         )

@@ -1,0 +1,240 @@
+"""Representations as plain numpy maps, for learners that know gymnasium and no TorchRL."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import Compose
+
+from flowrep.envs.outcome import Outcome, hit_code
+from flowrep.envs.scene import Scene
+from flowrep.envs.sensing import SENSORS
+from flowrep.envs.street_env import StreetEnv
+from flowrep.transforms import representation_stack
+from flowrep.transforms.flow import Intrinsics
+
+Representations = Sequence[str] | Mapping[str, Mapping[str, Any] | None]
+Maps = NDArray[Any] | dict[str, NDArray[Any]]
+
+
+class RepresentationObservation(gym.Wrapper):
+    """Turns an environment's sensor maps into representations, channels first and finite.
+
+    Joined, the observation is one `Box` `[C, H, W]`: float32, the representations' channels in the
+    order of their names, ids one-hot and colours divided by 255. Where all are uint8 (rgb alone)
+    they stay so. Not joined, it is a `Dict` with a map under each name as `make_env` gives it.
+
+    Args:
+        env: gives a dict of sensor maps, as `StreetEnv` does; `prev_from_curr` and its like
+            among them.
+        representations: names, or a mapping from name to options.
+        joined: whether the maps are joined on their channels.
+        intrinsics: K `[3, 3]` of the maps in pixels; the environment's own `K` if None.
+        num_classes: of `semantic`; the environment's own if None.
+        dt_s: seconds a step; from the environment's `frame_rate_hz` if None and known.
+
+    Raises:
+        ValueError: for an unknown representation, or one that lacks what it needs.
+
+    >>> env = gym.make("flowrep/StraightRoad-v0", representations=["ego", "obj"])
+    >>> observation, info = env.reset(seed=0)
+    >>> observation.shape, observation.dtype
+    ((4, 84, 84), dtype('float32'))
+    >>> env.close()
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        representations: Representations,
+        *,
+        joined: bool = True,
+        intrinsics: Intrinsics | None = None,
+        num_classes: int | None = None,
+        dt_s: float | None = None,
+    ) -> None:
+        super().__init__(env)
+        self.names = tuple(representations)
+        self.joined = joined
+        inner = env.unwrapped
+        if intrinsics is None and hasattr(inner, "K"):
+            intrinsics = torch.from_numpy(inner.K)
+        if dt_s is None and hasattr(inner, "frame_rate_hz"):
+            dt_s = 1.0 / inner.frame_rate_hz
+        self._stack = representation_stack(
+            _onehot(representations) if joined else representations,
+            intrinsics=intrinsics,
+            num_classes=getattr(inner, "num_classes", None) if num_classes is None else num_classes,
+            dt_s=dt_s,
+        )
+        self._now = TensorDict()
+        self.observation_space = self._space(env.observation_space)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Maps, dict[str, Any]]:
+        """Begins an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        sensed = _sensed(observation)
+        self._now = self._stack._reset(sensed, sensed)
+        return self._maps(), info
+
+    def step(self, action: Any) -> tuple[Maps, float, bool, bool, dict[str, Any]]:
+        """Acts."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._now = self._stack._step(self._now, _sensed(observation))
+        return self._maps(), float(reward), terminated, truncated, info
+
+    def _maps(self) -> Maps:
+        maps = {name: self._now[name].numpy() for name in self.names}
+        if not self.joined:
+            return maps
+        if all(value.dtype == np.uint8 for value in maps.values()):
+            return np.concatenate(list(maps.values()))
+        return np.concatenate([_as_float(value) for value in maps.values()])
+
+    def _space(self, sensors: spaces.Space) -> spaces.Space:
+        if not isinstance(sensors, spaces.Dict):
+            raise ValueError(f"representations are made of a dict of sensor maps, got {sensors}")
+        spec = Composite(sensor=Composite({key: _spec(box) for key, box in sensors.items()}))
+        spec = self._stack.transform_observation_spec(spec)
+        boxes = {name: _box(spec[name]) for name in self.names}
+        if not self.joined:
+            return spaces.Dict(dict[str, spaces.Space](boxes))
+        narrow = all(box.dtype == np.uint8 for box in boxes.values())
+        sides = [
+            [bound if narrow else _as_float(bound) for bound in bounds]
+            for bounds in zip(*((box.low, box.high) for box in boxes.values()))
+        ]
+        low, high = (np.concatenate(side) for side in sides)
+        return spaces.Box(low, high, dtype=np.uint8 if narrow else np.float32)
+
+
+class NumericInfo(gym.Wrapper):
+    """Gives `info` of numbers alone, and time-outs as truncations where that is wanted.
+
+    | key | what |
+    | --- | --- |
+    | `outcome` | code of `flowrep.envs.Outcome`; 0 while the episode runs |
+    | `hit` | class id of what was hit; 255 for nothing |
+    | `episode_seed` | names the episode, see `StreetEnv.reset` |
+    | `path` | position of the episode's path among the scene's |
+    | `is_success` | whether the episode ended well, as Stable-Baselines3 reads it |
+
+    Args:
+        env: a `StreetEnv`, wrapped or not.
+        truncate_timeouts: whether running out of time is `truncated` and not `terminated`.
+    """
+
+    def __init__(self, env: gym.Env, *, truncate_timeouts: bool = False) -> None:
+        super().__init__(env)
+        self.truncate_timeouts = truncate_timeouts
+        self._paths = [path.name for path in cast(StreetEnv, env.unwrapped).scene.paths]
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, self._numbers(info)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Drives one step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        numbers = self._numbers(info)
+        if self.truncate_timeouts and numbers["outcome"] == Outcome.TIMEOUT:
+            terminated, truncated = False, True
+        return observation, float(reward), terminated, truncated, numbers
+
+    def _numbers(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        outcome = Outcome[info["outcome"].upper()]
+        return {
+            "outcome": int(outcome),
+            "hit": hit_code(info["hit"]),
+            "episode_seed": info["episode_seed"],
+            "path": self._paths.index(info["path"]),
+            "is_success": outcome == Outcome.SUCCESS,
+        }
+
+
+def make_street(
+    scene: str | Path | Mapping[str, Any] | Scene = "straight_road",
+    representations: Representations = (),
+    *,
+    joined: bool = True,
+    truncate_timeouts: bool = False,
+    **options: Any,
+) -> gym.Env:
+    """Returns what `gymnasium.make` gives: a `StreetEnv`, or its representations.
+
+    Without representations nor `truncate_timeouts` it is the plain `StreetEnv`, with its sensors
+    and with words in `info`.
+
+    Args:
+        scene: as in `StreetEnv`.
+        representations: names, or a mapping from name to options.
+        joined: as in `RepresentationObservation`.
+        truncate_timeouts: as in `NumericInfo`.
+        options: of `StreetEnv`.
+    """
+    if representations and "sensors" not in options:
+        options["sensors"] = _sensors_for(representations)
+    env: gym.Env = StreetEnv(scene, **options)
+    if representations or truncate_timeouts:
+        env = NumericInfo(env, truncate_timeouts=truncate_timeouts)
+    if representations:
+        env = RepresentationObservation(env, representations, joined=joined)
+    return env
+
+
+def _sensors_for(representations: Representations) -> list[str]:
+    """Returns the sensors that representations read: K and classes don't matter for that."""
+    stack: Compose = representation_stack(
+        representations, intrinsics=torch.eye(3), num_classes=1, dt_s=1.0
+    )
+    read = {key for transform in stack for key in transform.in_keys}
+    return [name for name in SENSORS if ("sensor", name) in read]
+
+
+def _onehot(representations: Representations) -> dict[str, dict[str, Any]]:
+    """Returns the representations with ids one-hot: a class's number is no intensity."""
+    given = representations if isinstance(representations, Mapping) else {}
+    return {
+        name: {"encoding": "onehot", **(given.get(name) or {})}
+        if name in ("seg", "seg2")
+        else dict(given.get(name) or {})
+        for name in representations
+    }
+
+
+def _sensed(observation: Mapping[str, NDArray[Any]]) -> TensorDict:
+    return TensorDict({"sensor": {key: torch.as_tensor(m) for key, m in observation.items()}})
+
+
+def _as_float(values: NDArray[Any]) -> NDArray[np.float32]:
+    return values.astype(np.float32) / (255.0 if values.dtype == np.uint8 else 1.0)
+
+
+def _spec(box: spaces.Space) -> Bounded | Unbounded:
+    if not isinstance(box, spaces.Box):
+        raise ValueError(f"representations are made of sensor maps in a Box, got {box}")
+    dtype = torch.as_tensor(np.empty(0, box.dtype)).dtype
+    if dtype.is_floating_point:
+        return Unbounded(box.shape, dtype=dtype)
+    return Bounded(torch.as_tensor(box.low), torch.as_tensor(box.high), box.shape, dtype=dtype)
+
+
+def _box(spec: Bounded | Categorical | Unbounded) -> spaces.Box:
+    dtype = np.uint8 if spec.dtype == torch.uint8 else np.float32
+    if isinstance(spec, Categorical):
+        return spaces.Box(0, spec.n - 1, tuple(spec.shape), dtype)
+    if isinstance(spec, Bounded):
+        return spaces.Box(spec.space.low.numpy(), spec.space.high.numpy(), dtype=dtype)
+    return spaces.Box(-np.inf, np.inf, tuple(spec.shape), dtype)

@@ -1,0 +1,138 @@
+"""Representations without TorchRL: numpy maps that other learners take as they are."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+
+from flowrep.envs import Outcome, RepresentationObservation, make_env
+from flowrep.transforms import REPRESENTATIONS
+
+ID = "flowrep/StraightRoad-v0"
+ALL = [name for name in REPRESENTATIONS if name != "rgb"]
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space.*", "ignore:.*unwrapped version.*")
+@pytest.mark.parametrize("joined", [True, False])
+def test_gymnasiums_own_checks_pass(joined):
+    env = gymnasium.make(ID, representations=["ego", "seg2"], joined=joined)
+    check_env(env, skip_render_check=True)
+    assert env.unwrapped.K.shape == (3, 3)
+    env.close()
+
+
+def test_maps_are_those_of_the_torchrl_env():
+    env = gymnasium.make(ID, representations=ALL, joined=False)
+    same = make_env("straight_road", ALL, num_envs=1)
+    td = same.reset(seed=3)
+    # The vector env seeds each street by its own rule: the episode's seed makes them the same.
+    observation, _ = env.reset(options={"episode_seed": int(td["episode_seed"])})
+    for _ in range(3):
+        for name in ALL:
+            assert observation[name].shape == tuple(td[name].shape[1:])
+            np.testing.assert_array_equal(observation[name], td[name][0].numpy())
+        td = same.step(td.set("action", torch.tensor([1])))["next"]
+        observation, *_ = env.step(1)
+    env.close()
+    same.close()
+
+
+def test_joined_maps_are_finite_float_channels_in_the_order_of_the_names():
+    env = gymnasium.make(ID, representations=["depth", "seg", "obj"])
+    parts = gymnasium.make(ID, representations=["depth", "seg", "obj"], joined=False)
+    for _ in range(2):
+        joined, _ = env.reset(options={"episode_seed": 4})
+        apart, _ = parts.reset(options={"episode_seed": 4})
+        for _ in range(4):
+            joined, *_ = env.step(2)
+            apart, *_ = parts.step(2)
+        assert joined.shape == env.observation_space.shape == (1 + 5 + 2, 84, 84)
+        assert joined.dtype == np.float32
+        assert joined in env.observation_space
+        assert np.isfinite(joined).all()
+        sky = apart["seg"][0] == 0
+        assert sky.any()
+        assert (joined[0][sky] == 1.0).all()
+        np.testing.assert_array_equal(joined[1:6].argmax(0), apart["seg"][0])
+        np.testing.assert_array_equal(joined[1:6].sum(0), 1.0)
+        np.testing.assert_array_equal(joined[6:], apart["obj"])
+    env.close()
+    parts.close()
+
+
+def test_colours_alone_stay_bytes():
+    env = gymnasium.make(ID, representations=["rgb"])
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space == spaces.Box(0, 255, (3, 84, 84), np.uint8)
+    assert observation.dtype == np.uint8
+    assert observation.max() > 1
+    env.close()
+
+
+@pytest.mark.parametrize("truncate", [False, True])
+def test_a_time_out_may_be_a_truncation_and_info_holds_numbers(truncate):
+    env = gymnasium.make(ID, representations=["seg"], truncate_timeouts=truncate)
+    env.reset(options={"episode_seed": 0, "vehicle_speed_mps": 0.0})  # it never gets anywhere
+    ended, steps = (False, False), 0
+    while not any(ended):
+        _, reward, *ended, info = env.step(0)
+        steps += 1
+        assert all(isinstance(value, int | bool) for value in info.values())
+    if info["outcome"] == Outcome.TIMEOUT:
+        assert ended == [not truncate, truncate]
+    assert reward == pytest.approx(-4.99)
+    assert info["outcome"] == Outcome.TIMEOUT
+    assert info["hit"] == 255
+    assert info["episode_seed"] == 0
+    assert not info["is_success"]
+    env.close()
+
+
+def test_vectorised_streets_give_stacked_maps():
+    envs = gymnasium.make_vec(ID, num_envs=2, representations=["ego", "obj"])
+    observation, _ = envs.reset(seed=0)
+    assert observation.shape == (2, 4, 84, 84)
+    observation, _, *_, info = envs.step(np.array([1, 2]))
+    assert observation in envs.observation_space
+    assert info["outcome"].dtype.kind == "i"
+    assert not np.array_equal(observation[0], observation[1])
+    envs.close()
+
+
+class Wall(gymnasium.Env):
+    """A wall 2 m ahead of a camera that goes 0.1 m to the right at each step."""
+
+    action_space = spaces.Discrete(1)
+    observation_space = spaces.Dict(
+        depth=spaces.Box(0, np.inf, (1, 3, 5), np.float32),
+        prev_from_curr=spaces.Box(-np.inf, np.inf, (4, 4), np.float32),
+    )
+
+    def look(self, x_m):
+        motion = np.eye(4, dtype=np.float32)
+        motion[0, 3] = x_m
+        return {"depth": np.full((1, 3, 5), 2.0, np.float32), "prev_from_curr": motion}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.look(0.0), {}
+
+    def step(self, action):
+        return self.look(0.1), 0.0, False, False, {}
+
+
+def test_an_env_of_ones_own_is_wrapped_by_its_camera():
+    K = [[40.0, 0.0, 2.5], [0.0, 50.0, 1.5], [0.0, 0.0, 1.0]]
+    env = RepresentationObservation(Wall(), ["ego", "depth"], intrinsics=K)
+    observation, _ = env.reset(seed=0)
+    assert not observation[:2].any()
+    observation, *_ = env.step(0)
+    np.testing.assert_allclose(observation[0], -40 * 0.1 / 2)  # u; fy would give -2.5
+    np.testing.assert_array_equal(observation[1], 0)
+    np.testing.assert_allclose(observation[2], 0.02)
+    with pytest.raises(KeyError, match=r"needs key .*'instance'"):
+        RepresentationObservation(Wall(), ["raw"], intrinsics=K)
+    with pytest.raises(ValueError, match="need intrinsics="):
+        RepresentationObservation(Wall(), ["ego"])
