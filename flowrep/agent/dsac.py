@@ -10,10 +10,11 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.objectives import DiscreteSACLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives import SoftUpdate, ValueEstimators
 
 from flowrep.agent.action import DiscreteActions
 from flowrep.agent.algorithm import move_targets, named_weights
+from flowrep.agent.dsac_loss import DiscreteSACHeadsLoss
 from flowrep.agent.encoder import Encoder
 from flowrep.agent.heads import Head
 from flowrep.agent.observation import decode_maps, map_codecs
@@ -116,7 +117,7 @@ class DiscreteSAC(OffPolicy):
             )
             critic_head = Head(self.critic_encoder.embedding_size, hidden_size, actions.count)
         self.target_encoder = copy.deepcopy(self.critic_encoder).requires_grad_(False)
-        self.loss = DiscreteSACLoss(
+        self.loss = DiscreteSACHeadsLoss(
             stochastic_policy(actor_head, ["actor_embedding"], actions),
             TensorDictModule(critic_head, ["critic_embedding"], ["action_value"]),
             action_space=actions.space,
@@ -125,12 +126,16 @@ class DiscreteSAC(OffPolicy):
             alpha_init=initial_alpha,
             target_entropy="auto",
             target_entropy_weight=target_entropy_weight,
-            # for two small heads a loop is as fast as vmap, and asks nothing of what they do
-            deactivate_vmap=True,
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.tau = tau
-        self._move_target_heads = SoftUpdate(self.loss, tau=tau)
+        SoftUpdate(self.loss, tau=tau)  # tells the loss that its targets are moved: below, at once
+        heads = zip(
+            self.loss.target_qvalue_network_params.values(True, True),
+            self.loss.qvalue_network_params.values(True, True),
+        )
+        encoders = zip(self.target_encoder.parameters(), self.critic_encoder.parameters())
+        self._targets = [(target, online.detach()) for target, online in [*heads, *encoders]]
         super().__init__(
             self._all_weights(),
             self.codecs,
@@ -206,6 +211,5 @@ class DiscreteSAC(OffPolicy):
 
     def after_update(self) -> None:
         """Moves the targets by `tau` of their distance."""
-        self._move_target_heads.step()
-        targets, online = self.target_encoder.parameters(), self.critic_encoder.parameters()
+        targets, online = zip(*self._targets)
         move_targets(targets, online, self.tau)

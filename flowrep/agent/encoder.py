@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from flowrep.agent.layers import SLOPE, convolve, linear
 from flowrep.agent.observation import BLOCK, KERNEL, MapCodec
 
 EMBEDDING_SIZE = 512
+STRIDES = (1, 2, 1)  # of the convolutions, in packed pixels
 
 
 class NatureEncoder(nn.Module):
@@ -30,14 +33,22 @@ class NatureEncoder(nn.Module):
         rows, columns = ((((size - 1) - 4) // 2 + 1) - 2 for size in codec.grid)
         self.linear = nn.Linear(64 * rows * columns, EMBEDDING_SIZE)
 
+    def convolutions(self) -> list[Tensor]:
+        """Returns weights and biases of the convolutions, the first one's over packed maps."""
+        kernel = self.codec.pack_weight(self.conv1.weight)
+        weights = (kernel, self.conv2.weight, self.conv3.weight)
+        biases = (self.conv1.bias, self.conv2.bias, self.conv3.bias)
+        both = chain.from_iterable(zip(weights, biases))
+        return [tensor for tensor in both if tensor is not None]
+
+    def embed(self, features: Tensor) -> Tensor:
+        """Returns `[N, 512]` of what the convolutions made."""
+        return F.leaky_relu_(linear(features, self.linear.weight, self.linear.bias), SLOPE)
+
     def forward(self, image: Tensor) -> Tensor:
         """Returns `[N, 512]` of a decoded map `[N, 16 * channels, h, w]`."""
-        kernel = self.codec.pack_weight(self.conv1.weight)
-        x = _convolve(image, kernel, self.conv1.bias, (1, 1))
-        x = _convolve(x, self.conv2.weight, self.conv2.bias, self.conv2.stride)
-        x = _convolve(x, self.conv3.weight, self.conv3.bias, self.conv3.stride)
-        x = x.permute(0, 2, 3, 1).flatten(1)  # [N, rows * columns * 64]
-        return F.leaky_relu_(linear(x, self.linear))
+        (features,) = convolve([image], self.convolutions(), STRIDES)
+        return self.embed(features)
 
 
 class Encoder(nn.Module):
@@ -61,19 +72,10 @@ class Encoder(nn.Module):
 
     def forward(self, images: Sequence[Tensor]) -> Tensor:
         """Returns `[N, 512 * maps]` of decoded maps, in the maps' order."""
-        embeddings = [encode(x) for encode, x in zip(self.encoders, images)]
+        encoders: list[NatureEncoder] = list(self.encoders)  # type: ignore[arg-type]
+        weights = [w for encoder in encoders for w in encoder.convolutions()]
+        features = convolve(images, weights, STRIDES)
+        embeddings = [encoder.embed(x) for encoder, x in zip(encoders, features)]
         if self.layer_norm:
             embeddings = [F.layer_norm(x, x.shape[-1:]) for x in embeddings]
         return torch.cat(embeddings, dim=-1)
-
-
-def linear(x: Tensor, layer: nn.Linear) -> Tensor:
-    """Returns `layer(x)` computed in the dtype of `x`."""
-    return F.linear(x, layer.weight.to(x.dtype), layer.bias.to(x.dtype))
-
-
-def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None, stride: tuple[int, ...]) -> Tensor:
-    # channels-last weights keep the whole chain in that layout, without reorders in between
-    weight = weight.to(x.dtype, memory_format=torch.channels_last)
-    bias = None if bias is None else bias.to(x.dtype)
-    return F.leaky_relu_(F.conv2d(x, weight, bias, stride))

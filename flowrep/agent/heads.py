@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -21,5 +25,18 @@ class Head(nn.Module):
 
     def forward(self, embedding: Tensor) -> Tensor:
         """Returns one float32 number an action."""
-        hidden = F.silu(linear(embedding, self.hidden))
+        hidden = F.silu(linear(embedding, self.hidden.weight, self.hidden.bias))
         return self.output(hidden.float())
+
+
+def heads_together(embedding: Tensor, weights: Mapping[str, Any]) -> Tensor:
+    """Returns `[heads, N, n_actions]` of several heads on one embedding `[N, embedding]`.
+
+    Args:
+        embedding: what all of them read.
+        weights: those of `Head` by module and name, stacked: the first dim is the heads.
+    """
+    hidden, output = weights["hidden"], weights["output"]
+    x = linear(embedding, hidden["weight"].flatten(0, 1), hidden["bias"].flatten())
+    x = F.silu(x).float().unflatten(-1, hidden["bias"].shape).movedim(-2, 0)
+    return torch.baddbmm(output["bias"].unsqueeze(-2), x, output["weight"].mT)

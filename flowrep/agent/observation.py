@@ -51,9 +51,12 @@ class MapCodec:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Height and width in blocks; rows and columns that no kernel reaches are left out."""
-        height, width = ((size - KERNEL) // BLOCK + 2 for size in (self.height, self.width))
-        return height, width
+        """Height and width in blocks; rows and columns that no kernel reaches are left out.
+
+        The second convolution has kernel 4 and stride 2: of an odd number of rows, it skips one.
+        """
+        height, width = ((size - KERNEL) // BLOCK + 1 for size in (self.height, self.width))
+        return height // 2 * 2 + 1, width // 2 * 2 + 1
 
     @property
     def stored_dtype(self) -> torch.dtype:

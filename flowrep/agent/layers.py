@@ -1,0 +1,227 @@
+"""The layers of a network on a CPU, a batch cut into parts that a team of threads shares.
+
+They compute what PyTorch's `conv2d`, `leaky_relu` and `linear` do, in the dtype of their input,
+with gradients for weights in float32. Besides being shared out, they cost less: no cast is taken
+twice, and the weight gradients of strided convolutions are products over unfolded maps, small
+enough to stay in a core's cache.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
+
+from flowrep.agent.team import parts, run_tasks
+
+SLOPE = 0.01  # of LeakyReLU below 0
+ROWS, FEATURES = 128, 128  # of one task
+CACHE_BYTES = 1 << 20  # of a core: what the largest map of a task should fit into
+
+aten = torch.ops.aten
+
+
+def convolve(
+    images: Sequence[Tensor], weights: Sequence[Tensor], strides: Sequence[int]
+) -> Sequence[Tensor]:
+    """Returns the features of several maps: convolutions, LeakyReLU after each, flattened.
+
+    Args:
+        images: `[N, C, h, w]`, channels last in memory, one a map.
+        weights: of the first map `[O, C, k, k]` and `[O]` for each stride, then of the next one.
+        strides: of the convolutions.
+
+    Returns:
+        `[N, rows * columns * O]` a map, rows first, channels last, in the dtype of the images.
+    """
+    if all(image.is_cpu and not image.requires_grad for image in images):
+        keeps = torch.is_grad_enabled()
+        return Convolutions.apply(strides, keeps, len(images), *images, *weights)
+    features = []
+    for i, x in enumerate(images):
+        layers = iter(weights[2 * len(strides) * i :])
+        for stride, weight, bias in zip(strides, layers, layers):
+            x = F.leaky_relu_(F.conv2d(x, *_cast(weight, bias, x.dtype), stride), SLOPE)
+        features.append(x.permute(0, 2, 3, 1).flatten(1))
+    return features
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Returns `x Wᵀ + b` of `[N, inputs]`, computed in the dtype of `x`."""
+    if x.is_cpu:
+        return Linear.apply(x, weight, bias)
+    return F.linear(x, weight.to(x.dtype), bias.to(x.dtype))
+
+
+class Convolutions(torch.autograd.Function):
+    """Several chains of convolutions, each followed by LeakyReLU, one a map.
+
+    `apply(strides, keeps, maps, *tensors)` takes each map's image `[N, C, h, w]` (channels last,
+    no gradient is computed for it), then each map's weights `[O, C, k, k]` and biases `[O]` in
+    turn; it returns each map's features `[N, rows * columns * O]`, rows first, channels last.
+    `keeps` says whether what `backward` needs is kept.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, strides: Sequence[int], keeps: bool, maps: int, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Returns the features of each map."""
+        images, weights = tensors[:maps], tensors[maps:]
+        size = 2 * len(strides)
+        chains = [
+            _Chain(image, weights[i * size : (i + 1) * size], strides)
+            for i, image in enumerate(images)
+        ]
+        run_tasks(task for chain in chains for task in chain.forward_tasks(keeps))
+        ctx.chains = chains if keeps else None
+        return tuple(chain.features for chain in chains)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        """Returns the gradients of weights and biases."""
+        chains: list[_Chain] = ctx.chains
+        run_tasks(task for chain, g in zip(chains, gradients) for task in chain.backward_tasks(g))
+        ctx.chains = None
+        nothing = [None] * (3 + len(chains))
+        return (*nothing, *(g for chain in chains for g in chain.weight_gradients()))
+
+
+class _Chain:
+    """One map's way through its convolutions."""
+
+    def __init__(self, image: Tensor, weights: Sequence[Tensor], strides: Sequence[int]) -> None:
+        self.image = image
+        self.layers = [
+            (*_cast(weight, bias, image.dtype), stride)
+            for weight, bias, stride in zip(weights[::2], weights[1::2], strides)
+        ]
+        shapes = [tuple(image.shape[2:])]  # rows, columns, and from the first layer on channels
+        for weight, _, stride in self.layers:
+            sizes = [(n - k) // stride + 1 for n, k in zip(shapes[-1], weight.shape[2:])]
+            shapes.append((*sizes, weight.shape[0]))
+        self.last = shapes[-1]
+        self.features = image.new_empty(len(image), math.prod(self.last))
+        largest = max(math.prod(shape) for shape in shapes[1:]) * image.element_size()
+        self.parts = parts(len(image), max(1, CACHE_BYTES // largest))
+        self.kept: list[list[Tensor]] = [[]] * len(self.parts)
+        self.gradients: list[list[Tensor]] = [[]] * len(self.parts)
+
+    def forward_tasks(self, keeps: bool) -> list[Any]:
+        return [partial(self._forward, i, part, keeps) for i, part in enumerate(self.parts)]
+
+    def _forward(self, i: int, part: slice, keeps: bool) -> None:
+        x = self.image[part]
+        kept = [x]
+        for weight, bias, stride in self.layers:
+            x = F.leaky_relu_(F.conv2d(x, weight, bias, stride), SLOPE)
+            kept.append(x)
+        self.features[part].view(-1, *self.last).copy_(x.permute(0, 2, 3, 1))
+        if keeps:
+            self.kept[i] = kept
+
+    def backward_tasks(self, gradient: Tensor) -> list[Any]:
+        return [partial(self._backward, i, part, gradient) for i, part in enumerate(self.parts)]
+
+    def _backward(self, i: int, part: slice, gradient: Tensor) -> None:
+        g = gradient[part].reshape(-1, *self.last).permute(0, 3, 1, 2)
+        found: list[Tensor] = []
+        for index in reversed(range(len(self.layers))):
+            weight, _, stride = self.layers[index]
+            x, y = self.kept[i][index : index + 2]
+            g = aten.leaky_relu_backward(g, y, SLOPE, True)
+            found = [_weight_gradient(g, x, weight, stride), _channel_rows(g).sum(0), *found]
+            if index:
+                g = _convolution_backward(g, x, weight, stride, [True, False])[0]
+        self.kept[i], self.gradients[i] = [], found
+
+    def weight_gradients(self) -> list[Tensor]:
+        """Returns the sums over all parts, in float32."""
+        return [_sum(gradients) for gradients in zip(*self.gradients)]
+
+
+class Linear(torch.autograd.Function):
+    """`apply(x, weight, bias)` returns `x Wᵀ + b` of `[N, inputs]` in the dtype of `x`."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """Returns `[N, outputs]`."""
+        w, b = weight.to(x.dtype), bias.to(x.dtype)
+        y = x.new_empty(len(x), len(w))
+        run_tasks(partial(torch.addmm, b, x[p], w.t(), out=y[p]) for p in parts(len(x), ROWS))
+        ctx.save_for_backward(x, w)
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
+        """Returns the gradients of input, weight and bias."""
+        x, w = ctx.saved_tensors
+        tasks: list[Any] = []
+        dx = dw = db = None
+        if ctx.needs_input_grad[1]:
+            dw = torch.empty_like(w, dtype=torch.float32)
+            tasks += [partial(_product, g[:, p].t(), x, dw[p]) for p in parts(len(w), FEATURES)]
+        if ctx.needs_input_grad[0]:
+            dx = torch.empty_like(x)
+            tasks += [partial(_product, g[p], w, dx[p]) for p in parts(len(x), ROWS)]
+        run_tasks(tasks)
+        if ctx.needs_input_grad[2]:
+            db = g.sum(0, dtype=torch.float32)
+        return dx, dw, db
+
+
+def _product(a: Tensor, b: Tensor, out: Tensor) -> None:
+    if a.dtype is out.dtype:
+        torch.mm(a, b, out=out)
+    else:
+        out.copy_(a @ b)
+
+
+def _sum(tensors: Sequence[Tensor]) -> Tensor:
+    total = tensors[0].float()
+    for tensor in tensors[1:]:
+        total = total + tensor
+    return total
+
+
+def _cast(weight: Tensor, bias: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    # channels-last weights keep the whole chain in that layout, without reorders in between
+    return weight.to(dtype, memory_format=torch.channels_last), bias.to(dtype)
+
+
+def _weight_gradient(g: Tensor, x: Tensor, weight: Tensor, stride: int) -> Tensor:
+    """Returns the gradient of a convolution's weight."""
+    outputs, channels, height, width = weight.shape
+    if height * width < 9:  # unfolding costs more than the better product brings
+        return _convolution_backward(g, x, weight, stride, [False, True])[1]
+    product = _channel_rows(g).t() @ _unfold(x, height, width, stride)
+    return product.view(outputs, height, width, channels).permute(0, 3, 1, 2)
+
+
+def _convolution_backward(
+    g: Tensor, x: Tensor, weight: Tensor, stride: int, wanted: list[bool]
+) -> tuple[Tensor, ...]:
+    """Returns the gradients of input and weight, those that are wanted."""
+    return aten.convolution_backward(
+        g, x, weight, None, [stride] * 2, [0, 0], [1, 1], False, [0, 0], 1, [*wanted, False]
+    )
+
+
+def _unfold(x: Tensor, height: int, width: int, stride: int) -> Tensor:
+    """Returns `[N * rows * columns, height * width * C]`: what each output pixel reads."""
+    x = x.permute(0, 2, 3, 1)
+    windows = x.unfold(1, height, stride).unfold(2, width, stride)  # [N, rows, columns, C, h, w]
+    return windows.permute(0, 1, 2, 4, 5, 3).reshape(-1, height * width * x.shape[-1])
+
+
+def _channel_rows(x: Tensor) -> Tensor:
+    """Returns `[N * h * w, C]` of `[N, C, h, w]`."""
+    return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])
