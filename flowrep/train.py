@@ -13,13 +13,20 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from flowrep.agent import CheckpointError, DivergenceError, keep_freed_memory
-from flowrep.build import Config, build_agent, build_env
+from flowrep.agent import (
+    CheckpointError,
+    DivergenceError,
+    keep_freed_memory,
+    threads_in_use,
+    use_threads,
+)
+from flowrep.build import Config, build_agent, build_env, choose_device
 from flowrep.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config import UsageError, validated
 from flowrep.config.training import EVALUATION_SEED, TrainConfig, validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import SceneError, WorkerError, load_scene
+from flowrep.envs.workers import available_cores
 from flowrep.experiment.comparison import compare, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.figures import draw_learning_curve
@@ -116,6 +123,7 @@ def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
 def build(config: Config, folder: RunFolder) -> Training:
     """Returns the run at its start, or at its checkpoint where it has one."""
     keep_freed_memory()
+    share_cores(config)
     torch.manual_seed(config["seed"])
     env = build_env(config)
     env.set_seed(config["seed"] * config["num_envs"])
@@ -126,6 +134,18 @@ def build(config: Config, folder: RunFolder) -> Training:
         else:
             folder.forget_after(0)
     return training
+
+
+def share_cores(config: Config) -> None:
+    """Has the updates computed by a thread a core, as many as PyTorch would take.
+
+    What is beside them is small and takes one thread, but for flow that is estimated.
+    """
+    if choose_device(config["device"]).type != "cpu":
+        return
+    use_threads(min(threads_in_use(), available_cores()))
+    if config["flow"]["source"] == "exact":
+        torch.set_num_threads(1)
 
 
 def log_evaluation(training: Training, config: Config, stop: StopRequest, frames: int) -> bool:

@@ -9,6 +9,7 @@ from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.dsac_v import DiscreteSACWithValue
 from flowrep.agent.ppo import PPO
 from flowrep.agent.replay import ReplayMemory
+from flowrep.agent.team import threads_in_use, use_threads
 
 __all__ = [
     "PPO",
@@ -22,4 +23,6 @@ __all__ = [
     "keep_freed_memory",
     "load_checkpoint",
     "save_checkpoint",
+    "threads_in_use",
+    "use_threads",
 ]

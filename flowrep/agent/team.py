@@ -11,7 +11,8 @@ do the numbers.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from queue import SimpleQueue
 from threading import Thread
@@ -23,6 +24,8 @@ Task = Callable[[], object]
 
 class Team:
     """The calling thread and `size - 1` helpers; all compute without gradients.
+
+    A team of several takes one thread for each of PyTorch's own operations.
 
     Args:
         size: threads that work at the same time, the caller's among them.
@@ -45,7 +48,7 @@ class Team:
         work = Work(tasks)
         for calls in self._calls[: len(work.tasks) - 1]:
             calls.put(work)
-        with torch.no_grad():
+        with torch.no_grad(), nullcontext() if self.size == 1 else _one_thread_an_operation():
             work.take()
         work.wait()
 
@@ -86,8 +89,22 @@ class Work:
                 raise error
 
 
+@contextmanager
+def _one_thread_an_operation() -> Iterator[None]:
+    before = torch.get_num_threads()
+    if before == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def _help(calls: SimpleQueue[Work | None]) -> None:
-    torch.set_grad_enabled(False)  # a thread's own setting
+    torch.set_num_threads(1)  # both are a thread's own settings
+    torch.set_grad_enabled(False)
     while (work := calls.get()) is not None:
         work.take()
         del work  # its tasks hold tensors
@@ -97,14 +114,19 @@ _team = Team(1)
 
 
 def use_threads(count: int) -> None:
-    """Has this process's updates on the CPU computed by `count` threads.
+    """Has `count` threads compute this process's updates on the CPU, from now on.
 
-    PyTorch's own operations take one thread each from then on, in the whole process.
+    PyTorch goes on splitting operations outside of them. Where those are small, that is slower than
+    `torch.set_num_threads(1)`, and much slower on a machine that is busy with more.
     """
     global _team
     _team.dismiss()
-    torch.set_num_threads(1)
     _team = Team(count)
+
+
+def threads_in_use() -> int:
+    """Returns how many threads compute this process's updates on the CPU."""
+    return max(_team.size, torch.get_num_threads())
 
 
 def run_tasks(tasks: Iterable[Task]) -> None:

@@ -12,7 +12,13 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
-from flowrep.agent import Algorithm, DivergenceError, load_checkpoint, save_checkpoint
+from flowrep.agent import (
+    Algorithm,
+    DivergenceError,
+    load_checkpoint,
+    save_checkpoint,
+    threads_in_use,
+)
 from flowrep.envs import begin_step, get_states, has_cores_beside, set_states
 from flowrep.experiment.cadence import Every
 from flowrep.experiment.evaluation import OUTCOMES
@@ -140,7 +146,7 @@ def train(
     should_save = Every(config["checkpoint_every_frames"], t.frames)
     total = config["total_frames"]
     is_on_gpu = t.agent.device.type == "cuda"
-    drives_meanwhile = is_on_gpu or has_cores_beside(t.env, torch.get_num_threads())
+    drives_meanwhile = is_on_gpu or has_cores_beside(t.env, threads_in_use())
     if t.carried is None:
         t.carried = t.env.reset()
     if t.owes_evaluation:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from flowrep.agent import team
-from flowrep.agent.team import Team, parts, run_tasks, use_threads
+from flowrep.agent.team import Team, parts, run_tasks, threads_in_use, use_threads
 
 
 @pytest.fixture
@@ -82,9 +82,10 @@ def test_threads_that_wait_cost_no_processor_time(threads):
     assert time.process_time() - start < 0.1  # three that spin would burn 0.5 to 1.5 s
 
 
-def test_a_process_takes_one_thread_an_operation_and_several_for_an_update(threads):
+def test_an_operation_in_a_team_takes_one_thread_and_several_outside(threads):
+    torch.set_num_threads(3)
     threads(2)
-    assert torch.get_num_threads() == 1
+    assert threads_in_use() == torch.get_num_threads() == 3
     seen = []
     meeting = threading.Barrier(2, timeout=10)
 
@@ -95,6 +96,9 @@ def test_a_process_takes_one_thread_an_operation_and_several_for_an_update(threa
     run_tasks([task, task])
     assert len({ident for ident, _ in seen}) == 2
     assert [count for _, count in seen] == [1, 1]
+    assert torch.get_num_threads() == 3
+    torch.set_num_threads(1)
+    assert threads_in_use() == 2
 
 
 @pytest.mark.parametrize("encoder", ["shared", "separate"])
