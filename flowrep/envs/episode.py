@@ -13,7 +13,6 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
-from flowrep.envs.calm import CalmGround
 from flowrep.envs.layout import Layout
 from flowrep.envs.outcome import Outcome
 from flowrep.envs.pedestrians import Crowd, draw_crowd
@@ -46,7 +45,6 @@ class Rules:
         self.tick_s = self.dt_s / self.ticks_a_step
         self.tick_times_s = [(1 + i) * self.tick_s for i in range(self.ticks_a_step)]
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
-        self.is_calm = CalmGround(layout)
 
     def is_out_of_bounds(self, state: VehicleState) -> bool:
         """Returns whether any part of the footprint is off the road."""
@@ -104,7 +102,7 @@ class Episode:
         poses = self._poses_ahead()
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
-            if is_near[i] or not rules.is_calm(vehicle.x_m, vehicle.y_m):
+            if is_near[i] or not street.is_calm(vehicle.x_m, vehicle.y_m):
                 self._judge(vehicle, poses[i], street)
             if self.outcome:
                 break
@@ -125,7 +123,7 @@ class Episode:
         return self._foreseen[at : at + count]
 
     def _judge(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
-        self.hit = street.hit(vehicle, poses)
+        self.hit = street.hit(vehicle, poses, self.path.closures)
         if self.hit:
             self.outcome = Outcome.COLLISION
         elif self.rules.is_out_of_bounds(vehicle):

@@ -69,7 +69,7 @@ class Sensing:
         return rgb
 
     def look(self, episode: Episode) -> Picture:
-        """Returns a picture of an episode's present, with everyone where they were last put."""
+        """Returns a picture from an episode's camera of what was last put into the street."""
         camera, pose = self._camera, self._camera_poses([episode.now])
         return self._street.simulator.look(
             gl_view(pose.cam_from_world[0]), self._projection, camera.height_px, camera.width_px
@@ -92,8 +92,10 @@ class Sensing:
 
     def _seen(self, episode: Episode) -> Picture:
         if self._picture is None:
-            self._street.place_pedestrians(episode.poses, episode.now.vehicle)
-            self._picture = self.look(episode)
+            with self._street.lock:
+                self._street.close_exits(episode.path.closures)
+                self._street.place_pedestrians(episode.poses, episode.now.vehicle)
+                self._picture = self.look(episode)
         return self._picture
 
     def _camera_poses(self, moments: Sequence[Moment]) -> CameraPose:
@@ -134,7 +136,9 @@ def observe_together(sensings: Sequence[Sensing], episodes: Sequence[Episode]) -
                 name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]
             }
         else:
-            is_shown = np.stack([sensing._street.is_shown for sensing in sensings])
+            street = first._street
+            closed = [street.solids(episode.path.closures).is_shown for episode in episodes]
+            is_shown = np.stack(closed)
             drawn = first._rasterise(now.cam_from_world, parts, is_shown)
             observation |= {name: maps[:, None] for name, maps in drawn._asdict().items()}
     if not names.isdisjoint(_MOTIONS):

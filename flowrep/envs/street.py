@@ -1,8 +1,11 @@
 """A laid-out scene as bodies in the simulator: what the camera sees and the vehicle can hit."""
 
 import math
-from collections.abc import Iterable, Sequence
+import pickle
+import threading
+from collections.abc import Sequence
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 import shapely
@@ -10,7 +13,9 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from flowrep.envs import furniture, meshes, paint, people
+from flowrep.envs.calm import CalmGround
 from flowrep.envs.layout import Box, Layout
+from flowrep.envs.scene import Scene
 from flowrep.envs.simulator import Simulator
 from flowrep.envs.vehicle import VehicleState
 from flowrep.palette import CATEGORY_ID
@@ -31,11 +36,28 @@ class Solid(NamedTuple):
     number: int  # of `Street.bodies`
 
 
+class Solids(NamedTuple):
+    """What can be hit while some exits are closed, box by box, and which bodies are there."""
+
+    owners: tuple[Solid, ...]
+    centres: Array  # [B, 2]
+    reaches_m: Array  # [B], within which the vehicle may touch a box
+    is_shown: Array  # of `Street.bodies`
+
+
 class Street:
-    """The bodies of one scene. Closures start hidden, pedestrians at the origin."""
+    """The bodies of one scene, for all environments of a process that drive through it.
+
+    It keeps no account of an episode: who asks says where the vehicle and everyone is and which
+    exits are closed. A PyBullet client of its own takes 28 MB, so that each environment shares one.
+    """
 
     def __init__(self, layout: Layout) -> None:
-        """Builds every body of the scene in a simulator of its own."""
+        """Builds every body of the scene in a simulator."""
+        self.layout = layout
+        self.is_calm = CalmGround(layout)
+        self.lock = threading.RLock()  # held from placing bodies to looking at them
+        self.users = 0
         self.simulator = Simulator(paint.picture())
         self.bodies: list[Body] = []
         vehicle = layout.scene.vehicle
@@ -56,24 +78,55 @@ class Street:
         self._parts = np.array(parts, dtype=int).reshape(count, len(people.PARTS))
         self._placed = np.full((count, 4), np.nan)  # where everyone's parts were last put
         self.triangles = gather(self.bodies)
+        self._solids_while_closed: dict[tuple[str, ...], Solids] = {}
+        self._closed: tuple[str, ...] | None = None
         self.close_exits(())
 
-    def close_exits(self, names: Iterable[str]) -> None:
+    @classmethod
+    def shared(cls, scene: Scene) -> "Street":
+        """Returns the street that all open environments of the process with this scene share."""
+        key = pickle.dumps(scene)
+        street = _STREETS.get(key)
+        if street is None:
+            street = _STREETS[key] = cls(Layout(scene))
+        street.users += 1
+        return street
+
+    def leave(self) -> None:
+        """Gives the simulator's client back when the last environment that shares it leaves."""
+        self.users -= 1
+        if self.users == 0:
+            self.simulator.close()
+            for key in [key for key, street in _STREETS.items() if street is self]:
+                del _STREETS[key]
+
+    def solids(self, closures: tuple[str, ...]) -> Solids:
+        """Returns what can be hit and seen while the closures of these names are up."""
+        if closures not in self._solids_while_closed:
+            solids = [*self._solids, *(self._closures[name] for name in closures)]
+            boxes = [box for solid in solids for box in solid.boxes]
+            reaches = [math.hypot(*box.size_m[:2]) / 2 for box in boxes]
+            is_shown = np.ones(len(self.bodies), dtype=bool)
+            for name, solid in self._closures.items():
+                is_shown[solid.number] = name in closures
+            self._solids_while_closed[closures] = Solids(
+                tuple(solid for solid in solids for _ in solid.boxes),
+                np.array([(box.x_m, box.y_m) for box in boxes]).reshape(-1, 2),
+                np.array(reaches) + self._vehicle_reach_m,
+                is_shown,
+            )
+        return self._solids_while_closed[closures]
+
+    def close_exits(self, closures: tuple[str, ...]) -> None:
         """Puts up the closures that are named and takes away all others."""
-        self._closed = [name for name in self._closures if name in set(names)]
-        self.is_shown = np.ones(len(self.bodies), dtype=bool)
+        if closures == self._closed:
+            return
         for name, solid in self._closures.items():
-            if name in self._closed:
+            if name in closures:
                 self.simulator.place(solid.body, 0.0, 0.0, 0.0)
             else:
                 self.simulator.hide(solid.body)
-                self.is_shown[solid.number] = False
-        solids = [*self._solids, *(self._closures[name] for name in self._closed)]
-        self._owners = [solid for solid in solids for _ in solid.boxes]
-        boxes = [box for solid in solids for box in solid.boxes]
-        self._centres = np.array([(box.x_m, box.y_m) for box in boxes]).reshape(-1, 2)
-        reaches = [math.hypot(*box.size_m[:2]) / 2 for box in boxes]
-        self._reaches = np.array(reaches) + self._vehicle_reach_m
+        self._closed = closures
 
     def place_pedestrians(self, poses: Array, viewer: VehicleState) -> None:
         """Puts everyone at their pose [P, 4] who has moved and is, or was last put, in view."""
@@ -103,11 +156,7 @@ class Street:
         gaps = poses[..., :2] - centres[:, None]
         return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)
 
-    def _boxes_near(self, state: VehicleState) -> Array:
-        gaps = np.hypot(self._centres[:, 0] - state.x_m, self._centres[:, 1] - state.y_m)
-        return gaps <= self._reaches
-
-    def hit(self, state: VehicleState, poses: Array) -> str:
+    def hit(self, state: VehicleState, poses: Array, closures: tuple[str, ...]) -> str:
         """Returns the category of what the vehicle overlaps, or "".
 
         Only what is near enough to be touched is put before the simulator's collision oracle.
@@ -115,17 +164,23 @@ class Street:
         Args:
             state: where the vehicle is.
             poses: where everyone is, poses [P, 4].
+            closures: names of those that are up.
         """
-        self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)
         gaps = np.hypot(poses[:, 0] - state.x_m, poses[:, 1] - state.y_m)
-        for i in np.flatnonzero(gaps <= self._person_reach_m).tolist():
-            self.simulator.place(self._person, *poses[i, :3].tolist())
-            if self.simulator.vehicle_touches(self._person):
-                return "pedestrian"
-        owners = (self._owners[i] for i in np.flatnonzero(self._boxes_near(state)).tolist())
+        people_near = np.flatnonzero(gaps <= self._person_reach_m).tolist()
+        solids = self.solids(closures)
+        gaps = np.hypot(solids.centres[:, 0] - state.x_m, solids.centres[:, 1] - state.y_m)
+        owners = (solids.owners[i] for i in np.flatnonzero(gaps <= solids.reaches_m).tolist())
         near = {solid.body: solid.category for solid in owners}
-        touched = (name for body, name in near.items() if self.simulator.vehicle_touches(body))
-        return next(touched, "")
+        with self.lock:
+            self.close_exits(closures)
+            self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)
+            for i in people_near:
+                self.simulator.place(self._person, *poses[i, :3].tolist())
+                if self.simulator.vehicle_touches(self._person):
+                    return "pedestrian"
+            touched = (name for body, name in near.items() if self.simulator.vehicle_touches(body))
+            return next(touched, "")
 
     def _add_ground(self, layout: Layout) -> None:
         striped = shapely.union_all([area.polygon for area in layout.crosswalks])
@@ -187,3 +242,6 @@ class Street:
         seen_as = CATEGORY_ID[category], instance
         self.bodies.append(Body(vertices, triangles, *seen_as, moves=instance > 0))
         return self.simulator.add_body(mesh, category, instance=instance, **options)
+
+
+_STREETS: WeakValueDictionary[bytes, Street] = WeakValueDictionary()

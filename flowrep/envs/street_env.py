@@ -8,7 +8,6 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from flowrep.envs.episode import Episode, Moment, Rules
-from flowrep.envs.layout import Layout
 from flowrep.envs.loading import load_scene
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.scene import Range, Scene, SpeedMode
@@ -68,8 +67,9 @@ class StreetEnv(gym.Env):
         self.render_mode = _render_mode(render_mode)
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
-        self._rules = Rules(Layout(self.scene), self.frame_rate_hz)
-        self._street = Street(self._rules.layout)
+        self._street = Street.shared(self.scene)
+        self._is_open = True
+        self._rules = Rules(self._street.layout, self.frame_rate_hz)
         self.sensing = Sensing(self.scene, self._street, sensors, renderer)
         self.K = self.sensing.K
         self._episode: Episode | None = None
@@ -128,8 +128,10 @@ class StreetEnv(gym.Env):
         return self.sensing.rgb(self.episode)
 
     def close(self) -> None:
-        """Gives the simulator's client back."""
-        self._street.simulator.close()
+        """Leaves the street; the last one to do so gives the simulator's client back."""
+        if self._is_open:
+            self._is_open = False
+            self._street.leave()
 
     def get_state(self) -> dict[str, Any]:
         """Returns all that the future depends on, as plain data that JSON can hold."""
@@ -160,7 +162,6 @@ class StreetEnv(gym.Env):
         self._episode = Episode(
             self._rules, seed, self.speed_mps, path=path, vehicle_speed_mps=vehicle_speed_mps
         )
-        self._street.close_exits(self._episode.path.closures)
 
     def _info(self) -> dict[str, Any]:
         episode = self.episode

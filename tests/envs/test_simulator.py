@@ -7,6 +7,7 @@ import sys
 import textwrap
 import weakref
 
+import numpy as np
 import pybullet
 import pytest
 
@@ -24,6 +25,48 @@ def test_closing_twice_gives_one_client_back():
     env.close()
     env.close()
     assert clients() == before
+
+
+def test_streets_of_one_scene_share_a_client_until_the_last_one_is_closed(straight_road):
+    before = clients()
+    streets = [StreetEnv(straight_road, sensors=()) for _ in range(3)]
+    other = StreetEnv("s_turn", sensors=())
+    assert clients() == before + 2
+    for env in streets[:2]:
+        env.close()
+        env.close()
+    streets[2].reset(seed=0)
+    streets[2].step(0)
+    assert clients() == before + 2
+    streets[2].close()
+    assert clients() == before + 1
+    again = StreetEnv(straight_road, sensors=())
+    again.reset(seed=0)
+    again.step(0)
+    again.close()
+    other.close()
+    assert clients() == before
+
+
+def test_streets_that_share_a_client_keep_their_exits_and_people_apart():
+    # Both stand in one world: each is asked in turn, and must not see the other's.
+    paths = "south_to_north", "north_to_south"
+    alone = []
+    for path in paths:
+        env = StreetEnv("h_shaped_pathways", renderer="pybullet")
+        env.reset(options={"path": path, "episode_seed": 7})
+        alone.append([env.step(i % 3)[0] for i in range(6)])
+        env.close()
+    envs = [StreetEnv("h_shaped_pathways", renderer="pybullet") for _ in paths]
+    for env, path in zip(envs, paths):
+        env.reset(options={"path": path, "episode_seed": 7})
+    shared = [[env.step(i % 3)[0] for env in envs] for i in range(6)]
+    for env in envs:
+        env.close()
+    for k in range(len(paths)):
+        for i in range(6):
+            for name, value in alone[k][i].items():
+                np.testing.assert_array_equal(value, shared[i][k][name])
 
 
 def test_a_forgotten_street_gives_its_client_back():
