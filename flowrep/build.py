@@ -1,14 +1,17 @@
 """From a resolved config to the env and the agent that it describes."""
 
+import inspect
 from collections.abc import Mapping
+from pkgutil import resolve_name
 from typing import Any
 
 import torch
-from hydra.utils import get_class
 from torchrl.envs import EnvBase
 
 from flowrep.agent import Algorithm
 from flowrep.config import UsageError
+from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.violations import closest
 from flowrep.envs import make_env
 from flowrep.envs.workers import available_cores
 
@@ -64,22 +67,77 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
     return make_env(**(arguments | changes | workers))
 
 
-def build_agent(config: Config, env: EnvBase) -> Algorithm:
-    """Returns the config's algorithm, untrained, on what the env emits."""
-    algorithm, arguments, options = _algorithm(config, env)
-    return algorithm(*arguments, **options)
+def build_agent(config: Config, env: EnvBase, trust: str | None = None) -> Algorithm:
+    """Returns the config's algorithm, untrained, on what the env emits.
+
+    Args:
+        config: of a run.
+        env: that the run's config describes.
+        trust: a class outside flowrep that may be imported, see `algorithm_class`.
+    """
+    arguments, options = _arguments(config, env)
+    return algorithm_class(config["algorithm"], trust)(*arguments, **options)
 
 
-def build_policy(config: Config, env: EnvBase) -> Any:
-    """Returns the acting side of the config's algorithm alone, untrained."""
-    algorithm, arguments, options = _algorithm(config, env)
-    return algorithm.build_policy(*arguments, **options)
+def build_policy(config: Config, env: EnvBase, trust: str | None = None) -> Any:
+    """Returns the acting side of the config's algorithm alone, untrained; see `build_agent`."""
+    arguments, options = _arguments(config, env)
+    return algorithm_class(config["algorithm"], trust).build_policy(*arguments, **options)
 
 
-def _algorithm(config: Config, env: EnvBase) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
-    """Returns the algorithm's class and its arguments, by position and by name."""
-    options = dict(config["algorithm"])
-    algorithm = get_class(options.pop("_target_"))
+def algorithm_class(section: Mapping[str, Any], trust: str | None) -> Any:
+    """Returns the class that a config's `_target_` names, one of flowrep's or the trusted one.
+
+    Importing a module runs its code. A config may come from somebody else, so only what the person
+    at the command line names is imported.
+
+    Args:
+        section: a config's `algorithm`.
+        trust: the full name of a class outside flowrep that may be imported.
+
+    Raises:
+        UsageError: it is another class, or no algorithm, or its options are not those given.
+    """
+    target = section["_target_"]
+    if target not in ALGORITHMS and target != trust:
+        raise UsageError(
+            f"the run's algorithm is {target}, which is not one of flowrep's, and loading it runs "
+            f"code of its author: if you trust it, add trust={target}"
+        )
+    try:
+        found = resolve_name(target)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(
+            f"algorithm._target_={target} can't be imported: {error}; is its folder in PYTHONPATH?"
+        ) from None
+    if not (isinstance(found, type) and issubclass(found, Algorithm)):
+        raise UsageError(f"algorithm._target_={target} is no subclass of flowrep.agent.Algorithm")
+    if target not in ALGORITHMS:
+        _check_options(section, inspect.signature(found))
+    return found
+
+
+GIVEN_BY_THE_RUN = ("observation_spec", "action_spec", "keys", "total_frames", "device")
+
+
+def _check_options(section: Mapping[str, Any], signature: inspect.Signature) -> None:
+    """Refuses options that a class does not have, and the lack of those that it needs."""
+    options = [key for key in section if key != "_target_"]
+    known = {n: p for n, p in signature.parameters.items() if n not in GIVEN_BY_THE_RUN}
+    for key in options:
+        if key not in known:
+            raise UsageError(
+                f"unknown key '{key}' of 'algorithm'{closest(key, list(known))}; "
+                f"{section['_target_']} has: {', '.join(known)}"
+            )
+    for name, parameter in known.items():
+        if parameter.default is inspect.Parameter.empty and name not in options:
+            raise UsageError(f"'algorithm.{name}' needs a value: +algorithm.{name}=...")
+
+
+def _arguments(config: Config, env: EnvBase) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Returns the arguments of the config's algorithm, by position and by name."""
+    options = {key: value for key, value in config["algorithm"].items() if key != "_target_"}
     specs = env.observation_spec, env.action_spec, list(config["representations"])
     device = choose_device(config["device"])
-    return algorithm, specs, {"total_frames": config["total_frames"], "device": device} | options
+    return specs, {"total_frames": config["total_frames"], "device": device} | options

@@ -28,6 +28,8 @@ from flowrep.experiment.origin import check_origin, origin_of
 from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder
 
+OF_THE_MACHINE = ("device", "num_envs", "num_workers", "trust")  # not as the run was trained
+
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="evaluate")
 def run(config: DictConfig) -> None:
@@ -44,7 +46,7 @@ def run(config: DictConfig) -> None:
 def evaluate(config: DictConfig, folder: RunFolder) -> None:
     """Does what `run` says, for an agent in a folder that is held."""
     own = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
-    trained = own | {key: config[key] for key in ("device", "num_envs", "num_workers")}
+    trained = own | {key: config[key] for key in OF_THE_MACHINE}
     speeds, policies, baselines = (as_list(config[key]) for key in ("speed", "policy", "baselines"))
     rates = [float(rate) for rate in as_list(config.fps)]
     folder.read_episodes()  # a table that can't be added to is better known before than after
@@ -88,7 +90,7 @@ def load_policy(
     state = load_checkpoint(path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin, path)
     env = build_env(trained, num_envs=1, num_workers=0)
-    policy = build_policy(trained, env)
+    policy = build_policy(trained, env, trust=trained["trust"])
     env.close()
     policy.load_state_dict(state["policy"])
     return policy, state["frames"]

@@ -21,8 +21,16 @@ from flowrep.agent import (
     use_threads,
 )
 from flowrep.build import Config, build_agent, build_env, choose_device
-from flowrep.command_line import exit_with, own_keys, plain_config, run_command
+from flowrep.command_line import (
+    exit_with,
+    line_for,
+    own_keys,
+    plain_config,
+    run_command,
+    typed_value,
+)
 from flowrep.config import UsageError, validated
+from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.training import EVALUATION_SEED, TrainConfig, validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import SceneError, WorkerError, load_scene
@@ -36,8 +44,9 @@ from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import Training, train
+from flowrep.quoting import override
 
-OF_THE_MACHINE = ("device", "num_workers")  # what a resumed run takes from its new command line
+OF_THE_MACHINE = ("device", "num_workers", "trust")  # a resumed run's, from its new command line
 FINAL_POLICIES = ("greedy", "sampled")  # of the agent, beside the baselines
 
 
@@ -72,10 +81,11 @@ def carry_out(config: Config, folder: RunFolder) -> None:
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
     print(f"run folder: {folder.path}")
+    where, how_to_go_on = str(folder.path), how_to_resume(config, folder)
     if training.frames >= config["total_frames"] and folder.is_evaluated(
         training.frames, final_episodes(config)
     ):
-        print(f"this run is complete; evaluate it with: flowrep.evaluate run={folder.path}")
+        print(f"this run is complete; evaluate it with: {line_for('evaluate', run=where)}")
         return
     with StopRequest() as stop:
         try:
@@ -87,21 +97,26 @@ def carry_out(config: Config, folder: RunFolder) -> None:
         except (CheckpointError, DivergenceError) as error:
             exit_with(f"after {training.frames} frames: {error}")
         except WorkerError as error:
-            exit_with(
-                f"after {training.frames} frames: {error}\nContinue with resume={folder.path}"
-            )
+            exit_with(f"after {training.frames} frames: {error}\nContinue with: {how_to_go_on}")
         except OSError as error:
             exit_with(
                 f"after {training.frames} frames: {error}. Free some space or make the folder "
-                f"writable, then continue with resume={folder.path}"
+                f"writable, then continue with: {how_to_go_on}"
             )
     training.env.close()
     if stop:
         print(
             f"\nstopped after {training.frames} frames; all is saved. Continue with\n"
-            f"  python -m flowrep.train resume={folder.path}"
+            f"  {how_to_go_on}"
         )
         sys.exit(stop.exit_code)
+
+
+def how_to_resume(config: Config, folder: RunFolder) -> str:
+    """Returns the line that continues a run."""
+    target = config["algorithm"]["_target_"]
+    trust = {} if target in ALGORITHMS else {"trust": target}
+    return line_for("train", resume=str(folder.path), **trust)
 
 
 def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
@@ -114,7 +129,7 @@ def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
     if others:
         raise UsageError(
             f"resume= continues a run with its own config, so '{others[0]}' would be ignored; "
-            "leave it out (device= and num_workers= may be changed)"
+            "leave it out (device=, num_workers= and trust= may be given)"
         )
     stored = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
     return stored | {key: plain[key] for key in (*OF_THE_MACHINE, "resume")}
@@ -127,8 +142,12 @@ def build(config: Config, folder: RunFolder) -> Training:
     torch.manual_seed(config["seed"])
     env = build_env(config)
     env.set_seed(config["seed"] * config["num_envs"])
-    training = Training(env, build_agent(config, env), folder, origin_of(config))
-    if config["resume"] is not None:
+    is_new = config["resume"] is None
+    # of a new run the person who typed the command named the class
+    trusted = config["algorithm"]["_target_"] if is_new else config["trust"]
+    agent = build_agent(config, env, trust=trusted)
+    training = Training(env, agent, folder, origin_of(config))
+    if not is_new:
         if folder.checkpoint_path.exists():
             training.load()
         else:
@@ -202,13 +221,14 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
 
 def main() -> None:
     """Entry point; mistakes on the command line end in one line that lists what exists."""
-    resumed = [a.removeprefix("resume=") for a in sys.argv[1:] if a.startswith("resume=")]
-    if resumed:
+    resumed = typed_value("resume")
+    if resumed is not None:
         try:
-            folder = RunFolder.existing(resumed[-1])
+            folder = RunFolder.existing(str(resumed))
         except RunFolderError as error:
             exit_with(str(error))
-        sys.argv.append(f"hydra.run.dir={folder.path}")
+        place = max(i for i, a in enumerate(sys.argv) if a.startswith("resume="))
+        sys.argv.insert(place + 1, override("hydra.run.dir", str(folder.path)))
     run_command("train", run, TrainConfig)
 
 

@@ -5,8 +5,12 @@ import subprocess
 import sys
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
 
-from flowrep.command_line import UsageError, check_overrides
+from flowrep.config import UsageError
+from flowrep.config.training import TrainConfig
+from flowrep.config_tree import CONF_DIR
+from flowrep.preview import check_command
 
 pytest.importorskip("pybullet", reason="the commands need the simulator")
 
@@ -15,7 +19,7 @@ pytest.importorskip("pybullet", reason="the commands need the simulator")
     ("override", "names"),
     [
         ("representations=[eggo]", ["unknown representations 'eggo'", "'ego'", "depth2", "seg"]),
-        ("representations=[ego,eggo],[raw]", ["unknown representations 'eggo'"]),
+        ("-m representations=[ego],[raw,eggo]", ["unknown representations 'eggo'"]),
         ("sed=3", ["unknown key 'sed'", "did you mean 'seed'", "total_frames", "preset"]),
         ("scene=straight", ["unknown scene 'straight'", "straight_road"]),
         ("preset=desktop", ["unknown preset 'desktop'", "laptop, paper"]),
@@ -24,11 +28,24 @@ pytest.importorskip("pybullet", reason="the commands need the simulator")
         ("scene.camera.heigth_px=84", ["unknown key 'heigth_px' of 'scene.camera'", "height_px"]),
         ("seed.value=3", ["unknown key 'value' of 'seed'", "it has no keys"]),
         ("representations=[ego", ["can't read 'representations=[ego'"]),
+        ("representations=null", ["representations should be one of: depth, depth2", "not null"]),
+        ("scene=null", ["scene should be one of: h_shaped_pathways", "not null"]),
+        ("hydra/launcher=joblb", ["unknown hydra/launcher 'joblb'", "'joblib'", "basic"]),
+        ("hydra/job_logging=loud", ["unknown hydra/job_logging 'loud'", "default"]),
+        ("hydra.run.dirr=x", ["Could not override 'hydra.run.dirr'"]),
+        ("~sed", ["unknown key 'sed'", "did you mean 'seed'"]),
+        ("-m scene=s_turn,straight", ["unknown scene 'straight'"]),
+        ("-m seed=0,1,-2", ["seed should be a whole number from 0 to 2147483647, not -2"]),
+        ("-m algorithm.gamma=interval(0.9,1.5)", ["algorithm.gamma should be", "not 1.5"]),
+        ("seed=0,1", ["'seed=0,1' is several values: add -m", "seed=[0,1]"]),
+        ("hydra.run.dir=/home/josé/x", ["'hydra.run.dir='\"'\"'/home/josé/x'\"'\"''"]),
+        ("--config-dir nowhere", ["--config-dir: there is no folder", "nowhere"]),
+        ("--cfg job sed=1", ["unknown key 'sed'"]),
     ],
 )
 def test_a_mistake_is_named_and_what_exists_is_listed(override, names):
     with pytest.raises(UsageError) as caught:
-        check_overrides("train", [override])
+        check_command("train", override.split(), TrainConfig)
     message = str(caught.value)
     assert "\n" not in message
     for name in names:
@@ -36,17 +53,47 @@ def test_a_mistake_is_named_and_what_exists_is_listed(override, names):
 
 
 @pytest.mark.parametrize(
-    "overrides",
+    "line",
     [
-        [],
-        ["representations=[ego,obj,seg2]", "scene=straight_road", "preset=laptop", "seed=1"],
-        ["representations=[ego],[raw],[ego,obj]", "seed=0,1,2"],
-        ["representations.ego.scale=0.5", "scene.camera.height_px=64", "debug=smoke"],
-        ["hydra.run.dir=elsewhere", "algorithm.encoder=separate"],
+        "",
+        "representations=[ego,obj,seg2] scene=straight_road preset=laptop seed=1",
+        "-m representations=[ego],[raw],[ego,obj] seed=0,1,2",
+        "-m scene=glob(s*) seed=range(0,1000)",
+        "representations.ego.scale=0.5 scene.camera.height_px=64 debug=smoke",
+        "hydra.run.dir=elsewhere algorithm.encoder=separate",
+        "-m hydra/launcher=joblib seed=0,1",
+        "-m hydra/launcher=submitit_local seed=0,1",
+        "-m hydra/sweeper=optuna hydra/sweeper/sampler=random algorithm.gamma=interval(0.9,0.99)",
+        "hydra/job_logging=default hydra/hydra_logging=none hydra.verbose=true",
+        "+note=pilot ++seed=4 +mine.deep=1 +algorithm@beside=dqn +hydra.job.env_set.A=1",
+        "~debug",
+        "--cfg job seed=-1",
+        "--info searchpath",
     ],
 )
-def test_what_is_right_passes(overrides):
-    check_overrides("train", overrides)
+def test_what_hydra_accepts_passes(line):
+    check_command("train", line.split(), TrainConfig)
+
+
+@pytest.mark.parametrize("form", ["hydra.searchpath=[pkg://mypkg.conf]", "--config-dir"])
+def test_configs_of_one_s_own_are_found(form, tmp_path, monkeypatch):
+    """An algorithm of the user's, by a package on the path or by a folder."""
+    folder = tmp_path / "mypkg" / "conf"
+    (folder / "algorithm").mkdir(parents=True)
+    for place in (folder.parent, folder):
+        (place / "__init__.py").touch()
+    dqn = (CONF_DIR / "algorithm" / "dqn.yaml").read_text()
+    (folder / "algorithm" / "mine.yaml").write_text(dqn.replace("gamma: 0.99", "gamma: 0.5"))
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = [form, str(folder)] if form.startswith("--") else [form]
+    check_command("train", [*arguments, "algorithm=mine"], TrainConfig)
+    with pytest.raises(UsageError, match=r"unknown algorithm 'mein'.*dqn, dsac, dsac_v, mine, ppo"):
+        check_command("train", [*arguments, "algorithm=mein"])
+
+
+def test_the_check_leaves_hydra_as_it_found_it():
+    check_command("train", [])
+    assert not GlobalHydra.instance().is_initialized()
 
 
 def run_command(*arguments, cwd):

@@ -19,11 +19,11 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 import cv2
 import imageio.v3 as imageio
 
-from flowrep.command_line import check_overrides
 from flowrep.config import UsageError, validated
 from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config_tree import CONF_DIR, group_choices
 from flowrep.factorize import factorize_recording, main
+from flowrep.preview import check_command
 from flowrep.sequences import RECORDINGS, STREAMS, SequenceError, read_flo, read_kitti_flow
 from flowrep.sequences.job import Job
 from flowrep.sequences.scores import COLUMNS
@@ -242,7 +242,7 @@ def test_exact_flow_where_there_is_none(tmp_path):
 )
 def test_what_cannot_be_is_named(override, says):
     with pytest.raises(UsageError) as caught:
-        check_overrides(
+        check_command(
             "factorize", ["input=a", "output=b", "format=frames", override], FactorizeConfig
         )
     assert says in str(caught.value)
@@ -257,9 +257,7 @@ def test_what_cannot_be_is_named(override, says):
 )
 def test_what_cannot_be_of_a_format_is_named(override, says):
     with pytest.raises(UsageError) as caught:
-        check_overrides(
-            "factorize", ["input=a", "output=b", "format=tum", override], FactorizeConfig
-        )
+        check_command("factorize", ["input=a", "output=b", "format=tum", override], FactorizeConfig)
     assert says in str(caught.value)
 
 
@@ -271,7 +269,7 @@ def test_flow_on_the_other_grid_is_refused(moments, tmp_path):
 
 def test_unknown_formats_are_refused_and_the_known_ones_listed():
     with pytest.raises(UsageError, match=r"unknown format 'tumm' \(did you mean 'tum'"):
-        check_overrides("factorize", ["input=a", "output=b", "format=tumm"], FactorizeConfig)
+        check_command("factorize", ["input=a", "output=b", "format=tumm"], FactorizeConfig)
     assert set(group_choices("format")) == {*RECORDINGS, *STREAMS}
 
 

@@ -11,8 +11,9 @@ from hydra import compose, initialize_config_dir
 
 pytest.importorskip("pybullet", reason="the command needs the simulator")
 
-from flowrep.command_line import UsageError, check_overrides
+from flowrep.config import UsageError
 from flowrep.config_tree import CONF_DIR
+from flowrep.preview import check_command
 from flowrep.view import check, moments, moving_pixels
 
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
@@ -61,7 +62,7 @@ def test_what_cannot_be_is_named(override, expected):
 
 def test_an_unknown_scene_is_named():
     with pytest.raises(UsageError, match=r"unknown scene 's_turm' \(did you mean 's_turn'\?\)"):
-        check_overrides("view", ["scene=s_turm"])
+        check_command("view", ["scene=s_turm"])
 
 
 def test_without_a_screen_the_command_ends_in_one_line(tmp_path, monkeypatch):

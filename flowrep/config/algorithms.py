@@ -23,7 +23,7 @@ from flowrep.config.section import Section
 from flowrep.config.violations import broken_rule
 
 OFF_BEFORE: Any = None
-"""Marks options that runs of before do not have; what their class does without them is as then."""
+"""Marks keys that runs of before do not have, and what is done without them is as then."""
 
 
 class Run(Protocol):

@@ -6,7 +6,7 @@ from pydantic import model_validator
 
 from flowrep.config.expectations import Count, CountOrZero, ListOf, Number, OneOf, Seed, Text
 from flowrep.config.section import Section
-from flowrep.config.training import SPEEDS, Device, Workers, check_workers
+from flowrep.config.training import SPEEDS, Device, Trust, Workers, check_workers
 from flowrep.envs.baselines import BASELINES
 
 POLICIES = ("greedy", "sampled")
@@ -25,6 +25,7 @@ class EvaluateConfig(Section):
     num_envs: Count
     num_workers: Workers
     device: Device
+    trust: Trust
     video: CountOrZero
 
     @model_validator(mode="after")

@@ -64,8 +64,9 @@ def validated(schema: type[S], config: Mapping[str, Any], own_keys: Collection[s
     Raises:
         UsageError: a line for each key that is unknown, missing, or not what it should be.
     """
-    if own_keys:
-        config = {key: value for key, value in config.items() if key not in own_keys}
+    not_checked = set(own_keys) - set(schema.keys())
+    if not_checked:
+        config = {key: value for key, value in config.items() if key not in not_checked}
     try:
         return schema.model_validate(config)
     except ValidationError as error:

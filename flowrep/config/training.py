@@ -5,7 +5,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import ConfigDict, Field, model_validator
 
-from flowrep.config.algorithms import AnyAlgorithm, ByTarget
+from flowrep.config.algorithms import OFF_BEFORE, AnyAlgorithm, ByTarget
 from flowrep.config.expectations import Count, ListOf, OneOf, Seed, Switch, Text, Whole
 from flowrep.config.representations import BySource, Representations
 from flowrep.config.section import Section, validated
@@ -23,6 +23,7 @@ SPEEDS: tuple[str, ...] = get_args(SpeedMode)
 Speed = Annotated[str, OneOf(SPEEDS)]
 Device = Annotated[str, Text("auto, cpu, cuda or cuda:<number>", r"^(auto|cpu|cuda(:\d+)?)$")]
 Workers = Annotated[int | str, Whole(0, also=("auto",))]
+Trust = Annotated[str | None, Text("a class, package.module.Class", also=(None,))]
 Path = Annotated[str | None, Text("a folder", also=(None,))]
 
 
@@ -57,6 +58,7 @@ class TrainConfig(Section):
     checkpoint_every_frames: Count
     wandb: Annotated[str, OneOf(WANDB_MODES)]
     resume: Path
+    trust: Trust = OFF_BEFORE
     evaluation: Evaluation
     representations: Representations = Field(examples=["[ego,obj]"])
     flow: Annotated[Any, BySource()] = Field(examples=["exact"])

@@ -1,0 +1,49 @@
+"""What to say of overrides that Hydra refuses."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from flowrep.config.violations import closest
+
+
+def unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
+    """Returns that a group has no such choice, and which it has.
+
+    >>> unknown_choice("scene", "s_turm", ["s_turn", "straight_road"])
+    "unknown scene 's_turm' (did you mean 's_turn'?); there are: s_turn, straight_road"
+    """
+    known = sorted(options)
+    return f"unknown {group} '{name}'{closest(name, known)}; there are: {', '.join(known)}"
+
+
+def unknown_key(key: str, config: DictConfig, groups: Sequence[str]) -> str | None:
+    """Walks a dotted key down a config; returns what to say of a part that isn't there.
+
+    Args:
+        key: as typed, e.g. "scene.camera.heigth_px".
+        config: composed without the override of that key.
+        groups: those whose choices are overridden by their name.
+    """
+    node: Any = config
+    parts = key.split(".")
+    if parts[0] == "hydra":
+        return None
+    for depth, part in enumerate(parts):
+        known = [str(name) for name in node] if isinstance(node, DictConfig) else []
+        if not depth:
+            known = [name for name in dict.fromkeys([*known, *groups]) if name != "hydra"]
+        if part not in known:
+            where = f" of '{'.'.join(parts[:depth])}'" if depth else ""
+            there = f"there are: {', '.join(known)}" if known else "it has no keys"
+            return f"unknown key '{part}'{where}{closest(part, known)}; {there}"
+        node = OmegaConf.select(node, part) if isinstance(node, DictConfig) else None
+    return None
+
+
+def one_line(error: Exception) -> str:
+    """Returns what Hydra or OmegaConf say, without the lines on where in the config it is."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    place = ("full_key:", "object_type=", "See http")
+    return " ".join([line for line in lines if not line.startswith(place)][:2])

@@ -1,0 +1,63 @@
+"""Texts with any characters in them, as Hydra and the shell have to be given them."""
+
+import re
+import shlex
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ValueType
+from hydra.errors import HydraException
+
+
+def override(key: str, text: str) -> str:
+    """Returns an override after which `key` holds exactly `text`, quoted only where it must be.
+
+    >>> print(override("resume", "outputs/a"), override("resume", "a=b, c"))
+    resume=outputs/a resume='a=b, c'
+    """
+    plain = f"{key}={text}"
+    return plain if _reads_as(plain, text) else f"{key}={_quoted(text)}"
+
+
+def shell_line(*words: str) -> str:
+    """Returns words as a line to paste into a shell.
+
+    >>> print(shell_line("flowrep-train", override("resume", "a=b")))
+    flowrep-train 'resume='"'"'a=b'"'"''
+    """
+    return shlex.join(words)
+
+
+def taken_as_typed(arguments: Iterable[str], keys: Collection[str]) -> list[str]:
+    """Returns arguments in which a folder that was typed without Hydra's quotes has them.
+
+    Args:
+        arguments: of the command line.
+        keys: those whose values are folders.
+    """
+    return [_as_typed(argument, keys) for argument in arguments]
+
+
+def _as_typed(argument: str, keys: Collection[str]) -> str:
+    key, _, text = argument.partition("=")
+    return override(key, text) if key in keys and text and Path(text).exists() else argument
+
+
+def _reads_as(line: str, text: str) -> bool:
+    if "${" in text:  # which OmegaConf would replace
+        return False
+    try:
+        (parsed,) = OverridesParser.create().parse_overrides([line])
+    except HydraException:
+        return False
+    return parsed.value_type is ValueType.ELEMENT and parsed.value() == text
+
+
+def _quoted(text: str) -> str:
+    """Returns text in Hydra's single quotes, with what OmegaConf would replace escaped."""
+    text = re.sub(r"(\\*)\$\{", lambda found: found[1] * 2 + r"\${", text)
+    # backslashes count as escapes before a quote alone, the closing one included
+    text = re.sub(r"(\\*)(')", lambda found: found[1] * 2 + r"\'", text)
+    text = re.sub(r"(\\+)$", lambda found: found[1] * 2, text)
+    return f"'{text}'"
