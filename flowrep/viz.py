@@ -29,6 +29,12 @@ _DEPTH_COLOURS = np.array(
     [(252, 253, 191), (254, 176, 120), (241, 96, 93), (183, 55, 121), (104, 28, 129), (40, 16, 80)],
     dtype=np.float32,
 )
+# What a direction at full saturation takes away from white. HSV to RGB at full value: each channel
+# is a trapezoid over hue, a third of a turn apart.
+_HUES = 6 * 4096
+_OFF_WHITE = 255 * (
+    1 - np.clip(np.abs((6 * np.arange(_HUES)[:, None] / _HUES + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
+).astype(np.float32)
 _BAR_PX = 28
 _GAP_PX = 4
 _GAP_GREY = 200  # so that the white of no motion has an edge
@@ -52,17 +58,17 @@ def flow_to_rgb(flow: Any, scale_px: float) -> Image:
     >>> flow_to_rgb(np.array([[[0.0, 2.0]], [[0.0, 0.0]]]), scale_px=2.0).tolist()
     [[[255, 255, 255], [255, 0, 0]]]
     """
-    flow = _channels("flow", flow, 2).astype(np.float32)
+    flow = _channels("flow", flow, 2).astype(np.float32, copy=False)
     if not scale_px > 0:
         raise ValueError(f"scale_px must be positive, got {scale_px}")
-    known = np.isfinite(flow).all(0)
-    u, v = np.where(known, flow, 0.0)
-    saturation = np.sqrt(np.minimum(np.hypot(u, v) / scale_px, 1.0))
-    hue = np.arctan2(v, u) * (3 / np.pi)  # [-3, 3], sixths of a turn
-    # HSV to RGB at full value: each channel is a trapezoid over hue, a third of a turn apart.
-    pure = np.clip(np.abs((hue[..., None] + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
-    rgb = 1 - saturation[..., None] * (1 - pure)
-    return np.where(known[..., None], np.rint(255 * rgb), _UNKNOWN).astype(np.uint8)
+    known = np.isfinite(flow[0]) & np.isfinite(flow[1])
+    u, v = (np.where(known, channel, np.float32(0)) for channel in flow)
+    saturation = np.sqrt(np.minimum(np.hypot(u, v) / np.float32(scale_px), 1.0))
+    hue = np.rint(np.arctan2(v, u) * np.float32(_HUES / (2 * np.pi))).astype(np.int32)
+    off_white = _OFF_WHITE.take(hue % _HUES, axis=0) * saturation[..., None]
+    rgb = (255.5 - off_white).astype(np.uint8)  # rounded
+    rgb[~known] = _UNKNOWN
+    return rgb
 
 
 def flow_wheel(size_px: int, background: tuple[int, int, int] = (255, 255, 255)) -> Image:

@@ -33,16 +33,16 @@ def score(index: int, factorized: FactorizedFrame, *, moving_px: float) -> dict[
         moving_px: object flow from which a pixel counts as moving by itself.
     """
     valid, frame = factorized.valid, factorized.frame
-    obj = lengths(factorized.obj, valid)
+    obj = squared_lengths(factorized.obj, valid)
     row: dict[str, Any] = {
         "index": index,
         "name": frame.name,
         "timestamp_s": "" if frame.timestamp_s is None else f"{frame.timestamp_s:.6f}",
-        "raw_median_px": _median(lengths(factorized.raw, valid)),
-        "ego_median_px": _median(lengths(factorized.ego, valid)),
-        "obj_median_px": _median(obj),
+        "raw_median_px": _median_px(squared_lengths(factorized.raw, valid)),
+        "ego_median_px": _median_px(squared_lengths(factorized.ego, valid)),
+        "obj_median_px": _median_px(obj),
         "valid_share": float(valid.mean()),
-        "moving_share": float((obj > moving_px).mean()) if len(obj) else math.nan,
+        "moving_share": float((obj > moving_px**2).mean()) if len(obj) else math.nan,
         "epe_px": _error_px(factorized),
     }
     return {key: _text(value) for key, value in row.items()}
@@ -56,10 +56,10 @@ def _error_px(factorized: FactorizedFrame) -> float:
     return end_point_error(factorized.raw, truth)
 
 
-def lengths(flow: Flow, where: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Returns the lengths of the vectors at the chosen pixels, `[N]`, pixels."""
-    u, v = flow[0][where], flow[1][where]
-    return np.sqrt(u * u + v * v)
+def squared_lengths(flow: Flow, where: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Returns the squared lengths of the vectors at the chosen pixels, `[N]`, square pixels."""
+    u, v = flow
+    return (u * u + v * v)[where]
 
 
 def end_point_error(flow: Flow, truth: Flow) -> float:
@@ -69,12 +69,13 @@ def end_point_error(flow: Flow, truth: Flow) -> float:
     return float(known.mean()) if len(known) else math.nan
 
 
-def _median(values: NDArray[np.float32]) -> float:
-    """Returns the median, of an even count the lower of the two in the middle: one selection."""
-    if not len(values):
+def _median_px(squares: NDArray[np.float32]) -> float:
+    """Returns the median length, of an even count the lower of the two in the middle."""
+    if not len(squares):
         return math.nan
-    middle = (len(values) - 1) // 2
-    return float(np.partition(values, middle)[middle])
+    middle = (len(squares) - 1) // 2
+    squares.partition(middle)
+    return math.sqrt(squares[middle])
 
 
 def _text(value: Any) -> Any:
