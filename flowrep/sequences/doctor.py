@@ -48,21 +48,23 @@ class Diagnosis:
         """The diagnosis in a sentence or two."""
         if not self.pairs:
             return "conventions could not be checked: hardly anything moves"
-        share = f"{self.residual_px:.2f} px of {self.raw_px:.2f} px are left over (medians)"
+        medians = (
+            f"|raw - ego| is {self.residual_px:.2f} px, raw flow {self.raw_px:.2f} px (medians)"
+        )
         if not self.suspects:
             if self.residual_px > _SHRINKS * self.raw_px:
                 return (
-                    f"ego flow does not explain the raw flow: {share}. No usual mistake of "
+                    f"ego flow does not explain the raw flow: {medians}. No usual mistake of "
                     "conventions would halve that: are intrinsics, poses and pictures of one "
                     "recording, and does most of the picture stand still?"
                 )
-            return f"conventions look right: {share}"
-        told = "; or if ".join(
-            f"{MISTAKES[name].says}, {self.rivals_px[name]:.2f} px "
+            return f"conventions look right: {medians}"
+        told = "; or ".join(
+            f"{self.rivals_px[name]:.2f} px if {MISTAKES[name].says} "
             f"(frames: {on_command_line(name)})"
             for name in self.suspects
         )
-        return f"a convention looks wrong: {share}. It would be less if {told}"
+        return f"a convention looks wrong: {medians}. It would be {told}"
 
 
 @dataclass

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import threading
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -16,6 +20,7 @@ from flowrep.sequences.frame import SequenceError
 PICTURES = (".png", ".jpg", ".jpeg")
 MAX_PIXELS = 7680 * 4320
 
+_SILENCE = threading.Lock()  # two that end in the other order would leave stderr closed
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _JPEG_SIZES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
@@ -78,12 +83,35 @@ def _decode(path: Path, flags: int) -> NDArray:
     else:
         raise SequenceError(path, "is neither a PNG nor a JPEG")
     try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        with _native_silence():
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise SequenceError(path, f"can't be decoded ({error.err or error})") from None
     if picture is None:
         raise SequenceError(path, "can't be decoded: its data are corrupt")
     return picture
+
+
+@contextmanager
+def _native_silence() -> Iterator[None]:
+    """Keeps libpng and libjpeg from writing about broken files beside the line that refuses them.
+
+    They write to the process's file number 2, whatever Python has made of its stderr.
+    """
+    with _SILENCE:
+        try:
+            stderr = os.dup(2)
+        except OSError:  # closed: nobody hears them
+            yield
+            return
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            os.close(nowhere)
 
 
 def _check_png(path: Path, data: bytes) -> None:

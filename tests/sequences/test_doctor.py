@@ -91,7 +91,7 @@ def test_right_conventions_are_left_in_peace(right):
     found = right.diagnosis()
     assert found.suspects == ()
     assert found.residual_px < 1e-3 < found.raw_px
-    assert found.words.startswith("conventions look right: 0.00 px of")
+    assert found.words.startswith("conventions look right: |raw - ego| is 0.00 px, raw flow ")
 
 
 @pytest.mark.parametrize("mistake", WRONG)
