@@ -4,7 +4,7 @@ A camera rides through a yard in which a ball rolls, a door swings and a crate s
 depth and segmentation off-screen and says where camera and bodies are; flowrep's transforms make
 flow of that.
 
-    pip install 'flowrep[examples]'
+    pip install '.[examples]'
     apt-get install libegl1 libgl1-mesa-dri     # off-screen, on a CPU; or libosmesa6
     MUJOCO_GL=egl python examples/mujoco_flow.py strip.png
 

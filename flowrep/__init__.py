@@ -1,3 +1,3 @@
 """Factorized optical flow (ego + object) as mid-level representations for visual RL."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -4,11 +4,15 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
+from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
 
 from flowrep import transforms
+from flowrep.transforms import RawFlow
 from flowrep.transforms.configs import CONFIGS
-from tests.transforms.fake_env import FakeSensorEnv
+from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
@@ -50,12 +54,62 @@ def test_links_to_pages_and_pictures_lead_somewhere(page):
     assert missing == []
 
 
+class TwoBodies(FakeSensorEnv):
+    """The test's env as a simulator of its own conventions would give it."""
+
+    def __init__(self):
+        super().__init__()
+        size = (1, HEIGHT, WIDTH)
+        self.observation_spec = Composite(
+            zbuffer=Unbounded(size),
+            camera_pose=Unbounded((7,), dtype=torch.float64),
+            body_poses=Unbounded((2, 7), dtype=torch.float64),
+            segmentation=Unbounded(size, dtype=torch.int32),
+            want=Composite(instance_motion=Unbounded((3, 4, 4)), depth=Unbounded(size), shape=()),
+        )
+
+    def _observe(self):
+        sensor = super()._observe()["sensor"]
+        near, far = 0.1, 100.0
+        buffer = (far / (far - near)) * (1 - near / sensor["depth"])
+        *position, x, y, z, w = position_and_quaternion(sensor["world_from_cam"])
+        # OpenGL's y is up, its z backward: half a turn about x, the quaternion (1, 0, 0, 0), first.
+        camera = torch.stack([*position, w, z, -y, -x])
+        ids = torch.tensor([3, 7, 12], dtype=torch.int32)[sensor["instance"].long()]
+        return TensorDict(
+            zbuffer=buffer.where(sensor["depth"].isfinite() | sensor["depth"].isnan(), 1.0),
+            camera_pose=camera,
+            body_poses=torch.stack(
+                [position_and_quaternion(body) for body in sensor["world_from_body"]]
+            ),
+            segmentation=ids,
+            want=sensor.select("instance_motion", "depth"),
+        )
+
+
+def position_and_quaternion(pose):
+    """Returns x, y, z and the quaternion (x, y, z, w) of a pose that is turned by less than 180."""
+    m = pose[:3, :3]
+    w = (1 + m.trace()).sqrt() / 2
+    vector = torch.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]) / (4 * w)
+    return torch.cat([pose[:3, 3], vector, w[None]])
+
+
 def test_the_env_guide_runs_with_the_readers_own_env():
-    namespace = {"my_env": FakeSensorEnv((2,))}
+    namespace = {"my_env": TwoBodies(), "__name__": "__main__"}
     exec(python_of(DOCS / "use_in_your_env.md"), namespace)
-    assert namespace["rollout"]["obj"].shape[-3] == 2
+    rollout = namespace["rollout"]
+    want, got = rollout["want"], rollout["sensor"]
+    motions = got["instance_motion"]
+    torch.testing.assert_close(motions, want["instance_motion"], atol=1e-5, rtol=0)
+    torch.testing.assert_close(got["depth"], want["depth"], rtol=1e-3, atol=0, equal_nan=True)
+    exact = RawFlow(namespace["K"])
+    flow = exact.compute(want["depth"], got["instance"], want["instance_motion"])[0]
+    torch.testing.assert_close(rollout["raw"], flow, atol=0.05, rtol=0)
+    assert rollout["obj"][1:].abs().amax() > 0.5  # the walker
     assert len(namespace["stack"]) > 1
     assert namespace["valid"].all()
+    assert namespace["observation"].shape == (4, 84, 84)
 
 
 def test_the_data_guide_runs_and_gives_what_it_says():
