@@ -101,9 +101,33 @@ class Training:
         try:
             self.agent.divergence.check()
         except DivergenceError as error:
-            path = self.run.checkpoint_path
-            good = f"the last good checkpoint is {path}" if path.exists() else "none was saved yet"
-            raise DivergenceError(f"{error}; {good}") from error
+            raise self._diverged(str(error)) from error
+
+    def act(self) -> TensorDictBase:
+        """Returns the present observation with the policy's actions.
+
+        Raises:
+            DivergenceError: there are no actions to draw: the policy's numbers are nan or infinite.
+        """
+        assert self.carried is not None
+        try:
+            with torch.no_grad():
+                return self.agent.policy(self.carried)
+        except RuntimeError as error:
+            self.check()  # an update may have seen it first, and says more
+            if "probability tensor" not in str(error):
+                raise
+            maps = [key for key in self.agent.policy.in_keys if _is_bad(self.carried[key])]
+            cause = f"{maps[0]!r} is not finite: lower its scale" if maps else "weights too large"
+            raise self._diverged(
+                f"the policy gives actions no probabilities after {self.agent.updates} updates "
+                f"({cause})"
+            ) from error
+
+    def _diverged(self, what: str) -> DivergenceError:
+        path = self.run.checkpoint_path
+        good = f"the last good checkpoint is {path}" if path.exists() else "none was saved yet"
+        return DivergenceError(f"{what}; {good}")
 
     def load(self) -> None:
         """Continues from the checkpoint, and forgets what was logged after it.
@@ -154,8 +178,8 @@ def train(
             t.owes_evaluation = evaluate(t.frames)
     with tqdm(total=total, initial=t.frames, unit="frame", unit_scale=True, mininterval=0.5) as bar:
         while t.frames < total and not stop:
-            with clock("policy"), torch.no_grad():
-                acted = t.agent.policy(t.carried)
+            with clock("policy"):
+                acted = t.act()
             if drives_meanwhile:
                 begin_step(t.env, acted)
             learn(t, clock)
@@ -192,6 +216,10 @@ def learn(training: Training, clock: Stopwatch) -> None:
             batch = agent.sample()
         with clock("update"):
             training.metrics = agent.update(batch)
+
+
+def _is_bad(values: Tensor) -> bool:
+    return values.is_floating_point() and not bool(values.isfinite().all())
 
 
 def finished_outcomes(stepped: TensorDictBase) -> list[int]:

@@ -196,3 +196,23 @@ def test_a_loss_that_is_no_number_from_the_start_leaves_no_checkpoint(tmp_path):
         train(training, config, StopAfter(training, 50), lambda frames: False)
     training.env.close()
     assert not training.run.checkpoint_path.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ("algorithm.learning_rate=1e9", r"became (nan|inf) in update|weights too large"),
+        ("representations.ego.scale=1e300", r"'ego' is not finite: lower its scale"),
+    ],
+)
+def test_a_policy_that_can_draw_no_action_ends_the_run_by_name(tmp_path, change, what):
+    config = composed(
+        "debug=smoke", "num_envs=2", "total_frames=400", "log_every_frames=400", "device=cpu",
+        "evaluation.every_frames=0", "representations=[ego]", "algorithm.batch_size=8",
+        "algorithm.frames_per_update=2", "num_workers=0", change,
+    )  # fmt: skip
+    training = build(config | {"resume": None}, RunFolder(tmp_path))
+    with pytest.raises(DivergenceError, match=rf"({what}).*none was saved yet"):
+        train(training, config, StopRequest(), lambda frames: False)
+    assert training.frames < 400  # before the first look at the losses
+    training.env.close()
