@@ -3,6 +3,7 @@
 import csv
 import subprocess
 import sys
+from dataclasses import replace
 
 import imageio.v3 as imageio
 import pytest
@@ -13,9 +14,12 @@ pytest.importorskip("pybullet", reason="the command needs the simulator")
 
 from flowrep.config import UsageError
 from flowrep.config_tree import CONF_DIR
+from flowrep.envs import StreetEnv, drives, load_scene, never_turn
+from flowrep.envs.camera import CameraConfig
 from flowrep.preview import check_command
-from flowrep.view import check, moments, moving_pixels
+from flowrep.view import check, drive_on, film, moments, moving_pixels
 
+TINY = CameraConfig(6, 8, 90.0, 1.5, 0.0, -5.0, 0.2, 300.0)
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
 
 
@@ -58,6 +62,22 @@ def test_what_cannot_be_is_named(override, expected):
     with pytest.raises(UsageError) as caught:
         check(config)
     assert str(caught.value) == expected
+
+
+def test_the_episodes_that_are_shown_are_those_of_the_seed():
+    def shown(seed):
+        overrides = ["driver=never_turn", f"seed={seed}"]
+        with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+            config = compose("view", overrides)
+        street = {"scene": replace(load_scene("straight_road"), camera=TINY)}
+        episodes = [film(config, street)[1], *drive_on(config, street, 2)]
+        return [episode.episode_seed for episode in episodes]
+
+    env = StreetEnv("straight_road", sensors=())
+    expected = [drive.episode_seed for drive in drives(env, never_turn, 3, seed=7)]
+    env.close()
+    assert shown(7) == expected
+    assert shown(8) != expected
 
 
 def test_an_unknown_scene_is_named():

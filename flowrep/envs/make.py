@@ -26,10 +26,13 @@ from flowrep.transforms import representation_stack
 class VectorWrapper(GymWrapper):
     """TorchRL's wrapper, with the marks of what to reset brought to where NumPy reads them.
 
-    TorchRL 0.14 hands them on from the device of the TensorDict, which fails on CUDA.
+    TorchRL 0.14 hands them on from the device of the TensorDict, which fails on CUDA, and expects
+    them of every TensorDict; where they are missing, all streets begin anew.
     """
 
-    def _replace_reset(self, reset: Tensor, kwargs: dict[str, Any]) -> dict[str, Any]:
+    def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
+        if reset is None:
+            return kwargs
         mask = {"reset_mask": reset.view(self.batch_size).cpu().numpy()}
         return kwargs | {"options": {**(kwargs.get("options") or {}), **mask}}
 
@@ -83,11 +86,20 @@ def make_env(
             `flowrep.transforms.representation_stack`.
         renderer: who draws depth, classes and ids, see `StreetEnv`.
 
+    Raises:
+        SceneError: the scene can't be.
+        ValueError: there are no streets, or more workers than streets.
+
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
     torch.Size([2, 3, 2, 84, 84])
     >>> env.close()
     """
+    if num_envs < 1 or not 0 <= num_workers <= num_envs:
+        raise ValueError(
+            f"num_envs is {num_envs} and num_workers {num_workers}; give one street or more, and "
+            "no more workers than streets"
+        )
     loaded = load_scene(scene)
     street = partial(
         StreetEnv,

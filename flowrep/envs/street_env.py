@@ -1,5 +1,7 @@
 """The gymnasium environment."""
 
+import math
+import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.envs.street import Street
-from flowrep.envs.vehicle import VehicleState
+from flowrep.envs.vehicle import YAW_SIGN, VehicleState
 from flowrep.palette import num_classes
 
 
@@ -109,12 +111,17 @@ class StreetEnv(gym.Env):
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drives one step. Every end of an episode is `terminated`, the time-out too."""
-        outcome = self.drive(int(action))
+        outcome = self.drive(action)
         observation = self.sensing.observe(self.episode)
         return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
 
     def drive(self, action: int) -> Outcome:
-        """Drives one step as `step` does, and does not look at it."""
+        """Drives one step as `step` does, and does not look at it.
+
+        Raises:
+            ValueError: the action is not 0, 1 or 2.
+        """
+        action = _action(action)
         if self.episode.outcome:
             label = self.episode.outcome.label
             raise RuntimeError(f"the episode has ended ({label}): call reset() first")
@@ -173,6 +180,18 @@ class StreetEnv(gym.Env):
         }
 
 
+def _action(action: Any) -> int:
+    try:
+        number = operator.index(action)  # of any whole number, NumPy's and torch's too
+    except TypeError:
+        number = -1
+    if number not in range(len(YAW_SIGN)):
+        raise ValueError(
+            f"action is {action!r}; give 0 (keep the yaw rate), 1 (turn left) or 2 (turn right)"
+        )
+    return number
+
+
 def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
     if isinstance(speed, str):
         if speed not in scene.pedestrian_speed_mps:
@@ -180,15 +199,15 @@ def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
             raise ValueError(f"unknown speed {speed!r}; choose one of {modes}, or give (low, high)")
         return scene.pedestrian_speed_mps[speed]
     low, high = (float(bound) for bound in speed)
-    if not 0 <= low <= high:
+    if not 0 <= low <= high < math.inf:
         raise ValueError(f"speed is ({low}, {high}) m/s; give (lowest, highest), from 0")
     return low, high
 
 
 def _frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
     rate = scene.frame_rate_hz if frame_rate_hz is None else float(frame_rate_hz)
-    if not rate > 0:
-        raise ValueError(f"frame_rate_hz is {rate}; give a rate above 0, say 12")
+    if not 0.5 <= rate <= 1000.0:
+        raise ValueError(f"frame_rate_hz is {rate}; give a rate from 0.5 to 1000, say 12")
     return rate
 
 

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -51,6 +52,23 @@ def assert_same(a, b):
     assert set(a.keys(True, True)) == set(b.keys(True, True))
     for key in a.keys(True, True):
         assert torch.equal(a[key], b[key]), key
+
+
+def test_a_tensordict_without_marks_resets_every_street(make):
+    env = make("straight_road", ["seg"], num_envs=2, seed=0)
+    first = env.reset()
+    env.step(first.set("action", torch.tensor([1, 2])))
+    again = env.reset(TensorDict({}, env.batch_size))
+    assert (again["episode_seed"] != first["episode_seed"]).all()
+    assert not again["done"].any()
+    with pytest.raises(ValueError, match="action is 7; give 0"):
+        env.step(again.set("action", torch.tensor([0, 7])))
+
+
+@pytest.mark.parametrize(("num_envs", "num_workers"), [(0, 0), (-1, 0), (2, 3), (2, -1)])
+def test_no_streets_and_too_many_workers_are_refused(num_envs, num_workers):
+    with pytest.raises(ValueError, match=r"give one street or more, and no more workers than"):
+        make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])

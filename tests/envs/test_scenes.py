@@ -3,6 +3,8 @@
 Counts are small here; `benchmarks/scene_validity.py` runs hundreds of episodes a cell.
 """
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -90,6 +92,59 @@ def test_the_only_way_out_is_the_path_s_own_ending_zone(name):
             other.end for other in layout.scene.paths if reached.intersects(layout.zones[other.end])
         }
         assert ends == {path.end}
+
+
+CLOSED_EXITS = [
+    # (scene, what is driven, where, the exit that is closed there)
+    ("h_shaped_pathways", "south_to_north", "south_to_south", "northeast"),
+    ("h_shaped_pathways", "south_to_south", "south_to_north", "southeast"),
+    ("h_shaped_pathways", "north_to_north", "north_to_south", "northeast"),
+    ("h_shaped_pathways", "north_to_south", "north_to_north", "southeast"),
+    ("three_way_junction", "left", "right", "left"),
+    ("three_way_junction", "right", "left", "right"),
+]
+
+
+@pytest.mark.parametrize(("name", "driven", "path", "closed"), CLOSED_EXITS)
+def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, closed):
+    env = make_street(replace(load_scene(name), pedestrian_groups=()), sensors=())
+    env.reset(seed=0, options={"path": driven})
+    actions = Planner().search(env.episode)
+    for action in actions:
+        info = env.step(action)[4]
+        if info["outcome"] != "running":
+            break
+    assert info["outcome"] == "success"
+    env.reset(options={"path": path})
+    for action in actions:
+        info = env.step(action)[4]
+        if info["outcome"] != "running":
+            break
+    assert (info["outcome"], info["hit"]) == ("collision", "building")
+    # Right there: the vehicle's middle is no further off than half its diagonal, a square metre's.
+    x, y = env.episode.now.vehicle[:2]
+    front = Layout(env.scene).closures[closed].footprint.exterior.distance(shapely.Point(x, y))
+    assert front < 0.5 * 2**0.5 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("path", "y_m"),
+    [
+        # From 9 m on along the western leg, which begins at y = -65, to the face of the house at
+        # 78 - 2.5 m, less the vehicle's front: 66 m; the 159th look at 24 a second sees it touch.
+        ("south_to_north", -65.0 + 9.0 + 159 * 10 / 24),
+        # The same from the other end: from 121 to 52 + 2.5 m, again 66 m.
+        ("north_to_south", -65.0 + 121.0 - 159 * 10 / 24),
+    ],
+)
+def test_straight_on_in_the_h_stands_a_house(make_street, path, y_m):
+    env = make_street(replace(load_scene("h_shaped_pathways"), pedestrian_groups=()), sensors=())
+    env.reset(seed=0, options={"path": path})
+    info = {"outcome": "running"}
+    while info["outcome"] == "running":
+        info = env.step(0)[4]
+    assert (info["outcome"], info["hit"]) == ("collision", "building")
+    assert env.episode.now.vehicle[:2] == pytest.approx((0.0, y_m), abs=1e-6)
 
 
 @pytest.mark.parametrize("name", TABLE_1)

@@ -8,9 +8,11 @@ from itertools import pairwise
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 
-from flowrep.envs.scene import Obstacle
+from flowrep.envs import StreetEnv
+from flowrep.envs.scene import Obstacle, PedestrianGroup, Walk
 from flowrep.palette import CATEGORY_ID
 
 NO_OP, LEFT, RIGHT = 0, 1, 2
@@ -114,11 +116,52 @@ def test_the_time_limit_keeps_its_seconds(make_street, empty_road, rate_hz, step
 
 @pytest.mark.parametrize("rate_hz", [12.0, 6.0, 3.0])
 def test_no_frame_rate_lets_the_vehicle_pass_through_a_person(make_street, one_stands, rate_hz):
-    rewards, info = drive(make_street(one_stands, frame_rate_hz=rate_hz, sensors=()))
+    env = make_street(one_stands, frame_rate_hz=rate_hz, sensors=())
+    rewards, info = drive(env)
     assert (info["outcome"], info["hit"]) == ("collision", "pedestrian")
+    # Looked at 24 times a second, wherever the frames lie: at the 71st look it is at 29.58 m.
+    assert env.episode.now.ticks == 71
+    assert env.episode.now.vehicle.x_m == pytest.approx(71 * 10 / 24)
     # The front, 0.5 m ahead, meets a cylinder of 0.3 m at x = 29.2: after 2.92 s.
     assert len(rewards) == math.ceil(2.92 * rate_hz)
     assert sum(rewards) == pytest.approx(-5.0 + 0.01 * len(rewards))
+
+
+def test_one_who_stands_between_two_frames_is_not_passed_by(make_street, straight_road):
+    # At 3 Hz a frame is at 30 m and the next one at 33.3 m: at neither does the vehicle, 0.8 m to
+    # either side with a person's radius, touch who stands at 31.67 m.
+    walk = Walk("points", points_m=((31.67, -0.01), (31.67, 0.01)))
+    person = PedestrianGroup("one", 1, 0.0, walk, standing=1)
+    scene = replace(straight_road, pedestrian_groups=(person,))
+    rewards, info = drive(make_street(scene, frame_rate_hz=3.0, sensors=()))
+    assert (info["outcome"], info["hit"]) == ("collision", "pedestrian")
+    assert len(rewards) == 10  # on the way to the tenth frame
+
+
+@pytest.mark.parametrize("action", [-1, 3, 7, 1.7, 1.0, "1", None, np.array([0, 1])])
+def test_other_actions_are_refused_and_drive_nowhere(make_street, empty_road, action):
+    env = make_street(empty_road, sensors=())
+    env.reset(seed=0)
+    with pytest.raises(
+        ValueError, match=r"action is .*; give 0 \(keep the yaw rate\), 1 \(turn le"
+    ):
+        env.step(action)
+    assert (env.episode.steps, env.episode.now.vehicle.x_m) == (0, 0.0)
+
+
+@pytest.mark.parametrize("action", [1, np.int64(1), np.array(1), torch.tensor(1)])
+def test_a_whole_number_of_any_kind_is_an_action(make_street, empty_road, action):
+    env = make_street(empty_road, sensors=())
+    env.reset(seed=0)
+    env.step(action)
+    # 35°/s² for a twelfth of a second, to the left.
+    assert env.episode.now.vehicle.yaw_rate_rps == pytest.approx(math.radians(35) / 12)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, 1e-9, math.inf, math.nan])
+def test_frame_rates_that_can_t_be_are_refused(straight_road, rate_hz):
+    with pytest.raises(ValueError, match=r"frame_rate_hz is .*; give a rate from 0\.5 to 1000"):
+        StreetEnv(straight_road, frame_rate_hz=rate_hz, sensors=())
 
 
 def test_a_parked_car_is_hit_as_a_car(make_street, empty_road):
@@ -226,7 +269,7 @@ def test_colour_pictures_come_in_both_layouts(make_street):
     [
         ({"speed": "fast"}, r"unknown speed 'fast'; choose one of low, normal, high"),
         ({"speed": (2.0, 1.0)}, r"lowest, highest"),
-        ({"frame_rate_hz": 0}, r"frame_rate_hz is 0.0; give a rate above 0"),
+        ({"frame_rate_hz": 0}, r"frame_rate_hz is 0.0; give a rate from 0.5"),
         ({"sensors": ("depth", "lidar")}, r"unknown sensors \['lidar'\]; they are: depth, "),
         ({"render_mode": "human"}, r"unknown render_mode 'human'"),
     ],
