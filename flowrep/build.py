@@ -1,6 +1,7 @@
 """From a resolved config to the env and the agent that it describes."""
 
 import inspect
+import multiprocessing
 from collections.abc import Mapping
 from pkgutil import resolve_name
 from typing import Any
@@ -36,10 +37,15 @@ def choose_device(name: str) -> torch.device:
 def choose_workers(num_workers: Any, num_envs: int) -> int:
     """Returns how many processes drive `num_envs` streets, for "auto" one a core if there are two.
 
+    A job of a pool of processes, as `hydra/launcher=joblib` makes one, has no cores but its own:
+    there "auto" is none.
+
     Raises:
         UsageError: it is no such number.
     """
     if num_workers == "auto":
+        if multiprocessing.current_process().name != "MainProcess":
+            return 0
         cores = available_cores()
         return min(cores, num_envs) if cores > 1 and num_envs > 1 else 0
     if not isinstance(num_workers, int) or not 0 <= num_workers <= num_envs:

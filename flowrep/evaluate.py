@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-try:
-    import hydra
-except ImportError:
-    sys.exit("error: evaluation needs packages of an extra: pip install 'flowrep[train]'")
+from flowrep.extras import require
 
+require("evaluation", "train", "hydra", "pydantic", module=__name__)
+
+import hydra
 from omegaconf import DictConfig, ListConfig
 
 from flowrep.agent import CheckpointError, load_checkpoint

@@ -6,14 +6,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-try:
-    import cv2
-    import hydra
-    import imageio  # noqa: F401
-    import tqdm  # noqa: F401
-except ImportError:
-    sys.exit("error: factorising needs packages of an extra: pip install 'flowrep[factorize]'")
+from flowrep.extras import require
 
+require("factorising", "factorize", "cv2", "hydra", "imageio", "pydantic", "tqdm", module=__name__)
+
+import cv2
+import hydra
 from hydra.utils import get_class
 from omegaconf import DictConfig
 

@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from hydra import version
 from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path, get_args_parser
@@ -30,6 +31,7 @@ from flowrep.mistakes import one_line, unknown_choice, unknown_key
 from flowrep.quoting import override as quoted_override
 from flowrep.quoting import shell_line
 
+VERSION_BASE = "1.3"  # of Hydra's behaviour; what the commands' entry points say too
 REFUSALS = (HydraException, OmegaConfBaseException, ValueError)  # the last for `scene=null`
 
 
@@ -98,6 +100,7 @@ class Preview:
     def __init__(self, args: argparse.Namespace, config_name: str) -> None:
         self.config_name, self.is_multirun = config_name, args.multirun
         GlobalHydra.instance().clear()
+        version.setbase(VERSION_BASE)
         self._hydra = Hydra.create_main_hydra2("flowrep", _search_path(args.config_dir))
         self._loader = self._hydra.config_loader
         self._typed: list[str] = args.overrides

@@ -4,11 +4,11 @@ import sys
 from functools import partial
 from typing import Any
 
-try:
-    import hydra
-except ImportError:
-    sys.exit("error: training needs packages of an extra: pip install 'flowrep[train]'")
+from flowrep.extras import require
 
+require("training", "train", "hydra", "pydantic", module=__name__)
+
+import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -51,8 +51,13 @@ FINAL_POLICIES = ("greedy", "sampled")  # of the agent, beside the baselines
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="train")
-def run(config: DictConfig) -> None:
-    """Trains, evaluates and films one agent, or continues a run with `resume=`."""
+def run(config: DictConfig) -> float:
+    """Trains, evaluates and films one agent, or continues a run with `resume=`.
+
+    Returns:
+        The final evaluation's share of greedy episodes that succeed, over all its speeds: what a
+        sweeper such as Optuna maximises.
+    """
     try:
         plain = plain_config(config)
         validated(TrainConfig, plain, own_keys())
@@ -68,13 +73,13 @@ def run(config: DictConfig) -> None:
                 folder.write_config(plain, hydra.overrides.task)
             else:
                 plain = resumed_config(plain, folder)
-            carry_out(plain, folder)
+            return carry_out(plain, folder)
     except (UsageError, SceneError, RunFolderError, TableError, OSError) as error:
         exit_with(str(error))
 
 
-def carry_out(config: Config, folder: RunFolder) -> None:
-    """Does what is left to do of a run: training, evaluation, video."""
+def carry_out(config: Config, folder: RunFolder) -> float:
+    """Does what is left to do of a run: training, evaluation, video; returns its success."""
     try:
         training = build(config, folder)
         folder.log_to_wandb(config["wandb"], config)
@@ -86,7 +91,7 @@ def carry_out(config: Config, folder: RunFolder) -> None:
         training.frames, final_episodes(config)
     ):
         print(f"this run is complete; evaluate it with: {line_for('evaluate', run=where)}")
-        return
+        return final_success(folder, training.frames)
     with StopRequest() as stop:
         try:
             clock = train(training, config, stop, partial(log_evaluation, training, config, stop))
@@ -110,6 +115,17 @@ def carry_out(config: Config, folder: RunFolder) -> None:
             f"  {how_to_go_on}"
         )
         sys.exit(stop.exit_code)
+    return final_success(folder, training.frames)
+
+
+def final_success(folder: RunFolder, frames: int) -> float:
+    """Returns the share of greedy episodes, of those that ended a run of `frames`, that succeed."""
+    outcomes = [
+        row["outcome"]
+        for row in folder.read_episodes()
+        if (row["evaluation"], row["policy"], int(row["frames"])) == ("final", "greedy", frames)
+    ]
+    return outcomes.count("success") / len(outcomes)
 
 
 def how_to_resume(config: Config, folder: RunFolder) -> str:

@@ -1,15 +1,14 @@
 """Looks at a scene: `python -m flowrep.view scene=s_turn`, or drives it: `interactive=true`."""
 
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-try:
-    import hydra
-except ImportError:
-    sys.exit("error: viewing needs packages of an extra: pip install 'flowrep[train]'")
+from flowrep.extras import require
 
+require("viewing", "train", "hydra", "pydantic", module=__name__)
+
+import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf

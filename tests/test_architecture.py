@@ -13,8 +13,8 @@ PACKAGE = Path(flowrep.__file__).parent
 
 FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry"},
-    "transforms": {"transforms", "geometry"},
-    "agent": {"agent"},
+    "transforms": {"transforms", "geometry", "extras"},
+    "agent": {"agent", "extras"},
     "simulator": {"simulator"},
     "envs": {"envs", "simulator", "transforms", "geometry", "config_tree", "palette"},
     "palette": set(),

@@ -63,6 +63,7 @@ def test_a_mistake_is_named_and_what_exists_is_listed(override, names):
         "hydra.run.dir=elsewhere algorithm.encoder=separate",
         "-m hydra/launcher=joblib seed=0,1",
         "-m hydra/launcher=submitit_local seed=0,1",
+        "-m hydra/launcher=slurm hydra.launcher.partition=gpu seed=0,1",
         "-m hydra/sweeper=optuna hydra/sweeper/sampler=random algorithm.gamma=interval(0.9,0.99)",
         "hydra/job_logging=default hydra/hydra_logging=none hydra.verbose=true",
         "+note=pilot ++seed=4 +mine.deep=1 +algorithm@beside=dqn +hydra.job.env_set.A=1",

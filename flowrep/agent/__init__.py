@@ -1,5 +1,9 @@
 """Networks and algorithms: sees specs and keys, never an environment or a representation."""
 
+from flowrep.extras import require
+
+require("flowrep.agent", "train", "safetensors")
+
 from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.allocator import keep_freed_memory
 from flowrep.agent.checkpoint import CheckpointError, load_checkpoint, save_checkpoint

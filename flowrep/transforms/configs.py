@@ -25,6 +25,10 @@ import dataclasses
 import inspect
 from typing import Any
 
+from flowrep.extras import require
+
+require("flowrep.transforms.configs", "train", "hydra")
+
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from torchrl.trainers.algorithms.configs.transforms import TransformConfig

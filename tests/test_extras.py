@@ -1,0 +1,70 @@
+"""Where packages are missing, an import says which extra has them, and ends no interpreter."""
+
+import importlib.util
+from pathlib import Path
+from pkgutil import resolve_name
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+import flowrep
+from flowrep import extras
+from flowrep.config_tree import CONF_DIR, config_groups
+
+PACKAGE = Path(flowrep.__file__).parent
+MODULES = {
+    "train.py": "training needs hydra; run: pip install 'flowrep[train]'",
+    "evaluate.py": "evaluation needs hydra; run: pip install 'flowrep[train]'",
+    "view.py": "viewing needs hydra; run: pip install 'flowrep[train]'",
+    "factorize.py": "factorising needs cv2; run: pip install 'flowrep[factorize]'",
+    "agent/__init__.py": "flowrep.agent needs safetensors; run: pip install 'flowrep[train]'",
+    "transforms/configs.py": "flowrep.transforms.configs needs hydra; run: pip install 'flowrep[",
+}
+
+
+def load(name, path):
+    spec = importlib.util.spec_from_file_location(name, PACKAGE / path)
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
+
+
+@pytest.mark.parametrize(("path", "says"), MODULES.items(), ids=list(MODULES))
+def test_an_import_names_the_extra(path, says, monkeypatch):
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    with pytest.raises(ImportError) as caught:
+        load("a_copy", path)
+    assert says in str(caught.value)
+
+
+def test_a_command_ends_in_one_line(monkeypatch):
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as caught:
+        load("__main__", "train.py")
+    assert caught.value.code == "error: training needs hydra; run: pip install 'flowrep[train]'"
+
+
+def test_every_console_script_is_there():
+    tomllib = pytest.importorskip("tomllib", reason="Python 3.10 can't read pyproject.toml")
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    for name, target in project["scripts"].items():
+        assert callable(resolve_name(target))
+        assert (PACKAGE / f"{name.removeprefix('flowrep-')}.py").is_file()
+
+
+@pytest.mark.filterwarnings("error")
+def test_another_project_composes_flowreps_groups(tmp_path):
+    (tmp_path / "theirs.yaml").write_text(
+        "defaults:\n"
+        "  - representations: [ego, seg]\n"
+        "  - algorithm@learner: ppo\n"
+        "  - _self_\n"
+        "hydra: {searchpath: ['pkg://flowrep.conf']}\n"
+    )
+    with initialize_config_dir(str(tmp_path), version_base="1.3"):
+        config = compose("theirs", ["learner.gamma=0.9"])
+    assert list(config.representations) == ["ego", "seg"]
+    assert (config.learner["_target_"], config.learner.gamma) == ("flowrep.agent.PPO", 0.9)
+
+
+def test_the_packages_configs_are_those_of_the_checkout():
+    assert (PACKAGE / "conf").resolve() == CONF_DIR
+    assert "hydra" not in config_groups()
