@@ -32,6 +32,7 @@ Stepper = Callable[[int], Any]  # takes so many frames
 def pictures(scene: Scene) -> tuple[Stepper, Callable[[], None]]:
     env = StreetEnv(scene, sensors=SENSORS)
     env.reset(seed=0)
+    env.sensing.rgb(env.episode)  # puts everyone where they are
     return lambda frames: [env.sensing.look(env.episode) for _ in range(frames)], env.close
 
 

@@ -3,7 +3,7 @@
     python benchmarks/profile_step.py [--scene straight_road] [--size 84] [--num-envs 32]
 
 Functions along the way are timed, each without what it calls of the others; a training's own loop
-is run, without updates. The floor of a frame is its picture, which PyBullet's renderer draws.
+is run, without updates. Times are of the processor.
 """
 
 import argparse
@@ -15,7 +15,6 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
 
-import gymnasium as gym
 import torch
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 from update import agent_for
@@ -23,20 +22,15 @@ from update import agent_for
 from flowrep.agent import ReplayMemory, keep_freed_memory
 from flowrep.envs import StreetEnv, load_scene, make_env
 from flowrep.envs.episode import Episode
-from flowrep.envs.sensing import Sensing
-from flowrep.envs.simulator import Simulator
-from flowrep.envs.street import Street
+from flowrep.envs.street_vector import StreetVectorEnv
 
 WARM_UP = 20  # steps of every street
 PARTS: list[tuple[str, Any, str]] = [
-    ("picture (getCameraImage)", Simulator, "look"),
-    ("people put where they are", Street, "place_pedestrians"),
-    ("depth, classes and ids of the picture", Sensing, "_add_maps"),
-    ("motions of camera and people", Sensing, "_add_motion"),
+    ("maps and motions of all streets", StreetVectorEnv, "_observe"),
     ("driving, people's clock, collisions", Episode, "step"),
-    ("new episodes", StreetEnv, "reset"),
-    ("gymnasium: the rest of a street's step", StreetEnv, "step"),
-    ("gymnasium: the vector of streets", gym.vector.SyncVectorEnv, "step"),
+    ("new episodes", StreetEnv, "begin"),
+    ("the vector of streets", StreetVectorEnv, "step"),
+    ("the vector of streets", StreetVectorEnv, "reset"),
     ("TorchRL: GymWrapper", GymWrapper, "_step"),
     ("TorchRL: GymWrapper", GymWrapper, "_reset"),
     ("representations", Compose, "_step"),
@@ -65,7 +59,7 @@ class SelfTimer:
             self._open.pop()
 
     def _turn(self) -> None:
-        now = time.perf_counter()
+        now = time.process_time()
         if self._open:
             self.seconds[self._open[-1]] += now - self._since
         self._since = now
@@ -105,12 +99,12 @@ def main() -> None:
         for turn in range(steps + WARM_UP):
             if turn == WARM_UP:
                 timer.seconds.clear()
-                start = time.perf_counter()
+                start = time.process_time()
             with timer("policy"):
                 acted = agent.policy(carried)
             stepped, carried = env.step_and_maybe_reset(acted)
             agent.remember(stepped)
-    frame = (time.perf_counter() - start) / (steps * args.num_envs)
+    frame = (time.process_time() - start) / (steps * args.num_envs)
     env.close()
     print(f"{scene.name}, {args.size}x{args.size}, {args.num_envs} streets in one process, ego+obj")
     print("| where | ms a frame | share |")
