@@ -1,6 +1,7 @@
 """Times one gradient step of discrete SAC, against TorchRL's stock recipe and the machine's floor.
 
-    python benchmarks/update.py [--device cuda] [--rounds 5] [--default-malloc] [--busy]
+    python benchmarks/update.py [--device cuda] [--rounds 5] [--threads 2] [--default-malloc]
+        [--busy]
 
 All variants learn from the same transitions; each round times every variant once, in turn, and the
 machine's matrix products between them, so that a change of load hits all alike. The floor is the
@@ -23,7 +24,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
-from flowrep.agent import DiscreteSAC, keep_freed_memory
+from flowrep.agent import DiscreteSAC, keep_freed_memory, use_threads
 from flowrep.agent.captured import WARM_UP
 
 MAPS = ("ego", "obj")
@@ -76,7 +77,16 @@ def flowrep_update(
     if eager:
         agent.step_eagerly()
     sample = agent.sample()
-    return lambda: agent.update(sample)
+
+    def update() -> None:
+        """Takes threads as training does: a team for the update, one for all beside it."""
+        threads = torch.get_num_threads()
+        if steps.device.type == "cpu":
+            torch.set_num_threads(1)
+        agent.update(sample)
+        torch.set_num_threads(threads)
+
+    return update
 
 
 class StockNetwork(nn.Module):
@@ -163,12 +173,13 @@ def main() -> None:
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=[*SIZES])
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--default-malloc", action="store_true")
     parser.add_argument("--busy", action="store_true")
     args = parser.parse_args()
     clock = time.process_time if args.busy else time.perf_counter
-    if args.busy:
-        torch.set_num_threads(1)
+    threads = 1 if args.busy else args.threads
+    torch.set_num_threads(threads)
     kept = not args.default_malloc and keep_freed_memory()
     print(f"{args.device}, {torch.get_num_threads()} threads, freed memory kept: {kept}")
     for size in args.sizes:
@@ -185,8 +196,10 @@ def main() -> None:
         width = 8192 if args.device.type == "cuda" else 2048
         types = {"bf16": torch.bfloat16, "fp32": torch.float32}
         products = {n: matrix_product(t, args.device, width) for n, t in types.items()}
-        # counted first: what a CUDA graph does later can't be seen from here
+        # counted first: what a CUDA graph or another thread does can't be seen from here
+        use_threads(1)
         counts = {n: None if "stock" in n else operations(u) for n, u in updates.items()}
+        use_threads(threads)
         seconds = interleaved({**updates, **products}, args.rounds, args.device, clock)
         rates = {name: 2 * width**3 / seconds[name] for name in products}
         print(f"\n{size}: {side}x{side}, {len(MAPS)} maps of {CHANNELS} channels, batch {batch}")
