@@ -2,7 +2,7 @@
 
 import inspect
 import multiprocessing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pkgutil import resolve_name
 from typing import Any
 
@@ -13,7 +13,8 @@ from flowrep.agent import Algorithm
 from flowrep.config import UsageError
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.violations import closest
-from flowrep.envs import make_env
+from flowrep.envs import Scene, make_env
+from flowrep.envs.street_pool import StreetPool
 from flowrep.envs.workers import available_cores
 
 Config = Mapping[str, Any]
@@ -71,6 +72,19 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
     }
     workers = {"num_workers": choose_workers(num_workers, num_envs)}
     return make_env(**(arguments | changes | workers))
+
+
+def build_pool(config: Config, num_envs: int, scene: Scene, sensors: Sequence[str]) -> StreetPool:
+    """Returns streets for episodes to be evaluated in, no more than `num_envs`."""
+    num_envs = min(num_envs, config["num_envs"])
+    workers = choose_workers(config["num_workers"], config["num_envs"])
+    return StreetPool(
+        scene,
+        sensors,
+        num_envs=num_envs,
+        num_workers=min(workers, num_envs),
+        renderer=config["renderer"],
+    )
 
 
 def build_agent(config: Config, env: EnvBase, trust: str | None = None) -> Algorithm:

@@ -1,8 +1,12 @@
-"""Evaluates a trained agent: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
+"""Evaluates trained agents: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
 
+import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 from flowrep.extras import require
@@ -10,18 +14,18 @@ from flowrep.extras import require
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
 import hydra
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig
 
 from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.build import Config, build_env, build_policy
+from flowrep.build import Config, build_env, build_policy, build_pool, choose_device
 from flowrep.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config import UsageError, validated
 from flowrep.config.evaluating import EvaluateConfig
 from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import WorkerError
-from flowrep.experiment.comparison import compare, print_table, with_origin
-from flowrep.experiment.evaluation import Policy
+from flowrep.envs import WorkerError, load_scene
+from flowrep.experiment.arena import Agent, Arena
+from flowrep.experiment.comparison import Comparison, Row, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.origin import check_origin, origin_of
@@ -31,88 +35,145 @@ from flowrep.experiment.run_folder import RunFolder
 OF_THE_MACHINE = ("device", "num_envs", "num_workers", "trust")  # not as the run was trained
 
 
+@dataclass(frozen=True)
+class Subject:
+    """A run whose agent is evaluated.
+
+    Args:
+        run: its folder.
+        config: its own, but for the scene and the machine that were asked for.
+        agent: its policy with what that looks at.
+        frames: that it was trained for.
+    """
+
+    run: RunFolder
+    config: Config
+    agent: Agent
+    frames: int
+
+
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="evaluate")
 def run(config: DictConfig) -> None:
-    """Runs episodes of a saved agent and of baselines, prints a table and keeps the rows."""
+    """Runs episodes of saved agents and of baselines, prints tables and keeps the rows."""
     try:
-        validated(EvaluateConfig, plain_config(config), own_keys())
-        folder = RunFolder.existing(config.run)
-        with folder.held("evaluating"):
-            evaluate(config, folder)
+        asked = plain_config(config)
+        validated(EvaluateConfig, asked, own_keys())
+        runs = [run for path in as_list(asked["run"]) for run in RunFolder.all_in(path)]
+        with ExitStack() as stack:
+            for folder in runs:
+                stack.enter_context(folder.held("evaluating"))
+            evaluate(asked, runs)
     except (UsageError, CheckpointError, WorkerError, ValueError, ImportError, OSError) as error:
         exit_with(str(error))
 
 
-def evaluate(config: DictConfig, folder: RunFolder) -> None:
-    """Does what `run` says, for an agent in a folder that is held."""
-    own = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
-    trained = own | {key: config[key] for key in OF_THE_MACHINE}
-    speeds, policies, baselines = (as_list(config[key]) for key in ("speed", "policy", "baselines"))
-    rates = [float(rate) for rate in as_list(config.fps)]
-    folder.read_episodes()  # a table that can't be added to is better known before than after
-    policy, frames = load_policy(trained, folder, origin_of(own))
+def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
+    """Does what `run` says, for agents in folders that are held.
+
+    Runs of one scene and camera share the streets; their episodes are the same.
+    """
+    subjects = [load_subject(asked, run) for run in runs]
+    by_scene: dict[str, list[Subject]] = {}
+    for subject in subjects:
+        by_scene.setdefault(json.dumps(subject.config["scene"]), []).append(subject)
     with StopRequest() as stop:
-        rows = compare(
-            dict.fromkeys(policies, policy),
-            partial(build_env, trained),
-            speeds=speeds,
-            fps=rates,
-            episodes=config.episodes,
-            seed=config.seed,
-            baselines=baselines,
-            should_stop=lambda: bool(stop),
-        )
-        print_table(rows)
-        print_failures(rows)
-        folder.log_episodes(with_origin(rows, trained, frames, "evaluate"))
-        write_failures(folder.failures_path, folder.read_episodes())
-        print(f"{len(rows)} episodes are in {folder.evaluation_path}")
-        if not stop:
-            film(policy, trained, folder, config, speeds, rates)
+        for group in by_scene.values():
+            compare(asked, group, stop)
+            if stop:
+                break
+        else:
+            for subject in subjects:
+                film(asked, subject)
     if stop:
         sys.exit(stop.exit_code)
 
 
+def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> None:
+    """Runs the episodes of agents of one scene; keeps those that were run, however it ends."""
+    speeds, policies, baselines = (as_list(asked[key]) for key in ("speed", "policy", "baselines"))
+    rates = [float(rate) for rate in as_list(asked["fps"])]
+    comparison = Comparison(
+        speeds=speeds,
+        fps=rates,
+        episodes=asked["episodes"],
+        seed=asked["seed"],
+        policies=policies,
+        baselines=baselines,
+        agents=len(subjects),
+    )
+    config = subjects[0].config
+    make_pool = partial(build_pool, config, comparison.rides)
+    agents = [subject.agent for subject in subjects]
+    arena = Arena(load_scene(config["scene"]), agents, rates, make_pool)
+    try:
+        comparison.run(arena, lambda: bool(stop))
+    finally:
+        for number, subject in enumerate(subjects):
+            keep(subject, comparison.rows(number))
+        arena.pool.close()
+
+
+def keep(subject: Subject, rows: list[Row]) -> None:
+    """Prints what the episodes of one run say and adds them to its table."""
+    run = subject.run
+    rows = with_origin(rows, subject.config, subject.frames, "evaluate")
+    print(run.path)
+    print_table(rows)
+    print_failures(rows)
+    run.log_episodes(rows)
+    write_failures(run.failures_path, run.read_episodes())
+    print(f"{len(rows)} episodes are in {run.evaluation_path}")
+
+
 def as_list(value: Any) -> list[Any]:
     """Returns a list as it is, and a single value as a list of one."""
-    return list(value) if isinstance(value, ListConfig) else [value]
+    return value if isinstance(value, list) else [value]
 
 
-def load_policy(
-    trained: Config, folder: RunFolder, origin: Mapping[str, Any]
-) -> tuple[Policy, int]:
-    """Returns the run's policy and the number of frames that it was trained for.
+def load_subject(asked: Config, run: RunFolder) -> Subject:
+    """Returns a run's agent, in the scene that was asked for, else in its own.
 
     Raises:
+        UsageError, TableError: its config or its table is damaged; that is better known before
+            episodes are run than after.
         CheckpointError: there is no checkpoint, it is damaged, or belongs to another run.
     """
-    path = folder.checkpoint_path
+    own = validated_run(run.read_config(), f"{run.path}/config.yaml")
+    run.read_episodes()
+    path = run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
-    check_origin(state["origin"], origin, path)
-    env = build_env(trained, num_envs=1, num_workers=0)
-    policy = build_policy(trained, env, trust=trained["trust"])
+    check_origin(state["origin"], origin_of(own), path)
+    here = {key: asked[key] for key in OF_THE_MACHINE}
+    scene = asked.get("scene")
+    if scene is not None:  # the camera is the agent's, and goes where it goes
+        here["scene"] = scene | {"camera": own["scene"]["camera"]}
+    config = own | here
+    env = build_env(config, num_envs=1, num_workers=0)
+    policy = build_policy(config, env, trust=config["trust"])
     env.close()
-    policy.load_state_dict(state["policy"])
-    return policy, state["frames"]
+    try:
+        policy.load_state_dict(state["policy"])
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise CheckpointError(
+            f"the agent of {run.path} can't look at scene '{config['scene']['name']}', which has "
+            f"other classes than its own ({reason})"
+        ) from error
+    device = choose_device(config["device"])
+    agent = Agent(policy, config["representations"], config["flow"], device)
+    return Subject(run, config, agent, state["frames"])
 
 
-def film(
-    policy: Policy,
-    trained: Config,
-    folder: RunFolder,
-    config: DictConfig,
-    speeds: list[str],
-    rates: list[float],
-) -> None:
+def film(asked: Config, subject: Subject) -> None:
     """Writes `video` episodes for each speed and frame rate."""
-    for speed in speeds:
-        for rate in rates:
-            for number in range(config.video):
-                path = folder.video_path(f"{speed}_{rate:g}fps_{number}")
-                make = partial(build_env, trained, speed=speed, frame_rate_hz=rate)
-                seen = trained["representations"]
-                record_episode(make, policy, seen, path, seed=config.seed + number)
-                print(f"video: {path}")
+    config, run = subject.config, subject.run
+    for speed, rate in product(as_list(asked["speed"]), as_list(asked["fps"])):
+        for number in range(asked["video"]):
+            path = run.video_path(f"{speed}_{rate:g}fps_{number}")
+            make = partial(build_env, config, speed=speed, frame_rate_hz=float(rate))
+            seen, seed = config["representations"], asked["seed"] + number
+            record_episode(make, subject.agent.policy, seen, path, seed=seed)
+            print(f"video: {path}")
 
 
 def main() -> None:

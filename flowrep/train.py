@@ -20,7 +20,7 @@ from flowrep.agent import (
     threads_in_use,
     use_threads,
 )
-from flowrep.build import Config, build_agent, build_env, choose_device
+from flowrep.build import Config, build_agent, build_env, build_pool, choose_device
 from flowrep.command_line import (
     exit_with,
     line_for,
@@ -35,7 +35,8 @@ from flowrep.config.training import EVALUATION_SEED, TrainConfig, validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import SceneError, WorkerError, load_scene
 from flowrep.envs.workers import available_cores
-from flowrep.experiment.comparison import compare, print_table, with_origin
+from flowrep.experiment.arena import Agent, Arena
+from flowrep.experiment.comparison import Comparison, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.figures import draw_learning_curve
 from flowrep.experiment.interruption import StopRequest
@@ -48,6 +49,7 @@ from flowrep.quoting import override
 
 OF_THE_MACHINE = ("device", "num_workers", "trust")  # a resumed run's, from its new command line
 FINAL_POLICIES = ("greedy", "sampled")  # of the agent, beside the baselines
+FINAL_SEED = EVALUATION_SEED + 500_000  # other episodes than those that were watched in training
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="train")
@@ -184,20 +186,34 @@ def share_cores(config: Config) -> None:
 
 
 def log_evaluation(training: Training, config: Config, stop: StopRequest, frames: int) -> bool:
-    """Appends greedy episodes at the training speed to evaluation.csv; says if it was stopped."""
-    evaluation = config["evaluation"]
+    """Adds greedy episodes at the training speed to evaluation.csv; says if it was stopped."""
+    comparison = Comparison(
+        speeds=[config["speed"]],
+        fps=[config["scene"]["frame_rate_hz"]],
+        episodes=config["evaluation"]["episodes"],
+        seed=EVALUATION_SEED,
+        policies=["greedy"],
+    )
     with torch.random.fork_rng(devices=[]):
-        rows = compare(
-            {"greedy": training.agent.policy},
-            partial(build_env, config),
-            speeds=[config["speed"]],
-            fps=[config["scene"]["frame_rate_hz"]],
-            episodes=evaluation["episodes"],
-            seed=EVALUATION_SEED,
-            should_stop=lambda: bool(stop),
-        )
-    training.run.log_episodes(with_origin(rows, config, frames, "training"))
-    return not rows
+        run_comparison(comparison, training, config, stop)
+    if comparison.is_complete:
+        training.run.log_episodes(with_origin(comparison.rows(), config, frames, "training"))
+    return not comparison.is_complete
+
+
+def run_comparison(
+    comparison: Comparison, training: Training, config: Config, stop: StopRequest
+) -> None:
+    """Runs the episodes of the agent that is being trained, on streets made for them."""
+    agent = Agent(
+        training.agent.policy, config["representations"], config["flow"], training.agent.device
+    )
+    scene, rate = load_scene(config["scene"]), config["scene"]["frame_rate_hz"]
+    arena = Arena(scene, [agent], [rate], partial(build_pool, config, comparison.rides))
+    try:
+        comparison.run(arena, lambda: bool(stop))
+    finally:
+        arena.pool.close()
 
 
 def final_episodes(config: Config) -> int:
@@ -210,19 +226,18 @@ def final_episodes(config: Config) -> int:
 def final_evaluation(training: Training, config: Config, stop: StopRequest) -> None:
     """Compares the agent with baselines at each speed, films an episode and draws the figures."""
     evaluation, run = config["evaluation"], training.run
-    seed = EVALUATION_SEED + config["num_envs"]
-    rows = compare(
-        dict.fromkeys(FINAL_POLICIES, training.agent.policy),
-        partial(build_env, config),
+    comparison = Comparison(
         speeds=evaluation["speeds"],
         fps=[config["scene"]["frame_rate_hz"]],
         episodes=evaluation["final_episodes"],
-        seed=seed,
+        seed=FINAL_SEED,
+        policies=FINAL_POLICIES,
         baselines=evaluation["baselines"],
-        should_stop=lambda: bool(stop),
     )
-    if stop:
+    run_comparison(comparison, training, config, stop)
+    if not comparison.is_complete:
         return
+    rows = comparison.rows()
     print_table(rows)
     print_failures(rows)
     run.log_episodes(with_origin(rows, config, training.frames, "final"))
@@ -231,7 +246,9 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
     if evaluation["video"]:
         path = run.video_path(f"episode_{config['speed']}")
         make_env = partial(build_env, config)
-        record_episode(make_env, training.agent.policy, config["representations"], path, seed=seed)
+        record_episode(
+            make_env, training.agent.policy, config["representations"], path, seed=FINAL_SEED
+        )
         print(f"video: {path}")
 
 

@@ -1,13 +1,17 @@
 """`flowrep.evaluate` on runs of a few frames: what it runs, what it refuses, what it keeps."""
 
 import csv
+import os
+import shutil
+import signal
 
 import pytest
-from omegaconf import OmegaConf
 
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
 from flowrep.agent import CheckpointError
+from flowrep.envs import Drive, WorkerError
+from flowrep.envs.street_pool import StreetPool
 from flowrep.evaluate import evaluate
 from flowrep.experiment.figures import _evaluated
 from flowrep.experiment.interruption import StopRequest
@@ -34,7 +38,7 @@ def trained(path, *overrides):
 
 
 def asked(run, *overrides):
-    return OmegaConf.create(composed(f"run={run.path}", *QUICK, *overrides, name="evaluate"))
+    return composed(f"run={run.path}", *QUICK, *overrides, name="evaluate")
 
 
 def rows_of(run):
@@ -44,7 +48,8 @@ def rows_of(run):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return trained(tmp_path_factory.mktemp("runs") / "dsac", "evaluation.final_episodes=2")
+    sweep = tmp_path_factory.mktemp("runs")
+    return trained(sweep / "dsac", "evaluation.final_episodes=2", "representations=[obj]")
 
 
 @pytest.fixture
@@ -59,16 +64,53 @@ def untouched(run):
 def test_a_run_of_ppo_is_evaluated_whatever_its_batch(tmp_path):
     whole_rollout = ["algorithm.rollout_length=16", "algorithm.batch_size=64"]
     run = trained(tmp_path / "ppo", "algorithm=ppo", *whole_rollout)
-    evaluate(asked(run, "policy=[greedy,sampled]"), run)
+    evaluate(asked(run, "policy=[greedy,sampled]"), [run])
     assert [row["policy"] for row in rows_of(run)] == ["greedy"] * 2 + ["sampled"] * 2
 
 
 def test_what_was_asked_for_is_neither_a_final_evaluation_nor_in_the_learning_curve(untouched):
     run = untouched
-    evaluate(asked(run, "policy=[greedy,sampled]", "fps=[6,12]"), run)
+    evaluate(asked(run, "policy=[greedy,sampled]", "fps=[6,12]"), [run])
     assert {row["evaluation"] for row in rows_of(run)} == {"evaluate"}
     assert not run.is_evaluated(64, 2)
     assert _evaluated(run) == []
+
+
+def test_evaluated_again_the_table_is_the_same_byte_for_byte(untouched):
+    run = untouched
+    evaluate(asked(run, "policy=sampled", "speed=[low,high]", "baselines=[random]"), [run])
+    before = run.evaluation_path.read_bytes()
+    evaluate(asked(run, "policy=sampled", "speed=[low,high]", "baselines=[random]"), [run])
+    assert run.evaluation_path.read_bytes() == before
+    evaluate(asked(run, "policy=sampled", "speed=high", "num_envs=5"), [run])
+    assert run.evaluation_path.read_bytes() == before
+
+
+def test_the_runs_of_a_sweep_are_evaluated_together_on_the_same_episodes(untouched):
+    run = untouched
+    other = RunFolder(run.path.parent / "other")
+    shutil.copytree(run.path, other.path, dirs_exist_ok=True)
+    sweep = RunFolder.all_in(run.path.parent)
+    assert [each.path.name for each in sweep] == ["dsac", "other"]
+    try:
+        evaluate(asked(run, "baselines=[random]"), sweep)
+        assert rows_of(other) == rows_of(run)
+        assert len(rows_of(run)) == 4
+    finally:
+        shutil.rmtree(other.path)
+
+
+def test_an_agent_drives_in_another_scene_when_that_is_asked_for(untouched):
+    run = untouched
+    evaluate(asked(run, "scene=s_turn", "baselines=[never_turn]"), [run])
+    assert {row["scene"] for row in rows_of(run)} == {"s_turn"}
+    assert len(rows_of(run)) == 4
+
+
+def test_an_agent_that_reads_classes_is_told_that_another_scene_has_others(tmp_path):
+    run = trained(tmp_path / "seg", "representations=[seg]")
+    with pytest.raises(CheckpointError, match="can't look at scene 's_turn', which has other clas"):
+        evaluate(asked(run, "scene=s_turn"), [run])
 
 
 def test_an_edited_config_is_refused(untouched):
@@ -76,12 +118,40 @@ def test_an_edited_config_is_refused(untouched):
     path = run.path / "config.yaml"
     path.write_text(path.read_text().replace("straight_road", "s_turn"))
     with pytest.raises(CheckpointError, match=r"scene\.name=straight_road, .* scene\.name=s_turn"):
-        evaluate(asked(run), run)
+        evaluate(asked(run), [run])
 
 
 def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypatch):
     run = untouched
     run.evaluation_path.write_text("scene;fps\nstraight_road;12\n")
-    monkeypatch.setattr("flowrep.evaluate.compare", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr("flowrep.evaluate.compare", lambda *_: pytest.fail("too late"))
     with pytest.raises(TableError, match="lacks the columns"):
-        evaluate(asked(run), run)
+        evaluate(asked(run), [run])
+
+
+def test_a_worker_that_dies_is_one_line_and_what_was_run_is_kept(untouched, monkeypatch):
+    run = untouched
+
+    def dies(self, jobs):
+        yield from ()
+        raise WorkerError("the worker process of environment 0 is gone (SIGKILL)")
+
+    monkeypatch.setattr(StreetPool, "drive", dies)
+    with pytest.raises(WorkerError):
+        evaluate(asked(run, "baselines=[random]"), [run])
+    assert [row["policy"] for row in rows_of(run)] == ["greedy"] * 2
+
+
+def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(untouched, monkeypatch):
+    run = untouched
+
+    def interrupted(self, jobs):
+        os.kill(os.getpid(), signal.SIGINT)
+        yield 0, Drive(2_000_000, "timeout", "", -5.0, 7)
+
+    monkeypatch.setattr(StreetPool, "drive", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        evaluate(asked(run, "baselines=[random]", "video=1"), [run])
+    assert ended.value.code == 130
+    assert [row["policy"] for row in rows_of(run)] == ["greedy", "greedy", "random"]
+    assert not (run.path / "videos").exists()

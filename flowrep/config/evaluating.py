@@ -6,7 +6,14 @@ from pydantic import model_validator
 
 from flowrep.config.expectations import Count, CountOrZero, ListOf, Number, OneOf, Seed, Text
 from flowrep.config.section import Section
-from flowrep.config.training import SPEEDS, Device, Trust, Workers, check_workers
+from flowrep.config.training import (
+    SPEEDS,
+    Device,
+    SceneSection,
+    Trust,
+    Workers,
+    check_workers,
+)
 from flowrep.envs.baselines import BASELINES
 
 POLICIES = ("greedy", "sampled")
@@ -15,7 +22,8 @@ POLICIES = ("greedy", "sampled")
 class EvaluateConfig(Section):
     """The whole config of an evaluation."""
 
-    run: Annotated[str, Text("a run folder")]
+    run: Annotated[Any, ListOf(Text("a run folder, or a sweep's"), or_one=True)]
+    scene: SceneSection | None = None
     speed: Annotated[Any, ListOf(OneOf(SPEEDS), or_one=True)]
     fps: Annotated[Any, ListOf(Number(above=0), or_one=True)]
     episodes: Count

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.planner import Planner
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.vehicle import NO_OP
@@ -18,14 +20,17 @@ def never_turn(env: StreetEnv) -> int:
 
 
 class RandomDriver:
-    """Returns actions drawn evenly."""
+    """Returns actions drawn evenly; in an episode always the same, whichever came before."""
 
     def __init__(self, seed: int = 0) -> None:
-        """Seeds its own generator."""
+        """Takes the seed that sets it apart from other random drivers."""
+        self._seed = seed
         self._rng = np.random.default_rng(seed)
 
     def __call__(self, env: StreetEnv) -> int:
         """Returns one of the three actions."""
+        if not env.episode.steps:
+            self._rng = np.random.default_rng((env.episode.seed, self._seed))
         return int(self._rng.integers(3))
 
 
@@ -38,6 +43,23 @@ class Drive:
     hit: str
     total_reward: float
     steps: int
+
+
+def drive_episode(env: StreetEnv, driver: Driver, options: dict[str, Any]) -> Drive:
+    """Returns an episode, driven to its end without anything being looked at.
+
+    Args:
+        env: the street.
+        driver: chooses the actions.
+        options: of `StreetEnv.reset`, which name the episode.
+    """
+    env.begin(options=options)
+    total, outcome = 0.0, Outcome.RUNNING
+    while not outcome:
+        outcome = env.drive(driver(env))
+        total += reward(outcome)
+    episode = env.episode
+    return Drive(episode.seed, outcome.label, episode.hit, total, episode.steps)
 
 
 def drives(

@@ -39,7 +39,7 @@ class Rules:
 
     def __init__(self, layout: Layout, frame_rate_hz: float) -> None:
         """Prepares the tests for a layout at a frame rate."""
-        self.layout = layout
+        self.layout, self.frame_rate_hz = layout, frame_rate_hz
         self.dt_s = 1.0 / frame_rate_hz
         self.ticks_a_step = math.ceil(_CHECKS_HZ / frame_rate_hz - 1e-9)
         self.tick_s = self.dt_s / self.ticks_a_step
@@ -69,7 +69,7 @@ class Episode:
         rng = np.random.default_rng(episode_seed)
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
         self.rules = rules
-        self.seed = episode_seed
+        self.seed, self.speed_mps = episode_seed, speed_mps
         self.path = drawn if path is None else _path_named(scene.paths, path)
         self.crowd: Crowd = draw_crowd(rules.layout, scene.pedestrian_groups, speed_mps, rng)
         self.vehicle_speed_mps = (

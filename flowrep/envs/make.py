@@ -120,7 +120,7 @@ def make_env(
             flow=flow,
         )
     probe.close()
-    sensors = _sensors_read(transforms)
+    sensors = sensors_read(transforms)
     if keep_sensor:
         sensors = [name for name in SENSORS if name in sensors or name != "rgb"]
     elif sensors:
@@ -203,6 +203,7 @@ def _sensed(street: Callable[..., StreetEnv], sensors: Sequence[str]) -> SensorO
     return SensorObservation(street(sensors=sensors))
 
 
-def _sensors_read(transforms: Iterable[Any]) -> list[str]:
+def sensors_read(transforms: Iterable[Any]) -> list[str]:
+    """Returns the sensors that transforms read, in the order of `SENSORS`."""
     keys = {key for transform in transforms for key in transform.in_keys}
     return [name for name in SENSORS if ("sensor", name) in keys]

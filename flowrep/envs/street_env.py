@@ -18,6 +18,8 @@ from flowrep.envs.street import Street
 from flowrep.envs.vehicle import YAW_SIGN, VehicleState
 from flowrep.palette import num_classes
 
+_OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz")
+
 
 class StreetEnv(gym.Env):
     """A vehicle drives through a street of pedestrians at constant speed, and steers.
@@ -71,7 +73,7 @@ class StreetEnv(gym.Env):
         self.num_classes = num_classes(self.scene.categories)
         self._street = Street.shared(self.scene)
         self._is_open = True
-        self._rules = Rules(self._street.layout, self.frame_rate_hz)
+        self._rules: dict[float, Rules] = {}  # of each frame rate that was asked for
         self.sensing = Sensing(self.scene, self._street, sensors, renderer)
         self.K = self.sensing.K
         self._episode: Episode | None = None
@@ -93,7 +95,8 @@ class StreetEnv(gym.Env):
         Args:
             seed: seeds the generator that draws the episodes' seeds.
             options: `episode_seed` (int) names the episode, `path` (str) its path,
-                `vehicle_speed_mps` (float) another speed than the scene's: 0 holds the camera.
+                `vehicle_speed_mps` (float) another speed than the scene's: 0 holds the camera;
+                `speed` and `frame_rate_hz`, of this episode, are others than the env's.
         """
         self.begin(seed=seed, options=options)
         return self.sensing.observe(self.episode), self._info()
@@ -102,12 +105,7 @@ class StreetEnv(gym.Env):
         """Begins an episode as `reset` does, and does not look at it."""
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(1 << 31))
-        options = dict(options or {})
-        episode_seed = int(options.pop("episode_seed", drawn))
-        self._begin(episode_seed, options.pop("path", None), options.pop("vehicle_speed_mps", None))
-        if options:
-            known = "episode_seed, path, vehicle_speed_mps"
-            raise ValueError(f"unknown reset options {sorted(options)}; they are: {known}")
+        self._begin({"episode_seed": drawn} | (options or {}))
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drives one step. Every end of an episode is `terminated`, the time-out too."""
@@ -148,6 +146,8 @@ class StreetEnv(gym.Env):
             "episode_seed": episode.seed,
             "path": episode.path.name,
             "vehicle_speed_mps": episode.vehicle_speed_mps,
+            "speed": list(episode.speed_mps),
+            "frame_rate_hz": episode.rules.frame_rate_hz,
             "steps": episode.steps,
             "outcome": episode.outcome.label,
             "hit": episode.hit,
@@ -158,16 +158,25 @@ class StreetEnv(gym.Env):
     def set_state(self, state: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Goes back to a state of `get_state`; returns its observation and info."""
         self.np_random.bit_generator.state = state["np_random"]
-        self._begin(state["episode_seed"], state["path"], state["vehicle_speed_mps"])
+        self._begin({name: state[name] for name in _OPTIONS})
         episode = self.episode
         episode.steps, episode.hit = state["steps"], state["hit"]
         episode.outcome = Outcome[state["outcome"].upper()]
         episode.resume(_moment(state["before"]), _moment(state["now"]))
         return self.sensing.observe(self.episode), self._info()
 
-    def _begin(self, seed: int, path: str | None, vehicle_speed_mps: float | None) -> None:
+    def _begin(self, options: Mapping[str, Any]) -> None:
+        if unknown := sorted(options.keys() - set(_OPTIONS)):
+            raise ValueError(f"unknown reset options {unknown}; they are: {', '.join(_OPTIONS)}")
+        rate = _frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz))
+        if rate not in self._rules:
+            self._rules[rate] = Rules(self._street.layout, rate)
         self._episode = Episode(
-            self._rules, seed, self.speed_mps, path=path, vehicle_speed_mps=vehicle_speed_mps
+            self._rules[rate],
+            int(options["episode_seed"]),
+            _speed_range(self.scene, options.get("speed", self.speed_mps)),
+            path=options.get("path"),
+            vehicle_speed_mps=options.get("vehicle_speed_mps"),
         )
 
     def _info(self) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Many streets of one scene in a process: each drives alone, all of them are seen at once."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.sensing import observe_together
 from flowrep.envs.sensor_observation import standing
+from flowrep.envs.worker_process import Order
 
 
 class StreetVectorEnv(SyncVectorEnv):
@@ -54,6 +55,33 @@ class StreetVectorEnv(SyncVectorEnv):
         ended = np.array([outcome != Outcome.RUNNING for outcome in outcomes])
         everyone = list(range(self.num_envs))
         return self._observe(everyone), rewards, ended, np.zeros_like(ended), {}
+
+    def advance(
+        self, orders: Sequence[Order], into: Mapping[str, NDArray[Any]]
+    ) -> list[tuple[str, str] | None]:
+        """Lets each street follow its order, and looks at those whose episode goes on.
+
+        Args:
+            orders: one a street: an action to drive a step with, options of `StreetEnv.reset` to
+                begin an episode with, or None, which leaves it alone.
+            into: arrays `[num_envs, ...]` by sensor, of which their rows are written.
+
+        Returns:
+            How the episode stands, its outcome's name and what was hit, of each that had an order.
+        """
+        for street, order in zip(self._streets, orders, strict=True):
+            if isinstance(order, Mapping):
+                street.begin(options=dict(order))
+            elif order is not None:
+                street.drive(order)
+        asked = [None if order is None else s.episode for s, order in zip(self._streets, orders)]
+        rows = [i for i, episode in enumerate(asked) if episode and not episode.outcome]
+        if rows:
+            streets = [self._streets[row] for row in rows]
+            seen = observe_together([s.sensing for s in streets], [s.episode for s in streets])
+            for name, values in seen.items():
+                into[name][rows] = values
+        return [episode and (episode.outcome.label, episode.hit) for episode in asked]
 
     def _observe(self, rows: list[int]) -> dict[str, Any]:
         """Looks at the streets of some rows; the others' are those of before."""

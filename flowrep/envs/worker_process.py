@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 EnvFactory = Callable[[], gym.Env]
 VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
+Order = int | Mapping[str, Any] | None  # an action, reset options, or nothing
 Arrays = dict[str, Any]  # arrays, or such dicts of them, as a Dict space holds them
 
 
@@ -145,11 +146,23 @@ def _call_each(vector: SyncVectorEnv, shared: Arrays, name: str, arguments: list
     return [env.get_wrapper_attr(name)(given) for env, given in zip(vector.envs, arguments)]
 
 
+def _advance(vector: Any, shared: Arrays, orders: Sequence[Order]) -> list[Any]:
+    return vector.advance(orders, shared.get("sensor", {}))
+
+
+def _apply(
+    vector: SyncVectorEnv, shared: Arrays, function: Callable[[gym.Env, Any], Any], argument: Any
+) -> Any:
+    return function(vector.envs[0], argument)
+
+
 _COMMANDS: dict[str, Callable[..., Any]] = {
     "reset": _reset,
     "step": _step,
     "call": _call_all,
     "call_each": _call_each,
+    "advance": _advance,
+    "apply": _apply,
 }
 
 

@@ -6,12 +6,14 @@ import os
 import pickle
 import sys
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
+from multiprocessing import connection
 from types import ModuleType
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory
@@ -21,6 +23,7 @@ from flowrep.envs import worker_process
 from flowrep.envs.worker_process import (
     Arrays,
     EnvFactory,
+    Order,
     VectorFactory,
     Worker,
     WorkerError,
@@ -163,6 +166,44 @@ class WorkerVectorEnv(VectorEnv):
         self.drop_step()
         self._send("call_each", lambda rows: (name, list(arguments[rows])))
         return tuple(result for results in self._receive() for result in results)
+
+    def advance(self, orders: Sequence[Order]) -> tuple[Arrays, list[Any]]:
+        """Lets each environment follow its order, where workers hold `StreetVectorEnv`s.
+
+        Returns:
+            What is seen, `[num_envs, ...]` by sensor, in memory that the next call writes to; how
+            each episode stands. See `StreetVectorEnv.advance`.
+        """
+        self.drop_step()
+        self._send("advance", lambda rows: (orders[rows],))
+        standings = [standing for part in self._receive() for standing in part]
+        return self._shared.get("sensor", {}), standings
+
+    def apply(
+        self, function: Callable[[gym.Env, Any], Any], arguments: Iterable[Any]
+    ) -> Iterator[tuple[int, Any]]:
+        """Yields each argument's number and what the function made of it, as they are done.
+
+        Args:
+            function: can be pickled; called with an environment of whichever worker is free.
+            arguments: one for each call.
+        """
+        self.drop_step()
+        waiting = enumerate(arguments)
+        busy: dict[Any, tuple[Worker, int]] = {}
+        free = list(self._workers)
+        with self._ending_with_a_failure():
+            while True:
+                for worker, (number, argument) in zip(free, waiting):
+                    worker.send("apply", (function, argument))
+                    busy[worker.pipe] = worker, number
+                if not busy:
+                    return
+                free = []
+                for pipe in connection.wait(list(busy)):
+                    worker, number = busy.pop(pipe)
+                    free.append(worker)
+                    yield number, worker.receive()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the workers."""

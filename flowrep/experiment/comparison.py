@@ -1,104 +1,134 @@
-"""An agent beside baselines on the same episodes: rows for evaluation.csv and a table to read."""
+"""Agents beside baselines on the same episodes: rows for evaluation.csv and a table to read."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
-from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
-from flowrep.envs import streets
-from flowrep.envs.baselines import BASELINES, drives
-from flowrep.experiment.evaluation import (
-    OUTCOMES,
-    Episode,
-    Policy,
-    outcome_shares,
-    quotas,
-    run_episodes,
-)
+from flowrep.envs.street_pool import Options
+from flowrep.experiment.arena import Arena, Job
+from flowrep.experiment.evaluation import OUTCOMES, Episode, outcome_shares
 
 Row = dict[str, Any]
 
 
-def compare(
-    agents: Mapping[str, Policy],
-    make_env: Callable[..., EnvBase],
-    *,
-    speeds: Sequence[str],
-    fps: Sequence[float],
-    episodes: int,
-    seed: int,
-    baselines: Sequence[str] = (),
-    should_stop: Callable[[], bool] = lambda: False,
-) -> list[Row]:
-    """Returns one row an episode, for every speed, frame rate and policy.
+class _Cell(NamedTuple):
+    """Whose episodes, how driven, in which conditions; a baseline's are everybody's."""
+
+    agent: int | None
+    policy: str
+    speed: str
+    fps: float
+
+
+class Comparison:
+    """Which episodes are to be run, and those that have been.
+
+    Episode k of each policy, speed and frame rate is the one of `seed + k`.
 
     Args:
-        agents: "greedy" and / or "sampled" → the policy that is run in that way.
-        make_env: called with `speed` and `frame_rate_hz`, and, for the street that baselines drive
-            through, `representations`, `num_envs` and `num_workers`.
         speeds: pedestrians' speed modes.
         fps: frame rates in Hz.
         episodes: for each policy, speed and frame rate.
-        seed: of the environments; the same for every policy, so that the episodes are too.
-        baselines: names in `flowrep.envs.baselines.BASELINES`, run on the same episodes.
-        should_stop: asked between steps; the rows of unfinished policies are left out.
+        seed: of the first episode.
+        policies: "greedy" and / or "sampled", in which every agent is run.
+        baselines: names in `flowrep.envs.BASELINES`, run on the same episodes.
+        agents: how many there are.
     """
-    rows: list[Row] = []
-    total = len(speeds) * len(fps) * (len(agents) + len(baselines)) * episodes
-    with tqdm(total=total, unit="episode", desc="evaluating", leave=False) as bar:
-        for speed, rate in product(speeds, fps):
-            make = partial(make_env, speed=speed, frame_rate_hz=rate)
-            env = make()
-            split = quotas(episodes, env.batch_size.numel())
-            runs: dict[str, partial[Iterator[Episode]]] = {
-                name: partial(
-                    run_episodes, env, policy, episodes, seed=seed, greedy=name != "sampled"
-                )
-                for name, policy in agents.items()
-            } | {
-                name: partial(baseline_episodes, make, name, split, seed=seed) for name in baselines
-            }
-            for name, run in runs.items():
-                finished = []
-                for episode in run():
-                    finished.append(_row(name, speed, rate, episode))
-                    bar.update()
-                    if should_stop():
-                        env.close()
-                        return rows
-                rows += finished
-            env.close()
-    return rows
 
+    def __init__(
+        self,
+        *,
+        speeds: Sequence[str],
+        fps: Sequence[float],
+        episodes: int,
+        seed: int,
+        policies: Sequence[str],
+        baselines: Sequence[str] = (),
+        agents: int = 1,
+    ) -> None:
+        self._seeds = [(seed + k) % (1 << 31) for k in range(episodes)]
+        # one agent and frame rate after the other, so that streets which share them do so for long
+        self._rides = [
+            _Cell(agent, policy, speed, rate)
+            for agent, rate, speed, policy in product(range(agents), fps, speeds, policies)
+        ]
+        self._drives = [
+            _Cell(None, name, speed, rate) for rate, speed, name in product(fps, speeds, baselines)
+        ]
+        self._conditions = list(product(speeds, fps))
+        self._names = ([*policies], [*baselines])
+        self._done: dict[_Cell, dict[int, Episode]] = defaultdict(dict)
 
-def baseline_episodes(
-    make_env: Callable[..., EnvBase], name: str, split: Sequence[int], *, seed: int
-) -> Iterator[Episode]:
-    """Yields the episodes that `run_episodes` runs, driven by a baseline, which sees no picture.
+    @property
+    def rides(self) -> int:
+        """How many episodes agents are to drive."""
+        return len(self._rides) * len(self._seeds)
 
-    Args:
-        make_env: called with `representations`, `num_envs` and `num_workers`; its one street is
-            driven through, for each environment of the batch in turn.
-        name: in `flowrep.envs.baselines.BASELINES`.
-        split: how many episodes each environment of the batch runs, see `quotas`.
-        seed: of the environments.
-    """
-    env = make_env(representations=(), num_envs=1, num_workers=0)
-    (street,), driver = streets(env), BASELINES[name]()
-    for number, quota in enumerate(split):
-        street.reset(seed=seed + number)
-        for drive in drives(street, driver, quota):
-            yield Episode(
-                drive.episode_seed, drive.outcome, drive.hit, drive.total_reward, drive.steps
-            )
-    env.close()
+    @property
+    def is_complete(self) -> bool:
+        """Says whether all episodes have been run."""
+        cells = [*self._rides, *self._drives]
+        return all(len(self._done[cell]) == len(self._seeds) for cell in cells)
+
+    def run(self, arena: Arena, should_stop: Callable[[], bool] = lambda: False) -> None:
+        """Runs the episodes; what is done is kept, however it ends.
+
+        Args:
+            arena: with as many agents.
+            should_stop: asked after each episode.
+        """
+        count = len(self._seeds)
+        rides = [(cell, k) for cell in self._rides for k in range(count)]
+        drives = [(cell, k) for cell in self._drives for k in range(count)]
+        jobs = [
+            Job(cell.agent or 0, cell.policy == "greedy", cell.speed, cell.fps, self._seeds[k])
+            for cell, k in rides
+        ]
+        driven = [(cell.policy, self._options(cell, k)) for cell, k in drives]
+        total = len(rides) + len(drives)
+        with tqdm(total=total, unit="episode", desc="evaluating", leave=False) as bar:
+            for number, episode in arena.run(jobs):
+                self._keep(rides[number], episode)
+                bar.update()
+                if should_stop():
+                    return
+            for number, drive in arena.pool.drive(driven):
+                ended = drive.outcome, drive.hit, drive.total_reward, drive.steps
+                self._keep(drives[number], Episode(drive.episode_seed, *ended))
+                bar.update()
+                if should_stop():
+                    return
+
+    def rows(self, agent: int = 0) -> list[Row]:
+        """Returns a row for each episode of an agent and of the baselines, in their order.
+
+        Of what was not run to its end, those before the first gap: whichever are done first are
+        short ones, and would say too little of the others.
+        """
+        rows = []
+        policies, baselines = self._names
+        for speed, rate in self._conditions:
+            cells = [_Cell(agent, name, speed, rate) for name in policies]
+            cells += [_Cell(None, name, speed, rate) for name in baselines]
+            for cell in cells:
+                episodes, k = self._done[cell], 0
+                while k in episodes:
+                    rows.append(_row(cell, episodes[k]))
+                    k += 1
+        return rows
+
+    def _options(self, cell: _Cell, k: int) -> Options:
+        return {"episode_seed": self._seeds[k], "speed": cell.speed, "frame_rate_hz": cell.fps}
+
+    def _keep(self, place: tuple[_Cell, int], episode: Episode) -> None:
+        cell, k = place
+        self._done[cell][k] = episode
 
 
 def with_origin(
@@ -123,11 +153,11 @@ def with_origin(
     return [origin | row for row in rows]
 
 
-def _row(policy: str, speed: str, fps: float, episode: Episode) -> Row:
+def _row(cell: _Cell, episode: Episode) -> Row:
     return {
-        "policy": policy,
-        "speed": speed,
-        "fps": fps,
+        "policy": cell.policy,
+        "speed": cell.speed,
+        "fps": cell.fps,
         "episode_seed": episode.episode_seed,
         "outcome": episode.outcome,
         "hit": episode.hit,

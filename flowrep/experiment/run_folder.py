@@ -74,6 +74,17 @@ class RunFolder:
             )
         return cls(path)
 
+    @classmethod
+    def all_in(cls, path: str | Path) -> list["RunFolder"]:
+        """Opens a folder that holds a run, or those of a sweep's folder that do.
+
+        Raises:
+            RunFolderError: there is no run at `path`, nor right below it.
+        """
+        runs = sorted(config.parent for config in Path(path).glob("*/config.yaml"))
+        is_sweep = runs and not (Path(path) / "config.yaml").is_file()
+        return [cls(run) for run in runs] if is_sweep else [cls.existing(path)]
+
     def check_is_new(self) -> None:
         """Looks whether a run can begin here.
 

@@ -237,6 +237,25 @@ def test_an_episodes_seed_names_it(make_street):
     assert same(observation, again)
 
 
+def test_an_episode_may_have_a_speed_and_a_frame_rate_of_its_own(make_street):
+    """On one street all is as on a street made for them, and its own come back afterwards."""
+    shared, made_for = make_street(), make_street(speed="high", frame_rate_hz=7.0)
+    for env, options in ((shared, {"speed": "high", "frame_rate_hz": 7.0}), (made_for, {})):
+        env.reset(options={"episode_seed": 11} | options)
+        for _ in range(3):
+            env.step(LEFT)
+    state = json.loads(json.dumps(shared.get_state()))
+    assert shared.episode.now == made_for.episode.now
+    assert np.array_equal(shared.episode.poses, made_for.episode.poses)
+    assert same(shared.step(RIGHT)[0], made_for.step(RIGHT)[0])
+    resumed = make_street()
+    resumed.set_state(state)
+    assert same(resumed.step(RIGHT)[0], shared.sensing.observe(shared.episode))
+    shared.reset(options={"episode_seed": 11})
+    assert shared.episode.speed_mps == shared.scene.pedestrian_speed_mps["normal"]
+    assert shared.episode.rules.frame_rate_hz == 12.0
+
+
 def test_a_state_written_as_json_goes_on_bit_for_bit(make_street):
     env = make_street()
     env.reset(seed=2)

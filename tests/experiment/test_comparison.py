@@ -1,62 +1,175 @@
-"""Every policy is measured on the same episodes."""
+"""Every agent and every baseline is measured on the same episodes, wherever they are run."""
 
 from functools import partial
 
 import pytest
 import torch
 from rich.console import Console
+from torch import nn
 
 pytest.importorskip("pybullet", reason="policies drive the simulated street")
 
-from flowrep.envs import make_env
-from flowrep.experiment.comparison import compare, print_table, with_origin
+from flowrep.agent.action import DiscreteActions
+from flowrep.agent.policy import stochastic_policy
+from flowrep.envs import load_scene, make_env
+from flowrep.envs.street_pool import StreetPool
+from flowrep.experiment.arena import Agent, Arena
+from flowrep.experiment.comparison import Comparison, print_table, with_origin
+from flowrep.experiment.eye import Eye
 from flowrep.experiment.run_folder import EVALUATION_COLUMNS
+from tests.test_configs import composed
 
 NO_OP = 0
-
-
-def straight_on(tensordict):
-    return tensordict.set("action", torch.full(tensordict.batch_size, NO_OP))
+ACTIONS = DiscreteActions(3, "categorical", torch.distributions.Categorical)
 
 
 @pytest.fixture(scope="module")
-def rows():
-    return compare(
-        {"greedy": straight_on},
-        partial(make_env, "straight_road", num_envs=3),
-        speeds=["low", "high"],
-        fps=[12.0],
-        episodes=7,
-        seed=5,
-        baselines=["never_turn", "random"],
-    )
+def scene():
+    small = ["scene.camera.height_px=12", "scene.camera.width_px=20"]
+    return load_scene(composed(*small)["scene"])
+
+
+class Weigher(nn.Module):
+    """Logits from sums over maps, so that an action depends on what is seen."""
+
+    def __init__(self, factor: float) -> None:
+        super().__init__()
+        self.factor = factor
+
+    def forward(self, *maps: torch.Tensor) -> torch.Tensor:
+        total = sum(m.float().flatten(1).sum(-1) for m in maps)
+        return torch.stack([0.5 * torch.cos(self.factor * total + i) for i in range(3)], -1)
+
+
+def agent(*names, factor=1.0):
+    policy = stochastic_policy(Weigher(factor), list(names), ACTIONS)
+    return Agent(policy, {name: {} for name in names}, "exact")
+
+
+def straight_on():
+    def act(tensordict):
+        return tensordict.set("action", torch.full(tensordict.batch_size, NO_OP))
+
+    return Agent(act, {"depth": {}}, "exact")
+
+
+def rows_of(scene, agents, num_envs=3, num_workers=0, **asked):
+    asked = {
+        "speeds": ["low"],
+        "fps": [12],
+        "seed": 5,
+        "policies": ["greedy"],
+        "episodes": 4,
+    } | asked
+    comparison = Comparison(**asked, agents=len(agents))
+    make_pool = partial(StreetPool, num_envs=num_envs, num_workers=num_workers)
+    arena = Arena(scene, agents, asked["fps"], make_pool)
+    comparison.run(arena)
+    arena.pool.close()
+    assert comparison.is_complete
+    return [comparison.rows(number) for number in range(len(agents))]
+
+
+@pytest.fixture(scope="module")
+def rows(scene):
+    baselines = ["never_turn", "random"]
+    settings = {"speeds": ["low", "high"], "episodes": 7, "baselines": baselines}
+    return rows_of(scene, [straight_on()], **settings)[0]
 
 
 def of(rows, policy, speed="low"):
-    return sorted(
-        (row["episode_seed"], row["outcome"], row["return"], row["length"])
-        for row in rows
-        if row["policy"] == policy and row["speed"] == speed
-    )
+    columns = "episode_seed", "outcome", "hit", "return", "length"
+    chosen = [row for row in rows if row["policy"] == policy and row["speed"] == speed]
+    return [tuple(row[name] for name in columns) for row in chosen]
 
 
-def test_a_batched_policy_and_its_baseline_twin_live_through_the_same_episodes(rows):
-    assert len(of(rows, "greedy")) == 7
+def test_an_agent_and_its_baseline_twin_live_through_the_same_episodes(rows):
+    assert [row[0] for row in of(rows, "greedy")] == [5, 6, 7, 8, 9, 10, 11]
     assert of(rows, "greedy") == of(rows, "never_turn")
     assert of(rows, "greedy", "high") == of(rows, "never_turn", "high")
+    assert of(rows, "greedy") != of(rows, "greedy", "high")
 
 
 def test_another_policy_gets_the_same_episodes_and_ends_them_otherwise(rows):
-    seeds = [row[0] for row in of(rows, "never_turn")]
-    assert len(set(seeds)) == 7
-    assert [row[0] for row in of(rows, "random")] == seeds
+    assert [row[0] for row in of(rows, "random")] == [row[0] for row in of(rows, "never_turn")]
     assert of(rows, "random") != of(rows, "never_turn")
 
 
 def test_returns_are_the_papers_rewards(rows):
     for row in rows:
         end = 5.0 if row["outcome"] == "success" else -5.0
-        assert row["return"] == pytest.approx(end + 0.01 * row["length"], abs=1e-3)
+        assert row["return"] == pytest.approx(end + 0.01 * row["length"], abs=1e-9)
+
+
+ASKED = {"fps": [12, 6], "policies": ["greedy", "sampled"], "baselines": ["random"]}
+
+
+@pytest.fixture(scope="module")
+def alone(scene):
+    return rows_of(scene, [agent("obj", "seg2")], num_envs=1, **ASKED)[0]
+
+
+def test_rows_come_in_the_order_of_what_was_asked(alone):
+    order = [(row["fps"], row["policy"], row["episode_seed"]) for row in alone]
+    names = "greedy", "sampled", "random"
+    assert order == [(f, name, s) for f in (12.0, 6.0) for name in names for s in (5, 6, 7, 8)]
+    assert len({(row["outcome"], row["length"]) for row in alone}) > 6
+
+
+@pytest.mark.parametrize(("num_envs", "num_workers"), [(3, 0), (5, 2)])
+def test_where_episodes_are_run_is_not_seen_in_what_comes_out(scene, alone, num_envs, num_workers):
+    assert rows_of(scene, [agent("obj", "seg2")], num_envs, num_workers, **ASKED)[0] == alone
+
+
+def test_agents_that_share_streets_do_not_touch_each_other(scene, alone):
+    agents = [agent("depth2", factor=3.0), agent("obj", "seg2")]
+    other, same = rows_of(scene, agents, num_envs=4, **ASKED)
+    assert same == alone
+    assert [row for row in other if row["policy"] == "random"] == [
+        row for row in alone if row["policy"] == "random"
+    ]
+    assert other != alone
+
+
+def test_more_episodes_begin_with_those_of_fewer(scene, alone):
+    more = rows_of(scene, [agent("obj", "seg2")], episodes=6, **ASKED)[0]
+    assert [row for row in more if row["episode_seed"] < 9] == alone
+
+
+def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
+    comparison = Comparison(
+        speeds=["low"], fps=[12], episodes=6, seed=5, policies=["greedy"], baselines=["random"]
+    )
+    arena = Arena(scene, [agent("obj")], [12], partial(StreetPool, num_envs=6))
+    done = []
+    comparison.run(arena, lambda: done.append(1) or len(done) == 3)
+    arena.pool.close()
+    assert not comparison.is_complete
+    ended = {k for episodes in comparison._done.values() for k in episodes}
+    assert len(ended) == 3
+    gap = next(k for k in range(6) if k not in ended)
+    assert [row["episode_seed"] for row in comparison.rows()] == [5 + k for k in range(gap)]
+
+
+@pytest.mark.parametrize("flow", ["exact", "estimated"])
+def test_an_eye_sees_what_the_env_shows(scene, flow):
+    if flow == "estimated":
+        pytest.importorskip("cv2")
+    names = ["raw", "obj", "seg2", "depth2"]
+    env = make_env(scene, names, seed=3, flow=flow)
+    tensordict = env.reset()
+    eye = Eye(scene, names, flow, 12.0)
+    pool = StreetPool(scene, eye.sensors, num_envs=2)
+    order = {"episode_seed": int(tensordict["episode_seed"]), "speed": "normal"}
+    for step in range(5):
+        seen, _ = pool.advance([None, order])
+        maps = eye.look(seen, [] if step else [1], [1] if step else [])
+        for name in names:
+            assert torch.equal(maps[name], tensordict[name]), (name, step)
+        order = step % 3
+        tensordict = env.step(tensordict.set("action", torch.tensor([order])))["next"]
+    env.close()
+    pool.close()
 
 
 def test_rows_have_the_columns_of_evaluation_csv(rows):

@@ -1,0 +1,161 @@
+"""Runs episodes of agents on a pool of streets, each street busy until the last of them."""
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from flowrep.envs.outcome import Outcome, reward
+from flowrep.envs.scene import Scene
+from flowrep.envs.street_pool import StreetPool
+from flowrep.envs.worker_process import Order
+from flowrep.experiment.evaluation import Episode
+from flowrep.experiment.eye import Eye
+
+_REWARD = {outcome.label: reward(outcome) for outcome in Outcome}
+_RUNNING = Outcome.RUNNING.label
+_DRAWS = 1  # sets an agent's draws apart from what else is drawn from an episode's seed
+
+
+class Agent(NamedTuple):
+    """A policy and what it looks at."""
+
+    policy: Any
+    representations: Mapping[str, Any]
+    flow: str | Mapping[str, Any]
+    device: torch.device | str = "cpu"
+
+
+class Job(NamedTuple):
+    """One episode that an agent is to drive: which agent, how, and which episode."""
+
+    agent: int
+    is_greedy: bool
+    speed: str
+    fps: float
+    episode_seed: int
+
+
+@dataclass
+class _Ride:
+    """A job that a street is at."""
+
+    number: int
+    job: Job
+    rng: np.random.Generator
+    total_reward: float = 0.0
+    length: int = 0
+
+
+class Arena:
+    """Agents and the streets of one scene.
+
+    Args:
+        scene: a loaded scene.
+        agents: those that will drive.
+        fps: frame rates at which they will.
+        make_pool: gets the scene and the sensors that the agents need.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        agents: Sequence[Agent],
+        fps: Sequence[float],
+        make_pool: Callable[[Scene, Sequence[str]], StreetPool],
+    ) -> None:
+        """Makes the pool."""
+        self.agents = list(agents)
+        self._eyes = {
+            (number, rate): Eye(scene, agent.representations, agent.flow, rate, agent.device)
+            for number, agent in enumerate(agents)
+            for rate in fps
+        }
+        sensors = {name for eye in self._eyes.values() for name in eye.sensors}
+        self.pool = make_pool(scene, sorted(sensors))
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[int, Episode]]:
+        """Yields the jobs' episodes with their numbers, as they end.
+
+        An episode depends on its job alone: not on how many streets there are, nor on what else
+        they do. A free street takes the next job, in the order of `jobs`; those that share an
+        agent and a frame rate, one after the other, are computed together.
+        """
+        waiting = deque(enumerate(jobs))
+        rides: list[_Ride | None] = [None] * self.pool.num_envs
+        actions: dict[int, int] = {}
+        while True:
+            orders: list[Order] = [None] * len(rides)
+            for street, ride in enumerate(rides):
+                if ride is not None:
+                    orders[street] = actions[street]
+                elif waiting:
+                    number, job = waiting.popleft()
+                    rng = np.random.default_rng((job.episode_seed, _DRAWS))
+                    rides[street] = _Ride(number, job, rng)
+                    orders[street] = {
+                        "episode_seed": job.episode_seed,
+                        "speed": job.speed,
+                        "frame_rate_hz": job.fps,
+                    }
+            if all(order is None for order in orders):
+                return
+            seen, standings = self.pool.advance(orders)
+            begun = {street for street, order in enumerate(orders) if isinstance(order, dict)}
+            for street, (ride, standing) in enumerate(zip(rides, standings)):
+                if ride is None or standing is None or street in begun:
+                    continue
+                outcome, hit = standing
+                ride.total_reward += _REWARD[outcome]
+                ride.length += 1
+                if outcome != _RUNNING:
+                    seed = ride.job.episode_seed
+                    yield ride.number, Episode(seed, outcome, hit, ride.total_reward, ride.length)
+                    rides[street] = None
+            actions = self._act(seen, rides, begun)
+
+    @torch.no_grad()
+    def _act(
+        self, seen: Mapping[str, Any], rides: Sequence[_Ride | None], begun: set[int]
+    ) -> dict[int, int]:
+        """Returns an action for each street that is at a job."""
+        groups: dict[tuple[int, float], list[int]] = defaultdict(list)
+        for street, ride in enumerate(rides):
+            if ride is not None:
+                groups[ride.job.agent, ride.job.fps].append(street)
+        actions: dict[int, int] = {}
+        for (agent, rate), streets in groups.items():
+            first = [street for street in streets if street in begun]
+            later = [street for street in streets if street not in begun]
+            maps = self._eyes[agent, rate].look(seen, first, later)
+            order = [*first, *later]
+            policy = self.agents[agent].policy
+            for is_greedy, choose in ((True, _likeliest), (False, _drawn)):
+                rows = [i for i, s in enumerate(order) if _job(rides, s).is_greedy is is_greedy]
+                if rows:
+                    chosen = choose(policy, maps[rows], [rides[order[row]] for row in rows])
+                    actions |= zip((order[row] for row in rows), chosen)
+        return actions
+
+
+def _job(rides: Sequence[_Ride | None], street: int) -> Job:
+    ride = rides[street]
+    assert ride is not None
+    return ride.job
+
+
+def _likeliest(policy: Any, maps: TensorDictBase, rides: Sequence[Any]) -> list[int]:
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return policy(maps)["action"].tolist()
+
+
+def _drawn(policy: Any, maps: TensorDictBase, rides: Sequence[Any]) -> list[int]:
+    """Draws each action by its episode's own generator, whichever others are drawn beside it."""
+    shares = policy.get_dist(maps).probs.double().cumsum(-1).cpu().numpy()
+    drawn = np.array([ride.rng.random() for ride in rides])[:, None]
+    return (drawn * shares[:, -1:] >= shares[:, :-1]).sum(axis=-1).tolist()

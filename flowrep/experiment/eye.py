@@ -1,0 +1,75 @@
+"""What one agent sees of a pool of streets: its representations, from what their cameras give."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+
+from flowrep.envs.camera import sampled_intrinsics
+from flowrep.envs.make import sensors_read
+from flowrep.envs.scene import Scene
+from flowrep.palette import num_classes
+from flowrep.transforms import representation_stack
+
+
+class Eye:
+    """An agent's representations of every street, kept from step to step for those that need it.
+
+    Args:
+        scene: whose camera and classes they are of.
+        representations: names, or a mapping from name to options.
+        flow: where raw and obj come from, see `representation_stack`.
+        frame_rate_hz: steps a second.
+        device: where they are computed.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        representations: Sequence[str] | Mapping[str, Any],
+        flow: str | Mapping[str, Any],
+        frame_rate_hz: float,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        camera = scene.camera
+        focal, size = camera.focal_px, (camera.height_px, camera.width_px)
+        self._transforms = representation_stack(
+            representations,
+            intrinsics=torch.from_numpy(sampled_intrinsics(focal, focal, *size)),
+            num_classes=num_classes(scene.categories),
+            dt_s=1.0 / frame_rate_hz,
+            flow=flow,
+        )
+        self.sensors = sensors_read(self._transforms)
+        self._device = torch.device(device)
+        self._latest: TensorDictBase | None = None  # [num_envs]
+
+    def look(
+        self, seen: Mapping[str, NDArray[Any]], begun: Sequence[int], going_on: Sequence[int]
+    ) -> TensorDictBase:
+        """Returns what it sees of the streets `[*begun, *going_on]`.
+
+        Args:
+            seen: what their cameras give, `[num_envs, ...]` by sensor.
+            begun: streets whose episode has just begun.
+            going_on: streets of which the step before was looked at.
+        """
+        parts = []
+        for rows in (begun, going_on):
+            if not rows:
+                continue
+            sensor = {name: torch.from_numpy(seen[name][rows]) for name in self.sensors}
+            now: TensorDictBase = TensorDict({"sensor": sensor}, [len(rows)]).to(self._device)
+            if rows is begun:
+                now = self._transforms._reset(now.empty(), now)
+            else:
+                assert self._latest is not None
+                now = self._transforms._step(self._latest[rows], now)
+            parts.append(now.exclude(*(("sensor", name) for name in self.sensors)))
+            if self._latest is None:
+                num_envs = len(next(iter(seen.values())))
+                self._latest = parts[-1][:1].expand(num_envs).clone()
+            self._latest[rows] = parts[-1]
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
