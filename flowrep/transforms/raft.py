@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +108,25 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
             from safetensors.torch import load_file
         except ImportError as error:
             raise ImportError(f"'{path}' needs safetensors: pip install safetensors") from error
-        return load_file(path)
-    return torch.load(path, map_location="cpu", weights_only=True)
+        return _state_of(path, lambda: load_file(path))
+    return _state_of(path, lambda: torch.load(path, map_location="cpu", weights_only=True))
+
+
+def _state_of(path: Path, read: Callable[[], Any]) -> dict[str, Tensor]:
+    """Returns what a reader finds; its own words are left out, which advise to trust the file."""
+    try:
+        state = read()
+    except Exception as error:  # readers fail on garbage in as many ways as there is garbage
+        if isinstance(error, OSError):
+            raise
+        raise ValueError(
+            f"'{path}' is no readable file of weights ({type(error).__name__}): it is damaged, or "
+            "holds more than a state dict. Save the network's state_dict() again, best as "
+            ".safetensors"
+        ) from None
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise ValueError(f"'{path}' holds no state dict, a mapping from names to tensors")
+    return state
 
 
 def _optical_flow() -> Any:

@@ -119,3 +119,21 @@ def test_torchvisions_network_takes_small_pictures(tmp_path):
     flow = RAFT(path, updates=2)(*pictures)
     assert flow.shape == (2, 2, 40, 52)
     assert flow.isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["w.pth", "w.safetensors"])
+@pytest.mark.parametrize("content", [b"", b"garbage", bytes(1000), b"\x80\x05cos\nsystem\n."])
+def test_weights_that_are_garbage_are_named_without_advice_to_trust_them(tmp_path, name, content):
+    pytest.importorskip("safetensors")
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"'{path}' is no readable file of weights") as caught:
+        RAFT(path)
+    assert "weights_only" not in str(caught.value)
+    assert caught.value.__cause__ is None
+
+
+def test_weights_that_are_no_state_dict_are_named(tmp_path):
+    torch.save([torch.ones(2)], tmp_path / "w.pth")
+    with pytest.raises(ValueError, match="holds no state dict"):
+        RAFT(tmp_path / "w.pth")
