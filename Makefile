@@ -10,7 +10,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate view gallery test fuzz schema lint types format bench bench-gpu smoke docs wheel clean check-python
+.PHONY: help install train evaluate view gallery test test-fast fuzz schema lint types format bench bench-gpu smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -49,8 +49,15 @@ gallery: $(INSTALLED)  ## Make the README's gallery anew
 	$(BIN)/python examples/filmstrip.py docs/images/strip.png
 	$(BIN)/python examples/transform_pictures.py docs/images/transforms
 
+# A process a core, one thread each. A file stays in one process,
+# since its tests share what they prepare.
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --dist=loadfile
+
 test: $(INSTALLED)  ## Run the tests
-	$(BIN)/python -m pytest $(ARGS)
+	$(PYTEST) $(ARGS)
+
+test-fast: $(INSTALLED)  ## Run those that take no more than some seconds
+	$(PYTEST) -m "not slow" $(ARGS)
 
 fuzz: $(INSTALLED)  ## Throw odd inputs at every part: make fuzz ARGS="--parts scenes --mutations 10000"
 	$(BIN)/python -m tests.fuzz $(ARGS)

@@ -21,6 +21,8 @@ from flowrep.experiment.training import train
 from flowrep.train import build
 from tests.test_configs import composed
 
+pytestmark = pytest.mark.slow
+
 QUICK = ["speed=normal", "episodes=2", "num_envs=2", "num_workers=0", "baselines=[]", "device=cpu"]
 
 

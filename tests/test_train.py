@@ -11,6 +11,8 @@ import pytest
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
+pytestmark = pytest.mark.slow
+
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
 
 

@@ -10,6 +10,8 @@ import pytest
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 pytest.importorskip("cv2", reason="flow is estimated by OpenCV: pip install 'flowrep[flow]'")
 
+pytestmark = pytest.mark.slow
+
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
 QUICK = [
     "total_frames=64", "evaluation.episodes=1", "evaluation.final_episodes=1",

@@ -14,6 +14,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from flowrep.envs import WorkerError, WorkerVectorEnv
 
+pytestmark = pytest.mark.slow
+
 
 class Counter(gym.Env):
     """Counts on from its seed; an action of 9 ends the episode, one of 13 is a mistake."""

@@ -19,6 +19,8 @@ from flowrep.experiment.eye import Eye
 from flowrep.experiment.run_folder import EVALUATION_COLUMNS
 from tests.test_configs import composed
 
+pytestmark = pytest.mark.slow
+
 NO_OP = 0
 ACTIONS = DiscreteActions(3, "categorical", torch.distributions.Categorical)
 

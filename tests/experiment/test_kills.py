@@ -19,6 +19,8 @@ from flowrep.experiment.run_folder import RunFolder
 from tests.experiment.test_training import differing
 from tests.test_configs import composed
 
+pytestmark = pytest.mark.slow
+
 KILLS = 13  # of each of four algorithms
 STAGES = ("write", "half", "flush", "rename", "renamed")
 SMALL = [

@@ -15,6 +15,8 @@ from flowrep.experiment.training import train
 from flowrep.train import build
 from tests.test_configs import composed
 
+pytestmark = pytest.mark.slow
+
 GLOSSARY = Path(__file__).parents[2] / "docs" / "metrics.md"
 
 

@@ -17,6 +17,8 @@ from flowrep.experiment.training import Training, train
 from flowrep.train import build
 from tests.test_configs import composed
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"ppo": ["algorithm.rollout_length=16"]}
 
 
