@@ -264,7 +264,10 @@ def test_everything_that_is_wrong_is_said_at_once():
     ("line", "expected"),
     [
         ("", "'run' needs a value: run=..."),
-        ("run=null", "run should be a run folder, not null"),
+        (
+            "run=null",
+            "run should be a run folder, or a sweep's, or a list of such values, not null",
+        ),
         ("speed=[]", "speed should be low, normal or high, or a list of such values, not []"),
         (
             "speed=hihg",
