@@ -69,8 +69,10 @@ def png(path: Path, picture: np.ndarray) -> None:
     assert cv2.imwrite(str(path), turned)
 
 
-def stored(depth: np.ndarray, unit_m: float) -> np.ndarray:
-    return np.rint(depth / unit_m).astype(np.uint16)
+def stored(depth: np.ndarray, unit_m: float, *, beyond: int = 0) -> np.ndarray:
+    """Returns 16-bit depth; `beyond` stands for what is too far for 16 bits."""
+    counts = np.rint(depth / unit_m)
+    return np.where(counts < 65535, counts, beyond).astype(np.uint16)
 
 
 def text(path: Path, lines) -> None:
@@ -97,28 +99,33 @@ def write_flo(path: Path, flow: np.ndarray) -> None:
     path.write_bytes(size + pairs.tobytes())
 
 
-def camera_json(K=K, height=HEIGHT, width=WIDTH) -> dict:
+def camera_json(K=K, size=(HEIGHT, WIDTH)) -> dict:
+    height, width = size
     return {
         "width": width, "height": height, "fx": K[0, 0], "fy": K[1, 1],
         "cx": K[0, 2], "cy": K[1, 2], "first_pixel_centre": 0.5,
     }  # fmt: skip
 
 
-def write_frames(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=0.001)
+# Each writer takes moments of any size in the order of its files, or makes its own.
+
+
+def write_frames(folder: Path, moments=None, K=K) -> list[Moment]:
+    moments = moments or make_moments(unit_m=0.001)
     for i, moment in enumerate(moments):
         png(folder / f"rgb/{i:04d}.png", moment.rgb)
         png(folder / f"depth/{i:04d}.png", stored(moment.depth, 0.001))
         if i > 0:
             write_flo(folder / f"flow/{i:04d}.flo", moment.raw)
     text(folder / "poses.txt", [numbers(m.world_from_cam) for m in moments])
-    text(folder / "timestamps.txt", [f"{0.1 * i}" for i in range(FRAMES)])
-    text(folder / "intrinsics.json", [json.dumps(camera_json())])
+    text(folder / "timestamps.txt", [f"{0.1 * i}" for i in range(len(moments))])
+    camera = camera_json(K, moments[0].depth.shape)
+    text(folder / "intrinsics.json", [json.dumps(camera)])
     return moments
 
 
-def write_tum(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=1 / 5000)
+def write_tum(folder: Path, moments=None) -> list[Moment]:
+    moments = moments or make_moments(unit_m=1 / 5000)
     index: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for i, moment in enumerate(moments):
         rgb_s, depth_s, pose_s = 100 + 0.1 * i, 100 + 0.1 * i + 0.012, 100 + 0.1 * i - 0.004
@@ -135,8 +142,13 @@ def write_tum(folder: Path) -> list[Moment]:
 TUM_INTRINSICS = (31.0, 27.0, 18.0, 12.5)  # K, with pixel (0, 0)'s centre at (0, 0)
 
 
-def write_sevenscenes(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=0.001)
+def from_first_pixel(K) -> tuple[float, ...]:
+    """Returns fx, fy, cx, cy with pixel (0, 0)'s centre at (0, 0)."""
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2] - 0.5), float(K[1, 2] - 0.5)
+
+
+def write_sevenscenes(folder: Path, moments=None) -> list[Moment]:
+    moments = moments or make_moments(unit_m=0.001)
     for i, moment in enumerate(moments):
         png(folder / f"frame-{i:06d}.color.png", moment.rgb)
         png(folder / f"frame-{i:06d}.depth.png", stored(moment.depth, 0.001))
@@ -144,14 +156,14 @@ def write_sevenscenes(folder: Path) -> list[Moment]:
     return moments
 
 
-def write_vkitti2(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=0.01)
+def write_vkitti2(folder: Path, moments=None, K=K) -> list[Moment]:
+    moments = moments or make_moments(unit_m=0.01)
     extrinsics = ["frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"]
     intrinsics = ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
     for i, moment in enumerate(moments):
         frames = folder / "frames"
         png(frames / f"rgb/Camera_0/rgb_{i:05d}.png", moment.rgb)
-        png(frames / f"depth/Camera_0/depth_{i:05d}.png", stored(moment.depth, 0.01))
+        png(frames / f"depth/Camera_0/depth_{i:05d}.png", stored(moment.depth, 0.01, beyond=65535))
         if i > 0:
             flow = vkitti_flow(-moment.raw)
             png(frames / f"backwardFlow/Camera_0/backwardFlow_{i:05d}.png", flow)
@@ -160,7 +172,7 @@ def write_vkitti2(folder: Path) -> list[Moment]:
             other = cam_from_world.copy()
             other[0, 3] += shift
             extrinsics.append(f"{i} {camera} {numbers(other)}")
-            intrinsics.append(f"{i} {camera} {numbers(TUM_INTRINSICS)}")
+            intrinsics.append(f"{i} {camera} {numbers(from_first_pixel(K))}")
     text(folder / "extrinsic.txt", extrinsics)
     text(folder / "intrinsic.txt", intrinsics)
     return moments
@@ -168,26 +180,27 @@ def write_vkitti2(folder: Path) -> list[Moment]:
 
 def vkitti_flow(flow: np.ndarray) -> np.ndarray:
     """Returns red, green, blue: 2 I / 65535 - 1 times width - 1 and height - 1."""
-    size = np.array([WIDTH - 1, HEIGHT - 1])[:, None, None]
+    size = np.array([flow.shape[2] - 1, flow.shape[1] - 1])[:, None, None]
     red, green = np.rint((flow / size + 1) / 2 * 65535)
     return np.stack([red, green, np.full_like(red, 65535)], -1).astype(np.uint16)
 
 
-def write_sintel(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=1e-6, backwards=True)
+def write_sintel(folder: Path, moments=None, K=K) -> list[Moment]:
+    moments = moments or make_moments(unit_m=1e-6, backwards=True)
     for i, moment in enumerate(moments):
         stem = f"cave/frame_{i + 1:04d}"
         png(folder / f"final/{stem}.png", moment.rgb)
         for kind in ("depth", "camdata_left"):
             (folder / kind / "cave").mkdir(parents=True, exist_ok=True)
-        head = struct.pack("<fii", 202021.25, WIDTH, HEIGHT)
+        height, width = moment.depth.shape
+        head = struct.pack("<fii", 202021.25, width, height)
         (folder / f"depth/{stem}.dpt").write_bytes(head + moment.depth.astype("<f4").tobytes())
         opencv = K.copy()
         opencv[:2, 2] -= 0.5
         cam_from_world = np.linalg.inv(moment.world_from_cam)[:3]
         cam = struct.pack("<f", 202021.25) + opencv.tobytes() + cam_from_world.tobytes()
         (folder / f"camdata_left/{stem}.cam").write_bytes(cam)
-        if i + 1 < FRAMES:
+        if i + 1 < len(moments):
             write_flo(folder / f"flow/{stem}.flo", -moment.raw)
     return moments
 
@@ -213,8 +226,8 @@ def write_tartanair(folder: Path) -> list[Moment]:
     return moments
 
 
-def write_zed(folder: Path) -> list[Moment]:
-    moments = make_moments(unit_m=0.001)
+def write_zed(folder: Path, moments=None, K=K) -> list[Moment]:
+    moments = moments or make_moments(unit_m=0.001)
     folder.mkdir(parents=True, exist_ok=True)
     for i, moment in enumerate(moments):
         png(folder / f"left{i:06d}.png", moment.rgb)
@@ -223,7 +236,8 @@ def write_zed(folder: Path) -> list[Moment]:
         else:
             png(folder / f"depth{i:06d}.png", stored(moment.depth, 0.001))
     text(folder / "poses.txt", [quaternion_line(m.world_from_cam) for m in moments])
-    text(folder / "intrinsics.json", [json.dumps(camera_json())])
+    camera = camera_json(K, moments[0].depth.shape)
+    text(folder / "intrinsics.json", [json.dumps(camera)])
     return moments
 
 
