@@ -5,7 +5,11 @@ from __future__ import annotations
 import csv
 import inspect
 import json
+import signal
+import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +28,15 @@ from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config_tree import CONF_DIR, group_choices
 from flowrep.factorize import factorize_recording, main
 from flowrep.preview import check_command
-from flowrep.sequences import RECORDINGS, STREAMS, SequenceError, read_flo, read_kitti_flow
+from flowrep.sequences import (
+    RECORDINGS,
+    STREAMS,
+    SequenceError,
+    SevenScenes,
+    factorize_pair,
+    read_flo,
+    read_kitti_flow,
+)
 from flowrep.sequences.job import Job
 from flowrep.sequences.scores import COLUMNS
 from tests.sequences import synthetic
@@ -151,6 +163,37 @@ def test_an_interrupted_job_is_continued(video, tmp_path, monkeypatch):
     assert files_of(out) == files_of(tmp_path / "whole")
     if video:
         assert len(imageio.imread(out / "strip.mp4", plugin="FFMPEG")) == 5
+
+
+@pytest.mark.slow
+def test_a_killed_job_is_continued(tmp_path, monkeypatch):
+    monkeypatch.setattr(synthetic, "FRAMES", 60)
+    synthetic.write_frames(tmp_path / "in")
+    options = ["video=false", "flow_files=[flo,npz]", "pictures_every=5"]
+    _, whole = factorize(tmp_path, *options)
+    whole.rename(tmp_path / "whole")
+    rows = tmp_path / "out.partial/frames.csv"
+    command = [sys.executable, "-m", "flowrep.factorize", "format=frames", *options]
+    command += [f"input={tmp_path / 'in'}", f"output={tmp_path / 'out'}"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as job:
+        deadline = time.monotonic() + 120
+        while job.poll() is None and time.monotonic() < deadline:
+            if rows.exists() and rows.read_bytes().count(b"\n") > 5:
+                break
+            time.sleep(0.002)
+        job.kill()
+    assert job.returncode == -signal.SIGKILL
+    assert not (tmp_path / "out").exists()
+    assert 5 <= len(table(tmp_path / "out.partial")) < 59
+    code, out = factorize(tmp_path, *options, "resume=true")
+    assert code == 0
+    assert files_of(out) == files_of(tmp_path / "whole")
+    for name in files_of(out):
+        if name != "summary.json":  # which says where the time went
+            assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    summaries = [json.loads((f / "summary.json").read_text()) for f in (out, tmp_path / "whole")]
+    assert summaries[0]["frames"] == summaries[1]["frames"] == 59
+    assert summaries[0]["medians"] == summaries[1]["medians"]
 
 
 def test_a_job_is_continued_as_it_was_started_alone(moments, tmp_path, monkeypatch):
@@ -346,3 +389,11 @@ def test_a_real_static_room_has_little_object_flow(stride, pair, tmp_path):
     valid = arrays["valid"]
     wrong_sign = np.hypot(*(-arrays["raw"] - arrays["ego"]))[valid]
     assert np.median(wrong_sign) > 0.35 * raw_px
+    recording = SevenScenes(SEVEN_SCENES)
+    inverted = [
+        replace(frame, world_from_cam=np.linalg.inv(frame.world_from_cam))
+        for frame in (recording[0], recording[stride])
+    ]
+    made = factorize_pair(*inverted, arrays["raw"])
+    assert made.valid.sum() > 0.9 * valid.sum()
+    assert np.median(np.hypot(*made.obj)[made.valid]) > 0.35 * raw_px
