@@ -16,6 +16,7 @@ from flowrep.sequences.frame import SequenceError
 
 MAX_TEXT_BYTES = 64 * 2**20
 MAX_FILE_BYTES = 512 * 2**20
+_MAX_PATH = 1000
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
@@ -113,7 +114,13 @@ def list_files(folder: Path, suffixes: Iterable[str], prefix: str = "") -> list[
 
 
 def path_inside(folder: Path, relative: str, index: Path) -> Path:
-    """Returns the path that an index file names; one that leads out of the folder is refused."""
+    """Returns the path that an index file names.
+
+    Raises:
+        SequenceError: it leads out of the folder, or is longer than any path.
+    """
+    if len(relative) > _MAX_PATH:
+        raise SequenceError(index, f"names a file by {len(relative):,} characters")
     parts = PurePosixPath(relative.replace("\\", "/"))
     if parts.is_absolute() or ".." in parts.parts or "\0" in relative or ":" in relative:
         raise SequenceError(index, f"names {relative!r}, which lies outside of the folder")

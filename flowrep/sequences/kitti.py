@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.calibration import opencv_intrinsics
+from flowrep.sequences.calibration import intrinsics, opencv_intrinsics
 from flowrep.sequences.files import list_files, path_inside, read_lines, read_table
 from flowrep.sequences.flow_files import read_kitti_flow
 from flowrep.sequences.frame import Frame, Recording, SequenceError
@@ -19,6 +19,7 @@ from flowrep.sequences.poses import Pose, as_pose
 
 EARTH_RADIUS_M = 6378137.0
 _OXTS_NUMBERS = 30
+_MAX_DIGITS = 10  # of a frame's number in a raw recording
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class Kitti(Recording):
         found = {}
         text = {number: line.split() for number, line in read_lines(mapping)}
         for number, words in text.items():
-            if len(words) != 3 or not words[2].isdecimal():
+            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > _MAX_DIGITS:
                 raise SequenceError(mapping, f"line {number} is no date, recording and frame")
             drive = path_inside(self.raw_data, f"{words[0]}/{words[1]}", mapping)
             found[number - 1] = drive / "oxts" / "data", int(words[2])
@@ -111,8 +112,11 @@ class Kitti(Recording):
         path = self.folder / "calib_cam_to_cam" / f"{pair}.txt"
         cameras = read_calibration(path)
         left, right = (_matrix(path, cameras, f"P_rect_{i}", (3, 4)) for i in ("02", "03"))
-        rectified_from_cam0 = np.eye(4)
-        rectified_from_cam0[:3, :3] = _matrix(path, cameras, "R_rect_00", (3, 3))
+        rotation = _matrix(path, cameras, "R_rect_00", (3, 3))
+        rectified_from_cam0 = as_pose(np.hstack([rotation, np.zeros((3, 1))]), path)
+        fx, fy, cx, cy = left[0, 0], left[1, 1], left[0, 2], left[1, 2]
+        if min(fx, fy) <= 0 or not np.array_equal(left[:, :3], intrinsics(fx, fy, cx, cy)):
+            raise SequenceError(path, "P_rect_02 should be K [I | t] of a rectified camera")
         # P = K [I | t], so that the left colour camera sees a rectified point at x + K^-1 p.
         cam_from_rectified = np.eye(4)
         cam_from_rectified[:3, 3] = np.linalg.solve(left[:, :3], left[:, 3])
@@ -122,7 +126,7 @@ class Kitti(Recording):
         focal_baseline = float(left[0, 3] - right[0, 3])
         if not focal_baseline > 0:
             raise SequenceError(path, f"has no baseline between P_rect_02 and 03: {focal_baseline}")
-        K = opencv_intrinsics([left[0, 0], left[1, 1], left[0, 2], left[1, 2]])
+        K = opencv_intrinsics([fx, fy, cx, cy])
         return _Calibration(K, focal_baseline, np.linalg.inv(cam_from_imu).astype(np.float64))
 
     def _rigid(self, kind: str, pair: str) -> NDArray[np.float64]:

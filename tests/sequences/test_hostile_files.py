@@ -228,6 +228,7 @@ def test_a_quaternion_that_is_none(tmp_path):
         ("rgb.txt", ["1.0 ../../etc/passwd"], "names '../../etc/passwd', which lies outside"),
         ("rgb.txt", ["1.0 /etc/passwd"], "names '/etc/passwd', which lies outside"),
         ("depth.txt", ["1.0 a/../../b.png"], "lies outside"),
+        ("rgb.txt", ["1.0 " + 5000 * "9"], "names a file by 5,000 characters"),
         ("rgb.txt", ["2.0 rgb/b.png", "1.0 rgb/a.png"], "timestamps go backwards: 1.000000"),
         ("groundtruth.txt", ["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], "timestamps go backwards"),
         ("groundtruth.txt", ["nan 0 0 0 0 0 0 1"], "a timestamp that is no number"),
@@ -308,6 +309,31 @@ def test_kitti_mapping_that_leads_out_of_the_folder(tmp_path):
     synthetic.write_kitti(tmp_path)
     text(tmp_path / "train_mapping.txt", ["../.. 2011_09_26_drive_0005_sync 0000000059"])
     assert "lies outside" in refusal(lambda: open_kitti(tmp_path), "train_mapping.txt")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("R_rect_00: 1.0 0.0 0.0", "R_rect_00: 0.0 0.0 0.0", "not rigid"),
+        ("P_rect_02: 31.0 0.0", "P_rect_02: 0.0 0.0", "P_rect_02 should be K [I | t]"),
+        ("P_rect_02: 31.0 0.0", "P_rect_02: 31.0 1.0", "P_rect_02 should be K [I | t]"),
+        ("P_rect_02: 31.0", "P_rect_02: nan", "P_rect_02 should be 12 numbers"),
+    ],
+)
+def test_kitti_cameras_that_are_none(before, after, says, tmp_path):
+    synthetic.write_kitti(tmp_path)
+    path = tmp_path / "training/calib_cam_to_cam/000000.txt"
+    assert before in path.read_text()
+    path.write_text(path.read_text().replace(before, after))
+    assert says in refusal(lambda: all_of(open_kitti(tmp_path)), "calib_cam_to_cam/000000.txt")
+
+
+def test_a_kitti_frame_number_without_end(tmp_path):
+    synthetic.write_kitti(tmp_path)
+    path = tmp_path / "train_mapping.txt"
+    path.write_text(path.read_text().replace("0000000059", 5000 * "9"))
+    said = refusal(lambda: open_kitti(tmp_path), "train_mapping.txt")
+    assert "line 1 is no date, recording and frame" in said
 
 
 def test_kitti_flow_png_of_another_kind(tmp_path):
