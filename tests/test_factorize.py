@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
@@ -31,14 +32,17 @@ from flowrep.preview import check_command
 from flowrep.sequences import (
     RECORDINGS,
     STREAMS,
+    EstimatedFlowSource,
     SequenceError,
     SevenScenes,
+    diagnose,
     factorize_pair,
     read_flo,
     read_kitti_flow,
 )
 from flowrep.sequences.job import Job
 from flowrep.sequences.scores import COLUMNS
+from flowrep.transforms import DIS
 from tests.sequences import synthetic
 
 SEVEN_SCENES = Path(__file__).resolve().parents[2] / "shared" / "data" / "7scenes"
@@ -397,3 +401,15 @@ def test_a_real_static_room_has_little_object_flow(stride, pair, tmp_path):
     made = factorize_pair(*inverted, arrays["raw"])
     assert made.valid.sum() > 0.9 * valid.sum()
     assert np.median(np.hypot(*made.obj)[made.valid]) > 0.35 * raw_px
+
+
+@needs_7scenes
+@pytest.mark.parametrize(("factor", "named"), [(1000, "depth_times_0.001"), (0.2, "depth_times_5")])
+def test_the_doctor_names_a_wrong_unit_of_real_depth(factor, named):
+    recording = SevenScenes(SEVEN_SCENES)
+    pair = recording[0], recording[1]
+    raw = EstimatedFlowSource(DIS("fast"))(*pair)
+    poses = [torch.from_numpy(frame.world_from_cam) for frame in pair]
+    depth = torch.from_numpy(factor * pair[1].depth)[None]
+    diagnosis = diagnose(torch.from_numpy(raw), depth, torch.from_numpy(pair[1].K), *poses)
+    assert diagnosis.suspects == (named,)

@@ -73,9 +73,16 @@ def _median_px(squares: NDArray[np.float32]) -> float:
     """Returns the median length, of an even count the lower of the two in the middle."""
     if not len(squares):
         return math.nan
+    # The bits of floats from 0 on sort as the floats do. Counting their upper halves leaves few to
+    # be sorted, in a third of the time that a partition of all of them takes.
     middle = (len(squares) - 1) // 2
-    squares.partition(middle)
-    return math.sqrt(squares[middle])
+    upper = squares.view(np.uint32) >> 16
+    up_to = np.bincount(upper).cumsum()
+    of_middle = int(np.searchsorted(up_to, middle, side="right"))
+    candidates = squares[upper == of_middle]
+    place = middle - (int(up_to[of_middle - 1]) if of_middle else 0)
+    candidates.partition(place)
+    return math.sqrt(candidates[place])
 
 
 def _text(value: Any) -> Any:

@@ -20,7 +20,7 @@ from flowrep.sequences import (
     recorded_flow,
 )
 from flowrep.sequences.factorization import consistent
-from flowrep.sequences.scores import end_point_error, score
+from flowrep.sequences.scores import _median_px, end_point_error, score
 from flowrep.transforms import DIS
 
 K = np.array([[30.0, 0, 30.5], [0, 28.0, 21.0], [0, 0, 1]])
@@ -118,6 +118,20 @@ def test_a_row_says_medians_shares_and_the_error():
     assert float(row["moving_share"]) == pytest.approx(300 / 1199, abs=1e-6)
     assert float(row["raw_median_px"]) == float(row["obj_median_px"]) == 0.0
     assert float(row["epe_px"]) == pytest.approx(5 * 300 / (40 * 59), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "lengths", [[0.0], [0.0, 0.0, 7.0], [3.0, 1.0], [2.0, 1e-20, 900.0, 5.0], [4.0] * 6]
+)
+def test_a_median_is_the_lower_of_the_middle_two(lengths):
+    squares = np.square(np.array(lengths, np.float32))
+    assert _median_px(squares) == pytest.approx(sorted(lengths)[(len(lengths) - 1) // 2])
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_a_median_is_that_of_a_sort(scale):
+    squares = (scale * np.random.default_rng(0).random(1001) ** 4).astype(np.float32)
+    assert _median_px(squares) == np.sqrt(np.sort(squares)[500].astype(float))
 
 
 def test_what_is_unknown_is_empty_in_the_row():
