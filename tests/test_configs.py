@@ -72,6 +72,14 @@ def test_the_default_is_the_papers_table_ii():
     assert (camera["height_px"], camera["width_px"], camera["fov_deg"]) == (84, 84, 90)
 
 
+def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():
+    assert composed("preset=laptop")["algorithm"]["n_steps"] == 3
+    assert composed("preset=paper")["algorithm"]["n_steps"] == 1
+    assert "n_steps" not in composed("preset=laptop", "algorithm=ppo")["algorithm"]
+    # the command line has the last word
+    assert composed("preset=laptop", "algorithm.n_steps=2")["algorithm"]["n_steps"] == 2
+
+
 def test_run_folders_are_named_by_scene_representations_and_seed():
     register_resolvers()
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
