@@ -74,7 +74,12 @@ def line_for(command: str, **values: str) -> str:
 
 
 def own_keys() -> set[str]:
-    """Returns the top level's keys that were added to the running job's config: `+note=pilot`."""
+    """Returns the top level's keys that were added to the running job's config: `+note=pilot`.
+
+    Outside of a job there are none.
+    """
+    if not HydraConfig.initialized():
+        return set()
     return keys_added(parse(HydraConfig.get().overrides.task))
 
 

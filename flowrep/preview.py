@@ -180,6 +180,8 @@ class Preview:
             options = self._options(override.key_or_group)
             if options and override.value() is None and not override.is_delete():
                 return f"{override.key_or_group} should be one of: {', '.join(options)}, not null"
+            if options and override.is_delete():
+                return f"'{override.key_or_group}' needs a value; there are: {', '.join(options)}"
         groups = [o for o in overrides if self._options(o.key_or_group)]
         try:
             config = self._compose([str(o.input_line) for o in groups])

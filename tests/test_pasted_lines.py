@@ -43,17 +43,17 @@ def test_a_run_continues(folder, monkeypatch):
 
 def test_a_run_is_evaluated(folder, monkeypatch):
     opened = []
-    monkeypatch.setattr(evaluate, "evaluate", lambda config, run: opened.append(run.path))
+    monkeypatch.setattr(evaluate, "evaluate", lambda config, runs: opened.extend(runs))
     run_line(line_for("evaluate", run=str(folder.path)), evaluate.main, monkeypatch)
-    assert opened == [folder.path]
+    assert [run.path for run in opened] == [folder.path]
 
 
 def test_a_name_typed_without_hydras_quotes_is_understood(folder, monkeypatch):
     opened = []
-    monkeypatch.setattr(evaluate, "evaluate", lambda config, run: opened.append(run.path.resolve()))
+    monkeypatch.setattr(evaluate, "evaluate", lambda config, runs: opened.extend(runs))
     monkeypatch.setattr("sys.argv", ["evaluate", f"run={folder.path.name}"])
     evaluate.main()
-    assert opened == [folder.path.resolve()]
+    assert [run.path.resolve() for run in opened] == [folder.path.resolve()]
 
 
 def test_an_algorithm_of_one_s_own_is_vouched_for_again(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ from typing import Annotated, Any, get_args
 from pydantic import ConfigDict, Field, model_validator
 
 from flowrep.config.algorithms import OFF_BEFORE, AnyAlgorithm, ByTarget
-from flowrep.config.expectations import Count, ListOf, OneOf, Seed, Switch, Text, Whole
+from flowrep.config.expectations import Count, CountOrZero, ListOf, OneOf, Seed, Switch, Text, Whole
 from flowrep.config.representations import BySource, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
@@ -30,7 +30,7 @@ Path = Annotated[str | None, Text("a folder", also=(None,))]
 class Evaluation(Section):
     """How the agent is evaluated while it learns and at the end."""
 
-    every_frames: Count
+    every_frames: CountOrZero
     episodes: Count
     final_episodes: Count
     speeds: Annotated[list[str], ListOf(OneOf(SPEEDS))]

@@ -24,7 +24,7 @@ GROUP_FILES = [(group, name) for group in OF_TRAINING for name in group_choices(
     ("name", "schema", "given"),
     [
         ("train", TrainConfig, []),
-        ("evaluate", EvaluateConfig, ["run=x"]),
+        ("evaluate", EvaluateConfig, ["run=x", "scene=s_turn"]),
         ("view", ViewConfig, []),
         ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
     ],

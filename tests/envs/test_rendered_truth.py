@@ -24,7 +24,7 @@ def street(name, speed):
 
 def frames(env, actions, options=None):
     """Yields the observations, as tensors, of an episode in which someone walks close by."""
-    observation, _ = env.reset(seed=0, options={"episode_seed": 7, **(options or {})})
+    observation, _ = env.reset(seed=0, options={"episode_seed": 11, **(options or {})})
     yield tensors(observation)
     for action in actions:
         observation, _, ended, _, _ = env.step(action)
