@@ -1,9 +1,8 @@
 """The section `algorithm`: the options of each class that `_target_` may name."""
 
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Protocol
 
-from pydantic import ConfigDict, Field, GetCoreSchemaHandler
-from pydantic_core import CoreSchema, core_schema
+from pydantic import ConfigDict, Field
 
 from flowrep.agent.dsac import ENCODERS
 from flowrep.agent.precision import PRECISIONS
@@ -19,11 +18,8 @@ from flowrep.config.expectations import (
     Text,
     Whole,
 )
-from flowrep.config.section import Section
+from flowrep.config.section import ChosenBy, Section
 from flowrep.config.violations import broken_rule
-
-OFF_BEFORE: Any = None
-"""Marks keys that runs of before do not have, and what is done without them is as then."""
 
 
 class Run(Protocol):
@@ -71,12 +67,12 @@ class OffPolicy(Learner):
     replay_capacity: Count
     frames_per_update: Count
     learning_starts: Annotated[int | None, Whole(1, also=(None,))]
-    n_steps: Count = OFF_BEFORE
-    layer_norm: Switch = OFF_BEFORE
+    n_steps: Count
+    layer_norm: Switch
 
     def check_with(self, run: Run) -> None:
         """Checks that the memory holds what is asked of it, and that there is time to learn."""
-        steps = (self.n_steps or 1) + 1
+        steps = self.n_steps + 1
         for name, least in (
             (f"batch_size={self.batch_size}", self.batch_size),
             (f"{steps} steps of num_envs={run.num_envs}", steps * run.num_envs),
@@ -111,7 +107,7 @@ class DiscreteSAC(OffPolicy):
     encoder: Annotated[str, OneOf(ENCODERS)]
     initial_alpha: Positive
     target_entropy_weight: Share
-    alpha_rate_factor: NotNegative = OFF_BEFORE
+    alpha_rate_factor: NotNegative
 
 
 class DiscreteSACWithValue(OffPolicy):
@@ -119,7 +115,7 @@ class DiscreteSACWithValue(OffPolicy):
 
     initial_alpha: Positive
     target_entropy_weight: Share
-    alpha_rate_factor: NotNegative = OFF_BEFORE
+    alpha_rate_factor: NotNegative
 
 
 class DoubleDQN(OffPolicy):
@@ -177,19 +173,4 @@ ALGORITHMS: dict[str, type[AnyAlgorithm]] = {
 }
 """The sections of flowrep's own algorithms, by what `_target_` says."""
 
-
-class ByTarget:
-    """The section that `_target_` chooses, for a field's annotation."""
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        """Returns a union of all sections, told apart by `_target_`."""
-        choices = {f"@{target}": handler.generate_schema(s) for target, s in ALGORITHMS.items()}
-        choices["@own"] = handler.generate_schema(OwnAlgorithm)
-        return core_schema.tagged_union_schema(choices, discriminator=_choice)
-
-
-def _choice(value: Any) -> str:
-    target = value.get("_target_") if isinstance(value, dict) else None
-    return f"@{target}" if isinstance(target, str) and target in ALGORITHMS else "@own"
+BY_TARGET = ChosenBy("_target_", ALGORITHMS, otherwise=OwnAlgorithm)

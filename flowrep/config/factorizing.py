@@ -5,8 +5,8 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from flowrep.config.expectations import Count, CountOrZero, ListOf, OneOf, Positive, Switch, Whole
-from flowrep.config.recordings import ByReader
-from flowrep.config.representations import BySource
+from flowrep.config.recordings import BY_READER
+from flowrep.config.representations import BY_SOURCE
 from flowrep.config.section import Section
 from flowrep.config.violations import broken_rule
 from flowrep.sequences.output import FLOW_FORMATS
@@ -25,8 +25,8 @@ class FactorizeConfig(Section):
 
     input: str | int = Field(examples=["<folder>"])
     output: str = Field(examples=["<folder>"])
-    format: Annotated[Any, ByReader()] = Field(examples=["tum"])
-    flow: Annotated[Any, BySource()] = Field(examples=["estimated"])
+    format: Annotated[Any, BY_READER] = Field(examples=["tum"])
+    flow: Annotated[Any, BY_SOURCE] = Field(examples=["estimated"])
     resume: Switch
     start: CountOrZero
     stop: Annotated[int | None, Whole(0, also=(None,))]

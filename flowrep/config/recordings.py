@@ -1,13 +1,13 @@
 """The section `format` of `flowrep.factorize`: the options of each reader of recordings."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args
+from typing import Annotated, get_args
 
-from pydantic import Field, GetCoreSchemaHandler, model_validator
+from pydantic import Field, model_validator
 from pydantic_core import CoreSchema, core_schema
 
 from flowrep.config.expectations import Expectation, NotNegative, Number, OneOf, Switch, Text, Whole
-from flowrep.config.section import Section
+from flowrep.config.section import ChosenBy, Section
 from flowrep.config.violations import broken_rule
 from flowrep.geometry import (
     CameraAxes,
@@ -139,19 +139,4 @@ READERS: dict[str, type[Reader]] = {
 }  # fmt: skip
 """The section of each reader, by its class."""
 
-
-class ByReader:
-    """The section that `_target_` chooses, for a field's annotation."""
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        """Returns a union of all sections, told apart by `_target_`."""
-        choices = {f"@{target}": handler.generate_schema(s) for target, s in READERS.items()}
-        choices["@none"] = handler.generate_schema(Reader)
-        return core_schema.tagged_union_schema(choices, discriminator=_choice)
-
-
-def _choice(value: Any) -> str:
-    target = value.get("_target_") if isinstance(value, dict) else None
-    return f"@{target}" if target in READERS else "@none"
+BY_READER = ChosenBy("_target_", READERS, otherwise=Reader)

@@ -2,11 +2,10 @@
 
 from typing import Annotated, Any
 
-from pydantic import GetCoreSchemaHandler, model_validator
-from pydantic_core import CoreSchema, core_schema
+from pydantic import model_validator
 
 from flowrep.config.expectations import Count, Factor, OneOf, Positive, Share, Text
-from flowrep.config.section import Section
+from flowrep.config.section import ChosenBy, Section
 from flowrep.config.violations import broken_rule
 from flowrep.transforms.dis import PRESETS
 from flowrep.transforms.flow import UNITS
@@ -98,20 +97,4 @@ class EstimatedFlow(ExactFlow):
         return self
 
 
-class BySource:
-    """The section that `source` chooses, for a field's annotation."""
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        """Returns a union of both, told apart by `source`."""
-        choices = {
-            "@exact": handler.generate_schema(ExactFlow),
-            "@estimated": handler.generate_schema(EstimatedFlow),
-        }
-        return core_schema.tagged_union_schema(choices, discriminator=_choice)
-
-
-def _choice(value: Any) -> str:
-    is_estimated = isinstance(value, dict) and value.get("source") == "estimated"
-    return "@estimated" if is_estimated else "@exact"
+BY_SOURCE = ChosenBy("source", {"estimated": EstimatedFlow}, otherwise=ExactFlow)

@@ -4,8 +4,15 @@ from collections.abc import Collection, Mapping
 from typing import Any, TypeVar
 
 from omegaconf import MISSING
-from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from flowrep.config.violations import (
     ABSENT,
@@ -51,6 +58,33 @@ class Section(BaseModel):
                 example = (field.examples or ["..."])[0]
                 raise PydanticCustomError(ABSENT, "{example}", {"key": key, "example": example})
         return value
+
+
+class ChosenBy:
+    """The section that one of its own keys chooses, for a field's annotation.
+
+    Args:
+        key: e.g. `_target_`.
+        sections: by the key's value.
+        otherwise: the section where the value is none of those.
+    """
+
+    def __init__(
+        self, key: str, sections: Mapping[str, type[Section]], otherwise: type[Section]
+    ) -> None:
+        self.key, self.sections, self.otherwise = key, sections, otherwise
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Returns a union of all sections, told apart by the key."""
+        choices = {f"@{name}": handler.generate_schema(s) for name, s in self.sections.items()}
+        choices["@"] = handler.generate_schema(self.otherwise)
+        return core_schema.tagged_union_schema(choices, discriminator=self._choice)
+
+    def _choice(self, value: Any) -> str:
+        name = value.get(self.key) if isinstance(value, Mapping) else None
+        return f"@{name}" if isinstance(name, str) and name in self.sections else "@"
 
 
 def validated(schema: type[S], config: Mapping[str, Any], own_keys: Collection[str] = ()) -> S:

@@ -5,9 +5,9 @@ from typing import Annotated, Any, get_args
 
 from pydantic import ConfigDict, Field, model_validator
 
-from flowrep.config.algorithms import OFF_BEFORE, AnyAlgorithm, ByTarget
+from flowrep.config.algorithms import BY_TARGET, AnyAlgorithm
 from flowrep.config.expectations import Count, CountOrZero, ListOf, OneOf, Seed, Switch, Text, Whole
-from flowrep.config.representations import BySource, Representations
+from flowrep.config.representations import BY_SOURCE, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
 from flowrep.envs.baselines import BASELINES
@@ -58,12 +58,12 @@ class TrainConfig(Section):
     checkpoint_every_frames: Count
     wandb: Annotated[str, OneOf(WANDB_MODES)]
     resume: Path
-    trust: Trust = OFF_BEFORE
+    trust: Trust
     evaluation: Evaluation
     representations: Representations = Field(examples=["[ego,obj]"])
-    flow: Annotated[Any, BySource()] = Field(examples=["exact"])
+    flow: Annotated[Any, BY_SOURCE] = Field(examples=["exact"])
     scene: SceneSection = Field(examples=["straight_road"])
-    algorithm: Annotated[AnyAlgorithm, ByTarget()] = Field(examples=["dsac"])
+    algorithm: Annotated[AnyAlgorithm, BY_TARGET] = Field(examples=["dsac"])
 
     @model_validator(mode="after")
     def _fits_together(self) -> "TrainConfig":
