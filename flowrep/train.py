@@ -66,13 +66,13 @@ def run(config: DictConfig) -> float:
         is_new = plain["resume"] is None
         if is_new:
             load_scene(plain["scene"])
-        hydra = HydraConfig.get()
-        new = hydra.runtime.output_dir
+        job = HydraConfig.get()
+        new = job.runtime.output_dir
         folder = RunFolder(new) if is_new else RunFolder.existing(plain["resume"])
         with folder.held("training"):
             if is_new:
                 folder.check_is_new()
-                folder.write_config(plain, hydra.overrides.task)
+                folder.write_config(plain, job.overrides.task)
             else:
                 plain = resumed_config(plain, folder)
             return carry_out(plain, folder)

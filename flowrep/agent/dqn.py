@@ -76,8 +76,8 @@ class DoubleDQN(OffPolicy):
         replay_capacity: transitions kept.
         frames_per_update: environment frames for each gradient step.
         learning_starts: frames before the first update; None: one batch.
-        n_steps: frames that a transition spans: r becomes the discounted sum of its rewards,
-            without the entropy bonus on the way, and γ becomes γ to that power.
+        n_steps: frames that a transition spans: r becomes the discounted sum of its rewards, and γ
+            becomes γ to that power.
         layer_norm: normalise each map's embedding, see `Encoder`.
     """
 
