@@ -27,8 +27,9 @@ def test_every_task_is_carried_out_once(size, count):
 
 
 def test_two_threads_work_at_the_same_time():
-    crew, meeting = Team(2), threading.Barrier(2, timeout=10)
-    crew.run([meeting.wait, meeting.wait])  # each needs the other to go on
+    crew, meeting, places = Team(2), threading.Barrier(2, timeout=10), []
+    crew.run([lambda: places.append(meeting.wait())] * 2)  # each needs the other to go on
+    assert sorted(places) == [0, 1]
     crew.dismiss()
 
 

@@ -234,7 +234,8 @@ def test_values_that_do_not_go_together_are_named(line, expected):
     ],
 )
 def test_what_just_can_be_passes(line):
-    validated(TrainConfig, plain("train", *line.split()))
+    config = plain("train", *line.split())
+    assert validated(TrainConfig, config).seed == config["seed"]
 
 
 def test_a_key_that_an_algorithm_does_not_have_is_named():
@@ -288,7 +289,8 @@ def test_an_evaluation_that_can_not_be_is_refused(line, expected):
 
 @pytest.mark.parametrize("line", ["speed=low fps=6 policy=sampled baselines=[]", "fps=[6,7.5]"])
 def test_an_evaluation_takes_one_value_or_a_list(line):
-    validated(EvaluateConfig, plain("evaluate", "run=here", *line.split()))
+    config = plain("evaluate", "run=here", *line.split())
+    assert validated(EvaluateConfig, config).fps == config["fps"]
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,8 @@ def test_a_command_has_the_keys_of_its_schema(name, schema, given):
 def test_every_choice_of_every_group_is_right(group, name):
     choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
     given = ["flow.weights=file"] if name == "raft" else []
-    validated(TrainConfig, plain("train", choice, *given))
+    config = plain("train", choice, *given)
+    assert validated(TrainConfig, config).algorithm.target == config["algorithm"]["_target_"]
 
 
 def keys_of(*place):
