@@ -31,7 +31,7 @@ from flowrep.command_line import (
 )
 from flowrep.config import UsageError, validated
 from flowrep.config.algorithms import ALGORITHMS
-from flowrep.config.training import EVALUATION_SEED, TrainConfig, validated_run
+from flowrep.config.training import TrainConfig, validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import SceneError, WorkerError, load_scene
 from flowrep.envs.workers import available_cores
@@ -49,7 +49,8 @@ from flowrep.quoting import override
 
 OF_THE_MACHINE = ("device", "num_workers", "trust")  # a resumed run's, from its new command line
 FINAL_POLICIES = ("greedy", "sampled")  # of the agent, beside the baselines
-FINAL_SEED = EVALUATION_SEED + 500_000  # other episodes than those that were watched in training
+EVALUATION_SEED = 1_000_000  # of the first episode that is evaluated while training
+FINAL_SEED = 1_500_000  # other episodes than those that were watched in training
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="train")

@@ -15,9 +15,6 @@ from flowrep.envs.scene import SpeedMode
 from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
 from flowrep.simulator.renderer import RENDERERS
 
-EVALUATION_SEED = 1_000_000
-"""First of the evaluated episodes of a training; what it learns from are those below."""
-
 SPEEDS: tuple[str, ...] = get_args(SpeedMode)
 
 Speed = Annotated[str, OneOf(SPEEDS)]
@@ -68,13 +65,6 @@ class TrainConfig(Section):
     @model_validator(mode="after")
     def _fits_together(self) -> "TrainConfig":
         check_workers(self.num_workers, self.num_envs)
-        most = EVALUATION_SEED // self.num_envs - 1
-        if self.seed > most:
-            raise broken_rule(
-                "seed",
-                f"should be at most {most} with num_envs={self.num_envs}, not {self.seed}: from "
-                "there on its episodes are those of evaluations",
-            )
         self.algorithm.check_with(self)
         return self
 
