@@ -89,7 +89,7 @@ bench-gpu: $(INSTALLED)  ## Measure everything on a GPU into outputs/gpu/
 
 docs: $(INSTALLED)  ## Build the documentation into site/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
-	$(BIN)/mkdocs build --strict
+	$(BIN)/zensical build --strict --clean
 
 wheel: $(INSTALLED)  ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel
