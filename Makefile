@@ -63,7 +63,7 @@ fuzz: $(INSTALLED)  ## Throw odd inputs at every part: make fuzz ARGS="--parts s
 	$(BIN)/python -m tests.fuzz $(ARGS)
 
 schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
-	$(BIN)/python -c 'from flowrep.envs.schema import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
+	$(BIN)/python -c 'from flowrep.scenes.schema import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
 
 lint: $(INSTALLED)  ## Check style and formatting
 	$(BIN)/ruff check .

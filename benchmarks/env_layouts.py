@@ -21,7 +21,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ParallelEnv
 
-from flowrep.envs import Scene, StreetEnv, load_scene, make_env
+from flowrep.envs import StreetEnv, make_env
+from flowrep.scenes import Scene, load_scene
 
 SENSORS = ("depth", "instance", "prev_from_curr", "instance_motion")  # what ego and obj read
 MAPS = ("ego", "obj")

@@ -13,7 +13,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from flowrep.envs import Planner, StreetEnv, load_scene, scene_names
+from flowrep.drivers import Planner
+from flowrep.envs import StreetEnv
+from flowrep.scenes import load_scene, scene_names
 
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion")
 

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.drivers.planner import Planner
 from flowrep.envs import make_env, streets
-from flowrep.envs.planner import Planner
 from flowrep.geometry import rigid_flow
 from flowrep.palette import CLASS_COLOURS
 from flowrep.transforms import DIS, EstimatedFlow

@@ -19,10 +19,11 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torchrl.envs import Compose, EnvBase, GymWrapper, TransformedEnv
 
-from flowrep.envs import load_scene, make_env, scene_names
+from flowrep.envs import make_env
 from flowrep.envs.episode import Episode
-from flowrep.envs.scene import Scene
 from flowrep.envs.street_vector import StreetVectorEnv
+from flowrep.scenes import load_scene, scene_names
+from flowrep.scenes.scene import Scene
 
 MAPS = ("ego", "obj")
 ONE_BY_ONE = partial(SyncVectorEnv, autoreset_mode=AutoresetMode.DISABLED)

@@ -92,7 +92,8 @@ def street_env(num_envs: int, side: int, num_workers: int, device: torch.device)
     """Returns simulated streets with ego and obj; the one place that says what `make_env` takes."""
     import dataclasses
 
-    from flowrep.envs import load_scene, make_env
+    from flowrep.envs import make_env
+    from flowrep.scenes import load_scene
 
     scene = load_scene("straight_road")
     camera = dataclasses.replace(scene.camera, height_px=side, width_px=side)
@@ -152,7 +153,7 @@ def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, fl
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 
-    from flowrep.command_line import register_resolvers
+    from flowrep.config.command_line import register_resolvers
     from flowrep.config_tree import CONF_DIR
     from flowrep.experiment.interruption import StopRequest
     from flowrep.experiment.run_folder import RunFolder

@@ -20,9 +20,10 @@ from torchrl.envs import Compose, GymWrapper, TransformedEnv
 from update import agent_for
 
 from flowrep.agent import ReplayMemory, keep_freed_memory
-from flowrep.envs import StreetEnv, load_scene, make_env
+from flowrep.envs import StreetEnv, make_env
 from flowrep.envs.episode import Episode
 from flowrep.envs.street_vector import StreetVectorEnv
+from flowrep.scenes import load_scene
 
 WARM_UP = 20  # steps of every street
 PARTS: list[tuple[str, Any, str]] = [

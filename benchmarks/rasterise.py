@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
-from flowrep.envs import StreetEnv, load_scene, scene_names
+from flowrep.envs import StreetEnv
 from flowrep.envs.episode import Moment
-from flowrep.envs.vehicle import VehicleState
+from flowrep.scenes import load_scene, scene_names
+from flowrep.scenes.vehicle import VehicleState
 
 MAPS = ("depth", "semantic", "instance")
 VIEWS_AN_EPISODE = 10

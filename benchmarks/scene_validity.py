@@ -7,8 +7,10 @@ import argparse
 import time
 from collections import Counter
 
-from flowrep.envs import BASELINES, StreetEnv, drives, load_scene, scene_names
+from flowrep.drivers import BASELINES, drives
+from flowrep.envs import StreetEnv
 from flowrep.experiment.evaluation import wilson_interval
+from flowrep.scenes import load_scene, scene_names
 
 OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
 BOUNDS = {"planner": (0.95, 1.0), "never_turn": (0.0, 0.15), "random": (0.0, 0.05)}

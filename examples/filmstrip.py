@@ -7,10 +7,10 @@ import sys
 
 import torch
 
+from flowrep.drivers.planner import Planner
 from flowrep.envs import make_env, streets
-from flowrep.envs.planner import Planner
-from flowrep.experiment.recording import film_episode
 from flowrep.viz import representation_strip, write_png
+from flowrep.viz.film import film_episode
 
 
 def main(path: str, seed: int = 2) -> None:

@@ -6,8 +6,9 @@ python examples/shapes.py docs/images/shapes.png
 import sys
 from dataclasses import replace
 
-from flowrep.envs import StreetEnv, load_scene
-from flowrep.envs.scene import Obstacle, PedestrianGroup, Walk
+from flowrep.envs import StreetEnv
+from flowrep.scenes import load_scene
+from flowrep.scenes.scene import Obstacle, PedestrianGroup, Walk
 from flowrep.viz import contact_sheet, strip, write_png
 
 SIZES = {

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from flowrep.envs import Planner, StreetEnv, load_scene
+from flowrep.drivers import Planner
+from flowrep.envs import StreetEnv
 from flowrep.envs.sensing import SENSORS
-from flowrep.experiment.recording import maps_of
 from flowrep.experiment.viewing import view_episode
 from flowrep.geometry import ego_flow, unproject
+from flowrep.scenes import load_scene
 from flowrep.transforms import DIS
 from flowrep.viz import (
     FLOW_SCALE_PX,
@@ -24,6 +25,7 @@ from flowrep.viz import (
     strip,
     write_png,
 )
+from flowrep.viz.film import maps_of
 
 SCENE, SEED, SIZE_PX = "h_shaped_pathways", 4, 160
 PARTS = np.array([(235, 235, 235), (222, 40, 60), (46, 64, 196), (60, 160, 90)], dtype=np.uint8)

@@ -13,9 +13,10 @@ from flowrep.agent import Algorithm
 from flowrep.config import UsageError
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.violations import closest
-from flowrep.envs import Scene, make_env
-from flowrep.envs.street_pool import StreetPool
+from flowrep.envs import make_env
 from flowrep.envs.workers import available_cores
+from flowrep.experiment.street_pool import StreetPool
+from flowrep.scenes import Scene
 
 Config = Mapping[str, Any]
 

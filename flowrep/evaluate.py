@@ -18,19 +18,20 @@ from omegaconf import DictConfig
 
 from flowrep.agent import CheckpointError, load_checkpoint
 from flowrep.build import Config, build_env, build_policy, build_pool, choose_device
-from flowrep.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config import UsageError, validated
+from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config.evaluating import EvaluateConfig
 from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import WorkerError, load_scene
+from flowrep.envs import WorkerError
 from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.comparison import Comparison, Row, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.origin import check_origin, origin_of
-from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder
+from flowrep.scenes import load_scene
+from flowrep.viz.film import record_episode
 
 OF_THE_MACHINE = ("device", "num_envs", "num_workers", "trust")  # not as the run was trained
 

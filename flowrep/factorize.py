@@ -15,8 +15,8 @@ import hydra
 from hydra.utils import get_class
 from omegaconf import DictConfig
 
-from flowrep.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config import UsageError, validated
+from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config_tree import CONF_DIR, group_choices
 from flowrep.sequences import EstimatedFlowSource, Recording, SequenceError, Stream, recorded_flow

@@ -21,7 +21,9 @@ from flowrep.agent import (
     use_threads,
 )
 from flowrep.build import Config, build_agent, build_env, build_pool, choose_device
-from flowrep.command_line import (
+from flowrep.config import UsageError, validated
+from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.command_line import (
     exit_with,
     line_for,
     own_keys,
@@ -29,23 +31,22 @@ from flowrep.command_line import (
     run_command,
     typed_value,
 )
-from flowrep.config import UsageError, validated
-from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.quoting import override
 from flowrep.config.training import TrainConfig, validated_run
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import SceneError, WorkerError, load_scene
+from flowrep.envs import WorkerError
 from flowrep.envs.workers import available_cores
 from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.comparison import Comparison, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
-from flowrep.experiment.figures import draw_learning_curve
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.origin import origin_of
-from flowrep.experiment.recording import record_episode
 from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import Training, train
-from flowrep.quoting import override
+from flowrep.scenes import SceneError, load_scene
+from flowrep.viz.curves import draw_learning_curve
+from flowrep.viz.film import record_episode
 
 OF_THE_MACHINE = ("device", "num_workers", "trust")  # a resumed run's, from its new command line
 FINAL_POLICIES = ("greedy", "sampled")  # of the agent, beside the baselines

@@ -17,19 +17,21 @@ from rich.console import Console
 from rich.table import Table
 from tqdm.auto import tqdm
 
-from flowrep.cockpit import Cockpit, NoScreenError, drive_by_hand
-from flowrep.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config import UsageError, validated
+from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config.viewing import ViewConfig
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import BASELINES, SceneError, StreetEnv, load_scene
-from flowrep.envs.layout import Layout
+from flowrep.drivers import BASELINES
+from flowrep.envs import StreetEnv
 from flowrep.envs.sensing import SENSORS
-from flowrep.experiment.recording import Maps, maps_of
 from flowrep.experiment.tables import append_rows
 from flowrep.experiment.viewing import CategoryCount, Viewed, view_episode
-from flowrep.plan_view import Track, draw_plan
+from flowrep.scenes import SceneError, load_scene
+from flowrep.scenes.layout import Layout
 from flowrep.viz import contact_sheet, representation_strip, write_png, write_video
+from flowrep.viz.film import Maps, maps_of
+from flowrep.viz.plan import Track, draw_plan
+from flowrep.viz.window import KeyboardDriver, NoScreenError, drive_by_hand
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="view")
@@ -45,7 +47,7 @@ def run(config: DictConfig) -> None:
         }
         if config.interactive:
             env = StreetEnv(**street, sensors=SENSORS)
-            drive_by_hand(Cockpit(env, seed=config.seed, path=config.path))
+            drive_by_hand(KeyboardDriver(env, seed=config.seed, path=config.path))
         else:
             look_at(config, street, Path(HydraConfig.get().runtime.output_dir))
     except (UsageError, SceneError, NoScreenError, ValueError, OSError) as error:

@@ -1,4 +1,4 @@
-"""Imports point one way: train, evaluate → experiment → envs → transforms → geometry → torch."""
+"""Imports point one way: commands → config → experiment → envs → simulator → scenes, and so on."""
 
 import ast
 import subprocess
@@ -15,36 +15,29 @@ FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry"},
     "transforms": {"transforms", "geometry", "extras"},
     "agent": {"agent", "extras"},
-    "simulator": {"simulator"},
-    "envs": {"envs", "simulator", "transforms", "geometry", "config_tree", "palette"},
     "palette": set(),
-    "viz": {"palette"},
-    "plan_view": {"envs", "palette"},
-    "cockpit": {"envs", "experiment", "viz"},
-    "config": {
-        "config",
-        "agent",
-        "envs",
-        "experiment",
-        "geometry",
-        "sequences",
-        "simulator",
-        "transforms",
-    },  # fmt: skip,
+    "scenes": {"scenes", "config_tree", "extras", "palette"},
+    "simulator": {"simulator", "scenes", "palette"},
+    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette"},
+    "drivers": {"drivers", "envs", "scenes"},
+    "experiment": {"experiment", "drivers", "envs", "simulator", "scenes", "agent"}
+    | {"transforms", "palette"},
+    "viz": {"viz", "experiment", "envs", "scenes", "geometry", "palette"},
     "sequences": {"sequences", "experiment", "transforms", "geometry", "viz"},
-    "experiment": {"experiment", "envs", "agent", "palette", "transforms", "geometry", "viz"},
+    "config": {"config", "agent", "drivers", "envs", "experiment", "scenes", "simulator"}
+    | {"sequences", "transforms", "geometry", "config_tree"},
 }
 THIRD_PARTY_ONLY_IN = {
-    "pybullet": {"envs/simulator.py"},
+    "pybullet": {"simulator/bullet.py"},
     "numba": {"simulator/rasteriser.py"},
     "hydra": {
         "train.py",
         "evaluate.py",
         "view.py",
-        "command_line.py",
-        "preview.py",
-        "quoting.py",
         "factorize.py",
+        "config/command_line.py",
+        "config/composition.py",
+        "config/quoting.py",
         "transforms/configs.py",
     },
 }
@@ -57,7 +50,8 @@ PACKAGES_LIMITED_TO = {
     "geometry": {"torch"},
     "transforms": {"torch", "tensordict", "torchrl"},
     "agent": {"torch", "tensordict", "torchrl", "safetensors", "numpy"},
-    "simulator": {"numpy", "numba"},
+    "scenes": {"numpy", "shapely", "yaml", "pydantic", "pydantic_core"},
+    "simulator": {"numpy", "numba", "pybullet", "shapely"},
 }
 
 # Nothing of flowrep imports this one: whoever has Hydra does.

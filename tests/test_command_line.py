@@ -8,9 +8,9 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from flowrep.config import UsageError
+from flowrep.config.composition import check_command
 from flowrep.config.training import TrainConfig
 from flowrep.config_tree import CONF_DIR
-from flowrep.preview import check_command
 
 pytest.importorskip("pybullet", reason="the commands need the simulator")
 

@@ -7,7 +7,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
-from flowrep.command_line import register_resolvers
+from flowrep.config.command_line import register_resolvers
 from flowrep.config_tree import CONF_DIR, config_groups, group_choices
 
 pytest.importorskip("pybullet", reason="composed configs are built into environments")
@@ -90,7 +90,7 @@ def test_run_folders_are_named_by_scene_representations_and_seed():
 def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
     from flowrep.build import build_env
 
-    crossroads = CONF_DIR.parent / "tests" / "envs" / "crossroads.yaml"
+    crossroads = CONF_DIR.parent / "tests" / "scenes" / "crossroads.yaml"
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "mine.yaml").write_text(crossroads.read_text())
     config = composed(f"hydra.searchpath=[file://{tmp_path}]", "scene=mine", "num_envs=1")

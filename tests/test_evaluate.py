@@ -10,15 +10,16 @@ import pytest
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
 from flowrep.agent import CheckpointError
-from flowrep.envs import Drive, WorkerError
-from flowrep.envs.street_pool import StreetPool
+from flowrep.drivers import Drive
+from flowrep.envs import WorkerError
 from flowrep.evaluate import evaluate
-from flowrep.experiment.figures import _evaluated
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.street_pool import StreetPool
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import train
 from flowrep.train import build
+from flowrep.viz.curves import _evaluated
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow

@@ -25,10 +25,10 @@ import cv2
 import imageio.v3 as imageio
 
 from flowrep.config import UsageError, validated
+from flowrep.config.composition import check_command
 from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config_tree import CONF_DIR, group_choices
 from flowrep.factorize import factorize_recording, main
-from flowrep.preview import check_command
 from flowrep.sequences import (
     RECORDINGS,
     STREAMS,

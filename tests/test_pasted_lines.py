@@ -8,7 +8,7 @@ from hydra.core.global_hydra import GlobalHydra
 pytest.importorskip("pybullet", reason="the commands need the simulator")
 
 from flowrep import evaluate, train
-from flowrep.command_line import line_for
+from flowrep.config.command_line import line_for
 from flowrep.experiment.run_folder import RunFolder
 from tests.config.composing import plain
 

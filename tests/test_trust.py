@@ -11,9 +11,9 @@ pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
 from flowrep.agent import DoubleDQN
 from flowrep.build import algorithm_class
-from flowrep.command_line import register_resolvers
 from flowrep.config import UsageError
 from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.command_line import register_resolvers
 from flowrep.config_tree import CONF_DIR
 from tests.config.composing import plain
 

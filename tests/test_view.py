@@ -13,10 +13,12 @@ from hydra import compose, initialize_config_dir
 pytest.importorskip("pybullet", reason="the command needs the simulator")
 
 from flowrep.config import UsageError
+from flowrep.config.composition import check_command
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import StreetEnv, drives, load_scene, never_turn
-from flowrep.envs.camera import CameraConfig
-from flowrep.preview import check_command
+from flowrep.drivers import drives, never_turn
+from flowrep.envs import StreetEnv
+from flowrep.scenes import load_scene
+from flowrep.scenes.camera import CameraConfig
 from flowrep.view import check, drive_on, film, moments, moving_pixels
 
 TINY = CameraConfig(6, 8, 90.0, 1.5, 0.0, -5.0, 0.2, 300.0)

@@ -14,7 +14,7 @@ from flowrep.config.training import (
     Workers,
     check_workers,
 )
-from flowrep.envs.baselines import BASELINES
+from flowrep.drivers.baselines import BASELINES
 
 POLICIES = ("greedy", "sampled")
 

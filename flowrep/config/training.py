@@ -10,9 +10,9 @@ from flowrep.config.expectations import Count, CountOrZero, ListOf, OneOf, Seed,
 from flowrep.config.representations import BY_SOURCE, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
-from flowrep.envs.baselines import BASELINES
-from flowrep.envs.scene import SpeedMode
+from flowrep.drivers.baselines import BASELINES
 from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
+from flowrep.scenes.scene import SpeedMode
 from flowrep.simulator.renderer import RENDERERS
 
 SPEEDS: tuple[str, ...] = get_args(SpeedMode)

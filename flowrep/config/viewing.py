@@ -7,7 +7,7 @@ from pydantic import Field
 from flowrep.config.expectations import Count, Number, OneOf, Seed, Switch, Text
 from flowrep.config.section import Section
 from flowrep.config.training import SceneSection, Speed
-from flowrep.envs.baselines import BASELINES
+from flowrep.drivers.baselines import BASELINES
 
 
 class ViewConfig(Section):

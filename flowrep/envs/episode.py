@@ -13,12 +13,12 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
-from flowrep.envs.layout import Layout
 from flowrep.envs.outcome import Outcome
-from flowrep.envs.pedestrians import Crowd, draw_crowd
-from flowrep.envs.scene import Path, Range
-from flowrep.envs.street import Street
-from flowrep.envs.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
+from flowrep.scenes.layout import Layout
+from flowrep.scenes.pedestrians import Crowd, draw_crowd
+from flowrep.scenes.scene import Path, Range
+from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
+from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
 # Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't pass anyone by.

@@ -12,13 +12,13 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
-from flowrep.envs.loading import load_scene
-from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.sensor_observation import SensorObservation
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.street_vector import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
+from flowrep.scenes.loading import load_scene
+from flowrep.scenes.scene import Range, Scene, SpeedMode
 from flowrep.simulator.renderer import choose_renderer
 from flowrep.transforms import representation_stack
 

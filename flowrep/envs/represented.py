@@ -14,9 +14,9 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose
 
 from flowrep.envs.outcome import Outcome, hit_code
-from flowrep.envs.scene import Scene
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
+from flowrep.scenes.scene import Scene
 from flowrep.transforms import representation_stack
 from flowrep.transforms.flow import Intrinsics
 

@@ -7,21 +7,21 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from flowrep.envs.camera import (
+from flowrep.envs.episode import Episode, Moment
+from flowrep.envs.motion import CameraPose, instance_motion, relative_camera
+from flowrep.palette import CLASS_COLOURS, num_classes
+from flowrep.scenes.people import PARTS, world_from_parts
+from flowrep.scenes.scene import Scene
+from flowrep.simulator.bullet import Picture
+from flowrep.simulator.camera import (
     depth_from_zbuffer,
     gl_projection,
     gl_view,
     sampled_intrinsics,
     vehicle_from_camera,
 )
-from flowrep.envs.episode import Episode, Moment
-from flowrep.envs.motion import CameraPose, instance_motion, relative_camera
-from flowrep.envs.people import PARTS, world_from_parts
-from flowrep.envs.scene import Scene
-from flowrep.envs.simulator import Picture
-from flowrep.envs.street import Street
-from flowrep.palette import CLASS_COLOURS, num_classes
 from flowrep.simulator.renderer import choose_renderer
+from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]

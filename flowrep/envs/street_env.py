@@ -10,13 +10,13 @@ import gymnasium as gym
 from gymnasium import spaces
 
 from flowrep.envs.episode import Episode, Moment, Rules
-from flowrep.envs.loading import load_scene
 from flowrep.envs.outcome import Outcome, reward
-from flowrep.envs.scene import Range, Scene, SpeedMode
 from flowrep.envs.sensing import SENSORS, Sensing
-from flowrep.envs.street import Street
-from flowrep.envs.vehicle import YAW_SIGN, VehicleState
 from flowrep.palette import num_classes
+from flowrep.scenes.loading import load_scene
+from flowrep.scenes.scene import Range, Scene, SpeedMode
+from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
+from flowrep.simulator.street import Street
 
 _OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz")
 

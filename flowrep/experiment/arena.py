@@ -11,11 +11,11 @@ from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.envs.outcome import Outcome, reward
-from flowrep.envs.scene import Scene
-from flowrep.envs.street_pool import StreetPool
 from flowrep.envs.worker_process import Order
 from flowrep.experiment.evaluation import Episode
 from flowrep.experiment.eye import Eye
+from flowrep.experiment.street_pool import StreetPool
+from flowrep.scenes.scene import Scene
 
 _REWARD = {outcome.label: reward(outcome) for outcome in Outcome}
 _RUNNING = Outcome.RUNNING.label

@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.table import Table
 from tqdm.auto import tqdm
 
-from flowrep.envs.street_pool import Options
 from flowrep.experiment.arena import Arena, Job
 from flowrep.experiment.evaluation import OUTCOMES, Episode, outcome_shares
+from flowrep.experiment.street_pool import Options
 
 Row = dict[str, Any]
 

@@ -7,10 +7,10 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from flowrep.envs.camera import sampled_intrinsics
 from flowrep.envs.make import sensors_read
-from flowrep.envs.scene import Scene
 from flowrep.palette import num_classes
+from flowrep.scenes.scene import Scene
+from flowrep.simulator.camera import sampled_intrinsics
 from flowrep.transforms import representation_stack
 
 

@@ -1,1 +1,1 @@
-"""What a camera sees of rigid bodies made of triangles: depth and ids, drawn without PyBullet."""
+"""A street as bodies and triangles: collisions and pictures by PyBullet, maps by a rasteriser."""

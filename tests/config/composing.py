@@ -6,7 +6,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
 
-from flowrep.command_line import register_resolvers
+from flowrep.config.command_line import register_resolvers
 from flowrep.config_tree import CONF_DIR, config_groups
 
 

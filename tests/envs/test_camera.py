@@ -5,17 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from flowrep.envs.camera import (
-    CameraConfig,
+from flowrep.scenes.camera import CameraConfig
+from flowrep.simulator.bullet import Simulator
+from flowrep.simulator.camera import (
     depth_from_zbuffer,
     gl_projection,
     gl_view,
     sampled_intrinsics,
     vehicle_from_camera,
 )
-from flowrep.envs.meshes import Mesh
-from flowrep.envs.paint import picture, swatch
-from flowrep.envs.simulator import Simulator
+from flowrep.simulator.meshes import Mesh
+from flowrep.simulator.paint import picture, swatch
 
 NEAR_M, FAR_M = 0.2, 300.0
 # Columns: height, width, fx, fy. Nothing is square, so that no two numbers can be swapped.

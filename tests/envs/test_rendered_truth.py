@@ -6,8 +6,9 @@ from functools import partial
 import pytest
 import torch
 
-from flowrep.envs import StreetEnv, load_scene, scene_names
+from flowrep.envs import StreetEnv
 from flowrep.geometry import ego_flow, factorize, rigid_flow, unproject
+from flowrep.scenes import load_scene, scene_names
 
 STILL, WALKING = (0.0, 0.0), (1.2, 1.8)
 LEFT, RIGHT, NO_OP = 1, 2, 0

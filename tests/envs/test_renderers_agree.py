@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrep.envs import StreetEnv, load_scene, scene_names
-from flowrep.envs.scene import PedestrianGroup, Walk
+from flowrep.envs import StreetEnv
 from flowrep.palette import CATEGORY_ID
+from flowrep.scenes import load_scene, scene_names
+from flowrep.scenes.scene import PedestrianGroup, Walk
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "rasterise.py"
-CROSSROADS = Path(__file__).parent / "crossroads.yaml"
+CROSSROADS = Path(__file__).parents[1] / "scenes" / "crossroads.yaml"
 
 
 @pytest.fixture(scope="module")

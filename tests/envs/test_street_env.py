@@ -12,8 +12,8 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from flowrep.envs import StreetEnv
-from flowrep.envs.scene import Obstacle, PedestrianGroup, Walk
 from flowrep.palette import CATEGORY_ID
+from flowrep.scenes.scene import Obstacle, PedestrianGroup, Walk
 
 NO_OP, LEFT, RIGHT = 0, 1, 2
 

@@ -11,12 +11,13 @@ pytest.importorskip("pybullet", reason="policies drive the simulated street")
 
 from flowrep.agent.action import DiscreteActions
 from flowrep.agent.policy import stochastic_policy
-from flowrep.envs import load_scene, make_env
-from flowrep.envs.street_pool import StreetPool
+from flowrep.envs import make_env
 from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.comparison import Comparison, print_table, with_origin
 from flowrep.experiment.eye import Eye
 from flowrep.experiment.run_folder import EVALUATION_COLUMNS
+from flowrep.experiment.street_pool import StreetPool
+from flowrep.scenes import load_scene
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,8 @@ import pytest
 
 pytest.importorskip("pybullet", reason="the simulated street is driven")
 
-from flowrep.envs import StreetEnv, drives, never_turn
+from flowrep.drivers import drives, never_turn
+from flowrep.envs import StreetEnv
 from flowrep.experiment.viewing import CategoryCount, view_episode
 
 

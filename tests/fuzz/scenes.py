@@ -13,13 +13,13 @@ import numpy as np
 import yaml
 
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import SceneError, load_scene
 from flowrep.envs.episode import Rules
-from flowrep.envs.layout import Layout
-from flowrep.envs.pedestrians import draw_crowd
+from flowrep.scenes import SceneError, load_scene
+from flowrep.scenes.layout import Layout
+from flowrep.scenes.pedestrians import draw_crowd
 from tests.fuzz.framework import Part
 
-_CROSSROADS = Path(__file__).parents[1] / "envs" / "crossroads.yaml"
+_CROSSROADS = Path(__file__).parents[1] / "scenes" / "crossroads.yaml"
 _ODD: list[Any] = [
     *(float("nan"), float("inf"), -float("inf"), 0, 0.0, -0.0, -1, -1.0, 0.5, 1.5, 3, 1e-9, -1e-9),
     *(1e-300, 1e6, 1e9, 1e300, 2**31, 2**53, 2**63, 10**400, -(10**30), 5000.0, 99.0, 360, -360.0),

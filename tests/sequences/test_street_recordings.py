@@ -15,11 +15,11 @@ import torch
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 pytest.importorskip("pybullet", reason="the streets are PyBullet's")
 
-from flowrep.envs import StreetEnv, load_scene
-from flowrep.envs.camera import vehicle_from_camera
+from flowrep.envs import StreetEnv
 from flowrep.envs.motion import CameraPose
 from flowrep.envs.sensing import SENSORS
 from flowrep.geometry import factorize, rigid_flow
+from flowrep.scenes import load_scene
 from flowrep.sequences import (
     Frames,
     SevenScenes,
@@ -30,6 +30,7 @@ from flowrep.sequences import (
     factorize_frames,
     recorded_flow,
 )
+from flowrep.simulator.camera import vehicle_from_camera
 from tests.sequences import synthetic
 from tests.sequences.synthetic import Moment, from_first_pixel
 

@@ -1,0 +1,112 @@
+"""The command line's manners: a mistake ends in one line that names it and lists what exists."""
+
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NoReturn
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from flowrep.config import Section, UsageError
+from flowrep.config.composition import check_command, keys_added, parse, plain_config
+from flowrep.config.quoting import override, shell_line, taken_as_typed
+
+__all__ = [
+    "exit_with",
+    "line_for",
+    "own_keys",
+    "plain_config",
+    "register_resolvers",
+    "run_command",
+    "typed_value",
+]
+
+EXIT_USAGE = 2
+FOLDERS = ("resume", "run", "input", "output")
+"""Keys whose values are folders, which may have any name."""
+
+
+def register_resolvers() -> None:
+    """Adds what the paths of run folders are made of, in conf/run_folder.yaml and conf/view.yaml.
+
+    `${run_name:scene,representations,flow,seed}` names a run; `${folder_name:text}` is a text that
+    is one folder's name, whatever it holds.
+    """
+
+    def run_name(scene: str, representations: Iterable[str], flow: str, seed: int) -> str:
+        source = "" if flow == "exact" else f"_{flow}"
+        return folder_name(f"{scene}_{'+'.join(representations)}{source}_s{seed}")
+
+    OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+    OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+
+
+def folder_name(text: str) -> str:
+    """Returns a text as the name of one folder, which leads nowhere else.
+
+    >>> folder_name("s_turn"), folder_name("../../etc"), folder_name("..")
+    ('s_turn', '.._.._etc', '_')
+    """
+    name = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in str(text))[:200]
+    return "_" if name in ("", ".", "..") else name
+
+
+def exit_with(message: str) -> NoReturn:
+    """Ends the process with the exit code of a wrong command, each line saying what is wrong."""
+    for line in message.splitlines():
+        print(f"error: {line}", file=sys.stderr)
+    sys.exit(EXIT_USAGE)
+
+
+def line_for(command: str, **values: str) -> str:
+    """Returns a line to paste into a shell: a command of flowrep's, called as this one was.
+
+    Args:
+        command: e.g. "train".
+        values: what its keys are to hold, whatever characters are in it.
+    """
+    is_script = Path(sys.argv[0]).name.startswith("flowrep-")
+    program = [f"flowrep-{command}"] if is_script else ["python", "-m", f"flowrep.{command}"]
+    return shell_line(*program, *(override(key, text) for key, text in values.items()))
+
+
+def own_keys() -> set[str]:
+    """Returns the top level's keys that were added to the running job's config: `+note=pilot`.
+
+    Outside of a job there are none.
+    """
+    if not HydraConfig.initialized():
+        return set()
+    return keys_added(parse(HydraConfig.get().overrides.task))
+
+
+def typed_value(key: str) -> Any:
+    """Returns what a key was given on the command line, None where it was not."""
+    typed = [a for a in taken_as_typed(sys.argv[1:], FOLDERS) if a.startswith(f"{key}=")]
+    if not typed:
+        return None
+    try:
+        (last,) = parse(typed[-1:])
+        return OmegaConf.create([last.value()])[0]
+    except (HydraException, OmegaConfBaseException):
+        return None  # the check of the whole line says what is wrong
+
+
+def run_command(config_name: str, command: Callable[[], Any], schema: type[Section]) -> None:
+    """Runs a Hydra entry point once its command line is found right, so that mistakes read well.
+
+    Args:
+        config_name: a file of conf/, without its ending.
+        command: the entry point.
+        schema: what the composed config may hold.
+    """
+    register_resolvers()
+    sys.argv[1:] = taken_as_typed(sys.argv[1:], FOLDERS)
+    try:
+        check_command(config_name, sys.argv[1:], schema)
+    except UsageError as error:
+        exit_with(str(error))
+    command()

@@ -1,0 +1,240 @@
+"""A look at what Hydra will compose, before it runs anything: mistakes are then said in one line.
+
+Hydra is asked, with the same search path and overrides that it will run with, so that whatever it
+accepts is accepted: plugins' groups, a user's own configs, `+key=` and `~key`. Only what it refuses
+is looked at again, to say what is wrong and what there is instead.
+"""
+
+import argparse
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from hydra import version
+from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path, get_args_parser
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from flowrep.config import Section, UsageError, validated
+from flowrep.config.hydra_mistakes import one_line, unknown_choice, unknown_key
+from flowrep.config.quoting import override as quoted_override
+from flowrep.config.quoting import shell_line
+from flowrep.config_tree import CONF_DIR
+
+VERSION_BASE = "1.3"  # of Hydra's behaviour; what the commands' entry points say too
+REFUSALS = (HydraException, OmegaConfBaseException, ValueError)  # the last for `scene=null`
+
+
+def check_command(
+    config_name: str, arguments: Sequence[str], schema: type[Section] | None = None
+) -> None:
+    """Refuses a command line that Hydra would, or whose config the schema does.
+
+    Every value of a sweep is looked at, before any of its jobs starts.
+
+    Args:
+        config_name: a file of conf/, without its ending.
+        arguments: as typed, e.g. `["-m", "representations=[ego],[raw]", "seed=1"]`.
+        schema: what a job's config may hold.
+
+    Raises:
+        UsageError: a line for each thing that is wrong.
+    """
+    args = get_args_parser().parse_args(list(arguments))
+    if args.help or args.hydra_help or args.info or args.shell_completion or args.config_path:
+        return
+    if args.experimental_rerun:
+        return
+    preview = Preview(args, args.config_name or config_name)
+    try:
+        parsed = preview.parse(args.overrides)
+        for config in preview.configs(parsed):
+            if schema is not None and not args.cfg:
+                validated(schema, config, keys_added(parsed))
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def plain_config(config: DictConfig) -> dict[str, Any]:
+    """Returns a composed config as plain data, interpolations resolved, `???` left as it is.
+
+    Raises:
+        UsageError: an interpolation leads nowhere.
+    """
+    try:
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:
+        raise UsageError(one_line(error)) from None
+    return plain
+
+
+def keys_added(overrides: Iterable[Override]) -> set[str]:
+    """Returns the top level's keys that overrides add: `+note=pilot`."""
+    added = [o for o in overrides if o.is_add() or o.is_force_add()]
+    return {(o.package or o.key_or_group).split(".")[0] for o in added}
+
+
+def parse(overrides: Iterable[str]) -> list[Override]:
+    """Returns overrides as Hydra reads them."""
+    return list(OverridesParser.create().parse_overrides(list(overrides)))
+
+
+class Preview:
+    """Hydra as the command will run it, and a person's words for what it says.
+
+    Args:
+        args: of the command line.
+        config_name: of the primary config.
+    """
+
+    def __init__(self, args: argparse.Namespace, config_name: str) -> None:
+        self.config_name, self.is_multirun = config_name, args.multirun
+        GlobalHydra.instance().clear()
+        version.setbase(VERSION_BASE)
+        self._hydra = Hydra.create_main_hydra2("flowrep", _search_path(args.config_dir))
+        self._loader = self._hydra.config_loader
+        self._typed: list[str] = args.overrides
+
+    def parse(self, overrides: Iterable[str]) -> list[Override]:
+        """Returns overrides as Hydra reads them."""
+        parsed = []
+        for text in overrides:
+            try:
+                parsed += OverridesParser.create(self._loader).parse_overrides([text])
+            except HydraException as error:
+                key, _, value = text.partition("=")
+                if value and value[0] not in "[{(":
+                    remedy = shell_line(quoted_override(key, value))
+                    raise UsageError(f"can't read '{text}'; quoted it is {remedy}") from None
+                raise UsageError(f"can't read '{text}': {one_line(error)}") from None
+        if not self.is_multirun and not any(o.key_or_group == "hydra.mode" for o in parsed):
+            for override in (o for o in parsed if o.is_sweep_override()):
+                value = override.get_value_string()
+                raise UsageError(
+                    f"'{override.input_line}' is several values: add -m to run each of them, or "
+                    f"write {override.key_or_group}=[{value}] for a list"
+                )
+        return parsed
+
+    def configs(self, parsed: Sequence[Override]) -> Iterator[dict[str, Any]]:
+        """Yields plain configs of jobs, so that each value of each sweep is in one of them."""
+        values = [self._values(override) for override in parsed]
+        job = [texts[0] for texts in values]
+        first = self.compose(job)
+        yield first
+        for place, (override, texts) in enumerate(zip(parsed, values)):
+            is_choice = bool(texts[1:]) and bool(self._options(override.key_or_group))
+            for text in texts[1:]:
+                if is_choice:
+                    yield self.compose([*job[:place], text, *job[place + 1 :]])
+                else:
+                    (one,) = parse([text])
+                    yield _changed(first, one.key_or_group.split("."), one.value())
+
+    def _values(self, override: Override) -> list[str]:
+        """Returns an override once for each value that it stands for, the ends of an interval."""
+        if not override.is_sweep_override():
+            return [str(override.input_line)]
+        key = override.get_key_element()
+        if override.is_interval_sweep():
+            interval: Any = override.value()
+            return [f"{key}={interval.start}", f"{key}={interval.end}"]
+        return [f"{key}={text}" for text in override.sweep_string_iterator()]
+
+    def compose(self, job: list[str]) -> dict[str, Any]:
+        """Returns the config of a job, without Hydra's own part."""
+        try:
+            config = self._compose(job)
+        except REFUSALS as error:
+            raise UsageError(self._explained(error, parse(job))) from None
+        _check_plugins(config.hydra)
+        with open_dict(config):
+            del config["hydra"]
+        return plain_config(config)
+
+    def _compose(self, job: list[str]) -> DictConfig:
+        return self._hydra.compose_config(
+            self.config_name, job, run_mode=RunMode.RUN, with_log_configuration=False
+        )
+
+    def _explained(self, error: Exception, overrides: Sequence[Override]) -> str:
+        """Returns what is wrong with overrides that Hydra refuses, and what there is instead."""
+        if isinstance(error, MissingConfigException) and error.options is not None:
+            group, _, name = str(error.missing_cfg_file).rpartition("/")
+            return unknown_choice(group, name, error.options)
+        one_of_several = re.match(r".*Could not load '(.+)/([^/']+)'", one_line(error))
+        if one_of_several:
+            group, name = one_of_several.groups()
+            return unknown_choice(group, name, self._options(group))
+        for override in overrides:
+            options = self._options(override.key_or_group)
+            if options and override.value() is None and not override.is_delete():
+                return f"{override.key_or_group} should be one of: {', '.join(options)}, not null"
+            if options and override.is_delete():
+                return f"'{override.key_or_group}' needs a value; there are: {', '.join(options)}"
+        groups = [o for o in overrides if self._options(o.key_or_group)]
+        try:
+            config = self._compose([str(o.input_line) for o in groups])
+        except REFUSALS:
+            return one_line(error)
+        for override in overrides:
+            if override not in groups and override.type in (OverrideType.CHANGE, OverrideType.DEL):
+                unknown = unknown_key(override.key_or_group, config, self._loader.list_groups(""))
+                if unknown:
+                    return unknown
+        return one_line(error)
+
+    def _options(self, group: str) -> list[str]:
+        """Returns the choices of a group, none where there is no such group."""
+        return self._loader.get_group_options(
+            group, config_name=self.config_name, overrides=self._searchpath()
+        )
+
+    def _searchpath(self) -> list[str]:
+        return [text for text in self._typed if text.startswith("hydra.searchpath=")]
+
+
+def _changed(config: dict[str, Any], keys: Sequence[str], value: Any) -> dict[str, Any]:
+    """Returns a config in which `value` is at `keys`; what does not change is shared."""
+    key, *rest = keys
+    if not rest:
+        return config | {key: value}
+    section = config.get(key)
+    return config | {key: _changed(section if isinstance(section, dict) else {}, rest, value)}
+
+
+def _search_path(config_dir: str | None) -> ConfigSearchPathImpl:
+    """Returns where Hydra will look: conf/, plugins, and the folder of `--config-dir`.
+
+    Raises:
+        UsageError: there is no such folder.
+    """
+    path: Any = create_config_search_path(str(CONF_DIR))
+    if config_dir is not None:
+        folder = Path(config_dir).absolute()
+        if not folder.is_dir():
+            raise UsageError(f"--config-dir: there is no folder {folder}")
+        path.prepend("command-line", f"file://{folder}", SearchPathQuery(provider="schema"))
+    return path
+
+
+def _check_plugins(hydra: DictConfig) -> None:
+    """Refuses a launcher or sweeper of `conf/hydra/` whose package is not installed."""
+    for part in ("launcher", "sweeper"):
+        package = ".".join(str(hydra[part]["_target_"]).split(".")[:2])
+        if package.startswith("hydra_plugins.") and find_spec(package) is None:
+            name = package.split(".")[1].replace("_", "-")
+            raise UsageError(
+                f"hydra/{part}={hydra.runtime.choices[f'hydra/{part}']} needs a package that is "
+                f"not installed: pip install {name}"
+            )

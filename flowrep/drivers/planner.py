@@ -1,0 +1,166 @@
+"""A privileged driver: sees every pose, knows where everyone will walk, and searches ahead.
+
+It is the upper bound that a scene is measured by, not an agent: it plays the episode's own
+clockwork forward, from the present to the ending zone, and keeps a broad beam of drives that
+touch nothing.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from flowrep.envs.episode import Episode, Rules
+from flowrep.envs.street_env import StreetEnv
+from flowrep.scenes.goal_distance import GoalDistance, free_ground
+from flowrep.scenes.people import RADIUS_M as PERSON_RADIUS_M
+from flowrep.scenes.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
+
+Array = NDArray[Any]
+_ACTIONS = np.array([0, 1, 2])
+_HOLD_STEPS = 2  # one decision of the search, in steps
+_MARGIN_M = 0.1  # kept from people and from the road's edge
+_LOOK_AHEAD_M = 6.0
+# States of one cell are as good as one another: x, y in metres, yaw and yaw rate in degrees.
+_CELL = np.array([0.5, 0.5, 4.0, 6.0])
+
+
+class Planner:
+    """Chooses the action of a planned drive; plans anew where its actions were not taken.
+
+    Args:
+        beams: how many drives are kept side by side; a broader beam is tried where all of a
+            narrower one's end before the ending zone.
+    """
+
+    def __init__(self, beams: Sequence[int] = (100, 600)) -> None:
+        """Starts without a plan."""
+        self.beams = tuple(beams)
+        self._ways: dict[tuple[Rules, str], GoalDistance] = {}
+        self._plan: dict[int, int] = {}
+        self._episode: Episode | None = None
+        self._expected = (0, 0.0)  # steps and yaw rate, should the action be taken
+
+    def __call__(self, env: StreetEnv) -> int:
+        """Returns the action for the env's running episode."""
+        episode = env.episode
+        state = episode.now.vehicle
+        is_followed = episode is self._episode and self._expected == (
+            episode.steps,
+            state.yaw_rate_rps,
+        )
+        if not (is_followed and episode.steps in self._plan):
+            self._episode = episode
+            actions = self.search(episode)
+            self._plan = {episode.steps + i: action for i, action in enumerate(actions)}
+        action = self._plan.get(episode.steps, NO_OP)
+        rules = episode.rules
+        turned = turn(state, YAW_SIGN[action], rules.dt_s, rules.layout.scene.vehicle)
+        self._expected = (episode.steps + 1, turned.yaw_rate_rps)
+        return action
+
+    def search(self, episode: Episode) -> list[int]:
+        """Returns the actions of a drive to the ending zone, else of the longest one found."""
+        search = _Search(episode, self._way(episode))
+        actions: list[int] = []
+        for beam in self.beams:
+            found, is_complete = search.run(beam)
+            actions = max(actions, found, key=len)
+            if is_complete:
+                return found
+        return actions
+
+    def _way(self, episode: Episode) -> GoalDistance:
+        key = (episode.rules, episode.path.name)
+        if key not in self._ways:
+            free = free_ground(episode.rules.layout, episode.path)
+            self._ways[key] = GoalDistance(free, episode.goal)
+        return self._ways[key]
+
+
+class _Search:
+    """The clockwork of one episode for many vehicles at once."""
+
+    def __init__(self, episode: Episode, way: GoalDistance) -> None:
+        self.episode, self.way = episode, way
+        self.rules, self.vehicle = episode.rules, episode.rules.layout.scene.vehicle
+        self.free = free_ground(self.rules.layout, episode.path)
+
+    def run(self, beam: int) -> tuple[list[int], bool]:
+        """Returns the actions of the best drive found, and whether it arrives."""
+        episode = self.episode
+        state = VehicleState(*(np.array([value]) for value in episode.now.vehicle))
+        steps, ticks = episode.steps, episode.now.ticks
+        history: list[tuple[Array, Array]] = []
+        while steps < episode.rules.limit_steps:
+            parents = np.repeat(np.arange(state.x_m.size), len(_ACTIONS))
+            actions = np.tile(_ACTIONS, state.x_m.size)
+            state = VehicleState(*(value[parents] for value in state))
+            state, alive, arrived = self.drive(state, actions, ticks)
+            steps, ticks = steps + _HOLD_STEPS, ticks + _HOLD_STEPS * episode.rules.ticks_a_step
+            kept = np.flatnonzero(arrived)[:1] if arrived.any() else self.best(state, alive, beam)
+            if not kept.size:
+                break
+            history.append((parents[kept], actions[kept]))
+            state = VehicleState(*(value[kept] for value in state))
+            if arrived.any():
+                return _trace(history), True
+        return _trace(history), False
+
+    def drive(
+        self, state: VehicleState, actions: Array, ticks: int
+    ) -> tuple[VehicleState, Array, Array]:
+        """Returns the states after one decision, who is unharmed, and who has arrived."""
+        alive = np.ones(actions.size, dtype=bool)
+        arrived = np.zeros(actions.size, dtype=bool)
+        signs = np.array(YAW_SIGN)[actions]
+        for _ in range(_HOLD_STEPS):
+            state = turn(state, signs, self.rules.dt_s, self.vehicle)
+            for _ in range(self.rules.ticks_a_step):
+                state = roll(state, self.rules.tick_s, self.episode.vehicle_speed_mps)
+                ticks += 1
+                alive &= arrived | ~self._touches(state, ticks)
+                corners = footprint_corners(state, self.vehicle, _MARGIN_M)
+                inside = shapely.contains_xy(self.free, corners[..., 0], corners[..., 1])
+                alive &= arrived | inside.all(axis=-1)
+                arrived |= alive & shapely.contains_xy(self.episode.goal, state.x_m, state.y_m)
+        return state, alive, arrived
+
+    def best(self, state: VehicleState, alive: Array, most: int) -> Array:
+        """Returns the numbers of the most promising states, one of each cell."""
+        index = np.flatnonzero(alive)
+        x, y, yaw, rate = (value[index] for value in state)
+        ahead = [_LOOK_AHEAD_M * share for share in (0.5, 1.0)]
+        to_go = sum(self.way(x + d * np.cos(yaw), y + d * np.sin(yaw)) for d in ahead)
+        order = np.argsort(np.minimum(to_go, 1e6) + 0.02 * np.abs(np.degrees(rate)), kind="stable")
+        features = np.stack([x, y, np.degrees(yaw), np.degrees(rate)], axis=-1)[order]
+        cells = np.round(features / _CELL).astype(np.int64)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        return index[order[np.sort(first)[:most]]]
+
+    def _touches(self, state: VehicleState, ticks: int) -> Array:
+        people = self.episode.crowd.positions(ticks * self.rules.tick_s)
+        reach = self.vehicle.length_m + self.vehicle.width_m
+        low = np.array([state.x_m.min(), state.y_m.min()]) - reach
+        high = np.array([state.x_m.max(), state.y_m.max()]) + reach
+        people = people[((people > low) & (people < high)).all(axis=-1)]
+        # How far each person is from each footprint, in the vehicle's axes.
+        dx = people[:, 0] - state.x_m[:, None]
+        dy = people[:, 1] - state.y_m[:, None]
+        cosine, sine = np.cos(state.yaw_rad)[:, None], np.sin(state.yaw_rad)[:, None]
+        ahead = np.abs(cosine * dx + sine * dy) - self.vehicle.length_m / 2
+        aside = np.abs(cosine * dy - sine * dx) - self.vehicle.width_m / 2
+        gap = np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
+        return (gap < PERSON_RADIUS_M + _MARGIN_M).any(axis=-1)
+
+
+def _trace(history: list[tuple[Array, Array]]) -> list[int]:
+    """Returns the actions that lead to the first state of the last level, step by step."""
+    actions: list[int] = []
+    at = 0
+    for parents, chosen in reversed(history):
+        actions += [int(chosen[at])] * _HOLD_STEPS
+        at = int(parents[at])
+    return actions[::-1]

@@ -1,0 +1,115 @@
+"""Refuses a scene whose parts contradict each other: names that nobody has, keys that don't fit."""
+
+from collections import Counter
+from collections.abc import Iterable
+
+from flowrep.palette import CATEGORY_ID
+from flowrep.scenes.people import PARTS
+from flowrep.scenes.scene import CATEGORY_OF_KIND, PedestrianGroup, Piece, Scene
+from flowrep.scenes.schema import SceneError
+
+_KEYS_OF_WALK = {
+    "across": ("road", "at_m"),
+    "along": ("road", "from_m", "to_m"),
+    "points": ("points_m",),
+}
+
+
+def check_consistency(scene: Scene, source: str) -> None:
+    """Makes sure that every name is known and every part complete.
+
+    Raises:
+        SceneError: names the key and what to do.
+    """
+    _check_camera_and_people(scene, source)
+    _check_unique(scene, source)
+    _check_categories(scene, source)
+    _check_references(scene, source)
+    for road in scene.roads:
+        for i, piece in enumerate(road.pieces):
+            _check_piece(piece, source, f"roads.{road.name}.pieces[{i}]")
+    for group in scene.pedestrian_groups:
+        _check_walk(group, [road.name for road in scene.roads], source)
+
+
+def _check_camera_and_people(scene: Scene, source: str) -> None:
+    if scene.camera.far_m <= scene.camera.near_m:
+        raise SceneError(source, "camera.far_m", "is not beyond near_m", "give a larger far_m")
+    if len(PARTS) * scene.num_pedestrians > 255:
+        problem = (
+            f"{scene.num_pedestrians} people, but their {len(PARTS)} parts each have 8-bit ids"
+        )
+        raise SceneError(source, "pedestrian_groups", problem, f"keep to {255 // len(PARTS)}")
+    for group in scene.pedestrian_groups:
+        if group.standing > group.count:
+            key = f"pedestrian_groups.{group.name}.standing"
+            raise SceneError(source, key, f"is {group.standing}", f"stay in 0..{group.count}")
+
+
+def _check_piece(piece: Piece, source: str, key: str) -> None:
+    arc = (piece.arc_radius_m, piece.arc_deg)
+    is_straight = piece.straight_m is not None and arc == (None, None)
+    is_arc = piece.straight_m is None and None not in arc
+    if not (is_straight or is_arc):
+        remedy = "give straight_m alone, or arc_radius_m and arc_deg"
+        raise SceneError(source, key, "neither a straight piece nor an arc", remedy)
+    if piece.arc_deg == 0:
+        raise SceneError(source, f"{key}.arc_deg", "is 0", "give straight_m, or a turn")
+
+
+def _check_categories(scene: Scene, source: str) -> None:
+    _known(source, "categories", scene.categories, CATEGORY_ID)
+    used = {
+        "scene": ["sky", "road"],
+        "obstacles": [CATEGORY_OF_KIND[o.kind] for o in scene.obstacles],
+        "obstacle_rows": [CATEGORY_OF_KIND[row.kind] for row in scene.obstacle_rows],
+        "crosswalks": ["crosswalk"] * bool(scene.crosswalks),
+        "terrain_m": ["terrain"] * (scene.terrain_m > 0),
+        "roads": ["sidewalk"] * any(road.sidewalk_m > 0 for road in scene.roads),
+        "pedestrian_groups": ["pedestrian"] * bool(scene.pedestrian_groups),
+        "building_rows or closures": ["building"] * bool(scene.building_rows or scene.closures),
+    }
+    for key, names in used.items():
+        _known(source, key, names, scene.categories)
+
+
+def _check_unique(scene: Scene, source: str) -> None:
+    listed = {"categories": list(scene.categories)}
+    for part in ("roads", "zones", "paths", "pedestrian_groups", "closures"):
+        listed[part] = [item.name for item in getattr(scene, part)]
+    for key, names in listed.items():
+        for name, count in Counter(names).items():
+            if count > 1:
+                raise SceneError(source, key, f"two are named {name!r}", "rename one of them")
+
+
+def _check_references(scene: Scene, source: str) -> None:
+    roads = [road.name for road in scene.roads]
+    zones = [zone.name for zone in scene.zones]
+    closures = [closure.name for closure in scene.closures]
+    for zone in scene.zones:
+        _known(source, f"zones.{zone.name}.road", [zone.road], roads)
+    for path in scene.paths:
+        _known(source, f"paths.{path.name}", [path.start, path.end], zones)
+        _known(source, f"paths.{path.name}.closures", path.closures, closures)
+    for key in ("building_rows", "obstacle_rows", "closures", "crosswalks"):
+        for i, item in enumerate(getattr(scene, key)):
+            _known(source, f"{key}[{i}].road", [item.road], roads)
+
+
+def _check_walk(group: PedestrianGroup, roads: list[str], source: str) -> None:
+    key = f"pedestrian_groups.{group.name}.walk"
+    needed = _KEYS_OF_WALK[group.walk.kind]
+    for name in needed:
+        if getattr(group.walk, name) in (None, ()):
+            remedy = f"a walk of kind {group.walk.kind!r} needs {', '.join(needed)}"
+            raise SceneError(source, f"{key}.{name}", "missing key", remedy)
+    if group.walk.road is not None:
+        _known(source, f"{key}.road", [group.walk.road], roads)
+
+
+def _known(source: str, key: str, names: Iterable[str], known: Iterable[str]) -> None:
+    known = list(known)
+    for name in names:
+        if name not in known:
+            raise SceneError(source, key, f"unknown name {name!r}", f"choose from {known}")

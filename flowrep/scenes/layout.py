@@ -1,0 +1,275 @@
+"""A scene laid out on the ground: polygons, boxes and walking lines, computed once from its data.
+
+Convention: world metres, x forward at yaw 0, yaw counter-clockwise.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+import shapely.ops
+from numpy.typing import NDArray
+from shapely.geometry import LineString, Polygon
+from shapely.geometry.base import BaseGeometry
+
+from flowrep.scenes.scene import (
+    CATEGORY_OF_KIND,
+    BuildingRow,
+    Closure,
+    Crosswalk,
+    Kind,
+    ObstacleRow,
+    Road,
+    Scene,
+    Walk,
+    Zone,
+)
+from flowrep.scenes.vehicle import VehicleState
+from flowrep.scenes.walks import parallel, without_repeats
+
+Array = NDArray[np.float64]
+_ARC_STEP_DEG = 5.0
+_TOUCH_M = 0.05  # houses of a row stand wall to wall
+_PLOT_STEP_M = 0.5
+
+
+@dataclass(frozen=True)
+class Box:
+    """What stands upright on the ground and can be hit: kind, centre, heading, size, variant.
+
+    Convention: `size_m` is (length, width, height), length runs along the heading. A house shows
+    its front to its right. The variant is any number; it chooses between looks.
+    """
+
+    kind: Kind
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    size_m: tuple[float, float, float]
+    variant: int = 0
+
+    @property
+    def category(self) -> str:
+        """The class in the semantic map."""
+        return CATEGORY_OF_KIND[self.kind]
+
+    @cached_property
+    def footprint(self) -> Polygon:
+        """The rectangle that the box covers."""
+        forward, left = self.size_m[0] / 2, self.size_m[1] / 2
+        sine, cosine = math.sin(self.yaw_rad), math.cos(self.yaw_rad)
+        return Polygon(
+            [
+                (self.x_m + cosine * u - sine * v, self.y_m + sine * u + cosine * v)
+                for u, v in ((forward, left), (-forward, left), (-forward, -left), (forward, -left))
+            ]
+        )
+
+
+class CrosswalkArea(NamedTuple):
+    """The ground of a crosswalk and the heading of the road that it crosses."""
+
+    polygon: Polygon
+    heading_rad: float
+
+
+def centreline(road: Road) -> LineString:
+    """Returns a road's centreline, arcs sampled every few degrees."""
+    (x, y), heading = road.start_m, math.radians(road.heading_deg)
+    points = [(x, y)]
+    for piece in road.pieces:
+        if piece.straight_m is not None:
+            lengths, turn = [piece.straight_m], 0.0
+        else:
+            assert piece.arc_radius_m is not None
+            assert piece.arc_deg is not None
+            count = max(1, math.ceil(abs(piece.arc_deg) / _ARC_STEP_DEG))
+            turn = math.radians(piece.arc_deg) / count
+            lengths = [2 * piece.arc_radius_m * math.sin(abs(turn) / 2)] * count
+        for length in lengths:
+            x += length * math.cos(heading + turn / 2)
+            y += length * math.sin(heading + turn / 2)
+            heading += turn
+            points.append((x, y))
+    return LineString(points)
+
+
+def centrelines(scene: Scene) -> dict[str, LineString]:
+    """Returns the centreline of every road, by name."""
+    return {road.name: centreline(road) for road in scene.roads}
+
+
+def _with_round_corners(ground: BaseGeometry, radius_m: float) -> BaseGeometry:
+    # Widening and narrowing again fills the corners that point inwards.
+    return ground.buffer(radius_m).buffer(-radius_m) if radius_m > 0 else ground
+
+
+def ribbon(line: LineString, half_width_m: float) -> Polygon:
+    """Returns the ground within `half_width_m` of a line, cut square at its ends."""
+    return line.buffer(half_width_m, cap_style="flat", join_style="mitre")
+
+
+class Layout:
+    """The ground plan of one scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Lays out roads, zones, buildings and obstacles."""
+        self.scene = scene
+        self.lines = centrelines(scene)
+        self._roads = {road.name: road for road in scene.roads}
+        self._walks: dict[Walk, Array] = {}
+        self.ribbons = {
+            road.name: ribbon(self.lines[road.name], road.width_m / 2) for road in scene.roads
+        }
+        wide = [
+            ribbon(self.lines[road.name], road.width_m / 2 + road.sidewalk_m)
+            for road in scene.roads
+        ]
+        radius = scene.corner_radius_m
+        self.drivable = _with_round_corners(shapely.union_all([*self.ribbons.values()]), radius)
+        paved = shapely.union_all([*wide, _with_round_corners(shapely.union_all(wide), radius)])
+        self._paved = shapely.union(paved, self.drivable)
+        self.sidewalks = self._paved.difference(self.drivable)
+        self.terrain = self._terrain(scene.terrain_m)
+        self.crosswalks = tuple(self._crosswalk_area(crosswalk) for crosswalk in scene.crosswalks)
+        self.zones = {zone.name: self._zone_polygon(zone) for zone in scene.zones}
+        self.closures = {closure.name: self._closure_box(closure) for closure in scene.closures}
+        self.buildings = self._buildings()
+        single = [
+            Box(o.kind, *o.center_m, math.radians(o.yaw_deg), o.size_m, i)
+            for i, o in enumerate(scene.obstacles)
+        ]
+        rows = [self._obstacle_row(row) for row in scene.obstacle_rows]
+        self.obstacles = (*single, *(box for row in rows for box in row))
+        shapely.prepare(self.drivable)
+
+    def pose_at(self, road: str, at_m: float, offset_m: float = 0.0) -> tuple[float, float, float]:
+        """Returns x, y and heading at a distance along a road, `offset_m` to its left."""
+        line = self.lines[road]
+        step = min(0.05, line.length / 4)
+        middle = min(max(at_m, step), line.length - step)
+        behind, ahead = (line.interpolate(middle + sign * step) for sign in (-1, 1))
+        heading = math.atan2(ahead.y - behind.y, ahead.x - behind.x)
+        point = line.interpolate(at_m)
+        return (
+            point.x - offset_m * math.sin(heading),
+            point.y + offset_m * math.cos(heading),
+            heading,
+        )
+
+    def width_m(self, road: str) -> float:
+        """Returns how wide a road is, without its sidewalks."""
+        return self._roads[road].width_m
+
+    def start_state(self, zone_name: str) -> VehicleState:
+        """Returns the vehicle at rest in its yaw, in the middle of a start zone."""
+        zone = next(zone for zone in self.scene.zones if zone.name == zone_name)
+        x, y, heading = self.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
+        return VehicleState(x, y, heading + (math.pi if zone.reverse else 0.0), 0.0)
+
+    def walk_line(self, walk: Walk, lateral_m: float = 0.0) -> Array:
+        """Returns the points [M, 2] of a walk, moved `lateral_m` to the left of its direction."""
+        if walk not in self._walks:
+            self._walks[walk] = without_repeats(self._walk_points(walk))
+        return parallel(self._walks[walk], lateral_m)
+
+    def _walk_points(self, walk: Walk) -> Array:
+        if walk.kind == "points":
+            return np.array(walk.points_m)
+        assert walk.road is not None
+        if walk.kind == "along":
+            assert walk.from_m is not None
+            assert walk.to_m is not None
+            part = shapely.ops.substring(self.lines[walk.road], walk.from_m, walk.to_m)
+            return parallel(without_repeats(np.array(part.coords)), walk.offset_m)
+        assert walk.at_m is not None
+        road = self._roads[walk.road]
+        # A stride is kept from the house fronts.
+        reach = road.width_m / 2 + road.sidewalk_m - 0.5
+        # From the right-hand sidewalk to the left-hand one: its left is back along the road.
+        ends = [self.pose_at(walk.road, walk.at_m, side * reach) for side in (-1, 1)]
+        return np.array([end[:2] for end in ends])
+
+    def _zone_polygon(self, zone: Zone) -> Polygon:
+        part = shapely.ops.substring(self.lines[zone.road], zone.from_m, zone.to_m)
+        return ribbon(part, self._roads[zone.road].width_m / 2)
+
+    def _closure_box(self, closure: Closure) -> Box:
+        road = self._roads[closure.road]
+        x, y, heading = self.pose_at(closure.road, closure.at_m)
+        width = road.width_m + 2 * road.sidewalk_m
+        size = (width, closure.depth_m, closure.height_m)
+        return Box("house", x, y, heading - math.pi / 2, size)
+
+    def _terrain(self, reach_m: float) -> BaseGeometry:
+        if reach_m <= 0:
+            return Polygon()
+        return shapely.box(*self._paved.bounds).buffer(reach_m).difference(self._paved)
+
+    def _crosswalk_area(self, crosswalk: Crosswalk) -> CrosswalkArea:
+        first, last = (crosswalk.at_m + side * crosswalk.depth_m / 2 for side in (-1, 1))
+        part = shapely.ops.substring(self.lines[crosswalk.road], first, last)
+        _, _, heading = self.pose_at(crosswalk.road, crosswalk.at_m)
+        return CrosswalkArea(ribbon(part, self._roads[crosswalk.road].width_m / 2), heading)
+
+    def _buildings(self) -> tuple[Box, ...]:
+        rng = np.random.default_rng(self.scene.layout_seed)
+        boxes: list[Box] = []
+        for row in self.scene.building_rows:
+            if row.side in ("start", "end"):
+                boxes.append(self._house_across(row, rng))
+            else:
+                self._add_building_row(row, rng, boxes)
+        return tuple(boxes)
+
+    def _is_free(self, box: Box, houses: list[Box]) -> bool:
+        ground = box.footprint.buffer(-_TOUCH_M)
+        taken = [self._paved, *(house.footprint for house in houses)]
+        return not shapely.intersects(ground, taken).any()
+
+    def _house_across(self, row: BuildingRow, rng: np.random.Generator) -> Box:
+        at = self.lines[row.road].length if row.side == "end" else 0.0
+        x, y, heading = self.pose_at(row.road, at)
+        depth, front = rng.uniform(*row.depth_m), rng.uniform(*row.front_m)
+        away = (row.setback_m + depth / 2) * (1 if row.side == "end" else -1)
+        x, y = x + away * math.cos(heading), y + away * math.sin(heading)
+        size = (front, depth, rng.uniform(*row.height_m))
+        facing = heading + math.pi / 2 * (-1 if row.side == "end" else 1)
+        return Box("house", x, y, facing, size, int(rng.integers(1 << 16)))
+
+    def _add_building_row(
+        self, row: BuildingRow, rng: np.random.Generator, houses: list[Box]
+    ) -> None:
+        side = 1.0 if row.side == "left" else -1.0
+        edge = self._roads[row.road].width_m / 2 + row.setback_m
+        at = row.from_m
+        while at < row.to_m:
+            front, depth = rng.uniform(*row.front_m), rng.uniform(*row.depth_m)
+            size = (front, depth, rng.uniform(*row.height_m))
+            offset = side * (edge + rng.uniform(0.0, 0.8) + depth / 2)
+            variant = int(rng.integers(1 << 16))
+            while at < row.to_m:  # to the next place that is free
+                x, y, heading = self.pose_at(row.road, at + front / 2, offset)
+                facing = heading + (0.0 if row.side == "left" else math.pi)
+                house = Box("house", x, y, facing, size, variant)
+                if self._is_free(house, houses):
+                    houses.append(house)
+                    at += front
+                    break
+                at += _PLOT_STEP_M
+
+    def _obstacle_row(self, row: ObstacleRow) -> Iterator[Box]:
+        taken = [
+            self.drivable.difference(self.ribbons[row.road]),
+            *(box.footprint for box in self.buildings),
+        ]
+        facing = math.pi if row.offset_m > 0 else 0.0
+        for i, at in enumerate(np.arange(row.from_m, row.to_m, row.every_m).tolist()):
+            x, y, heading = self.pose_at(row.road, at, row.offset_m)
+            box = Box(row.kind, x, y, heading + facing, row.size_m, i)
+            if not shapely.intersects(box.footprint, taken).any():
+                yield box

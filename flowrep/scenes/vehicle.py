@@ -1,0 +1,80 @@
+"""The vehicle: constant speed, three actions that change its yaw rate, a rectangular footprint."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.scenes.fields import Part, TurnRate, VehicleSize, VehicleSpeed
+
+NO_OP, TURN_LEFT, TURN_RIGHT = 0, 1, 2
+YAW_SIGN = (0.0, 1.0, -1.0)  # by action; left is counter-clockwise
+
+
+@dataclass(frozen=True)
+class VehicleConfig(Part):
+    """Footprint, speed and turning of the vehicle."""
+
+    length_m: VehicleSize
+    width_m: VehicleSize
+    height_m: VehicleSize
+    speed_mps: VehicleSpeed
+    yaw_acceleration_dps2: TurnRate
+    max_yaw_rate_dps: TurnRate
+
+
+class VehicleState(NamedTuple):
+    """Pose of the footprint's centre and yaw rate; scalars, or arrays of one shape."""
+
+    x_m: Any
+    y_m: Any
+    yaw_rad: Any
+    yaw_rate_rps: Any
+
+
+def turn(state: VehicleState, sign: Any, dt_s: float, vehicle: VehicleConfig) -> VehicleState:
+    """Returns the state with its yaw rate changed by `sign`·α·Δt, within its limit.
+
+    `sign` is `YAW_SIGN` of the action; where the state's fields are arrays, so is it.
+    """
+    limit = math.radians(vehicle.max_yaw_rate_dps)
+    rate = state.yaw_rate_rps + sign * (math.radians(vehicle.yaw_acceleration_dps2) * dt_s)
+    if isinstance(rate, np.ndarray):
+        rate = np.clip(rate, -limit, limit)
+    else:
+        rate = min(max(rate, -limit), limit)
+    return state._replace(yaw_rate_rps=rate)
+
+
+def roll(state: VehicleState, dt_s: float, speed_mps: float) -> VehicleState:
+    """Returns the state after `dt_s` on the circular arc of its yaw rate, exactly."""
+    xp: Any = np if isinstance(state.yaw_rate_rps, np.ndarray) else math
+    angle = state.yaw_rate_rps * dt_s
+    # The chord of an arc of length d and angle a is d·sin(a/2)/(a/2), along the mean heading. For
+    # no angle a tiny one stands in, whose quotient is 1.
+    half = 0.5 * angle
+    half_or_tiny = half + (half == 0.0) * 1e-20
+    chord = speed_mps * dt_s * (xp.sin(half_or_tiny) / half_or_tiny)
+    heading = state.yaw_rad + half
+    return VehicleState(
+        state.x_m + chord * xp.cos(heading),
+        state.y_m + chord * xp.sin(heading),
+        state.yaw_rad + angle,
+        state.yaw_rate_rps,
+    )
+
+
+def footprint_corners(
+    state: VehicleState, vehicle: VehicleConfig, margin_m: float = 0.0
+) -> NDArray[np.float64]:
+    """Returns the footprint's corners [..., 4, 2], counter-clockwise, widened by `margin_m`."""
+    half_length = vehicle.length_m / 2 + margin_m
+    half_width = vehicle.width_m / 2 + margin_m
+    forward = half_length * np.array([1.0, -1.0, -1.0, 1.0])
+    left = half_width * np.array([1.0, 1.0, -1.0, -1.0])
+    sine, cosine = np.sin(state.yaw_rad)[..., None], np.cos(state.yaw_rad)[..., None]
+    x = np.asarray(state.x_m)[..., None] + cosine * forward - sine * left
+    y = np.asarray(state.y_m)[..., None] + sine * forward + cosine * left
+    return np.stack([x, y], axis=-1)

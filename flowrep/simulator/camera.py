@@ -1,0 +1,78 @@
+"""The simulated pinhole camera: intrinsics, OpenGL matrices, depth in metres.
+
+Convention: camera axes are OpenCV's (x right, y down, z forward), pixel (0, 0)'s centre is
+(0.5, 0.5), depth is metres along z.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.scenes.camera import CameraConfig
+
+Matrix = NDArray[np.float64]
+_GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def sampled_intrinsics(fx_px: float, fy_px: float, height_px: int, width_px: int) -> Matrix:
+    """Returns the K [3, 3] at which PyBullet's software renderer takes its samples.
+
+    Convention: pixel (column i, row j) is asked for at (i + 0.5, j + 0.5). The renderer takes its
+    sample at (i, j + 1) of a camera whose principal point is (W / 2, H / 2), so that the K which
+    puts unprojected points on the true surfaces has its principal point moved by (+0.5, -0.5).
+    `tests/envs/test_camera.py` measures that.
+    """
+    return np.array(
+        [
+            [fx_px, 0.0, width_px / 2 + 0.5],
+            [0.0, fy_px, height_px / 2 - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def gl_projection(
+    fx_px: float, fy_px: float, height_px: int, width_px: int, near_m: float, far_m: float
+) -> list[float]:
+    """Returns the 16 numbers, column by column, of the OpenGL projection of a centred camera."""
+    depth_sum, depth_gap = far_m + near_m, far_m - near_m
+    rows = np.array(
+        [
+            [2 * fx_px / width_px, 0.0, 0.0, 0.0],
+            [0.0, 2 * fy_px / height_px, 0.0, 0.0],
+            [0.0, 0.0, -depth_sum / depth_gap, -2 * far_m * near_m / depth_gap],
+            [0.0, 0.0, -1.0, 0.0],
+        ]
+    )
+    return rows.T.ravel().tolist()
+
+
+def gl_view(cam_from_world: Matrix) -> list[float]:
+    """Returns the 16 numbers, column by column, of the OpenGL view matrix (y up, z backward)."""
+    return (_GL_FROM_CV @ cam_from_world).T.ravel().tolist()
+
+
+def vehicle_from_camera(camera: CameraConfig) -> Matrix:
+    """Returns the camera's mount [4, 4]: camera axes into the vehicle's (x forward, z up)."""
+    pitch = math.radians(camera.pitch_deg)
+    sine, cosine = math.sin(pitch), math.cos(pitch)
+    return np.array(
+        [
+            [0.0, sine, cosine, camera.mount_forward_m],
+            [-1.0, 0.0, 0.0, 0.0],
+            [0.0, -cosine, sine, camera.mount_height_m],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def depth_from_zbuffer(
+    zbuffer: NDArray[np.float32], near_m: float, far_m: float
+) -> NDArray[np.float32]:
+    """Returns metres along z for OpenGL depth-buffer values in [0, 1], of the same shape."""
+    # far - (far - near)·z would cancel near z = 1, where 1 - z is exact in float32.
+    gap = np.float32(1.0) - zbuffer
+    gap *= np.float32(far_m - near_m)
+    gap += np.float32(near_m)
+    return np.divide(np.float32(far_m * near_m), gap, out=gap)

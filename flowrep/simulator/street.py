@@ -1,0 +1,249 @@
+"""A laid-out scene as bodies in the simulator: what the camera sees and the vehicle can hit."""
+
+import math
+import pickle
+import threading
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
+from flowrep.palette import CATEGORY_ID
+from flowrep.scenes import people
+from flowrep.scenes.layout import Box, Layout
+from flowrep.scenes.safe_ground import SafeGround
+from flowrep.scenes.scene import Scene
+from flowrep.scenes.vehicle import VehicleState
+from flowrep.simulator import furniture, meshes, paint
+from flowrep.simulator.bullet import Simulator
+from flowrep.simulator.person import person_meshes
+from flowrep.simulator.triangles import Body, gather
+
+Array = NDArray[Any]
+_BEHIND_M = 2.0  # behind the vehicle nobody is seen, wherever on it the camera is
+_TWO_LANES_M = 5.0  # a narrower road has no marks along its middle
+_BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
+
+
+class Solid(NamedTuple):
+    """Boxes that stand still and are one body."""
+
+    body: int
+    category: str
+    boxes: tuple[Box, ...]
+    number: int  # of `Street.bodies`
+
+
+class Solids(NamedTuple):
+    """What can be hit while some exits are closed, box by box, and which bodies are there."""
+
+    owners: tuple[Solid, ...]
+    centres: Array  # [B, 2]
+    reaches_m: Array  # [B], within which the vehicle may touch a box
+    is_shown: Array  # of `Street.bodies`
+
+
+class Street:
+    """The bodies of one scene, for all environments of a process that drive through it.
+
+    It keeps no account of an episode: who asks says where the vehicle and everyone is and which
+    exits are closed. A PyBullet client of its own takes 28 MB, so that each environment shares one.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        """Builds every body of the scene in a simulator."""
+        self.layout = layout
+        self.is_calm = SafeGround(layout)
+        self.lock = threading.RLock()  # held from placing bodies to looking at them
+        self.users = 0
+        self.simulator = Simulator(paint.picture())
+        self.bodies: list[Body] = []
+        vehicle = layout.scene.vehicle
+        self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
+        self._vehicle_reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
+        self._person_reach_m = self._vehicle_reach_m + people.RADIUS_M
+        self._person = self.simulator.add_cylinder(people.RADIUS_M, people.HEIGHT_M)
+        self._solids: list[Solid] = []
+        self._add_ground(layout)
+        self._add_solids(layout)
+        self._closures = {name: self._add_closure(box) for name, box in layout.closures.items()}
+        count = layout.scene.num_pedestrians
+        meshes_of_all = [mesh for i in range(count) for mesh in person_meshes(i)]
+        parts = [
+            self._add_body(mesh, "pedestrian", instance=number)
+            for number, mesh in enumerate(meshes_of_all, start=1)
+        ]
+        self._parts = np.array(parts, dtype=int).reshape(count, len(people.PARTS))
+        self._placed = np.full((count, 4), np.nan)  # where everyone's parts were last put
+        self.triangles = gather(self.bodies)
+        self._solids_while_closed: dict[tuple[str, ...], Solids] = {}
+        self._closed: tuple[str, ...] | None = None
+        self.close_exits(())
+
+    @classmethod
+    def shared(cls, scene: Scene) -> "Street":
+        """Returns the street that all open environments of the process with this scene share."""
+        key = pickle.dumps(scene)
+        street = _STREETS.get(key)
+        if street is None:
+            street = _STREETS[key] = cls(Layout(scene))
+        street.users += 1
+        return street
+
+    def leave(self) -> None:
+        """Gives the simulator's client back when the last environment that shares it leaves."""
+        self.users -= 1
+        if self.users == 0:
+            self.simulator.close()
+            for key in [key for key, street in _STREETS.items() if street is self]:
+                del _STREETS[key]
+
+    def solids(self, closures: tuple[str, ...]) -> Solids:
+        """Returns what can be hit and seen while the closures of these names are up."""
+        if closures not in self._solids_while_closed:
+            solids = [*self._solids, *(self._closures[name] for name in closures)]
+            boxes = [box for solid in solids for box in solid.boxes]
+            reaches = [math.hypot(*box.size_m[:2]) / 2 for box in boxes]
+            is_shown = np.ones(len(self.bodies), dtype=bool)
+            for name, solid in self._closures.items():
+                is_shown[solid.number] = name in closures
+            self._solids_while_closed[closures] = Solids(
+                tuple(solid for solid in solids for _ in solid.boxes),
+                np.array([(box.x_m, box.y_m) for box in boxes]).reshape(-1, 2),
+                np.array(reaches) + self._vehicle_reach_m,
+                is_shown,
+            )
+        return self._solids_while_closed[closures]
+
+    def close_exits(self, closures: tuple[str, ...]) -> None:
+        """Puts up the closures that are named and takes away all others."""
+        if closures == self._closed:
+            return
+        for name, solid in self._closures.items():
+            if name in closures:
+                self.simulator.place(solid.body, 0.0, 0.0, 0.0)
+            else:
+                self.simulator.hide(solid.body)
+        self._closed = closures
+
+    def place_pedestrians(self, poses: Array, viewer: VehicleState) -> None:
+        """Puts everyone at their pose [P, 4] who has moved and is, or was last put, in view."""
+        ahead = np.array([math.cos(viewer.yaw_rad), math.sin(viewer.yaw_rad)])
+        eye = np.array([viewer.x_m, viewer.y_m])
+        behind = ((poses[:, :2] - eye) @ ahead < -_BEHIND_M) & (
+            (self._placed[:, :2] - eye) @ ahead < -_BEHIND_M
+        )
+        due = np.flatnonzero((poses != self._placed).any(axis=-1) & ~behind)
+        if due.size:
+            places = people.place_parts(poses[due])
+            self.simulator.place_all(
+                self._parts[due].ravel().tolist(),
+                places.positions.reshape(-1, 3),
+                places.quaternions_xyzw.reshape(-1, 4),
+            )
+            self._placed[due] = poses[due]
+
+    def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
+        """Returns when someone is near enough to be touched [T].
+
+        Args:
+            track: where the vehicle is, T times.
+            poses: where everyone is then, poses [T, P, 4].
+        """
+        centres = np.array([state[:2] for state in track])
+        gaps = poses[..., :2] - centres[:, None]
+        return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)
+
+    def hit(self, state: VehicleState, poses: Array, closures: tuple[str, ...]) -> str:
+        """Returns the category of what the vehicle overlaps, or "".
+
+        Only what is near enough to be touched is put before the simulator's collision oracle.
+
+        Args:
+            state: where the vehicle is.
+            poses: where everyone is, poses [P, 4].
+            closures: names of those that are up.
+        """
+        gaps = np.hypot(poses[:, 0] - state.x_m, poses[:, 1] - state.y_m)
+        people_near = np.flatnonzero(gaps <= self._person_reach_m).tolist()
+        solids = self.solids(closures)
+        gaps = np.hypot(solids.centres[:, 0] - state.x_m, solids.centres[:, 1] - state.y_m)
+        owners = (solids.owners[i] for i in np.flatnonzero(gaps <= solids.reaches_m).tolist())
+        near = {solid.body: solid.category for solid in owners}
+        with self.lock:
+            self.close_exits(closures)
+            self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)
+            for i in people_near:
+                self.simulator.place(self._person, *poses[i, :3].tolist())
+                if self.simulator.vehicle_touches(self._person):
+                    return "pedestrian"
+            touched = (name for body, name in near.items() if self.simulator.vehicle_touches(body))
+            return next(touched, "")
+
+    def _add_ground(self, layout: Layout) -> None:
+        striped = shapely.union_all([area.polygon for area in layout.crosswalks])
+        road, crosswalks = meshes.Mesh(), meshes.Mesh()
+        road.ground(layout.drivable.difference(striped), 0.0, "asphalt")
+        for name in layout.lines:
+            road.add(self._lane_marks(layout, name, striped))
+        for area in layout.crosswalks:
+            crosswalks.add(meshes.crosswalk(*area))
+        paved = layout.sidewalks
+        if layout.terrain.is_empty:
+            # The paving runs on under the houses, so that no gap opens between them.
+            paved = paved.buffer(2.0).difference(layout.drivable)
+        paving, grass = meshes.Mesh(), meshes.Mesh()
+        paving.ground(paved, 0.0, "paving")
+        grass.ground(layout.terrain, 0.0, "grass")
+        for mesh, category in (
+            (road, "road"),
+            (crosswalks, "crosswalk"),
+            (paving, "sidewalk"),
+            (grass, "terrain"),
+        ):
+            if mesh.indices:
+                self._add_body(mesh, category)
+
+    def _lane_marks(self, layout: Layout, name: str, striped: BaseGeometry) -> meshes.Mesh:
+        if layout.width_m(name) < _TWO_LANES_M:
+            return meshes.Mesh()
+        others = [ground for other, ground in layout.ribbons.items() if other != name]
+        return meshes.lane_marks(layout.lines[name], shapely.union_all([*others, striped]))
+
+    def _add_solids(self, layout: Layout) -> None:
+        by_category: dict[str, list[Box]] = {}
+        for box in (*layout.buildings, *layout.obstacles):
+            by_category.setdefault(box.category, []).append(box)
+        for category, boxes in by_category.items():
+            for first in range(0, len(boxes), _BOXES_A_BODY):
+                mesh, chunk = meshes.Mesh(), boxes[first : first + _BOXES_A_BODY]
+                for box in chunk:
+                    mesh.add(furniture.mesh_of(box))
+                self._solids.append(self._add_solid(mesh, category, chunk))
+
+    def _add_closure(self, box: Box) -> Solid:
+        return self._add_solid(furniture.mesh_of(box, both_sides=True), box.category, [box])
+
+    def _add_solid(self, mesh: meshes.Mesh, category: str, boxes: list[Box]) -> Solid:
+        body = self._add_body(
+            mesh,
+            category,
+            boxes_m=tuple((box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes),
+        )
+        return Solid(body, category, tuple(boxes), len(self.bodies) - 1)
+
+    def _add_body(
+        self, mesh: meshes.Mesh, category: str, *, instance: int = 0, **options: Any
+    ) -> int:
+        vertices = np.array(mesh.vertices, dtype=np.float64)
+        triangles = np.array(mesh.indices).reshape(-1, 3)
+        seen_as = CATEGORY_ID[category], instance
+        self.bodies.append(Body(vertices, triangles, *seen_as, moves=instance > 0))
+        return self.simulator.add_body(mesh, category, instance=instance, **options)
+
+
+_STREETS: WeakValueDictionary[bytes, Street] = WeakValueDictionary()

@@ -1,0 +1,35 @@
+"""Pictures: of representations, of scenes from above, of episodes and of learning.
+
+What draws representations is handed on here; `flowrep.viz.plan`, `film`, `curves` and `window`
+need the packages of an extra.
+"""
+
+from flowrep.viz.maps import (
+    DEPTH_RANGE_M,
+    FLOW_SCALE_PX,
+    Image,
+    classes_to_rgb,
+    contact_sheet,
+    depth_to_rgb,
+    flow_to_rgb,
+    flow_wheel,
+    representation_strip,
+    strip,
+    write_png,
+    write_video,
+)
+
+__all__ = [
+    "DEPTH_RANGE_M",
+    "FLOW_SCALE_PX",
+    "Image",
+    "classes_to_rgb",
+    "contact_sheet",
+    "depth_to_rgb",
+    "flow_to_rgb",
+    "flow_wheel",
+    "representation_strip",
+    "strip",
+    "write_png",
+    "write_video",
+]

@@ -1,0 +1,83 @@
+"""Films an episode: what the camera sees and every representation of it, side by side."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from flowrep.envs import streets
+from flowrep.experiment.evaluation import OUTCOMES, Policy
+from flowrep.geometry import factorize, rigid_flow
+from flowrep.viz.maps import representation_strip, write_video
+
+Maps = dict[str, Tensor]
+
+
+@torch.no_grad()
+def film_episode(env: EnvBase, policy: Policy) -> tuple[list[Maps], str]:
+    """Returns the maps of every frame of one greedy episode, and how it ended.
+
+    Args:
+        env: of one street, with all sensors and rgb kept.
+        policy: writes `action`.
+    """
+    intrinsics = torch.as_tensor(streets(env)[0].K)
+    tensordict = env.reset()
+    frames = [maps_of(tensordict["sensor"][0].cpu(), intrinsics)]
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        while not tensordict["done"].any():
+            tensordict = env.step(policy(tensordict))["next"]
+            frames.append(maps_of(tensordict["sensor"][0].cpu(), intrinsics))
+    return frames, OUTCOMES[int(tensordict["outcome"])]
+
+
+def maps_of(sensor: Mapping[str, Any], intrinsics: Tensor) -> Maps:
+    """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` of what one street's sensors gave.
+
+    Flow is in px/step, whatever unit and scale the agent's own representations have. Raw flow is
+    the estimate where the agent lives on one, the exact one otherwise.
+    """
+    depth = sensor["depth"]
+    raw = sensor.get("flow", None)
+    if raw is None:
+        raw, _ = rigid_flow(depth, sensor["instance"], intrinsics, sensor["instance_motion"])
+    ego, obj, _ = factorize(raw, depth, intrinsics, sensor["prev_from_curr"])
+    return {
+        "rgb": sensor["rgb"],
+        "semantic": sensor["semantic"],
+        "depth": depth,
+        "raw": raw,
+        "ego": ego,
+        "obj": obj,
+    }
+
+
+def record_episode(
+    make_env: Callable[..., EnvBase],
+    policy: Policy,
+    representations: Mapping[str, Any],
+    path: Path,
+    *,
+    seed: int,
+) -> str:
+    """Writes the video of one greedy episode to `path`; returns how it ended.
+
+    Args:
+        make_env: called with `representations`, `keep_sensor`, `num_envs` and `num_workers`.
+        policy: writes `action`.
+        representations: what the policy reads, a mapping from name to options.
+        path: the mp4 file.
+        seed: of the environment, which draws the episode.
+    """
+    seen = dict(representations) | {"rgb": {}}
+    env = make_env(representations=seen, keep_sensor=True, num_envs=1, num_workers=0)
+    env.set_seed(seed)
+    frames, outcome = film_episode(env, policy)
+    fps = streets(env)[0].frame_rate_hz
+    env.close()
+    write_video(path, [representation_strip(maps) for maps in frames], fps=fps)
+    return outcome

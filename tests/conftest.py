@@ -1,0 +1,47 @@
+"""Scenes for the tests: Straight Road, and what is left of it without people.
+
+Each imports what it needs: some tests run where no simulator is installed.
+"""
+
+from dataclasses import replace
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def straight_road():
+    from flowrep.scenes import load_scene
+
+    return load_scene("straight_road")
+
+
+@pytest.fixture(scope="session")
+def empty_road(straight_road):
+    """Nobody walks here; the vehicle starts at (0, 0) and looks along x."""
+    return replace(straight_road, pedestrian_groups=())
+
+
+@pytest.fixture(scope="session")
+def one_stands(straight_road):
+    """One person stands at (30, 0), in the vehicle's way."""
+    from flowrep.scenes.scene import PedestrianGroup, Walk
+
+    walk = Walk("points", points_m=((30.0, -0.01), (30.0, 0.01)))
+    person = PedestrianGroup("one", 1, 0.0, walk, standing=1)
+    return replace(straight_road, pedestrian_groups=(person,))
+
+
+@pytest.fixture
+def make_street():
+    """Makes streets that are closed when the test ends."""
+    from flowrep.envs import StreetEnv
+
+    made = []
+
+    def make(*args, **kwargs):
+        made.append(StreetEnv(*args, **kwargs))
+        return made[-1]
+
+    yield make
+    for street in made:
+        street.close()

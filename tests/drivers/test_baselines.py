@@ -1,0 +1,60 @@
+"""Is Straight Road a fair task? A small count here; `benchmarks/scene_validity.py` has the rest."""
+
+import numpy as np
+import pytest
+import shapely
+
+from flowrep.drivers import Planner, RandomDriver, drives, never_turn
+from flowrep.scenes.goal_distance import GoalDistance
+
+
+@pytest.mark.parametrize("speed", ["low", "normal", "high"])
+def test_the_planner_arrives(make_street, speed):
+    ended = list(drives(make_street(speed=speed, sensors=()), Planner(), 5, seed=0))
+    assert [drive.outcome for drive in ended] == ["success"] * 5
+
+
+@pytest.mark.parametrize("speed", ["low", "normal", "high"])
+def test_habit_and_chance_seldom_arrive(make_street, speed):
+    env = make_street(speed=speed, sensors=())
+    # With 60 episodes a true share of 12 % gives more than 15 in less than one run in 1,000.
+    straight = [drive.outcome for drive in drives(env, never_turn, 60, seed=0)]
+    assert straight.count("success") <= 15
+    assert set(straight) <= {"success", "collision"}
+    by_chance = [drive.outcome for drive in drives(env, RandomDriver(0), 60, seed=0)]
+    assert by_chance.count("success") <= 6
+
+
+def test_all_drivers_are_given_the_same_episodes(make_street):
+    env = make_street(sensors=())
+    seeds = [
+        [drive.episode_seed for drive in drives(env, driver, 4, seed=3)]
+        for driver in (never_turn, RandomDriver(1))
+    ]
+    assert seeds[0] == seeds[1]
+    assert len(set(seeds[0])) == 4
+
+
+def test_the_planner_plans_anew_where_it_is_led_astray(make_street, empty_road):
+    env = make_street(empty_road, sensors=())
+    planner = Planner()
+    env.reset(seed=0)
+    planner(env)
+    for action in (1, 1, 0, 2, 2):  # not its own choice: the vehicle now heads for the kerb
+        env.step(action)
+    while not env.episode.outcome:
+        env.step(planner(env))
+    assert env.episode.outcome.label == "success"
+
+
+def test_the_way_to_go_leads_round_corners():
+    # An L: 10 m along x, then 10 m along y, 2 m wide; the goal is its upper end.
+    corner = shapely.union(shapely.box(0, 0, 10, 2), shapely.box(8, 0, 10, 10))
+    way = GoalDistance(corner, shapely.box(8, 9, 10, 10))
+    start, bend, goal, outside = way(np.array([0.6, 9.1, 9.0, 4.0]), np.array([1.1, 1.1, 9.6, 6.0]))
+    assert goal == 0.0
+    assert bend == pytest.approx(8.0, abs=0.6)
+    # Straight through the corner's inside it would be 11.5 m; along it about 15.
+    assert 13.5 < start < 17
+    assert outside == np.inf
+    assert way(np.array([100.0]), np.array([-100.0]))[0] == np.inf

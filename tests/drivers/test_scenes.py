@@ -1,0 +1,186 @@
+"""The paper's four environments: Table I, their paths, what is seen there, that they are fair.
+
+Counts are small here; `benchmarks/scene_validity.py` runs hundreds of episodes a cell.
+"""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import shapely
+from gymnasium.utils.env_checker import check_env
+
+from flowrep.drivers import Planner, RandomDriver, drives, never_turn
+from flowrep.envs.registration import SCENE_BY_ID
+from flowrep.palette import CATEGORY_ID
+from flowrep.scenes import load_scene, scene_names
+from flowrep.scenes.goal_distance import free_ground
+from flowrep.scenes.layout import Layout
+
+PEOPLE = {"across", "along", "standing"}
+# Paper, Table I: steps, paths, lane width factor, categories, kinds of pedestrians, α in °/s².
+TABLE_1 = {
+    "straight_road": (200, 1, 2.0, 5, {"across"}, 35.0),
+    "s_turn": (250, 2, 1.5, 6, {"across"}, 70.0),
+    "h_shaped_pathways": (300, 4, 2.0, 7, PEOPLE, 70.0),
+    "three_way_junction": (250, 2, 1.0, 11, {"along"}, 70.0),
+}
+LANE_M = 3.5  # one unit of the lane width factor
+TURNING = [name for name in TABLE_1 if name != "straight_road"]
+
+
+def kinds_of_people(scene):
+    kinds = set()
+    for group in scene.pedestrian_groups:
+        if group.standing:
+            kinds.add("standing")
+        if group.standing < group.count:
+            kinds.add(group.walk.kind)
+    return kinds
+
+
+@pytest.mark.parametrize("name", TABLE_1)
+def test_a_scene_has_the_numbers_of_the_paper(name):
+    steps, paths, lane, categories, people, alpha = TABLE_1[name]
+    scene = load_scene(name)
+    assert scene.time_limit_steps == steps
+    assert len(scene.paths) == paths
+    assert {road.width_m for road in scene.roads} == {lane * LANE_M}
+    assert len(scene.categories) == categories
+    assert kinds_of_people(scene) == people
+    assert scene.vehicle.yaw_acceleration_dps2 == alpha
+    assert (scene.vehicle.speed_mps, scene.frame_rate_hz) == (10.0, 12.0)
+    has_obstacles = bool(scene.obstacles or scene.obstacle_rows)
+    assert has_obstacles == (name == "three_way_junction")
+    speeds = {"low": (0.6, 1.0), "normal": (1.2, 1.8), "high": (2.0, 2.4)}
+    assert scene.pedestrian_speed_mps == speeds
+
+
+def test_the_four_scenes_are_those_of_the_paper():
+    assert set(scene_names()) == set(SCENE_BY_ID.values()) == set(TABLE_1)
+
+
+@pytest.mark.parametrize("env_id", SCENE_BY_ID)
+def test_gymnasium_makes_and_checks_every_scene(env_id):
+    env = gymnasium.make(env_id)
+    assert env.unwrapped.scene.name == SCENE_BY_ID[env_id]
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize("name", TURNING)
+def test_every_path_is_drawn_equally_often(make_street, name):
+    env = make_street(name, sensors=())
+    draws = 400
+    drawn = [env.reset(seed=5 if i == 0 else None)[1]["path"] for i in range(draws)]
+    expected = draws / len(env.scene.paths)
+    for path in env.scene.paths:
+        # Four standard deviations of a binomial count.
+        spread = 4 * (expected * (1 - 1 / len(env.scene.paths))) ** 0.5
+        assert abs(drawn.count(path.name) - expected) < spread
+
+
+@pytest.mark.parametrize("name", ["h_shaped_pathways", "three_way_junction"])
+def test_the_only_way_out_is_the_path_s_own_ending_zone(name):
+    layout = Layout(load_scene(name))
+    for path in layout.scene.paths:
+        start = shapely.Point(layout.start_state(path.start)[:2])
+        (reached,) = [
+            part for part in shapely.get_parts(free_ground(layout, path)) if part.covers(start)
+        ]
+        ends = {
+            other.end for other in layout.scene.paths if reached.intersects(layout.zones[other.end])
+        }
+        assert ends == {path.end}
+
+
+CLOSED_EXITS = [
+    # (scene, what is driven, where, the exit that is closed there)
+    ("h_shaped_pathways", "south_to_north", "south_to_south", "northeast"),
+    ("h_shaped_pathways", "south_to_south", "south_to_north", "southeast"),
+    ("h_shaped_pathways", "north_to_north", "north_to_south", "northeast"),
+    ("h_shaped_pathways", "north_to_south", "north_to_north", "southeast"),
+    ("three_way_junction", "left", "right", "left"),
+    ("three_way_junction", "right", "left", "right"),
+]
+
+
+@pytest.mark.parametrize(("name", "driven", "path", "closed"), CLOSED_EXITS)
+def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, closed):
+    env = make_street(replace(load_scene(name), pedestrian_groups=()), sensors=())
+    env.reset(seed=0, options={"path": driven})
+    actions = Planner().search(env.episode)
+    for action in actions:
+        info = env.step(action)[4]
+        if info["outcome"] != "running":
+            break
+    assert info["outcome"] == "success"
+    env.reset(options={"path": path})
+    for action in actions:
+        info = env.step(action)[4]
+        if info["outcome"] != "running":
+            break
+    assert (info["outcome"], info["hit"]) == ("collision", "building")
+    # Right there: the vehicle's middle is no further off than half its diagonal, a square metre's.
+    x, y = env.episode.now.vehicle[:2]
+    front = Layout(env.scene).closures[closed].footprint.exterior.distance(shapely.Point(x, y))
+    assert front < 0.5 * 2**0.5 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("path", "y_m"),
+    [
+        # From 9 m on along the western leg, which begins at y = -65, to the face of the house at
+        # 78 - 2.5 m, less the vehicle's front: 66 m; the 159th look at 24 a second sees it touch.
+        ("south_to_north", -65.0 + 9.0 + 159 * 10 / 24),
+        # The same from the other end: from 121 to 52 + 2.5 m, again 66 m.
+        ("north_to_south", -65.0 + 121.0 - 159 * 10 / 24),
+    ],
+)
+def test_straight_on_in_the_h_stands_a_house(make_street, path, y_m):
+    env = make_street(replace(load_scene("h_shaped_pathways"), pedestrian_groups=()), sensors=())
+    env.reset(seed=0, options={"path": path})
+    info = {"outcome": "running"}
+    while info["outcome"] == "running":
+        info = env.step(0)[4]
+    assert (info["outcome"], info["hit"]) == ("collision", "building")
+    assert env.episode.now.vehicle[:2] == pytest.approx((0.0, y_m), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", TABLE_1)
+def test_every_category_is_seen_on_a_drive(make_street, name):
+    env = make_street(name, sensors=("semantic",))
+    planner, pixels = Planner(), np.zeros(len(CATEGORY_ID), dtype=int)
+    observation, _ = env.reset(seed=1)
+    ended = False
+    while not ended:
+        observation, _, ended, _, _ = env.step(planner(env))
+        pixels += np.bincount(observation["semantic"].ravel(), minlength=len(pixels))
+    seen = {category for category, number in CATEGORY_ID.items() if pixels[number]}
+    assert seen == set(env.scene.categories)
+
+
+@pytest.mark.parametrize("name", TURNING)
+@pytest.mark.parametrize("speed", ["low", "normal", "high"])
+def test_the_planner_arrives_and_habit_and_chance_do_not(make_street, name, speed):
+    env = make_street(name, speed=speed, sensors=())
+    planned = [drive.outcome for drive in drives(env, Planner(), 3, seed=0)]
+    assert planned == ["success"] * 3
+    # A bend ahead: straight on leads off the road or into somebody.
+    straight = [drive.outcome for drive in drives(env, never_turn, 20, seed=0)]
+    assert straight.count("success") == 0
+    by_chance = [drive.outcome for drive in drives(env, RandomDriver(0), 20, seed=0)]
+    assert by_chance.count("success") == 0
+
+
+def test_lane_marks_stop_where_crosswalks_and_other_roads_are(make_street):
+    env = make_street("h_shaped_pathways", sensors=())
+    layout = Layout(env.scene)
+    striped = shapely.union_all([area.polygon for area in layout.crosswalks])
+    marks = env._street._lane_marks(layout, "bar", striped)
+    points = shapely.points(np.array(marks.vertices)[:, :2])
+    # 70 m of bar less half a leg at either end and the crosswalk: ten dashes, six metres apart.
+    assert len(points) > 30
+    assert not shapely.intersects(points, striped).any()
+    assert not shapely.intersects(points, layout.ribbons["west"]).any()

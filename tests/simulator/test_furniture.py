@@ -1,0 +1,62 @@
+"""What stands in a street keeps to its box where it can be hit, and shows what it is."""
+
+import numpy as np
+import pytest
+
+from flowrep.scenes.layout import Box
+from flowrep.simulator.furniture import mesh_of
+
+SIZES = {
+    "car": (4.2, 1.8, 1.45),
+    "tree": (0.4, 0.4, 5.5),
+    "fence": (3.0, 0.1, 1.1),
+    "traffic_light": (0.2, 0.2, 3.6),
+    "lamp_post": (0.2, 0.2, 5.0),
+    "house": (8.0, 6.0, 7.0),
+}
+OVERHANG = {"car": 0.03, "tree": 1.5, "fence": 0.0, "traffic_light": 0.1, "lamp_post": 1.4}
+
+
+def vertices(kind, variant=0, x=0.0, y=0.0, yaw=0.0):
+    return np.array(mesh_of(Box(kind, x, y, yaw, SIZES[kind], variant)).vertices)
+
+
+@pytest.mark.parametrize("variant", range(4))
+@pytest.mark.parametrize("kind", SIZES)
+def test_a_shape_fills_its_box_and_hangs_over_it_only_above_heads(kind, variant):
+    points, size = vertices(kind, variant), np.array(SIZES[kind])
+    assert points[:, 2].min() == pytest.approx(0.0)
+    assert points[:, 2].max() == pytest.approx(size[2])
+    beyond = (np.abs(points[:, :2]) - size[:2] / 2).max(axis=-1)
+    assert beyond.max() <= OVERHANG.get(kind, 0.0) + 1e-9
+    # A person of 1.75 m walks below whatever hangs over; a fir's lowest branches are at 1.5 m.
+    low = points[:, 2] < (1.5 if kind == "tree" else 1.8)
+    assert beyond[low].max() <= 0.03
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_no_shape_has_many_triangles(kind):
+    assert len(mesh_of(Box(kind, 0.0, 0.0, 0.0, SIZES[kind])).indices) // 3 <= 160
+
+
+def test_a_shape_stands_where_its_box_does_and_faces_its_way():
+    # At (10, 3) looking along +y: 4.2 m along y, 1.8 m along x.
+    points = vertices("car", x=10.0, y=3.0, yaw=np.pi / 2)
+    assert points[:, 1].min() == pytest.approx(3.0 - 2.1, abs=0.02)
+    assert points[:, 0].max() == pytest.approx(10.0 + 0.9, abs=0.03)
+
+
+def test_the_traffic_lights_lamps_are_seen_by_those_who_drive_its_way():
+    mesh = mesh_of(Box("traffic_light", 0.0, 0.0, 0.0, SIZES["traffic_light"]))
+    normals, uvs = np.array(mesh.normals), np.array(mesh.uvs)
+    from flowrep.simulator.paint import swatch
+
+    red = np.isclose(uvs, swatch("lamp_red")[:2]).all(axis=-1)
+    assert red.any()
+    np.testing.assert_allclose(normals[red], [[-1.0, 0.0, 0.0]] * red.sum(), atol=1e-12)
+
+
+def test_every_normal_points_away_from_the_inside_of_a_car():
+    mesh = mesh_of(Box("car", 0.0, 0.0, 0.0, SIZES["car"]))
+    points, normals = np.array(mesh.vertices), np.array(mesh.normals)
+    assert ((points - [0.0, 0.0, 0.7]) * normals).sum(axis=-1).min() > 0

@@ -1,0 +1,186 @@
+"""Pictures: a colour means one thing everywhere, and what is written can be read back."""
+
+import colorsys
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from flowrep.palette import CLASS_COLOURS
+from flowrep.viz import (
+    classes_to_rgb,
+    contact_sheet,
+    depth_to_rgb,
+    flow_to_rgb,
+    flow_wheel,
+    representation_strip,
+    strip,
+    write_png,
+    write_video,
+)
+
+
+def flow_of(u: float, v: float) -> np.ndarray:
+    return np.array([[[u]], [[v]]], dtype=np.float32)
+
+
+@pytest.mark.parametrize(
+    ("u", "v", "rgb"),
+    [
+        (0.0, 0.0, (255, 255, 255)),
+        (4.0, 0.0, (255, 0, 0)),  # right; with the u axis flipped this would be cyan
+        (-4.0, 0.0, (0, 255, 255)),
+        (0.0, 4.0, (128, 255, 0)),  # down, a quarter of a turn; v upwards gives (128, 0, 255)
+        (0.0, -4.0, (128, 0, 255)),
+        (1.0, 0.0, (255, 128, 128)),  # a quarter of the scale: half the saturation
+        (400.0, 0.0, (255, 0, 0)),  # beyond the scale: full, not wrapped
+    ],
+)
+def test_flow_colour_by_hand(u, v, rgb):
+    assert np.abs(flow_to_rgb(flow_of(u, v), scale_px=4.0)[0, 0].astype(int) - rgb).max() <= 1
+
+
+def test_flow_colour_is_the_hsv_wheel():
+    u, v = 1.5, 2.0  # magnitude 2.5, an angle within no axis
+    hue = np.arctan2(v, u) / (2 * np.pi)
+    expected = 255 * np.array(colorsys.hsv_to_rgb(hue, np.sqrt(2.5 / 10), 1.0))
+    assert np.abs(flow_to_rgb(flow_of(u, v), scale_px=10.0)[0, 0] - expected).max() <= 0.51
+
+
+def test_flow_colour_does_not_depend_on_the_rest_of_the_image():
+    alone = flow_to_rgb(flow_of(0.3, -0.2), scale_px=2.0)[0, 0]
+    beside_a_giant = np.concatenate([flow_of(0.3, -0.2), flow_of(90.0, 5.0)], axis=-1)
+    # Normalised per image, the small flow would be almost white here.
+    assert (flow_to_rgb(beside_a_giant, scale_px=2.0)[0, 0] == alone).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_flow_that_is_not_finite_is_grey(bad):
+    assert flow_to_rgb(flow_of(0.0, bad), scale_px=1.0)[0, 0].tolist() == [128, 128, 128]
+
+
+def test_flow_wheel_is_its_own_legend():
+    wheel = flow_wheel(101)
+    assert wheel[50, 50].tolist() == [255, 255, 255]
+    assert wheel[50, 0].tolist() == [0, 255, 255]  # left rim: flow to the left
+    assert np.abs(wheel[100, 50].astype(int) - (128, 255, 0)).max() <= 1  # lower rim: down
+    assert wheel[0, 0].tolist() == [255, 255, 255]  # outside the disc
+
+
+def test_classes_take_their_colour_from_the_one_table():
+    image = classes_to_rgb(torch.tensor([[[0, 4, 10, 200]]], dtype=torch.uint8))
+    assert [tuple(pixel) for pixel in image[0].tolist()] == [
+        CLASS_COLOURS["sky"],
+        CLASS_COLOURS["pedestrian"],
+        CLASS_COLOURS["traffic_light"],
+        (128, 128, 128),
+    ]
+
+
+def test_depth_gets_darker_and_ends_in_black_where_nothing_is():
+    depth = np.array([[[0.0, 1.0, 9.0, 99.0, 150.0, np.inf, np.nan]]], dtype=np.float32)
+    near, *rest, far, further, sky, missing = depth_to_rgb(depth, range_m=99.0)[0].astype(int)
+    assert near.tolist() == [252, 253, 191]
+    assert far.tolist() == further.tolist() == [40, 16, 80]
+    assert sky.tolist() == [0, 0, 0]
+    assert missing.tolist() == [128, 128, 128]
+    brightness = [colour.sum() for colour in (near, *rest, far, sky)]
+    assert brightness == sorted(brightness, reverse=True)
+    # log(1 + 9) is half of log(1 + 99): halfway between the third and the fourth of six stops.
+    assert np.abs(rest[1] - (212, 75.5, 107)).max() <= 1
+
+
+def maps(height: int = 30, width: int = 40) -> dict[str, torch.Tensor]:
+    return {
+        "obj": torch.zeros(2, height, width),
+        "rgb": torch.full((3, height, width), 7, dtype=torch.uint8),
+        "depth": torch.ones(1, height, width),
+        "instance": torch.zeros(1, height, width),
+    }
+
+
+def test_strip_draws_what_is_there_in_a_fixed_order_enlarged_without_blur():
+    given = maps()
+    given["obj"][0, 3, 5] = 2.0  # full colour at the default scale
+    image = representation_strip(given)
+    # rgb, depth and obj, 40 columns enlarged 6 times, 2 gaps of 4; a bar of 28 above 30 rows.
+    assert image.shape == (28 + 180, 3 * 240 + 2 * 4, 3)
+    assert (image[28:, :240] == 7).all()
+    obj = image[28:, 488:]
+    assert (obj[18:24, 30:36] == (255, 0, 0)).all()
+    assert (np.delete(obj.reshape(30, 6, 40, 6, 3), 3, axis=0) == 255).all()
+
+
+def test_labels_are_written_and_the_wheel_stands_beside_flow_only():
+    image = representation_strip(maps())
+    rgb_bar, obj_bar = image[:28, :240], image[:28, 488:]
+    assert (rgb_bar < 128).any()
+    assert (obj_bar < 128).any()
+    assert (rgb_bar.min(-1) == rgb_bar.max(-1)).all()  # black on white, no hue
+    assert (obj_bar[:, -28:].min(-1) != obj_bar[:, -28:].max(-1)).any()
+
+
+def test_scale_of_the_label_is_the_scale_of_the_colours(monkeypatch):
+    labels = []
+    monkeypatch.setattr(
+        "flowrep.viz.maps.strip", lambda images, wheel_for: labels.extend(images) or images
+    )
+    images = representation_strip(
+        maps() | {"ego": torch.full((2, 3, 4), 0.0)}, flow_scale_px={"ego": 8.0, "obj": 0.5}
+    )
+    assert labels == ["RGB", "depth, 0-100 m", "ego flow, full at 8 px", "obj flow, full at 0.5 px"]
+    assert set(images) == set(labels)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: flow_to_rgb(np.zeros((3, 4, 2)), 1.0), r"flow must be \[2, H, W\].*\[3, 4, 2\]"),
+        (lambda: flow_to_rgb(flow_of(0, 0), 0.0), "scale_px must be positive"),
+        (lambda: depth_to_rgb(np.zeros((4, 4))), r"depth must be \[1, H, W\]"),
+        (lambda: representation_strip({"eggo": np.zeros(1)}), "eggo.*expected some of.*'ego'"),
+        (
+            lambda: strip({"a": np.zeros((2, 3, 3), np.uint8), "b": np.zeros((3, 2, 3), np.uint8)}),
+            "images of one size",
+        ),
+    ],
+)
+def test_mistakes_are_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_contact_sheet_stacks_rows_of_different_width():
+    wide, narrow = np.zeros((2, 9, 3), np.uint8), np.zeros((3, 4, 3), np.uint8)
+    sheet = contact_sheet([wide, narrow])
+    assert sheet.shape == (2 + 4 + 3, 9, 3)
+    assert (sheet[6:, :4] == 0).all()
+    assert (sheet[6:, 4:] == 255).all()
+
+
+def test_png_comes_back_bit_for_bit(tmp_path):
+    pillow = pytest.importorskip("PIL.Image")
+    image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    write_png(tmp_path / "new" / "folder.png", image)
+    assert (np.asarray(pillow.open(tmp_path / "new" / "folder.png")) == image).all()
+
+
+def test_video_of_odd_size_can_be_played(tmp_path):
+    imageio = pytest.importorskip("imageio.v3")
+    frames = [np.full((33, 51, 3), grey, np.uint8) for grey in (20, 120, 220)]
+    write_video(tmp_path / "new" / "episode.mp4", frames, fps=12)
+    played = imageio.imread(tmp_path / "new" / "episode.mp4")
+    assert played.shape == (3, 34, 52, 3)
+    assert np.abs(played[:, 16, 25, 0].astype(int) - [20, 120, 220]).max() <= 6
+
+
+def test_importing_viz_needs_numpy_alone():
+    code = (
+        "import sys, flowrep.viz; "
+        "print([m for m in ('PIL', 'imageio', 'matplotlib', 'torch', 'pybullet') "
+        "if m in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

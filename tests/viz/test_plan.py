@@ -1,0 +1,102 @@
+"""The plan of a scene: what is drawn where."""
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+pytest.importorskip("shapely", reason="plans are drawn of scenes")
+
+from shapely.geometry import Point
+
+from flowrep.envs import Outcome
+from flowrep.scenes import load_scene
+from flowrep.scenes.layout import Layout
+from flowrep.viz.plan import OUTCOME_COLOURS, Track, draw_plan
+
+
+@pytest.fixture(scope="module")
+def layout():
+    return Layout(load_scene("three_way_junction"))
+
+
+def labels(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_every_way_to_end_has_a_colour_of_its_own():
+    assert list(OUTCOME_COLOURS) == [outcome.label for outcome in Outcome if outcome]
+    assert len(set(OUTCOME_COLOURS.values())) == len(OUTCOME_COLOURS)
+
+
+def test_a_track_is_drawn_in_its_outcomes_colour_where_it_was_driven(layout):
+    points = np.array([[7.0, 0.0], [30.0, 0.5], [60.0, -1.0]])
+    figure = draw_plan(layout, [Track(points, "collision")])
+    (axes,) = figure.axes
+    drawn = [
+        line
+        for line in axes.lines
+        if to_hex(line.get_color()) == OUTCOME_COLOURS["collision"] and len(line.get_xdata()) == 3
+    ]
+    assert len(drawn) == 1
+    np.testing.assert_array_equal(np.stack(drawn[0].get_data(), -1), points)
+    assert "collision" in labels(figure)
+    assert "success" not in labels(figure)
+    # x to the right, y upwards, one metre as long on either axis.
+    assert axes.get_aspect() == 1.0
+    assert axes.get_xlim()[0] < axes.get_xlim()[1]
+    assert axes.get_ylim()[0] < axes.get_ylim()[1]
+    assert "x (m)" in axes.get_xlabel()
+
+
+def test_the_legend_names_what_the_scene_has(layout):
+    names = labels(draw_plan(layout))
+    for name in ("road", "crosswalk", "terrain", "tree", "fence", "car", "traffic light"):
+        assert name in names
+    straight = labels(draw_plan(Layout(load_scene("straight_road"))))
+    assert "tree" not in straight
+    assert "pedestrians who stand" not in straight  # everyone there walks
+    assert not any("exit" in name for name in straight)
+
+
+def test_nothing_that_stands_is_cut_off(layout):
+    (axes,) = draw_plan(layout).axes
+    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    for box in (*layout.buildings, *layout.obstacles):
+        left, lower, right, upper = box.footprint.bounds
+        assert x0 < left < right < x1
+        assert y0 < lower < upper < y1
+
+
+def test_every_zone_of_a_path_is_named_where_it_is(layout):
+    (axes,) = draw_plan(layout).axes
+    named = {text.get_text(): text.xy for text in axes.texts if text.get_text()}
+    assert set(named) == {"entry", "left end", "right end"}
+    # The start lies about the first road's 7th metre, which runs along x from the origin.
+    assert named["entry"] == pytest.approx((7.0, 0.0))
+    for name, place in named.items():
+        assert layout.zones[name.replace(" ", "_")].contains(Point(place))
+
+
+def test_where_a_place_is_start_and_end_both_names_can_be_read():
+    (axes,) = draw_plan(Layout(load_scene("s_turn"))).axes
+    offsets = {t.get_text(): t.xyann for t in axes.texts if t.get_text()}
+    # The western stretch runs along x: its start is named above it, its end below.
+    assert offsets["west"] == pytest.approx((0, 30), abs=1e-6)
+    assert offsets["west end"] == pytest.approx((0, -30), abs=1e-6)
+
+
+def test_a_path_shows_its_own_closures_alone(layout):
+    def closed(path):
+        figure = draw_plan(layout, path=path)
+        colour = (48 / 255, 48 / 255, 48 / 255)
+        return [
+            patch.get_path().vertices.mean(axis=0)
+            for patch in figure.axes[0].patches
+            if tuple(patch.get_facecolor()[:3]) == pytest.approx(colour)
+        ]
+
+    assert len(closed(None)) == 2
+    assert "exit, closed on some paths" in labels(draw_plan(layout))
+    assert "closed exit" in labels(draw_plan(layout, path="left"))
+    (only,) = closed("left")  # drives to the left, +y, with the right arm closed
+    assert only[1] < 0
