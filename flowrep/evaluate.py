@@ -71,14 +71,15 @@ def run(config: DictConfig) -> None:
 def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
     """Does what `run` says, for agents in folders that are held.
 
-    Runs of one scene and camera share the streets; their episodes are the same.
+    Runs of one scene, camera and renderer share the streets; their episodes are the same.
     """
     subjects = [load_subject(asked, run) for run in runs]
-    by_scene: dict[str, list[Subject]] = {}
+    by_street: dict[str, list[Subject]] = {}
     for subject in subjects:
-        by_scene.setdefault(json.dumps(subject.config["scene"]), []).append(subject)
+        street = json.dumps([subject.config[key] for key in ("scene", "renderer")])
+        by_street.setdefault(street, []).append(subject)
     with StopRequest() as stop:
-        for group in by_scene.values():
+        for group in by_street.values():
             compare(asked, group, stop)
             if stop:
                 break

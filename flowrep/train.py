@@ -59,8 +59,8 @@ def run(config: DictConfig) -> float:
     """Trains, evaluates and films one agent, or continues a run with `resume=`.
 
     Returns:
-        The final evaluation's share of greedy episodes that succeed, over all its speeds: what a
-        sweeper such as Optuna maximises.
+        The final evaluation's share of greedy episodes that succeed, over all its speeds and frame
+        rates: what a sweeper such as Optuna maximises.
     """
     try:
         plain = plain_config(config)
@@ -210,8 +210,8 @@ def run_comparison(
     agent = Agent(
         training.agent.policy, config["representations"], config["flow"], training.agent.device
     )
-    scene, rate = load_scene(config["scene"]), config["scene"]["frame_rate_hz"]
-    arena = Arena(scene, [agent], [rate], partial(build_pool, config, comparison.rides))
+    make_pool = partial(build_pool, config, comparison.rides)
+    arena = Arena(load_scene(config["scene"]), [agent], comparison.fps, make_pool)
     try:
         comparison.run(arena, lambda: bool(stop))
     finally:
@@ -222,7 +222,8 @@ def final_episodes(config: Config) -> int:
     """Returns how many episodes the evaluation that ends a run has."""
     evaluation = config["evaluation"]
     policies = len(FINAL_POLICIES) + len(evaluation["baselines"])
-    return len(evaluation["speeds"]) * policies * evaluation["final_episodes"]
+    conditions = len(evaluation["speeds"]) * len(evaluation["fps"])
+    return conditions * policies * evaluation["final_episodes"]
 
 
 def final_evaluation(training: Training, config: Config, stop: StopRequest) -> None:
@@ -230,7 +231,7 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
     evaluation, run = config["evaluation"], training.run
     comparison = Comparison(
         speeds=evaluation["speeds"],
-        fps=[config["scene"]["frame_rate_hz"]],
+        fps=[float(rate) for rate in evaluation["fps"]],
         episodes=evaluation["final_episodes"],
         seed=FINAL_SEED,
         policies=FINAL_POLICIES,

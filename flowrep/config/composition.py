@@ -57,7 +57,7 @@ def check_command(
         return
     preview = Preview(args, args.config_name or config_name)
     try:
-        parsed = preview.parse(args.overrides)
+        parsed = preview.with_sweepers(preview.parse(args.overrides))
         for config in preview.configs(parsed):
             if schema is not None and not args.cfg:
                 validated(schema, config, keys_added(parsed))
@@ -126,6 +126,19 @@ class Preview:
                 )
         return parsed
 
+    def with_sweepers(self, parsed: Sequence[Override]) -> list[Override]:
+        """Returns overrides with those of `hydra.sweeper.params`, which an experiment gives.
+
+        What is typed wins.
+        """
+        if not self.is_multirun:
+            return [*parsed]
+        first = [self._values(override)[0] for override in parsed]
+        params = OmegaConf.select(self._explained_config(first), "hydra.sweeper.params") or {}
+        typed = {override.get_key_element() for override in parsed}
+        added = [f"{key}={value}" for key, value in params.items() if key not in typed]
+        return [*self.parse(added), *parsed]
+
     def configs(self, parsed: Sequence[Override]) -> Iterator[dict[str, Any]]:
         """Yields plain configs of jobs, so that each value of each sweep is in one of them."""
         values = [self._values(override) for override in parsed]
@@ -153,14 +166,19 @@ class Preview:
 
     def compose(self, job: list[str]) -> dict[str, Any]:
         """Returns the config of a job, without Hydra's own part."""
+        config = self._explained_config(job)
+        with open_dict(config):
+            del config["hydra"]
+        return plain_config(config)
+
+    def _explained_config(self, job: list[str]) -> DictConfig:
+        """Returns the config of a job; what Hydra refuses is said in words."""
         try:
             config = self._compose(job)
         except REFUSALS as error:
             raise UsageError(self._explained(error, parse(job))) from None
         _check_plugins(config.hydra)
-        with open_dict(config):
-            del config["hydra"]
-        return plain_config(config)
+        return config
 
     def _compose(self, job: list[str]) -> DictConfig:
         return self._hydra.compose_config(

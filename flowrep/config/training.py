@@ -6,7 +6,17 @@ from typing import Annotated, Any, get_args
 from pydantic import ConfigDict, Field, model_validator
 
 from flowrep.config.algorithms import BY_TARGET, AnyAlgorithm
-from flowrep.config.expectations import Count, CountOrZero, ListOf, OneOf, Seed, Switch, Text, Whole
+from flowrep.config.expectations import (
+    Count,
+    CountOrZero,
+    ListOf,
+    Number,
+    OneOf,
+    Seed,
+    Switch,
+    Text,
+    Whole,
+)
 from flowrep.config.representations import BY_SOURCE, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
@@ -31,6 +41,7 @@ class Evaluation(Section):
     episodes: Count
     final_episodes: Count
     speeds: Annotated[list[str], ListOf(OneOf(SPEEDS))]
+    fps: Annotated[list[float], ListOf(Number(above=0))]
     baselines: Annotated[list[str], ListOf(OneOf(tuple(BASELINES)), least=0)]
     video: Switch
 
@@ -56,6 +67,7 @@ class TrainConfig(Section):
     wandb: Annotated[str, OneOf(WANDB_MODES)]
     resume: Path
     trust: Trust
+    experiment: Annotated[str | None, Text("an experiment's name", also=(None,))]
     evaluation: Evaluation
     representations: Representations = Field(examples=["[ego,obj]"])
     flow: Annotated[Any, BY_SOURCE] = Field(examples=["exact"])

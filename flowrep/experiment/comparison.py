@@ -52,6 +52,7 @@ class Comparison:
         baselines: Sequence[str] = (),
         agents: int = 1,
     ) -> None:
+        self.fps = [*fps]
         self._seeds = [(seed + k) % (1 << 31) for k in range(episodes)]
         # one agent and frame rate after the other, so that streets which share them do so for long
         self._rides = [

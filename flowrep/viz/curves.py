@@ -41,11 +41,12 @@ def _evaluated(run: RunFolder) -> list[tuple[int, float, float, float]]:
 
     What flowrep.evaluate added, at whatever frame rate and in whatever scene, is left out.
     """
-    speed = run.read_config()["speed"]
+    config = run.read_config()
+    trained_at = config["speed"], float(config["scene"]["frame_rate_hz"])
     outcomes = defaultdict(list)
     for row in run.read_episodes():
-        is_own = row["evaluation"] in ("training", "final")
-        if is_own and row["policy"] == "greedy" and row["speed"] == speed:
+        is_own = row["evaluation"] in ("training", "final") and row["policy"] == "greedy"
+        if is_own and (row["speed"], float(row["fps"])) == trained_at:
             outcomes[int(row["frames"])].append(row["outcome"])
     points = []
     for frames, names in sorted(outcomes.items()):

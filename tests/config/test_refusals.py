@@ -146,7 +146,7 @@ def refusal(command, schema, line):
         (
             "evaluation=null",
             "evaluation should be a section with the keys every_frames, episodes, final_episodes, "
-            "speeds, baselines, video, not null",
+            "speeds, fps, baselines, video, not null",
         ),
         ("representations=[]", "'representations' needs a value: representations=[ego,obj]"),
         ("~seed", "'seed' needs a value: seed=0"),
