@@ -9,11 +9,11 @@ from hydra.core.global_hydra import GlobalHydra
 
 pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
 
-from flowrep.command_line import register_resolvers
 from flowrep.config import UsageError
+from flowrep.config.command_line import register_resolvers
+from flowrep.config.composition import Preview, check_command
 from flowrep.config.training import TrainConfig
 from flowrep.config_tree import group_choices
-from flowrep.preview import Preview, check_command
 from flowrep.train import final_episodes
 from tests.config.composing import plain
 
