@@ -54,12 +54,7 @@ def drive_episode(env: StreetEnv, driver: Driver, options: dict[str, Any]) -> Dr
         options: of `StreetEnv.reset`, which name the episode.
     """
     env.begin(options=options)
-    total, outcome = 0.0, Outcome.RUNNING
-    while not outcome:
-        outcome = env.drive(driver(env))
-        total += reward(outcome)
-    episode = env.episode
-    return Drive(episode.seed, outcome.label, episode.hit, total, episode.steps)
+    return _drive_on(env, driver)
 
 
 def drives(
@@ -67,17 +62,24 @@ def drives(
 ) -> Iterator[Drive]:
     """Yields finished episodes, the same ones for every driver; `seed` None goes on in the env's.
 
+    Nothing is looked at.
+
     >>> env = StreetEnv("straight_road", sensors=())
     >>> [drive.outcome in ("success", "collision") for drive in drives(env, never_turn, 2, seed=0)]
     [True, True]
     """
     for number in range(episodes):
-        env.reset(seed=seed if number == 0 else None)
-        total, ended = 0.0, False
-        while not ended:
-            _, reward, ended, _, info = env.step(driver(env))
-            total += reward
-        yield Drive(info["episode_seed"], info["outcome"], info["hit"], total, env.episode.steps)
+        env.begin(seed=seed if number == 0 else None)
+        yield _drive_on(env, driver)
+
+
+def _drive_on(env: StreetEnv, driver: Driver) -> Drive:
+    total, outcome = 0.0, Outcome.RUNNING
+    while not outcome:
+        outcome = env.drive(driver(env))
+        total += reward(outcome)
+    episode = env.episode
+    return Drive(episode.seed, outcome.label, episode.hit, total, episode.steps)
 
 
 BASELINES: dict[str, Callable[[], Driver]] = {

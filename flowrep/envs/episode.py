@@ -102,7 +102,7 @@ class Episode:
         poses = self._poses_ahead()
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
-            if is_near[i] or not street.is_calm(vehicle.x_m, vehicle.y_m):
+            if is_near[i] or not street.is_safe(vehicle.x_m, vehicle.y_m):
                 self._judge(vehicle, poses[i], street)
             if self.outcome:
                 break

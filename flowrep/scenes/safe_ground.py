@@ -17,23 +17,23 @@ class SafeGround:
     """
 
     def __init__(self, layout: Layout) -> None:
-        """Marks the cells that are calm wherever in them the vehicle stands, whichever way."""
+        """Marks the cells that are safe wherever in them the vehicle stands, whichever way."""
         vehicle = layout.scene.vehicle
         reach = math.hypot(vehicle.length_m, vehicle.width_m) / 2 + _CELL_M
         ends = [layout.zones[path.end] for path in layout.scene.paths]
         boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
         unsafe = shapely.union_all([*ends, *(box.footprint for box in boxes)]).buffer(reach)
-        calm = layout.drivable.buffer(-reach).difference(unsafe)
+        safe = layout.drivable.buffer(-reach).difference(unsafe)
         self._x0, self._y0, x1, y1 = layout.drivable.bounds
         x = np.arange(self._x0, x1, _CELL_M) + _CELL_M / 2
         y = np.arange(self._y0, y1, _CELL_M) + _CELL_M / 2
-        shapely.prepare(calm)
-        table = shapely.contains_xy(calm, *np.meshgrid(x, y, indexing="ij"))
+        shapely.prepare(safe)
+        table = shapely.contains_xy(safe, *np.meshgrid(x, y, indexing="ij"))
         self._columns = [column.astype(np.uint8).tobytes() for column in table]
         self._rows = len(y)
 
     def __call__(self, x_m: float, y_m: float) -> bool:
-        """Returns whether the vehicle's centre is on calm ground."""
+        """Returns whether the vehicle's centre is on safe ground."""
         i, j = int((x_m - self._x0) // _CELL_M), int((y_m - self._y0) // _CELL_M)
         is_on_table = 0 <= i < len(self._columns) and 0 <= j < self._rows
         return is_on_table and self._columns[i][j] == 1

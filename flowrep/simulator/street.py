@@ -57,7 +57,7 @@ class Street:
     def __init__(self, layout: Layout) -> None:
         """Builds every body of the scene in a simulator."""
         self.layout = layout
-        self.is_calm = SafeGround(layout)
+        self.is_safe = SafeGround(layout)
         self.lock = threading.RLock()  # held from placing bodies to looking at them
         self.users = 0
         self.simulator = Simulator(paint.picture())

@@ -61,6 +61,10 @@ class MapTransform(Transform):
         reads: the expected layout of each input, in the order of `in_keys`.
         in_keys: keys that are read.
         out_keys: keys that are written.
+
+    Attributes:
+        label: the representations that it serves, as errors name them; its out_keys unless whoever
+            builds a stack knows better.
     """
 
     # Pure: one tensor an input key in, one tensor an output key out.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from tensordict import TensorDictBase
 from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
@@ -25,27 +25,31 @@ from flowrep.transforms.raw_flow import RawFlow
 from flowrep.transforms.rgb import Rgb
 from flowrep.transforms.segmentation import Segmentation
 
-# What makes each representation, in the order of computation.
-_MADE_BY: dict[str, tuple[type[Transform], ...]] = {
-    "rgb": (Rgb,),
-    "seg": (Segmentation,),
-    "depth": (Depth,),
-    "raw": (RawFlow,),
-    "ego": (FlowFactorize,),
-    "obj": (FlowFactorize,),
-    "seg2": (FrameStack, Segmentation),
-    "depth2": (FrameStack, Depth),
+_FLOW_OPTIONS = ("scale", "unit")
+
+
+class _Recipe(NamedTuple):
+    """What writes a representation, and which of its parameters a user may set."""
+
+    transform: type[Transform]
+    options: tuple[str, ...] = ()
+    frames_of: str | None = None  # the representation whose last k frames it is
+
+
+# In the order of computation.
+_RECIPES: dict[str, _Recipe] = {
+    "rgb": _Recipe(Rgb),
+    "seg": _Recipe(Segmentation, ("encoding",)),
+    "depth": _Recipe(Depth, ("range_m", "missing")),
+    "raw": _Recipe(RawFlow, _FLOW_OPTIONS),
+    "ego": _Recipe(FlowFactorize, _FLOW_OPTIONS),
+    "obj": _Recipe(FlowFactorize, _FLOW_OPTIONS),
+    "seg2": _Recipe(Segmentation, ("encoding",), frames_of="seg"),
+    "depth2": _Recipe(Depth, ("range_m", "missing"), frames_of="depth"),
 }
-_STACK_OF = {"seg2": "seg", "depth2": "depth"}
 _FLOWS = ("raw", "ego", "obj")
 
-REPRESENTATIONS: tuple[str, ...] = tuple(_MADE_BY)
-
-# Parameters that say how transforms are wired up, which representation_stack decides.
-_WIRING = {
-    "self", "in_keys", "out_keys", "outputs", "invalid", "intrinsics", "num_classes", "dt_s",
-    "compiled",
-}  # fmt: skip
+REPRESENTATIONS: tuple[str, ...] = tuple(_RECIPES)
 
 
 def representation_options(name: str) -> dict[str, Any]:
@@ -58,14 +62,16 @@ def representation_options(name: str) -> dict[str, Any]:
         >>> representation_options("depth2")
         {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
-    if name not in _MADE_BY:
+    if name not in _RECIPES:
         raise ValueError(unknown_name("representation", name, REPRESENTATIONS))
-    return {
-        parameter.name: parameter.default
-        for made_by in _MADE_BY[name]
-        for parameter in inspect.signature(made_by).parameters.values()
-        if parameter.name not in _WIRING
-    }
+    recipe = _RECIPES[name]
+    options = _defaults(FrameStack, ("k",)) if recipe.frames_of else {}
+    return options | _defaults(recipe.transform, recipe.options)
+
+
+def _defaults(transform: type[Transform], names: Sequence[str]) -> dict[str, Any]:
+    parameters = inspect.signature(transform).parameters
+    return {name: parameters[name].default for name in names}
 
 
 def representation_stack(
@@ -170,9 +176,10 @@ def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) ->
     for name, options in chosen.items():
         if name in _FLOWS:
             continue
-        frame, key = _STACK_OF.get(name, name), name
-        frame_options = {option: value for option, value in options.items() if option != "k"}
-        if name in _STACK_OF:
+        recipe = _RECIPES[name]
+        key, frame = name, recipe.frames_of or name
+        frame_options = {option: options[option] for option in recipe.options}
+        if recipe.frames_of:
             shared = chosen.get(frame) == frame_options
             key = frame if shared else f"_{frame}"
             stacks.append(FrameStack(k=options["k"], in_keys=key, out_keys=name))
@@ -180,5 +187,5 @@ def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) ->
                 continue
         if frame == "seg":
             frame_options["num_classes"] = num_classes
-        makers.append(_MADE_BY[frame][-1](**frame_options, out_keys=key))
+        makers.append(recipe.transform(**frame_options, out_keys=key))
     return makers + stacks
