@@ -1,7 +1,9 @@
 """Stable-Baselines3's PPO on ego and object flow, out of the box.
 
-    pip install '.[sim,learners]'
+    pip install '.[train,learners]'
     python examples/stable_baselines3_ppo.py --steps 200000
+    python -m flowrep.evaluate policy=examples/stable_baselines3_ppo.py:make \
+        representations=[ego,obj] scene=straight_road
 
 A few thousand steps show that it runs; to learn to cross the street takes some 100,000.
 """
@@ -9,6 +11,7 @@ A few thousand steps show that it runs; to learn to cross the street takes some 
 import argparse
 
 import gymnasium as gym
+import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -35,6 +38,17 @@ def train(steps: int, num_envs: int = 4, rollout_length: int = 128, seed: int = 
     learner.learn(total_timesteps=steps)
     envs.close()
     return learner
+
+
+def make(task, path: str = "ppo_street"):
+    """Returns the saved learner as a policy that `flowrep.evaluate` takes."""
+    learner = PPO.load(path, device="auto")
+
+    def act(maps):
+        joined = np.concatenate([maps[name].cpu().numpy() for name in task.representations], 1)
+        return learner.predict(joined, deterministic=True)[0]
+
+    return act
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The console scripts `flowrep-train`, `flowrep-evaluate`, `flowrep-view`, `flowrep-factorize`."""
+"""The console scripts: `flowrep-train` and its like do what `python -m flowrep.train` does."""
 
 import sys
 from importlib import import_module
@@ -12,6 +12,11 @@ def train() -> None:
 def evaluate() -> None:
     """Runs `flowrep.evaluate`."""
     _run("evaluate")
+
+
+def export() -> None:
+    """Runs `flowrep.export`."""
+    _run("export")
 
 
 def view() -> None:

@@ -1,4 +1,4 @@
-"""Evaluates trained agents: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
+"""Evaluates agents: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
 
 import json
 import sys
@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 from flowrep.extras import require
@@ -14,16 +15,25 @@ from flowrep.extras import require
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
 import hydra
+import torch
 from omegaconf import DictConfig
+from torchrl.data import Composite
 
 from flowrep.agent import CheckpointError, load_checkpoint
 from flowrep.build import Config, build_env, build_policy, build_pool, choose_device
 from flowrep.config import UsageError, validated
-from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
+from flowrep.config.command_line import (
+    exit_with,
+    folder_name,
+    own_keys,
+    plain_config,
+    run_command,
+)
 from flowrep.config.evaluating import EvaluateConfig
 from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import WorkerError
+from flowrep.envs import WorkerError, streets
+from flowrep.exchange.policies import ForeignPolicy, PolicyError, Task, is_reference, load_policy
 from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.comparison import Comparison, Row, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
@@ -33,16 +43,25 @@ from flowrep.experiment.run_folder import RunFolder
 from flowrep.scenes import load_scene
 from flowrep.viz.film import record_episode
 
+MISTAKES = (
+    UsageError,
+    CheckpointError,
+    WorkerError,
+    PolicyError,
+    ValueError,
+    ImportError,
+    OSError,
+)
 OF_THE_MACHINE = ("device", "num_envs", "num_workers", "trust")  # not as the run was trained
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A run whose agent is evaluated.
+    """An agent that is evaluated: a run's, or a policy of the user's own.
 
     Args:
-        run: its folder.
-        config: its own, but for the scene and the machine that were asked for.
+        run: the run's folder; the folder for the table of a policy of the user's own.
+        config: the run's own, but for the scene and the machine that were asked for.
         agent: its policy with what that looks at.
         frames: that it was trained for.
     """
@@ -59,12 +78,16 @@ def run(config: DictConfig) -> None:
     try:
         asked = plain_config(config)
         validated(EvaluateConfig, asked, own_keys())
+        own = [name for name in as_list(asked["policy"]) if is_reference(name)]
+        if own:
+            evaluate_own(asked, own)
+            return
         runs = [run for path in as_list(asked["run"]) for run in RunFolder.all_in(path)]
         with ExitStack() as stack:
             for folder in runs:
                 stack.enter_context(folder.held("evaluating"))
             evaluate(asked, runs)
-    except (UsageError, CheckpointError, WorkerError, ValueError, ImportError, OSError) as error:
+    except MISTAKES as error:
         exit_with(str(error))
 
 
@@ -88,6 +111,54 @@ def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
                 film(asked, subject)
     if stop:
         sys.exit(stop.exit_code)
+
+
+def evaluate_own(asked: Config, names: Sequence[str]) -> None:
+    """Does what `run` says for policies of the user's own, one after the other.
+
+    Raises:
+        PolicyError: one of them can't be had, fails, or gives no actions.
+    """
+    with StopRequest() as stop:
+        for name in names:
+            folder = asked["output"] or f"outputs/evaluate/{folder_name(name)}"
+            if Path(folder, "config.yaml").exists():
+                raise UsageError(f"output={folder} is a run's folder; give another")
+            subject = load_own(asked, name, RunFolder(folder))
+            with subject.run.held("evaluating"):
+                compare({**asked, "policy": name}, [subject], stop)
+                if stop:
+                    break
+                film(asked, subject)
+    if stop:
+        sys.exit(stop.exit_code)
+
+
+def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
+    """Returns a policy of the user's own with what it looks at.
+
+    Raises:
+        PolicyError, TableError: as `load_policy` and `RunFolder.read_episodes`.
+    """
+    folder.read_episodes()
+    config = {key: asked[key] for key in (*OF_THE_MACHINE, "scene", "representations")}
+    config |= {"flow": asked.get("flow") or {"source": "exact"}, "renderer": "auto"}
+    config |= {"speed": "normal", "seed": ""}  # of its training, of which nothing is known
+    env = build_env(config, num_envs=1, num_workers=0)
+    device = choose_device(config["device"])
+    task = Task(
+        scene=config["scene"]["name"],
+        representations=config["representations"],
+        observation_spec=Composite(
+            {name: env.observation_spec[name][0] for name in config["representations"]}
+        ),
+        action_spec=env.action_spec[0],
+        intrinsics=torch.from_numpy(streets(env)[0].K),
+        device=device,
+    )
+    env.close()
+    agent = Agent(load_policy(name, task), config["representations"], config["flow"], device)
+    return Subject(folder, config, agent, frames=0)
 
 
 def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> None:
@@ -174,7 +245,10 @@ def film(asked: Config, subject: Subject) -> None:
             path = run.video_path(f"{speed}_{rate:g}fps_{number}")
             make = partial(build_env, config, speed=speed, frame_rate_hz=float(rate))
             seen, seed = config["representations"], asked["seed"] + number
-            record_episode(make, subject.agent.policy, seen, path, seed=seed)
+            policy = subject.agent.policy
+            if isinstance(policy, ForeignPolicy):
+                policy = policy.alone()
+            record_episode(make, policy, seen, path, seed=seed)
             print(f"video: {path}")
 
 

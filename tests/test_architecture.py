@@ -23,8 +23,18 @@ FLOWREP_IMPORTS_ALLOWED = {
     "experiment": {"experiment", "drivers", "envs", "simulator", "scenes", "agent"}
     | {"transforms", "palette"},
     "viz": {"viz", "experiment", "envs", "scenes", "geometry", "palette"},
+    "exchange": {"exchange", "agent"},
     "sequences": {"sequences", "experiment", "transforms", "geometry", "viz"},
-    "config": {"config", "agent", "drivers", "envs", "experiment", "scenes", "simulator"}
+    "config": {
+        "config",
+        "agent",
+        "drivers",
+        "envs",
+        "exchange",
+        "experiment",
+        "scenes",
+        "simulator",
+    }
     | {"sequences", "transforms", "geometry", "config_tree"},
 }
 THIRD_PARTY_ONLY_IN = {
@@ -33,6 +43,7 @@ THIRD_PARTY_ONLY_IN = {
     "hydra": {
         "train.py",
         "evaluate.py",
+        "export.py",
         "view.py",
         "factorize.py",
         "config/command_line.py",

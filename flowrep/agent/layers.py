@@ -40,7 +40,7 @@ def convolve(
     Returns:
         `[N, rows * columns * O]` a map, rows first, channels last, in the dtype of the images.
     """
-    if all(image.is_cpu and not image.requires_grad for image in images):
+    if all(_is_shared_out(image) and not image.requires_grad for image in images):
         keeps = torch.is_grad_enabled()
         return Convolutions.apply(strides, keeps, len(images), *images, *weights)
     features = []
@@ -54,9 +54,14 @@ def convolve(
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Returns `x Wᵀ + b` of `[N, inputs]`, computed in the dtype of `x`."""
-    if x.is_cpu:
+    if _is_shared_out(x):
         return Linear.apply(x, weight, bias)
     return F.linear(x, weight.to(x.dtype), bias.to(x.dtype))
+
+
+def _is_shared_out(x: Tensor) -> bool:
+    # an exported program has a batch of any size, and no team of threads to share it
+    return x.is_cpu and not torch.compiler.is_exporting()
 
 
 class Convolutions(torch.autograd.Function):

@@ -134,6 +134,9 @@ class Arena:
             later = [street for street in streets if street not in begun]
             maps = self._eyes[agent, rate].look(seen, first, later)
             order = [*first, *later]
+            # for policies that remember what they saw of a street
+            maps["street"] = torch.tensor(order, device=maps.device)
+            maps["is_init"] = (torch.arange(len(order)) < len(first)).unsqueeze(-1)
             policy = self.agents[agent].policy
             for is_greedy, choose in ((True, _likeliest), (False, _drawn)):
                 rows = [i for i, s in enumerate(order) if _job(rides, s).is_greedy is is_greedy]

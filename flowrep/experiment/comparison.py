@@ -36,7 +36,8 @@ class Comparison:
         fps: frame rates in Hz.
         episodes: for each policy, speed and frame rate.
         seed: of the first episode.
-        policies: "greedy" and / or "sampled", in which every agent is run.
+        policies: "greedy" and / or "sampled", in which every agent is run, or the name of a policy
+            that knows one way to act.
         baselines: names in `flowrep.envs.BASELINES`, run on the same episodes.
         agents: how many there are.
     """
@@ -88,7 +89,7 @@ class Comparison:
         rides = [(cell, k) for cell in self._rides for k in range(count)]
         drives = [(cell, k) for cell in self._drives for k in range(count)]
         jobs = [
-            Job(cell.agent or 0, cell.policy == "greedy", cell.speed, cell.fps, self._seeds[k])
+            Job(cell.agent or 0, cell.policy != "sampled", cell.speed, cell.fps, self._seeds[k])
             for cell, k in rides
         ]
         driven = [(cell.policy, self._options(cell, k)) for cell, k in drives]

@@ -259,10 +259,16 @@ def test_everything_that_is_wrong_is_said_at_once():
     ("line", "expected"),
     [
         ("", "'run' needs a value: run=..."),
+        ("run=null", "'run' needs a value: run=..."),
         (
-            "run=null",
-            "run should be a run folder, or a sweep's, or a list of such values, not null",
+            "run=3",
+            "run should be a run folder, or a sweep's, or a list of such values, or null, not 3",
         ),
+        (
+            "run=here policy=mine.py:make scene=s_turn representations=[ego]",
+            "run and policy=mine.py:make are agents of two kinds: give one of them",
+        ),
+        ("run=here output=out", "output is for a policy of your own; run= has it in its config"),
         ("speed=[]", "speed should be low, normal or high, or a list of such values, not []"),
         (
             "speed=hihg",
@@ -272,13 +278,26 @@ def test_everything_that_is_wrong_is_said_at_once():
         ("fps=[]", "fps should be a number above 0, or a list of such values, not []"),
         ("fps=nan", "fps should be a number above 0, or a list of such values, not nan"),
         ("fps=[12,0]", "fps should be a number above 0, or a list of such values, not [12, 0]"),
-        ("policy=[]", "policy should be greedy or sampled, or a list of such values, not []"),
+        (
+            "policy=[]",
+            "policy should be greedy, sampled, path.py:make, package.module:make or path.pt2, or a "
+            "list of such values, not []",
+        ),
+        (
+            "policy=gredy",
+            "policy should be greedy, sampled, path.py:make, package.module:make or path.pt2, or a "
+            "list of such values, not 'gredy' (did you mean 'greedy'?)",
+        ),
+        (
+            "policy=[greedy,mine.py:make]",
+            "policy should be greedy, sampled, or your own, not both",
+        ),
         ("episodes=0", "episodes should be a positive whole number, not 0"),
         ("video=true", "video should be a whole number from 0, not true"),
     ],
 )
 def test_an_evaluation_that_can_not_be_is_refused(line, expected):
-    line = line if "run" in expected else f"run=here {line}"
+    line = line if "run" in line + expected else f"run=here {line}"
     assert refusal("evaluate", EvaluateConfig, line) == expected
 
 

@@ -8,6 +8,7 @@ pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
 from flowrep.config import validated
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.evaluating import EvaluateConfig
+from flowrep.config.exporting import ExportConfig
 from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config.recordings import READERS
 from flowrep.config.representations import EstimatedFlow, ExactFlow, Representations
@@ -24,11 +25,16 @@ GROUP_FILES = [(group, name) for group in OF_TRAINING for name in group_choices(
     ("name", "schema", "given"),
     [
         ("train", TrainConfig, []),
-        ("evaluate", EvaluateConfig, ["run=x", "scene=s_turn"]),
+        (
+            "evaluate",
+            EvaluateConfig,
+            ["policy=a.py:make", "scene=s_turn", "flow=exact", "representations=[ego]"],
+        ),
+        ("export", ExportConfig, ["run=x"]),
         ("view", ViewConfig, []),
         ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
     ],
-    ids=["train", "evaluate", "view", "factorize"],
+    ids=["train", "evaluate", "export", "view", "factorize"],
 )
 def test_a_command_has_the_keys_of_its_schema(name, schema, given):
     config = plain(name, *given)

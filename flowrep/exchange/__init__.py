@@ -1,0 +1,1 @@
+"""Policies that were made elsewhere, and agents that are to run elsewhere."""

@@ -1,0 +1,127 @@
+"""An exported agent gives what the agent gives, with torch alone."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+
+from flowrep.agent import PPO, DiscreteSAC, DoubleDQN
+from flowrep.agent.policy import PolicyNetwork
+from flowrep.exchange.programs import ExportError, acting_program, write_agent
+
+HEIGHT, WIDTH, CLASSES = 40, 52, 5
+SPEC = Composite(
+    ego=Unbounded((1, 2, HEIGHT, WIDTH)),
+    seg=Categorical(CLASSES, (1, 1, HEIGHT, WIDTH), dtype=torch.uint8),
+    rgb=Bounded(0, 255, (1, 3, HEIGHT, WIDTH), dtype=torch.uint8),
+    shape=(1,),
+)
+KEYS = ["ego", "seg", "rgb"]
+
+
+def build(algorithm):
+    torch.manual_seed(3)
+    options = {"device": "cpu", "precision": "fp32", "hidden_size": 24}
+    if algorithm is DoubleDQN:
+        options |= {"total_frames": 9, "final_epsilon": 0.0, "initial_epsilon": 0.0}
+        options |= {"exploration_share": 0.5, "layer_norm": True}
+    return algorithm.build_policy(SPEC, Categorical(3, (1,)), KEYS, **options)
+
+
+def network_of(policy):
+    (network,) = (module for module in policy.modules() if isinstance(module, PolicyNetwork))
+    return network
+
+
+def maps(count):
+    generator = torch.Generator().manual_seed(count)
+    size = (count, 1, HEIGHT, WIDTH)
+    return {
+        "ego": 4 * torch.randn(count, 2, HEIGHT, WIDTH, generator=generator),
+        "seg": torch.randint(CLASSES, size, generator=generator).to(torch.uint8),
+        "rgb": torch.randint(256, (count, 3, HEIGHT, WIDTH), generator=generator).to(torch.uint8),
+    }
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A policy and the folder that it was written to."""
+    policy, folder = build(DiscreteSAC), tmp_path_factory.mktemp("agent") / "new"
+    card = {"maps": [{"name": name} for name in KEYS]}
+    write_agent(folder, acting_program(policy, SPEC), card)
+    return policy, folder
+
+
+@pytest.mark.parametrize("algorithm", [DoubleDQN, PPO])
+def test_every_algorithms_program_gives_the_scores_of_its_network(algorithm):
+    policy = build(algorithm)
+    seen = maps(3)
+    with torch.no_grad():
+        want = network_of(policy)(*seen.values())
+    got = acting_program(policy, SPEC).module()(*seen.values())
+    torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-5)
+
+
+def test_the_loader_acts_as_the_agent_and_needs_torch_alone(exported, tmp_path):
+    policy, folder = exported
+    batches = [maps(1), maps(5)]
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "sys.modules.update(dict.fromkeys(['flowrep', 'tensordict', 'torchrl', 'safetensors']))\n"
+        "import torch, load_agent\n"
+        "act = load_agent.make()\n"
+        "torch.save([act(maps) for maps in torch.load(sys.argv[2])], sys.argv[3])\n"
+    )
+    torch.save(batches, tmp_path / "maps.pt")
+    files = [str(folder), str(tmp_path / "maps.pt"), str(tmp_path / "actions.pt")]
+    result = subprocess.run([sys.executable, "-c", code, *files], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    for seen, got in zip(batches, torch.load(files[2])):
+        with torch.no_grad():
+            want = network_of(policy)(*seen.values()).argmax(-1)
+        assert got.tolist() == want.tolist()
+
+
+def test_the_weights_are_those_of_ordinary_layers(exported):
+    """Nothing of flowrep's and no program: the network of the docs, written by hand."""
+    policy, folder = exported
+    weights, seen = load_file(folder / "agent.safetensors"), maps(4)
+    ids = F.one_hot(seen["seg"][:, 0].long(), CLASSES).movedim(-1, 1).float()
+    embeddings = []
+    # What the maps lose where they are kept as float16, the scores may differ by.
+    for number, x in enumerate((seen["ego"].half().float(), ids, seen["rgb"].float() / 255)):
+        own = {
+            name.split(f"encoders.{number}.")[1]: weight
+            for name, weight in weights.items()
+            if f"encoders.{number}." in name
+        }
+        for layer, stride in (("conv1", 4), ("conv2", 2), ("conv3", 1)):
+            x = F.conv2d(x, own[f"{layer}.weight"], own[f"{layer}.bias"], stride)
+            x = F.leaky_relu(x, 0.01)
+        x = x.movedim(1, -1).flatten(1)
+        embeddings.append(F.leaky_relu(F.linear(x, own["linear.weight"], own["linear.bias"]), 0.01))
+    head = {
+        name.rsplit("head.", 1)[1]: weight for name, weight in weights.items() if "head." in name
+    }
+    hidden = F.silu(F.linear(torch.cat(embeddings, -1), head["hidden.weight"], head["hidden.bias"]))
+    got = F.linear(hidden, head["output.weight"], head["output.bias"])
+    with torch.no_grad():
+        want = network_of(policy)(*seen.values())
+    torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-4)
+
+
+def test_a_policy_of_another_making_is_refused_by_name():
+    with pytest.raises(ExportError, match="of which Sequential has 0; build it by acting_network"):
+        acting_program(torch.nn.Sequential(torch.nn.Linear(2, 3)), SPEC)
+
+
+def test_the_card_says_what_is_read(exported):
+    _, folder = exported
+    assert [
+        each["name"] for each in json.loads((folder / "agent.json").read_text())["maps"]
+    ] == KEYS

@@ -1,0 +1,93 @@
+"""`flowrep.evaluate policy=...`: policies of one's own and exported agents on the benchmark."""
+
+import csv
+import json
+
+import pytest
+
+pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
+
+from flowrep.evaluate import evaluate, evaluate_own
+from flowrep.exchange.policies import PolicyError
+from flowrep.export import export
+from tests.test_configs import composed
+from tests.test_evaluate import trained
+
+pytestmark = pytest.mark.slow
+
+SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=24"]
+QUICK = ["speed=normal", "num_workers=0", "num_envs=2", "device=cpu", "scene=straight_road"]
+
+
+def own(name, output, *overrides):
+    asked = composed(f"output={output}", *QUICK, *overrides, name="evaluate")
+    evaluate_own(asked, [name])
+    with (output / "evaluation.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def episodes(rows, policy):
+    return [{**row, "policy": ""} for row in rows if row["policy"] == policy]
+
+
+def test_a_policy_that_goes_on_drives_as_the_baseline_does(tmp_path):
+    path = tmp_path / "straight.py"
+    path.write_text("def make(task):\n    return lambda maps: [0] * len(maps)\n")
+    name = f"{path}:make"
+    given = ["representations=[seg]", "episodes=3", "baselines=[never_turn]"]
+    rows = own(name, tmp_path / "out", *given)
+    assert len(episodes(rows, name)) == 3
+    assert episodes(rows, name) == episodes(rows, "never_turn")
+    assert {(row["representations"], row["frames"]) for row in rows} == {("seg", "0")}
+
+
+def test_the_documented_example_steers_and_is_filmed(tmp_path):
+    given = [
+        "representations=[obj,depth]",
+        "episodes=4",
+        "baselines=[never_turn]",
+        *SMALL,
+        "video=1",
+    ]
+    rows = own("examples/own_policy.py:make", tmp_path, *given)
+    mine = episodes(rows, "examples/own_policy.py:make")
+    assert len(mine) == 4
+    assert mine != episodes(rows, "never_turn")
+    assert [path.name for path in (tmp_path / "videos").iterdir()] == ["normal_12fps_0.mp4"]
+
+
+def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
+    given = ["algorithm.precision=fp32", "representations=[ego,obj]"]
+    run = trained(tmp_path / "run", *given)
+    quick = ["speed=normal", "num_workers=0", "num_envs=2", "device=cpu"]
+    evaluate(
+        composed(f"run={run.path}", *quick, "episodes=3", "baselines=[]", name="evaluate"), [run]
+    )
+    mine = episodes(run.read_episodes(), "greedy")
+    folder = export(composed(f"run={run.path}", name="export"), run)
+    assert folder == run.path / "export"
+    card = json.loads((folder / "agent.json").read_text())
+    assert [(each["name"], each["shape"]) for each in card["maps"]] == [
+        ("ego", [2, 40, 48]),
+        ("obj", [2, 40, 48]),
+    ]
+    for number, name in enumerate([f"{folder}/load_agent.py:make", f"{folder}/agent.pt2"]):
+        # the scene with the camera that the agent was trained with
+        camera = [f"scene.camera.{key}={value}" for key, value in camera_of(run).items()]
+        options = [*given[1:], *camera, "episodes=3", "baselines=[]"]
+        rows = own(name, tmp_path / str(number), *options)
+        drives = [(row["episode_seed"], row["outcome"], row["return"]) for row in rows]
+        assert drives == [(row["episode_seed"], row["outcome"], row["return"]) for row in mine]
+
+
+def camera_of(run):
+    camera = run.read_config()["scene"]["camera"]
+    return {key: camera[key] for key in ("height_px", "width_px", "fov_deg")}
+
+
+def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text("def make(task):\n    return lambda maps: None\n")
+    with pytest.raises(PolicyError, match="gave a NoneType; expected 1 whole numbers"):
+        own(f"{path}:make", tmp_path / "out", "representations=[seg]", "num_envs=1", "episodes=1")
+    assert not (tmp_path / "out" / "videos").exists()
