@@ -4,13 +4,15 @@
 #   docker run --rm flowrep test
 FROM python:3.11-slim-bookworm
 
-# A compiler for torch.compile, make for the two commands; nothing of a screen.
+# A compiler for torch.compile, make for the two commands; nothing of a screen. Debian's mirrors keep
+# the newest versions alone, so that a pinned one is soon gone.
+# hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends g++ make \
     && rm -rf /var/lib/apt/lists/*
 
 RUN useradd --create-home --uid 1000 flowrep && install --directory --owner flowrep /flowrep
-USER flowrep
+USER 1000
 WORKDIR /flowrep
 
 # .venv first: it is built anew only when what is needed changes.

