@@ -29,6 +29,11 @@ def factorize() -> None:
     _run("factorize")
 
 
+def report() -> None:
+    """Runs `flowrep.report`."""
+    _run("report.command")
+
+
 def _run(command: str) -> None:
     try:
         module = import_module(f"flowrep.{command}")

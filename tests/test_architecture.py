@@ -36,6 +36,8 @@ FLOWREP_IMPORTS_ALLOWED = {
         "simulator",
     }
     | {"sequences", "transforms", "geometry", "config_tree"},
+    "report": {"report", "evaluate", "viz", "config", "experiment", "agent", "envs", "scenes"}
+    | {"config_tree", "extras"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py"},
@@ -46,6 +48,7 @@ THIRD_PARTY_ONLY_IN = {
         "export.py",
         "view.py",
         "factorize.py",
+        "report/command.py",
         "config/command_line.py",
         "config/composition.py",
         "config/quoting.py",

@@ -11,6 +11,7 @@ from flowrep.config.evaluating import EvaluateConfig
 from flowrep.config.exporting import ExportConfig
 from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config.recordings import READERS
+from flowrep.config.reporting import ReportConfig
 from flowrep.config.representations import EstimatedFlow, ExactFlow, Representations
 from flowrep.config.training import Evaluation, TrainConfig
 from flowrep.config.viewing import ViewConfig
@@ -33,8 +34,9 @@ GROUP_FILES = [(group, name) for group in OF_TRAINING for name in group_choices(
         ("export", ExportConfig, ["run=x"]),
         ("view", ViewConfig, []),
         ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
+        ("report", ReportConfig, ["run=x"]),
     ],
-    ids=["train", "evaluate", "export", "view", "factorize"],
+    ids=["train", "evaluate", "export", "view", "factorize", "report"],
 )
 def test_a_command_has_the_keys_of_its_schema(name, schema, given):
     config = plain(name, *given)

@@ -1,0 +1,131 @@
+"""Which sections the runs of some folders make."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from flowrep.report.comparing import Settings, experiment_section, scenes_of, success_section
+from flowrep.report.experiments import COMPLEMENTARY, FLOW_COMPOSITION, STACKS
+from flowrep.report.failing import failure_section
+from flowrep.report.families import Family, families_of
+from flowrep.report.learning import curve_panels, draw_curves
+from flowrep.report.rates import has_rates, rate_section
+from flowrep.report.results import by_stack, in_order
+from flowrep.report.runs import Run
+from flowrep.report.sections import Drawing, Section
+from flowrep.report.tables import Table
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """The sections of runs that may be compared; `label` says what sets them apart from others."""
+
+    label: str
+    runs: tuple[Run, ...]
+    sections: tuple[Section, ...]
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that a page shows of runs, besides pictures of their drives."""
+
+    runs: tuple[Run, ...]
+    complaints: tuple[str, ...]
+    chapters: tuple[Chapter, ...]
+
+
+def assemble(runs: Sequence[Run], complaints: Sequence[str], ask: Settings) -> Report:
+    """Returns the sections that runs make, family by family, and what is wrong with runs."""
+    families = families_of(runs)
+    wrong = [*complaints, *(w for w in (_unusable(run, ask) for run in runs) if w)]
+    chapters = []
+    for number, family in enumerate(families):
+        sections = family_sections(family, ask)
+        if len(families) > 1:
+            sections = [replace(s, name=f"{number + 1}_{s.name}") for s in sections]
+        chapters.append(Chapter(family.label, family.runs, tuple(sections)))
+    if len(families) > 1:
+        chapters.append(Chapter("", tuple(runs), tuple(across(families, ask))))
+    return Report(tuple(runs), tuple(wrong), tuple(c for c in chapters if c.sections))
+
+
+def _unusable(run: Run, ask: Settings) -> str | None:
+    """Says why a run fills no cell, None where it does."""
+    if not run.is_finished:
+        return (
+            f"{run.path} is not finished, at {run.frames:,} of {run.total_frames:,} frames: only "
+            "its learning curve is used"
+        )
+    if not any(condition.policy == ask.policy for condition in run.by_condition):
+        return (
+            f"{run.path} has no {ask.policy} evaluation at its end: only its learning curve is "
+            f"used; python -m flowrep.evaluate run={run.path} policy={ask.policy} adds one"
+        )
+    return None
+
+
+def family_sections(family: Family, ask: Settings) -> list[Section]:
+    """Returns the sections of runs whose configs agree."""
+    runs = [run for run in family.runs if _unusable(run, ask) is None]
+    sections = []
+    shown: set[str] = set()
+    if runs:
+        for experiment in (FLOW_COMPOSITION, COMPLEMENTARY):
+            if experiment.is_in(family.runs) and any(r.stack in experiment.stacks for r in runs):
+                sections.append(experiment_section(experiment, runs, ask))
+                shown |= set(experiment.stacks)
+        stacks = in_order([run.stack for run in runs], STACKS)
+        if set(stacks) - shown:
+            series = by_stack(runs, stacks)
+            sections.append(success_section("success", "Success", series, None, ask))
+        sections.append(failure_section(runs, ask))
+        if has_rates(runs, ask):
+            sections.append(rate_section(runs, ask))
+    return [*sections, *_curves(family.runs)]
+
+
+def _curves(runs: Sequence[Run]) -> list[Section]:
+    stacks = in_order([run.stack for run in runs], STACKS)
+    panels = curve_panels(by_stack(runs, stacks), scenes_of(runs))
+    if not panels:
+        return []
+    caption = (
+        "Learning curves. Bold, with markers: greedy evaluations at the training speed, the "
+        "interquartile mean over seeds. Thin: each seed's training episodes, sampled actions."
+    )
+    drawing = Drawing("learning_curves", caption, tuple(panels), draw_curves)
+    return [Section("learning_curves", "Learning curves", drawings=(drawing,))]
+
+
+def across(families: Sequence[Family], ask: Settings) -> list[Section]:
+    """Returns what stacks do in families whose configs differ, side by side and never pooled."""
+    sections = []
+    in_all = [{run.stack for run in family.runs} for family in families]
+    for stack in in_order([s for stacks in in_all for s in stacks], STACKS):
+        series: dict[str, list[Run]] = {}
+        taken: set[Run] = set()
+        for letter, family in zip("ABCDEFGHIJKLMNOPQRSTUVWXYZ", families):
+            ours = [r for r in family.runs if r.stack == stack and _unusable(r, ask) is None]
+            if ours and not taken & set(ours):
+                series[letter] = ours
+                taken |= set(ours)
+        if len(series) > 1:
+            named = f"across_{stack}"
+            sections.append(
+                success_section(named, f"{stack} under configs that differ", series, None, ask)
+            )
+    if not sections:
+        return []
+    return [
+        Section("configs", "Configs that differ", tables=(differing_keys(families),)),
+        *sections,
+    ]
+
+
+def differing_keys(families: Sequence[Family]) -> Table:
+    """Returns the keys in which families differ, a column each."""
+    keys = list(dict.fromkeys(key for family in families for key in family.differences))
+    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[: len(families)]
+    rows = tuple((key, *(f.differences.get(key, "") for f in families)) for key in keys)
+    caption = "Keys of the configs in which the runs differ. No number is of runs of two columns."
+    columns = tuple(range(1, len(families) + 1))
+    return Table("configs", caption, ("key", *letters), (("", rows),), words=columns)

@@ -1,0 +1,94 @@
+"""Runs of one stack in one scene under one condition, as outcomes to compute with."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowrep.report.runs import Condition, Run
+from flowrep.report.statistics import Array
+
+BASELINES = ("never_turn", "random", "planner")
+
+Judge = Callable[[Mapping[str, str]], float]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What the runs of one stack did in one scene and condition.
+
+    Args:
+        seeds: of the runs, in the rows' order.
+        episodes: their seeds, in the columns' order.
+        outcomes: `[R, E]`, what the judge says of each episode, nan where it was not driven.
+    """
+
+    seeds: tuple[int, ...]
+    episodes: tuple[int, ...]
+    outcomes: Array
+
+    @property
+    def counts(self) -> str:
+        """How many seeds and episodes, as text: `3 × 192`."""
+        of_each = (~np.isnan(self.outcomes)).sum(axis=1)
+        low, high = of_each.min(), of_each.max()
+        return f"{len(self.seeds)} × {low}" + (f"–{high}" if high > low else "")
+
+
+def success(row: Mapping[str, str]) -> float:
+    """Judges an episode: 1 for a success, else 0."""
+    return float(row["outcome"] == "success")
+
+
+def out_of_bounds_of_both(row: Mapping[str, str]) -> float:
+    """Judges a failure as the paper's Table III does: 1 out of bounds, 0 collision, nan others."""
+    return {"out_of_bounds": 1.0, "collision": 0.0}.get(row["outcome"], np.nan)
+
+
+def cell_of(runs: Iterable[Run], condition: Condition, judge: Judge = success) -> Cell | None:
+    """Returns what runs of one stack and scene did; None where none was evaluated so.
+
+    Episodes are columns, so that those which several runs drove stand in one.
+    """
+    found: list[tuple[int, dict[int, float]]] = []
+    for run in sorted(runs, key=lambda run: run.seed):
+        driven = {
+            int(row["episode_seed"]): judge(row) for row in run.by_condition.get(condition, ())
+        }
+        if driven:
+            found.append((run.seed, driven))
+    if not found:
+        return None
+    episodes = sorted({seed for _, driven in found for seed in driven})
+    outcomes = np.array([[driven.get(e, np.nan) for e in episodes] for _, driven in found])
+    return Cell(tuple(seed for seed, _ in found), tuple(episodes), outcomes)
+
+
+def side_by_side(first: Cell, second: Cell) -> tuple[Array, Array]:
+    """Returns the outcomes of two cells with the same episodes in their columns."""
+    episodes = sorted({*first.episodes, *second.episodes})
+    column = {episode: place for place, episode in enumerate(episodes)}
+    sides = []
+    for cell in (first, second):
+        wide = np.full((len(cell.seeds), len(episodes)), np.nan)
+        wide[:, [column[episode] for episode in cell.episodes]] = cell.outcomes
+        sides.append(wide)
+    return sides[0], sides[1]
+
+
+def shared_episodes(first: Cell, second: Cell) -> int:
+    """Returns how many episodes both drove."""
+    return len({*first.episodes} & {*second.episodes})
+
+
+def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:
+    """Returns how often a baseline, the condition's policy, succeeded; None where it did not drive.
+
+    It drives an episode as it does whichever agent it is compared with, so each counts once.
+    """
+    driven = {
+        int(row["episode_seed"]): success(row)
+        for run in runs
+        for row in run.by_condition.get(condition, ())
+    }
+    return float(np.mean(list(driven.values()))) if driven else None

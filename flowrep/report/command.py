@@ -1,0 +1,109 @@
+"""Reports on runs: `python -m flowrep.report outputs/<sweep>`."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from flowrep.extras import require
+
+require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja2", module=__name__)
+
+import hydra
+from omegaconf import DictConfig
+
+from flowrep.config import UsageError, validated
+from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
+from flowrep.config.quoting import override
+from flowrep.config.reporting import ReportConfig
+from flowrep.config_tree import CONF_DIR
+from flowrep.experiment.run_folder import RunFolderError
+from flowrep.report.assembly import assemble
+from flowrep.report.comparing import Settings
+from flowrep.report.drives import Drives
+from flowrep.report.files import write_files, write_page
+from flowrep.report.page import render_page, summary
+from flowrep.report.runs import read_runs
+from flowrep.report.statistics import Bootstrap
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="report")
+def run(config: DictConfig) -> None:
+    """Writes figures, tables and a page of runs."""
+    try:
+        asked = plain_config(config)
+        validated(ReportConfig, asked, own_keys())
+        report_on(asked)
+    except (UsageError, RunFolderError, ValueError, ImportError, OSError) as error:
+        exit_with(str(error))
+
+
+def report_on(asked: dict[str, Any]) -> Path:
+    """Does what `run` says; returns the page's path.
+
+    Raises:
+        UsageError: nothing in the folders can be read.
+        RunFolderError: a folder holds no run.
+    """
+    given = asked["run"]
+    folders = [Path(folder) for folder in (given if isinstance(given, list) else [given])]
+    output = Path(asked["output"] or folders[0] / "report")
+    runs, complaints = read_runs(folders)
+    for complaint in complaints:
+        print(f"left out: {complaint}")
+    if not runs:
+        raise UsageError("none of the runs can be read, see above")
+    print(summary(runs))
+    ask = Settings(asked["policy"], Bootstrap(asked["resamples"]))
+    report = assemble(runs, complaints, ask)
+    for complaint in report.complaints[len(complaints) :]:
+        print(f"in part: {complaint}")
+    for folder in write_files(report, output):
+        print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    drives = _drives(report.runs, asked)
+    for complaint in drives.complaints:
+        print(f"drives: {complaint}")
+    page = write_page(render_page(report, drives, folders), output)
+    print(f"page: {page}")
+    return page
+
+
+def _drives(runs: Sequence[Any], asked: dict[str, Any]) -> Drives:
+    if not asked["trajectories"] and not asked["videos"]:
+        return Drives()
+    # the simulator is needed for these alone
+    from flowrep.report.replay import drive_again
+
+    return drive_again(
+        runs,
+        trajectories=asked["trajectories"],
+        videos=asked["videos"],
+        device=asked["device"],
+        trust=asked["trust"],
+    )
+
+
+def with_folders_named(arguments: Sequence[str]) -> list[str]:
+    """Returns a command line in which folders that were given bare are the value of `run`.
+
+    >>> with_folders_named(["outputs/a", "outputs/b", "videos=1"])
+    ['run=[outputs/a,outputs/b]', 'videos=1']
+    """
+    bare = [text for text in arguments if _is_folder(text)]
+    if not bare:
+        return list(arguments)
+    if len(bare) == 1:
+        value = override("run", bare[0])
+    else:
+        value = f"run=[{','.join(override('run', text)[len('run=') :] for text in bare)}]"
+    return [value, *(text for text in arguments if text not in bare)]
+
+
+def _is_folder(text: str) -> bool:
+    return not text.startswith(("-", "~", "+")) and ("=" not in text or Path(text).exists())
+
+
+def main() -> None:
+    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    sys.argv[1:] = with_folders_named(sys.argv[1:])
+    run_command("report", run, ReportConfig)

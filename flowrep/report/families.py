@@ -1,0 +1,80 @@
+"""Sorts runs into families within which no config key has two values, save what is compared."""
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from flowrep.report.runs import Run
+
+_SHOWN = 3  # keys in a label
+_LONG = 24  # characters of a value; what is longer is said to differ
+
+
+@dataclass(frozen=True)
+class Family:
+    """Runs that may be compared: they differ in scene, representations and seed alone.
+
+    Args:
+        runs: of the family; one that lacks a key, as `ego` does `representations.obj.scale`, may
+            be in several.
+        differences: the keys in which families differ, with this one's values as text.
+    """
+
+    runs: tuple[Run, ...]
+    differences: dict[str, str]
+
+    @property
+    def label(self) -> str:
+        """Names it by what sets it apart; empty where there is one family alone."""
+        shown = [f"{key}={value}" for key, value in self.differences.items()]
+        rest = [f"{len(shown) - _SHOWN} more keys"] if len(shown) > _SHOWN + 1 else []
+        return ", ".join(shown[:_SHOWN] + rest if rest else shown)
+
+
+def families_of(runs: Sequence[Run]) -> list[Family]:
+    """Returns families, the one with the most runs first."""
+    values: dict[str, dict[Hashable, Any]] = {}
+    for run in runs:
+        for key, value in run.identity.items():
+            values.setdefault(key, {})[repr(value)] = value
+    differing = [key for key, found in values.items() if len(found) > 1]
+    signatures = [
+        {key: repr(run.identity[key]) for key in differing if key in run.identity} for run in runs
+    ]
+    distinct = list({tuple(sorted(s.items())): s for s in signatures}.values())
+    whole = _widest(distinct)
+    found = []
+    for signature in whole:
+        members = [run for run, own in zip(runs, signatures) if _fits(own, signature)]
+        shown = {
+            key: _text(key, values[key], signature[key]) for key in differing if key in signature
+        }
+        found.append(Family(tuple(members), shown))
+    return sorted(found, key=lambda family: -len(family.runs))
+
+
+Signature = dict[str, str]
+
+
+def _widest(signatures: Sequence[Signature]) -> list[Signature]:
+    """Returns signatures joined with all that they do not contradict, none inside another."""
+    joined: list[Signature] = []
+    for signature in sorted(signatures, key=len, reverse=True):
+        for place, other in enumerate(joined):
+            if all(other.get(key, value) == value for key, value in signature.items()):
+                joined[place] = other | signature
+                break
+        else:
+            joined.append(dict(signature))
+    return joined
+
+
+def _fits(own: Signature, signature: Signature) -> bool:
+    return all(signature.get(key, value) == value for key, value in own.items())
+
+
+def _text(key: str, values: dict[Hashable, Any], chosen: str) -> str:
+    text = str(values[chosen])
+    if len(text) <= _LONG:
+        return text
+    return f"{sorted(values, key=str).index(chosen) + 1} of {len(values)} versions"

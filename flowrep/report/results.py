@@ -1,0 +1,102 @@
+"""What runs of a family did, scene by scene: estimates for each stack and condition."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import NamedTuple
+
+from flowrep.report.cells import BASELINES, Cell, baseline_share, cell_of
+from flowrep.report.runs import Condition, Run
+from flowrep.report.statistics import Bootstrap, Estimate, rates
+
+SPEEDS = ("low", "normal", "high")
+
+
+class Score(NamedTuple):
+    """An estimate of success, each seed's own, and how many seeds and episodes that were."""
+
+    estimate: Estimate
+    of_seeds: tuple[float, ...]
+    counts: str
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Success in one scene: a score for each series and condition, None where it is missing.
+
+    Args:
+        scene: its name.
+        series: what is compared, in the order of the figure: stacks, or stacks of families.
+        conditions: groups of bars, or points of a line.
+        cells: the outcomes behind the scores.
+        scores: by series and condition.
+        baselines: success by the baseline's name and condition.
+    """
+
+    scene: str
+    series: tuple[str, ...]
+    conditions: tuple[Condition, ...]
+    cells: Mapping[tuple[str, Condition], Cell | None]
+    scores: Mapping[tuple[str, Condition], Score | None]
+    baselines: Mapping[tuple[str, Condition], float] = field(default_factory=dict)
+
+    @property
+    def is_empty(self) -> bool:
+        """Says whether nothing at all was evaluated so."""
+        return all(score is None for score in self.scores.values())
+
+
+def grid_of(
+    scene: str,
+    runs: Mapping[str, Sequence[Run]],
+    conditions: Sequence[Condition],
+    bootstrap: Bootstrap,
+) -> Grid:
+    """Returns the success of several series of runs in a scene.
+
+    Args:
+        scene: its name; runs of others are left out.
+        runs: by series, which may have none.
+        conditions: in which they are compared.
+        bootstrap: makes the intervals.
+    """
+    here = {name: [run for run in members if run.scene == scene] for name, members in runs.items()}
+    cells = {(name, c): cell_of(here[name], c) for name, c in product(runs, conditions)}
+    scores = {place: score_of(cell, bootstrap) for place, cell in cells.items()}
+    everybody = [run for members in here.values() for run in members]
+    shares = {
+        (name, c): baseline_share(everybody, c._replace(policy=name))
+        for name, c in product(BASELINES, conditions)
+    }
+    found = {place: share for place, share in shares.items() if share is not None}
+    return Grid(scene, tuple(runs), tuple(conditions), cells, scores, found)
+
+
+def score_of(cell: Cell | None, bootstrap: Bootstrap) -> Score | None:
+    """Returns the success of a cell's runs."""
+    if cell is None:
+        return None
+    of_seeds = tuple(float(rate) for rate in rates(cell.outcomes))
+    return Score(bootstrap.success([cell.outcomes]), of_seeds, cell.counts)
+
+
+def by_stack(runs: Sequence[Run], stacks: Sequence[str]) -> dict[str, list[Run]]:
+    """Returns the runs of each of these stacks."""
+    return {stack: [run for run in runs if run.stack == stack] for stack in stacks}
+
+
+def in_order(found: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Returns the names that were found, once each, the known ones first and in their order."""
+    first = [name for name in known if name in found]
+    return first + sorted(set(found) - set(first))
+
+
+def speeds_tested(runs: Sequence[Run], policy: str, fps: float) -> list[str]:
+    """Returns the speed modes in which runs were evaluated."""
+    found = [c.speed for run in runs for c in run.by_condition if c[::2] == (policy, fps)]
+    return in_order(found, SPEEDS)
+
+
+def rates_tested(runs: Sequence[Run], policy: str, speed: str) -> list[float]:
+    """Returns the frame rates at which runs were evaluated, the lowest first."""
+    return sorted({c.fps for run in runs for c in run.by_condition if c[:2] == (policy, speed)})

@@ -1,0 +1,225 @@
+"""Reads run folders: what each was, what its episodes were, and what can't be read."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from flowrep.experiment.origin import origin_of
+from flowrep.experiment.run_folder import RunFolder, RunFolderError
+from flowrep.experiment.tables import TableError
+
+_ORDER = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
+Rows = list[dict[str, str]]
+
+
+class Condition(NamedTuple):
+    """How agents were evaluated: policy, pedestrians' speed mode, frames a second."""
+
+    policy: str
+    speed: str
+    fps: float
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run folder, read.
+
+    Args:
+        path: the folder.
+        config: its config.yaml.
+        episodes: rows of evaluation.csv.
+        metrics: rows of metrics.csv.
+    """
+
+    path: Path
+    config: Mapping[str, Any]
+    episodes: Rows
+    metrics: Rows
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What its weights are a function of, by dotted key; the seed is not among it.
+
+        Keys of the scene that every scene has for its own are under its name, and options of a
+        representation under that one's, so that two runs differ in them only where both have them.
+        """
+        parts = origin_of(self.config)
+        del parts["flowrep"], parts["seed"]
+        scene = parts.pop("scene")
+        own = {key: value for key, value in scene.items() if key not in _OF_EVERY_SCENE}
+        shared = {f"scene.{key}": scene[key] for key in _OF_EVERY_SCENE if key in scene}
+        return dict([*_flat(parts | shared), *_flat(own, f"scene.{self.scene}")])
+
+    @property
+    def scene(self) -> str:
+        """The name of the scene that it was trained in."""
+        return self.config["scene"]["name"]
+
+    @property
+    def stack(self) -> str:
+        """What the agent sees, e.g. `ego+obj`, in one order whatever that of the config."""
+        return stack_of(self.config["representations"])
+
+    @property
+    def seed(self) -> int:
+        """Of the training."""
+        return self.config["seed"]
+
+    @property
+    def speed(self) -> Any:
+        """The pedestrians' speed mode in training."""
+        return self.config["speed"]
+
+    @property
+    def fps(self) -> float:
+        """The frame rate in training, in Hz."""
+        return float(self.config["scene"]["frame_rate_hz"])
+
+    @property
+    def total_frames(self) -> int:
+        """How long it was to be trained."""
+        return self.config["total_frames"]
+
+    @property
+    def frames(self) -> int:
+        """How long it has been trained, as its tables say."""
+        return max((int(row["frames"]) for row in (*self.metrics, *self.episodes)), default=0)
+
+    @property
+    def is_finished(self) -> bool:
+        """Says whether it was trained for as long as it was to be."""
+        return self.frames >= self.total_frames
+
+    @cached_property
+    def tested(self) -> Rows:
+        """Rows of the finished agent in its own scene, drawn for no decision in training."""
+        return [
+            row
+            for row in self.episodes
+            if row["evaluation"] != "training"
+            and row["scene"] == self.scene
+            and int(row["frames"]) >= self.total_frames
+        ]
+
+    @cached_property
+    def by_condition(self) -> dict[Condition, Rows]:
+        """The tested rows, by how they were evaluated."""
+        rows: dict[Condition, Rows] = {}
+        for row in self.tested:
+            condition = Condition(row["policy"], row["speed"], float(row["fps"]))
+            rows.setdefault(condition, []).append(row)
+        return rows
+
+
+_OF_EVERY_SCENE = ("camera", "frame_rate_hz")
+
+
+def stack_of(representations: Iterable[str]) -> str:
+    """Returns the name of a set of representations, whatever their order.
+
+    >>> stack_of(["seg2", "obj", "ego"]), stack_of(["raw"])
+    ('ego+obj+seg2', 'raw')
+    """
+    names = list(representations)
+    known = [name for name in _ORDER if name in names]
+    return "+".join([*known, *sorted(set(names) - set(known))])
+
+
+def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
+    """Returns the runs in folders, however deep, and a line for each that was left out.
+
+    Raises:
+        RunFolderError: there is none at all in one of the folders.
+    """
+    runs: dict[Path, Run] = {}
+    complaints: list[str] = []
+    for folder in folders:
+        configs = sorted(path for path in folder.rglob("config.yaml") if _is_of_a_run(path))
+        if not configs:
+            what = (
+                "holds no run: no config.yaml is in it or below"
+                if folder.is_dir()
+                else ("is a file" if folder.exists() else "does not exist")
+            )
+            raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
+        for config in configs:
+            if config.parent.resolve() in runs:
+                continue
+            try:
+                runs[config.parent.resolve()] = _read(config.parent)
+            except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
+                complaints.append(" ".join(str(error).split()))
+    return _without_repeats(list(runs.values()), complaints), complaints
+
+
+def _is_of_a_run(config: Path) -> bool:
+    return ".hydra" not in config.parts and "wandb" not in config.parts
+
+
+def _read(path: Path) -> Run:
+    folder = RunFolder.existing(path)
+    run = Run(path, folder.read_config(), folder.read_episodes(), folder.read_metrics())
+    remedy = "put back the file that the run was started with"
+    try:
+        wrong = [
+            f"{key} is {value!r}" for key, value, kind in _parts(run) if type(value) not in kind
+        ]
+    except KeyError as error:
+        raise RunFolderError(f"{path}/config.yaml has no {error.args[0]}; {remedy}") from None
+    except (TypeError, ValueError, AttributeError) as error:
+        raise RunFolderError(
+            f"{path}/config.yaml is not what a run leaves ({error}); {remedy}"
+        ) from None
+    if wrong:
+        raise RunFolderError(f"{path}/config.yaml: {wrong[0]}; {remedy}")
+    for number, row in enumerate(run.metrics, start=2):
+        try:
+            float(row.get("success") or 0)
+        except ValueError:
+            raise TableError(
+                f"{folder.metrics_path}, line {number}: success can't be {row['success']!r}; mend "
+                "or delete the line"
+            ) from None
+    return run
+
+
+def _parts(run: Run) -> list[tuple[str, Any, tuple[type, ...]]]:
+    """The parts of a config that a report reads, with the types that they may have."""
+    assert run.identity
+    return [
+        ("scene.name", run.scene, (str,)),
+        ("scene.frame_rate_hz", run.config["scene"]["frame_rate_hz"], (float, int)),
+        ("representations", run.config["representations"], (dict,)),
+        ("seed", run.seed, (int,)),
+        ("speed", run.speed, (str,)),
+        ("total_frames", run.total_frames, (int,)),
+    ]
+
+
+def _without_repeats(runs: list[Run], complaints: list[str]) -> list[Run]:
+    """Keeps one run of a config and seed: two would count as two seeds."""
+    kept: dict[Any, Run] = {}
+    for run in runs:
+        key = (run.stack, run.seed, repr(sorted(run.identity.items(), key=lambda item: item[0])))
+        other = kept.get(key)
+        if other is None:
+            kept[key] = run
+            continue
+        best = max(other, run, key=lambda r: (len(r.tested), r.frames))
+        left = run if best is other else other
+        complaints.append(
+            f"{left.path} is the same run as {best.path}, config and seed: left out, it would "
+            "count as another seed"
+        )
+        kept[key] = best
+    return list(kept.values())
+
+
+def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        for key, inner in value.items():
+            yield from _flat(inner, f"{place}.{key}" if place else str(key))
+    else:
+        yield place, value

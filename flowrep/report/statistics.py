@@ -1,0 +1,242 @@
+"""What the scores of a few runs say: interquartile means, bootstrap intervals, comparisons.
+
+As rliable does it (Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical
+Precipice, NeurIPS 2021): scores are aggregated by their interquartile mean over runs and scenes,
+and runs are resampled within their scene. Two things differ. A run's score is itself a share of a
+few hundred episodes, so the episodes are resampled too, the same ones for all runs: otherwise two
+seeds that happen to agree would have an interval of no width. And scenes may have different numbers
+of runs, or lack some.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from flowrep.experiment.evaluation import wilson_interval
+
+Array = NDArray[np.float64]
+
+_OF_RUNS, _OF_EPISODES = 0, 1  # set the two draws apart
+
+FEWEST_SEEDS = 3
+"""With fewer a side, a difference is said of the agents, not of what they were trained on."""
+
+
+class Estimate(NamedTuple):
+    """A number with the ends of its interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+class Comparison(NamedTuple):
+    """How much better one side does than another, from score to score.
+
+    Args:
+        difference: of the interquartile means, with its bootstrap interval.
+        improvement: the probability that a run of the first side beats one of the second.
+        p_value: of Welch's t-test over the runs' scores; nan where a side has one run alone.
+        runs: how many of each side; of one scene alone where a scene has one run of a side.
+    """
+
+    difference: Estimate
+    improvement: Estimate
+    p_value: float
+    runs: int
+
+    @property
+    def is_noise(self) -> bool:
+        """Says whether the difference can't be told from noise.
+
+        Its interval has 0 inside; or the t-test sees nothing, since a bootstrap over two or three
+        runs is too sure of itself.
+        """
+        has_zero = self.difference.low <= 0 <= self.difference.high
+        return has_zero or self.p_value >= 0.05
+
+    @property
+    def verdict(self) -> str:
+        """Says in words what the difference is worth."""
+        if self.is_noise:
+            return "can't be told from noise"
+        word = "higher" if self.difference.value > 0 else "lower"
+        if self.runs < FEWEST_SEEDS:
+            seeds = "one seed" if self.runs == 1 else f"{self.runs} seeds"
+            return f"{word} for these agents; {seeds} a side say no more"
+        return word
+
+
+def interquartile_mean(scores: Any, axis: int = -1) -> Any:
+    """Returns the mean of the middle half of scores; of up to three, their mean.
+
+    >>> float(interquartile_mean([0.0, 0.5, 0.7, 1.0]))
+    0.6
+    """
+    return stats.trim_mean(scores, 0.25, axis=axis)
+
+
+def rates(outcomes: Array, weights: Array | None = None) -> Array:
+    """Returns each run's share of episodes that have it.
+
+    Args:
+        outcomes: [R, E], 1 where run r's episode e has it, 0 where not, nan where the run did not
+            drive that episode.
+        weights: [N, E], how often each episode counts in each of N resamples; all once if None.
+
+    Returns:
+        [N, R], or [R] without weights. A run none of whose episodes is in a resample keeps its own
+        rate there.
+    """
+    there = ~np.isnan(outcomes)
+    found = np.where(there, outcomes, 0.0)
+    own = found.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+    if weights is None:
+        return own
+    counts = weights @ there.T
+    return np.where(counts > 0, weights @ found.T / np.maximum(counts, 1), own)
+
+
+class Bootstrap:
+    """Resamples runs and episodes; the same seed gives the same intervals.
+
+    Args:
+        resamples: how many.
+        confidence: share of them inside an interval.
+        seed: of the generator; each estimate starts from it anew, whatever was estimated
+            before.
+    """
+
+    def __init__(self, resamples: int = 2000, confidence: float = 0.95, seed: int = 0) -> None:
+        self.resamples, self.confidence, self.seed = resamples, confidence, seed
+
+    def success(self, scenes: Sequence[Array]) -> Estimate:
+        """Returns the interquartile mean over the runs of all scenes.
+
+        Args:
+            scenes: for each scene [R, E], see `rates`. One run alone gives Wilson's interval.
+        """
+        if sum(map(len, scenes)) == 1:
+            return self._wilson(scenes[0])
+        return self.mean(scenes)
+
+    def mean(self, scenes: Sequence[Array]) -> Estimate:
+        """Returns the same of outcomes of any kind, such as changes between two conditions."""
+        own = np.concatenate([rates(outcomes) for outcomes in scenes])
+        draws = [self._draw(k, outcomes, [len(outcomes)])[0] for k, outcomes in enumerate(scenes)]
+        return self._estimate(
+            float(interquartile_mean(own)), interquartile_mean(np.concatenate(draws, axis=1))
+        )
+
+    def pooled_share(self, outcomes: Array) -> Estimate:
+        """Returns the share of all runs' episodes together that have it; nan without episodes.
+
+        Args:
+            outcomes: [R, E], nan where an episode does not count.
+        """
+        if np.isnan(outcomes).all():
+            return Estimate(np.nan, np.nan, np.nan)
+        if len(outcomes) == 1:
+            return self._wilson(outcomes)
+        rng = np.random.default_rng((self.seed, 0, _OF_RUNS))
+        weights = _episode_weights(self.seed, 0, outcomes.shape[1], self.resamples)
+        chosen = rng.integers(len(outcomes), size=(self.resamples, len(outcomes)))
+        there = ~np.isnan(outcomes)
+        counts = np.take_along_axis(weights @ there.T, chosen, axis=1).sum(axis=1)
+        found = np.where(there, outcomes, 0.0)
+        sums = np.take_along_axis(weights @ found.T, chosen, axis=1).sum(axis=1)
+        drawn = sums[counts > 0] / counts[counts > 0]
+        return self._estimate(float(found.sum() / there.sum()), drawn)
+
+    def compare(self, scenes: Sequence[tuple[Array, Array]]) -> Comparison:
+        """Returns how much better the first of each pair does than the second.
+
+        Args:
+            scenes: for each scene two sides, [R1, E] and [R2, E]: column e is the same episode in
+                both, so that what makes an episode hard is no part of the difference.
+        """
+        own = [(rates(a), rates(b)) for a, b in scenes]
+        drawn = [
+            self._draw(k, np.concatenate(pair), [len(side) for side in pair])
+            for k, pair in enumerate(scenes)
+        ]
+        ours, theirs = (np.concatenate([pair[side] for pair in own]) for side in (0, 1))
+        ours_drawn, theirs_drawn = (
+            np.concatenate([pair[side] for pair in drawn], axis=1) for side in (0, 1)
+        )
+        difference = float(interquartile_mean(ours) - interquartile_mean(theirs))
+        differences = interquartile_mean(ours_drawn) - interquartile_mean(theirs_drawn)
+        improvement = float(np.mean([_improvement(*pair) for pair in own]))
+        improvements = np.mean([_improvement(*pair) for pair in drawn], axis=0)
+        return Comparison(
+            self._estimate(difference, differences),
+            self._estimate(improvement, improvements),
+            _welch(own),
+            _runs_a_side(own),
+        )
+
+    def _draw(self, scene: int, outcomes: Array, sides: Sequence[int]) -> list[Array]:
+        """Returns rates [N, R] of resampled runs of each side, over the same drawn episodes.
+
+        Args:
+            scene: its number, so that scenes are drawn from one by one.
+            outcomes: of all sides, below one another.
+            sides: how many runs each side has.
+        """
+        rng = np.random.default_rng((self.seed, scene, _OF_RUNS))
+        weights = _episode_weights(self.seed, scene, outcomes.shape[1], self.resamples)
+        drawn, first = [], 0
+        for count in sides:
+            side = rates(outcomes[first : first + count], weights)
+            chosen = rng.integers(count, size=(self.resamples, count))
+            drawn.append(np.take_along_axis(side, chosen, axis=1))
+            first += count
+        return drawn
+
+    def _wilson(self, outcomes: Array) -> Estimate:
+        there = ~np.isnan(outcomes)
+        found, trials = int(outcomes[there].sum()), int(there.sum())
+        return Estimate(found / max(trials, 1), *wilson_interval(found, trials, self.confidence))
+
+    def _estimate(self, value: float, drawn: Array) -> Estimate:
+        tail = (1 - self.confidence) / 2
+        low, high = np.quantile(drawn, [tail, 1 - tail])
+        return Estimate(value, float(low), float(high))
+
+
+@lru_cache(maxsize=8)
+def _episode_weights(seed: int, scene: int, episodes: int, resamples: int) -> Array:
+    """How often each of `episodes` is in each resample, [N, E]."""
+    rng = np.random.default_rng((seed, scene, _OF_EPISODES))
+    shares = np.full(episodes, 1 / episodes)
+    return rng.multinomial(episodes, shares, size=resamples).astype(np.float64)
+
+
+def _improvement(ours: Array, theirs: Array) -> Any:
+    """Share of pairs [..., R1] × [..., R2] in which ours is higher; a tie is half."""
+    a, b = ours[..., :, None], theirs[..., None, :]
+    return ((a > b) + 0.5 * (a == b)).mean(axis=(-2, -1))
+
+
+def _runs_a_side(scenes: Sequence[tuple[Array, Array]]) -> int:
+    """Runs of all scenes together, where each tells how runs differ; else of the poorest."""
+    fewest = min(len(side) for pair in scenes for side in pair)
+    return fewest if fewest < 2 else min(sum(len(pair[side]) for pair in scenes) for side in (0, 1))
+
+
+def _welch(scenes: Sequence[tuple[Array, Array]]) -> float:
+    """Two-sided p of no difference in the mean over scenes, variances unequal between sides."""
+    sides = [side for pair in scenes for side in pair]
+    if min(len(side) for side in sides) < 2:
+        return float("nan")
+    difference = sum(a.mean() - b.mean() for a, b in scenes)
+    parts = [side.var(ddof=1) / len(side) for side in sides]
+    if not sum(parts):
+        return 1.0 if difference == 0 else 0.0
+    # Welch and Satterthwaite's degrees of freedom of a sum of means
+    freedom = sum(parts) ** 2 / sum(p**2 / (len(s) - 1) for p, s in zip(parts, sides))
+    return float(2 * stats.t.sf(abs(difference) / sum(parts) ** 0.5, freedom))

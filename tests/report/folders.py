@@ -1,0 +1,86 @@
+"""Run folders without a training: configs and tables, with as many successes as a test asks for."""
+
+import csv
+
+import yaml
+
+from flowrep.experiment.run_folder import EVALUATION_COLUMNS
+
+EPISODES = 8
+
+
+def config_of(scene="straight_road", stack="ego+obj", seed=0, **changes):
+    """A run's config, as little of it as a report reads."""
+    config = {
+        "seed": seed,
+        "device": "cpu",
+        "speed": "normal",
+        "total_frames": 1000,
+        "num_envs": 2,
+        "representations": {name: {} for name in stack.split("+")},
+        "flow": {"source": "exact"},
+        "scene": {
+            "name": scene,
+            "frame_rate_hz": 12.0,
+            "time_limit_steps": {"straight_road": 200}.get(scene, 250),
+            "camera": {"height_px": 48, "width_px": 64},
+        },
+        "algorithm": {"_target_": "flowrep.agent.DiscreteSAC", "tau": 0.02},
+    }
+    for key, value in changes.items():
+        *places, last = key.split("__")
+        section = config
+        for place in places:
+            section = section[place]
+        section[last] = value
+    return config
+
+
+def rows_of(config, outcomes, *, speed="normal", fps=12.0, policy="greedy", **changes):
+    """Rows of evaluation.csv: episode k is that of seed 100 + k.
+
+    Args:
+        outcomes: a letter an episode: s(uccess), c(ollision), o(ut of bounds), t(ime-out).
+    """
+    names = {"s": "success", "c": "collision", "o": "out_of_bounds", "t": "timeout"}
+    return [
+        {
+            "scene": config["scene"]["name"],
+            "representations": "+".join(config["representations"]),
+            "flow": config["flow"]["source"],
+            "seed": config["seed"],
+            "frames": config["total_frames"],
+            "evaluation": "evaluate",
+            "policy": policy,
+            "speed": speed,
+            "fps": fps,
+            "episode_seed": 100 + k,
+            "outcome": names[letter],
+            "hit": "pedestrian" if letter == "c" else "",
+            "return": 5.0 if letter == "s" else -5.0,
+            "length": 150,
+        }
+        | changes
+        for k, letter in enumerate(outcomes)
+    ]
+
+
+def write_run(path, config, rows, metrics=()):
+    """Writes a run's folder."""
+    path.mkdir(parents=True)
+    (path / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+    for name, columns, lines in (
+        ("evaluation.csv", EVALUATION_COLUMNS, rows),
+        ("metrics.csv", ("frames", "success"), metrics),
+    ):
+        if lines:
+            with (path / name).open("w", newline="") as file:
+                writer = csv.DictWriter(file, columns)
+                writer.writeheader()
+                writer.writerows(lines)
+    return path
+
+
+def letters(successes, episodes=EPISODES, rest="c"):
+    """Outcomes of which the first are successes and the others `rest`."""
+    return "s" * successes + rest * (episodes - successes)

@@ -1,0 +1,82 @@
+"""The command line: folders as they were typed, mistakes in one line."""
+
+import sys
+
+import pytest
+
+pytest.importorskip("scipy", reason="reports are an extra")
+pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
+
+from flowrep.config import UsageError
+from flowrep.config.composition import check_command
+from flowrep.config.reporting import ReportConfig
+from flowrep.report import command
+from flowrep.report.command import main, with_folders_named
+from tests.config.composing import plain
+from tests.report.folders import config_of, rows_of, write_run
+
+
+@pytest.mark.parametrize(
+    "names", [["plain"], ["a=b"], ["with space", "ego+obj_s0"], ["a,b", "c'd", "[e]"]]
+)
+def test_folders_may_have_any_name(tmp_path, monkeypatch, names):
+    monkeypatch.chdir(tmp_path)
+    for name in names:
+        (tmp_path / name).mkdir()
+    arguments = with_folders_named([*names, "videos=1"])
+    check_command("report", arguments, ReportConfig)
+    given = plain("report", *arguments)["run"]
+    assert (given if isinstance(given, list) else [given]) == names
+
+
+def test_what_is_no_folder_stays_what_it_is():
+    typed = ["run=[a,b]", "+note=x", "~policy", "--cfg", "trajectories=2"]
+    assert with_folders_named(typed) == typed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "'run' needs a value"),
+        (["x", "policy=best"], "policy should be greedy or sampled, not 'best'"),
+        (["x", "trajectories=-1"], "trajectories should be a whole number"),
+        (["x", "vidoes=1"], "unknown key 'vidoes' (did you mean 'videos'?)"),
+    ],
+)
+def test_a_wrong_command_is_refused_by_name(arguments, expected):
+    with pytest.raises(UsageError) as caught:
+        check_command("report", with_folders_named(arguments), ReportConfig)
+    assert expected in str(caught.value)
+
+
+def ended(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["flowrep-report", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    return caught.value.code, capsys.readouterr()
+
+
+def test_a_folder_without_runs_is_one_line_and_no_traceback(tmp_path, monkeypatch, capsys):
+    code, said = ended(monkeypatch, capsys, tmp_path)
+    assert code == 2
+    assert said.err.startswith(f"error: '{tmp_path}' holds no run")
+    assert said.err.count("\n") == 1
+
+
+def test_folders_that_are_all_damaged_are_lines(tmp_path, monkeypatch, capsys):
+    run = write_run(tmp_path / "run", config_of(), rows_of(config_of(), "s"))
+    (run / "config.yaml").write_text("[")
+    code, said = ended(monkeypatch, capsys, tmp_path)
+    assert code == 2
+    assert said.out.startswith(f"left out: {run}/config.yaml can't be read")
+    assert said.err == "error: none of the runs can be read, see above\n"
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, capsys):
+    run = write_run(tmp_path / "run", config_of(), rows_of(config_of(), "s"))
+    (tmp_path / "taken").write_text("")
+    monkeypatch.setattr(command, "write_page", lambda *_: pytest.fail("too late"))
+    code, said = ended(monkeypatch, capsys, run, "resamples=5", f"output={tmp_path / 'taken'}")
+    assert code == 2
+    assert said.err.count("\n") == 1
+    assert "taken" in said.err

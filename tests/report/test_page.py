@@ -1,0 +1,178 @@
+"""A whole report, from folders to a page in a browser."""
+
+import json
+import re
+import shutil
+import subprocess
+
+import pytest
+
+pytest.importorskip("scipy", reason="reports are an extra")
+pytest.importorskip("jinja2", reason="reports are an extra")
+
+from flowrep.report.command import report_on
+from flowrep.report.experiments import COMPLEMENTARY
+from flowrep.report.figures import draw_bars
+from flowrep.report.files import save
+from flowrep.report.pictures import svg_uri
+from flowrep.report.results import grid_of
+from flowrep.report.runs import Condition, read_runs
+from flowrep.report.statistics import Bootstrap
+from flowrep.report.style import LIGHT
+from tests.report.folders import config_of, letters, rows_of, write_run
+
+ASKED = {
+    "output": None,
+    "policy": "greedy",
+    "resamples": 200,
+    "trajectories": 0,
+    "videos": 0,
+    "device": "cpu",
+    "trust": None,
+}
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    """All of the paper's experiments in two scenes, one cell empty, one run damaged."""
+    folder = tmp_path_factory.mktemp("outputs") / "sweep"
+    stacks = ("ego", "raw", "obj", *COMPLEMENTARY.stacks)
+    for scene in ("straight_road", "s_turn"):
+        for place, stack in enumerate(stacks):
+            for seed in range(2):
+                if (scene, stack) == ("s_turn", "raw"):
+                    continue
+                config = config_of(scene, stack, seed, experiment="flow_composition")
+                rows = []
+                for speed in ("low", "normal", "high"):
+                    rows += rows_of(config, letters(2 + (place + seed) % 6, rest="o"), speed=speed)
+                    rows += rows_of(config, letters(1), speed=speed, policy="never_turn")
+                for fps in (6.0, 9.0):
+                    rows += rows_of(config, letters(1 + place % 7), fps=fps)
+                rows += rows_of(config, letters(1), evaluation="training", frames=500)
+                metrics = [{"frames": f, "success": f / 2000} for f in (250, 500, 1000)]
+                write_run(folder / f"{scene}_{stack}_s{seed}", config, rows, metrics)
+    write_run(folder / "damaged", config_of(seed=9), []).joinpath("config.yaml").write_text("a: [")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(sweep):
+    return report_on(ASKED | {"run": str(sweep)})
+
+
+def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
+    found = {
+        str(path.relative_to(page.parent)) for path in page.parent.rglob("*") if path.is_file()
+    }
+    drawn = {
+        f"{name}/{stem}.{kind}"
+        for name, stem in (
+            ("flow_composition", "flow_composition"),
+            ("complementary", "complementary"),
+            ("frame_rate", "frame_rate"),
+            ("frame_rate", "frame_rate_others"),
+            ("learning_curves", "learning_curves"),
+        )
+        for kind in ("png", "pdf", "tex")
+    }
+    tables = {
+        f"{name}/{stem}.{kind}"
+        for name, stem in (
+            ("flow_composition", "flow_composition_success"),
+            ("flow_composition", "flow_composition_differences"),
+            ("complementary", "complementary_success"),
+            ("complementary", "complementary_differences"),
+            ("failure_causes", "failure_causes"),
+            ("frame_rate", "frame_rate_success"),
+        )
+        for kind in ("png", "pdf", "tex", "csv")
+    }
+    assert found == drawn | tables | {"index.html"}
+
+
+def test_the_page_says_what_is_missing_and_what_is_wrong(page):
+    text = page.read_text(encoding="utf-8")
+    assert "Missing in S-Turn: raw." in text
+    assert "No runs in H-Shaped Pathways and Three-Way Junction." in text
+    assert "damaged/config.yaml can&#39;t be read" in text
+    assert "34 runs, 34 of them finished, of 9 stacks" in text
+
+
+def test_a_figure_saved_again_is_the_same_byte_for_byte(tmp_path):
+    config = config_of()
+    run = write_run(tmp_path / "run", config, rows_of(config, letters(3)))
+    conditions = [Condition("greedy", "normal", 12.0)]
+    series = {"ego+obj": read_runs([run])[0], "ego+obj+seg2": []}
+    grid = grid_of("straight_road", series, conditions, Bootstrap(50))
+
+    def saved(name):
+        figure = draw_bars([grid], LIGHT)
+        save(figure, tmp_path / name)
+        return svg_uri(figure), *((tmp_path / f"{name}.{k}").read_bytes() for k in ("png", "pdf"))
+
+    assert saved("first") == saved("second")
+
+
+def test_the_page_asks_for_nothing(page):
+    text = page.read_text(encoding="utf-8")
+    assert set(re.findall(r'(?:src|srcset|href)="(data:[a-z+/0-9]+|#|[^"]*)', text)) == {
+        "data:image/svg+xml",
+        "#",
+    }
+    assert "url(" not in text
+    assert "@import" not in text
+
+
+PROBE = """<!DOCTYPE html><html><body><script>
+const found = {};
+async function look(width) {
+  const frame = document.createElement('iframe');
+  frame.style.cssText = `width: ${width}px; height: 900px; border: 0`;
+  document.body.append(frame);
+  frame.srcdoc = PAGE;
+  await new Promise(done => { frame.onload = done; });
+  const inside = frame.contentDocument, root = inside.documentElement;
+  const images = [...inside.images];
+  await Promise.all(images.map(image => image.decode()));
+  const boxes = images.map(image => image.getBoundingClientRect());
+  found[width] = {
+    overflow: root.scrollWidth - root.clientWidth,
+    images: images.length,
+    broken: images.filter(image => !image.naturalWidth).length,
+    in_a_row: boxes.filter(box => box.top === boxes[0].top).length,
+    narrowest: Math.min(...boxes.map(box => box.width)),
+    anchors: [...inside.querySelectorAll('nav a')].every(
+      a => inside.getElementById(a.getAttribute('href').slice(1))),
+    fetched: frame.contentWindow.performance.getEntriesByType('resource')
+      .filter(entry => !entry.name.startsWith('data:')).length,
+  };
+}
+look(1400).then(() => look(400)).then(() => { document.title = JSON.stringify(found); });
+</script></body></html>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed to open the page in")
+def test_a_browser_shows_the_page_on_wide_and_narrow_screens(page, tmp_path):
+    text = page.read_text(encoding="utf-8")
+    probe = tmp_path / "probe.html"
+    quoted = json.dumps(text).replace("</", r"<\/")
+    probe.write_text(PROBE.replace("PAGE", quoted), encoding="utf-8")
+    arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000"]
+    arguments += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1500,1000"]
+    shown = subprocess.run(
+        [CHROMIUM, *arguments, "--dump-dom", probe.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    ).stdout  # fmt: skip
+    titles = re.findall(r"<title>(\{.*?\})</title>", shown)
+    assert titles, shown[:500]
+    found = json.loads(titles[0].replace("&amp;", "&"))
+    for width in ("1400", "400"):
+        seen = found[width]
+        assert (seen["overflow"], seen["broken"], seen["fetched"]) == (0, 0, 0)
+        assert seen["images"] == 10  # five figures of two scenes
+        assert seen["anchors"]
+    assert found["1400"]["in_a_row"] == 2
+    assert found["400"]["in_a_row"] == 1
+    assert found["400"]["narrowest"] > 300

@@ -1,0 +1,185 @@
+"""Sections of runs whose every number is worked by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy", reason="reports are an extra")
+
+from flowrep.report.assembly import assemble
+from flowrep.report.cells import cell_of, side_by_side
+from flowrep.report.comparing import Settings
+from flowrep.report.learning import curve_of
+from flowrep.report.rates import change
+from flowrep.report.runs import Condition, read_runs
+from flowrep.report.sections import percent, points
+from flowrep.report.statistics import Bootstrap, Estimate
+from flowrep.report.tables import Table
+from tests.report.folders import config_of, rows_of, write_run
+
+ASK = Settings("greedy", Bootstrap(100))
+NORMAL = Condition("greedy", "normal", 12.0)
+
+
+def sections_of(folder):
+    runs, complaints = read_runs([folder])
+    report = assemble(runs, complaints, ASK)
+    found = {section.name: section for chapter in report.chapters for section in chapter.sections}
+    return found, report
+
+
+def run_in(folder, name, outcomes, *, stack="ego+obj", scene="s_turn", seed=0, **changes):
+    """A run whose episodes end as the letters say, by speed or at normal speed."""
+    config = config_of(scene, stack, seed, **changes)
+    of = outcomes if isinstance(outcomes, dict) else {"normal": outcomes}
+    rows = [row for speed, ends in of.items() for row in rows_of(config, ends, speed=speed)]
+    return write_run(folder / name, config, rows)
+
+
+def rows_in(table):
+    return [row for _, rows in table.blocks for row in rows]
+
+
+def test_an_episode_has_one_column_whichever_runs_drove_it(tmp_path):
+    config, other = config_of(seed=0), config_of(seed=1)
+    late = [row | {"episode_seed": row["episode_seed"] + 1} for row in rows_of(other, "sc")]
+    write_run(tmp_path / "a", config, rows_of(config, "cs"))
+    write_run(tmp_path / "b", other, late)
+    cell = cell_of(read_runs([tmp_path])[0], NORMAL)
+    assert (cell.seeds, cell.episodes, cell.counts) == ((0, 1), (100, 101, 102), "2 × 2")
+    np.testing.assert_array_equal(cell.outcomes, [[0, 1, math.nan], [math.nan, 1, 0]])
+
+
+def test_two_cells_stand_side_by_side_by_episode(tmp_path):
+    first, second = config_of(), config_of(stack="seg2")
+    write_run(tmp_path / "a", first, rows_of(first, "cs"))
+    late = [row | {"episode_seed": 101} for row in rows_of(second, "s")]
+    write_run(tmp_path / "b", second, late)
+    runs = {run.stack: run for run in read_runs([tmp_path])[0]}
+    a, b = side_by_side(cell_of([runs["ego+obj"]], NORMAL), cell_of([runs["seg2"]], NORMAL))
+    np.testing.assert_array_equal(a, [[0, 1]])
+    np.testing.assert_array_equal(b, [[math.nan, 1]])
+
+
+def test_table_iii_leaves_time_outs_out_and_tells_the_ratio(tmp_path):
+    # Two seeds: 3 out of bounds, 12 collisions: 20 %, 80 %, 0.25. With time-outs 3 of 20: 15 %.
+    run_in(tmp_path, "a", "o" + "c" * 6 + "t" * 4 + "s")
+    run_in(tmp_path, "b", "oo" + "c" * 6 + "t" + "sss", seed=1)
+    run_in(tmp_path, "c", "ssssssss", stack="seg2")
+    run_in(tmp_path, "d", {"low": "cccc"}, stack="depth2")
+    found, _ = sections_of(tmp_path)
+    (table,) = found["failure_causes"].tables
+    flows, depth, seg = rows_in(table)
+    assert flows[0] == "ego+obj"
+    assert [cell.split()[0] for cell in flows[1:]] == ["20.0", "80.0", "0.250", "15", "5", "24"]
+    assert depth == ("depth2", "missing", "missing", "missing", "0", "0", "0")
+    assert seg == ("seg2", "no failures", "no failures", "no failures", "0", "0", "8")
+    assert found["failure_causes"].notes == ("Missing: depth2 in S-Turn.",)
+
+
+def test_a_cell_without_runs_is_missing_and_so_is_what_needs_it(tmp_path):
+    run_in(tmp_path, "a", {"low": "sssc", "normal": "sscc", "high": "sccc"}, stack="ego")
+    run_in(tmp_path, "b", {"low": "ssss", "normal": "ssss"}, stack="ego+obj")
+    run_in(tmp_path, "c", {"low": "ssss"}, stack="raw", scene="straight_road")
+    found, _ = sections_of(tmp_path)
+    section = found["flow_composition"]
+    success, differences = section.tables
+    road, turn, everywhere = ({row[0]: row[1:] for row in rows} for _, rows in success.blocks)
+    assert [cell.split()[0] for cell in turn["ego"]] == ["75", "50", "25", "1"]
+    assert [cell.split()[0] for cell in turn["ego+obj"]] == ["100", "100", "missing", "1"]
+    assert turn["obj"] == ("missing", "missing", "missing", "0")
+    assert road["raw"][0].split()[0] == "100"
+    assert everywhere["ego"] == ("missing", "missing", "missing", "")
+    assert section.notes == (
+        "Missing in Straight Road: ego, raw (normal and high), obj and ego+obj.",
+        "Missing in S-Turn: raw, obj and ego+obj (high).",
+        "No runs in H-Shaped Pathways and Three-Way Junction.",
+    )
+    told = {(row[0], row[1]): row for row in rows_in(differences)}
+    assert sorted(told) == [("ego+obj − ego", "low"), ("ego+obj − ego", "normal")]
+    assert told["ego+obj − ego", "normal"][2].startswith("+50 [")
+
+
+def test_the_change_with_the_frame_rate_is_that_of_the_same_agents_and_episodes(tmp_path):
+    # At 12 Hz 4 of 4, at 6 Hz 1 of 4: -75 points; a seed without 6 Hz is no part of it.
+    config, other = config_of(), config_of(seed=1)
+    rows = rows_of(config, "ssss") + rows_of(config, "sccc", fps=6.0)
+    write_run(tmp_path / "a", config, rows)
+    write_run(tmp_path / "b", other, rows_of(other, "cccc") + rows_of(other, "ss", fps=9.0))
+    found, _ = sections_of(tmp_path)
+    (table,) = found["frame_rate"].tables
+    assert table.header[1:] == ("6 Hz (%)", "9 Hz (%)", "12 Hz (%)", "12 → 6 Hz (points)")
+    ((_, at_6, _, at_12, lost),) = rows_in(table)
+    assert at_6.startswith("25 [")
+    assert at_12.startswith("50 [")
+    assert lost.startswith("−75 [−100, ")
+
+
+def test_a_change_needs_seeds_and_episodes_in_common(tmp_path):
+    run_in(tmp_path, "a", {"low": "ss", "normal": "sc"})
+    (run,), _ = read_runs([tmp_path])
+    low, normal = cell_of([run], Condition("greedy", "low", 12.0)), cell_of([run], NORMAL)
+    np.testing.assert_array_equal(change(low, normal), [[0, -1]])
+    assert change(low, None) is None
+
+
+def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):
+    run_in(tmp_path, "a", "ssss", algorithm__tau=0.02)
+    run_in(tmp_path, "b", "sccc", algorithm__tau=0.005)
+    found, report = sections_of(tmp_path)
+    assert [chapter.label for chapter in report.chapters] == [
+        "algorithm.tau=0.02",
+        "algorithm.tau=0.005",
+        "",
+    ]
+    assert rows_in(found["configs"].tables[0]) == [("algorithm.tau", "0.02", "0.005")]
+    success, differences = found["across_ego+obj"].tables
+    assert [(row[0], row[-1]) for row in rows_in(success)] == [("A", "1 × 4"), ("B", "1 × 4")]
+    assert [row[0] for row in rows_in(differences)] == ["B − A"]
+
+
+def test_runs_of_none_of_the_papers_experiments_are_shown_all_the_same(tmp_path):
+    run_in(tmp_path, "a", "sscc", stack="rgb", scene="my_crossing")
+    found, _ = sections_of(tmp_path)
+    assert list(found) == ["success", "failure_causes"]
+    ((stack, share, counts),) = rows_in(found["success"].tables[0])
+    assert (stack, share.split()[0], counts) == ("rgb", "50", "1 × 4")
+
+
+def test_an_unfinished_run_is_in_the_learning_curve_alone(tmp_path):
+    config = config_of()
+    rows = rows_of(config, "sc", evaluation="training", frames=400)
+    write_run(tmp_path / "half", config, rows, [{"frames": 400, "success": 0.25}])
+    found, report = sections_of(tmp_path)
+    assert list(found) == ["learning_curves"]
+    assert "half is not finished, at 400 of 1,000 frames" in report.complaints[0]
+
+
+def test_a_learning_curve_is_of_the_speed_and_frame_rate_of_training(tmp_path):
+    config = config_of()
+    rows = rows_of(config, "sscc", evaluation="training", frames=500)
+    rows += rows_of(config, "sssc", evaluation="final")
+    rows += rows_of(config, "cccc", evaluation="final", fps=6.0)
+    rows += rows_of(config, "cccc", evaluation="final", speed="high")
+    rows += rows_of(config, "cccc", evaluation="evaluate")
+    write_run(tmp_path / "run", config, rows, [{"frames": 500, "success": 0.1}])
+    curve = curve_of(read_runs([tmp_path])[0][0])
+    assert curve == ([(500, 0.5), (1000, 0.75)], [(500, 0.1)])
+
+
+def test_a_table_is_latex_that_compiles_and_csv_that_reads():
+    blocks = (("S-Turn", (("a_b", "85 [79–90]"),)), ("", (("c", "−3"),)))
+    table = Table("t", "In %, 5 × 2.", ("what", "value (%)"), blocks)
+    latex = table.to_latex()
+    assert r"\caption{In \%, 5 $\times$ 2.}" in latex
+    assert r"\begin{tabular}{lr}" in latex
+    assert r"    a\_b & 85 [79--90] \\" in latex
+    assert r"    \multicolumn{2}{l}{\textit{S-Turn}} \\" in latex
+    assert r"    c & $-$3 \\" in latex
+    assert table.to_csv() == ("group,what,value (%)\nS-Turn,a_b,85 [79–90]\n,c,−3\n")
+
+
+def test_numbers_are_whole_percent_with_their_sign():
+    assert percent(Estimate(0.005, 0.0, 1.0)) == "0 [0–100]"
+    assert points(Estimate(-0.004, -0.126, 0.006)) == "0 [−13, +1]"

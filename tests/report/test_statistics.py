@@ -1,0 +1,142 @@
+"""Estimates and comparisons on outcomes whose bootstrap can be worked by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy", reason="reports are an extra")
+
+from flowrep.report.statistics import Bootstrap, interquartile_mean, rates
+
+NAN = np.nan
+
+
+def runs(*successes, episodes=10):
+    """A row a run, the first of its episodes successes."""
+    return np.array([[1.0] * n + [0.0] * (episodes - n) for n in successes])
+
+
+def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
+    assert interquartile_mean(np.array([0.0, 0.4, 0.6, 9.0])) == 0.5  # the mean would be 2.5
+    assert interquartile_mean(np.array([0.0, 0.0, 0.6])) == pytest.approx(0.2)  # median: 0
+    assert interquartile_mean(np.array([9, 9, 1, 2, 3, 4, -9, -9.0])) == 2.5
+
+
+def test_a_rate_counts_the_episodes_that_a_run_drove():
+    outcomes = np.array([[1.0, 0.0, NAN, NAN], [1.0, 1.0, 1.0, 0.0]])
+    assert rates(outcomes).tolist() == [0.5, 0.75]
+    # the first episode twice, the second never; the run keeps its own where it drove none
+    weights = np.array([[2.0, 0.0, 1.0, 1.0], [0.0, 0.0, 2.0, 2.0]])
+    assert rates(outcomes, weights).tolist() == [[1.0, 0.75], [0.5, 0.5]]
+
+
+def test_one_run_has_wilsons_interval():
+    # 8 of 10: (0.8 + z²/20 ± z·sqrt(0.8·0.2/10 + z²/400)) / (1 + z²/10), z = 1.96
+    found = Bootstrap().success([runs(8)])
+    assert found.value == 0.8
+    assert (round(found.low, 3), round(found.high, 3)) == (0.490, 0.943)
+
+
+def test_runs_are_resampled():
+    # All or nothing, so that episodes say nothing: means of two draws of {0, 1} are 0, 1/2 and 1,
+    # with 1/4, 1/2 and 1/4; Wilson's of 10 of 20 would be 0.30 to 0.70.
+    found = Bootstrap(4000).success([runs(0, 10)])
+    assert found == (0.5, 0.0, 1.0)
+    half = Bootstrap(4000, confidence=0.4).success([runs(0, 10)])  # tails of 0.3 > 1/4
+    assert half == (0.5, 0.5, 0.5)
+
+
+def test_episodes_are_resampled_the_same_ones_for_all_runs():
+    # Equal runs: a bootstrap over seeds alone has no width. With episodes in common, that of n
+    # runs is that of one: a binomial of 100 at 0.5, 0.5 ± 1.96 · 0.05. Were they drawn run by run,
+    # it would be ± 1.96 · 0.05 / sqrt(4).
+    found = Bootstrap(8000).success([runs(50, 50, 50, 50, episodes=100)])
+    assert found.low == pytest.approx(0.402, abs=0.011)
+    assert found.high == pytest.approx(0.598, abs=0.011)
+
+
+def test_scenes_are_strata():
+    # One scene always succeeds, the other never: resampled within scenes the mean stays 0.5 in
+    # every draw; resampled from all runs it would not.
+    found = Bootstrap(500).success([runs(10, 10), runs(0, 0)])
+    assert found == (0.5, 0.5, 0.5)
+
+
+def test_scenes_are_resampled_independently():
+    # Two scenes of one run at 0.5 in 100 episodes: the variance of their mean is half of one's.
+    found = Bootstrap(8000).success([runs(50, episodes=100), runs(50, episodes=100)])
+    assert found.high - 0.5 == pytest.approx(1.96 * 0.05 / math.sqrt(2), abs=0.008)
+
+
+def test_what_was_estimated_before_changes_nothing():
+    first = Bootstrap(300)
+    first.success([runs(3, 7)])
+    assert first.success([runs(2, 9)]) == Bootstrap(300).success([runs(2, 9)])
+
+
+def test_a_pooled_share_counts_all_runs_failures_together():
+    # 1 of 4 failures and 4 of 6: 5 of 10; the mean of the runs' shares would be 0.458
+    outcomes = np.array([[1, 0, 0, 0, NAN, NAN], [1, 1, 1, 1, 0, 0]])
+    assert Bootstrap(100).pooled_share(outcomes).value == 0.5
+    assert Bootstrap(100).pooled_share(outcomes[:1]).value == 0.25  # one run: Wilson's
+    assert math.isnan(Bootstrap(100).pooled_share(np.full((2, 3), NAN)).value)
+    # All or nothing, of 1 and of 3 failures: pooled 1/4; draws are 0, 1/4 and 1, a quarter, a
+    # half and a quarter of them.
+    uneven = np.array([[1] * 10 + [NAN] * 20, [0] * 30], dtype=float)
+    assert Bootstrap(4000).pooled_share(uneven)[1:] == (0.0, 1.0)
+    value, low, high = Bootstrap(4000, confidence=0.3).pooled_share(uneven)
+    assert value == 0.25
+    assert 0.15 < low < 0.25 < high < 0.35
+
+
+def test_a_difference_on_the_same_episodes_is_free_of_what_they_have_in_common():
+    # Equal outcomes episode by episode: paired, the difference is 0 in every draw; unpaired it
+    # would be ± 0.14.
+    pair = (runs(50, episodes=100), runs(50, episodes=100))
+    found = Bootstrap(500).compare([pair])
+    assert found.difference == (0.0, 0.0, 0.0)
+    assert found.improvement.value == 0.5  # a tie is half
+    assert found.is_noise
+    assert found.verdict == "can't be told from noise"
+
+
+def test_the_difference_is_first_minus_second():
+    found = Bootstrap(500).compare([(runs(9, 9, 9), runs(1, 1, 1))])
+    assert found.difference.value == pytest.approx(0.8)
+    assert found.improvement == (1.0, 1.0, 1.0)
+    assert found.verdict == "higher"
+    assert Bootstrap(500).compare([(runs(1, 1, 1), runs(9, 9, 9))]).verdict == "lower"
+
+
+def test_improvement_is_the_share_of_pairs_in_which_the_first_is_higher():
+    # 3 beats 1 and 2; 2 beats 1 and ties with 2; of four pairs 3.5
+    found = Bootstrap(500).compare([(runs(3, 2), runs(1, 2))])
+    assert found.improvement.value == 3.5 / 4
+
+
+def test_welchs_test_is_the_textbooks():
+    # Scores 0.5, 0.6, 0.7 and 0.2, 0.4, 0.6: means 0.6 and 0.4, variances 0.01 and 0.04;
+    # t = 0.2 / sqrt(0.05 / 3) = 1.549 at (0.05/3)² / ((0.01/3)²/2 + (0.04/3)²/2) = 2.94 degrees
+    found = Bootstrap(500).compare([(runs(5, 6, 7), runs(2, 4, 6))])
+    assert found.p_value == pytest.approx(0.221, abs=0.002)
+    assert found.is_noise
+
+
+def test_few_seeds_say_it_of_these_agents_alone():
+    one = Bootstrap(500).compare([(runs(90, episodes=100), runs(10, episodes=100))])
+    assert math.isnan(one.p_value)
+    assert one.verdict == "higher for these agents; one seed a side say no more"
+    two = Bootstrap(500).compare([(runs(90, 91, episodes=100), runs(10, 11, episodes=100))])
+    assert two.verdict == "higher for these agents; 2 seeds a side say no more"
+    # of two scenes there are four runs a side
+    pair = (runs(90, 91, episodes=100), runs(10, 11, episodes=100))
+    assert Bootstrap(500).compare([pair, pair]).verdict == "higher"
+
+
+def test_a_bootstrap_that_is_too_sure_is_overruled():
+    # Scores 0.1 and 0.9 against 0 and 0.05: every draw of runs has the first ahead or level, yet
+    # two runs that differ by 0.8 among themselves tell nothing.
+    found = Bootstrap(500).compare([(runs(10, 90, episodes=100), runs(0, 5, episodes=100))])
+    assert found.difference.low > 0
+    assert found.is_noise
