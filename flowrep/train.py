@@ -45,6 +45,8 @@ from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import Training, train
 from flowrep.scenes import SceneError, load_scene
+from flowrep.sweeps.plan import is_sweep
+from flowrep.sweeps.sweep import run_sweep
 from flowrep.viz.curves import draw_learning_curve
 from flowrep.viz.film import record_episode
 
@@ -265,7 +267,8 @@ def main() -> None:
             exit_with(str(error))
         place = max(i for i, a in enumerate(sys.argv) if a.startswith("resume="))
         sys.argv.insert(place + 1, override("hydra.run.dir", str(folder.path)))
-    run_command("train", run, TrainConfig)
+    sweeps = is_sweep(sys.argv[1:])
+    run_command("train", partial(run_sweep, "train") if sweeps else run, TrainConfig)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "viz": {"viz", "experiment", "envs", "scenes", "geometry", "palette"},
     "exchange": {"exchange", "agent"},
     "sequences": {"sequences", "experiment", "transforms", "geometry", "viz"},
+    "sweeps": {"sweeps", "train", "config", "config_tree", "experiment", "scenes"},
     "config": {
         "config",
         "agent",
@@ -52,6 +53,9 @@ THIRD_PARTY_ONLY_IN = {
         "config/command_line.py",
         "config/composition.py",
         "config/quoting.py",
+        "sweeps/job.py",
+        "sweeps/plan.py",
+        "sweeps/sweep.py",
         "transforms/configs.py",
     },
 }

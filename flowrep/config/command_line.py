@@ -13,6 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from flowrep.config import Section, UsageError
 from flowrep.config.composition import check_command, keys_added, parse, plain_config
 from flowrep.config.quoting import override, shell_line, taken_as_typed
+from flowrep.config.run_names import run_of_sweep
 
 __all__ = [
     "exit_with",
@@ -33,7 +34,7 @@ def register_resolvers() -> None:
     """Adds what the paths of run folders are made of, in conf/run_folder.yaml and conf/view.yaml.
 
     `${run_name:scene,representations,flow,seed}` names a run; `${folder_name:text}` is a text that
-    is one folder's name, whatever it holds.
+    is one folder's name, whatever it holds; `${run_of_sweep:overrides}` names a run of a sweep.
     """
 
     def run_name(scene: str, representations: Iterable[str], flow: str, seed: int) -> str:
@@ -42,6 +43,7 @@ def register_resolvers() -> None:
 
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
     OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+    OmegaConf.register_new_resolver("run_of_sweep", run_of_sweep, replace=True)
 
 
 def folder_name(text: str) -> str:

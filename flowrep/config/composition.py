@@ -133,11 +133,14 @@ class Preview:
         """
         if not self.is_multirun:
             return [*parsed]
-        first = [self._values(override)[0] for override in parsed]
-        params = OmegaConf.select(self._explained_config(first), "hydra.sweeper.params") or {}
+        params = OmegaConf.select(self.hydra_config(parsed), "sweeper.params") or {}
         typed = {override.get_key_element() for override in parsed}
         added = [f"{key}={value}" for key, value in params.items() if key not in typed]
         return [*self.parse(added), *parsed]
+
+    def hydra_config(self, parsed: Sequence[Override]) -> DictConfig:
+        """Returns Hydra's own part of the config, as it is for the first of a sweep's jobs."""
+        return self._explained_config([self._values(override)[0] for override in parsed]).hydra
 
     def configs(self, parsed: Sequence[Override]) -> Iterator[dict[str, Any]]:
         """Yields plain configs of jobs, so that each value of each sweep is in one of them."""

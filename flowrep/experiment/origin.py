@@ -45,14 +45,14 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
             "install that version, or start the run anew"
         )
-    for place, there, here in _differences(saved, expected):
+    for place, there, here in differences(saved, expected):
         raise CheckpointError(
             f"{path} belongs to a run with {place}={there}, the config.yaml of its folder says "
             f"{place}={here}: put back the file that was there, or start a run of its own"
         )
 
 
-def _differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+def differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Yields the dotted key of each difference with the two values."""
     if not (isinstance(saved, Mapping) and isinstance(expected, Mapping)):
         if saved != expected:
@@ -60,4 +60,4 @@ def _differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[s
         return
     for key in dict.fromkeys([*saved, *expected]):
         there, here = saved.get(key, _ABSENT), expected.get(key, _ABSENT)
-        yield from _differences(there, here, f"{place}.{key}" if place else key)
+        yield from differences(there, here, f"{place}.{key}" if place else key)

@@ -1,0 +1,91 @@
+"""`python -m flowrep.sweeps`: starts or continues the run that a JSON object on stdin describes.
+
+    {"folder": ..., "config": {...}, "machine": {"device": ..., "num_workers": ...},
+     "overrides": [...]}
+
+The run stops, and saves, when stdin is closed: when the process that asked for it is gone.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from flowrep.config import UsageError, validated
+from flowrep.config.algorithms import ALGORITHMS
+from flowrep.config.command_line import exit_with
+from flowrep.config.training import TrainConfig
+from flowrep.experiment.folder_lock import FolderInUseError
+from flowrep.experiment.origin import differences
+from flowrep.experiment.run_folder import RunFolder, RunFolderError
+from flowrep.experiment.tables import TableError
+from flowrep.scenes import SceneError, load_scene
+from flowrep.sweeps.ending import FINISHED, Ending
+from flowrep.sweeps.job import definition
+from flowrep.sweeps.stopping import stop_when_closed
+from flowrep.train import carry_out
+
+PATIENCE_S = 60.0  # with a run of the same sweep that was told to stop, and saves
+
+
+def main() -> None:
+    """Does what is left of the run; what goes wrong is said in a line of its log."""
+    request = json.loads(sys.stdin.buffer.readline())
+    stop_when_closed(sys.stdin.fileno())
+    try:
+        folder = RunFolder(request["folder"])
+        with held_soon(folder):
+            config = started_or_found(folder, request)
+            success = carry_out(config, folder)
+            Ending(FINISHED, success).write(folder.path)
+    except (UsageError, SceneError, RunFolderError, TableError, OSError) as error:
+        exit_with(str(error))
+
+
+@contextmanager
+def held_soon(folder: RunFolder) -> Iterator[None]:
+    """Holds a run's folder; one that is in use is waited for a while."""
+    until = time.monotonic() + PATIENCE_S
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(folder.held("training"))
+                break
+            except FolderInUseError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(1.0)
+        yield
+
+
+def started_or_found(folder: RunFolder, request: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the config of the run in a folder, once that is there and the one asked for.
+
+    Raises:
+        RunFolderError: the folder holds another run.
+        UsageError, SceneError: there can't be such a run.
+    """
+    asked = request["config"]
+    target = asked["algorithm"]["_target_"]
+    # it was named by the person who started the sweep
+    trust = {} if target in ALGORITHMS else {"trust": target}
+    if not (folder.path / "config.yaml").is_file():
+        own_keys = asked.keys() - TrainConfig.keys()
+        validated(TrainConfig, asked, own_keys)
+        load_scene(asked["scene"])
+        folder.check_is_new()
+        folder.write_config(asked, request["overrides"])
+        return asked | request["machine"] | trust
+    stored = folder.read_config()
+    for place, there, here in differences(definition(stored), definition(asked)):
+        raise RunFolderError(
+            f"'{folder.path}' holds a run with {place}={there}, the sweep asks for {here}: give "
+            "the sweep another folder by hydra.sweep.dir=, or move that run away"
+        )
+    return stored | request["machine"] | trust | {"resume": str(folder.path)}
+
+
+if __name__ == "__main__":
+    main()

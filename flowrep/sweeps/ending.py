@@ -1,0 +1,45 @@
+"""How a run of a sweep ended, kept in its folder."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+FINISHED: Final = "finished"
+FAILED: Final = "failed"
+STOPPED: Final = "stopped"
+LOG = "job.log"
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How the last attempt at a run ended.
+
+    Args:
+        how: "finished" is final; the others are tried again when the sweep is.
+        success: a finished run's share of greedy episodes that succeed.
+        message: of a run that failed, in one line.
+    """
+
+    how: Literal["finished", "failed", "stopped"]
+    success: float | None = None
+    message: str = ""
+
+    def write(self, folder: Path) -> None:
+        """Keeps it in a run's folder."""
+        whole = folder / "ending.json.tmp"
+        whole.write_text(json.dumps(asdict(self)) + "\n", encoding="utf-8")
+        whole.replace(folder / "ending.json")
+
+    @classmethod
+    def read(cls, folder: Path) -> "Ending | None":
+        """Returns what a run's folder holds, None while it has not ended."""
+        try:
+            return cls(**json.loads((folder / "ending.json").read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            return None
+
+    @staticmethod
+    def forget(folder: Path) -> None:
+        """Makes the run one that has not ended."""
+        (folder / "ending.json").unlink(missing_ok=True)

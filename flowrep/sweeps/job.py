@@ -1,0 +1,162 @@
+"""One run of a sweep, as a launcher's worker sees it: a process to start and to wait for.
+
+Workers import this module alone, so it imports no torch.
+"""
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from flowrep.config.command_line import plain_config, register_resolvers
+from flowrep.sweeps.ending import FAILED, FINISHED, LOG, STOPPED, Ending
+from flowrep.sweeps.stopping import is_stopped
+
+register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
+
+POLL_S = 0.5
+PARENT = os.getppid()
+RUN = (sys.executable, "-m", "flowrep.sweeps")
+_BASIC_SWEEPER = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+
+
+class RunFailedError(RuntimeError):
+    """A run of a sweep has no result."""
+
+
+def job(config: DictConfig) -> float:
+    """Does what is left of one run in a process of its own; what Hydra's launchers call.
+
+    Returns:
+        Its share of final greedy episodes that succeed; nan where a grid's run has none, so that
+        the others go on.
+
+    Raises:
+        RunFailedError: the run has no result, and a sweeper asked for it that has to know.
+    """
+    hydra = HydraConfig.get()
+    folder = Path(hydra.runtime.output_dir)
+    is_worker = multiprocessing.current_process().name != "MainProcess"  # of a pool, as joblib's
+    plain = plain_config(config)
+    machine = {key: plain[key] for key in ("device", "num_workers")}
+    if is_worker and plain["num_workers"] == "auto":  # it has no core but its own
+        machine["num_workers"] = 0
+    request = {
+        "folder": str(folder),
+        "config": plain,
+        "machine": machine,
+        "overrides": list(hydra.overrides.task),
+    }
+
+    def should_stop() -> bool:
+        # a pool's workers would outlive a launching process that was killed
+        return is_stopped(Path(hydra.sweep.dir)) or (is_worker and os.getppid() != PARENT)
+
+    ending = supervised(request, should_stop)
+    if ending.success is not None:
+        return ending.success
+    if hydra.sweeper["_target_"] == _BASIC_SWEEPER:
+        return float("nan")
+    raise RunFailedError(f"{folder} {ending.how}: {ending.message}")
+
+
+def supervised(request: Mapping[str, Any], should_stop: Callable[[], bool]) -> Ending:
+    """Runs what a request says, unless it is done, and returns how that ended.
+
+    Args:
+        request: for `flowrep.sweeps.__main__`.
+        should_stop: asked now and then; the run then saves and ends.
+    """
+    folder = Path(request["folder"])
+    ending = Ending.read(folder)
+    if ending is not None and ending.how == FINISHED and _is_same(folder, request["config"]):
+        return ending
+    if should_stop():
+        return Ending(STOPPED)
+    Ending.forget(folder)
+    with (folder / LOG).open("ab", buffering=0) as log, _deaf_to_ctrl_c():
+        log.write(f"--- {datetime.now().astimezone():%Y-%m-%d %H:%M:%S%z}\n".encode())
+        begin = log.tell()
+        # a session of its own: signals reach the run through this process alone
+        with subprocess.Popen(
+            RUN, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
+        ) as run:
+            code = _wait(run, json.dumps(request), should_stop)
+    ending = Ending.read(folder) or _without_result(folder / LOG, begin, code)
+    ending.write(folder)
+    return ending
+
+
+def _wait(run: subprocess.Popen[bytes], request: str, should_stop: Callable[[], bool]) -> int:
+    """Returns a run's exit code; whatever ends this process first, the run saves and ends too."""
+    assert run.stdin is not None
+    is_told = False
+    try:
+        run.stdin.write(request.encode() + b"\n")
+        run.stdin.flush()
+        while run.poll() is None:
+            if should_stop() and not is_told:
+                run.terminate()
+                is_told = True
+            time.sleep(POLL_S)
+    except BrokenPipeError:  # it ended before it read; its log says why
+        pass
+    finally:
+        if run.poll() is None and not is_told:
+            run.terminate()
+    return run.wait()
+
+
+def _without_result(log: Path, begin: int, code: int) -> Ending:
+    """Returns the ending of a run that left none: stopped by a signal it heeds, or failed."""
+    if code in (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGTERM):
+        return Ending(STOPPED)
+    if code < 0:
+        name = signal.Signals(-code).name
+        hint = ": is there enough memory?" if -code == signal.SIGKILL else ""
+        return Ending(FAILED, message=f"ended by {name}{hint}")
+    lines = [line.strip() for line in log.read_bytes()[begin:].decode(errors="replace").split("\n")]
+    errors = [line for line in lines if line.startswith("error: ")]
+    last = [line for line in lines if line][-1:]
+    return Ending(FAILED, message=(errors or last or [f"exit code {code}"])[-1])
+
+
+def _is_same(folder: Path, config: Mapping[str, Any]) -> bool:
+    """Says whether a run is defined by `config`; `flowrep.sweeps.__main__` says what differs."""
+    try:
+        stored = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError):
+        return False
+    return definition(stored) == definition(config)
+
+
+def definition(config: Any) -> Any:
+    """Returns what of a config makes a run what it is, as JSON has it."""
+    machine = ("device", "num_workers", "trust", "resume")
+    kept = {k: v for k, v in config.items() if k not in machine} if config else config
+    return json.loads(json.dumps(kept))
+
+
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Leaves Ctrl-C to the process that launched the sweep; a worker is told by it.
+
+    A launching process has a handler of its own, which stays.
+    """
+    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if is_default and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # for good: it may wait for its next job
+    yield

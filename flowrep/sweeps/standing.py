@@ -1,0 +1,87 @@
+"""How a sweep stands, read from the folders of its runs."""
+
+import json
+import os
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from flowrep.sweeps.ending import Ending
+
+WAITING, RUNNING = "waiting", "running"
+
+
+class Standing(NamedTuple):
+    """How one run stands.
+
+    Args:
+        name: of its folder.
+        state: "waiting", "running", or how it ended.
+        frames: trained for so far, of `total`; 0 of 0 while that is unknown.
+        success: the share of its last training episodes that succeed, or of the final greedy ones
+            where it has finished; None while that is unknown.
+        message: of a run that failed.
+    """
+
+    name: str
+    state: str
+    frames: int = 0
+    total: int = 0
+    success: float | None = None
+    message: str = ""
+
+
+def standing_of(run: Path) -> Standing:
+    """Returns how the run in this folder stands, which may not exist yet."""
+    ending = Ending.read(run)
+    if ending is not None:
+        return Standing(run.name, ending.how, 0, 0, ending.success, ending.message)
+    if not _is_held(run):
+        return Standing(run.name, WAITING)
+    row = _last_row(run / "metrics.csv")
+    frames = int(row.get("frames") or 0)
+    success = float(row.get("success") or "nan")
+    known = None if success != success else success
+    return Standing(run.name, RUNNING, frames, _total_frames(run), known)
+
+
+def standings_of(runs: Sequence[Path]) -> list[Standing]:
+    """Returns how runs stand, in their order."""
+    return [standing_of(run) for run in runs]
+
+
+def _is_held(run: Path) -> bool:
+    """Says whether a process works in a run's folder, by what it left in the lock."""
+    try:
+        holder = json.loads((run / ".lock").read_text(encoding="utf-8"))
+        if holder["host"] != platform.node():
+            return True
+        os.kill(holder["pid"], 0)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return True
+
+
+def _last_row(table: Path) -> dict[str, str]:
+    """Returns the last whole row of a table by its columns, empty where there is none."""
+    try:
+        with table.open("rb") as file:
+            names = file.readline().decode().strip().split(",")
+            file.seek(max(file.tell(), table.stat().st_size - 4096))
+            lines = file.read().decode(errors="replace").split("\n")[:-1]
+    except OSError:
+        return {}
+    cells = lines[-1].strip().split(",") if lines else []
+    return dict(zip(names, cells)) if len(cells) == len(names) else {}
+
+
+def _total_frames(run: Path) -> int:
+    try:
+        text = (run / "config.yaml").read_text(encoding="utf-8")
+    except OSError:
+        return 0
+    lines = [line for line in text.splitlines() if line.startswith("total_frames:")]
+    return int(yaml.safe_load(lines[0])["total_frames"]) if lines else 0

@@ -1,0 +1,68 @@
+"""Ending a sweep so that every run saves: launching process, workers and runs pass it on."""
+
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+_MARK = ".stop"
+
+
+def is_stopped(sweep: Path) -> bool:
+    """Says whether the sweep in this folder is to end."""
+    return (sweep / _MARK).exists()
+
+
+class SweepStop:
+    """Turns SIGINT and SIGTERM to the launching process into a mark in the sweep's folder.
+
+    Workers, on whatever machine, look for it. A second signal ends this process at once. Use it as
+    a context manager.
+
+    Args:
+        sweep: the sweep's folder, which exists.
+    """
+
+    def __init__(self, sweep: Path) -> None:
+        self.received: signal.Signals | None = None
+        self._mark = sweep / _MARK
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> "SweepStop":
+        """Installs the handlers."""
+        self._mark.unlink(missing_ok=True)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Gives the handlers back."""
+        self._give_back()
+        self._mark.unlink(missing_ok=True)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        self.received = signal.Signals(number)
+        self._mark.touch()
+        self._give_back()
+        print("stopping: each run saves; once more to end at once", file=sys.stderr)
+
+    def _give_back(self) -> None:
+        for each, handler in self._previous.items():
+            signal.signal(each, handler)
+
+
+def stop_when_closed(descriptor: int) -> None:
+    """Has this process asked to stop, by SIGTERM, when the other end of a pipe is closed.
+
+    A pipe's other end is closed however the process that holds it ends.
+    """
+
+    def watch() -> None:
+        while os.read(descriptor, 1):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,87 @@
+"""A sweep as a person runs it: interrupted, started again, with a run that fails."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytest.importorskip("pybullet", reason="training drives the simulated street")
+pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the sweep runs two at a time")
+
+pytestmark = pytest.mark.slow
+
+SWEEP = [
+    sys.executable, "-m", "flowrep.train", "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2",
+    "debug=smoke", "representations=[obj]", "device=cpu", "num_envs=2", "algorithm.hidden_size=16",
+    "total_frames=400", "checkpoint_every_frames=40", "log_every_frames=20",
+    "evaluation.every_frames=0", "evaluation.final_episodes=1", "evaluation.speeds=[high]",
+    "evaluation.baselines=[]", "evaluation.video=false", "scene.time_limit_steps=30",
+]  # fmt: skip
+# the second learning rate makes the losses infinite
+RATES = "algorithm.learning_rate=3e-4,1e9"
+
+
+def started(folder):
+    return subprocess.Popen(
+        [*SWEEP, RATES, f"hydra.sweep.dir={folder}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+
+
+def wait_for(find, seconds=180):
+    deadline = time.monotonic() + seconds
+    while not find() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert find()
+
+
+def frames_logged(folder):
+    (table,) = folder.glob("*learning_rate-0.0003*/metrics.csv")
+    with table.open(newline="") as file:
+        return [int(row["frames"]) for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)], ids=["killed", "ctrl-c"]
+)
+def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path, number, code):
+    sweep = started(tmp_path)
+    wait_for(lambda: list(tmp_path.glob("*learning_rate-0.0003*/checkpoint/latest.safetensors")))
+    if number == signal.SIGINT:
+        os.killpg(sweep.pid, number)  # as a terminal does
+    else:
+        sweep.kill()
+    sweep.communicate(timeout=180)
+    assert sweep.returncode == code
+    again = started(tmp_path)
+    printed, _ = again.communicate(timeout=300)
+    assert again.returncode == 1, printed
+    assert "1 of 2 runs finished" in printed
+    assert "1 failed:" in printed
+    (failed,) = tmp_path.glob("*learning_rate-1000000000.0*")
+    assert f"log: {failed}/job.log" in printed
+    assert "became" in (failed / "job.log").read_text()
+    assert f"hydra.sweep.dir={tmp_path}" in printed
+    assert frames_logged(tmp_path) == list(range(20, 401, 20))
+    (whole,) = tmp_path.glob("*learning_rate-0.0003*")
+    log = (whole / "job.log").read_text()
+    assert log.count("run folder: ") == 2  # it was begun, and resumed
+
+
+def test_what_is_finished_is_not_run_again(tmp_path):
+    line = [*SWEEP, "total_frames=40", "seed=0,1", f"hydra.sweep.dir={tmp_path}"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    for _ in range(2):
+        done = subprocess.run(line, capture_output=True, text=True, env=environment)
+        assert done.returncode == 0, done.stderr
+        assert "2 of 2 runs finished" in done.stdout
+    logs = [log.read_text() for log in tmp_path.glob("*/job.log")]
+    assert [log.count("run folder: ") for log in logs] == [1, 1]
