@@ -10,6 +10,7 @@ from torchrl.record.loggers import TensorboardLogger
 
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.folder_lock import folder_lock
+from flowrep.experiment.scalars import evaluation_scalars
 from flowrep.experiment.tables import TableError, append_rows, is_whole, read_rows, write_rows
 from flowrep.experiment.weights_and_biases import open_wandb
 
@@ -164,10 +165,13 @@ class RunFolder:
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
         """Appends one row to metrics.csv and gives the same values to TensorBoard and wandb."""
         append_rows(self.metrics_path, [{"frames": frames, **metrics}])
+        self._plot(frames, metrics)
+
+    def _plot(self, frames: int, values: Mapping[str, float]) -> None:
         if not any(isinstance(logger, TensorboardLogger) for logger in self._loggers):
             self._loggers.append(TensorboardLogger("tensorboard", str(self.path)))
         for logger in self._loggers:
-            logger.log_metrics(dict(metrics), frames)
+            logger.log_metrics(dict(values), frames)
 
     def log_to_wandb(self, mode: str, config: Mapping[str, Any]) -> None:
         """Gives what is logged from now on to Weights & Biases as well, unless `mode` is "off".
@@ -228,7 +232,7 @@ class RunFolder:
         return rows
 
     def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Adds evaluated episodes to evaluation.csv.
+        """Adds evaluated episodes to evaluation.csv, and what they say to TensorBoard and wandb.
 
         An episode that is there already, of the same policy after as many frames, speed and frame
         rate, is replaced in its place: evaluated again, it leaves the table as it was.
@@ -241,6 +245,8 @@ class RunFolder:
             tuple(row[name] for name in _EPISODE): row for row in (*self.read_episodes(), *rows)
         }
         write_rows(self.evaluation_path, table.values(), EVALUATION_COLUMNS)
+        for frames, scalars in evaluation_scalars(rows).items():
+            self._plot(frames, scalars)
 
 
 def _check_cell(

@@ -1,7 +1,6 @@
 """The training loop: act, store, learn, and now and then log, evaluate and save."""
 
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,13 +20,11 @@ from flowrep.agent import (
 )
 from flowrep.envs import begin_step, get_states, has_cores_beside, set_states
 from flowrep.experiment.cadence import Every
-from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.origin import check_origin
+from flowrep.experiment.recent import Means, RecentEpisodes
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.stopwatch import Stopwatch
-
-RECENT_EPISODES = 100
 
 
 @dataclass
@@ -48,8 +45,8 @@ class Training:
     frames: int = 0
     owes_evaluation: bool = False
     carried: TensorDictBase | None = None
-    metrics: dict[str, Tensor] = field(default_factory=dict)
-    recent: deque[int] = field(default_factory=lambda: deque(maxlen=RECENT_EPISODES))
+    metrics: Means = field(default_factory=Means)
+    recent: RecentEpisodes = field(default_factory=RecentEpisodes)
 
     def state(self) -> dict[str, Any]:
         """Returns all that the rest of the run depends on, as nested plain data and tensors."""
@@ -58,8 +55,8 @@ class Training:
             "origin": self.origin,
             "frames": self.frames,
             "owes_evaluation": self.owes_evaluation,
-            "metrics": self.metrics,
-            "recent": list(self.recent),
+            "metrics": self.metrics.state(),
+            "recent": self.recent.state(),
             "carried": self.carried.to_dict(),
             "policy": dict(self.agent.policy.state_dict()),
             "agent": self.agent.state_dict(),
@@ -72,9 +69,10 @@ class Training:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues where `state` was taken."""
         self.env.reset()
-        self.frames, self.metrics = state["frames"], state["metrics"]
+        self.frames = state["frames"]
         self.owes_evaluation = state["owes_evaluation"]
-        self.recent.extend(state["recent"])
+        self.metrics.restore(state["metrics"])
+        self.recent.restore(state["recent"])
         self.carried = TensorDict(state["carried"], self.env.batch_size, device=self.env.device)
         self.agent.load_state_dict(state["agent"])
         self.agent.memory.load_state_dict(state["memory"])
@@ -188,7 +186,7 @@ def train(
             with clock("memory"):
                 t.agent.remember(stepped)
             t.frames += stepped.numel()
-            t.recent.extend(finished_outcomes(stepped))
+            t.recent.add(stepped)
             if t.frames >= total:
                 learn(t, clock)  # no next step is there to drive meanwhile
             bar.update(t.frames - bar.n)
@@ -215,35 +213,24 @@ def learn(training: Training, clock: Stopwatch) -> None:
         with clock("memory"):
             batch = agent.sample()
         with clock("update"):
-            training.metrics = agent.update(batch)
+            training.metrics.add(agent.update(batch))
 
 
 def _is_bad(values: Tensor) -> bool:
     return values.is_floating_point() and not bool(values.isfinite().all())
 
 
-def finished_outcomes(stepped: TensorDictBase) -> list[int]:
-    """Returns the outcome codes of the episodes that this step ended."""
-    after = stepped["next"]
-    return after["outcome"][after["done"]].tolist()
-
-
 def metrics_row(training: Training, rate: float | None, clock: Stopwatch) -> dict[str, float]:
-    """Returns one row of metrics.csv; nan stands for what there is none of yet.
+    """Returns one row of metrics.csv, and begins the next; nan stands for what there is none of.
 
     docs/metrics.md says what each column means.
     """
-    recent, agent = training.recent, training.agent
-    row = {
-        name: recent.count(code) / len(recent) if recent else math.nan
-        for code, name in enumerate(OUTCOMES)
-        if code
-    }
-    row["updates"] = agent.updates
+    row = training.recent.summary()
+    row["updates"] = training.agent.updates
     row["frames_per_second"] = rate or math.nan
     row["share_outside_updates"] = 1 - clock.share("update")
-    nothing = torch.tensor(math.nan)
-    return row | {n: float(training.metrics.get(n, nothing)) for n in agent.metric_names()}
+    means = training.metrics.take()
+    return row | {name: means.get(name, math.nan) for name in training.agent.metric_names()}
 
 
 def progress_text(row: Mapping[str, float]) -> str:

@@ -1,6 +1,7 @@
 import csv
 
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from flowrep.experiment.run_folder import EVALUATION_COLUMNS, RunFolder, RunFolderError
 from flowrep.experiment.tables import TableError, append_rows
@@ -30,6 +31,41 @@ def test_metrics_go_to_csv_and_tensorboard(tmp_path):
         {"frames": "20", "alpha": "0.25"},
     ]
     assert list(run.path.rglob("events.out.tfevents.*"))
+
+
+def test_evaluations_go_to_tensorboard_as_shares_and_means(tmp_path):
+    """Two of four succeed; returns 1, 2, 3 and 10, lengths 10, 20, 30 and 60."""
+    run = RunFolder(tmp_path)
+    same = {
+        "scene": "s_turn", "representations": "ego", "flow": "exact", "seed": 3, "frames": 500,
+        "evaluation": "training", "policy": "greedy", "speed": "normal", "fps": 12.0, "hit": "",
+    }  # fmt: skip
+    ends = [
+        ("success", 1.0, 10),
+        ("timeout", 2.0, 20),
+        ("collision", 3.0, 30),
+        ("success", 10.0, 60),
+    ]
+    rows = [
+        same | {"episode_seed": k, "outcome": outcome, "return": total, "length": length}
+        for k, (outcome, total, length) in enumerate(ends)
+    ]
+    run.log_episodes(rows)
+    for logger in run._loggers:
+        logger.experiment.flush()
+    events = EventAccumulator(str(next(tmp_path.rglob("events.out.tfevents.*"))))
+    events.Reload()
+    title = "evaluation/s_turn/normal/12fps/greedy"
+    plotted = {tag: events.Scalars(tag)[0] for tag in events.Tags()["scalars"]}
+    assert {tag: event.value for tag, event in plotted.items()} == {
+        f"{title}/success": 0.5,
+        f"{title}/collision": 0.25,
+        f"{title}/out_of_bounds": 0.0,
+        f"{title}/timeout": 0.25,
+        f"{title}/return": 4.0,
+        f"{title}/length": 30.0,
+    }
+    assert {event.step for event in plotted.values()} == {500}
 
 
 def test_a_resumed_run_drops_the_rows_it_will_write_again(tmp_path):
