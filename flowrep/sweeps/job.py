@@ -11,9 +11,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker re
 
 POLL_S = 0.5
 PARENT = os.getppid()
+BUSY = threading.Lock()  # while there is a run to wait for
 RUN = (sys.executable, "-m", "flowrep.sweeps")
 _BASIC_SWEEPER = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
 
@@ -62,15 +63,30 @@ def job(config: DictConfig) -> float:
     }
 
     def should_stop() -> bool:
-        # a pool's workers would outlive a launching process that was killed
         return is_stopped(Path(hydra.sweep.dir)) or (is_worker and os.getppid() != PARENT)
 
-    ending = supervised(request, should_stop)
+    if is_worker:
+        _end_with_launcher()
+    with BUSY:
+        ending = supervised(request, should_stop)
     if ending.success is not None:
         return ending.success
     if hydra.sweeper["_target_"] == _BASIC_SWEEPER:
         return float("nan")
     raise RunFailedError(f"{folder} {ending.how}: {ending.message}")
+
+
+@cache
+def _end_with_launcher() -> None:
+    """Has a pool's worker end once the launching process is gone, which it would outlive."""
+
+    def watch() -> None:
+        while os.getppid() == PARENT:
+            time.sleep(1.0)
+        with BUSY:
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def supervised(request: Mapping[str, Any], should_stop: Callable[[], bool]) -> Ending:
@@ -87,7 +103,8 @@ def supervised(request: Mapping[str, Any], should_stop: Callable[[], bool]) -> E
     if should_stop():
         return Ending(STOPPED)
     Ending.forget(folder)
-    with (folder / LOG).open("ab", buffering=0) as log, _deaf_to_ctrl_c():
+    _leave_ctrl_c_to_the_launcher()
+    with (folder / LOG).open("ab", buffering=0) as log:
         log.write(f"--- {datetime.now().astimezone():%Y-%m-%d %H:%M:%S%z}\n".encode())
         begin = log.tell()
         # a session of its own: signals reach the run through this process alone
@@ -150,13 +167,11 @@ def definition(config: Any) -> Any:
     return json.loads(json.dumps(kept))
 
 
-@contextmanager
-def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Leaves Ctrl-C to the process that launched the sweep; a worker is told by it.
+def _leave_ctrl_c_to_the_launcher() -> None:
+    """Ignores Ctrl-C in a worker, for good: it may wait for its next job when that is pressed.
 
-    A launching process has a handler of its own, which stays.
+    The launching process has a handler of its own, which stays, and marks the sweep as stopped.
     """
     is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if is_default and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # for good: it may wait for its next job
-    yield
+        signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -28,9 +28,8 @@ RATES = "algorithm.learning_rate=3e-4,1e9"
 def started(folder):
     return subprocess.Popen(
         [*SWEEP, RATES, f"hydra.sweep.dir={folder}"],
-        stdout=subprocess.PIPE,
+        stdout=(folder / "printed").open("w"),  # a pipe would be held open by its workers
         stderr=subprocess.STDOUT,
-        text=True,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         start_new_session=True,
     )
@@ -59,11 +58,9 @@ def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path, 
         os.killpg(sweep.pid, number)  # as a terminal does
     else:
         sweep.kill()
-    sweep.communicate(timeout=180)
-    assert sweep.returncode == code
-    again = started(tmp_path)
-    printed, _ = again.communicate(timeout=300)
-    assert again.returncode == 1, printed
+    assert sweep.wait(timeout=180) == code
+    assert started(tmp_path).wait(timeout=300) == 1
+    printed = (tmp_path / "printed").read_text()
     assert "1 of 2 runs finished" in printed
     assert "1 failed:" in printed
     (failed,) = tmp_path.glob("*learning_rate-1000000000.0*")
