@@ -7,7 +7,7 @@ from typing import Any
 
 from flowrep.experiment.evaluation import OUTCOMES
 
-_TITLES = {"training": "evaluation", "final": "final", "evaluate": "evaluate"}
+_TITLES = {"training": "evaluation"}  # of training itself there are scalars too
 
 
 def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
@@ -23,10 +23,8 @@ def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str,
     """
     groups: dict[tuple[int, str], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
-        words = (
-            _TITLES[row["evaluation"]], row["scene"], row["speed"], f"{float(row['fps']):g}fps",
-            row["policy"],
-        )  # fmt: skip
+        kind, rate = row["evaluation"], f"{float(row['fps']):g}fps"
+        words = _TITLES.get(kind, kind), row["scene"], row["speed"], rate, row["policy"]
         groups[int(row["frames"]), "/".join(words)].append(row)
     scalars: dict[int, dict[str, float]] = defaultdict(dict)
     for (frames, title), episodes in groups.items():

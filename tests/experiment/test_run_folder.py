@@ -206,4 +206,4 @@ def test_a_table_that_can_not_be_replaced_stays(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         run.log_episodes([episode(2)])
     assert run.read_episodes() == [episode(1)]
-    assert [path.name for path in tmp_path.iterdir()] == ["evaluation.csv"]
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["evaluation.csv"]
