@@ -1,7 +1,15 @@
-"""The console scripts: `flowrep-train` and its like do what `python -m flowrep.train` does."""
+"""How a command of flowrep's begins and ends; the console scripts `flowrep-train` and so on."""
 
+import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
+from types import FrameType
+from typing import NoReturn
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def train() -> None:
@@ -35,8 +43,56 @@ def report() -> None:
 
 
 def _run(command: str) -> None:
+    prepare()
     try:
         module = import_module(f"flowrep.{command}")
     except ImportError as error:
         sys.exit(f"error: {error}")
     module.main()
+
+
+def prepare() -> None:
+    """Readies the process for the imports of a command, which take seconds.
+
+    Ctrl-C ends it at once: libraries take an exception in the middle of their imports for another
+    one. Standard streams that the caller closed lead nowhere, rather than to the first file that
+    is opened; what they can't encode is replaced. Lines are written as they come, also to a pipe.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="replace", line_buffering=True)  # type: ignore[union-attr]
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Has Ctrl-C and SIGTERM end the process by `SystemExit`, which closes what it has opened.
+
+    One that comes meanwhile ends it at once. A signal that the caller ignores stays ignored.
+    """
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, _end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end(number: int, _: FrameType | None) -> NoReturn:
+    for each in _SIGNALS:
+        signal.signal(each, signal.SIG_DFL)
+    sys.exit(128 + number)
+
+
+def exit_unread() -> NoReturn:
+    """Ends the process without a word where nobody reads what it prints, as after `| head -1`."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):  # what they still hold would be told of at the end
+        os.dup2(nowhere, stream.fileno())
+    sys.exit(128 + signal.SIGPIPE)

@@ -10,8 +10,11 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from flowrep.console import prepare
 from flowrep.extras import require
 
+if __name__ == "__main__":
+    prepare()
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
 import hydra
@@ -88,7 +91,7 @@ def run(config: DictConfig) -> None:
                 stack.enter_context(folder.held("evaluating"))
             evaluate(asked, runs)
     except MISTAKES as error:
-        exit_with(str(error))
+        exit_with(error)
 
 
 def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
@@ -190,11 +193,11 @@ def keep(subject: Subject, rows: list[Row]) -> None:
     """Prints what the episodes of one run say and adds them to its table."""
     run = subject.run
     rows = with_origin(rows, subject.config, subject.frames, "evaluate")
+    run.log_episodes(rows)
+    write_failures(run.failures_path, run.read_episodes())
     print(run.path)
     print_table(rows)
     print_failures(rows)
-    run.log_episodes(rows)
-    write_failures(run.failures_path, run.read_episodes())
     print(f"{len(rows)} episodes are in {run.evaluation_path}")
 
 

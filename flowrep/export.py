@@ -3,8 +3,11 @@
 from pathlib import Path
 from typing import Any
 
+from flowrep.console import prepare
 from flowrep.extras import require
 
+if __name__ == "__main__":
+    prepare()
 require("an export", "train", "hydra", "pydantic", module=__name__)
 
 import hydra
@@ -36,7 +39,7 @@ def run(config: DictConfig) -> None:
         validated(ExportConfig, asked, own_keys())
         folder = export(asked, RunFolder.existing(asked["run"]))
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
-        exit_with(str(error))
+        exit_with(error)
     print(f"the agent is in {folder}; load_agent.py there shows how to run it")
 
 

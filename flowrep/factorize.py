@@ -6,8 +6,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from flowrep.console import prepare
 from flowrep.extras import require
 
+if __name__ == "__main__":
+    prepare()
 require("factorising", "factorize", "cv2", "hydra", "imageio", "pydantic", "tqdm", module=__name__)
 
 import cv2
@@ -39,7 +42,9 @@ def run(config: DictConfig) -> None:
         validated(FactorizeConfig, settings, own_keys())
         code = factorize_recording(settings)
     except UsageError as error:
-        exit_with(str(error))
+        exit_with(error)
+    except BrokenPipeError as error:
+        exit_with(error)
     except MISTAKES as error:
         exit_with(" ".join(str(error).split()))
     sys.exit(code)

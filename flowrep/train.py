@@ -4,8 +4,11 @@ import sys
 from functools import partial
 from typing import Any
 
+from flowrep.console import prepare
 from flowrep.extras import require
 
+if __name__ == "__main__":
+    prepare()
 require("training", "train", "hydra", "pydantic", module=__name__)
 
 import hydra
@@ -81,7 +84,7 @@ def run(config: DictConfig) -> float:
                 plain = resumed_config(plain, folder)
             return carry_out(plain, folder)
     except (UsageError, SceneError, RunFolderError, TableError, OSError) as error:
-        exit_with(str(error))
+        exit_with(error)
 
 
 def carry_out(config: Config, folder: RunFolder) -> float:
@@ -90,7 +93,7 @@ def carry_out(config: Config, folder: RunFolder) -> float:
         training = build(config, folder)
         folder.log_to_wandb(config["wandb"], config)
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
-        exit_with(str(error))
+        exit_with(error)
     print(f"run folder: {folder.path}")
     where, how_to_go_on = str(folder.path), how_to_resume(config, folder)
     if training.frames >= config["total_frames"] and folder.is_evaluated(
@@ -109,6 +112,8 @@ def carry_out(config: Config, folder: RunFolder) -> float:
             exit_with(f"after {training.frames} frames: {error}")
         except WorkerError as error:
             exit_with(f"after {training.frames} frames: {error}\nContinue with: {how_to_go_on}")
+        except BrokenPipeError:
+            raise  # of what is printed: no disk is full
         except OSError as error:
             exit_with(
                 f"after {training.frames} frames: {error}. Free some space or make the folder "
@@ -243,10 +248,10 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
     if not comparison.is_complete:
         return
     rows = comparison.rows()
-    print_table(rows)
-    print_failures(rows)
     run.log_episodes(with_origin(rows, config, training.frames, "final"))
     write_failures(run.failures_path, run.read_episodes())
+    print_table(rows)
+    print_failures(rows)
     draw_learning_curve(run)
     if evaluation["video"]:
         path = run.video_path(f"episode_{config['speed']}")
@@ -264,7 +269,7 @@ def main() -> None:
         try:
             folder = RunFolder.existing(str(resumed))
         except RunFolderError as error:
-            exit_with(str(error))
+            exit_with(error)
         place = max(i for i, a in enumerate(sys.argv) if a.startswith("resume="))
         sys.argv.insert(place + 1, override("hydra.run.dir", str(folder.path)))
     sweeps = is_sweep(sys.argv[1:])

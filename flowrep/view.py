@@ -4,8 +4,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from flowrep.console import prepare
 from flowrep.extras import require
 
+if __name__ == "__main__":
+    prepare()
 require("viewing", "train", "hydra", "pydantic", module=__name__)
 
 import hydra
@@ -51,7 +54,7 @@ def run(config: DictConfig) -> None:
         else:
             look_at(config, street, Path(HydraConfig.get().runtime.output_dir))
     except (UsageError, SceneError, NoScreenError, ValueError, OSError) as error:
-        exit_with(str(error))
+        exit_with(error)
 
 
 def check(config: DictConfig) -> None:

@@ -36,9 +36,9 @@ FLOWREP_IMPORTS_ALLOWED = {
         "scenes",
         "simulator",
     }
-    | {"sequences", "transforms", "geometry", "config_tree"},
+    | {"sequences", "transforms", "geometry", "config_tree", "console"},
     "report": {"report", "evaluate", "viz", "config", "experiment", "agent", "envs", "scenes"}
-    | {"config_tree", "extras"},
+    | {"config_tree", "console", "extras"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py"},

@@ -14,6 +14,7 @@ from flowrep.config import Section, UsageError
 from flowrep.config.composition import check_command, keys_added, parse, plain_config
 from flowrep.config.quoting import override, shell_line, taken_as_typed
 from flowrep.config.run_names import run_of_sweep
+from flowrep.console import ended_by_signals, exit_unread
 
 __all__ = [
     "exit_with",
@@ -56,9 +57,14 @@ def folder_name(text: str) -> str:
     return "_" if name in ("", ".", "..") else name
 
 
-def exit_with(message: str) -> NoReturn:
-    """Ends the process with the exit code of a wrong command, each line saying what is wrong."""
-    for line in message.splitlines():
+def exit_with(problem: str | Exception) -> NoReturn:
+    """Ends the process with the exit code of a wrong command, each line saying what is wrong.
+
+    Where the problem is that nobody reads what the process prints, it says nothing.
+    """
+    if isinstance(problem, BrokenPipeError):
+        exit_unread()
+    for line in str(problem).splitlines():
         print(f"error: {line}", file=sys.stderr)
     sys.exit(EXIT_USAGE)
 
@@ -107,8 +113,9 @@ def run_command(config_name: str, command: Callable[[], Any], schema: type[Secti
     """
     register_resolvers()
     sys.argv[1:] = taken_as_typed(sys.argv[1:], FOLDERS)
-    try:
-        check_command(config_name, sys.argv[1:], schema)
-    except UsageError as error:
-        exit_with(str(error))
-    command()
+    with ended_by_signals():
+        try:
+            check_command(config_name, sys.argv[1:], schema)
+        except UsageError as error:
+            exit_with(error)
+        command()

@@ -1,7 +1,6 @@
 """Environments stepped side by side in several processes, several in each."""
 
 import atexit
-import multiprocessing
 import os
 import pickle
 import sys
@@ -30,6 +29,7 @@ from flowrep.envs.worker_process import (
     copied,
     views,
 )
+from flowrep.envs.worker_server import server_context
 
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
@@ -82,7 +82,7 @@ class WorkerVectorEnv(VectorEnv):
         example.close()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        context = _server()
+        context = server_context(__name__)
         memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
         self._shared = views(self.single_observation_space, memory, self.num_envs)
         self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
@@ -252,13 +252,6 @@ class WorkerVectorEnv(VectorEnv):
 def available_cores() -> int:
     """Returns how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _server() -> Any:
-    """Returns the context whose server has imported what workers need, once for all of them."""
-    context: Any = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
-    return context
 
 
 @contextmanager

@@ -2,6 +2,10 @@
 
 import sys
 
+from flowrep.console import prepare
+
+if __name__ == "__main__":
+    prepare()
 try:
     from flowrep.report.command import main
 except ImportError as error:

@@ -35,7 +35,7 @@ def run(config: DictConfig) -> None:
         validated(ReportConfig, asked, own_keys())
         report_on(asked)
     except (UsageError, RunFolderError, ValueError, ImportError, OSError) as error:
-        exit_with(str(error))
+        exit_with(error)
 
 
 def report_on(asked: dict[str, Any]) -> Path:

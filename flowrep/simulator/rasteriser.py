@@ -10,7 +10,8 @@ in u and v. That holds for corners behind the camera too, so that nothing has to
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,6 +20,13 @@ from numpy.typing import NDArray
 from flowrep.simulator.triangles import Triangles
 
 _LEAST_AREA_PX = 0.01  # twice the area of triangles that PyBullet's renderer leaves out
+
+
+def _compiled(function: Callable[..., None]) -> Any:
+    try:
+        return njit(cache=True, nogil=True)(function)
+    except RuntimeError:  # no folder for a cache can be written: each process compiles anew
+        return njit(nogil=True)(function)
 
 
 class Maps(NamedTuple):
@@ -74,7 +82,7 @@ class Rasteriser:
         return maps
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _draw(
     points, corners, point_bounds, corner_bounds, centres, radii, bodies, poses, classes, instances,
     K, near_m, far_m, cam_from_world, world_from_body, is_shown, depth, semantic, instance,
@@ -104,7 +112,7 @@ def _draw(
         _look_up(inverse, body, classes, instances, depth[n], semantic[n], instance[n])
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _side_planes(K, height, width):
     # Unit normals, inwards, of the four planes through the outermost samples.
     planes = np.empty((4, 3))
@@ -119,7 +127,7 @@ def _side_planes(K, height, width):
     return planes
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _compose(cam_from_world, world_from_body, pose, into):
     for i in range(3):
         for j in range(4):
@@ -131,7 +139,7 @@ def _compose(cam_from_world, world_from_body, pose, into):
                     into[i, j] += cam_from_world[i, k] * world_from_body[pose, k, j]
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _is_outside(cam_from_body, centre, radius, planes, near_m, far_m):
     x, y, z = _moved(cam_from_body, centre)
     is_outside = z + radius < near_m or z - radius > far_m
@@ -140,7 +148,7 @@ def _is_outside(cam_from_body, centre, radius, planes, near_m, far_m):
     return is_outside
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _moved(m, p):
     return (
         m[0, 0] * p[0] + m[0, 1] * p[1] + m[0, 2] * p[2] + m[0, 3],
@@ -149,7 +157,7 @@ def _moved(m, p):
     )
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _project(K, cam_from_body, point, q):
     x, y, z = _moved(cam_from_body, point)
     q[0] = K[0, 0] * x + K[0, 2] * z
@@ -157,12 +165,12 @@ def _project(K, cam_from_body, point, q):
     q[2] = z
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _cross(p, q):
     return (p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0])
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _fill(p, q, r, near_m, far_m, number, inverse, body):
     """Draws the triangle of corners p, q, r; clockwise in a picture whose y points down."""
     e, f, g = _cross(r, q), _cross(p, r), _cross(q, p)
@@ -207,7 +215,7 @@ def _fill(p, q, r, near_m, far_m, number, inverse, body):
                 body[y, x] = number
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _look_up(inverse, body, classes, instances, depth, semantic, instance):
     height, width = body.shape
     for y in range(height):

@@ -1,0 +1,57 @@
+"""The process that workers are forked from: what it imports, and what it leaves behind."""
+
+import atexit
+import multiprocessing
+import os
+import shutil
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import forkserver, resource_tracker, util
+from typing import Any
+
+_FOLDER = "FLOWREP_WORKER_SERVER_FOLDER"
+
+
+def server_context(module: str) -> Any:
+    """Returns a context of multiprocessing whose fork server runs.
+
+    SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, reach neither
+    the server nor what it forks, from their first moment on: they end when the caller closes, or is
+    gone.
+
+    Args:
+        module: is imported by the server, once for all workers, with all that it imports.
+    """
+    context: Any = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([module])
+    resource_tracker.ensure_running()  # which unblocks signals when it starts
+    with _signals_blocked(), _folder_told():
+        forkserver.ensure_running()
+    return context
+
+
+@contextmanager
+def _signals_blocked() -> Iterator[None]:
+    # A process that is started inherits the mask, and multiprocessing leaves it as it is. A signal
+    # to this process is not lost: it comes at the end of the block.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _folder_told() -> Iterator[None]:
+    os.environ[_FOLDER] = util.get_temp_dir()
+    try:
+        yield
+    finally:
+        del os.environ[_FOLDER]
+
+
+if _FOLDER in os.environ:
+    # This is the server. Its socket lies in a folder that the caller removes; a caller that is
+    # killed can't, and is outlived by its server for a moment.
+    atexit.register(shutil.rmtree, os.environ.pop(_FOLDER), ignore_errors=True)
