@@ -26,15 +26,18 @@ def server_context(module: str) -> Any:
     context: Any = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([module])
     resource_tracker.ensure_running()  # which unblocks signals when it starts
-    with _signals_blocked(), _folder_told():
+    with signals_held(), _folder_told():
         forkserver.ensure_running()
     return context
 
 
 @contextmanager
-def _signals_blocked() -> Iterator[None]:
-    # A process that is started inherits the mask, and multiprocessing leaves it as it is. A signal
-    # to this process is not lost: it comes at the end of the block.
+def signals_held() -> Iterator[None]:
+    """Has SIGINT and SIGTERM wait for the end of the block; what begins in it never hears them.
+
+    A process inherits the mask, and multiprocessing leaves it as it is. A worker whose caller ends
+    while it is begun would tell of the half of its task that it was given.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     try:
         yield

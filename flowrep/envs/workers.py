@@ -29,7 +29,7 @@ from flowrep.envs.worker_process import (
     copied,
     views,
 )
-from flowrep.envs.worker_server import server_context
+from flowrep.envs.worker_server import server_context, signals_held
 
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
@@ -90,7 +90,8 @@ class WorkerVectorEnv(VectorEnv):
         self._at_exit = partial(_call, weakref.WeakMethod(self._shut_down))
         atexit.register(self._at_exit)
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
-        with nullcontext() if _need_main_module(env_factories) else _without_main_module():
+        needs_main = _need_main_module(env_factories)
+        with signals_held(), nullcontext() if needs_main else _without_main_module():
             for rows in map(slice, bounds, bounds[1:]):
                 self._workers.append(Worker(context, env_factories, rows, memory, in_each))
         self._check_code(self._receive())

@@ -12,7 +12,7 @@ SPEC = Composite(view=Unbounded((ENVS, 1, 36, 36)), shape=(ENVS,))
 def make_ppo(**changes):
     settings = {
         "total_frames": 600, "device": "cpu", "precision": "fp32", "learning_rate": 1e-3,
-        "rollout_length": 4, "epochs": 3, "batch_size": 3, "gamma": 0.5, "gae_lambda": 0.5,
+        "rollout_length": 4, "epochs": 3, "batch_size": 3, "gamma": 0.5, "gae_lambda": 0.75,
         "clip": 0.2, "value_weight": 0.5, "entropy_weight": 0.01, "max_grad_norm": 0.5,
         "hidden_size": 16,
     }  # fmt: skip
@@ -81,14 +81,14 @@ def test_advantages_by_hand():
         n: worth(agent, n).item()
         for n in (0.125, 0.25, 0.75, 0.875, 4.0, 1.0, 1.125, 1.25, 1.5, 2.0, 3.0)
     }
-    # delta = r + 0.5 V' - V; advantage = delta + 0.25 the next one's, within an episode
+    # delta = r + 0.5 V' - V; advantage = delta + 0.5 · 0.75 the next one's, within an episode
     a1 = 3 - v[0.25]
-    a0 = 1 + 0.5 * v[0.25] - v[0.125] + 0.25 * a1
+    a0 = 1 + 0.5 * v[0.25] - v[0.125] + 0.375 * a1
     a3 = 7 + 0.5 * v[4.0] - v[0.875]
-    a2 = 5 + 0.5 * v[0.875] - v[0.75] + 0.25 * a3
+    a2 = 5 + 0.5 * v[0.875] - v[0.75] + 0.375 * a3
     b2 = 6 + 0.5 * v[1.5] - v[1.25]
-    b1 = 4 + 0.5 * v[1.25] - v[1.125] + 0.25 * b2
-    b0 = 2 + 0.5 * v[1.125] - v[1.0] + 0.25 * b1
+    b1 = 4 + 0.5 * v[1.25] - v[1.125] + 0.375 * b2
+    b0 = 2 + 0.5 * v[1.125] - v[1.0] + 0.375 * b1
     b3 = 8 + 0.5 * v[3.0] - v[2.0]
     expected = torch.tensor([[a0, a1, a2, a3], [b0, b1, b2, b3]])
     advantage = steps["advantage"].squeeze(-1)

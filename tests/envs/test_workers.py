@@ -208,6 +208,14 @@ def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
     assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
 
 
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks into /proc")
+def test_such_signals_reach_no_worker_from_its_first_moment_on(make):
+    with open(f"/proc/{make(1, 1)._workers[0].process.pid}/status") as file:
+        blocked = int(dict(line.split(":") for line in file)["SigBlk"], 16)
+    assert all(blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM))
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & {signal.SIGINT, signal.SIGTERM}
+
+
 HOLDER = """
 import sys
 from functools import partial
@@ -237,7 +245,8 @@ def test_no_worker_outlives_its_caller(tmp_path, how):
     script = tmp_path / "holder.py"
     script.write_text(HOLDER)
     command = [sys.executable, str(script), "wait" if how == "killed" else "end"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([".", *sys.path])}
+    paths = {"PYTHONPATH": os.pathsep.join([".", *sys.path]), "TMPDIR": str(tmp_path)}
+    environment = os.environ | paths
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     ) as holder:
@@ -254,6 +263,9 @@ def test_no_worker_outlives_its_caller(tmp_path, how):
     while any(is_running(pid) for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not any(is_running(pid) for pid in workers)
+    while list(tmp_path.glob("pymp-*")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not list(tmp_path.glob("pymp-*"))  # where the socket of the workers' server was
 
 
 GUARD = 'if __name__ == "__main__":'

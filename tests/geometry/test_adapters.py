@@ -1,6 +1,7 @@
 """What other simulators, data sets and robots mean, each convention worked by hand."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from flowrep.geometry import (
     project,
     unproject,
 )
+from flowrep.geometry.depth import z_from_z_buffer
 from tests.geometry.scenes import K, depth_map, rigid
 
 # 1 x 3 pixels whose rays lead through (-0.75, 0.5), (0, 0.5) and (0.75, 0.5) at z = 1.
@@ -108,6 +110,12 @@ def test_field_of_view_is_checked(changed, expected):
     options = {"fov_deg": 90.0, "axis": "vertical", "height": 4, "width": 6, **changed}
     with pytest.raises(ValueError, match=expected):
         intrinsics_from_fov(**options)
+
+
+def test_a_picture_may_be_one_pixel_wide():
+    # One pixel across 90 degrees: the focal length is half of it, and its centre lies at 0.5.
+    K = intrinsics_from_fov(90.0, axis="horizontal", height=1, width=1)
+    assert (K[0, 0], K[0, 2], K[1, 2]) == (pytest.approx(0.5), 0.5, 0.5)
 
 
 def test_opencv_calibration_moves_by_half_a_pixel_and_no_more():
@@ -224,6 +232,24 @@ def test_a_quaternion_that_is_not_of_unit_length_is_refused():
         adapt_pose(pose, layout="xyz_xyzw")
     normalised = adapt_pose(pose, layout="xyz_xyzw", check=False)
     assert torch.equal(normalised, torch.eye(4).double())
+
+
+@pytest.mark.parametrize(
+    ("adapt", "expected"),
+    [
+        (partial(adapt_depth, kind="z"), r"^depth must be .*1, H, W\], got \[5, 7\]"),
+        (partial(z_from_z_buffer, near_m=0.1, far_m=9.0), r"^z_buffer must be .*1, H, W\]"),
+        (adapt_pose, r"^pose must be .*4, 4\], got \[5, 7\]"),
+        (
+            partial(adapt_flow, direction="forward", grid="current"),
+            r"^flow must be .*2, H, W\], got \[5, 7\]",
+        ),
+    ],
+    ids=["depth", "z-buffer", "pose", "flow"],
+)
+def test_a_tensor_of_another_shape_is_refused_by_name_and_with_the_right_one(adapt, expected):
+    with pytest.raises(ValueError, match=expected):
+        adapt(torch.ones(5, 7))
 
 
 def test_flow_that_needs_no_change_and_flow_that_points_back():

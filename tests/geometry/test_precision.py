@@ -44,6 +44,12 @@ def test_narrow_types_are_computed_in_float32_and_rounded_once(dtype):
     inputs = [tensor.to(dtype) for tensor in street(2.0)]
     wide = [tensor.float() for tensor in inputs]
     assert torch.equal(ego_flow(*inputs).flow, ego_flow(*wide).flow.to(dtype))
+    depth, camera, motion = inputs
+    instance = (torch.arange(SIZE**2) % 2).reshape(1, SIZE, SIZE)
+    motions = torch.stack([motion, rigid((0.0, 0.0, 0.1), (0.5, 0.0, 0.0)).to(dtype)])
+    flow = rigid_flow(depth, instance, camera, motions).flow
+    wide_flow = rigid_flow(depth.float(), instance, camera.float(), motions.float()).flow
+    assert torch.equal(flow, wide_flow.to(dtype))
 
 
 def test_result_has_the_widest_type():
@@ -51,6 +57,7 @@ def test_result_has_the_widest_type():
     instance = torch.zeros_like(depth, dtype=torch.int32)
     raw = torch.zeros(2, SIZE, SIZE)
     assert ego_flow(depth.half(), camera, motion.bfloat16()).flow.dtype == torch.float32
+    assert ego_flow(depth, camera, motion.double()).flow.dtype == torch.float64
     assert rigid_flow(depth, instance, camera.double(), motion[None]).flow.dtype == torch.float64
     assert factorize(raw, depth, camera, motion.double()).obj.dtype == torch.float64
     narrow = factorize(raw.half(), depth.half(), camera.half(), motion.half())
