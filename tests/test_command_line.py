@@ -108,6 +108,7 @@ def run_command(*arguments, cwd):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -134,6 +135,7 @@ def test_the_commands_end_with_one_line_and_code_2(arguments, says, tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "view"])
 def test_a_scene_of_ones_own_that_cannot_be_ends_in_one_line(command, tmp_path):
     (tmp_path / "scene").mkdir()

@@ -30,6 +30,7 @@ def view(*arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
+@pytest.mark.slow
 def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
     out = tmp_path / "seen"
     done = view("scene=three_way_junction", "driver=never_turn", *SMALL, f"hydra.run.dir={out}")
@@ -87,6 +88,7 @@ def test_an_unknown_scene_is_named():
         check_command("view", ["scene=s_turm"])
 
 
+@pytest.mark.slow
 def test_without_a_screen_the_command_ends_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     done = view("interactive=true", f"hydra.run.dir={tmp_path}")

@@ -168,7 +168,7 @@ def test_intrinsics_are_copied_and_no_part_of_the_state():
         ({"unit": "px_per_s", "dt_s": 0.0}, "needs dt_s"),
         ({"scale": 0.0}, "scale is a finite number other than 0"),
         ({"scale": math.inf}, "scale is a finite number other than 0"),
-        ({"scale": {"ego": 1.0}}, r"one value for each of \['ego', 'obj'\]"),
+        ({"scale": {"ego": 1.0}}, r"^scale needs one value for each of \['ego', 'obj'\]"),
         ({"intrinsics": torch.eye(4)}, r"K, \[3, 3\], or the key of .*; got \[4, 4\]"),
     ],
 )

@@ -148,8 +148,9 @@ def test_an_unknown_name_has_no_options():
 
 
 def test_what_the_camera_has_to_say_is_asked_for():
-    with pytest.raises(ValueError, match="need num_classes="):
-        representation_stack(["seg2"])
+    for segmentation in ("seg", "seg2"):
+        with pytest.raises(ValueError, match="need num_classes="):
+            representation_stack([segmentation])
     with pytest.raises(ValueError, match="need intrinsics="):
         representation_stack(["depth", "ego"], num_classes=3)
     with pytest.raises(ValueError, match="needs dt_s"):
