@@ -5,6 +5,7 @@ python examples/transform_pictures.py docs/images/transforms
 
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,12 @@ from flowrep.geometry import ego_flow, unproject
 from flowrep.scenes import load_scene
 from flowrep.transforms import DIS
 from flowrep.viz import (
+    DEPTH_RANGE_M,
     FLOW_SCALE_PX,
     classes_to_rgb,
+    depth_bar,
     depth_to_rgb,
+    flow_note,
     flow_to_rgb,
     strip,
     write_png,
@@ -28,6 +32,8 @@ from flowrep.viz import (
 from flowrep.viz.film import maps_of
 
 SCENE, SEED, SIZE_PX = "h_shaped_pathways", 4, 160
+NOTES = {name: flow_note(scale) for name, scale in FLOW_SCALE_PX.items()}
+NOTES |= {"depth": partial(depth_bar, DEPTH_RANGE_M), "z": partial(depth_bar, DEPTH_RANGE_M)}
 PARTS = np.array([(235, 235, 235), (222, 40, 60), (46, 64, 196), (60, 160, 90)], dtype=np.uint8)
 
 
@@ -48,7 +54,8 @@ def main(folder: str) -> None:
     at = max(range(1, len(maps)), key=lambda i: motion[i])
     for name, images in pictures(steps[at - 1], steps[at], maps[at - 1], maps[at], K).items():
         path = Path(folder) / f"{name}.png"
-        write_png(path, strip(images))
+        notes = {name: note for name, note in NOTES.items() if name in images}
+        write_png(path, strip(images, wheel_for=FLOW_SCALE_PX, notes=notes))
         print(path)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flowrep.sequences.factorization import FactorizedFrame
 from flowrep.sequences.flow_files import write_flo, write_kitti_flow
-from flowrep.viz import Image, representation_strip, strip
+from flowrep.viz import Image, flow_note, representation_strip, strip
 from flowrep.viz import flow_to_rgb as colours_of
 
 FLOW_FORMATS = ("flo", "kitti", "npz")
@@ -89,8 +89,9 @@ def arrays(factorized: FactorizedFrame) -> dict[str, NDArray[Any]]:
 
 def flow_picture(kind: str, factorized: FactorizedFrame, scale_px: float) -> Image:
     """Returns a flow's colours under a label with the scale and the wheel; unknown is grey."""
-    label = f"{kind} flow, full at {scale_px:g} px"
-    return strip({label: colours_of(shown(kind, factorized), scale_px)}, wheel_for=[label])
+    label = f"{kind} flow"
+    colours = colours_of(shown(kind, factorized), scale_px)
+    return strip({label: colours}, wheel_for=[label], notes={label: flow_note(scale_px)})
 
 
 def shown(kind: str, factorized: FactorizedFrame) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ import numpy as np
 from flowrep.scenes.layout import Box
 from flowrep.scenes.scene import Kind
 from flowrep.simulator.meshes import Mesh
-from flowrep.simulator.paint import front, swatch, wall
+from flowrep.simulator.paint import front, swatch, upper_storeys
 
 _CAR_PAINTS = ("car_body", "car_red", "car_white", "car_grey")
 _CROWN_SIDES = 6
@@ -24,13 +24,13 @@ def mesh_of(box: Box, *, both_sides: bool = False) -> Mesh:
 
 
 def house(box: Box, *, both_sides: bool = False) -> Mesh:
-    """Returns what a street shows of a house: a front of windows to its right, its side walls.
+    """Returns what a street shows of a house: a front with a door to its right, its side walls.
 
     With `both_sides` there is a front to its left too. No one looks at its roof.
     """
     length, width, height = box.size_m
-    windows, plain = front(box.variant), wall(box.variant)
-    sides = (windows, plain, windows if both_sides else None, plain)
+    windows, beside = front(box.variant), upper_storeys(box.variant)
+    sides = (windows, beside, windows if both_sides else None, beside)
     mesh = Mesh()
     mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
     return mesh
@@ -93,14 +93,14 @@ def fence(box: Box) -> Mesh:
 
 
 def traffic_light(box: Box) -> Mesh:
-    """Returns a post with a head of three lamps for those who drive along x."""
+    """Returns a post with a head of three lamps, the lowest lit, for those who drive along x."""
     length, width, height = box.size_m
     head_m, reach = 0.95, 0.17
     mesh = Mesh()
     post = (swatch("metal"),) * 4
     mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height - head_m), post)
     mesh.box((-reach, -reach, height - head_m), (reach, reach, height), swatch("tyre"))
-    for name, share in (("lamp_red", 0.83), ("lamp_amber", 0.5), ("lamp_green", 0.17)):
+    for name, share in (("lamp_off", 0.83), ("lamp_off", 0.5), ("lamp_green", 0.17)):
         centre = (-reach - 0.01, 0.0, height - head_m * (1 - share))
         mesh.disc(centre, (-1.0, 0.0, 0.0), 0.12, swatch(name))
     return mesh

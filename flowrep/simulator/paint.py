@@ -34,8 +34,8 @@ PAINTS: dict[str, tuple[int, int, int]] = {
     "leaf_light": (92, 146, 62),
     "lamp_white": (250, 244, 214),
     "lamp_red": (230, 48, 40),
-    "lamp_amber": (244, 176, 40),
     "lamp_green": (60, 200, 96),
+    "lamp_off": (52, 46, 44),
 }
 SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
 _WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))
@@ -52,12 +52,6 @@ def swatch(name: str) -> Patch:
     return (u, v, u, v)
 
 
-def wall(variant: int) -> Patch:
-    """Returns a plain piece of a house front's wall, without extent."""
-    u0, v0, _, _ = front(variant)
-    return (u0 + 1.5 / SIZE_PX, v0 + 1.5 / SIZE_PX) * 2
-
-
 def front(variant: int) -> Patch:
     """Returns the patch of house front number `variant` (taken modulo their number)."""
     row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
@@ -66,6 +60,13 @@ def front(variant: int) -> Patch:
     pixels = np.array([left + 0.5, top + 0.5, left + _FRONT_PX[1] - 0.5, top + _FRONT_PX[0] - 0.5])
     u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
     return (u0, v0, u1, v1)
+
+
+def upper_storeys(variant: int) -> Patch:
+    """Returns a house front above its ground floor, for walls without a door."""
+    u0, v0, u1, v1 = front(variant)
+    floors = _FLOORS[variant % NUM_FRONTS // len(_WALLS)]
+    return (u0, v0, u1, v1 - (v1 - v0) / floors)
 
 
 def picture() -> NDArray[np.uint8]:

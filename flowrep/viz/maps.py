@@ -7,8 +7,9 @@ Images are numpy uint8 `[H, W, 3]`. Maps go in as numpy or torch, `[C, H, W]`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 from flowrep.palette import CLASS_COLOURS
 
 Image = NDArray[np.uint8]
+Note = str | Callable[[int], Image]
 
-FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 2.0}
+FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 5.0}
 """Flow, in pixels, at which a representation's colour is full."""
 
 DEPTH_RANGE_M = 100.0
@@ -36,6 +38,7 @@ _OFF_WHITE = 255 * (
     1 - np.clip(np.abs((6 * np.arange(_HUES)[:, None] / _HUES + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
 ).astype(np.float32)
 _BAR_PX = 28
+_NOTE_PX = 20
 _GAP_PX = 4
 _GAP_GREY = 200  # so that the white of no motion has an edge
 _TILE_PX = 240
@@ -134,8 +137,8 @@ def representation_strip(
             for name, scale_px in flow_scale_px.items()
         ),
     ]
-    labels = {"rgb": "RGB", "semantic": "segmentation", "depth": f"depth, 0-{depth_range_m:g} m"}
-    labels |= {name: f"{name} flow, full at {scale:g} px" for name, scale in flow_scale_px.items()}
+    labels = {"rgb": "RGB", "semantic": "segmentation", "depth": "depth, logarithmic"}
+    labels |= {name: f"{name} flow" for name in flow_scale_px}
     names = set(maps.keys())
     images = {labels[name]: draw(maps[name]) for name, draw in tiles if name in names}
     if not images:
@@ -143,10 +146,34 @@ def representation_strip(
             f"nothing to draw: maps has {sorted(map(str, names))}, "
             f"expected some of {[name for name, _ in tiles]}"
         )
-    return strip(images, wheel_for=[labels[name] for name in flow_scale_px])
+    notes: dict[str, Note] = {labels["depth"]: partial(depth_bar, depth_range_m)}
+    notes |= {labels[name]: flow_note(scale) for name, scale in flow_scale_px.items()}
+    return strip(images, wheel_for=[labels[name] for name in flow_scale_px], notes=notes)
 
 
-def strip(images: Mapping[str, Image], *, wheel_for: Iterable[str] = ()) -> Image:
+def flow_note(scale_px: float) -> str:
+    """Returns what saturation means at a scale: it goes with the square root of the magnitude.
+
+    >>> flow_note(20.0)
+    'full at 20 px, half at 5 px'
+    """
+    return f"full at {scale_px:g} px, half at {scale_px / 4:g} px"
+
+
+def depth_bar(range_m: float, width: int) -> Image:
+    """Returns the colours of depth from 0 m to `range_m`, evenly in metres' logarithm, named."""
+    metres = np.expm1(np.linspace(0, np.log1p(range_m), width))
+    bar = depth_to_rgb(metres[None, None].repeat(_NOTE_PX - 2, axis=1), range_m)
+    ends = {2: ("near", "lm", (0, 0, 0)), width - 2: (f"{range_m:g} m", "rm", (255, 255, 255))}
+    return _written(bar, {(x, (_NOTE_PX - 2) // 2): text for x, text in ends.items()}, size=13)
+
+
+def strip(
+    images: Mapping[str, Image],
+    *,
+    wheel_for: Iterable[str] = (),
+    notes: Mapping[str, Note] = MappingProxyType({}),
+) -> Image:
     """Returns images of one size side by side, each under its label, small ones enlarged.
 
     Enlarged by a whole factor and without interpolation: a pixel stays a square of one colour.
@@ -154,6 +181,7 @@ def strip(images: Mapping[str, Image], *, wheel_for: Iterable[str] = ()) -> Imag
     Args:
         images: label to image `[H, W, 3]`.
         wheel_for: labels that get the flow wheel beside them.
+        notes: by label, what stands below it: a text, or a legend that is drawn for a width.
 
     Raises:
         ValueError: the images differ in size.
@@ -166,9 +194,11 @@ def strip(images: Mapping[str, Image], *, wheel_for: Iterable[str] = ()) -> Imag
     with_wheel = frozenset(wheel_for)
     columns: list[Image] = []
     for label, image in images.items():
-        bar = _label_bar(label, width * zoom, label in with_wheel)
+        bars = [_label_bar(label, width * zoom, label in with_wheel)]
+        if notes.keys() & images.keys():
+            bars.append(_note_bar(notes.get(label, ""), width * zoom))
         tile = image.repeat(zoom, axis=0).repeat(zoom, axis=1)
-        column = np.concatenate([bar, tile])
+        column = np.concatenate([*bars, tile])
         columns += [column, np.full((len(column), _GAP_PX, 3), _GAP_GREY, np.uint8)]
     return np.concatenate(columns[:-1], axis=1)
 
@@ -212,15 +242,31 @@ def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> Non
 
 @lru_cache(maxsize=64)
 def _label_bar(label: str, width: int, with_wheel: bool) -> Image:
+    bar = np.full((_BAR_PX, width, 3), 255, np.uint8)
+    bar = _written(bar, {(2, _BAR_PX // 2): (label, "lm", (0, 0, 0))}, size=18)
+    if with_wheel:
+        bar[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
+    return bar
+
+
+def _note_bar(note: Note, width: int) -> Image:
+    bar = np.full((_NOTE_PX, width, 3), 255, np.uint8)
+    if isinstance(note, str):
+        return _written(bar, {(2, _NOTE_PX // 2): (note, "lm", (70, 70, 70))}, size=14)
+    bar[: _NOTE_PX - 2] = note(width)
+    return bar
+
+
+def _written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, size: int) -> Image:
+    """Returns an image with texts in it: by place (x, y), each with its anchor and colour."""
     from PIL import Image as pillow
     from PIL import ImageDraw, ImageFont
 
-    bar = pillow.new("RGB", (width, _BAR_PX), (255, 255, 255))
-    font = ImageFont.load_default(size=18)
-    ImageDraw.Draw(bar).text((2, _BAR_PX // 2), label, fill=(0, 0, 0), font=font, anchor="lm")
-    if with_wheel:
-        bar.paste(pillow.fromarray(flow_wheel(_BAR_PX - 2)), (width - _BAR_PX, 1))
-    return np.asarray(bar)
+    picture = pillow.fromarray(image)
+    font, draw = ImageFont.load_default(size=size), ImageDraw.Draw(picture)
+    for place, (text, anchor, colour) in texts.items():
+        draw.text(place, text, fill=colour, font=font, anchor=anchor)
+    return np.array(picture)
 
 
 def _channels(name: str, values: Any, channels: int) -> NDArray[Any]:

@@ -46,14 +46,16 @@ def test_a_shape_stands_where_its_box_does_and_faces_its_way():
     assert points[:, 0].max() == pytest.approx(10.0 + 0.9, abs=0.03)
 
 
-def test_the_traffic_lights_lamps_are_seen_by_those_who_drive_its_way():
+def test_one_lamp_of_a_traffic_light_is_lit_for_those_who_drive_its_way():
     mesh = mesh_of(Box("traffic_light", 0.0, 0.0, 0.0, SIZES["traffic_light"]))
     normals, uvs = np.array(mesh.normals), np.array(mesh.uvs)
     from flowrep.simulator.paint import swatch
 
-    red = np.isclose(uvs, swatch("lamp_red")[:2]).all(axis=-1)
-    assert red.any()
-    np.testing.assert_allclose(normals[red], [[-1.0, 0.0, 0.0]] * red.sum(), atol=1e-12)
+    lit = np.isclose(uvs, swatch("lamp_green")[:2]).all(axis=-1)
+    assert lit.sum() == 8  # the corners of one disc
+    np.testing.assert_allclose(normals[lit], [[-1.0, 0.0, 0.0]] * 8, atol=1e-12)
+    for other in ("lamp_red", "lamp_white"):
+        assert not np.isclose(uvs, swatch(other)[:2]).all(axis=-1).any()
 
 
 def test_every_normal_points_away_from_the_inside_of_a_car():

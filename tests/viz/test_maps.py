@@ -12,6 +12,7 @@ from flowrep.palette import CLASS_COLOURS
 from flowrep.viz import (
     classes_to_rgb,
     contact_sheet,
+    depth_bar,
     depth_to_rgb,
     flow_to_rgb,
     flow_wheel,
@@ -103,12 +104,12 @@ def maps(height: int = 30, width: int = 40) -> dict[str, torch.Tensor]:
 
 def test_strip_draws_what_is_there_in_a_fixed_order_enlarged_without_blur():
     given = maps()
-    given["obj"][0, 3, 5] = 2.0  # full colour at the default scale
+    given["obj"][0, 3, 5] = 5.0  # full colour at the default scale
     image = representation_strip(given)
-    # rgb, depth and obj, 40 columns enlarged 6 times, 2 gaps of 4; a bar of 28 above 30 rows.
-    assert image.shape == (28 + 180, 3 * 240 + 2 * 4, 3)
-    assert (image[28:, :240] == 7).all()
-    obj = image[28:, 488:]
+    # rgb, depth and obj, 40 columns enlarged 6 times, 2 gaps of 4; bars of 28 and 20 above 30 rows.
+    assert image.shape == (48 + 180, 3 * 240 + 2 * 4, 3)
+    assert (image[48:, :240] == 7).all()
+    obj = image[48:, 488:]
     assert (obj[18:24, 30:36] == (255, 0, 0)).all()
     assert (np.delete(obj.reshape(30, 6, 40, 6, 3), 3, axis=0) == 255).all()
 
@@ -123,15 +124,32 @@ def test_labels_are_written_and_the_wheel_stands_beside_flow_only():
 
 
 def test_scale_of_the_label_is_the_scale_of_the_colours(monkeypatch):
-    labels = []
-    monkeypatch.setattr(
-        "flowrep.viz.maps.strip", lambda images, wheel_for: labels.extend(images) or images
-    )
+    written = {}
+
+    def strip(images, wheel_for, notes):
+        written.update(notes)
+        return images
+
+    monkeypatch.setattr("flowrep.viz.maps.strip", strip)
     images = representation_strip(
         maps() | {"ego": torch.full((2, 3, 4), 0.0)}, flow_scale_px={"ego": 8.0, "obj": 0.5}
     )
-    assert labels == ["RGB", "depth, 0-100 m", "ego flow, full at 8 px", "obj flow, full at 0.5 px"]
-    assert set(images) == set(labels)
+    assert list(images) == ["RGB", "depth, logarithmic", "ego flow", "obj flow"]
+    assert written["ego flow"] == "full at 8 px, half at 2 px"
+    assert written["obj flow"] == "full at 0.5 px, half at 0.125 px"
+
+
+def test_half_the_saturation_is_where_the_note_says():
+    half = flow_to_rgb(flow_of(2.0, 0.0), scale_px=8.0)[0, 0]
+    assert np.abs(half.astype(int) - (255, 128, 128)).max() <= 1
+
+
+def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
+    bar = depth_bar(99.0, 241)[0].astype(int)
+    assert bar[0].tolist() == [252, 253, 191]
+    assert bar[240].tolist() == [40, 16, 80]
+    # 9 m is in the middle: log(1 + 9) is half of log(1 + 99), between the third and fourth stop.
+    assert np.abs(bar[120] - (212, 75.5, 107)).max() <= 1
 
 
 @pytest.mark.parametrize(
