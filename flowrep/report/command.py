@@ -10,7 +10,11 @@ from flowrep.extras import require
 require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja2", module=__name__)
 
 import hydra
+import rich.box
+import rich.table
 from omegaconf import DictConfig
+from rich.console import Console
+from rich.text import Text
 
 from flowrep.config import UsageError, validated
 from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
@@ -25,6 +29,7 @@ from flowrep.report.files import write_files, write_page
 from flowrep.report.page import render_page, summary
 from flowrep.report.runs import read_runs
 from flowrep.report.statistics import Bootstrap
+from flowrep.report.tables import Table
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="report")
@@ -58,6 +63,11 @@ def report_on(asked: dict[str, Any]) -> Path:
     report = assemble(runs, complaints, ask)
     for complaint in report.complaints[len(complaints) :]:
         print(f"in part: {complaint}")
+    for chapter in report.chapters:
+        for section in chapter.sections:
+            for table in section.tables:
+                if not table.name.endswith("_differences"):  # too long for a screen
+                    show(table, f"{section.title} {chapter.label}".strip())
     for folder in write_files(report, output):
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     drives = _drives(report.runs, asked)
@@ -66,6 +76,21 @@ def report_on(asked: dict[str, Any]) -> Path:
     page = write_page(render_page(report, drives, folders), output)
     print(f"page: {page}")
     return page
+
+
+def show(table: Table, title: str) -> None:
+    """Prints a table."""
+    shown = rich.table.Table(title=title, box=rich.box.SIMPLE, pad_edge=False)
+    for place, heading in enumerate(table.header):
+        justify: Any = "left" if table.is_text(place) else "right"
+        shown.add_column(Text(heading), justify=justify, no_wrap=True)
+    for heading, rows in table.blocks:
+        if heading:
+            shown.add_row(Text(heading, style="italic"))
+        for row in rows:
+            shown.add_row(*map(Text, row))
+        shown.add_section()
+    Console(width=max(160, Console().width)).print(shown)
 
 
 def _drives(runs: Sequence[Any], asked: dict[str, Any]) -> Drives:

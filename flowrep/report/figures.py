@@ -17,6 +17,7 @@ _BASELINE_LINES: dict[str, Any] = {"never_turn": ":", "random": "-.", "planner":
 _BASELINE_NAMES = {"never_turn": "never turns", "random": "random", "planner": "planner"}
 _PAPER_PT, _PAGE_PT = 7.5, 10.0
 _MOST_IN_A_ROW = 4  # panels
+_WIDEST_BAR = 0.3  # of a group
 
 
 def canvas(panels: int, theme: Theme, *, for_page: bool) -> tuple[Figure, list[Axes]]:
@@ -58,7 +59,7 @@ def draw_bars(grids: Sequence[Grid], theme: Theme, *, for_page: bool = False) ->
 
 def _bars(axes: Axes, grid: Grid, theme: Theme) -> None:
     style = looks(grid.series, theme)
-    width = 0.84 / len(grid.series)
+    width = min(0.84 / len(grid.series), _WIDEST_BAR)
     for group, condition in enumerate(grid.conditions):
         for place, name in enumerate(grid.series):
             at = group + (place - (len(grid.series) - 1) / 2) * width

@@ -67,7 +67,7 @@ def draw_curves(panels: Sequence[CurvePanel], theme: Theme, *, for_page: bool = 
                 look = style[name]
                 for curve in curves:
                     xs, ys = _thousands(curve.training)
-                    axes.plot(xs, ys, color=look.colour, linewidth=0.6, alpha=0.45)
+                    axes.plot(xs, ys, color=look.colour, linewidth=0.6, alpha=0.6)
                 xs, ys = _thousands(together([curve.evaluated for curve in curves]))
                 axes.plot(
                     xs, ys, color=look.colour, linestyle=look.dashes, marker=look.marker,

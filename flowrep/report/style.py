@@ -39,6 +39,7 @@ _ADDED = {
     "ego+obj+depth2": {"light": "#7d3f66", "dark": "#efbfdc", "hatch": "\\\\\\\\"},
     "ego+obj+seg2+depth2": {"light": "#4a4a4a", "dark": "#d0d0d0", "hatch": "xxxx"},
 }
+_DARK = {"ego+obj": "#2f8fd6"}  # on black its own blue is too faint for a line
 _OTHERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _HATCHES = ("", "////", "xxxx", "....")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
@@ -78,6 +79,8 @@ def looks(names: Sequence[str], theme: Theme) -> dict[str, Look]:
         if known:
             added = _ADDED.get(name)
             colour = added[theme.name] if added else _COLOURS[name]
+            if theme.name == "dark":
+                colour = _DARK.get(name, colour)
             found[name] = Look(colour, added["hatch"] if added else "", _MARKERS[places[name]])
         else:
             hatch = _HATCHES[turn // len(_OTHERS) % len(_HATCHES)]

@@ -72,6 +72,17 @@ def test_folders_that_are_all_damaged_are_lines(tmp_path, monkeypatch, capsys):
     assert said.err == "error: none of the runs can be read, see above\n"
 
 
+def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatch, capsys):
+    run = write_run(tmp_path / "run", config_of(), rows_of(config_of(), "soccc"))
+    monkeypatch.setattr(command, "write_files", lambda *_: [])
+    monkeypatch.setattr(sys, "argv", ["flowrep-report", str(run), f"output={tmp_path / 'out'}"])
+    main()
+    said = capsys.readouterr().out
+    assert "1 run, 1 of them finished, of 1 stack (ego+obj) in Straight Road" in said
+    assert "0.333 [0.048–2.326]" in said  # 1 out of bounds to 3 collisions; Wilson's of 1 of 4
+    assert said.endswith(f"page: {tmp_path / 'out' / 'index.html'}\n")
+
+
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, capsys):
     run = write_run(tmp_path / "run", config_of(), rows_of(config_of(), "s"))
     (tmp_path / "taken").write_text("")

@@ -21,6 +21,8 @@ from flowrep.report.statistics import Bootstrap
 from flowrep.report.style import LIGHT
 from tests.report.folders import config_of, letters, rows_of, write_run
 
+pytestmark = pytest.mark.slow
+
 ASKED = {
     "output": None,
     "policy": "greedy",
