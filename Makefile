@@ -10,7 +10,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate view gallery test test-fast fuzz schema lint types format bench bench-gpu smoke docs wheel clean check-python
+.PHONY: help install train evaluate view gallery test test-fast fuzz mutate schema lint types format bench bench-gpu smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -62,6 +62,10 @@ test-fast: $(INSTALLED)  ## Run those that take no more than some seconds
 
 fuzz: $(INSTALLED)  ## Throw odd inputs at every part: make fuzz ARGS="--parts scenes --mutations 10000"
 	$(BIN)/python -m tests.fuzz $(ARGS)
+
+mutate: $(INSTALLED)  ## Break the code here and there and see tests fail: make mutate ARGS="geometry --sample 60"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[mutate]"
+	$(BIN)/python -m tests.mutate $(ARGS)
 
 schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
 	$(BIN)/python -c 'from flowrep.scenes.schema import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
