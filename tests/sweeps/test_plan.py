@@ -1,5 +1,7 @@
 """Which runs a sweep has, before it begins, and where they go."""
 
+from importlib.util import find_spec
+
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -8,6 +10,7 @@ pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
 
 from flowrep.config import UsageError
 from flowrep.config.command_line import register_resolvers
+from flowrep.config.composition import check_command
 from flowrep.config.run_names import run_of_sweep
 from flowrep.config_tree import CONF_DIR
 from flowrep.sweeps.plan import is_sweep, plan_of
@@ -59,6 +62,12 @@ def test_a_sweepers_own_runs_are_counted_and_found_by_their_logs(tmp_path):
 def test_what_is_no_sweep_is_refused(line, says):
     with pytest.raises(UsageError, match=says):
         plan_of("train", line.split())
+
+
+@pytest.mark.skipif(bool(find_spec("ray")), reason="Ray is installed")
+def test_a_launcher_that_lacks_its_package_says_which():
+    with pytest.raises(UsageError, match="pip install hydra-ray-launcher"):
+        check_command("train", ["-m", "hydra/launcher=ray_jobs", "seed=0,1"])
 
 
 @pytest.mark.parametrize(
