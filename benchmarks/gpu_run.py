@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from update import agent_for
 
 from flowrep.transforms import representation_stack
@@ -85,7 +85,8 @@ def recorded_env(num_envs: int, side: int, device: torch.device) -> TransformedE
     """Returns made-up streets with ego and obj."""
     K = torch.tensor([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1.0]])
     stack = representation_stack(MAPS, intrinsics=K, num_classes=5, dt_s=1 / 12)
-    return TransformedEnv(RecordedStreets(num_envs, side, device), stack)
+    env = TransformedEnv(RecordedStreets(num_envs, side, device), stack)
+    return env.append_transform(InitTracker())
 
 
 def street_env(num_envs: int, side: int, num_workers: int, device: torch.device) -> EnvBase:

@@ -16,7 +16,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from torchrl.envs import Compose, GymWrapper, TransformedEnv
+from torchrl.envs import Compose, GymWrapper, InitTracker, TransformedEnv
 from update import agent_for
 
 from flowrep.agent import ReplayMemory, keep_freed_memory
@@ -86,7 +86,7 @@ def main() -> None:
     camera = dataclasses.replace(scene.camera, height_px=args.size, width_px=args.size)
     scene = dataclasses.replace(scene, camera=camera)
     names = ["ego", "obj"]
-    env = make_env(scene, names, num_envs=args.num_envs, seed=0)
+    env = make_env(scene, names, num_envs=args.num_envs, seed=0).append_transform(InitTracker())
     # a memory that is soon full: a run of any length has touched all its pages
     capacity = WARM_UP * args.num_envs
     agent = agent_for(env.observation_spec, env.action_spec, names, replay_capacity=capacity)

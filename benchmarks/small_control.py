@@ -27,7 +27,7 @@ from torchrl.data import (
     TensorDictReplayBuffer,
     Unbounded,
 )
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
@@ -148,7 +148,7 @@ def stock_learner(env: EnvBase, frames: int) -> Learner:
 def train(make_learner: Callable[[EnvBase, int], Learner], frames: int, seed: int) -> float:
     """Returns the mean greedy return over 512 games after so many frames."""
     torch.manual_seed(seed)
-    env = Follow()
+    env = TransformedEnv(Follow(), InitTracker())
     policy, remember, update = make_learner(env, frames)
     carried = env.reset()
     for seen in range(ENVS, frames + 1, ENVS):

@@ -42,7 +42,8 @@ def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
     reward = torch.randn(batch, 1, device=device)
     following = {**maps(), "reward": reward, "done": ends, "terminated": ends}
     action = torch.randint(ACTIONS, (batch,), device=device)
-    return TensorDict({**maps(), "action": action, "next": following}, [batch], device=device)
+    seen = {**maps(), "action": action, "is_init": ends}
+    return TensorDict({**seen, "next": following}, [batch], device=device)
 
 
 def agent_for(

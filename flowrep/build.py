@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, InitTracker
 
 from flowrep.agent import Algorithm
 from flowrep.config import UsageError
@@ -59,7 +59,10 @@ def choose_workers(num_workers: Any, num_envs: int) -> int:
 
 
 def build_env(config: Config, **changes: Any) -> EnvBase:
-    """Returns the env that the config describes; `changes` go to `make_env` in its place."""
+    """Returns the env that the config describes; `changes` go to `make_env` in its place.
+
+    Each observation says whether an episode begins with it, `is_init`, as the replay memory asks.
+    """
     num_envs: int = changes.get("num_envs") or config["num_envs"]
     num_workers = changes.get("num_workers", config["num_workers"])
     arguments = {
@@ -72,7 +75,8 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
         "renderer": config["renderer"],
     }
     workers = {"num_workers": choose_workers(num_workers, num_envs)}
-    return make_env(**(arguments | changes | workers))
+    env = make_env(**(arguments | changes | workers))
+    return env.append_transform(InitTracker())
 
 
 def build_pool(config: Config, num_envs: int, scene: Scene, sensors: Sequence[str]) -> StreetPool:

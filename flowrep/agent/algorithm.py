@@ -20,7 +20,7 @@ from flowrep.agent.policy import acting_network, stochastic_policy
 class Memory(Protocol):
     """What an algorithm keeps of the frames that it has seen."""
 
-    def extend(self, frames: TensorDictBase) -> None:
+    def extend(self, frames: TensorDictBase) -> object:
         """Stores steps of N environments."""
 
     def state_dict(self) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-FORMAT = "flowrep checkpoint 3"
+FORMAT = "flowrep checkpoint 4"
 
 
 class CheckpointError(Exception):

@@ -1,34 +1,40 @@
-"""What the agent remembers: packed maps, each stored once, sampled uniformly."""
+"""Replay of packed maps: a TorchRL replay buffer of a storage, a sampler and a transform.
+
+Each observation is stored once. A row holds the maps seen, the action and what it brought; the
+maps that it led to are those of the row that followed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import LazyTensorStorage, RoundRobinWriter, Storage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.envs import Transform
 
 from flowrep.agent.observation import MapCodec, store_maps
 
+OUTCOME = ("reward", "done", "terminated")
 
-class ReplayMemory:
-    """A ring of transitions that stores an observation once, not again as the one before's next.
 
-    A slot holds the maps seen, the action taken and what it brought; `next` is looked up in the
-    slot of the frame that followed. A transition can be sampled as soon as that frame is known, so
-    the latest step of each environment waits for the following one. Where an episode terminated
-    there is nothing to look up: its value is masked by `terminated`, and the slot's own maps stand
-    in. Where it was cut off without terminating (`truncated`, or a restart between two calls) the
-    following frame was never stored, and the transition is left out of the samples.
+class ReplayMemory(TensorDictReplayBuffer):
+    """TorchRL's replay buffer of `RowStorage`, `SuccessorSampler` and `PackSteps`.
+
+    `sample` returns `batch_size` transitions, uniform with replacement: the maps, packed, `action`,
+    `steps_to_next_obs` `[batch_size, 1]` and, under `next`, the maps, `reward` (the discounted sum
+    over those steps), `done` and `terminated`.
 
     Args:
         codecs: the maps to keep; see `flowrep.agent.observation`.
-        capacity: slots; the oldest transition is overwritten.
-        batch_size: transitions a sample, drawn with replacement.
-        device: where frames are kept and samples appear.
-        n_steps: steps that a sampled transition spans at most; it ends earlier where its episode
-            does, or where the frame that follows is not stored.
+        capacity: rows; the oldest is overwritten.
+        batch_size: transitions a sample.
+        device: where rows are kept and samples appear.
+        n_steps: steps that a transition spans at most.
         gamma: discount a step of the rewards within it.
 
     Raises:
@@ -45,156 +51,213 @@ class ReplayMemory:
         n_steps: int = 1,
         gamma: float = 1.0,
     ) -> None:
-        if n_steps < 1:
-            raise ValueError(f"n_steps is {n_steps}: a transition spans at least 1 step")
+        super().__init__(
+            storage=RowStorage(capacity, device=device),
+            sampler=SuccessorSampler(n_steps, gamma),
+            writer=RoundRobinWriter(),
+            transform=PackSteps(codecs),
+            batch_size=batch_size,
+        )
+
+
+class PackSteps(Transform):
+    """Turns steps into rows with packed maps on `extend`, pairs of rows into transitions on `sample`.
+
+    Maps stay packed in the sample: the networks read them so, and decoding is part of the update.
+
+    | steps, on `extend` | rows |
+    | --- | --- |
+    | `[N]`, `[N, T]`, or with a dim named `time` | `[T * N]`, time first |
+    | the maps | packed |
+    | `action`, `is_init` | as they are |
+    | `("next", name)` of `reward`, `done`, `terminated` | `name` |
+    | | `env`: which of the N it is |
+
+    Args:
+        codecs: the maps to keep.
+    """
+
+    def __init__(self, codecs: Sequence[MapCodec]) -> None:
         self.codecs = tuple(codecs)
-        self.capacity, self.batch_size = capacity, batch_size
-        self.n_steps, self.gamma = n_steps, gamma
-        self.device = torch.device(device)
-        self._frames: TensorDictBase | None = None  # [capacity], allocated by the first extend
-        self._next_slot = torch.full((capacity,), -1)  # -1: the following frame is not stored
-        self._cursor = 0
-        self._size = 0
-        # each environment's latest step: its slot, and the maps it led to as they came
-        self._tail: dict[str, Any] | None = None
-        self._usable = torch.empty(0, dtype=torch.long)
+        super().__init__(in_keys=[codec.key for codec in codecs])
 
-    def __len__(self) -> int:
-        """Returns the number of transitions stored."""
-        return self._size
-
-    def extend(self, frames: TensorDictBase) -> None:
-        """Stores steps of N environments: `[N]`, `[N, T]`, or as a TorchRL collector returns them.
-
-        Args:
-            frames: with the maps, `action` and, under `next`, the maps, `reward`, `done` and
-                `terminated`. A dim named `time` is taken as such; without one, a single dim is N.
-
-        Raises:
-            ValueError: if the steps, with the N before them, do not fit into the capacity.
-        """
-        steps = time_first(frames)  # [T, N]
-        times, width = steps.batch_size
-        if (times + 1) * width > self.capacity:
-            raise ValueError(
-                f"a replay capacity of {self.capacity} cannot take {times} steps of {width} "
-                f"environments; it has to hold {(times + 1) * width}: raise replay_capacity or "
-                "lower num_envs"
+    def _inv_call(self, steps: TensorDictBase) -> TensorDictBase:
+        if "is_init" not in steps.keys():
+            raise KeyError(
+                "the steps lack 'is_init', which marks restarts: append TorchRL's InitTracker to "
+                "the environment"
             )
-        slots = (self._cursor + torch.arange(times * width)) % self.capacity
+        outcome = [("next", name) for name in OUTCOME]
+        steps = time_first(steps.select(*self.in_keys, "action", "is_init", *outcome))
+        times, envs = steps.batch_size
         steps = steps.reshape(-1)
-        outcome = steps["next"].select("reward", "done", "terminated")
-        rows = store_maps(self.codecs, steps).update({"action": steps["action"], **outcome})
-        self._write(slots, rows)
-        self._cursor = (self._cursor + times * width) % self.capacity
-        self._size = min(self._size + times * width, self.capacity)
-        terminated = outcome["terminated"].reshape(-1).cpu()
-        self._next_slot[slots] = torch.where(terminated, slots, -1)
-        self._link(slots, steps, width)
-        self._usable = (self._next_slot >= 0).nonzero().squeeze(-1)
+        rows = store_maps(self.codecs, steps).update(steps["next"])
+        rows["action"], rows["is_init"] = steps["action"], steps["is_init"]
+        rows["env"] = torch.arange(envs, dtype=torch.int32, device=rows.device).repeat(times)
+        return rows
 
-    def _write(self, slots: Tensor, rows: TensorDictBase) -> None:
-        if self._frames is None:
-            # pages that no frame has reached take no memory yet
-            self._frames = rows[0].apply(
-                lambda row: row.new_empty(self.capacity, *row.shape),
-                batch_size=[self.capacity],
-                device=self.device,
-            )
-        self._frames[slots.to(self.device)] = rows.to(self.device)
+    def forward(self, rows: TensorDictBase) -> TensorDictBase:
+        """Returns `[N]` transitions, without their outcome, of `[N, 2]` rows; others as they are."""
+        if rows.ndim < 2:
+            return rows
+        first, following = rows.unbind(1)
+        transitions = first.select(*self.in_keys, "action")
+        transitions["next"] = following.select(*self.in_keys)
+        return transitions
 
-    def _link(self, slots: Tensor, steps: TensorDictBase, width: int) -> None:
-        """Points each step to the one after it, where that one begins with what this one led to."""
-        keys = [codec.key for codec in self.codecs]
-        seen, led_to = steps.select(*keys), steps["next"].select(*keys)
-        tail = self._tail
-        if tail is not None and len(tail["slot"]) == width:
-            continues = _same_maps(tail["maps"], seen[:width], keys)
-            self._next_slot[tail["slot"][continues]] = slots[:width][continues]
-        continues = _same_maps(led_to[:-width], seen[width:], keys)
-        self._next_slot[slots[:-width][continues]] = slots[width:][continues]
-        self._tail = {"slot": slots[-width:].clone(), "maps": led_to[-width:].clone()}
 
-    def sample(self) -> TensorDictBase:
-        """Returns `batch_size` transitions, uniform with replacement, maps packed.
+class RowStorage(LazyTensorStorage):
+    """TorchRL's storage, which gathers rows by `index_select` and saves those that are written.
 
-        `("next", "reward")` is the discounted sum of the rewards on the way to `next`, and
-        `steps_to_next_obs` `[batch_size, 1]` how many steps that are, as TorchRL's value estimators
-        read it.
+    Indexing a TensorDict by a tensor, as its base class does, takes 2.4 times as long.
+    """
 
-        Raises:
-            RuntimeError: if no transition is complete yet.
-        """
-        if self._frames is None or not len(self._usable):
-            raise RuntimeError("nothing to sample: extend the replay memory by two steps first")
-        first = self._usable[torch.randint(len(self._usable), (self.batch_size,))]
-        last, reward, steps = self._look_ahead(self._frames["reward"], first)
-        following = self._next_slot[last].to(self.device)
-        first, last = first.to(self.device), last.to(self.device)
-        batch = TensorDict({}, [self.batch_size])
-        batch["action"] = self._frames["action"].index_select(0, first)
-        for codec in self.codecs:
-            batch[codec.key] = self._frames[codec.key].index_select(0, first)
-            batch["next", codec.key] = self._frames[codec.key].index_select(0, following)
-        batch["next", "reward"] = reward
-        for name in ("done", "terminated"):
-            batch["next", name] = self._frames[name].index_select(0, last)
-        batch["steps_to_next_obs"] = steps.to(self.device)
-        return batch
-
-    def _look_ahead(self, rewards: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns where transitions that begin in slots `first` [N] end.
-
-        Returns:
-            The slots of their last steps [N], the discounted sums of `rewards` [N, 1], and how many
-            steps they span [N, 1].
-        """
-        last, steps = first, torch.ones(len(first), 1)
-        reward = rewards.index_select(0, first.to(self.device))
-        for _ in range(self.n_steps - 1):
-            ahead = self._next_slot[last]
-            # a terminal step is its own successor, and one without a successor can't be the last
-            goes_on = (ahead != last) & (self._next_slot[ahead] >= 0)
-            last = torch.where(goes_on, ahead, last)
-            weight = (self.gamma**steps * goes_on[:, None]).to(self.device)
-            reward = reward + weight * rewards.index_select(0, last.to(self.device))
-            steps = steps + goes_on[:, None]
-        return last, reward, steps
+    def get(self, index: Any) -> TensorDictBase:
+        """Returns the rows of an index; of `[N, 2]`, all `[:, 0]` lie together in memory."""
+        if not (isinstance(index, Tensor) and index.dtype is torch.long and self.initialized):
+            return super().get(index)
+        flat = index.mT.reshape(-1) if index.ndim == 2 else index
+        rows = self._storage.apply(lambda x: x.index_select(0, flat), batch_size=[len(flat)])
+        return rows.unflatten(0, index.mT.shape).transpose(0, 1) if index.ndim == 2 else rows
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns everything that sampling and extending depend on, tensors uncopied."""
-        frames = None if self._frames is None else self._frames[: self._size]
-        return {
-            "capacity": self.capacity,
-            "cursor": self._cursor,
-            "size": self._size,
-            "next_slot": self._next_slot,
-            "frames": None if frames is None else frames.to_dict(),
-            "tail": self._tail and {**self._tail, "maps": self._tail["maps"].to_dict()},
-        }
+        """Returns the rows written, uncopied, and the capacity."""
+        rows = self._storage[: len(self)].to_dict() if self.initialized else None
+        return {"capacity": self.max_size, "rows": rows, "size": len(self)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a `state_dict`.
 
         Raises:
-            ValueError: if it was taken from a memory of another capacity.
+            ValueError: if it was taken from a storage of another capacity.
         """
-        if state["capacity"] != self.capacity:
+        if state["capacity"] != self.max_size:
             raise ValueError(
                 f"the saved replay memory has capacity {state['capacity']}, this one "
-                f"{self.capacity}; set replay_capacity={state['capacity']}"
+                f"{self.max_size}; set replay_capacity={state['capacity']}"
             )
-        self._cursor, self._size = state["cursor"], state["size"]
-        self._next_slot = state["next_slot"].clone()
-        self._frames, self._tail = None, None
-        if state["frames"] is not None:
-            frames = TensorDict(state["frames"], [self._size])
-            self._write(torch.arange(self._size), frames)
-        if state["tail"] is not None:
-            slots = state["tail"]["slot"]
-            maps = TensorDict(state["tail"]["maps"], [len(slots)])
-            self._tail = {"slot": slots.clone(), "maps": maps.clone()}
-        self._usable = (self._next_slot >= 0).nonzero().squeeze(-1)
+        self._storage, self.initialized, self._len = None, False, 0
+        if state["rows"] is not None:
+            rows = TensorDict(state["rows"], [state["size"]])
+            self.set(torch.arange(len(rows)), rows)
+
+
+class SuccessorSampler(Sampler):
+    """Draws pairs of rows, uniform with replacement: a step, and the one after its transition.
+
+    A step can be drawn as soon as the one that follows it in its environment is stored. Where an
+    episode terminated there is none: its value is masked by `terminated`, and the row itself stands
+    in. Where it was cut off (`done` without `terminated`), or the next row `is_init`, the
+    observation that followed was never stored, and the step is left out.
+
+    It reads `env`, `is_init`, `reward`, `done` and `terminated` of the rows, of which one `extend`
+    brings whole steps of all environments, as `PackSteps` does.
+
+    Args:
+        n_steps: steps that a transition spans at most; it ends earlier where its episode does, or
+            where the step that follows is not stored.
+        gamma: discount a step of the rewards within it.
+
+    Raises:
+        ValueError: if n_steps is below 1.
+    """
+
+    def __init__(self, n_steps: int = 1, gamma: float = 1.0) -> None:
+        if n_steps < 1:
+            raise ValueError(f"n_steps is {n_steps}: a transition spans at least 1 step")
+        self.n_steps, self.gamma = n_steps, gamma
+        self._empty()
+
+    def _empty(self) -> None:
+        self._next_row = torch.empty(0, dtype=torch.long)  # -1: what followed is not stored
+        self._latest = torch.empty(0, dtype=torch.long)  # each environment's, -1: it was the last
+        self._usable = torch.empty(0, dtype=torch.long)
+
+    def mark_update(self, index: Tensor, *, storage: Storage) -> None:
+        """Links the rows just written to those that they follow.
+
+        Raises:
+            ValueError: if they, with the step before them, do not fit into the storage.
+        """
+        rows = storage[:]
+        marks = [rows[name].flatten() for name in ("env", "done", "terminated", "is_init")]
+        written = torch.stack([mark[index.to(mark.device)].long() for mark in marks]).cpu()
+        env, (done, terminated, is_init) = written[0], written[1:].bool()
+        index, envs = index.cpu(), int(env.max()) + 1
+        self._check_capacity(len(index), envs, storage.max_size)
+        if not len(self._next_row):
+            self._next_row = torch.full((storage.max_size,), -1)
+        self._next_row[index] = torch.where(terminated, index, -1)
+        ahead = torch.where(done | terminated, -1, index)
+        known = self._latest if len(self._latest) == envs else self._latest[:0]
+        before = torch.cat([known, ahead[:-envs]])
+        after = slice(len(index) - len(before), None)
+        follows = (before >= 0) & ~is_init[after]
+        self._next_row[before[follows]] = index[after][follows]
+        self._latest = ahead[-envs:].clone()
+        self._usable = (self._next_row >= 0).nonzero().squeeze(-1)
+
+    @staticmethod
+    def _check_capacity(written: int, envs: int, capacity: int) -> None:
+        if written + envs > capacity:
+            raise ValueError(
+                f"a replay capacity of {capacity} cannot take {written // envs} steps of {envs} "
+                f"environments; it has to hold {written + envs}: raise replay_capacity or lower "
+                "num_envs"
+            )
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[NestedKey, Tensor]]:
+        """Returns the rows `[batch_size, 2]`, and what lies between them.
+
+        Raises:
+            RuntimeError: if no transition is complete yet.
+        """
+        if not len(self._usable):
+            raise RuntimeError("nothing to sample: extend the replay memory by two steps first")
+        rows = storage[:]
+        drawn = torch.randint(len(self._usable), (batch_size,), generator=self._rng)
+        first = self._usable[drawn]
+        last, reward, steps = self._look_ahead(rows["reward"], first)
+        info: dict[NestedKey, Tensor] = {"steps_to_next_obs": steps, ("next", "reward"): reward}
+        for name in ("done", "terminated"):
+            info["next", name] = rows[name].index_select(0, last.to(reward.device))
+        return torch.stack([first, self._next_row[last]]).mT, info
+
+    def _look_ahead(self, rewards: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns where transitions that begin in rows `first` [N] end.
+
+        Returns:
+            The rows of their last steps [N], the discounted sums of `rewards` [N, 1], and how many
+            steps they span [N, 1].
+        """
+        last, steps = first, torch.ones(len(first), 1)
+        reward = rewards.index_select(0, first.to(rewards.device))
+        for _ in range(self.n_steps - 1):
+            ahead = self._next_row[last]
+            # a terminal step is its own successor, and one without a successor can't be the last
+            goes_on = (ahead != last) & (self._next_row[ahead] >= 0)
+            last = torch.where(goes_on, ahead, last)
+            weight = (self.gamma**steps * goes_on[:, None]).to(rewards.device)
+            reward = reward + weight * rewards.index_select(0, last.to(rewards.device))
+            steps = steps + goes_on[:, None]
+        return last, reward, steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the links."""
+        return {"next_row": self._next_row, "latest": self._latest}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from a `state_dict`."""
+        self._next_row, self._latest = state["next_row"].clone(), state["latest"].clone()
+        self._usable = (self._next_row >= 0).nonzero().squeeze(-1)
+
+    def dumps(self, path: str | Path) -> None:
+        """Writes the links to a file in the folder `path`."""
+        torch.save(self.state_dict(), Path(path) / "links.pt")
+
+    def loads(self, path: str | Path) -> None:
+        """Continues from the file that `dumps` wrote."""
+        self.load_state_dict(torch.load(Path(path) / "links.pt", weights_only=True))
 
 
 def time_first(frames: TensorDictBase) -> TensorDictBase:
@@ -206,19 +269,3 @@ def time_first(frames: TensorDictBase) -> TensorDictBase:
     time = frames.ndim - 1 if time is None else time
     frames = frames.permute(time, *[dim for dim in range(frames.ndim) if dim != time])
     return frames.reshape(frames.shape[0], -1)
-
-
-def _same_maps(a: TensorDictBase, b: TensorDictBase, keys: Sequence[NestedKey]) -> Tensor:
-    """Returns which of N observations are equal in value, as `[N]` on the CPU.
-
-    nan equals nan, and -0.0 equals 0.0: whoever copies a map may lose the sign of a zero, as
-    `TensorDict.clone` does where it adds 0.
-    """
-    pairs = ((a[key].to(b[key].device), b[key]) for key in keys)
-    same = [_equal(x, y).flatten(1).all(1) for x, y in pairs]
-    return torch.stack(same).all(0).cpu()
-
-
-def _equal(x: Tensor, y: Tensor) -> Tensor:
-    equal = x == y
-    return equal | (x.isnan() & y.isnan()) if x.is_floating_point() else equal

@@ -95,6 +95,7 @@ def random_steps(random_maps):
     def draw(size):
         steps = random_maps(size)
         steps["action"] = torch.randint(3, (size,))
+        steps["is_init"] = torch.ones(size, 1, dtype=torch.bool)
         steps["action_log_prob"] = torch.full((size,), -1.0)
         steps["next"] = random_maps(size)
         steps["next", "reward"] = torch.randn(size, 1)

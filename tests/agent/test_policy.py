@@ -3,7 +3,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import Categorical, Composite, OneHot, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 
@@ -104,7 +104,7 @@ class Clock(EnvBase):
 
 
 def test_a_torchrl_collector_acts_with_it_and_the_replay_takes_its_frames(make_agent):
-    env = Clock()
+    env = TransformedEnv(Clock(), InitTracker())
     agent = make_agent(
         env.observation_spec, ["view"], env.full_action_spec["action"], batch_size=200
     )

@@ -20,10 +20,13 @@ def view(numbers):
     return numbers[..., None, None, None].expand(*numbers.shape, 1, 36, 36).clone()
 
 
-def step(seen, following, ended="", action=None):
-    """One step of N environments; `ended` has a letter for each: t(erminated), c(ut off), or -."""
+def step(seen, following, ended="", action=None, begun=""):
+    """One step of N environments; `ended` has a letter for each: t(erminated), c(ut off), or -.
+
+    So has `begun`: b where an episode begins with this step.
+    """
     size = len(seen)
-    ended = ended or "-" * size
+    ended, begun = ended or "-" * size, begun or "-" * size
     terminated = torch.tensor([e == "t" for e in ended]).unsqueeze(1)
     done = torch.tensor([e != "-" for e in ended]).unsqueeze(1)
     action = torch.tensor(seen if action is None else action, dtype=torch.long)
@@ -31,6 +34,7 @@ def step(seen, following, ended="", action=None):
         {
             "view": view(seen),
             "action": action,
+            "is_init": torch.tensor([b == "b" for b in begun]).unsqueeze(1),
             "next": {
                 "view": view(following),
                 "reward": torch.tensor(following, dtype=torch.float32).unsqueeze(1),
@@ -86,24 +90,36 @@ def test_a_step_that_was_cut_off_is_left_out():
 def test_a_restart_between_two_calls_does_not_join_two_episodes():
     replay = memory()
     replay.extend(step([10, 20], [11, 21]))
-    replay.extend(step([0, 21], [1, 22]))  # environment 0 began anew without saying so
+    replay.extend(step([0, 21], [1, 22], begun="b-"))  # environment 0 began anew, not done
     replay.extend(step([1, 22], [2, 23]))
     assert transitions(replay) == [(0, 0, 1, 1, 0), (20, 20, 21, 21, 0), (21, 21, 22, 22, 0)]
 
 
-def copied_as_tensordict_does(steps):
-    """`TensorDict.clone` of one that has a device adds 0 to each float, and -0.0 + 0 is +0.0."""
-    return steps.apply(lambda x: x + 0 if x.is_floating_point() else x.clone())
+def test_an_episode_that_begins_with_what_the_last_one_ended_with_is_not_joined_to_it():
+    replay = memory(n_steps=3)
+    # object flow where nothing moves: every map is the same
+    replay.extend(step([0, 0], [0, 0], action=[1, 2]))
+    replay.extend(step([0, 0], [0, 0], action=[3, 4], ended="tc"))
+    replay.extend(step([0, 0], [0, 0], action=[5, 6], begun="bb"))
+    replay.extend(step([0, 0], [0, 0], action=[7, 8]))
+    batch = replay.sample()
+    spans = set(zip(batch["action"].tolist(), batch["steps_to_next_obs"][:, 0].tolist()))
+    # what was cut off, action 4, has no successor, so 2 ends before it
+    assert spans == {(1, 2), (3, 1), (2, 1), (5, 1), (6, 1)}
 
 
 @pytest.mark.parametrize("value", [-0.0, float("nan"), float("inf"), -3.0])
-def test_a_step_is_joined_to_the_next_whatever_the_sign_of_its_zeros(value):
+def test_a_step_is_joined_to_the_next_whatever_the_maps_show(value):
     replay = memory()
     replay.extend(step([value, 20], [value, 21], action=[0, 20]))
-    replay.extend(copied_as_tensordict_does(step([value, 21], [value, 22], action=[1, 21])))
+    replay.extend(step([value, 21], [value, 22], action=[1, 21]))
     replay.extend(step([value, 22], [value, 23], action=[2, 22]))
-    # comparing bits would leave out actions 0 and 1
     assert replay.sample()["action"].unique().tolist() == [0, 1, 20, 21]
+
+
+def test_steps_without_the_mark_of_restarts_are_refused():
+    with pytest.raises(KeyError, match="lack 'is_init'.* append TorchRL's InitTracker"):
+        memory().extend(step([1], [2]).exclude("is_init"))
 
 
 def test_a_batch_of_steps_is_stored_as_the_steps_one_by_one():
@@ -208,8 +224,8 @@ def test_maps_are_kept_once_and_in_two_bytes_a_number(dtype):
     replay = memory(capacity=50, dtype=dtype)
     for i in range(30):
         replay.extend(step([i, 50 + i], [i + 1, 51 + i]))
-    frames = replay.state_dict()["frames"]
-    maps = [t for t in frames.values() if t.dim() > 2]
+    rows = replay.state_dict()["_storage"]["rows"]
+    maps = [t for t in rows.values() if t.dim() > 2]
     assert [t.nbytes for t in maps] == [50 * 36 * 36 * 2]
 
 

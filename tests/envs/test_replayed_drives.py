@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torchrl.envs import InitTracker
 
 from flowrep.agent.observation import map_codecs
 from flowrep.agent.replay import ReplayMemory
@@ -23,6 +24,7 @@ STACKS = {
 def test_every_transition_with_a_successor_is_sampled(straight_road, stack, drive):
     small = replace(straight_road, camera=replace(straight_road.camera, height_px=36, width_px=36))
     env = make_env(scene=small, representations=STACKS[stack], num_envs=STREETS, seed=3)
+    env = env.append_transform(InitTracker())
     keys = list(STACKS[stack])
     codecs = map_codecs(env.observation_spec, keys, torch.float32)
     replay = ReplayMemory(codecs, capacity=200, batch_size=2000, device="cpu")
