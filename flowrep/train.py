@@ -1,5 +1,6 @@
 """Trains an agent: `python -m flowrep.train representations=[ego,obj] preset=laptop`."""
 
+import logging
 import sys
 from functools import partial
 from typing import Any
@@ -67,6 +68,7 @@ def run(config: DictConfig) -> float:
         The final evaluation's share of greedy episodes that succeed, over all its speeds and frame
         rates: what a sweeper such as Optuna maximises.
     """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces each storage it makes
     try:
         plain = plain_config(config)
         validated(TrainConfig, plain, own_keys())

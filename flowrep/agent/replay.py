@@ -61,7 +61,7 @@ class ReplayMemory(TensorDictReplayBuffer):
 
 
 class PackSteps(Transform):
-    """Turns steps into rows with packed maps on `extend`, pairs of rows into transitions on `sample`.
+    """Turns steps into packed rows on `extend`, pairs of rows into transitions on `sample`.
 
     Maps stay packed in the sample: the networks read them so, and decoding is part of the update.
 
@@ -82,7 +82,7 @@ class PackSteps(Transform):
         super().__init__(in_keys=[codec.key for codec in codecs])
 
     def _inv_call(self, steps: TensorDictBase) -> TensorDictBase:
-        if "is_init" not in steps.keys():
+        if "is_init" not in steps:
             raise KeyError(
                 "the steps lack 'is_init', which marks restarts: append TorchRL's InitTracker to "
                 "the environment"
@@ -97,7 +97,7 @@ class PackSteps(Transform):
         return rows
 
     def forward(self, rows: TensorDictBase) -> TensorDictBase:
-        """Returns `[N]` transitions, without their outcome, of `[N, 2]` rows; others as they are."""
+        """Returns `[N]` transitions of `[N, 2]` rows, without outcome; other rows as they are."""
         if rows.ndim < 2:
             return rows
         first, following = rows.unbind(1)

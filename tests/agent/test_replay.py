@@ -118,7 +118,7 @@ def test_a_step_is_joined_to_the_next_whatever_the_maps_show(value):
 
 
 def test_steps_without_the_mark_of_restarts_are_refused():
-    with pytest.raises(KeyError, match="lack 'is_init'.* append TorchRL's InitTracker"):
+    with pytest.raises(KeyError, match=r"lack 'is_init'.* append TorchRL's InitTracker"):
         memory().extend(step([1], [2]).exclude("is_init"))
 
 
