@@ -50,13 +50,7 @@ def agent_for(
     spec: Composite, actions: Categorical, keys: Sequence[str], **changes: object
 ) -> DiscreteSAC:
     """Discrete SAC with the paper's hyperparameters."""
-    options = {
-        "total_frames": 10**9, "device": "cpu", "encoder": "shared", "precision": "auto",
-        "learning_rate": 3e-4, "initial_alpha": 0.5, "target_entropy_weight": 0.2, "gamma": 0.99,
-        "tau": 0.005, "hidden_size": 512, "batch_size": 1024, "replay_capacity": 10_240,
-        "frames_per_update": 10, "learning_starts": None,
-    }  # fmt: skip
-    return DiscreteSAC(spec, actions, list(keys), **(options | changes))
+    return DiscreteSAC(spec, actions, list(keys), total_frames=10**9, **changes)
 
 
 def flowrep_agent(steps: TensorDict, encoder: str, precision: str) -> DiscreteSAC:

@@ -138,17 +138,13 @@ def algorithm_class(section: Mapping[str, Any], trust: str | None) -> Any:
     if not (isinstance(found, type) and issubclass(found, Algorithm)):
         raise UsageError(f"algorithm._target_={target} is no subclass of flowrep.agent.Algorithm")
     if target not in ALGORITHMS:
-        _check_options(section, inspect.signature(found))
+        _check_options(section, found.options())
     return found
 
 
-GIVEN_BY_THE_RUN = ("observation_spec", "action_spec", "keys", "total_frames", "device")
-
-
-def _check_options(section: Mapping[str, Any], signature: inspect.Signature) -> None:
+def _check_options(section: Mapping[str, Any], known: Mapping[str, inspect.Parameter]) -> None:
     """Refuses options that a class does not have, and the lack of those that it needs."""
     options = [key for key in section if key != "_target_"]
-    known = {n: p for n, p in signature.parameters.items() if n not in GIVEN_BY_THE_RUN}
     for key in options:
         if key not in known:
             raise UsageError(

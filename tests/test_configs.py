@@ -45,11 +45,10 @@ def test_a_representation_is_one_key_named_as_its_file(name):
 
 
 @pytest.mark.parametrize("name", group_choices("algorithm"))
-def test_an_algorithm_spells_out_every_option_of_its_class_in_its_order(name):
-    options = OmegaConf.to_container(OmegaConf.load(CONF_DIR / "algorithm" / f"{name}.yaml"))
-    parameters = inspect.signature(get_class(options.pop("_target_"))).parameters.values()
-    given_by_the_run = {"observation_spec", "action_spec", "keys", "total_frames", "device"}
-    assert list(options) == [p.name for p in parameters if p.name not in given_by_the_run]
+def test_an_algorithm_spells_out_every_option_of_its_class_with_its_default(name):
+    options = composed(f"algorithm={name}")["algorithm"]
+    parameters = get_class(options.pop("_target_")).options()
+    assert options == {name: parameter.default for name, parameter in parameters.items()}
 
 
 def test_representations_keep_the_order_of_the_command_line():

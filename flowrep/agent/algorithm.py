@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
+from torchrl.objectives import LossModule, SoftUpdate
 
 from flowrep.agent.action import DiscreteActions
 from flowrep.agent.captured import captured
 from flowrep.agent.divergence import DivergenceWatch
 from flowrep.agent.policy import acting_network, stochastic_policy
+
+# the environment and the run give the first, a class hands the others on to its bases
+NO_OPTIONS = ("self", "observation_spec", "action_spec", "keys", "total_frames", "device")
+NO_OPTIONS += ("rate_factors", "policy_options", "network", "actor", "actions")
 
 
 class Memory(Protocol):
@@ -40,22 +46,27 @@ class Algorithm(ABC):
     algorithm.remember(steps)                               # with what the action brought
     ```
 
-    A subclass builds its networks, sets `policy` (by `build_policy`, which makes it for evaluation
-    too) and `memory`, then calls this constructor with all weights that training changes; it writes
-    `sample`, `updates_due` and `losses`. Everything it needs to continue then lies in those
-    weights, the memory and Adam's state, which are saved.
+    What is minimised is a TorchRL `LossModule`; this class has the rest of an update: schedule,
+    Adam, targets, CUDA graph, the watch for divergence. A subclass sets `policy` (by
+    `build_policy`, which makes it for evaluation too) and `memory`, calls this constructor with its
+    loss, and writes `sample` and `updates_due`. Everything it needs to continue then lies in the
+    loss's weights, the memory and Adam's state, which are saved.
 
     Args:
-        weights: by name; those that require gradients are trained, the others (targets, an
-            exploration rate) only saved.
+        loss: its parameters are trained, its target parameters follow them.
         learning_rate: Adam's, falling linearly to 0 over `total_updates`.
         total_updates: gradient steps of the whole training.
+        tau: share of the online weights in each move of the targets; None if there are none.
         max_grad_norm: gradients of a larger norm, all weights together, are scaled down to it.
         rate_factors: by the name of a trained weight, by how much its learning rate differs.
     """
 
-    METRICS: ClassVar[tuple[str, ...]]
-    """The keys of `losses`; those that end in `_loss` are minimised, as a sum."""
+    METRICS: ClassVar[Mapping[str, str]]
+    """What is logged, with the key under which the loss returns it; those that end in `_loss` are
+    minimised, as a sum."""
+
+    LOSS: ClassVar[Callable[..., LossModule]]
+    """Makes the loss, of the policy's `MapNetwork` and its `DiscreteActions`."""
 
     CAPTURABLE: ClassVar[bool] = True
     """Whether `losses` and `after_update` can be part of a CUDA graph, see `captured`."""
@@ -68,14 +79,17 @@ class Algorithm(ABC):
 
     def __init__(
         self,
-        weights: Mapping[str, Tensor],
+        loss: LossModule,
         *,
         learning_rate: float,
         total_updates: int,
+        tau: float | None = None,
         max_grad_norm: float | None = None,
         rate_factors: Mapping[str, float] | None = None,
     ) -> None:
-        self.weights = dict(weights)
+        self.loss = loss
+        self.target_updater = None if tau is None else SoftUpdate(loss, tau=tau)
+        self.weights = weights_of(loss) | dict(self.other_weights())
         self.trained = {n: w for n, w in self.weights.items() if w.requires_grad}
         self.learning_rate, self.total_updates = learning_rate, max(1, total_updates)
         self.max_grad_norm = max_grad_norm
@@ -146,6 +160,24 @@ class Algorithm(ABC):
         actions = DiscreteActions.from_spec(action_spec)
         return stochastic_policy(network, list(keys), actions, writes_log_prob=cls.WRITES_LOG_PROB)
 
+    @classmethod
+    def options(cls) -> dict[str, inspect.Parameter]:
+        """Returns what a config may set, by name.
+
+        These are the parameters of the class; where it takes any keyword, those of its bases and
+        of its loss too.
+        """
+        owners: list[Any] = [owner for owner in cls.__mro__ if "__init__" in vars(owner)]
+        owners = [*owners[: owners.index(Algorithm)], getattr(cls, "LOSS", None)]
+        found: dict[str, inspect.Parameter] = {}
+        for owner in filter(None, owners):
+            parameters = dict(inspect.signature(owner.__init__).parameters)
+            rest = [n for n, p in parameters.items() if p.kind is inspect.Parameter.VAR_KEYWORD]
+            found = {n: p for n, p in parameters.items() if n not in (*NO_OPTIONS, *rest)} | found
+            if not rest:
+                break
+        return found
+
     def step_eagerly(self) -> None:
         """Takes every further update operation by operation, never as a CUDA graph.
 
@@ -174,12 +206,19 @@ class Algorithm(ABC):
     def sample(self) -> TensorDictBase:
         """Returns the batch for one update."""
 
-    @abstractmethod
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Returns the scalars named in `METRICS`, the losses among them with gradients."""
+        out = self.loss(batch)
+        return {name: out[key] for name, key in self.METRICS.items()}
 
-    def after_update(self) -> None:  # noqa: B027
-        """Follows each step of the optimizer; for target networks."""
+    def other_weights(self) -> Mapping[str, Tensor]:
+        """Returns what training changes beside the weights of the loss, by name."""
+        return {}
+
+    def after_update(self) -> None:
+        """Follows each step of the optimizer: moves the targets by `tau` of their distance."""
+        if self.target_updater is not None:
+            self.target_updater.step()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Takes one gradient step on a batch from `sample()`; returns detached metrics.
@@ -256,16 +295,9 @@ class Algorithm(ABC):
         self._capture()  # Adam's moments lie elsewhere now
 
 
-def named_weights(**modules: torch.nn.Module) -> dict[str, Tensor]:
-    """Returns the parameters of several modules, each name after its module's."""
-    return {
-        f"{prefix}.{name}": weight
-        for prefix, module in modules.items()
-        for name, weight in module.named_parameters()
-    }
-
-
-@torch.no_grad()
-def move_targets(targets: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> None:
-    """Moves each target weight by `tau` of its distance to the online one."""
-    torch._foreach_lerp_(list(targets), list(online), tau)
+def weights_of(loss: LossModule) -> dict[str, Tensor]:
+    """Returns a loss's parameters and target parameters by name, those of encoders first."""
+    targets = {n: w for n, w in loss.named_buffers() if n.startswith("target_") and "_params." in n}
+    weights = dict(loss.named_parameters()) | targets
+    encoders = [name for name in weights if "encoder" in name.partition(".")[0]]
+    return {name: weights[name] for name in (*encoders, *weights)}

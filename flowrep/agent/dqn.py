@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -12,13 +12,11 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule, QValueModule
-from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives import DQNLoss, ValueEstimators
 
 from flowrep.agent.action import DiscreteActions
-from flowrep.agent.observation import map_codecs
 from flowrep.agent.off_policy import OffPolicy
-from flowrep.agent.policy import PackedNetwork, PolicyNetwork, acting_network
-from flowrep.agent.precision import compute_dtype
+from flowrep.agent.policy import MapNetwork, PackedNetwork, PolicyNetwork, acting_network
 
 
 class EpsilonGreedyPolicy(TensorDictSequential):
@@ -48,6 +46,30 @@ class EpsilonGreedyPolicy(TensorDictSequential):
         return self.distribution_class(probs=epsilon / values.shape[-1] + (1 - epsilon) * best)
 
 
+class DoubleDQNMapLoss(DQNLoss):
+    """TorchRL's loss of packed maps, of double Q-learning with a target; see `DoubleDQN`.
+
+    Args:
+        network: of the policy.
+        actions: what the policy chooses from.
+        gamma: discount a frame.
+    """
+
+    def __init__(
+        self, network: MapNetwork, actions: DiscreteActions, *, gamma: float = 0.99
+    ) -> None:
+        keys = [codec.key for codec in network.codecs]
+        learning = TensorDictModule(PackedNetwork(network.codecs, network), keys, ["action_value"])
+        super().__init__(
+            TensorDictSequential(learning, QValueModule(action_space=actions.space)),
+            loss_function="l2",
+            delay_value=True,
+            double_dqn=True,
+            action_space=actions.space,
+        )
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+
+
 class DoubleDQN(OffPolicy):
     """One Q-function and its target, acting at random with a probability ε that falls.
 
@@ -59,29 +81,22 @@ class DoubleDQN(OffPolicy):
     the policy takes the action of the largest value.
 
     Args:
-        observation_spec: the environment's; its last three dims of each map are C, H, W.
+        observation_spec: as `OffPolicy` takes it, like the arguments that follow.
         action_spec: `Categorical` or `OneHot`.
         keys: the observation maps to read, in order.
-        total_frames: environment frames of the whole training; sets the learning rate's end.
-        device: where networks, replay and updates live.
-        precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
-        learning_rate: Adam's, falling linearly to 0.
+        total_frames: environment frames of the whole training.
         initial_epsilon: ε at the start.
         final_epsilon: ε from `exploration_share` of the frames on; it falls linearly until there.
         exploration_share: of `total_frames`.
-        gamma: discount a frame.
-        tau: share of the online weights in each move of the target.
-        hidden_size: width of the one hidden layer after the embeddings.
-        batch_size: transitions an update.
-        replay_capacity: transitions kept.
-        frames_per_update: environment frames for each gradient step.
-        learning_starts: frames before the first update; None: one batch.
-        n_steps: frames that a transition spans: r becomes the discounted sum of its rewards, and γ
-            becomes γ to that power.
-        layer_norm: normalise each map's embedding, see `Encoder`.
+        options: of `OffPolicy`.
     """
 
-    METRICS = ("q_loss", "td_error", "epsilon")
+    LOSS = DoubleDQNMapLoss
+    METRICS: ClassVar[Mapping[str, str]] = {
+        "q_loss": "loss",
+        "td_error": "td_error",
+        "epsilon": "epsilon",
+    }
 
     def __init__(
         self,
@@ -90,66 +105,34 @@ class DoubleDQN(OffPolicy):
         keys: Sequence[NestedKey],
         *,
         total_frames: int,
-        device: torch.device | str,
-        precision: str,
-        learning_rate: float,
-        initial_epsilon: float,
-        final_epsilon: float,
-        exploration_share: float,
-        gamma: float,
-        tau: float,
-        hidden_size: int,
-        batch_size: int,
-        replay_capacity: int,
-        frames_per_update: int,
-        learning_starts: int | None,
-        n_steps: int = 1,
-        layer_norm: bool = False,
+        initial_epsilon: float = 1.0,
+        final_epsilon: float = 0.05,
+        exploration_share: float = 0.2,
+        **options: Any,
     ) -> None:
-        device = torch.device(device)
-        self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
-        actions = DiscreteActions.from_spec(action_spec)
-        self.policy = self.build_policy(
+        policy_options = {
+            "initial_epsilon": initial_epsilon,
+            "final_epsilon": final_epsilon,
+            "exploration_share": exploration_share,
+            "total_frames": total_frames,
+        }
+        super().__init__(
             observation_spec,
             action_spec,
             keys,
-            device=device,
-            precision=precision,
-            hidden_size=hidden_size,
-            layer_norm=layer_norm,
-            initial_epsilon=initial_epsilon,
-            final_epsilon=final_epsilon,
-            exploration_share=exploration_share,
             total_frames=total_frames,
+            policy_options=policy_options,
+            **options,
         )
-        acting, best, self.exploration = self.policy
-        learning = TensorDictModule(
-            PackedNetwork(self.codecs, acting.module.network), list(keys), ["action_value"]
-        )
-        self.loss = DQNLoss(
-            TensorDictSequential(learning, best),
-            loss_function="l2",
-            delay_value=True,
-            double_dqn=True,
-            action_space=actions.space,
-        )
-        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
-        self._move_target = SoftUpdate(self.loss, tau=tau)
-        buffers = self.loss.named_buffers()
-        targets = {name: weight for name, weight in buffers if name.startswith("target_value")}
-        super().__init__(
-            dict(self.loss.named_parameters()) | targets | {"epsilon": self.exploration.eps},
-            self.codecs,
-            device,
-            total_frames=total_frames,
-            learning_rate=learning_rate,
-            batch_size=batch_size,
-            replay_capacity=replay_capacity,
-            frames_per_update=frames_per_update,
-            learning_starts=learning_starts,
-            gamma=gamma,
-            n_steps=n_steps,
-        )
+
+    @property
+    def exploration(self) -> EGreedyModule:
+        """The part of the policy that holds ε."""
+        return self.policy[2]
+
+    def other_weights(self) -> Mapping[str, Tensor]:
+        """Returns ε."""
+        return {"epsilon": self.exploration.eps}
 
     @classmethod
     def build_policy(
@@ -192,14 +175,10 @@ class DoubleDQN(OffPolicy):
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Returns the loss, with gradients, and what it was computed from, without."""
-        q_loss = self.loss(batch)["loss"]
+        out = self.loss(batch)
         squared_error = batch["td_error"]  # the loss leaves it there
         return {
-            "q_loss": q_loss,
+            "q_loss": out["loss"],
             "td_error": squared_error.sqrt().mean(),
             "epsilon": self.exploration.eps.clone(),
         }
-
-    def after_update(self) -> None:
-        """Moves the target by `tau` of its distance."""
-        self._move_target.step()

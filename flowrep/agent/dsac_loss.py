@@ -1,14 +1,23 @@
-"""TorchRL's loss of discrete SAC, its Q-functions evaluated together and once."""
+"""TorchRL's loss of discrete SAC on packed maps: encoded once, both Q-functions together."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
-from tensordict import TensorDict, TensorDictBase
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor
-from torchrl.objectives import DiscreteSACLoss
+from torchrl.objectives import DiscreteSACLoss, ValueEstimators
 
-from flowrep.agent.heads import heads_together
+from flowrep.agent.action import DiscreteActions
+from flowrep.agent.encoder import Encoder
+from flowrep.agent.heads import Head, heads_together
+from flowrep.agent.observation import MapCodec, decode_maps
+from flowrep.agent.policy import MapNetwork, stochastic_policy
+
+ENCODERS = ("shared", "separate")
 
 
 class DiscreteSACHeadsLoss(DiscreteSACLoss):
@@ -33,3 +42,132 @@ class DiscreteSACHeadsLoss(DiscreteSACLoss):
             if params is self.qvalue_network_params:
                 self._of_this_batch = values.detach()
         return TensorDict({self.tensor_keys.action_value: values}, values.shape[:2])
+
+
+class DiscreteSACMapLoss(DiscreteSACHeadsLoss):
+    """Discrete SAC of packed maps, as `ReplayMemory` samples them; see `DiscreteSAC`.
+
+    Reads the maps, `action`, `steps_to_next_obs` and, under `next`, the maps, `reward`, `done` and
+    `terminated`. Returns `loss_qvalue`, `loss_actor` and `loss_alpha`, to be minimised as a sum,
+    with `alpha`, `entropy`, `q_mean` and `td_error`. Its target parameters are those of the
+    Q-functions and their encoder: TorchRL's `SoftUpdate` moves all of them.
+
+    Args:
+        actor: the policy's network.
+        actions: what the policy chooses from.
+        encoder: `"shared"`: policy and Q-functions read one set of encoders, trained by L_Q alone,
+            and in y both read its target, so that each observation is encoded once; `"separate"`:
+            each its own, and π(·|s') in y reads the policy's.
+        initial_alpha: α before the first update.
+        target_entropy_weight: share of the largest entropy, log n, that α steers to.
+        gamma: discount a frame.
+    """
+
+    critic_encoder: Encoder
+    critic_encoder_params: TensorDictParams
+    target_critic_encoder_params: TensorDictParams
+    actor_encoder: Encoder
+    actor_encoder_params: TensorDictParams
+    target_actor_encoder_params: TensorDictParams
+    out_keys: ClassVar[list[str]] = [
+        "loss_qvalue",
+        "loss_actor",
+        "loss_alpha",
+        "alpha",
+        "entropy",
+        "q_mean",
+        "td_error",
+    ]
+
+    def __init__(
+        self,
+        actor: MapNetwork,
+        actions: DiscreteActions,
+        *,
+        encoder: str = "shared",
+        initial_alpha: float = 0.5,
+        target_entropy_weight: float = 0.2,
+        gamma: float = 0.99,
+    ) -> None:
+        if encoder not in ENCODERS:
+            raise ValueError(f"encoder={encoder!r}: expected one of {', '.join(ENCODERS)}")
+        shared = encoder == "shared"
+        with next(actor.parameters()).device:
+            critic_encoder = actor.encoder if shared else actor.another_encoder()
+            critic_head = Head(critic_encoder.embedding_size, actor.hidden_size, actions.count)
+        super().__init__(
+            stochastic_policy(actor.head, ["actor_embedding"], actions),
+            TensorDictModule(critic_head, ["critic_embedding"], ["action_value"]),
+            action_space=actions.space,
+            num_actions=actions.count,
+            loss_function="l2",
+            alpha_init=initial_alpha,
+            target_entropy="auto",
+            target_entropy_weight=target_entropy_weight,
+        )
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        self.codecs, self.encoder_is_shared = actor.codecs, shared
+        self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
+        if not shared:
+            self.convert_to_functional(actor.encoder, "actor_encoder")
+
+    def _set_in_keys(self) -> None:
+        self._in_keys = transition_keys(self.codecs)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns the losses of a batch, with gradients, and what they are made of, without."""
+        embedded = self._embed(tensordict)
+        loss_qvalue, critic_info = self.qvalue_loss(embedded)
+        # the policy loss must not reach the critic's encoder through Q(s, a)
+        embedded["critic_embedding"] = embedded["critic_embedding"].detach()
+        loss_actor, actor_info = self.actor_loss(embedded)
+        negative_entropy = actor_info["log_prob"]
+        alpha = self.log_alpha.detach().exp()
+        entropy = -negative_entropy.mean()
+        return TensorDict(
+            {
+                "loss_qvalue": loss_qvalue,
+                "loss_actor": loss_actor,
+                "loss_alpha": self.alpha_loss(negative_entropy).mean(),
+                "alpha": alpha,
+                "entropy": entropy,
+                # L_π = -α · entropy - mean Σ_a π min_i Q_i
+                "q_mean": -(loss_actor.detach() + alpha * entropy),
+                "td_error": critic_info["td_error"].mean(),
+            }
+        )
+
+    def _embed(self, batch: TensorDictBase) -> TensorDict:
+        """Returns the batch with maps replaced by embeddings."""
+        images = decode_maps(self.codecs, batch)
+        critic = self.critic_encoder(images)
+        actor = critic.detach() if self.encoder_is_shared else self.actor_encoder(images)
+        with torch.no_grad():
+            images = decode_maps(self.codecs, batch["next"])
+            following = batch["next"].select("reward", "done", "terminated")
+            with self.target_critic_encoder_params.to_module(self.critic_encoder):
+                target = self.critic_encoder(images)
+            following["critic_embedding"] = target
+            following["actor_embedding"] = (
+                target if self.encoder_is_shared else self.actor_encoder(images)
+            )
+        return TensorDict(
+            {
+                "actor_embedding": actor,
+                "critic_embedding": critic,
+                "action": batch["action"],
+                "steps_to_next_obs": batch["steps_to_next_obs"],
+                "next": following,
+            },
+            batch.batch_size,
+        )
+
+
+def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
+    """Returns the keys of a sampled transition, as a loss reads them."""
+    maps = [codec.key for codec in codecs]
+    outcome = ["reward", "done", "terminated"]
+    following: list[NestedKey] = [
+        ("next", *(key if isinstance(key, tuple) else (key,))) for key in (*maps, *outcome)
+    ]
+    return [*maps, "action", "steps_to_next_obs", *following]

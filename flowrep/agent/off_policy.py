@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
+from tensordict import NestedKey, TensorDictBase
+from torchrl.data import Composite, TensorSpec
 
+from flowrep.agent.action import DiscreteActions
 from flowrep.agent.algorithm import Algorithm
-from flowrep.agent.observation import MapCodec
+from flowrep.agent.observation import map_codecs
+from flowrep.agent.precision import compute_dtype
 from flowrep.agent.replay import ReplayMemory
 
 
@@ -17,48 +20,78 @@ class OffPolicy(Algorithm):
     """One update every `frames_per_update` frames, on a uniform sample of the last frames.
 
     Args:
-        weights: as `Algorithm` takes them.
-        codecs: the maps to keep.
-        device: where they are kept.
+        observation_spec: the environment's; its last three dims of each map are C, H, W.
+        action_spec: `Categorical` or `OneHot`.
+        keys: the observation maps to read, in order.
         total_frames: environment frames of the whole training; sets the learning rate's end.
-        learning_rate: Adam's, falling linearly to 0.
+        device: where networks, replay and updates live.
+        precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
+        learning_rate: Adam's for all weights, falling linearly to 0.
+        gamma: discount a frame.
+        tau: share of the online weights in each move of the targets.
+        hidden_size: width of the one hidden layer after the embeddings.
         batch_size: transitions an update.
         replay_capacity: transitions kept.
         frames_per_update: environment frames for each gradient step.
         learning_starts: frames before the first update; None: one batch.
-        gamma: discount a frame, of the rewards within a sampled transition.
-        n_steps: frames that a sampled transition spans; see `ReplayMemory`.
+        n_steps: frames that a transition spans: r becomes the discounted sum of its rewards, and γ
+            becomes γ to that power.
+        layer_norm: normalise each map's embedding, see `Encoder`.
         rate_factors: as `Algorithm` takes them.
+        policy_options: of `build_policy`, beside those above.
+        loss_options: of `LOSS`, beside `gamma`.
     """
 
     memory: ReplayMemory
 
     def __init__(
         self,
-        weights: Mapping[str, Tensor],
-        codecs: Sequence[MapCodec],
-        device: torch.device,
+        observation_spec: Composite,
+        action_spec: TensorSpec,
+        keys: Sequence[NestedKey],
         *,
         total_frames: int,
-        learning_rate: float,
-        batch_size: int,
-        replay_capacity: int,
-        frames_per_update: int,
-        learning_starts: int | None,
-        gamma: float = 1.0,
+        device: torch.device | str = "cpu",
+        precision: str = "auto",
+        learning_rate: float = 3e-4,
+        gamma: float = 0.99,
+        tau: float = 0.005,
+        hidden_size: int = 512,
+        batch_size: int = 1024,
+        replay_capacity: int = 10_240,
+        frames_per_update: int = 10,
+        learning_starts: int | None = None,
         n_steps: int = 1,
+        layer_norm: bool = False,
         rate_factors: Mapping[str, float] | None = None,
+        policy_options: Mapping[str, Any] | None = None,
+        **loss_options: Any,
     ) -> None:
+        device = torch.device(device)
+        self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
+        self.policy = self.build_policy(
+            observation_spec,
+            action_spec,
+            keys,
+            device=device,
+            precision=precision,
+            hidden_size=hidden_size,
+            layer_norm=layer_norm,
+            **(policy_options or {}),
+        )
+        network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
+        loss = self.LOSS(network, actions, gamma=gamma, **loss_options)
         self.frames_per_update = frames_per_update
         self.learning_starts = batch_size if learning_starts is None else learning_starts
         super().__init__(
-            weights,
+            loss,
+            tau=tau,
             learning_rate=learning_rate,
             total_updates=(total_frames - self.learning_starts) // frames_per_update,
             rate_factors=rate_factors,
         )
         self.memory = ReplayMemory(
-            codecs,
+            self.codecs,
             capacity=replay_capacity,
             batch_size=batch_size,
             device=device,

@@ -23,7 +23,14 @@ from flowrep.agent.precision import compute_dtype
 
 
 class MapNetwork(nn.Module):
-    """Returns `[N, outputs]` float32 of decoded maps: an encoder a map, then a head."""
+    """Returns `[N, outputs]` float32 of decoded maps: an encoder a map, then a head.
+
+    Args:
+        codecs: the maps.
+        hidden_size: width of the one hidden layer after the embeddings.
+        outputs: numbers an observation.
+        layer_norm: normalise each map's embedding, see `Encoder`.
+    """
 
     def __init__(
         self,
@@ -34,12 +41,22 @@ class MapNetwork(nn.Module):
         layer_norm: bool = False,
     ) -> None:
         super().__init__()
+        self.codecs, self.hidden_size = tuple(codecs), hidden_size
         self.encoder = Encoder(codecs, layer_norm=layer_norm)
         self.head = Head(self.encoder.embedding_size, hidden_size, outputs)
 
     def forward(self, images: Sequence[Tensor]) -> Tensor:
         """Returns one number an output."""
         return self.head(self.encoder(images))
+
+    def another_encoder(self) -> Encoder:
+        """Returns an encoder of the same maps with weights of its own."""
+        return Encoder(self.codecs, layer_norm=self.encoder.layer_norm)
+
+    def another(self, outputs: int) -> MapNetwork:
+        """Returns a network of the same maps and sizes with weights of its own."""
+        layer_norm = self.encoder.layer_norm
+        return MapNetwork(self.codecs, self.hidden_size, outputs, layer_norm=layer_norm)
 
 
 class PackedNetwork(nn.Module):

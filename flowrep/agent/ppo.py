@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.data import Composite, TensorSpec
@@ -14,19 +15,71 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from flowrep.agent.action import DiscreteActions
-from flowrep.agent.algorithm import Algorithm, named_weights
+from flowrep.agent.algorithm import Algorithm
+from flowrep.agent.encoder import Encoder
 from flowrep.agent.heads import Head
 from flowrep.agent.observation import decode_maps, map_codecs
-from flowrep.agent.policy import stochastic_policy
+from flowrep.agent.policy import MapNetwork, stochastic_policy
 from flowrep.agent.precision import compute_dtype
 from flowrep.agent.rollout import Rollout
 
 
-class _ClipLoss(ClipPPOLoss):
-    """TorchRL's loss, without its question to the device whether the entropy is finite.
+class ClipPPOMapLoss(ClipPPOLoss):
+    """TorchRL's clipped loss of packed maps, with one encoder for policy and V; see `PPO`.
 
-    A policy whose entropy is not stops the run by name, see `Algorithm.update`.
+    TorchRL asks the device whether the entropy is finite; here, a policy whose entropy is not stops
+    the run by name, see `Algorithm.update`.
+
+    Args:
+        network: of the policy; V reads its encoder.
+        actions: what the policy chooses from.
+        clip: how far ρ pays to move from 1.
+        value_weight: of L_V.
+        entropy_weight: of L_H.
     """
+
+    encoder: Encoder
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+
+    def __init__(
+        self,
+        network: MapNetwork,
+        actions: DiscreteActions,
+        *,
+        clip: float = 0.2,
+        value_weight: float = 0.5,
+        entropy_weight: float = 0.01,
+    ) -> None:
+        with next(network.parameters()).device:
+            critic = Head(network.encoder.embedding_size, network.hidden_size, 1)
+        super().__init__(
+            stochastic_policy(network.head, ["embedding"], actions),
+            TensorDictModule(critic, ["embedding"], ["state_value"]),
+            clip_epsilon=clip,
+            entropy_coeff=entropy_weight,
+            critic_coeff=value_weight,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+        )
+        self.codecs = network.codecs
+        self.convert_to_functional(network.encoder, "encoder")
+
+    def embed(self, maps: TensorDictBase) -> Tensor:
+        """Returns the embeddings of packed maps."""
+        return self.encoder(decode_maps(self.codecs, maps))
+
+    def state_value(self, maps: TensorDictBase) -> Tensor:
+        """Returns V `[n, 1]` of packed maps."""
+        embedded = TensorDict({"embedding": self.embed(maps)}, maps.batch_size)
+        return self.critic_network(embedded)["state_value"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns the losses of a batch, with gradients, and what they are made of, without."""
+        noted = ("action", "action_log_prob", "advantage", "value_target")
+        embedded = tensordict.select(*noted).set("embedding", self.embed(tensordict))
+        out = super().forward(embedded)
+        return out.set("explained_variance", out["explained_variance"].squeeze())
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
         return dist.entropy().unsqueeze(-1)
@@ -58,18 +111,22 @@ class PPO(Algorithm):
         batch_size: steps an update; what does not fill a batch is left out of that pass.
         gamma: discount a frame.
         gae_lambda: GAE's λ: 0 trusts V, 1 the rewards.
-        clip: how far ρ pays to move from 1.
-        value_weight: of L_V.
-        entropy_weight: of L_H.
         max_grad_norm: gradients of a larger norm are scaled down to it.
         hidden_size: width of the one hidden layer after the embeddings.
+        loss_options: of `ClipPPOMapLoss`.
     """
 
     WRITES_LOG_PROB = True
-    METRICS = (
-        "policy_loss", "value_loss", "entropy_loss", "entropy", "kl", "clip_share",
-        "explained_variance",
-    )  # fmt: skip
+    LOSS = ClipPPOMapLoss
+    METRICS: ClassVar[Mapping[str, str]] = {
+        "policy_loss": "loss_objective",
+        "value_loss": "loss_critic",
+        "entropy_loss": "loss_entropy",
+        "entropy": "entropy",
+        "kl": "kl_approx",
+        "clip_share": "clip_fraction",
+        "explained_variance": "explained_variance",
+    }
     memory: Rollout
 
     def __init__(
@@ -79,23 +136,20 @@ class PPO(Algorithm):
         keys: Sequence[NestedKey],
         *,
         total_frames: int,
-        device: torch.device | str,
-        precision: str,
-        learning_rate: float,
-        rollout_length: int,
-        epochs: int,
-        batch_size: int,
-        gamma: float,
-        gae_lambda: float,
-        clip: float,
-        value_weight: float,
-        entropy_weight: float,
-        max_grad_norm: float,
-        hidden_size: int,
+        device: torch.device | str = "cpu",
+        precision: str = "auto",
+        learning_rate: float = 3e-4,
+        rollout_length: int = 64,
+        epochs: int = 4,
+        batch_size: int = 256,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        max_grad_norm: float = 0.5,
+        hidden_size: int = 512,
+        **loss_options: Any,
     ) -> None:
         device = torch.device(device)
         self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
-        actions = DiscreteActions.from_spec(action_spec)
         num_envs = observation_spec.shape.numel()
         self.rollout_length, self.epochs, self.batch_size = rollout_length, epochs, batch_size
         frames_per_round = rollout_length * num_envs
@@ -113,27 +167,13 @@ class PPO(Algorithm):
             precision=precision,
             hidden_size=hidden_size,
         )
-        acting = self.policy[0].module.network
-        self.encoder, actor = acting.encoder, acting.head
-        with device:
-            critic = Head(self.encoder.embedding_size, hidden_size, 1)
-        self._actor = stochastic_policy(actor, ["embedding"], actions)
-        self._critic = TensorDictModule(critic, ["embedding"], ["state_value"])
+        network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
         self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, device=device)
-        self.loss = _ClipLoss(
-            self._actor,
-            self._critic,
-            clip_epsilon=clip,
-            entropy_coeff=entropy_weight,
-            critic_coeff=value_weight,
-            loss_critic_type="l2",
-            normalize_advantage=True,
-        )
         self.memory = Rollout(self.codecs, device, beside=["action_log_prob"])
         self._round: TensorDictBase = TensorDict()  # the steps that are being learnt from, [n]
         self._batches: list[Tensor] = []  # rows of it, those to come
         super().__init__(
-            named_weights(encoder=self.encoder) | dict(self.loss.named_parameters()),
+            self.LOSS(network, actions, **loss_options),
             learning_rate=learning_rate,
             total_updates=total_frames // frames_per_round * self._updates_of(frames_per_round),
             max_grad_norm=max_grad_norm,
@@ -167,26 +207,7 @@ class PPO(Algorithm):
 
     def _judge(self, steps: TensorDictBase) -> TensorDictBase:
         """Returns what the present weights expect of steps: V and V'."""
-        judged = steps.empty().update({"state_value": self._worth(steps)})
-        judged["next"] = steps["next"].empty().update({"state_value": self._worth(steps["next"])})
+        value = self.loss.state_value
+        judged = steps.empty().update({"state_value": value(steps)})
+        judged["next"] = steps["next"].empty().update({"state_value": value(steps["next"])})
         return judged
-
-    def _worth(self, maps: TensorDictBase) -> Tensor:
-        """Returns V `[n, 1]` of packed maps."""
-        embedding = self.encoder(decode_maps(self.codecs, maps))
-        return self._critic(TensorDict({"embedding": embedding}, maps.batch_size))["state_value"]
-
-    def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Returns the three losses, with gradients, and what they were computed from, without."""
-        embedded = batch.select("action", "action_log_prob", "advantage", "value_target")
-        embedded["embedding"] = self.encoder(decode_maps(self.codecs, batch))
-        out = self.loss(embedded)
-        return {
-            "policy_loss": out["loss_objective"],
-            "value_loss": out["loss_critic"],
-            "entropy_loss": out["loss_entropy"],
-            "entropy": out["entropy"],
-            "kl": out["kl_approx"],
-            "clip_share": out["clip_fraction"],
-            "explained_variance": out["explained_variance"].squeeze(),
-        }

@@ -4,7 +4,7 @@ from typing import Annotated, Protocol
 
 from pydantic import ConfigDict, Field
 
-from flowrep.agent.dsac import ENCODERS
+from flowrep.agent.dsac_loss import ENCODERS
 from flowrep.agent.precision import PRECISIONS
 from flowrep.config.expectations import (
     Count,

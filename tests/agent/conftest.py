@@ -34,19 +34,10 @@ def make_agent(observation_spec):
     def make(spec=observation_spec, keys=("flow", "seg"), action_spec=None, seed=0, **changes):
         settings = {
             "total_frames": 1000,
-            "device": "cpu",
-            "encoder": "shared",
             "precision": "fp32",
-            "learning_rate": 3e-4,
-            "initial_alpha": 0.5,
-            "target_entropy_weight": 0.2,
-            "gamma": 0.99,
-            "tau": 0.005,
             "hidden_size": 32,
             "batch_size": 16,
             "replay_capacity": 100,
-            "frames_per_update": 10,
-            "learning_starts": None,
         }
         torch.manual_seed(seed)
         action_spec = Categorical(3) if action_spec is None else action_spec
@@ -57,9 +48,10 @@ def make_agent(observation_spec):
 
 @pytest.fixture(params=ALGORITHMS)
 def make_any(request, observation_spec):
-    """Builds a small float32 agent of each algorithm in turn, as its YAML file has it."""
-    options = yaml.safe_load((CONF_DIR / "algorithm" / f"{request.param}.yaml").read_text())
-    algorithm = getattr(flowrep.agent, options.pop("_target_").removeprefix("flowrep.agent."))
+    """Builds a small float32 agent of each algorithm in turn, else as its defaults have it."""
+    file = yaml.safe_load((CONF_DIR / "algorithm" / f"{request.param}.yaml").read_text())
+    algorithm = getattr(flowrep.agent, file["_target_"].removeprefix("flowrep.agent."))
+    options = {name: parameter.default for name, parameter in algorithm.options().items()}
     small = {name: value for name, value in SMALL.items() if name in options}
     if request.param == "ppo":
         small["rollout_length"] = 8

@@ -1,13 +1,14 @@
 """docs/adding_an_algorithm.md: its class and its YAML file make an algorithm."""
 
 import importlib.util
-import inspect
 import re
 from pathlib import Path
 
 import torch
 import yaml
 from torchrl.data import Categorical
+
+from flowrep.config_tree import CONF_DIR
 
 DOCS = Path(__file__).parents[2] / "docs" / "adding_an_algorithm.md"
 
@@ -25,13 +26,14 @@ def test_the_example_learns_and_its_yaml_spells_out_its_signature(
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     options = yaml.safe_load(block("yaml"))
+    assert options.pop("defaults") == ["base/off_policy@_here_", "_self_"]
     algorithm = getattr(module, options.pop("_target_").rpartition(".")[2])
-    given_by_the_run = ["observation_spec", "action_spec", "keys", "total_frames", "device"]
-    assert [*given_by_the_run, *options] == list(inspect.signature(algorithm).parameters)
+    shared = yaml.safe_load((CONF_DIR / "algorithm" / "base" / "off_policy.yaml").read_text())
+    assert {n: p.default for n, p in algorithm.options().items()} == {**shared, **options}
 
     agent = algorithm(
         observation_spec, Categorical(3), ["flow", "seg"], total_frames=500, device="cpu",
-        **(options | {"batch_size": 8}),
+        **(options | {"batch_size": 8, "hidden_size": 32}),
     )  # fmt: skip
     action = agent.policy(random_steps(5).exclude("action"))["action"]
     assert action.shape == (5,)

@@ -186,6 +186,7 @@ def test_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch, encoder):
     assert dist.probs.argmax(1).tolist() == [2, 2, 2, 2]
     critic = agent.loss.qvalue_network
     with torch.no_grad(), agent.loss.qvalue_network_params[0].to_module(critic):
-        q = critic.module(agent.critic_encoder([agent.codecs[0].pack(seen["view"]).movedim(-1, 1)]))
+        packed = agent.codecs[0].pack(seen["view"]).movedim(-1, 1)
+        q = critic.module(agent.loss.critic_encoder([packed]))
     # going right is worth gamma to the power of the cells left to go: 0.125, 0.25, 0.5, 1
     torch.testing.assert_close(q[:, 2], torch.tensor([0.125, 0.25, 0.5, 1.0]), atol=0.1, rtol=0)

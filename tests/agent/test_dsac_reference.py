@@ -34,7 +34,7 @@ def head(weights, prefix, x, net=...):
 
 def dsac_losses(weights, maps, next_maps, action, reward, terminated):
     """Losses of Q, actor and α."""
-    separate = "actor_encoder.encoders.0.conv1.weight" in weights
+    separate = "actor_encoder_params.encoders.0.conv1.weight" in weights
     actor, critic, target = (
         "actor_network_params.module.0.module",
         "qvalue_network_params.module",
@@ -42,17 +42,17 @@ def dsac_losses(weights, maps, next_maps, action, reward, terminated):
     )
     alpha = weights["log_alpha"].exp().detach()
     with torch.no_grad():
-        embedded = encode(weights, "target_encoder", next_maps)
-        seen = encode(weights, "actor_encoder", next_maps) if separate else embedded
+        embedded = encode(weights, "target_critic_encoder_params", next_maps)
+        seen = encode(weights, "actor_encoder_params", next_maps) if separate else embedded
         policy = head(weights, actor, seen).softmax(1)
         q = torch.minimum(*(head(weights, target, embedded, net=i) for i in (0, 1)))
         value = (policy * (q - alpha * policy.log())).sum(1)
         y = reward + GAMMA * torch.where(terminated, 0.0, value)
-    embedded = encode(weights, "critic_encoder", maps)
+    embedded = encode(weights, "critic_encoder_params", maps)
     qs = [head(weights, critic, embedded, net=i) for i in (0, 1)]
     chosen = [q[torch.arange(len(q)), action] for q in qs]
     q_loss = sum(((q - y) ** 2).mean() for q in chosen)
-    seen = encode(weights, "actor_encoder", maps) if separate else embedded.detach()
+    seen = encode(weights, "actor_encoder_params", maps) if separate else embedded.detach()
     policy = head(weights, actor, seen).softmax(1)
     smaller = torch.minimum(*qs).detach()
     actor_loss = (policy * (alpha * policy.log() - smaller)).sum(1).mean()
@@ -65,7 +65,7 @@ def dsac_v_losses(weights, maps, next_maps, action, reward, terminated):
     """Losses of Q, V, actor and α, of networks that share nothing."""
 
     def network(name, maps):
-        return head(weights, f"{name}.head", encode(weights, f"{name}.encoder", maps))
+        return head(weights, f"{name}_params.head", encode(weights, f"{name}_params.encoder", maps))
 
     rows, alpha = torch.arange(len(action)), weights["log_alpha"].exp().detach()
     policy = network("actor", maps).softmax(1)
@@ -88,8 +88,7 @@ def dsac_v_losses(weights, maps, next_maps, action, reward, terminated):
 
 def online_name(target):
     """The weight that a target weight follows."""
-    name = target.replace("target_encoder", "critic_encoder")
-    return name.removeprefix("target_")
+    return target.removeprefix("target_")
 
 
 @pytest.fixture

@@ -52,7 +52,8 @@ def worth(agent, number):
     codec = agent.codecs[0]
     image = codec.decode(codec.store(torch.full((1, 1, 36, 36), number)))
     with torch.no_grad():
-        return agent._critic(TensorDict({"embedding": agent.encoder([image])}, [1]))["state_value"]
+        embedded = TensorDict({"embedding": agent.loss.encoder([image])}, [1])
+        return agent.loss.critic_network(embedded)["state_value"]
 
 
 def test_a_round_is_due_when_the_rollout_is_complete_and_no_frame_is_learnt_from_twice():
@@ -117,7 +118,8 @@ def test_steps_that_earlier_weights_took_count_by_how_likely_they_then_were():
     batch = agent.sample()
     with torch.no_grad():
         image = agent.codecs[0].decode(batch["view"])
-        dist = agent._actor.get_dist(TensorDict({"embedding": agent.encoder([image])}, [8]))
+        embedded = TensorDict({"embedding": agent.loss.encoder([image])}, [8])
+        dist = agent.loss.actor_network.get_dist(embedded)
         now = dist.log_prob(batch["action"])
     then = torch.where(batch["action"] == 1, -0.5, -0.75)
     advantage = batch["advantage"].flatten()
