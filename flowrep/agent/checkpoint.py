@@ -2,7 +2,8 @@
 
 The file is a safetensors file. Its header's metadata carry one JSON document that mirrors the
 nested state, in which a tensor is `{"tensor": name, "crc32": checksum}`, and the document's own
-checksum: a byte that was changed is noticed. Nothing in the file can run code.
+checksum: a byte that was changed is noticed. Nothing in the file can run code. `torchrl.checkpoint`
+loses the last checkpoint if it is killed between its two renames, see docs/upstream.md.
 """
 
 from __future__ import annotations

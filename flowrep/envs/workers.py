@@ -38,7 +38,9 @@ class WorkerVectorEnv(VectorEnv):
     """Several environments in each of several processes, behind gymnasium's vector interface.
 
     To its user it is a `SyncVectorEnv` with autoreset disabled: the same seeds and actions give the
-    same numbers, bit for bit, whatever the number of workers. Infos are not handed on.
+    same numbers, bit for bit, whatever the number of workers. Infos are not handed on. Gymnasium's
+    `AsyncVectorEnv` made 386 to 403 frames/s where this one made 464 to 524, and Ctrl-C kills its
+    workers.
 
     Observations come back through shared memory, the rest through pipes. `step_async` begins a
     step, so that the caller can do other work until it asks for the outcome with `step`.

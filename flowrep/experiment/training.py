@@ -148,8 +148,9 @@ def train(
     """Trains until `total_frames` or until a stop is asked for; the last state is saved.
 
     Between acting and seeing what came of it, the updates are taken that the frames before allow:
-    where the environments have processes and cores of their own, they drive meanwhile. The order,
-    and so all that comes out, is the same where they don't.
+    where the environments have processes and cores of their own, they drive meanwhile, which
+    TorchRL's `Trainer`, one after the other, has no place for. The order, and so all that comes
+    out, is the same where they don't.
 
     Args:
         training: a new or a restored run.

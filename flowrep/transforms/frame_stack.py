@@ -22,7 +22,8 @@ class FrameStack(MapTransform):
     After a reset all k frames are the episode's first. The stack of the step before is read from
     the TensorDict that goes into `step`, where the env declares it as part of its state, as
     TorchRL's `StepCounter` does: nothing is remembered between calls, so stacks can't bleed from
-    one episode or one env into another.
+    one episode or one env into another. TorchRL's `CatFrames` remembers: in a replay buffer it
+    stacks what lies side by side in a sample, which is wrong where samples are shuffled.
 
     In a replay buffer the stored root stack and the next frame give the next stack exactly,
     shuffled or not: leave `("next", out_key)` out of what is stored, and a transition costs k + 1
