@@ -25,7 +25,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory, use_threads
-from flowrep.agent.captured import WARM_UP
+from flowrep.agent.cuda_graph import WARM_UP
 
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3

@@ -43,6 +43,7 @@ class StreetCollector(Collector):
     def load_state_dict(self, state_dict: dict[str, Any], **kwargs: Any) -> None:
         """Continues from a `state_dict`."""
         super().load_state_dict(state_dict, **kwargs)
+        self._traj_pool.load_state_dict(state_dict["traj_pool"])  # TorchRL begins new trajectories
         set_states(self.env, state_dict["streets"])
         self._carrier = TensorDict(
             state_dict["carrier"], self.env.batch_size, device=self._carrier.device

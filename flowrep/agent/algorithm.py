@@ -14,12 +14,19 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.objectives import LossModule, SoftUpdate
 
 from flowrep.agent.action import DiscreteActions
-from flowrep.agent.captured import captured
+from flowrep.agent.cuda_graph import as_cuda_graph
 from flowrep.agent.divergence import DivergenceWatch
 from flowrep.agent.policy import acting_network, stochastic_policy
 
 # the environment and the run give the first, a class hands the others on to its bases
-NO_OPTIONS = ("self", "observation_spec", "action_spec", "keys", "total_frames", "device")
+NO_OPTIONS: tuple[str, ...] = (
+    "self",
+    "observation_spec",
+    "action_spec",
+    "keys",
+    "total_frames",
+    "device",
+)
 NO_OPTIONS += ("rate_factors", "policy_options", "network", "actor", "actions")
 
 
@@ -69,7 +76,7 @@ class Algorithm(ABC):
     """Makes the loss, of the policy's `MapNetwork` and its `DiscreteActions`."""
 
     CAPTURABLE: ClassVar[bool] = True
-    """Whether `losses` and `after_update` can be part of a CUDA graph, see `captured`."""
+    """Whether `losses` and `after_update` can be part of a CUDA graph, see `as_cuda_graph`."""
 
     WRITES_LOG_PROB: ClassVar[bool] = False
     """Whether `policy` writes `action_log_prob` beside `action`."""
@@ -100,8 +107,8 @@ class Algorithm(ABC):
             capturable=self.device.type == "cuda",
         )
         losses = [name for name in self.METRICS if name.endswith("_loss")]
-        beside = [name for name in self.METRICS if name not in losses]
-        self.divergence = DivergenceWatch([*losses, "grad_norm"], beside, self.device)
+        others = [name for name in self.METRICS if name not in losses]
+        self.divergence = DivergenceWatch([*losses, "grad_norm"], others, self.device)
         # the fused step takes no step where it is 1, and asks the device, not the host
         self.optimizer.found_inf = self.divergence.is_bad  # type: ignore[attr-defined]
         self.updates = 0
@@ -187,7 +194,8 @@ class Algorithm(ABC):
         self._capture()
 
     def _capture(self) -> None:
-        self._step = self._take_step if self._is_eager else captured(self._take_step, self.device)
+        step = self._take_step
+        self._step = step if self._is_eager else as_cuda_graph(step, self.device)
 
     @classmethod
     def metric_names(cls) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ class DivergenceWatch:
 
     Args:
         watched: the metrics that have to be finite.
-        beside: those to tell with them.
+        others: those to tell with them.
         device: where the metrics are.
 
     >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
@@ -32,10 +32,10 @@ class DivergenceWatch:
     def __init__(
         self,
         watched: Sequence[str],
-        beside: Sequence[str] = (),
+        others: Sequence[str] = (),
         device: torch.device | str = "cpu",
     ) -> None:
-        self.watched, self.names = tuple(watched), (*watched, *beside)
+        self.watched, self.names = tuple(watched), (*watched, *others)
         self._values = torch.zeros(len(self.names), device=device)
         self._good_updates = torch.zeros((), dtype=torch.long, device=device)
         self.is_bad = torch.zeros((), device=device)

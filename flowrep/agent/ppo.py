@@ -169,7 +169,7 @@ class PPO(Algorithm):
         )
         network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
         self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, device=device)
-        self.memory = Rollout(self.codecs, device, beside=["action_log_prob"])
+        self.memory = Rollout(self.codecs, device, extra_keys=["action_log_prob"])
         self._round: TensorDictBase = TensorDict()  # the steps that are being learnt from, [n]
         self._batches: list[Tensor] = []  # rows of it, those to come
         super().__init__(

@@ -112,6 +112,8 @@ class RowStorage(LazyTensorStorage):
     Indexing a TensorDict by a tensor, as its base class does, takes 2.4 times as long.
     """
 
+    _storage: Any
+
     def get(self, index: Any) -> TensorDictBase:
         """Returns the rows of an index; of `[N, 2]`, all `[:, 0]` lie together in memory."""
         if not (isinstance(index, Tensor) and index.dtype is torch.long and self.initialized):

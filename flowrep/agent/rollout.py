@@ -18,17 +18,17 @@ class Rollout:
     Args:
         codecs: the maps to keep; see `flowrep.agent.observation`.
         device: where they are kept.
-        beside: what else of each step is kept, beside maps, `action` and what the action brought.
+        extra_keys: what else of each step is kept, beside maps, `action` and what the action brought.
     """
 
     def __init__(
         self,
         codecs: Sequence[MapCodec],
         device: torch.device | str,
-        beside: Sequence[NestedKey] = (),
+        extra_keys: Sequence[NestedKey] = (),
     ) -> None:
         self.codecs, self.device = tuple(codecs), torch.device(device)
-        self._keys = ("action", *beside)
+        self._keys = ("action", *extra_keys)
         self._steps: list[TensorDictBase] = []
 
     def __len__(self) -> int:
@@ -39,7 +39,7 @@ class Rollout:
         """Stores steps of N environments: `[N]`, `[N, T]`, or as a TorchRL collector returns them.
 
         Args:
-            frames: with the maps, `action`, what is kept `beside` and, under `next`, the maps,
+            frames: with the maps, `action`, `extra_keys` and, under `next`, the maps,
                 `reward`, `done` and `terminated`. A dim named `time` is taken as such; without
                 one, a single dim is N.
         """

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from flowrep.agent.captured import WARM_UP, OfOneShape, captured
+from flowrep.agent.cuda_graph import WARM_UP, OfOneShape, as_cuda_graph
 from tests.agent.tape import Foreign, Tape
 
 ENVS, BATCHES = 5, 7
@@ -110,11 +110,11 @@ def test_an_update_asks_the_device_for_no_number_and_brings_it_none(make_any, ra
 
 
 def test_on_a_cpu_a_step_stays_what_it_is():
-    assert captured(len, torch.device("cpu")) is len
+    assert as_cuda_graph(len, torch.device("cpu")) is len
 
 
 def test_an_algorithm_can_be_told_to_leave_graphs_alone(make_any):
-    with patch("flowrep.agent.algorithm.captured", return_value=len):  # as on CUDA
+    with patch("flowrep.agent.algorithm.as_cuda_graph", return_value=len):  # as on CUDA
         agent = make_any()
         assert agent._step is len
         agent.step_eagerly()

@@ -14,7 +14,7 @@ Step = Callable[[TensorDictBase], TensorDictBase]
 WARM_UP = 3  # steps taken as they are, in which Adam's moments and TorchRL's caches come to be
 
 
-def captured(step: Step, device: torch.device) -> Step:
+def as_cuda_graph(step: Step, device: torch.device) -> Step:
     """Returns what does the same as `step`, on a CUDA device from its fourth call on as a graph.
 
     The graph runs the same kernels on the same memory again and again: `step` may depend on what
