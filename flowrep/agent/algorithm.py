@@ -18,16 +18,9 @@ from flowrep.agent.cuda_graph import as_cuda_graph
 from flowrep.agent.divergence import DivergenceWatch
 from flowrep.agent.policy import acting_network, stochastic_policy
 
-# the environment and the run give the first, a class hands the others on to its bases
-NO_OPTIONS: tuple[str, ...] = (
-    "self",
-    "observation_spec",
-    "action_spec",
-    "keys",
-    "total_frames",
-    "device",
-)
-NO_OPTIONS += ("rate_factors", "policy_options", "network", "actor", "actions")
+GIVEN_BY_THE_RUN = ("observation_spec", "action_spec", "keys", "total_frames", "device")
+GIVEN_BY_THE_CLASS = ("self", "rate_factors", "policy_options", "network", "actor", "actions")
+NO_OPTIONS = (*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS)
 
 
 class Memory(Protocol):

@@ -18,7 +18,7 @@ class Rollout:
     Args:
         codecs: the maps to keep; see `flowrep.agent.observation`.
         device: where they are kept.
-        extra_keys: what else of each step is kept, beside maps, `action` and what the action brought.
+        extra_keys: kept beside the maps, `action` and what the action brought.
     """
 
     def __init__(
