@@ -16,11 +16,8 @@ from torchrl.objectives import LossModule, SoftUpdate
 from flowrep.agent.action import DiscreteActions
 from flowrep.agent.cuda_graph import as_cuda_graph
 from flowrep.agent.divergence import DivergenceWatch
+from flowrep.agent.options import options_of
 from flowrep.agent.policy import acting_network, stochastic_policy
-
-GIVEN_BY_THE_RUN = ("observation_spec", "action_spec", "keys", "total_frames", "device")
-GIVEN_BY_THE_CLASS = ("self", "rate_factors", "policy_options", "network", "actor", "actions")
-NO_OPTIONS = (*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS)
 
 
 class Memory(Protocol):
@@ -167,16 +164,8 @@ class Algorithm(ABC):
         These are the parameters of the class; where it takes any keyword, those of its bases and
         of its loss too.
         """
-        owners: list[Any] = [owner for owner in cls.__mro__ if "__init__" in vars(owner)]
-        owners = [*owners[: owners.index(Algorithm)], getattr(cls, "LOSS", None)]
-        found: dict[str, inspect.Parameter] = {}
-        for owner in filter(None, owners):
-            parameters = dict(inspect.signature(owner.__init__).parameters)
-            rest = [n for n, p in parameters.items() if p.kind is inspect.Parameter.VAR_KEYWORD]
-            found = {n: p for n, p in parameters.items() if n not in (*NO_OPTIONS, *rest)} | found
-            if not rest:
-                break
-        return found
+        owners = [owner for owner in cls.__mro__ if "__init__" in vars(owner)]
+        return options_of([*owners[: owners.index(Algorithm)], getattr(cls, "LOSS", None)])
 
     def step_eagerly(self) -> None:
         """Takes every further update operation by operation, never as a CUDA graph.
