@@ -100,9 +100,8 @@ class PackSteps(Transform):
         """Returns `[N]` transitions of `[N, 2]` rows, without outcome; other rows as they are."""
         if rows.ndim < 2:
             return rows
-        first, following = rows.unbind(1)
-        transitions = first.select(*self.in_keys, "action")
-        transitions["next"] = following.select(*self.in_keys)
+        transitions, following = rows.select(*self.in_keys).unbind(1)
+        transitions["action"], transitions["next"] = rows["action"][:, 0], following
         return transitions
 
 
@@ -118,9 +117,13 @@ class RowStorage(LazyTensorStorage):
         """Returns the rows of an index; of `[N, 2]`, all `[:, 0]` lie together in memory."""
         if not (isinstance(index, Tensor) and index.dtype is torch.long and self.initialized):
             return super().get(index)
-        flat = index.mT.reshape(-1) if index.ndim == 2 else index
-        rows = self._storage.apply(lambda x: x.index_select(0, flat), batch_size=[len(flat)])
-        return rows.unflatten(0, index.mT.shape).transpose(0, 1) if index.ndim == 2 else rows
+        if index.ndim == 1:
+            return self._storage.apply(lambda x: x.index_select(0, index), batch_size=index.shape)
+        flat, shape = index.mT.reshape(-1), index.mT.shape
+        return self._storage.apply(
+            lambda x: x.index_select(0, flat).unflatten(0, shape).transpose(0, 1),
+            batch_size=index.shape,
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the rows written, uncopied, and the capacity."""
