@@ -85,7 +85,8 @@ def test_configs_of_one_s_own_are_found(form, tmp_path, monkeypatch):
     for place in (folder.parent, folder):
         (place / "__init__.py").touch()
     dqn = (CONF_DIR / "algorithm" / "dqn.yaml").read_text()
-    (folder / "algorithm" / "mine.yaml").write_text(dqn.replace("gamma: 0.99", "gamma: 0.5"))
+    mine = dqn.replace("final_epsilon: 0.05", "final_epsilon: 0.1")
+    (folder / "algorithm" / "mine.yaml").write_text(mine)
     monkeypatch.syspath_prepend(tmp_path)
     arguments = [form, str(folder)] if form.startswith("--") else [form]
     check_command("train", [*arguments, "algorithm=mine"], TrainConfig)
