@@ -48,7 +48,7 @@ def test_every_console_script_is_there():
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
     for name, target in project["scripts"].items():
         assert callable(resolve_name(target))
-        assert (PACKAGE / f"{name.removeprefix('flowrep-')}.py").is_file()
+        assert importlib.util.find_spec(f"flowrep.{name.removeprefix('flowrep-')}")
 
 
 @pytest.mark.filterwarnings("error")

@@ -95,10 +95,11 @@ def make_env(
     torch.Size([2, 3, 2, 84, 84])
     >>> env.close()
     """
-    if num_envs < 1 or not 0 <= num_workers <= num_envs:
+    counts = isinstance(num_envs, int) and isinstance(num_workers, int)
+    if not counts or num_envs < 1 or not 0 <= num_workers <= num_envs:
         raise ValueError(
-            f"num_envs is {num_envs} and num_workers {num_workers}; give one street or more, and "
-            "no more workers than streets"
+            f"num_envs is {num_envs} and num_workers {num_workers}; give whole numbers, one street "
+            "or more, and no more workers than streets"
         )
     loaded = load_scene(scene)
     street = partial(

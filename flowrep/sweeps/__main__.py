@@ -41,7 +41,7 @@ def main() -> None:
             success = carry_out(config, folder)
             Ending(FINISHED, success).write(folder.path)
     except (UsageError, SceneError, RunFolderError, TableError, OSError) as error:
-        exit_with(str(error))
+        exit_with(error)
 
 
 @contextmanager

@@ -27,7 +27,7 @@ def run_sweep(config_name: str) -> None:
     try:
         plan = plan_of(config_name, sys.argv[1:])
     except UsageError as error:
-        exit_with(str(error))
+        exit_with(error)
     plan.folder.mkdir(parents=True, exist_ok=True)
     given = override("hydra.sweep.dir", str(plan.folder))
     typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
