@@ -3,9 +3,16 @@
 Each imports what it needs: some tests run where no simulator is installed.
 """
 
+import signal
 from dataclasses import replace
 
 import pytest
+
+
+def pytest_configure():
+    """Lets Ctrl-C be heard where a shell in the background has it ignored."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
