@@ -12,11 +12,13 @@ import shapely
 from gymnasium.utils.env_checker import check_env
 
 from flowrep.drivers import Planner, RandomDriver, drives, never_turn
+from flowrep.envs.episode import Moment
 from flowrep.envs.registration import SCENE_BY_ID
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.goal_distance import free_ground
 from flowrep.scenes.layout import Layout
+from flowrep.scenes.vehicle import VehicleState
 
 PEOPLE = {"across", "along", "standing"}
 # Paper, Table I: steps, paths, lane width factor, categories, kinds of pedestrians, α in °/s².
@@ -132,10 +134,10 @@ def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, c
     ("path", "y_m"),
     [
         # From 9 m on along the western leg, which begins at y = -65, to the face of the house at
-        # 78 - 2.5 m, less the vehicle's front: 66 m; the 159th look at 24 a second sees it touch.
-        ("south_to_north", -65.0 + 9.0 + 159 * 10 / 24),
-        # The same from the other end: from 121 to 52 + 2.5 m, again 66 m.
-        ("north_to_south", -65.0 + 121.0 - 159 * 10 / 24),
+        # 75 - 2.5 m, less the vehicle's front: 63 m; the 152nd look at 24 a second sees it touch.
+        ("south_to_north", -65.0 + 9.0 + 152 * 10 / 24),
+        # The same from the other end: from 121 to 55 + 2.5 m, again 63 m.
+        ("north_to_south", -65.0 + 121.0 - 152 * 10 / 24),
     ],
 )
 def test_straight_on_in_the_h_stands_a_house(make_street, path, y_m):
@@ -146,6 +148,30 @@ def test_straight_on_in_the_h_stands_a_house(make_street, path, y_m):
         info = env.step(0)[4]
     assert (info["outcome"], info["hit"]) == ("collision", "building")
     assert env.episode.now.vehicle[:2] == pytest.approx((0.0, y_m), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "paths", "x_m"),
+    [
+        ("three_way_junction", ("left", "right"), 52.0),  # the arms part at 62
+        ("h_shaped_pathways", ("south_to_north", "south_to_south"), 50.0),  # they turn off at 60
+    ],
+)
+def test_which_exit_is_closed_is_seen_a_second_before_the_turn(make_street, name, paths, x_m):
+    scene = load_scene(name)
+    laptop = replace(scene.camera, height_px=48, width_px=48, fov_deg=60.0)
+    scene = replace(scene, camera=laptop, pedestrian_groups=())
+    env, depths = make_street(scene, sensors=("depth",)), []
+    for path in paths:
+        env.reset(seed=0, options={"path": path})
+        here = Moment(VehicleState(x_m, 0.0, 0.0, 0.0), 0)
+        env.episode.resume(here, here)
+        depths.append(env.sensing.observe(env.episode)["depth"][0])
+    left_open, right_open = depths
+    closed_right, closed_left = left_open < right_open - 1.0, right_open < left_open - 1.0
+    for closed, half in ((closed_right, slice(24, None)), (closed_left, slice(None, 24))):
+        assert closed.sum() >= 20
+        assert closed.sum() == closed[:, half].sum()
 
 
 @pytest.mark.parametrize("name", TABLE_1)
