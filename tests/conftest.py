@@ -4,7 +4,9 @@ Each imports what it needs: some tests run where no simulator is installed.
 """
 
 import signal
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -52,3 +54,10 @@ def make_street():
     yield make
     for street in made:
         street.close()
+
+
+@pytest.fixture
+def short_folder():
+    """A folder for what commands leave in TMPDIR: sockets want a short path."""
+    with tempfile.TemporaryDirectory(prefix="fr") as folder:
+        yield Path(folder)

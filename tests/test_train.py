@@ -89,9 +89,7 @@ def test_evaluate_adds_rows_for_what_was_asked(smoke_run):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interrupted_run_saves_and_says_how_to_go_on(number, code, tmp_path):
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
+def test_an_interrupted_run_saves_and_says_how_to_go_on(number, code, tmp_path, short_folder):
     command = [
         sys.executable, "-m", "flowrep.train", "debug=smoke", "total_frames=1000000",
         "log_every_frames=16", "checkpoint_every_frames=1000000", "num_workers=2",
@@ -102,7 +100,7 @@ def test_an_interrupted_run_saves_and_says_how_to_go_on(number, code, tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
-        env=ENVIRONMENT | {"TMPDIR": str(temporary)},
+        env=ENVIRONMENT | {"TMPDIR": str(short_folder)},
         start_new_session=True,
     )
     deadline = time.monotonic() + 120
@@ -113,4 +111,4 @@ def test_an_interrupted_run_saves_and_says_how_to_go_on(number, code, tmp_path):
     assert process.returncode == code
     assert f"python -m flowrep.train resume={tmp_path}/run" in printed
     assert (tmp_path / "run" / "checkpoint" / "latest.safetensors").exists()
-    assert not list(temporary.glob("pymp-*"))  # what workers are told by
+    assert not list(short_folder.glob("pymp-*"))  # what workers are told by

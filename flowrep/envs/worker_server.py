@@ -11,6 +11,7 @@ from multiprocessing import forkserver, resource_tracker, util
 from typing import Any
 
 _FOLDER = "FLOWREP_WORKER_SERVER_FOLDER"
+_LONGEST_FOLDER = 107 - len("/listener-12345678")  # bytes: a socket's path has 107 at most
 
 
 def server_context(module: str) -> Any:
@@ -22,6 +23,9 @@ def server_context(module: str) -> Any:
 
     Args:
         module: is imported by the server, once for all workers, with all that it imports.
+
+    Raises:
+        OSError: the path of the folder for temporary files is too long.
     """
     context: Any = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([module])
@@ -47,7 +51,10 @@ def signals_held() -> Iterator[None]:
 
 @contextmanager
 def _folder_told() -> Iterator[None]:
-    os.environ[_FOLDER] = util.get_temp_dir()
+    folder = util.get_temp_dir()
+    if len(os.fsencode(folder)) > _LONGEST_FOLDER:
+        raise OSError(f"'{folder}' is too long for sockets: shorten TMPDIR, or set num_workers=0")
+    os.environ[_FOLDER] = folder
     try:
         yield
     finally:

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from flowrep.envs import WorkerError, WorkerVectorEnv
+from flowrep.envs.worker_server import server_context
 
 pytestmark = pytest.mark.slow
 
@@ -292,3 +293,10 @@ def test_a_script_needs_a_guard_only_for_environments_of_its_own(tmp_path):
     result = run_script(tmp_path, ours.replace(GUARD, "if True:"))
     assert result.returncode != 0
     assert GUARD in result.stderr
+
+
+def test_a_folder_too_long_for_sockets_is_named(monkeypatch):
+    folder = "/tmp/" + 85 * "x"  # 90 bytes, and "/listener-12345678" makes 108
+    monkeypatch.setattr("flowrep.envs.worker_server.util.get_temp_dir", lambda: folder)
+    with pytest.raises(OSError, match=f"'{folder}' is too long for sockets: shorten TMPDIR"):
+        server_context("flowrep.envs.workers")
