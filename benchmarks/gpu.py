@@ -13,6 +13,7 @@ cpu --quick` runs all of it in a tiny version, whose numbers mean nothing.
 
 import argparse
 import json
+import logging
 import sys
 import time
 from collections.abc import Callable
@@ -183,6 +184,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--recorded", action="store_true", help="made-up maps, no simulator")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, to try the script")
     args = parser.parse_args(argv)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces each storage, on stdout
     if args.device.type == "cuda" and not torch.cuda.is_available():
         print("no CUDA device here; --device cpu --quick tries the script", file=sys.stderr)
         sys.exit(NO_GPU)

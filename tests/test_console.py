@@ -114,18 +114,7 @@ def test_two_ctrl_c_in_a_row_end_it_without_a_trace(tmp_path, train):
 @IN_PROC
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("number", "code"),
-    [
-        pytest.param(signal.SIGKILL, -9, id="kill"),
-        pytest.param(
-            signal.SIGTERM,
-            143,
-            id="sigterm",
-            marks=pytest.mark.xfail(
-                reason="a worker begun just then tells of the folder that is gone", strict=False
-            ),
-        ),
-    ],
+    ("number", "code"), [(signal.SIGKILL, -9), (signal.SIGTERM, 143)], ids=["kill", "sigterm"]
 )
 def test_a_start_that_is_cut_short_leaves_no_workers(tmp_path, train, number, code):
     """While the server of the workers is begun, or imports what they need."""

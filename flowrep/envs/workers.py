@@ -93,10 +93,14 @@ class WorkerVectorEnv(VectorEnv):
         atexit.register(self._at_exit)
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
         needs_main = _need_main_module(env_factories)
-        with signals_held(), nullcontext() if needs_main else _without_main_module():
-            for rows in map(slice, bounds, bounds[1:]):
-                self._workers.append(Worker(context, env_factories, rows, memory, in_each))
-        self._check_code(self._receive())
+        try:
+            with signals_held(), nullcontext() if needs_main else _without_main_module():
+                for rows in map(slice, bounds, bounds[1:]):
+                    self._workers.append(Worker(context, env_factories, rows, memory, in_each))
+            self._check_code(self._receive())
+        except BaseException:
+            self._shut_down()  # while the memory is there, which they may be about to open
+            raise
 
     @property
     def num_workers(self) -> int:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pybullet
@@ -14,23 +15,30 @@ import pytest
 from flowrep.envs import StreetEnv
 
 
+@pytest.fixture
+def own_scene(straight_road):
+    """A scene whose simulator no street of another test shares."""
+    gc.collect()  # so that no forgotten street is collected between two counts
+    return replace(straight_road, name="clients")
+
+
 def clients():
     return sum(bool(pybullet.isConnected(physicsClientId=i)) for i in range(100))
 
 
-def test_closing_twice_gives_one_client_back():
+def test_closing_twice_gives_one_client_back(own_scene):
     before = clients()
-    env = StreetEnv(sensors=())
+    env = StreetEnv(own_scene, sensors=())
     assert clients() == before + 1
     env.close()
     env.close()
     assert clients() == before
 
 
-def test_streets_of_one_scene_share_a_client_until_the_last_one_is_closed(straight_road):
+def test_streets_of_one_scene_share_a_client_until_the_last_one_is_closed(own_scene):
     before = clients()
-    streets = [StreetEnv(straight_road, sensors=()) for _ in range(3)]
-    other = StreetEnv("s_turn", sensors=())
+    streets = [StreetEnv(own_scene, sensors=()) for _ in range(3)]
+    other = StreetEnv(replace(own_scene, name="other_clients"), sensors=())
     assert clients() == before + 2
     for env in streets[:2]:
         env.close()
@@ -40,7 +48,7 @@ def test_streets_of_one_scene_share_a_client_until_the_last_one_is_closed(straig
     assert clients() == before + 2
     streets[2].close()
     assert clients() == before + 1
-    again = StreetEnv(straight_road, sensors=())
+    again = StreetEnv(own_scene, sensors=())
     again.reset(seed=0)
     again.step(0)
     again.close()
@@ -69,9 +77,9 @@ def test_streets_that_share_a_client_keep_their_exits_and_people_apart():
                 np.testing.assert_array_equal(value, shared[i][k][name])
 
 
-def test_a_forgotten_street_gives_its_client_back():
+def test_a_forgotten_street_gives_its_client_back(own_scene):
     before = clients()
-    env = StreetEnv(sensors=())
+    env = StreetEnv(own_scene, sensors=())
     env.reset(seed=0)
     alive = weakref.ref(env)
     del env
@@ -80,7 +88,7 @@ def test_a_forgotten_street_gives_its_client_back():
     assert clients() == before
 
 
-def test_a_street_that_fails_to_build_gives_its_client_back(monkeypatch):
+def test_a_street_that_fails_to_build_gives_its_client_back(monkeypatch, own_scene):
     before = clients()
 
     def fail(*args, **kwargs):
@@ -88,7 +96,7 @@ def test_a_street_that_fails_to_build_gives_its_client_back(monkeypatch):
 
     monkeypatch.setattr(pybullet, "createMultiBody", fail)
     with pytest.raises(RuntimeError, match="no body today"):
-        StreetEnv(sensors=())
+        StreetEnv(own_scene, sensors=())
     gc.collect()
     assert clients() == before
 
