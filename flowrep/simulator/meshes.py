@@ -16,6 +16,7 @@ Point3 = tuple[float, float, float]
 _CELL_M = 15.0  # ground is cut into cells: the renderer interpolates short triangles better
 _DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M = 2.0, 6.0, 0.15
 _STRIPE_M = 0.5
+_KERB_M = 0.25
 _RISE_M = 0.004  # of what is painted on the ground
 
 
@@ -136,6 +137,18 @@ def lane_marks(line: LineString, clear_of: BaseGeometry) -> Mesh:
         if not dash.intersects(clear_of):
             area = dash.buffer(_DASH_WIDTH_M / 2, cap_style="flat")
             mesh.ground(area, _RISE_M, "lane_mark")
+    return mesh
+
+
+def kerb(drivable: BaseGeometry, paved: BaseGeometry) -> Mesh:
+    """Returns the stones along the edge of a sidewalk, a hair above it.
+
+    The paving runs on below them: the renderer leaves out thin triangles far away, and what
+    shows there then is the same category.
+    """
+    mesh = Mesh()
+    edge = drivable.buffer(_KERB_M, quad_segs=4, join_style="mitre")
+    mesh.ground(paved.intersection(edge), _RISE_M, "kerb")
     return mesh
 
 

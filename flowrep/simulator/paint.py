@@ -36,6 +36,7 @@ PAINTS: dict[str, tuple[int, int, int]] = {
     "lamp_red": (230, 48, 40),
     "lamp_green": (60, 200, 96),
     "lamp_off": (52, 46, 44),
+    "kerb": (214, 210, 202),
 }
 SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
 _WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))

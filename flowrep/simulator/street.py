@@ -198,6 +198,7 @@ class Street:
             paved = paved.buffer(2.0).difference(layout.drivable)
         paving, grass = meshes.Mesh(), meshes.Mesh()
         paving.ground(paved, 0.0, "paving")
+        paving.add(meshes.kerb(layout.drivable, paved))
         grass.ground(layout.terrain, 0.0, "grass")
         for mesh, category in (
             (road, "road"),

@@ -19,6 +19,7 @@ from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.goal_distance import free_ground
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.vehicle import VehicleState
+from flowrep.simulator.meshes import kerb
 
 PEOPLE = {"across", "along", "standing"}
 # Paper, Table I: steps, paths, lane width factor, categories, kinds of pedestrians, α in °/s².
@@ -198,6 +199,19 @@ def test_the_planner_arrives_and_habit_and_chance_do_not(make_street, name, spee
     assert straight.count("success") == 0
     by_chance = [drive.outcome for drive in drives(env, RandomDriver(0), 20, seed=0)]
     assert by_chance.count("success") == 0
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_the_kerb_is_on_the_sidewalk_and_paving_is_below_it(name):
+    layout = Layout(load_scene(name))
+    stones = kerb(layout.drivable, layout.sidewalks)
+    corners = np.array(stones.vertices)[stones.indices].reshape(-1, 3, 3)
+    stone = shapely.union_all(shapely.polygons(corners[:, :, :2]))
+    assert stone.difference(layout.sidewalks.buffer(1e-6)).area == 0
+    # A quarter of a metre all along the road, where there is a sidewalk.
+    along = layout.drivable.boundary.intersection(layout.sidewalks.buffer(1e-6)).length
+    assert stone.area == pytest.approx(0.25 * along, rel=0.02)
+    assert (corners[..., 2] > 0).all()  # or it would flicker with the paving
 
 
 def test_lane_marks_stop_where_crosswalks_and_other_roads_are(make_street):
