@@ -1,7 +1,9 @@
 """`flowrep.evaluate` on runs of a few frames: what it runs, what it refuses, what it keeps."""
 
 import csv
+import json
 import os
+import re
 import shutil
 import signal
 
@@ -18,6 +20,7 @@ from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.street_pool import StreetPool
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import train
+from flowrep.export import export
 from flowrep.train import build
 from flowrep.viz.curves import _evaluated
 from tests.test_configs import composed
@@ -122,6 +125,39 @@ def test_an_edited_config_is_refused(untouched):
     path.write_text(path.read_text().replace("straight_road", "s_turn"))
     with pytest.raises(CheckpointError, match=r"scene\.name=straight_road, .* scene\.name=s_turn"):
         evaluate(asked(run), [run])
+
+
+def offsets_in(data):
+    """Where a checkpoint can be damaged: its header, and inside the largest tensor of each part."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    tensors = json.loads(data[8:start])
+    del tensors["__metadata__"]
+    spans = {name: tensor["data_offsets"] for name, tensor in tensors.items()}
+    largest = {}
+    for name in sorted(spans, key=lambda name: spans[name][1] - spans[name][0]):
+        largest[name.split("/")[1]] = start + sum(spans[name]) // 2
+    return {"length": 1, "header": 8 + start // 2, "end": len(data) - 1} | largest
+
+
+READERS = {
+    "evaluate": lambda run: evaluate(asked(run), [run]),
+    "export": lambda run: export(composed(f"run={run.path}", name="export"), run),
+    "resume": lambda run: build(run.read_config() | {"resume": str(run.path)}, run),
+}
+
+
+@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
+def test_a_byte_that_was_changed_anywhere_in_a_checkpoint_is_refused_by_name(run, read, tmp_path):
+    damaged = RunFolder(shutil.copytree(run.path, tmp_path / "damaged"))
+    data = run.checkpoint_path.read_bytes()
+    offsets = offsets_in(data)
+    assert offsets.keys() >= {"carried", "policy", "agent", "memory", "torch_rng"}
+    for place, offset in offsets.items():
+        flipped = bytes([data[offset] ^ 0x10])
+        damaged.checkpoint_path.write_bytes(data[:offset] + flipped + data[offset + 1 :])
+        says = f"{re.escape(str(damaged.checkpoint_path))} is not a readable checkpoint"
+        with pytest.raises(CheckpointError, match=says):
+            pytest.fail(f"{place}: {read(damaged)}")
 
 
 def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypatch):

@@ -2,8 +2,9 @@
 
 The file is a safetensors file. Its header's metadata carry one JSON document that mirrors the
 nested state, in which a tensor is `{"tensor": name, "crc32": checksum}`, and the document's own
-checksum: a byte that was changed is noticed. Nothing in the file can run code. `torchrl.checkpoint`
-loses the last checkpoint if it is killed between its two renames, see docs/upstream.md.
+checksum. All of them are checked whenever the file is read, for a part of it too: a byte that was
+changed is noticed wherever it is. Nothing in the file can run code. `torchrl.checkpoint` loses the
+last checkpoint if it is killed between its two renames, see docs/upstream.md.
 """
 
 from __future__ import annotations
@@ -76,11 +77,10 @@ def load_checkpoint(
 
     Args:
         path: the file.
-        parts: the keys of the outermost dict to read, which is quick where they are small; None
-            for all.
+        parts: the keys of the outermost dict to return; None for all.
 
     Raises:
-        CheckpointError: if there is none, or it is damaged or something else.
+        CheckpointError: if there is none, or any byte of it is damaged, or it is something else.
     """
     path = Path(path)
     if not path.is_file():
@@ -97,10 +97,9 @@ def load_checkpoint(
             document = json.loads(metadata["state"])
             if not isinstance(document, dict):
                 raise TypeError(f"it holds a {type(document).__name__}, not a dict")
-            wanted = document["dict"]
-            if parts is not None:
-                wanted = {name: wanted[name] for name in parts}
-            return {name: _with_tensors(value, file.get_tensor) for name, value in wanted.items()}
+            # tensors are views of the file: those that nobody asked for cost a look, no memory
+            state = {k: _with_tensors(v, file.get_tensor) for k, v in document["dict"].items()}
+            return state if parts is None else {name: state[name] for name in parts}
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise CheckpointError(
             f"{path} is not a readable checkpoint ({error}): it is damaged or of another kind; "

@@ -134,8 +134,9 @@ class Training:
             CheckpointError: it can't be read, or belongs to another run.
         """
         path = self.run.checkpoint_path
-        check_origin(load_checkpoint(path, ["origin"])["origin"], self.origin, path)
-        self.restore(load_checkpoint(path))
+        state = load_checkpoint(path)
+        check_origin(state["origin"], self.origin, path)
+        self.restore(state)
         self.run.forget_after(self.frames)
 
 

@@ -157,7 +157,7 @@ def test_a_byte_that_was_changed_is_noticed(tmp_path, what):
         load_checkpoint(path)
 
 
-def test_parts_are_read_alone_and_checked_alone(tmp_path):
+def test_a_part_is_given_alone_and_the_whole_file_checked(tmp_path):
     path = tmp_path / "c.safetensors"
     save_checkpoint(path, STATE | {"frames": 1234})
     assert same(
@@ -167,9 +167,21 @@ def test_parts_are_read_alone_and_checked_alone(tmp_path):
         load_checkpoint(path, ["policy"])
     data = path.read_bytes()
     path.write_bytes(data.replace(torch.tensor(5.0).numpy().tobytes(), b"\0\0\0\0"))
-    assert load_checkpoint(path, ["frames"]) == {"frames": 1234}
     with pytest.raises(CheckpointError, match="/weights/w is not as it was written"):
-        load_checkpoint(path, ["weights"])
+        load_checkpoint(path, ["frames"])
+
+
+def test_a_bit_flipped_anywhere_is_noticed_whatever_part_is_read(tmp_path):
+    """Every byte of a file: its lengths, names, types, offsets, padding, checksums and tensors."""
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, STATE | {"frames": 1234, "half": torch.ones(3).half()})
+    data = path.read_bytes()
+    for offset in range(len(data)):
+        damaged = bytearray(data)
+        damaged[offset] ^= 1 << offset % 8
+        path.write_bytes(damaged)
+        with pytest.raises(CheckpointError, match=r"c\.safetensors is "):
+            pytest.fail(f"at {offset}: {load_checkpoint(path, ['frames'])}")
 
 
 def test_a_missing_checkpoint_is_named(tmp_path):
