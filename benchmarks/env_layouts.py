@@ -65,11 +65,11 @@ def gym_vector(scene: Scene, num_envs: int) -> tuple[Stepper, Callable[[], None]
 
 
 def torchrl_env(env: EnvBase) -> tuple[Stepper, Callable[[], None]]:
-    carried = [env.reset()]
+    observation = [env.reset()]
 
     def step(frames: int) -> None:
         for _ in range(frames // env.batch_size.numel()):
-            _, carried[0] = env.step_and_maybe_reset(env.rand_action(carried[0]))
+            _, observation[0] = env.step_and_maybe_reset(env.rand_action(observation[0]))
 
     return step, env.close
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from flowrep.drivers import Planner
+from flowrep.baselines import Planner
 from flowrep.envs import StreetEnv
 from flowrep.scenes import load_scene, scene_names
 

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from flowrep.baselines.planner import Planner
 from flowrep.config_tree import CONF_DIR, group_choices
-from flowrep.drivers.planner import Planner
-from flowrep.envs import make_env, streets
+from flowrep.envs import make_env, street_envs
 from flowrep.geometry import rigid_flow
 from flowrep.palette import CLASS_COLOURS
 from flowrep.transforms import DIS, EstimatedFlow
@@ -69,12 +69,12 @@ def contenders(raft_weights: str | None) -> dict[str, Callable[[Tensor], Tensor]
 
 def drive(scene: str, size: int, steps: int, num_envs: int) -> Seen:
     env = make_env(sized(scene, size), ["rgb"], num_envs=num_envs, keep_sensor=True, seed=2)
-    drivers = [(Planner(), street) for street in streets(env)]
-    K = torch.as_tensor(drivers[0][1].K).float()
+    planners = [(Planner(), street) for street in street_envs(env)]
+    K = torch.as_tensor(planners[0][1].K).float()
     parts: list[Seen] = []
     tensordict = env.reset()
     for step in range(1, steps + 1):
-        action = torch.tensor([planner(street) for planner, street in drivers])
+        action = torch.tensor([planner(street) for planner, street in planners])
         previous = tensordict["rgb"].clone()
         stepped, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
         if step % SEE_EVERY == 0:

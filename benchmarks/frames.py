@@ -40,12 +40,12 @@ def one_by_one(scene: Scene, num_envs: int) -> EnvBase:
 
 def stepper(env: EnvBase) -> Callable[[int], float]:
     """Returns what takes so many steps of every street and gives milliseconds a frame."""
-    carried = [env.reset()]
+    observation = [env.reset()]
 
     def take(steps: int) -> float:
         started = time.process_time()
         for _ in range(steps):
-            _, carried[0] = env.step_and_maybe_reset(env.rand_action(carried[0]))
+            _, observation[0] = env.step_and_maybe_reset(env.rand_action(observation[0]))
         return 1e3 * (time.process_time() - started) / (steps * env.batch_size.numel())
 
     return take

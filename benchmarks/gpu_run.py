@@ -120,11 +120,11 @@ def street_rates(device: torch.device, *, recorded: bool, quick: bool) -> list[d
             if recorded
             else street_env(num_envs, side, count, device)
         )
-        carried, start = env.reset(), 0.0
+        observation, start = env.reset(), 0.0
         for step in range(2 * steps):
             if step == steps:  # the first half warms up
                 start = finish(device)
-            _, carried = env.step_and_maybe_reset(env.rand_action(carried))
+            _, observation = env.step_and_maybe_reset(env.rand_action(observation))
         rate = num_envs * steps / (finish(device) - start)
         env.close()
         rows.append({"workers": count, "num_envs": num_envs, "frames/s": rate})
@@ -159,7 +159,7 @@ def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, fl
     from flowrep.experiment.interruption import StopRequest
     from flowrep.experiment.run_folder import RunFolder
     from flowrep.experiment.training import train
-    from flowrep.train import build
+    from flowrep.train import make_training
 
     register_resolvers()
     size = ["debug=smoke"] if quick else ["preset=paper", "total_frames=20_000"]
@@ -176,7 +176,7 @@ def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, fl
         return False
 
     with tempfile.TemporaryDirectory() as folder:
-        run = build(config, RunFolder(Path(folder)))
+        run = make_training(config, RunFolder(Path(folder)))
         try:
             clock = train(run, config, StopRequest(), mark)
         finally:
@@ -191,13 +191,13 @@ def recorded_training(device: torch.device, quick: bool) -> tuple[tuple[int, flo
     num_envs, side, total, batch = (4, 40, 256, 16) if quick else (NUM_ENVS, SIDE, 20_000, 1024)
     env = recorded_env(num_envs, side, device)
     agent = agent_for(env.observation_spec, env.action_spec, MAPS, device=device, batch_size=batch)
-    carried, frames, marks = env.reset(), 0, []
+    observation, frames, marks = env.reset(), 0, []
     while frames < total:
         with torch.no_grad():
-            acted = agent.policy(carried)
+            acted = agent.policy(observation)
         for _ in range(agent.updates_due(frames)):
             agent.update(agent.sample())
-        stepped, carried = env.step_and_maybe_reset(acted)
+        stepped, observation = env.step_and_maybe_reset(acted)
         agent.remember(stepped)
         frames += num_envs
         if frames >= total // 2 * (1 + len(marks)):

@@ -96,14 +96,14 @@ def main() -> None:
         for name, owner, method in PARTS:
             call = timer.timed(name, getattr(owner, method))
             stack.enter_context(patch.object(owner, method, call))
-        carried = env.reset()
+        observation = env.reset()
         for turn in range(steps + WARM_UP):
             if turn == WARM_UP:
                 timer.seconds.clear()
                 start = time.process_time()
             with timer("policy"):
-                acted = agent.policy(carried)
-            stepped, carried = env.step_and_maybe_reset(acted)
+                acted = agent.policy(observation)
+            stepped, observation = env.step_and_maybe_reset(acted)
             agent.remember(stepped)
     frame = (time.process_time() - start) / (steps * args.num_envs)
     env.close()

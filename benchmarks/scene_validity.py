@@ -7,7 +7,7 @@ import argparse
 import time
 from collections import Counter
 
-from flowrep.drivers import BASELINES, drives
+from flowrep.baselines import BASELINES, drives
 from flowrep.envs import StreetEnv
 from flowrep.experiment.evaluation import wilson_interval
 from flowrep.scenes import load_scene, scene_names
@@ -20,26 +20,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="+", default=scene_names())
     parser.add_argument("--episodes", type=int, default=500)
-    parser.add_argument("--drivers", nargs="+", default=list(BASELINES), choices=list(BASELINES))
+    parser.add_argument("--baselines", nargs="+", default=list(BASELINES), choices=list(BASELINES))
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     print(
-        f"{'scene':<20}{'speed':<8}{'driver':<12}", *(f"{name:<19}" for name in OUTCOMES), "valid"
+        f"{'scene':<20}{'speed':<8}{'baseline':<12}", *(f"{name:<19}" for name in OUTCOMES), "valid"
     )
     for name in args.scenes:
         scene = load_scene(name)
         for speed in scene.pedestrian_speed_mps:
-            for driver in args.drivers:
+            for baseline in args.baselines:
                 started = time.perf_counter()
                 env = StreetEnv(scene, speed=speed, sensors=())
-                ended = drives(env, BASELINES[driver](), args.episodes, seed=args.seed)
+                ended = drives(env, BASELINES[baseline](), args.episodes, seed=args.seed)
                 counts = Counter(drive.outcome for drive in ended)
                 env.close()
                 cells = [cell(counts[outcome], args.episodes) for outcome in OUTCOMES]
-                low, high = BOUNDS[driver]
+                low, high = BOUNDS[baseline]
                 is_valid = low <= counts["success"] / args.episodes <= high
                 seconds = time.perf_counter() - started
-                row = f"{scene.name:<20}{speed:<8}{driver:<12}"
+                row = f"{scene.name:<20}{speed:<8}{baseline:<12}"
                 print(row, *cells, "yes" if is_valid else "NO", f"({seconds:.0f} s)", flush=True)
 
 

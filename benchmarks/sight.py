@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.drivers import Planner
+from flowrep.baselines import Planner
 from flowrep.envs import StreetEnv
 from flowrep.scenes import Scene, load_scene, scene_names
 from flowrep.scenes.people import PARTS

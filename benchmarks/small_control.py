@@ -150,10 +150,10 @@ def train(make_learner: Callable[[EnvBase, int], Learner], frames: int, seed: in
     torch.manual_seed(seed)
     env = TransformedEnv(Follow(), InitTracker())
     policy, remember, update = make_learner(env, frames)
-    carried = env.reset()
+    observation = env.reset()
     for seen in range(ENVS, frames + 1, ENVS):
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            stepped, carried = env.step_and_maybe_reset(policy(carried))
+            stepped, observation = env.step_and_maybe_reset(policy(observation))
         remember(stepped)
         if seen >= BATCH + 2 * ENVS:
             update()

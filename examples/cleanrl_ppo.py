@@ -56,11 +56,11 @@ def advantages(rollout: dict[str, Tensor], next_value: Tensor, next_ended: Tenso
     """Returns generalised advantages [T, N]."""
     values = torch.cat([rollout["value"], next_value[None]])
     lives = 1 - torch.cat([rollout["ended"][1:], next_ended[None]])
-    found, carried = [], torch.zeros_like(next_value)
+    found, advantage = [], torch.zeros_like(next_value)
     for t in reversed(range(len(lives))):
         delta = rollout["reward"][t] + GAMMA * values[t + 1] * lives[t] - values[t]
-        carried = delta + GAMMA * LAMBDA * lives[t] * carried
-        found.append(carried)
+        advantage = delta + GAMMA * LAMBDA * lives[t] * advantage
+        found.append(advantage)
     return torch.stack(found[::-1])
 
 

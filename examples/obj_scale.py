@@ -7,15 +7,15 @@ import sys
 
 import torch
 
-from flowrep.drivers.planner import Planner
-from flowrep.envs import make_env, streets
+from flowrep.baselines.planner import Planner
+from flowrep.envs import make_env, street_envs
 from flowrep.viz import FLOW_SCALE_PX, flow_note, flow_to_rgb, strip, write_png
 from flowrep.viz.film import film_episode
 
 
 def main(path: str, seed: int = 2) -> None:
     env = make_env("straight_road", ["rgb"], keep_sensor=True, seed=seed)
-    street, planner = streets(env)[0], Planner()
+    street, planner = street_envs(env)[0], Planner()
 
     def drive(tensordict):
         return tensordict.set("action", torch.tensor([planner(street)]))

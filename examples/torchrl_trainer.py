@@ -58,7 +58,7 @@ def make_trainer(frames: int, num_envs: int, side: int, batch_size: int, seed: i
     scene = replace(scene, camera=replace(scene.camera, height_px=side, width_px=side))
     env = make_env(scene, MAPS, num_envs=num_envs, seed=seed).append_transform(InitTracker())
     spec, action_spec = env.observation_spec, env.action_spec
-    policy = DiscreteSAC.build_policy(
+    policy = DiscreteSAC.make_policy(
         spec, action_spec, MAPS, device="cpu", precision="auto", hidden_size=512
     )
     network = policy[0].module.network

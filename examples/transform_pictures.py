@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from flowrep.drivers import Planner
+from flowrep.baselines import Planner
 from flowrep.envs import StreetEnv
 from flowrep.envs.sensing import SENSORS
 from flowrep.experiment.viewing import view_episode

@@ -23,7 +23,6 @@ from omegaconf import DictConfig
 from torchrl.data import Composite
 
 from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.build import Config, build_env, build_policy, build_pool, choose_device
 from flowrep.config import UsageError, validated
 from flowrep.config.command_line import (
     exit_with,
@@ -35,7 +34,7 @@ from flowrep.config.command_line import (
 from flowrep.config.evaluating import EvaluateConfig
 from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import WorkerError, streets
+from flowrep.envs import WorkerError, street_envs
 from flowrep.exchange.policies import ForeignPolicy, PolicyError, Task, is_reference, load_policy
 from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.comparison import Comparison, Row, print_table, with_origin
@@ -43,6 +42,13 @@ from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.origin import check_origin, origin_of
 from flowrep.experiment.run_folder import RunFolder
+from flowrep.from_config import (
+    Config,
+    choose_device,
+    env_from_config,
+    policy_from_config,
+    pool_from_config,
+)
 from flowrep.scenes import load_scene
 from flowrep.viz.film import record_episode
 
@@ -147,7 +153,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
     config = {key: asked[key] for key in (*OF_THE_MACHINE, "scene", "representations")}
     config |= {"flow": asked.get("flow") or {"source": "exact"}, "renderer": "auto"}
     config |= {"speed": "normal", "seed": ""}  # of its training, of which nothing is known
-    env = build_env(config, num_envs=1, num_workers=0)
+    env = env_from_config(config, num_envs=1, num_workers=0)
     device = choose_device(config["device"])
     task = Task(
         scene=config["scene"]["name"],
@@ -156,7 +162,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
             {name: env.observation_spec[name][0] for name in config["representations"]}
         ),
         action_spec=env.action_spec[0],
-        intrinsics=torch.from_numpy(streets(env)[0].K),
+        intrinsics=torch.from_numpy(street_envs(env)[0].K),
         device=device,
     )
     env.close()
@@ -178,7 +184,7 @@ def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> No
         agents=len(subjects),
     )
     config = subjects[0].config
-    make_pool = partial(build_pool, config, comparison.rides)
+    make_pool = partial(pool_from_config, config, comparison.rides)
     agents = [subject.agent for subject in subjects]
     arena = Arena(load_scene(config["scene"]), agents, rates, make_pool)
     try:
@@ -224,8 +230,8 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
     if scene is not None:  # the camera is the agent's, and goes where it goes
         here["scene"] = scene | {"camera": own["scene"]["camera"]}
     config = own | here
-    env = build_env(config, num_envs=1, num_workers=0)
-    policy = build_policy(config, env, trust=config["trust"])
+    env = env_from_config(config, num_envs=1, num_workers=0)
+    policy = policy_from_config(config, env, trust=config["trust"])
     env.close()
     try:
         policy.load_state_dict(state["policy"])
@@ -246,7 +252,7 @@ def film(asked: Config, subject: Subject) -> None:
     for speed, rate in product(as_list(asked["speed"]), as_list(asked["fps"])):
         for number in range(asked["video"]):
             path = run.video_path(f"{speed}_{rate:g}fps_{number}")
-            make = partial(build_env, config, speed=speed, frame_rate_hz=float(rate))
+            make = partial(env_from_config, config, speed=speed, frame_rate_hz=float(rate))
             seen, seed = config["representations"], asked["seed"] + number
             policy = subject.agent.policy
             if isinstance(policy, ForeignPolicy):

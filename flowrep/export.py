@@ -16,16 +16,16 @@ from torchrl.envs import EnvBase
 
 from flowrep import __version__
 from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.build import Config, build_env, build_policy
 from flowrep.config import UsageError, validated
 from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config.exporting import ExportConfig
 from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs import streets
+from flowrep.envs import street_envs
 from flowrep.exchange.programs import acting_program, write_agent
 from flowrep.experiment.origin import check_origin, origin_of
 from flowrep.experiment.run_folder import RunFolder
+from flowrep.from_config import Config, env_from_config, policy_from_config
 from flowrep.scenes import load_scene
 
 ACTIONS = ("no_op", "turn_left", "turn_right")  # by their numbers in flowrep.scenes.vehicle
@@ -56,8 +56,8 @@ def export(asked: Config, run: RunFolder) -> Path:
     check_origin(state["origin"], origin_of(own), run.checkpoint_path)
     portable = own["algorithm"] | ({"precision": "fp32"} if "precision" in own["algorithm"] else {})
     config = own | {"algorithm": portable, "device": "cpu"}
-    env = build_env(config, num_envs=1, num_workers=0)
-    policy = build_policy(config, env, trust=asked["trust"])
+    env = env_from_config(config, num_envs=1, num_workers=0)
+    policy = policy_from_config(config, env, trust=asked["trust"])
     policy.load_state_dict(state["policy"])
     program = acting_program(policy, env.observation_spec)
     card = agent_card(config, env, state["frames"])
@@ -69,7 +69,7 @@ def export(asked: Config, run: RunFolder) -> Path:
 
 def agent_card(config: Config, env: EnvBase, frames: int) -> dict[str, Any]:
     """Returns what others need to know to show an agent what it was trained on."""
-    spec, (street,) = env.observation_spec, streets(env)
+    spec, (street,) = env.observation_spec, street_envs(env)
     scene = load_scene(config["scene"])
     return {
         "flowrep": __version__,

@@ -24,7 +24,6 @@ from flowrep.agent import (
     threads_in_use,
     use_threads,
 )
-from flowrep.build import Config, build_agent, build_env, build_pool, choose_device
 from flowrep.config import UsageError, validated
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.command_line import (
@@ -48,6 +47,13 @@ from flowrep.experiment.origin import origin_of
 from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import Training, train
+from flowrep.from_config import (
+    Config,
+    agent_from_config,
+    choose_device,
+    env_from_config,
+    pool_from_config,
+)
 from flowrep.scenes import SceneError, load_scene
 from flowrep.sweeps.plan import is_sweep
 from flowrep.sweeps.sweep import run_sweep
@@ -92,7 +98,7 @@ def run(config: DictConfig) -> float:
 def carry_out(config: Config, folder: RunFolder) -> float:
     """Does what is left to do of a run: training, evaluation, video; returns its success."""
     try:
-        training = build(config, folder)
+        training = make_training(config, folder)
         folder.log_to_wandb(config["wandb"], config)
     except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
         exit_with(error)
@@ -164,17 +170,17 @@ def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
     return stored | {key: plain[key] for key in (*OF_THE_MACHINE, "resume")}
 
 
-def build(config: Config, folder: RunFolder) -> Training:
+def make_training(config: Config, folder: RunFolder) -> Training:
     """Returns the run at its start, or at its checkpoint where it has one."""
     keep_freed_memory()
     share_cores(config)
     torch.manual_seed(config["seed"])
-    env = build_env(config)
+    env = env_from_config(config)
     env.set_seed(config["seed"] * config["num_envs"])
     is_new = config["resume"] is None
     # of a new run the person who typed the command named the class
     trusted = config["algorithm"]["_target_"] if is_new else config["trust"]
-    agent = build_agent(config, env, trust=trusted)
+    agent = agent_from_config(config, env, trust=trusted)
     training = Training(env, agent, folder, origin_of(config))
     if not is_new:
         if folder.checkpoint_path.exists():
@@ -219,7 +225,7 @@ def run_comparison(
     agent = Agent(
         training.agent.policy, config["representations"], config["flow"], training.agent.device
     )
-    make_pool = partial(build_pool, config, comparison.rides)
+    make_pool = partial(pool_from_config, config, comparison.rides)
     arena = Arena(load_scene(config["scene"]), [agent], comparison.fps, make_pool)
     try:
         comparison.run(arena, lambda: bool(stop))
@@ -257,7 +263,7 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
     draw_learning_curve(run)
     if evaluation["video"]:
         path = run.video_path(f"episode_{config['speed']}")
-        make_env = partial(build_env, config)
+        make_env = partial(env_from_config, config)
         record_episode(
             make_env, training.agent.policy, config["representations"], path, seed=FINAL_SEED
         )

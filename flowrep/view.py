@@ -20,11 +20,11 @@ from rich.console import Console
 from rich.table import Table
 from tqdm.auto import tqdm
 
+from flowrep.baselines import BASELINES
 from flowrep.config import UsageError, validated
 from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config.viewing import ViewConfig
 from flowrep.config_tree import CONF_DIR
-from flowrep.drivers import BASELINES
 from flowrep.envs import StreetEnv
 from flowrep.envs.sensing import SENSORS
 from flowrep.experiment.tables import append_rows
@@ -114,18 +114,18 @@ def film(
             frames.append(maps_of(maps, intrinsics))
             bar.update()
 
-        driver = BASELINES[config.driver]()
-        first = view_episode(env, driver, look=look, seed=config.seed, path=config.path)
+        baseline = BASELINES[config.policy]()
+        first = view_episode(env, baseline, look=look, seed=config.seed, path=config.path)
     env.close()
     return frames, first, counts, env.frame_rate_hz
 
 
 def drive_on(config: DictConfig, street: dict[str, Any], episodes: int) -> list[Viewed]:
     """Returns the episodes after the first, driven without a picture."""
-    env, driver = StreetEnv(**street, sensors=()), BASELINES[config.driver]()
+    env, baseline = StreetEnv(**street, sensors=()), BASELINES[config.policy]()
     env.reset(seed=config.seed)
     viewed = [
-        view_episode(env, driver, path=config.path)
+        view_episode(env, baseline, path=config.path)
         for _ in tqdm(range(episodes), desc="driving on", unit="episode")
     ]
     env.close()

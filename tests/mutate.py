@@ -42,7 +42,7 @@ TARGETS = {
     "agent": Target("flowrep/agent/*.py", ("tests/agent", "-k", "not compile and not captured")),
     "episode": Target(
         "flowrep/envs/episode.py",
-        ("tests/envs/test_street_env.py", "tests/drivers/test_scenes.py", "-k", "not checks"),
+        ("tests/envs/test_street_env.py", "tests/baselines/test_scenes.py", "-k", "not checks"),
     ),
 }
 

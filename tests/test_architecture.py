@@ -19,8 +19,8 @@ FLOWREP_IMPORTS_ALLOWED = {
     "scenes": {"scenes", "config_tree", "extras", "palette"},
     "simulator": {"simulator", "scenes", "palette"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette"},
-    "drivers": {"drivers", "envs", "scenes"},
-    "experiment": {"experiment", "drivers", "envs", "simulator", "scenes", "agent"}
+    "baselines": {"baselines", "envs", "scenes"},
+    "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
     | {"transforms", "palette"},
     "viz": {"viz", "experiment", "envs", "scenes", "geometry", "palette"},
     "exchange": {"exchange", "agent"},
@@ -29,7 +29,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "config": {
         "config",
         "agent",
-        "drivers",
+        "baselines",
         "envs",
         "exchange",
         "experiment",

@@ -27,13 +27,13 @@ GROUP_FILES = [(group, name) for group in GROUPS for name in group_choices(group
 
 @pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
 def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
-    from flowrep.build import build_agent, build_env
+    from flowrep.from_config import agent_from_config, env_from_config
 
     choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
     small = [] if group == "debug" else ["num_envs=1", "algorithm.batch_size=16"]
     config = composed(choice, *small, "device=cpu")
-    env = build_env(config)
-    agent = build_agent(config, env)
+    env = env_from_config(config)
+    agent = agent_from_config(config, env)
     action = agent.policy(env.reset())["action"]
     env.close()
     assert action.shape == env.batch_size
@@ -87,13 +87,13 @@ def test_run_folders_are_named_by_scene_representations_and_seed():
 
 
 def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
-    from flowrep.build import build_env
+    from flowrep.from_config import env_from_config
 
     crossroads = CONF_DIR.parent / "tests" / "scenes" / "crossroads.yaml"
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "mine.yaml").write_text(crossroads.read_text())
     config = composed(f"hydra.searchpath=[file://{tmp_path}]", "scene=mine", "num_envs=1")
-    env = build_env(config, device="cpu")
+    env = env_from_config(config, device="cpu")
     assert env.rollout(2)["ego"].shape == (1, 2, 2, 40, 60)
     env.close()
 

@@ -12,16 +12,16 @@ import pytest
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
 from flowrep.agent import CheckpointError
-from flowrep.drivers import Drive
+from flowrep.baselines import Drive
 from flowrep.envs import WorkerError
 from flowrep.evaluate import evaluate
+from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
-from flowrep.experiment.street_pool import StreetPool
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import train
 from flowrep.export import export
-from flowrep.train import build
+from flowrep.train import make_training
 from flowrep.viz.curves import _evaluated
 from tests.test_configs import composed
 
@@ -37,7 +37,7 @@ def trained(path, *overrides):
     )
     run = RunFolder(path)
     run.write_config(config)
-    training = build(config, run)
+    training = make_training(config, run)
     train(training, config, StopRequest(), lambda frames: False)
     training.env.close()
     return run
@@ -142,7 +142,7 @@ def offsets_in(data):
 READERS = {
     "evaluate": lambda run: evaluate(asked(run), [run]),
     "export": lambda run: export(composed(f"run={run.path}", name="export"), run),
-    "resume": lambda run: build(run.read_config() | {"resume": str(run.path)}, run),
+    "resume": lambda run: make_training(run.read_config() | {"resume": str(run.path)}, run),
 }
 
 
@@ -151,7 +151,7 @@ def test_a_byte_that_was_changed_anywhere_in_a_checkpoint_is_refused_by_name(run
     damaged = RunFolder(shutil.copytree(run.path, tmp_path / "damaged"))
     data = run.checkpoint_path.read_bytes()
     offsets = offsets_in(data)
-    assert offsets.keys() >= {"carried", "policy", "agent", "memory", "torch_rng"}
+    assert offsets.keys() >= {"observation", "policy", "agent", "memory", "torch_rng"}
     for place, offset in offsets.items():
         flipped = bytes([data[offset] ^ 0x10])
         damaged.checkpoint_path.write_bytes(data[:offset] + flipped + data[offset + 1 :])
@@ -175,7 +175,7 @@ def test_a_worker_that_dies_is_one_line_and_what_was_run_is_kept(untouched, monk
         yield from ()
         raise WorkerError("the worker process of environment 0 is gone (SIGKILL)")
 
-    monkeypatch.setattr(StreetPool, "drive", dies)
+    monkeypatch.setattr(EnvPool, "drive", dies)
     with pytest.raises(WorkerError):
         evaluate(asked(run, "baselines=[random]"), [run])
     assert [row["policy"] for row in rows_of(run)] == ["greedy"] * 2
@@ -188,7 +188,7 @@ def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(untouched, monkeypat
         os.kill(os.getpid(), signal.SIGINT)
         yield 0, Drive(2_000_000, "timeout", "", -5.0, 7)
 
-    monkeypatch.setattr(StreetPool, "drive", interrupted)
+    monkeypatch.setattr(EnvPool, "drive", interrupted)
     with pytest.raises(SystemExit) as ended:
         evaluate(asked(run, "baselines=[random]", "video=1"), [run])
     assert ended.value.code == 130

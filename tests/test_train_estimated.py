@@ -41,7 +41,7 @@ def test_a_run_on_estimated_flow_is_trained_and_evaluated(tmp_path):
 def test_the_agent_and_the_film_see_one_estimate():
     import torch
 
-    from flowrep.envs import make_env, streets
+    from flowrep.envs import make_env, street_envs
     from flowrep.geometry import rigid_flow
     from flowrep.viz.film import maps_of
 
@@ -51,7 +51,7 @@ def test_the_agent_and_the_film_see_one_estimate():
     action = torch.zeros(1, dtype=torch.long)
     for _ in range(2):
         tensordict = env.step(tensordict.set("action", action))["next"]
-    K = torch.as_tensor(streets(env)[0].K).float()
+    K = torch.as_tensor(street_envs(env)[0].K).float()
     maps = maps_of(tensordict["sensor"][0], K)
     env.close()
     sensor = tensordict["sensor"][0]

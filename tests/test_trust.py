@@ -10,11 +10,11 @@ from omegaconf import OmegaConf
 pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
 from flowrep.agent import DoubleDQN
-from flowrep.build import algorithm_class
 from flowrep.config import UsageError
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.command_line import register_resolvers
 from flowrep.config_tree import CONF_DIR
+from flowrep.from_config import algorithm_class
 from tests.config.composing import plain
 
 

@@ -12,10 +12,10 @@ from hydra import compose, initialize_config_dir
 
 pytest.importorskip("pybullet", reason="the command needs the simulator")
 
+from flowrep.baselines import drives, never_turn
 from flowrep.config import UsageError
 from flowrep.config.composition import check_command
 from flowrep.config_tree import CONF_DIR
-from flowrep.drivers import drives, never_turn
 from flowrep.envs import StreetEnv
 from flowrep.scenes import load_scene
 from flowrep.scenes.camera import CameraConfig
@@ -33,7 +33,7 @@ def view(*arguments):
 @pytest.mark.slow
 def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
     out = tmp_path / "seen"
-    done = view("scene=three_way_junction", "driver=never_turn", *SMALL, f"hydra.run.dir={out}")
+    done = view("scene=three_way_junction", "policy=never_turn", *SMALL, f"hydra.run.dir={out}")
     assert done.returncode == 0, done.stderr
     assert {path.name for path in out.iterdir()} == {
         "sheet.png", "episode.mp4", "plan.png", "episodes.csv", "categories.csv"
@@ -69,7 +69,7 @@ def test_what_cannot_be_is_named(override, expected):
 
 def test_the_episodes_that_are_shown_are_those_of_the_seed():
     def shown(seed):
-        overrides = ["driver=never_turn", f"seed={seed}"]
+        overrides = ["policy=never_turn", f"seed={seed}"]
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             config = compose("view", overrides)
         street = {"scene": replace(load_scene("straight_road"), camera=TINY)}

@@ -45,7 +45,7 @@ class Algorithm(ABC):
 
     What is minimised is a TorchRL `LossModule`; this class has the rest of an update: schedule,
     Adam, targets, CUDA graph, the watch for divergence. A subclass sets `policy` (by
-    `build_policy`, which makes it for evaluation too) and `memory`, calls this constructor with its
+    `make_policy`, which makes it for evaluation too) and `memory`, calls this constructor with its
     loss, and writes `sample` and `updates_due`. Everything it needs to continue then lies in the
     loss's weights, the memory and Adam's state, which are saved.
 
@@ -124,7 +124,7 @@ class Algorithm(ABC):
         ]
 
     @classmethod
-    def build_policy(
+    def make_policy(
         cls,
         observation_spec: Composite,
         action_spec: TensorSpec,

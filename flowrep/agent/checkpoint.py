@@ -23,7 +23,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-FORMAT = "flowrep checkpoint 4"
+FORMAT = "flowrep checkpoint 5"
 
 
 class CheckpointError(Exception):

@@ -135,7 +135,7 @@ class DoubleDQN(OffPolicy):
         return {"epsilon": self.exploration.eps}
 
     @classmethod
-    def build_policy(
+    def make_policy(
         cls,
         observation_spec: Composite,
         action_spec: TensorSpec,
@@ -144,7 +144,7 @@ class DoubleDQN(OffPolicy):
         device: torch.device | str,
         **options: Any,
     ) -> EpsilonGreedyPolicy:
-        """Returns the acting side alone, see `Algorithm.build_policy`; ε lies in its state."""
+        """Returns the acting side alone, see `Algorithm.make_policy`; ε lies in its state."""
         device = torch.device(device)
         network = acting_network(
             observation_spec,

@@ -38,7 +38,7 @@ class OffPolicy(Algorithm):
             becomes γ to that power.
         layer_norm: normalise each map's embedding, see `Encoder`.
         rate_factors: as `Algorithm` takes them.
-        policy_options: of `build_policy`, beside those above.
+        policy_options: of `make_policy`, beside those above.
         loss_options: of `LOSS`, beside `gamma`.
     """
 
@@ -69,7 +69,7 @@ class OffPolicy(Algorithm):
     ) -> None:
         device = torch.device(device)
         self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
-        self.policy = self.build_policy(
+        self.policy = self.make_policy(
             observation_spec,
             action_spec,
             keys,

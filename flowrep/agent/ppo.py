@@ -159,7 +159,7 @@ class PPO(Algorithm):
                 f"({rollout_length} steps of {num_envs} environments): raise rollout_length or "
                 "num_envs, or lower batch_size"
             )
-        self.policy = self.build_policy(
+        self.policy = self.make_policy(
             observation_spec,
             action_spec,
             keys,

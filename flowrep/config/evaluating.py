@@ -5,6 +5,7 @@ from typing import Annotated, Any
 from pydantic import model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+from flowrep.baselines.registry import BASELINES
 from flowrep.config.expectations import Count, CountOrZero, ListOf, Number, OneOf, Seed, Text
 from flowrep.config.representations import BY_SOURCE, Representations
 from flowrep.config.section import Section
@@ -18,7 +19,6 @@ from flowrep.config.training import (
     check_workers,
 )
 from flowrep.config.violations import ABSENT, broken_rule
-from flowrep.drivers.baselines import BASELINES
 from flowrep.exchange.policies import is_reference
 
 POLICIES = ("greedy", "sampled")

@@ -5,6 +5,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import ConfigDict, Field, model_validator
 
+from flowrep.baselines.registry import BASELINES
 from flowrep.config.algorithms import BY_TARGET, AnyAlgorithm
 from flowrep.config.expectations import (
     Count,
@@ -20,7 +21,6 @@ from flowrep.config.expectations import (
 from flowrep.config.representations import BY_SOURCE, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
-from flowrep.drivers.baselines import BASELINES
 from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
 from flowrep.scenes.scene import SpeedMode
 from flowrep.simulator.renderer import RENDERERS

@@ -4,17 +4,17 @@ from typing import Annotated
 
 from pydantic import Field
 
+from flowrep.baselines.registry import BASELINES
 from flowrep.config.expectations import Count, Number, OneOf, Seed, Switch, Text
 from flowrep.config.section import Section
 from flowrep.config.training import SceneSection, Speed
-from flowrep.drivers.baselines import BASELINES
 
 
 class ViewConfig(Section):
     """The whole config of a look at a scene."""
 
     scene: SceneSection = Field(examples=["straight_road"])
-    driver: Annotated[str, OneOf(tuple(BASELINES))]
+    policy: Annotated[str, OneOf(tuple(BASELINES))]
     speed: Speed
     frame_rate_hz: Annotated[float | None, Number(above=0, also=(None,))]
     path: Annotated[str | None, Text("the name of a path of the scene", also=(None,))]

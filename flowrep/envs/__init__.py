@@ -4,10 +4,10 @@ from flowrep.envs import availability as availability  # before all that it spea
 from flowrep.envs.make import (
     begin_step,
     get_states,
-    has_cores_beside,
+    has_spare_cores,
     make_env,
     set_states,
-    streets,
+    street_envs,
 )
 from flowrep.envs.outcome import Outcome
 from flowrep.envs.registration import register_environments
@@ -26,8 +26,8 @@ __all__ = [
     "WorkerVectorEnv",
     "begin_step",
     "get_states",
-    "has_cores_beside",
+    "has_spare_cores",
     "make_env",
     "set_states",
-    "streets",
+    "street_envs",
 ]

@@ -151,7 +151,7 @@ def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
         vector.step_async(env.base_env.read_action(acted[env.action_key]))
 
 
-def has_cores_beside(env: TransformedEnv, threads: int) -> bool:
+def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
     """Returns whether the env's workers and so many threads of the caller have a core each.
 
     Where they don't, two kinds of work at once are slower than one after the other: threads that
@@ -162,7 +162,7 @@ def has_cores_beside(env: TransformedEnv, threads: int) -> bool:
     return workers + threads <= available_cores()
 
 
-def streets(env: TransformedEnv) -> list[StreetEnv]:
+def street_envs(env: TransformedEnv) -> list[StreetEnv]:
     """Returns the streets of an env that `make_env` made, in the order of its batch.
 
     Raises:
@@ -192,7 +192,7 @@ def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None
     if isinstance(vector, WorkerVectorEnv):
         vector.call_each("set_state", states)
     else:
-        for street, state in zip(streets(env), states):
+        for street, state in zip(street_envs(env), states):
             street.set_state(state)
 
 

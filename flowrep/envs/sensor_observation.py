@@ -1,4 +1,4 @@
-"""The street's observation as `make_env` hands it on, with how the episode stands beside it."""
+"""The street's observation as `make_env` returns it: sensors, and the status of the episode."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,7 +13,7 @@ _OUTCOME_CODE = {outcome.label: outcome.value for outcome in Outcome}
 
 
 class SensorObservation(gym.Wrapper):
-    """Nests the observation under "sensor" and puts beside it how the episode stands.
+    """Nests the observation under "sensor" and adds the status of the episode.
 
     | key | shape | dtype | what |
     | --- | --- | --- | --- |
@@ -26,7 +26,7 @@ class SensorObservation(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         """Wraps a `StreetEnv`."""
         super().__init__(env)
-        beside: dict[str, spaces.Space] = {
+        status: dict[str, spaces.Space] = {
             "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
             "hit": spaces.Box(0, NOTHING_HIT, (1,), np.uint8),
             "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
@@ -34,7 +34,7 @@ class SensorObservation(gym.Wrapper):
         sensor = env.observation_space
         has_sensors = isinstance(sensor, spaces.Dict) and len(sensor.spaces) > 0
         self._names = ("sensor",) if has_sensors else ()
-        self.observation_space = spaces.Dict(dict.fromkeys(self._names, sensor) | beside)
+        self.observation_space = spaces.Dict(dict.fromkeys(self._names, sensor) | status)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -51,12 +51,14 @@ class SensorObservation(gym.Wrapper):
     def arrange(self, observation: dict[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
         """Returns the observation as this wrapper gives it."""
         code = _OUTCOME_CODE[info["outcome"]]
-        beside = standing([code], [info["hit"]], [info["episode_seed"]])
-        return dict.fromkeys(self._names, observation) | {k: v[0] for k, v in beside.items()}
+        status = episode_status([code], [info["hit"]], [info["episode_seed"]])
+        return dict.fromkeys(self._names, observation) | {k: v[0] for k, v in status.items()}
 
 
-def standing(codes: Sequence[int], hits: Sequence[str], seeds: Sequence[int]) -> dict[str, Any]:
-    """Returns what stands beside N observations, [N, 1] each: outcomes, hits, episodes' seeds."""
+def episode_status(
+    codes: Sequence[int], hits: Sequence[str], seeds: Sequence[int]
+) -> dict[str, Any]:
+    """Returns outcome, hit and episode seed of N episodes, `[N, 1]` each."""
     return {
         "outcome": np.array(codes, dtype=np.uint8)[:, None],
         "hit": np.array([hit_code(hit) for hit in hits], dtype=np.uint8)[:, None],

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.sensing import observe_together
-from flowrep.envs.sensor_observation import standing
+from flowrep.envs.sensor_observation import episode_status
 from flowrep.envs.worker_process import Order
 
 
@@ -88,7 +88,7 @@ class StreetVectorEnv(SyncVectorEnv):
         streets = [self._streets[row] for row in rows]
         episodes = [street.episode for street in streets]
         seen = observe_together([street.sensing for street in streets], episodes)
-        beside = standing(
+        status = episode_status(
             [episode.outcome for episode in episodes],
             [episode.hit for episode in episodes],
             [episode.seed for episode in episodes],
@@ -96,8 +96,8 @@ class StreetVectorEnv(SyncVectorEnv):
         if len(rows) < self.num_envs:
             # What was given away before is the caller's: it is copied, and stays as it is.
             seen = _replaced(self._latest.get("sensor", {}), seen, rows)
-            beside = _replaced(self._latest, beside, rows)
-        self._latest = ({"sensor": seen} if seen else {}) | beside
+            status = _replaced(self._latest, status, rows)
+        self._latest = ({"sensor": seen} if seen else {}) | status
         return dict(self._latest)
 
 

@@ -12,9 +12,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.worker_process import Order
+from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.evaluation import Episode
 from flowrep.experiment.eye import Eye
-from flowrep.experiment.street_pool import StreetPool
 from flowrep.scenes.scene import Scene
 
 _REWARD = {outcome.label: reward(outcome) for outcome in Outcome}
@@ -67,7 +67,7 @@ class Arena:
         scene: Scene,
         agents: Sequence[Agent],
         fps: Sequence[float],
-        make_pool: Callable[[Scene, Sequence[str]], StreetPool],
+        make_pool: Callable[[Scene, Sequence[str]], EnvPool],
     ) -> None:
         """Makes the pool."""
         self.agents = list(agents)

@@ -11,8 +11,8 @@ from rich.table import Table
 from tqdm.auto import tqdm
 
 from flowrep.experiment.arena import Arena, Job
+from flowrep.experiment.env_pool import Options
 from flowrep.experiment.evaluation import OUTCOMES, Episode, outcome_shares
-from flowrep.experiment.street_pool import Options
 
 Row = dict[str, Any]
 

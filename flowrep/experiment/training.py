@@ -18,7 +18,7 @@ from flowrep.agent import (
     save_checkpoint,
     threads_in_use,
 )
-from flowrep.envs import begin_step, get_states, has_cores_beside, set_states
+from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
 from flowrep.experiment.cadence import Every
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.origin import check_origin
@@ -43,21 +43,21 @@ class Training:
     run: RunFolder
     origin: Mapping[str, Any]
     frames: int = 0
-    owes_evaluation: bool = False
-    carried: TensorDictBase | None = None
+    evaluation_pending: bool = False
+    observation: TensorDictBase | None = None
     metrics: Means = field(default_factory=Means)
     recent: RecentEpisodes = field(default_factory=RecentEpisodes)
 
     def state(self) -> dict[str, Any]:
         """Returns all that the rest of the run depends on, as nested plain data and tensors."""
-        assert self.carried is not None
+        assert self.observation is not None
         return {
             "origin": self.origin,
             "frames": self.frames,
-            "owes_evaluation": self.owes_evaluation,
+            "evaluation_pending": self.evaluation_pending,
             "metrics": self.metrics.state(),
             "recent": self.recent.state(),
-            "carried": self.carried.to_dict(),
+            "observation": self.observation.to_dict(),
             "policy": dict(self.agent.policy.state_dict()),
             "agent": self.agent.state_dict(),
             "memory": self.agent.memory.state_dict(),
@@ -70,10 +70,12 @@ class Training:
         """Continues where `state` was taken."""
         self.env.reset()
         self.frames = state["frames"]
-        self.owes_evaluation = state["owes_evaluation"]
+        self.evaluation_pending = state["evaluation_pending"]
         self.metrics.restore(state["metrics"])
         self.recent.restore(state["recent"])
-        self.carried = TensorDict(state["carried"], self.env.batch_size, device=self.env.device)
+        self.observation = TensorDict(
+            state["observation"], self.env.batch_size, device=self.env.device
+        )
         self.agent.load_state_dict(state["agent"])
         self.agent.memory.load_state_dict(state["memory"])
         set_states(self.env, state["env"])
@@ -107,15 +109,15 @@ class Training:
         Raises:
             DivergenceError: there are no actions to draw: the policy's numbers are nan or infinite.
         """
-        assert self.carried is not None
+        assert self.observation is not None
         try:
             with torch.no_grad():
-                return self.agent.policy(self.carried)
+                return self.agent.policy(self.observation)
         except RuntimeError as error:
             self.check()  # an update may have seen it first, and says more
             if "probability tensor" not in str(error):
                 raise
-            maps = [key for key in self.agent.policy.in_keys if _is_bad(self.carried[key])]
+            maps = [key for key in self.agent.policy.in_keys if _is_bad(self.observation[key])]
             cause = f"{maps[0]!r} is not finite: lower its scale" if maps else "weights too large"
             raise self._diverged(
                 f"the policy gives actions no probabilities after {self.agent.updates} updates "
@@ -170,21 +172,21 @@ def train(
     should_save = Every(config["checkpoint_every_frames"], t.frames)
     total = config["total_frames"]
     is_on_gpu = t.agent.device.type == "cuda"
-    drives_meanwhile = is_on_gpu or has_cores_beside(t.env, threads_in_use())
-    if t.carried is None:
-        t.carried = t.env.reset()
-    if t.owes_evaluation:
+    steps_meanwhile = is_on_gpu or has_spare_cores(t.env, threads_in_use())
+    if t.observation is None:
+        t.observation = t.env.reset()
+    if t.evaluation_pending:
         with clock("evaluation"):
-            t.owes_evaluation = evaluate(t.frames)
+            t.evaluation_pending = evaluate(t.frames)
     with tqdm(total=total, initial=t.frames, unit="frame", unit_scale=True, mininterval=0.5) as bar:
         while t.frames < total and not stop:
             with clock("policy"):
                 acted = t.act()
-            if drives_meanwhile:
+            if steps_meanwhile:
                 begin_step(t.env, acted)
             learn(t, clock)
             with clock("environment"):
-                stepped, t.carried = t.env.step_and_maybe_reset(acted)
+                stepped, t.observation = t.env.step_and_maybe_reset(acted)
             with clock("memory"):
                 t.agent.remember(stepped)
             t.frames += stepped.numel()
@@ -199,7 +201,7 @@ def train(
                 bar.set_postfix_str(progress_text(row))
             if should_evaluate(t.frames):
                 with clock("evaluation"):
-                    t.owes_evaluation = evaluate(t.frames)
+                    t.evaluation_pending = evaluate(t.frames)
             if should_save(t.frames):
                 with clock("checkpoint"):
                     t.save()

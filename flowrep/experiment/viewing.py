@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.drivers.baselines import Driver
+from flowrep.baselines.registry import Baseline
 from flowrep.envs.street_env import StreetEnv
 from flowrep.palette import CATEGORY_ID
 
@@ -40,7 +40,7 @@ class Viewed:
 
 def view_episode(
     env: StreetEnv,
-    driver: Driver,
+    baseline: Baseline,
     *,
     look: Look | None = None,
     seed: int | None = None,
@@ -50,7 +50,7 @@ def view_episode(
 
     Args:
         env: the street.
-        driver: chooses the actions.
+        baseline: chooses the actions.
         look: is given every observation, that of the reset first.
         seed: as of `StreetEnv.reset`; None goes on in the env's own episodes.
         path: one of the scene's, drawn if None.
@@ -60,7 +60,7 @@ def view_episode(
     if look is not None:
         look(observation)
     while not ended:
-        observation, reward, ended, _, info = env.step(driver(env))
+        observation, reward, ended, _, info = env.step(baseline(env))
         total += reward
         points.append(env.episode.now.vehicle[:2])
         if look is not None:

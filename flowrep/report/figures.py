@@ -95,9 +95,9 @@ def _whisker(axes: Axes, at: float, width: float, score: Score, theme: Theme) ->
     )  # fmt: skip
     if len(score.of_seeds) > 1:
         dots = [100 * share for share in score.of_seeds]
-        beside = [at + 0.24 * width] * len(dots)
+        offset = [at + 0.24 * width] * len(dots)
         ring: Any = {"facecolor": theme.ground, "edgecolor": theme.text, "linewidth": 0.5}
-        axes.scatter(beside, dots, s=5, zorder=4, **ring)
+        axes.scatter(offset, dots, s=5, zorder=4, **ring)
 
 
 def _bar_handles(series: Sequence[str], baselines: set[str], theme: Theme) -> list[Any]:

@@ -13,7 +13,7 @@ from flowrep.scenes.ground_checks import check_extent, check_paths
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.plain_data import PlainDataError, read_yaml, shortened
 from flowrep.scenes.scene import Scene
-from flowrep.scenes.schema import SceneError, build_scene
+from flowrep.scenes.schema import SceneError, scene_from_data
 from flowrep.scenes.walk_checks import check_walks
 
 
@@ -31,7 +31,7 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
     200
     """
     data, source = _data(scene)
-    loaded = build_scene(data, source=source)
+    loaded = scene_from_data(data, source=source)
     check_consistency(loaded, source)
     try:
         check_extent(loaded, source)

@@ -25,7 +25,7 @@ def _adapter() -> TypeAdapter[Scene]:
     return TypeAdapter(Scene)
 
 
-def build_scene(data: Any, *, source: str) -> Scene:
+def scene_from_data(data: Any, *, source: str) -> Scene:
     """Returns a scene from a mapping whose keys are exactly a scene's.
 
     Args:

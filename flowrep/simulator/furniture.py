@@ -29,8 +29,8 @@ def house(box: Box, *, both_sides: bool = False) -> Mesh:
     With `both_sides` there is a front to its left too. No one looks at its roof.
     """
     length, width, height = box.size_m
-    windows, beside = front(box.variant), upper_storeys(box.variant)
-    sides = (windows, beside, windows if both_sides else None, beside)
+    windows, side = front(box.variant), upper_storeys(box.variant)
+    sides = (windows, side, windows if both_sides else None, side)
     mesh = Mesh()
     mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
     return mesh

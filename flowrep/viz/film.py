@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from flowrep.envs import streets
+from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import OUTCOMES, Policy
 from flowrep.geometry import factorize, rigid_flow
 from flowrep.viz.maps import representation_strip, write_video
@@ -25,7 +25,7 @@ def film_episode(env: EnvBase, policy: Policy) -> tuple[list[Maps], str]:
         env: of one street, with all sensors and rgb kept.
         policy: writes `action`.
     """
-    intrinsics = torch.as_tensor(streets(env)[0].K)
+    intrinsics = torch.as_tensor(street_envs(env)[0].K)
     tensordict = env.reset()
     frames = [maps_of(tensordict["sensor"][0].cpu(), intrinsics)]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -77,7 +77,7 @@ def record_episode(
     env = make_env(representations=seen, keep_sensor=True, num_envs=1, num_workers=0)
     env.set_seed(seed)
     frames, outcome = film_episode(env, policy)
-    fps = streets(env)[0].frame_rate_hz
+    fps = street_envs(env)[0].frame_rate_hz
     env.close()
     write_video(path, [representation_strip(maps) for maps in frames], fps=fps)
     return outcome

@@ -161,7 +161,7 @@ def test_a_policy_is_built_and_loaded_without_its_learner(
     save_checkpoint(tmp_path / "c", {"policy": dict(agent.policy.state_dict())})
     options = make_any.options | {"total_frames": 1000}
     options |= {name: value for name, value in changes.items() if name in options}
-    policy = type(agent).build_policy(
+    policy = type(agent).make_policy(
         observation_spec[:1], Categorical(3), ["flow", "seg"], device="cpu", **options
     )
     maps = random_maps(20)

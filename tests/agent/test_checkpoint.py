@@ -105,7 +105,7 @@ def document(state):
 
     def damage(path):
         checksum = str(zlib.crc32(state.encode()))
-        metadata = {"format": "flowrep checkpoint 4", "state": state, "state_crc32": checksum}
+        metadata = {"format": "flowrep checkpoint 5", "state": state, "state_crc32": checksum}
         save_file({"a": torch.ones(2)}, path, metadata=metadata)
 
     return damage

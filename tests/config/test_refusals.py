@@ -310,7 +310,7 @@ def test_an_evaluation_takes_one_value_or_a_list(line):
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("driver=pilot", "driver should be planner, never_turn or random, not 'pilot'"),
+        ("policy=pilot", "policy should be planner, never_turn or random, not 'pilot'"),
         ("speed=fast", "speed should be low, normal or high, not 'fast'"),
         ("episodes=0", "episodes should be a positive whole number, not 0"),
         ("sheet_rows=true", "sheet_rows should be a positive whole number, not true"),

@@ -12,10 +12,10 @@ from flowrep.envs import (
     Outcome,
     begin_step,
     get_states,
-    has_cores_beside,
+    has_spare_cores,
     make_env,
     set_states,
-    streets,
+    street_envs,
 )
 from flowrep.palette import CATEGORY_ID
 
@@ -95,9 +95,12 @@ def test_the_tensordict_has_the_representations_and_no_sensor(make):
 
 
 def test_only_what_is_read_is_rendered(make):
-    assert streets(make(representations=()))[0].sensing.names == ()
-    assert streets(make(representations=["seg"]))[0].sensing.names == ("semantic",)
-    assert streets(make(representations=["ego"]))[0].sensing.names == ("depth", "prev_from_curr")
+    assert street_envs(make(representations=()))[0].sensing.names == ()
+    assert street_envs(make(representations=["seg"]))[0].sensing.names == ("semantic",)
+    assert street_envs(make(representations=["ego"]))[0].sensing.names == (
+        "depth",
+        "prev_from_curr",
+    )
 
 
 def test_options_of_a_representation_reach_its_transform(make):
@@ -187,7 +190,7 @@ def test_a_street_on_cuda_is_the_street_on_the_cpu(make, num_workers):
 )
 def test_whether_cores_are_left_for_the_caller(make, monkeypatch, num_workers, threads, fits):
     monkeypatch.setattr("flowrep.envs.make.available_cores", lambda: 4)
-    assert has_cores_beside(make(num_envs=2, num_workers=num_workers), threads) == fits
+    assert has_spare_cores(make(num_envs=2, num_workers=num_workers), threads) == fits
 
 
 def test_states_pass_between_workers_and_one_process(make):
@@ -213,7 +216,7 @@ def test_states_of_another_number_of_streets_are_refused(make):
 
 def test_streets_in_workers_are_out_of_reach(make):
     with pytest.raises(ValueError, match="num_workers=0"):
-        streets(make(num_envs=2, num_workers=2))
+        street_envs(make(num_envs=2, num_workers=2))
 
 
 def test_which_episodes_come_does_not_depend_on_the_policy(make):

@@ -28,14 +28,14 @@ def test_every_transition_with_a_successor_is_sampled(straight_road, stack, driv
     keys = list(STACKS[stack])
     codecs = map_codecs(env.observation_spec, keys, torch.float32)
     replay = ReplayMemory(codecs, capacity=200, batch_size=2000, device="cpu")
-    carried = env.reset()
+    observation = env.reset()
     torch.manual_seed(0)
     expected = 0
     for number in range(STEPS):
-        carried["action"] = torch.zeros(STREETS, dtype=torch.long)
+        observation["action"] = torch.zeros(STREETS, dtype=torch.long)
         if drive == "random":
-            carried["action"] = torch.randint(3, (STREETS,))
-        stepped, carried = env.step_and_maybe_reset(carried)
+            observation["action"] = torch.randint(3, (STREETS,))
+        stepped, observation = env.step_and_maybe_reset(observation)
         # what tells transitions apart in the sample
         stepped["next", "reward"] = number * STREETS + torch.arange(STREETS).float()[:, None]
         replay.extend(stepped)

@@ -30,7 +30,7 @@ def build(algorithm):
     if algorithm is DoubleDQN:
         options |= {"total_frames": 9, "final_epsilon": 0.0, "initial_epsilon": 0.0}
         options |= {"exploration_share": 0.5, "layer_norm": True}
-    return algorithm.build_policy(SPEC, Categorical(3, (1,)), KEYS, **options)
+    return algorithm.make_policy(SPEC, Categorical(3, (1,)), KEYS, **options)
 
 
 def network_of(policy):

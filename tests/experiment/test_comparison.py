@@ -14,9 +14,9 @@ from flowrep.agent.policy import stochastic_policy
 from flowrep.envs import make_env
 from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.comparison import Comparison, print_table, with_origin
+from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.eye import Eye
 from flowrep.experiment.run_folder import EVALUATION_COLUMNS
-from flowrep.experiment.street_pool import StreetPool
 from flowrep.scenes import load_scene
 from tests.test_configs import composed
 
@@ -65,7 +65,7 @@ def rows_of(scene, agents, num_envs=3, num_workers=0, **asked):
         "episodes": 4,
     } | asked
     comparison = Comparison(**asked, agents=len(agents))
-    make_pool = partial(StreetPool, num_envs=num_envs, num_workers=num_workers)
+    make_pool = partial(EnvPool, num_envs=num_envs, num_workers=num_workers)
     arena = Arena(scene, agents, asked["fps"], make_pool)
     comparison.run(arena)
     arena.pool.close()
@@ -143,7 +143,7 @@ def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
     comparison = Comparison(
         speeds=["low"], fps=[12], episodes=6, seed=5, policies=["greedy"], baselines=["random"]
     )
-    arena = Arena(scene, [agent("obj")], [12], partial(StreetPool, num_envs=6))
+    arena = Arena(scene, [agent("obj")], [12], partial(EnvPool, num_envs=6))
     done = []
     comparison.run(arena, lambda: done.append(1) or len(done) == 3)
     arena.pool.close()
@@ -162,7 +162,7 @@ def test_an_eye_sees_what_the_env_shows(scene, flow):
     env = make_env(scene, names, seed=3, flow=flow)
     tensordict = env.reset()
     eye = Eye(scene, names, flow, 12.0)
-    pool = StreetPool(scene, eye.sensors, num_envs=2)
+    pool = EnvPool(scene, eye.sensors, num_envs=2)
     order = {"episode_seed": int(tensordict["episode_seed"]), "speed": "normal"}
     for step in range(5):
         seen, _ = pool.advance([None, order])

@@ -12,7 +12,7 @@ from flowrep.config_tree import group_choices
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.training import train
-from flowrep.train import build
+from flowrep.train import make_training
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow
@@ -40,7 +40,7 @@ def test_every_algorithm_has_its_section():
 @pytest.mark.parametrize("algorithm", group_choices("algorithm"))
 def test_a_smoke_run_logs_what_is_explained(tmp_path, algorithm):
     config = composed("debug=smoke", f"algorithm={algorithm}", "device=cpu")
-    training = build(config, RunFolder(tmp_path))
+    training = make_training(config, RunFolder(tmp_path))
     train(training, config, StopRequest(), lambda frames: False)
     training.env.close()
     with training.run.metrics_path.open(newline="") as file:

@@ -14,7 +14,7 @@ from flowrep.config_tree import group_choices
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.training import Training, train
-from flowrep.train import build
+from flowrep.train import make_training
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow
@@ -30,7 +30,7 @@ def new_run(folder, *, resume=False, algorithm="dsac", num_workers=0) -> tuple[T
         "device=cpu", "seed=7", f"algorithm={algorithm}", f"num_workers={num_workers}", *small,
     )  # fmt: skip
     config["resume"] = str(folder) if resume else None
-    return build(config, RunFolder(folder)), config
+    return make_training(config, RunFolder(folder)), config
 
 
 class StopAfter(StopRequest):
@@ -213,7 +213,7 @@ def test_a_policy_that_can_draw_no_action_ends_the_run_by_name(tmp_path, change,
         "evaluation.every_frames=0", "representations=[ego]", "algorithm.batch_size=8",
         "algorithm.frames_per_update=2", "num_workers=0", change,
     )  # fmt: skip
-    training = build(config | {"resume": None}, RunFolder(tmp_path))
+    training = make_training(config | {"resume": None}, RunFolder(tmp_path))
     with pytest.raises(DivergenceError, match=rf"({what}).*none was saved yet"):
         train(training, config, StopRequest(), lambda frames: False)
     assert training.frames < 400  # before the first look at the losses

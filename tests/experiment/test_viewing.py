@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("pybullet", reason="the simulated street is driven")
 
-from flowrep.drivers import drives, never_turn
+from flowrep.baselines import drives, never_turn
 from flowrep.envs import StreetEnv
 from flowrep.experiment.viewing import CategoryCount, view_episode
 

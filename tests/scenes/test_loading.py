@@ -9,7 +9,7 @@ import pytest
 import shapely
 import yaml
 
-from flowrep.drivers import Planner, drives
+from flowrep.baselines import Planner, drives
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
 

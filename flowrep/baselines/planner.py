@@ -1,4 +1,4 @@
-"""A privileged driver: sees every pose, knows where everyone will walk, and searches ahead.
+"""A privileged baseline: sees every pose, knows where everyone will walk, and searches ahead.
 
 It is the upper bound that a scene is measured by, not an agent: it plays the episode's own
 clockwork forward, from the present to the ending zone, and keeps a broad beam of drives that

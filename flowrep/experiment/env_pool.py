@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector.utils import create_empty_array
 
-from flowrep.drivers.baselines import BASELINES, Drive, Driver, drive_episode
+from flowrep.baselines.registry import BASELINES, Baseline, Drive, drive_episode
 from flowrep.envs.sensor_observation import SensorObservation
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.street_vector import StreetVectorEnv
@@ -19,7 +19,7 @@ Options = dict[str, Any]
 """What `StreetEnv.reset` takes to begin an episode: `episode_seed`, `speed`, `frame_rate_hz`."""
 
 
-class StreetPool:
+class EnvPool:
     """Streets of one scene, in this process or in others; an episode is the same in each of them.
 
     Args:
@@ -86,7 +86,7 @@ def _street(scene: Scene, sensors: tuple[str, ...], renderer: str) -> SensorObse
 
 
 @cache
-def _driver(name: str) -> Driver:
+def _baseline(name: str) -> Baseline:
     """One of each in a process: the planner remembers the ways through a scene."""
     return BASELINES[name]()
 
@@ -94,4 +94,4 @@ def _driver(name: str) -> Driver:
 def _drive(env: gym.Env, job: tuple[str, Options]) -> Drive:
     name, options = job
     street: Any = env.unwrapped
-    return drive_episode(street, _driver(name), options)
+    return drive_episode(street, _baseline(name), options)

@@ -1,4 +1,4 @@
-"""Drivers that learn nothing, which any agent is measured beside."""
+"""Baselines to compare an agent with: policies that learn nothing and see the street itself."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -6,24 +6,25 @@ from typing import Any
 
 import numpy as np
 
-from flowrep.drivers.planner import Planner
+from flowrep.baselines.planner import Planner
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.street_env import StreetEnv
 from flowrep.scenes.vehicle import NO_OP
 
-Driver = Callable[[StreetEnv], int]
+Baseline = Callable[[StreetEnv], int]
+"""Returns the next action; may read the whole state of the street."""
 
 
 def never_turn(env: StreetEnv) -> int:
-    """Returns NO_OP: drives on as at the start."""
+    """Returns NO_OP: drives straight on."""
     return NO_OP
 
 
-class RandomDriver:
-    """Returns actions drawn evenly; in an episode always the same, whichever came before."""
+class RandomActions:
+    """Draws actions uniformly; an episode gets the same ones whichever episodes came before it."""
 
     def __init__(self, seed: int = 0) -> None:
-        """Takes the seed that sets it apart from other random drivers."""
+        """Takes a seed that sets it apart from other instances."""
         self._seed = seed
         self._rng = np.random.default_rng(seed)
 
@@ -45,24 +46,24 @@ class Drive:
     steps: int
 
 
-def drive_episode(env: StreetEnv, driver: Driver, options: dict[str, Any]) -> Drive:
-    """Returns an episode, driven to its end without anything being looked at.
+def drive_episode(env: StreetEnv, baseline: Baseline, options: dict[str, Any]) -> Drive:
+    """Drives one episode to its end without rendering, and returns it.
 
     Args:
         env: the street.
-        driver: chooses the actions.
-        options: of `StreetEnv.reset`, which name the episode.
+        baseline: chooses the actions.
+        options: of `StreetEnv.reset`, which choose the episode.
     """
     env.begin(options=options)
-    return _drive_on(env, driver)
+    return _drive_on(env, baseline)
 
 
 def drives(
-    env: StreetEnv, driver: Driver, episodes: int, *, seed: int | None = None
+    env: StreetEnv, baseline: Baseline, episodes: int, *, seed: int | None = None
 ) -> Iterator[Drive]:
-    """Yields finished episodes, the same ones for every driver; `seed` None goes on in the env's.
+    """Yields finished episodes, the same ones for every baseline; nothing is rendered.
 
-    Nothing is looked at.
+    With `seed` None the env's own sequence of episodes goes on.
 
     >>> env = StreetEnv("straight_road", sensors=())
     >>> [drive.outcome in ("success", "collision") for drive in drives(env, never_turn, 2, seed=0)]
@@ -70,20 +71,20 @@ def drives(
     """
     for number in range(episodes):
         env.begin(seed=seed if number == 0 else None)
-        yield _drive_on(env, driver)
+        yield _drive_on(env, baseline)
 
 
-def _drive_on(env: StreetEnv, driver: Driver) -> Drive:
+def _drive_on(env: StreetEnv, baseline: Baseline) -> Drive:
     total, outcome = 0.0, Outcome.RUNNING
     while not outcome:
-        outcome = env.drive(driver(env))
+        outcome = env.drive(baseline(env))
         total += reward(outcome)
     episode = env.episode
     return Drive(episode.seed, outcome.label, episode.hit, total, episode.steps)
 
 
-BASELINES: dict[str, Callable[[], Driver]] = {
+BASELINES: dict[str, Callable[[], Baseline]] = {
     "planner": Planner,
     "never_turn": lambda: never_turn,
-    "random": RandomDriver,
+    "random": RandomActions,
 }

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from flowrep.drivers import Planner, RandomDriver, drives, never_turn
+from flowrep.baselines import Planner, RandomActions, drives, never_turn
 from flowrep.scenes.goal_distance import GoalDistance
 
 
@@ -21,15 +21,15 @@ def test_habit_and_chance_seldom_arrive(make_street, speed):
     straight = [drive.outcome for drive in drives(env, never_turn, 60, seed=0)]
     assert straight.count("success") <= 15
     assert set(straight) <= {"success", "collision"}
-    by_chance = [drive.outcome for drive in drives(env, RandomDriver(0), 60, seed=0)]
+    by_chance = [drive.outcome for drive in drives(env, RandomActions(0), 60, seed=0)]
     assert by_chance.count("success") <= 6
 
 
-def test_all_drivers_are_given_the_same_episodes(make_street):
+def test_all_baselines_are_given_the_same_episodes(make_street):
     env = make_street(sensors=())
     seeds = [
-        [drive.episode_seed for drive in drives(env, driver, 4, seed=3)]
-        for driver in (never_turn, RandomDriver(1))
+        [drive.episode_seed for drive in drives(env, baseline, 4, seed=3)]
+        for baseline in (never_turn, RandomActions(1))
     ]
     assert seeds[0] == seeds[1]
     assert len(set(seeds[0])) == 4

@@ -11,7 +11,7 @@ import pytest
 import shapely
 from gymnasium.utils.env_checker import check_env
 
-from flowrep.drivers import Planner, RandomDriver, drives, never_turn
+from flowrep.baselines import Planner, RandomActions, drives, never_turn
 from flowrep.envs.episode import Moment
 from flowrep.envs.registration import SCENE_BY_ID
 from flowrep.palette import CATEGORY_ID
@@ -197,7 +197,7 @@ def test_the_planner_arrives_and_habit_and_chance_do_not(make_street, name, spee
     # A bend ahead: straight on leads off the road or into somebody.
     straight = [drive.outcome for drive in drives(env, never_turn, 20, seed=0)]
     assert straight.count("success") == 0
-    by_chance = [drive.outcome for drive in drives(env, RandomDriver(0), 20, seed=0)]
+    by_chance = [drive.outcome for drive in drives(env, RandomActions(0), 20, seed=0)]
     assert by_chance.count("success") == 0
 
 

@@ -15,7 +15,7 @@ from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.violations import closest
 from flowrep.envs import make_env
 from flowrep.envs.workers import available_cores
-from flowrep.experiment.street_pool import StreetPool
+from flowrep.experiment.env_pool import EnvPool
 from flowrep.scenes import Scene
 
 Config = Mapping[str, Any]
@@ -58,7 +58,7 @@ def choose_workers(num_workers: Any, num_envs: int) -> int:
     return num_workers
 
 
-def build_env(config: Config, **changes: Any) -> EnvBase:
+def env_from_config(config: Config, **changes: Any) -> EnvBase:
     """Returns the env that the config describes; `changes` go to `make_env` in its place.
 
     Each observation says whether an episode begins with it, `is_init`, as the replay memory asks.
@@ -79,11 +79,13 @@ def build_env(config: Config, **changes: Any) -> EnvBase:
     return env.append_transform(InitTracker())
 
 
-def build_pool(config: Config, num_envs: int, scene: Scene, sensors: Sequence[str]) -> StreetPool:
-    """Returns streets for episodes to be evaluated in, no more than `num_envs`."""
+def pool_from_config(
+    config: Config, num_envs: int, scene: Scene, sensors: Sequence[str]
+) -> EnvPool:
+    """Returns environments for evaluation, at most `num_envs`."""
     num_envs = min(num_envs, config["num_envs"])
     workers = choose_workers(config["num_workers"], config["num_envs"])
-    return StreetPool(
+    return EnvPool(
         scene,
         sensors,
         num_envs=num_envs,
@@ -92,7 +94,7 @@ def build_pool(config: Config, num_envs: int, scene: Scene, sensors: Sequence[st
     )
 
 
-def build_agent(config: Config, env: EnvBase, trust: str | None = None) -> Algorithm:
+def agent_from_config(config: Config, env: EnvBase, trust: str | None = None) -> Algorithm:
     """Returns the config's algorithm, untrained, on what the env emits.
 
     Args:
@@ -104,10 +106,10 @@ def build_agent(config: Config, env: EnvBase, trust: str | None = None) -> Algor
     return algorithm_class(config["algorithm"], trust)(*arguments, **options)
 
 
-def build_policy(config: Config, env: EnvBase, trust: str | None = None) -> Any:
-    """Returns the acting side of the config's algorithm alone, untrained; see `build_agent`."""
+def policy_from_config(config: Config, env: EnvBase, trust: str | None = None) -> Any:
+    """Returns the untrained policy of the config's algorithm alone; see `agent_from_config`."""
     arguments, options = _arguments(config, env)
-    return algorithm_class(config["algorithm"], trust).build_policy(*arguments, **options)
+    return algorithm_class(config["algorithm"], trust).make_policy(*arguments, **options)
 
 
 def algorithm_class(section: Mapping[str, Any], trust: str | None) -> Any:
