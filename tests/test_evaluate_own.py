@@ -2,6 +2,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import pytest
 
@@ -54,6 +55,18 @@ def test_the_documented_example_steers_and_is_filmed(tmp_path):
     assert len(mine) == 4
     assert mine != episodes(rows, "never_turn")
     assert [path.name for path in (tmp_path / "videos").iterdir()] == ["normal_12fps_0.mp4"]
+
+
+def test_an_agent_of_stable_baselines3_drives(tmp_path, monkeypatch):
+    pytest.importorskip("stable_baselines3", reason="the agent is Stable-Baselines3's")
+    from examples.stable_baselines3_ppo import train
+
+    name = f"{Path('examples/stable_baselines3_ppo.py').resolve()}:make"
+    monkeypatch.chdir(tmp_path)
+    train(8, num_envs=2, rollout_length=4).save("ppo_street")
+    given = ["representations=[ego,obj]", "episodes=2", "baselines=[]"]
+    rows = own(name, tmp_path / "out", *given)
+    assert len(episodes(rows, name)) == 2
 
 
 def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
