@@ -74,7 +74,6 @@ def run(config: DictConfig) -> float:
         The final evaluation's share of greedy episodes that succeed, over all its speeds and frame
         rates: what a sweeper such as Optuna maximises.
     """
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces each storage it makes
     try:
         plain = plain_config(config)
         validated(TrainConfig, plain, own_keys())
@@ -97,6 +96,7 @@ def run(config: DictConfig) -> float:
 
 def carry_out(config: Config, folder: RunFolder) -> float:
     """Does what is left to do of a run: training, evaluation, video; returns its success."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces each storage it makes
     try:
         training = make_training(config, folder)
         folder.log_to_wandb(config["wandb"], config)

@@ -8,8 +8,9 @@ from typing import Any
 class StopRequest:
     """Turns SIGINT and SIGTERM into a question that the loop asks between two steps.
 
-    The first signal sets `received`; a second one ends the process at once, as it would have
-    without this. Use it as a context manager: the previous handlers come back at its end.
+    The first signal sets `received`. Ctrl-C after it ends the process at once, as it would have
+    without this; SIGTERM doesn't, since schedulers send it to each process of a job and more than
+    once. Use it as a context manager: the previous handlers come back at its end.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -39,6 +40,5 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _receive(self, number: int, _: FrameType | None) -> None:
-        self.received = signal.Signals(number)
-        for each, handler in self._previous.items():
-            signal.signal(each, handler)
+        self.received = self.received or signal.Signals(number)
+        signal.signal(signal.SIGINT, self._previous[signal.SIGINT])

@@ -32,6 +32,15 @@ def test_a_second_ctrl_c_ends_at_once(ctrl_c_raises):
             os.kill(os.getpid(), signal.SIGINT)
 
 
+def test_a_second_sigterm_changes_nothing_and_ctrl_c_after_it_ends_at_once(ctrl_c_raises):
+    with StopRequest() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.exit_code == 143
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
 def test_the_previous_handlers_come_back():
     before = signal.getsignal(signal.SIGTERM)
     with StopRequest():
