@@ -175,7 +175,7 @@ def make_training(config: Config, folder: RunFolder) -> Training:
     keep_freed_memory()
     share_cores(config)
     torch.manual_seed(config["seed"])
-    env = env_from_config(config)
+    env = env_from_config(config, compiled=config["compiled"])
     env.set_seed(config["seed"] * config["num_envs"])
     is_new = config["resume"] is None
     # of a new run the person who typed the command named the class

@@ -61,6 +61,7 @@ class TrainConfig(Section):
     total_frames: Count
     num_envs: Count
     num_workers: Workers
+    compiled: Switch
     renderer: Annotated[str, OneOf(RENDERERS)]
     log_every_frames: Count
     checkpoint_every_frames: Count

@@ -62,6 +62,7 @@ def make_env(
     seed: int | None = None,
     keep_sensor: bool = False,
     flow: str | Mapping[str, Any] = "exact",
+    compiled: bool = False,
     renderer: str = "auto",
 ) -> TransformedEnv:
     """Returns a TorchRL env of streets stepped side by side, always of batch size [num_envs].
@@ -84,11 +85,14 @@ def make_env(
         keep_sensor: whether all ("sensor", ...) keys stay beside the representations.
         flow: "exact" or "estimated", where raw and obj come from; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
+        compiled: whether flow is computed through `torch.compile`: some eight times as fast on a
+            CPU, equal up to rounding, after up to a minute of compiling.
         renderer: who draws depth, classes and ids, see `StreetEnv`.
 
     Raises:
         SceneError: the scene can't be.
-        ValueError: there are no streets, or more workers than streets.
+        ValueError: there are no streets, or more workers than streets; `compiled=True` without a
+            C++ compiler.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -118,6 +122,7 @@ def make_env(
             intrinsics=torch.from_numpy(probe.K),
             num_classes=probe.num_classes,
             dt_s=1.0 / probe.frame_rate_hz,
+            compiled=compiled,
             flow=flow,
         )
     probe.close()

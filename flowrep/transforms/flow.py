@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
@@ -71,6 +74,10 @@ class FlowTransform(CameraTransform):
         compiled: whether `compute` runs through `torch.compile`.
         in_keys: as in `MapTransform`.
         out_keys: one key an output.
+
+    Raises:
+        ValueError: for a number of keys, a unit or a `dt_s` that does not fit, and for
+            `compiled=True` on a machine without a C++ compiler.
     """
 
     def __init__(
@@ -99,6 +106,8 @@ class FlowTransform(CameraTransform):
         scales = _per_output("scale", scale, flows)
         units = _per_output("unit", unit, flows)
         self.factors = {name: _factor(scales[name], units[name], dt_s) for name in flows}
+        if compiled:
+            _check_compiler()
         self.compiled = bool(compiled)
 
     def _with_camera(self, maps: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
@@ -178,3 +187,13 @@ def as_intrinsics(intrinsics: Intrinsics) -> Tensor:
             f"{list(K.shape)}"
         )
     return K
+
+
+def _check_compiler() -> None:
+    """Raises ValueError if the C++ compiler that `torch.compile` calls is not installed."""
+    compiler = os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++")
+    if sys.platform != "win32" and shutil.which(compiler) is None:
+        raise ValueError(
+            f"compiled=True needs a C++ compiler, and {compiler} is not on PATH: install it, name "
+            "another one in the environment variable CXX, or set compiled=False"
+        )

@@ -41,8 +41,9 @@ class FlowFactorize(FlowTransform):
         scale: factor on the flows, or a mapping from output to factor.
         unit: `"px_per_step"` or `"px_per_s"`, or a mapping from output to unit.
         dt_s: seconds a step lasts; needed for `"px_per_s"` alone.
-        compiled: whether `compute` runs through `torch.compile`: ten times as fast on a CPU, after
-            some seconds of compilation in each process.
+        compiled: whether `compute` runs through `torch.compile`: some eight times as fast on a
+            CPU, equal up to rounding; compiling takes up to a minute, later processes find the
+            result in torch's cache.
         in_keys: raw flow (in px/step, unscaled), depth, camera motion; without the first for ego
             alone.
         out_keys: one key an output; their names by default.

@@ -42,8 +42,9 @@ class RawFlow(FlowTransform):
         scale: factor on the flow.
         unit: `"px_per_step"` or `"px_per_s"`.
         dt_s: seconds a step lasts; needed for `"px_per_s"` alone.
-        compiled: whether `compute` runs through `torch.compile`: ten times as fast on a CPU, after
-            some seconds of compilation in each process.
+        compiled: whether `compute` runs through `torch.compile`: some eight times as fast on a
+            CPU, equal up to rounding; compiling takes up to a minute, later processes find the
+            result in torch's cache.
         invalid: value, before scaling, where flow isn't known (depth `nan`, or a point behind the
             previous camera).
         in_keys: depth, instance ids, motion an instance.
@@ -102,7 +103,8 @@ class RawFlow(FlowTransform):
         motions, depth, K = self._at_one_precision(motions, depth=depth, K=K)
         flow, valid = geometry.rigid_flow(depth, instance, K, motions)
         if self.invalid != 0.0:
-            flow = torch.where(valid, flow, self.invalid)
+            # Read as bytes: inductor's CPU code fails to compile a `where` on a bool view.
+            flow = torch.where(valid.view(torch.uint8) != 0, flow, self.invalid)
         return tuple(
             valid if name == "valid" else self._in_unit(name, flow) for name in self.outputs
         )

@@ -97,7 +97,7 @@ def representation_stack(
             estimated raw flow.
         num_classes: number of semantic classes; seg and seg2 need it.
         dt_s: seconds a step lasts; flow in `px_per_s` needs it.
-        compiled: whether flow is computed through `torch.compile`.
+        compiled: whether flow is computed through `torch.compile`, see `RawFlow`.
         flow: where raw flow, and with it obj, comes from: `"exact"` (`RawFlow`), `"estimated"`
             (`EstimatedFlow`, from `("sensor", "rgb")`), or a mapping with one of them as
             `source` and `EstimatedFlow`'s own options beside it. Ego flow is exact either way:

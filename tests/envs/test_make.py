@@ -1,5 +1,6 @@
 """The TorchRL env: its specs, partial resets, the same episodes in one process and in two."""
 
+import shutil
 from functools import partial
 
 import pytest
@@ -18,6 +19,7 @@ from flowrep.envs import (
     street_envs,
 )
 from flowrep.palette import CATEGORY_ID
+from flowrep.transforms import FlowFactorize, RawFlow
 
 
 @pytest.fixture
@@ -101,6 +103,14 @@ def test_only_what_is_read_is_rendered(make):
         "depth",
         "prev_from_curr",
     )
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_flow_is_compiled_where_that_is_asked_for(make, monkeypatch, compiled):
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    env = make(representations=["obj", "seg"], compiled=compiled)
+    flows = [t.compiled for t in env.transform if isinstance(t, RawFlow | FlowFactorize)]
+    assert flows == [compiled, compiled]
 
 
 def test_options_of_a_representation_reach_its_transform(make):

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import shutil
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.training import Training, train
 from flowrep.train import make_training
+from flowrep.transforms import FlowFactorize, RawFlow
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow
@@ -31,6 +33,16 @@ def new_run(folder, *, resume=False, algorithm="dsac", num_workers=0) -> tuple[T
     )  # fmt: skip
     config["resume"] = str(folder) if resume else None
     return make_training(config, RunFolder(folder)), config
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_flow_is_compiled_where_the_config_says_so(tmp_path, monkeypatch, compiled):
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    config = composed("debug=smoke", "device=cpu", "num_workers=0", f"compiled={compiled}")
+    training = make_training(config, RunFolder(tmp_path))
+    flows = [t.compiled for t in training.env.transform if isinstance(t, RawFlow | FlowFactorize)]
+    training.env.close()
+    assert flows == [compiled, compiled]
 
 
 class StopAfter(StopRequest):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import pickle
+import shutil
+import sys
 
 import pytest
 import torch
@@ -73,6 +76,7 @@ def test_compiled_flow_goes_through_torch_compile_and_stays_picklable(monkeypatc
         return COMPILE(function, backend="eager", **options)
 
     monkeypatch.setattr(torch, "compile", spy)
+    monkeypatch.setattr(shutil, "which", lambda name: name)
     base._compiled.cache_clear()
     td = moments(2)
     transform = RawFlow(INTRINSICS, compiled=True)
@@ -81,6 +85,33 @@ def test_compiled_flow_goes_through_torch_compile_and_stays_picklable(monkeypatc
     assert torch.equal(fused, RawFlow(INTRINSICS)(td.clone())["raw"])
     assert torch.equal(fused, pickle.loads(pickle.dumps(transform))(td.clone())["raw"])
     base._compiled.cache_clear()
+
+
+def test_without_a_compiler_compiled_flow_is_refused(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setenv("CXX", "clang++-19")
+    with pytest.raises(ValueError, match=r"needs a C\+\+ compiler, and clang\+\+-19 is not"):
+        RawFlow(INTRINSICS, compiled=True)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs g++")
+def test_compiled_flow_of_unknown_pixels_is_nan_as_eager_s_is():
+    # Wide enough for inductor's vectors, which read masks in another way than its scalar code.
+    depth = torch.linspace(2.0, 40.0, 12 * 32).reshape(1, 12, 32)
+    depth[0, 3, 5:20] = math.nan
+    motions = torch.eye(4).repeat(2, 1, 1)
+    motions[0, 2, 3], motions[1, 0, 3] = 0.8, -0.1
+    instance = (torch.arange(12 * 32) % 2).reshape(1, 12, 32).to(torch.uint8)
+    sensor = {"depth": depth, "instance": instance, "instance_motion": motions}
+    td = TensorDict({"sensor": sensor})
+    eager, compiled = (
+        RawFlow(INTRINSICS, invalid=math.nan, compiled=compiled)(td.clone())["raw"]
+        for compiled in (False, True)
+    )
+    assert eager.isnan().sum() == 2 * 15
+    torch.testing.assert_close(compiled, eager, rtol=0, atol=1e-5, equal_nan=True)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
