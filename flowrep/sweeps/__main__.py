@@ -3,10 +3,13 @@
     {"folder": ..., "config": {...}, "machine": {"device": ..., "num_workers": ...},
      "overrides": [...]}
 
-The run stops, and saves, when stdin is closed: when the process that asked for it is gone.
+The run stops, and saves, when stdin is closed: when the process that asked for it is gone. SIGUSR1
+and SIGUSR2, by which SLURM tells all processes of a job that its time is nearly over, are for that
+process alone.
 """
 
 import json
+import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -32,6 +35,8 @@ PATIENCE_S = 60.0  # with a run of the same sweep that was told to stop, and sav
 
 def main() -> None:
     """Does what is left of the run; what goes wrong is said in a line of its log."""
+    for number in (signal.SIGUSR1, signal.SIGUSR2):
+        signal.signal(number, signal.SIG_IGN)
     request = json.loads(sys.stdin.buffer.readline())
     stop_when_closed(sys.stdin.fileno())
     try:

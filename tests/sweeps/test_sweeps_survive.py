@@ -1,6 +1,7 @@
 """A sweep as a person runs it: interrupted, started again, with a run that fails."""
 
 import csv
+import json
 import os
 import signal
 import subprocess
@@ -11,6 +12,9 @@ import pytest
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the sweep runs two at a time")
+
+from flowrep.sweeps.job import RUN
+from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow
 
@@ -72,6 +76,21 @@ def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path, 
     (whole,) = tmp_path.glob("*learning_rate-0.0003*")
     log = (whole / "job.log").read_text()
     assert log.count("run folder: ") == 2  # it was begun, and resumed
+
+
+def test_a_run_saves_whatever_signals_its_scheduler_sends(tmp_path):
+    """SLURM tells all processes of a job, not its first alone, and SIGTERM comes from two sides."""
+    config = composed(*(text for text in SWEEP[6:] if "=" in text), "total_frames=100000")
+    request = {"folder": str(tmp_path), "config": config, "machine": {}, "overrides": []}
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(RUN, stdin=subprocess.PIPE, env=environment) as run:
+        run.stdin.write(json.dumps(request).encode() + b"\n")
+        run.stdin.flush()
+        wait_for((tmp_path / "metrics.csv").is_file)
+        for number in (signal.SIGUSR2, signal.SIGTERM, signal.SIGTERM):
+            run.send_signal(number)
+        assert run.wait(timeout=60) == 128 + signal.SIGTERM
+    assert (tmp_path / "checkpoint" / "latest.safetensors").is_file()
 
 
 def test_what_is_finished_is_not_run_again(tmp_path):
