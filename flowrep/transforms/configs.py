@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 from flowrep.extras import require
@@ -37,24 +38,34 @@ from flowrep import transforms
 from flowrep.transforms.base import as_keys
 
 
-def config_class(transform: type) -> type[TransformConfig]:
-    """Returns the config of a transform: a dataclass with a field for each of its parameters.
+def config_class(
+    target: Callable[..., Any], base: type = TransformConfig, *, partial: bool = False
+) -> Any:
+    """Returns the config of a class or function: a dataclass with a field for each parameter.
+
+    Args:
+        target: what Hydra instantiates.
+        base: TorchRL's config class of the group.
+        partial: whether Hydra returns a function of the arguments that are still missing.
 
     >>> config_class(transforms.Depth)().range_m
     100.0
     """
+    # Of a class, that of its constructor: TorchRL's metaclasses hide it.
+    made_by = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
     fields: list[tuple[str, Any, Any]] = [
         (name, Any, _field(name, parameter.default))
-        for name, parameter in inspect.signature(transform).parameters.items()
+        for name, parameter in inspect.signature(made_by).parameters.items()
+        if name != "self"
     ]
-    target = f"{transforms.__name__}.{transform.__name__}"
-    # Lists and mappings reach the transforms as Python's own, not as OmegaConf's.
-    fields += [("_target_", str, target), ("_convert_", str, "all"), ("_partial_", bool, False)]
+    place = f"{target.__module__}.{target.__qualname__}"
+    # Lists and mappings reach the target as Python's own, not as OmegaConf's.
+    fields += [("_target_", str, place), ("_convert_", str, "all"), ("_partial_", bool, partial)]
     return dataclasses.make_dataclass(
-        f"{transform.__name__}Config",
+        f"{target.__name__}Config",
         fields,
-        bases=(TransformConfig,),
-        namespace={"__doc__": f"Configuration of `{target}`.", "__module__": __name__},
+        bases=(base,),
+        namespace={"__doc__": f"Configuration of `{place}`.", "__module__": __name__},
     )
 
 
