@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 from flowrep.config import UsageError, validated
 from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config.factorizing import FactorizeConfig
-from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.config_tree import CONF_DIR
 from flowrep.sequences import EstimatedFlowSource, Recording, SequenceError, Stream, recorded_flow
 from flowrep.sequences.factorization import FlowSource
 from flowrep.sequences.job import Job, JobOptions, as_settings
@@ -128,11 +128,6 @@ def open_flow_source(settings: dict[str, Any], stream: Stream) -> FlowSource:
 
 def main() -> None:
     """Entry point; mistakes on the command line end in one line that lists what exists."""
-    typed = sys.argv[1:]
-    if not any(word.startswith(("-", "format=")) for word in typed):
-        exit_with(
-            f"'format' needs a value: format=...; there are: {', '.join(group_choices('format'))}"
-        )
     run_command("factorize", run, FactorizeConfig)
 
 

@@ -100,7 +100,7 @@ def carry_out(config: Config, folder: RunFolder) -> float:
     try:
         training = make_training(config, folder)
         folder.log_to_wandb(config["wandb"], config)
-    except (UsageError, CheckpointError, ValueError, ImportError, OSError) as error:
+    except (UsageError, CheckpointError, WorkerError, ValueError, ImportError, OSError) as error:
         exit_with(error)
     print(f"run folder: {folder.path}")
     where, how_to_go_on = str(folder.path), how_to_resume(config, folder)

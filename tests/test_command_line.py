@@ -14,6 +14,10 @@ from flowrep.config_tree import CONF_DIR
 
 pytest.importorskip("pybullet", reason="the commands need the simulator")
 
+from flowrep.envs import WorkerError
+from flowrep.experiment.run_folder import RunFolder
+from flowrep.train import carry_out
+
 
 @pytest.mark.parametrize(
     ("override", "names"),
@@ -34,7 +38,7 @@ pytest.importorskip("pybullet", reason="the commands need the simulator")
         ("hydra/job_logging=loud", ["unknown hydra/job_logging 'loud'", "default"]),
         ("hydra.run.dirr=x", ["Could not override 'hydra.run.dirr'"]),
         ("~sed", ["unknown key 'sed'", "did you mean 'seed'"]),
-        ("~algorithm", ["'algorithm' needs a value", "dqn, dsac, dsac_v, ppo"]),
+        ("~algorithm", ["'algorithm' needs a value: algorithm=...", "dqn, dsac, dsac_v, ppo"]),
         ("-m scene=s_turn,straight", ["unknown scene 'straight'"]),
         ("-m seed=0,1,-2", ["seed should be a whole number from 0 to 2147483647, not -2"]),
         ("-m algorithm.gamma=interval(0.9,1.5)", ["algorithm.gamma should be", "not 1.5"]),
@@ -42,6 +46,12 @@ pytest.importorskip("pybullet", reason="the commands need the simulator")
         ("hydra.run.dir=/home/josé/x", ["'hydra.run.dir='\"'\"'/home/josé/x'\"'\"''"]),
         ("--config-dir nowhere", ["--config-dir: there is no folder", "nowhere"]),
         ("--cfg job sed=1", ["unknown key 'sed'"]),
+        ("--help scene=straight", ["unknown scene 'straight'"]),
+        ("--info config sed=1", ["unknown key 'sed'"]),
+        ("-m --hydra-help seed=0,1", ["'seed=0,1' is several values: give one of them"]),
+        ("hydra.mode=MULTIRUN seed=0,1 --cfg job", ["'seed=0,1' is several values: give one"]),
+        ("--config-name nope", ["Cannot find primary config 'nope'"]),
+        ("--config-path pkg://nowhere", ["Primary config module 'nowhere' not found"]),
     ],
 )
 def test_a_mistake_is_named_and_what_exists_is_listed(override, names):
@@ -51,6 +61,29 @@ def test_a_mistake_is_named_and_what_exists_is_listed(override, names):
     assert "\n" not in message
     for name in names:
         assert name in message
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (
+            "-m seed=0,1 --cfg job",
+            "--multirun starts a sweep, --cfg shows the config of one run: keep one",
+        ),
+        ("-m --info defaults", "--multirun starts a sweep, --info shows"),
+        ("--run -m seed=0", "--run starts a run, --multirun starts a sweep"),
+        ("--cfg job --info plugins -m", "--multirun .*, --cfg .*, --info .*: keep one"),
+        ("--resolve", "--resolve says how --cfg and --help show a config: add --cfg job"),
+        ("--resolve --hydra-help", "add --cfg job"),
+        ("--package scene", "--package says which part --cfg shows: add --cfg job"),
+        ("--experimental-rerun x.pickle", "reads a pickle.* resume="),
+        ("--config-path conf", "absolute path .* not 'conf'; --config-dir adds"),
+        ("--config-path /nowhere", "absolute path .* not '/nowhere'"),
+    ],
+)
+def test_flags_that_contradict_each_other_or_do_nothing_are_refused(flags, says):
+    with pytest.raises(UsageError, match=says):
+        check_command("train", flags.split(), TrainConfig)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +103,13 @@ def test_a_mistake_is_named_and_what_exists_is_listed(override, names):
         "+note=pilot ++seed=4 +mine.deep=1 +algorithm@beside=dqn +hydra.job.env_set.A=1",
         "~debug",
         "--cfg job seed=-1",
+        "--cfg all --package hydra.run --resolve",
         "--info searchpath",
+        "-m --help --resolve",
+        "-m --hydra-help",
+        "--shell-completion query=bash",
+        "--config-path pkg://flowrep.conf",
+        "-m",
     ],
 )
 def test_what_hydra_accepts_passes(line):
@@ -97,6 +136,18 @@ def test_configs_of_one_s_own_are_found(form, tmp_path, monkeypatch):
 def test_the_check_leaves_hydra_as_it_found_it():
     check_command("train", [])
     assert not GlobalHydra.instance().is_initialized()
+
+
+def test_a_worker_that_dies_while_a_run_is_built_is_one_line(tmp_path, monkeypatch, capsys):
+    def build(config, folder):
+        raise WorkerError("the worker process of environment 0 is gone (SIGKILL)")
+
+    monkeypatch.setattr("flowrep.train.build", build)
+    with pytest.raises(SystemExit) as ended:
+        carry_out({}, RunFolder(tmp_path))
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said == "error: the worker process of environment 0 is gone (SIGKILL)\n"
 
 
 def run_command(*arguments, cwd):

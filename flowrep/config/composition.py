@@ -26,7 +26,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from flowrep.config import Section, UsageError, validated
-from flowrep.config.hydra_mistakes import one_line, unknown_choice, unknown_key
+from flowrep.config.flags import check_flags, only_shows
+from flowrep.config.hydra_mistakes import needs_a_choice, one_line, unknown_choice, unknown_key
 from flowrep.config.quoting import override as quoted_override
 from flowrep.config.quoting import shell_line
 from flowrep.config_tree import CONF_DIR
@@ -51,15 +52,14 @@ def check_command(
         UsageError: a line for each thing that is wrong.
     """
     args = get_args_parser().parse_args(list(arguments))
-    if args.help or args.hydra_help or args.info or args.shell_completion or args.config_path:
-        return
-    if args.experimental_rerun:
-        return
-    preview = Preview(args, args.config_name or config_name)
+    check_flags(args)
+    if args.shell_completion or (args.hydra_help and not args.overrides):
+        return  # no config is composed
+    preview = Preview(args, config_name)
     try:
         parsed = preview.with_sweepers(preview.parse(args.overrides))
         for config in preview.configs(parsed):
-            if schema is not None and not args.cfg:
+            if schema is not None and not only_shows(args):
                 validated(schema, config, keys_added(parsed))
     finally:
         GlobalHydra.instance().clear()
@@ -94,14 +94,16 @@ class Preview:
 
     Args:
         args: of the command line.
-        config_name: of the primary config.
+        config_name: of the primary config, unless the command line names another.
     """
 
     def __init__(self, args: argparse.Namespace, config_name: str) -> None:
-        self.config_name, self.is_multirun = config_name, args.multirun
+        self.config_name = config_name if args.config_name is None else args.config_name
+        self.only_shows = only_shows(args)
+        self.is_multirun = args.multirun and not self.only_shows
         GlobalHydra.instance().clear()
         version.setbase(VERSION_BASE)
-        self._hydra = Hydra.create_main_hydra2("flowrep", _search_path(args.config_dir))
+        self._hydra = Hydra.create_main_hydra2("flowrep", _search_path(args))
         self._loader = self._hydra.config_loader
         self._typed: list[str] = args.overrides
 
@@ -117,12 +119,14 @@ class Preview:
                     remedy = shell_line(quoted_override(key, value))
                     raise UsageError(f"can't read '{text}'; quoted it is {remedy}") from None
                 raise UsageError(f"can't read '{text}': {one_line(error)}") from None
-        if not self.is_multirun and not any(o.key_or_group == "hydra.mode" for o in parsed):
+        has_mode = any(o.key_or_group == "hydra.mode" for o in parsed)
+        if self.only_shows or not (self.is_multirun or has_mode):
+            remedy = "give one of them" if self.only_shows else "add -m to run each of them"
             for override in (o for o in parsed if o.is_sweep_override()):
-                value = override.get_value_string()
+                as_list = f"{override.key_or_group}=[{override.get_value_string()}]"
                 raise UsageError(
-                    f"'{override.input_line}' is several values: add -m to run each of them, or "
-                    f"write {override.key_or_group}=[{value}] for a list"
+                    f"'{override.input_line}' is several values: {remedy}, or write {as_list} for "
+                    "a list"
                 )
         return parsed
 
@@ -193,6 +197,9 @@ class Preview:
         if isinstance(error, MissingConfigException) and error.options is not None:
             group, _, name = str(error.missing_cfg_file).rpartition("/")
             return unknown_choice(group, name, error.options)
+        missing = re.match(r"You must specify '([^']+)'", one_line(error))
+        if missing:
+            return needs_a_choice(missing[1], self._options(missing[1]))
         one_of_several = re.match(r".*Could not load '(.+)/([^/']+)'", one_line(error))
         if one_of_several:
             group, name = one_of_several.groups()
@@ -202,7 +209,7 @@ class Preview:
             if options and override.value() is None and not override.is_delete():
                 return f"{override.key_or_group} should be one of: {', '.join(options)}, not null"
             if options and override.is_delete():
-                return f"'{override.key_or_group}' needs a value; there are: {', '.join(options)}"
+                return needs_a_choice(override.key_or_group, options)
         groups = [o for o in overrides if self._options(o.key_or_group)]
         try:
             config = self._compose([str(o.input_line) for o in groups])
@@ -234,18 +241,12 @@ def _changed(config: dict[str, Any], keys: Sequence[str], value: Any) -> dict[st
     return config | {key: _changed(section if isinstance(section, dict) else {}, rest, value)}
 
 
-def _search_path(config_dir: str | None) -> ConfigSearchPathImpl:
-    """Returns where Hydra will look: conf/, plugins, and the folder of `--config-dir`.
-
-    Raises:
-        UsageError: there is no such folder.
-    """
-    path: Any = create_config_search_path(str(CONF_DIR))
-    if config_dir is not None:
-        folder = Path(config_dir).absolute()
-        if not folder.is_dir():
-            raise UsageError(f"--config-dir: there is no folder {folder}")
-        path.prepend("command-line", f"file://{folder}", SearchPathQuery(provider="schema"))
+def _search_path(args: argparse.Namespace) -> ConfigSearchPathImpl:
+    """Returns where Hydra will look: conf/, plugins, and the folder of `--config-dir`."""
+    path: Any = create_config_search_path(args.config_path or str(CONF_DIR))
+    if args.config_dir is not None:
+        folder = f"file://{Path(args.config_dir).absolute()}"
+        path.prepend("command-line", folder, SearchPathQuery(provider="schema"))
     return path
 
 

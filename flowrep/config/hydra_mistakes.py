@@ -18,6 +18,15 @@ def unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
     return f"unknown {group} '{name}'{closest(name, known)}; there are: {', '.join(known)}"
 
 
+def needs_a_choice(group: str, options: Sequence[str]) -> str:
+    """Returns that nothing of a group was chosen, and what there is.
+
+    >>> needs_a_choice("format", ["tum", "frames"])
+    "'format' needs a value: format=...; there are: frames, tum"
+    """
+    return f"'{group}' needs a value: {group}=...; there are: {', '.join(sorted(options))}"
+
+
 def unknown_key(key: str, config: DictConfig, groups: Sequence[str]) -> str | None:
     """Walks a dotted key down a config; returns what to say of a part that isn't there.
 
@@ -45,5 +54,5 @@ def unknown_key(key: str, config: DictConfig, groups: Sequence[str]) -> str | No
 def one_line(error: Exception) -> str:
     """Returns what Hydra or OmegaConf say, without the lines on where in the config it is."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    place = ("full_key:", "object_type=", "See http")
+    place = ("full_key:", "object_type=", "See http", "Config search path:")
     return " ".join([line for line in lines if not line.startswith(place)][:2])

@@ -12,6 +12,7 @@ require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja
 import hydra
 import rich.box
 import rich.table
+from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.text import Text
@@ -111,10 +112,10 @@ def _drives(runs: Sequence[Any], asked: dict[str, Any]) -> Drives:
 def with_folders_named(arguments: Sequence[str]) -> list[str]:
     """Returns a command line in which folders that were given bare are the value of `run`.
 
-    >>> with_folders_named(["outputs/a", "outputs/b", "videos=1"])
-    ['run=[outputs/a,outputs/b]', 'videos=1']
+    >>> with_folders_named(["outputs/a", "outputs/b", "videos=1", "--cfg", "job"])
+    ['run=[outputs/a,outputs/b]', 'videos=1', '--cfg', 'job']
     """
-    bare = [text for text in arguments if _is_folder(text)]
+    bare = [o for o in get_args_parser().parse_args([*arguments]).overrides if _is_folder(o)]
     if not bare:
         return list(arguments)
     if len(bare) == 1:
@@ -125,7 +126,7 @@ def with_folders_named(arguments: Sequence[str]) -> list[str]:
 
 
 def _is_folder(text: str) -> bool:
-    return not text.startswith(("-", "~", "+")) and ("=" not in text or Path(text).exists())
+    return not text.startswith(("~", "+")) and ("=" not in text or Path(text).exists())
 
 
 def main() -> None:

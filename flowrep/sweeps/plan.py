@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from flowrep.config import UsageError
 from flowrep.config.composition import Preview
+from flowrep.config.flags import only_shows
 from flowrep.config.run_names import run_of_sweep
 
 
@@ -40,9 +41,8 @@ class Plan:
 def is_sweep(arguments: Sequence[str]) -> bool:
     """Says whether a command line asks for several runs, not only for a look at their config."""
     args = get_args_parser().parse_args([*arguments])
-    looks = (args.help, args.hydra_help, args.cfg, args.info, args.shell_completion)
     modes = [text for text in args.overrides if text.startswith("hydra.mode=")]
-    return not any(looks) and (args.multirun or modes[-1:] == ["hydra.mode=MULTIRUN"])
+    return not only_shows(args) and (args.multirun or modes[-1:] == ["hydra.mode=MULTIRUN"])
 
 
 def plan_of(config_name: str, arguments: Sequence[str]) -> Plan:
@@ -56,7 +56,7 @@ def plan_of(config_name: str, arguments: Sequence[str]) -> Plan:
         UsageError: it would continue one run, or two of its runs would share a folder.
     """
     args = get_args_parser().parse_args([*arguments])
-    preview = Preview(args, args.config_name or config_name)
+    preview = Preview(args, config_name)
     try:
         parsed = preview.with_sweepers(preview.parse(args.overrides))
         if any(override.key_or_group == "resume" for override in parsed):

@@ -30,7 +30,7 @@ def test_folders_may_have_any_name(tmp_path, monkeypatch, names):
 
 
 def test_what_is_no_folder_stays_what_it_is():
-    typed = ["run=[a,b]", "+note=x", "~policy", "--cfg", "trajectories=2"]
+    typed = ["run=[a,b]", "+note=x", "~policy", "trajectories=2", "--cfg", "job"]
     assert with_folders_named(typed) == typed
 
 

@@ -1,0 +1,53 @@
+"""What Hydra's flags ask for, and which of them go together."""
+
+import argparse
+from pathlib import Path
+
+from flowrep.config import UsageError
+
+
+def only_shows(args: argparse.Namespace) -> bool:
+    """Says whether a command line asks for a look at configs, and for no job."""
+    return bool(args.help or args.hydra_help or args.cfg or args.info or args.shell_completion)
+
+
+def check_flags(args: argparse.Namespace) -> None:
+    """Refuses flags that contradict each other, or of which nothing would be seen.
+
+    Args:
+        args: of the command line, as Hydra's parser reads it.
+
+    Raises:
+        UsageError: names the flags, and what to leave out.
+    """
+    if args.experimental_rerun:
+        raise UsageError(
+            "--experimental-rerun reads a pickle, which can run any code: continue a run by "
+            "resume=<its folder>"
+        )
+    if args.config_dir is not None and not Path(args.config_dir).is_dir():
+        raise UsageError(f"--config-dir: there is no folder {Path(args.config_dir).absolute()}")
+    path = args.config_path
+    if path and "://" not in path and not (Path(path).is_absolute() and Path(path).is_dir()):
+        raise UsageError(
+            f"--config-path should be the absolute path of a folder that holds all configs, not "
+            f"'{path}'; --config-dir adds a folder to flowrep's own"
+        )
+    if args.help:
+        return
+    if args.resolve and not args.cfg:
+        raise UsageError("--resolve says how --cfg and --help show a config: add --cfg job")
+    if args.hydra_help:
+        return
+    if args.package and not args.cfg:
+        raise UsageError("--package says which part --cfg shows: add --cfg job")
+    tasks = {
+        "--run": (args.run, "starts a run"),
+        "--multirun": (args.multirun, "starts a sweep"),
+        "--cfg": (args.cfg, "shows the config of one run"),
+        "--info": (args.info, "shows what a config is made of"),
+        "--shell-completion": (args.shell_completion, "completes a line"),
+    }
+    asked = [f"{flag} {does}" for flag, (given, does) in tasks.items() if given]
+    if asked[1:]:
+        raise UsageError(f"{', '.join(asked)}: keep one of these flags")
