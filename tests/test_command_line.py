@@ -139,10 +139,10 @@ def test_the_check_leaves_hydra_as_it_found_it():
 
 
 def test_a_worker_that_dies_while_a_run_is_built_is_one_line(tmp_path, monkeypatch, capsys):
-    def build(config, folder):
+    def dies(config, folder):
         raise WorkerError("the worker process of environment 0 is gone (SIGKILL)")
 
-    monkeypatch.setattr("flowrep.train.build", build)
+    monkeypatch.setattr("flowrep.train.make_training", dies)
     with pytest.raises(SystemExit) as ended:
         carry_out({}, RunFolder(tmp_path))
     assert ended.value.code == 2
