@@ -22,6 +22,8 @@ from flowrep.scenes.scene import Range, Scene, SpeedMode
 from flowrep.simulator.renderer import choose_renderer
 from flowrep.transforms import representation_stack
 
+_SELDOM = ("rgb", "frame")  # sensors that are kept only where something reads them
+
 
 class VectorWrapper(GymWrapper):
     """TorchRL's wrapper, with the marks of what to reset brought to where NumPy reads them.
@@ -62,6 +64,7 @@ def make_env(
     seed: int | None = None,
     keep_sensor: bool = False,
     flow: str | Mapping[str, Any] = "exact",
+    noise: Mapping[str, float] | None = None,
     compiled: bool = False,
     renderer: str = "auto",
 ) -> TransformedEnv:
@@ -82,9 +85,12 @@ def make_env(
         speed: the pedestrians' speed mode, or their (lowest, highest) speed in m/s.
         frame_rate_hz: steps a second; the scene's own if None.
         seed: seeds the envs, which draw their episodes from it; None leaves that to `set_seed`.
-        keep_sensor: whether all ("sensor", ...) keys stay beside the representations.
+        keep_sensor: whether all ("sensor", ...) keys stay beside the representations; rgb and
+            frame only where a representation needs them.
         flow: "exact" or "estimated", where raw and obj come from; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
+        noise: errors of the depth camera and of odometry, see there. They are those of the frame:
+            an episode that is driven again looks the same.
         compiled: whether flow is computed through `torch.compile`: some eight times as fast on a
             CPU, equal up to rounding, after up to a minute of compiling.
         renderer: who draws depth, classes and ids, see `StreetEnv`.
@@ -124,11 +130,12 @@ def make_env(
             dt_s=1.0 / probe.frame_rate_hz,
             compiled=compiled,
             flow=flow,
+            noise=noise,
         )
     probe.close()
     sensors = sensors_read(transforms)
     if keep_sensor:
-        sensors = [name for name in SENSORS if name in sensors or name != "rgb"]
+        sensors = [name for name in SENSORS if name in sensors or name not in _SELDOM]
     elif sensors:
         transforms.append(DropSensor())
     factories = [partial(_sensed, street, sensors)] * num_envs

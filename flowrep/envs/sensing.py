@@ -25,7 +25,7 @@ from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]
-SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb")
+SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb", "frame")
 _MAPS = frozenset({"depth", "semantic", "instance"})
 _MOTIONS = frozenset({"prev_from_curr", "instance_motion"})
 
@@ -87,6 +87,7 @@ class Sensing:
             "prev_from_curr": spaces.Box(-np.inf, np.inf, (4, 4), np.float32),
             "instance_motion": spaces.Box(-np.inf, np.inf, (1 + parts, 4, 4), np.float32),
             "rgb": spaces.Box(0, 255, (3, *size), np.uint8),
+            "frame": spaces.Box(0, (1 << 31) - 1, (2,), np.int64),
         }
         return spaces.Dict({name: every[name] for name in self.names})
 
@@ -153,6 +154,9 @@ def observe_together(sensings: Sequence[Sensing], episodes: Sequence[Episode]) -
     if "rgb" in names:
         colours = [s.rgb(episode) for s, episode in zip(sensings, episodes)]
         observation["rgb"] = np.ascontiguousarray(np.stack(colours).transpose(0, 3, 1, 2))
+    if "frame" in names:
+        named = [(episode.seed, episode.steps) for episode in episodes]
+        observation["frame"] = np.array(named, dtype=np.int64)
     return {name: observation[name] for name in first.names}
 
 

@@ -36,6 +36,7 @@ class StreetEnv(gym.Env):
     | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
     | `instance_motion` | [1 + 3·P, 4, 4] | float32 | the same by instance; row 0: static world |
     | `rgb` | [3, H, W] | uint8 | |
+    | `frame` | [2] | int64 | its name: the episode's seed, and the steps since its start |
 
     At reset the previous pose is the current one. `info` holds `outcome`, `hit` (the category of
     what was hit, or ""), `episode_seed` and `path`.

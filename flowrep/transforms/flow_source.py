@@ -14,6 +14,7 @@ from flowrep.transforms.estimated_flow import EstimatedFlow
 from flowrep.transforms.flow import Intrinsics
 from flowrep.transforms.flow_factorize import FlowFactorize
 from flowrep.transforms.frame_stack import FrameStack
+from flowrep.transforms.noise_source import Sensed
 from flowrep.transforms.raw_flow import RawFlow
 
 _UNSCALED = "_raw"  # raw flow in px/step, nan where unknown: what FlowFactorize reads
@@ -42,6 +43,7 @@ def estimated_flow_makers(
     estimator: dict[str, Any],
     intrinsics: Intrinsics | None,
     context: dict[str, Any],
+    sensed: Sensed,
 ) -> list[Transform]:
     """Returns what `exact_flow_makers` does, with raw flow from the pictures."""
     makers: list[Transform] = []
@@ -60,7 +62,7 @@ def estimated_flow_makers(
         pictures.label = raw.label = "raw and obj by estimated flow"
         makers += [pictures, raw]
     if factors and intrinsics is not None:
-        reads: list[NestedKey] = [("sensor", "depth"), ("sensor", "prev_from_curr")]
+        reads: list[NestedKey] = [*sensed]
         makers.append(
             FlowFactorize(
                 intrinsics,
@@ -75,7 +77,10 @@ def estimated_flow_makers(
 
 
 def exact_flow_makers(
-    flows: dict[str, dict[str, Any]], intrinsics: Intrinsics, context: dict[str, Any]
+    flows: dict[str, dict[str, Any]],
+    intrinsics: Intrinsics,
+    context: dict[str, Any],
+    sensed: Sensed,
 ) -> list[Transform]:
     """Returns one RawFlow, if raw flow is needed, and one FlowFactorize, if a factor is."""
     if "obj" in flows:
@@ -86,7 +91,7 @@ def exact_flow_makers(
             outputs=list(flows),
             scale={name: options["scale"] for name, options in flows.items()},
             unit={name: options["unit"] for name, options in flows.items()},
-            in_keys=[_UNSCALED, ("sensor", "depth"), ("sensor", "prev_from_curr")],
+            in_keys=[_UNSCALED, *sensed],
             **context,
         )
         return [raw, factors]
@@ -94,5 +99,6 @@ def exact_flow_makers(
     if "raw" in flows:
         makers.append(RawFlow(intrinsics, **flows["raw"], **context))
     if "ego" in flows:
-        makers.append(FlowFactorize(intrinsics, outputs=["ego"], **flows["ego"], **context))
+        ego = {"outputs": ["ego"], "in_keys": [*sensed], **flows["ego"]}
+        makers.append(FlowFactorize(intrinsics, **ego, **context))
     return makers

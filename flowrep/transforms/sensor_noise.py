@@ -12,8 +12,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
-from flowrep.transforms.base import DEPTH, FLOW, MOTION, Keys, MapTransform
+from flowrep.transforms.base import DEPTH, FLOW, MOTION, Keys, MapTransform, Reads, as_keys
+from flowrep.transforms.frame_random import frame_bits, normal, uniform
 
+FRAME = Reads(("F",), "integer")
 _READS = {"depth": DEPTH, "motion": MOTION, "flow": FLOW}
 _KEYS: dict[str, NestedKey] = {
     "depth": ("sensor", "depth"),
@@ -25,6 +27,7 @@ _OPTIONS = {
     "motion": ("drift_m", "drift_rad"),
     "flow": ("flow_sigma_px",),
 }
+_STREAMS = {sensor: number for number, sensor in enumerate(_READS)}
 
 
 class SensorNoise(MapTransform):
@@ -35,6 +38,7 @@ class SensorNoise(MapTransform):
     | `("sensor", "depth")` | the same, noisy | float `[*B, 1, H, W]` | > 0, inf, nan | m |
     | `("sensor", "prev_from_curr")` | the same, noisy | float `[*B, 4, 4]` | rigid | m |
     | `"raw"` if asked for | the same, noisy | float `[*B, 2, H, W]` | any | px/step |
+    | `frame_key` if given | | integer `[*B, F]` | | |
 
     Convention: depth z gets a normal error of standard deviation `depth_sigma_per_m` · z², as
     stereo and structured light have; what would not be in front of the camera becomes a hole
@@ -43,12 +47,18 @@ class SensorNoise(MapTransform):
     Each sensor with all of its options at 0 comes out bit for bit as it came in.
 
     Put it into the env, after `RawFlow` and before `FlowFactorize`: stored samples then hold what
-    the agent saw. A call draws new noise each time, which on a replay buffer is augmentation: the
-    root and `"next"` get errors of their own. Resets get noise like any frame.
+    the agent saw. Resets get noise like any frame.
 
-    The generator is the transform's own, on the device of the maps; its state is part of
-    `state_dict`, so that a resumed run goes on in the same sequence. Each env of a `SerialEnv` or
-    `ParallelEnv` draws noise of its own unless all are given one seed.
+    With `frame_key` noise is a function of the frame that these integers name, e.g. episode and
+    step: a frame gets the same noise in whatever batch, order, process or session, at the root
+    and under `"next"`, and nothing is to be saved. Frames have to be named differently to get
+    noise of their own.
+
+    Without it a call draws new noise each time, which on a replay buffer is augmentation: the
+    root and `"next"` get errors of their own. The generator is the transform's own, on the device
+    of the maps; its state is part of `state_dict`, so that a resumed run goes on in the same
+    sequence. Each env of a `SerialEnv` or `ParallelEnv` draws noise of its own unless all are
+    given one seed.
 
     Args:
         sensors: of `"depth"`, `"motion"` and `"flow"`, those that are read and written.
@@ -59,7 +69,8 @@ class SensorNoise(MapTransform):
         flow_sigma_px: standard deviation of each flow channel, pixels a step.
         seed: of the generator: envs with the same seed have the same noise. None draws one from
             torch's global generator (`torch.manual_seed` makes it reproducible) and the name of
-            the worker process.
+            the worker process; with `frame_key` it is 0.
+        frame_key: where integers lie that name the frame, as `("sensor", "frame")` of the street.
         in_keys: one key a sensor; the table's by default.
         out_keys: one key a sensor; `in_keys` by default.
 
@@ -86,6 +97,7 @@ class SensorNoise(MapTransform):
         drift_rad: float = 0.0,
         flow_sigma_px: float = 0.0,
         seed: int | None = None,
+        frame_key: NestedKey | None = None,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
@@ -97,45 +109,60 @@ class SensorNoise(MapTransform):
             "flow_sigma_px": flow_sigma_px,
         }
         _check(sensors, options)
-        keys: Keys = [_KEYS[sensor] for sensor in sensors] if in_keys is None else in_keys
+        keys = [_KEYS[sensor] for sensor in sensors] if in_keys is None else as_keys(in_keys)
+        reads = [_READS[sensor] for sensor in sensors]
+        frame = [] if frame_key is None else as_keys([frame_key])
         super().__init__(
-            [_READS[sensor] for sensor in sensors], keys, keys if out_keys is None else out_keys
+            reads + [FRAME] * len(frame), keys + frame, keys if out_keys is None else out_keys
         )
-        if len(self.out_keys) != len(self.in_keys):
+        if len(self.out_keys) != len(sensors):
             raise ValueError(
                 f"SensorNoise writes one key a sensor of {list(sensors)}, got {self.out_keys}"
             )
         self.sensors = tuple(sensors)
         self.options = options
         self.seed = None if seed is None else int(seed)
+        self.has_frames = bool(frame)
         self._state: Tensor | None = None  # of a generator that is yet to be made
         self._generator: torch.Generator | None = None
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
-        """Returns the sensors' maps with new noise."""
-        return tuple(self._noisy(sensor, value) for sensor, value in zip(self.sensors, maps))
+        """Returns the sensors' maps with noise: new noise, or that of the frames, the last map."""
+        frame = maps[-1] if self.has_frames else None
+        return tuple(self._noisy(*named, frame) for named in zip(self.sensors, maps))
 
-    def _noisy(self, sensor: str, value: Tensor) -> Tensor:
+    def _noisy(self, sensor: str, value: Tensor, frame: Tensor | None) -> Tensor:
         used = {name: self.options[name] for name in _OPTIONS[sensor]}
         if not any(used.values()):
             return value
+        normals, *uniforms = self._numbers(sensor, value, frame)
         if sensor == "depth":
-            normal, uniform = self._normal(value.shape, value), self._uniform(value)
             sigma_per_m, dropout = used.values()
-            return noisy_depth(value, normal, uniform, sigma_per_m=sigma_per_m, dropout=dropout)
+            return noisy_depth(value, normals, *uniforms, sigma_per_m=sigma_per_m, dropout=dropout)
         if sensor == "motion":
-            normal = self._normal((*value.shape[:-2], 6), value)
             return drifted_motion(
-                value, normal, drift_m=used["drift_m"], drift_rad=used["drift_rad"]
+                value, normals, drift_m=used["drift_m"], drift_rad=used["drift_rad"]
             )
-        return value + used["flow_sigma_px"] * self._normal(value.shape, value)
+        return value + used["flow_sigma_px"] * normals
 
-    def _normal(self, shape: Sequence[int], like: Tensor) -> Tensor:
-        generator = self._generator_on(like.device)
-        return torch.randn(shape, generator=generator, device=like.device).to(like.dtype)
-
-    def _uniform(self, like: Tensor) -> Tensor:
-        return torch.rand(like.shape, generator=self._generator_on(like.device), device=like.device)
+    def _numbers(self, sensor: str, value: Tensor, frame: Tensor | None) -> list[Tensor]:
+        """Returns normal numbers, one a pixel or six a motion; for depth uniform ones as well."""
+        rank, is_depth = len(_READS[sensor].shape), sensor == "depth"
+        shape = (6,) if sensor == "motion" else tuple(value.shape[-rank:])
+        if frame is not None:
+            bits = frame_bits(frame, shape, seed=self.seed or 0, stream=_STREAMS[sensor])
+            normals, *uniforms = [normal(bits), uniform(bits)] if is_depth else [normal(bits)]
+        else:
+            generator = self._generator_on(value.device)
+            normals, *uniforms = (
+                draw(
+                    (*value.shape[: value.ndim - rank], *shape),
+                    generator=generator,
+                    device=value.device,
+                )
+                for draw in ((torch.randn, torch.rand) if is_depth else (torch.randn,))
+            )
+        return [normals.to(value.dtype), *uniforms]
 
     def _generator_on(self, device: torch.device) -> torch.Generator:
         """Returns the generator, made at the first use on a device."""

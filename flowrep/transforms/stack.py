@@ -21,6 +21,12 @@ from flowrep.transforms.flow_source import (
     exact_flow_makers,
 )
 from flowrep.transforms.frame_stack import FrameStack
+from flowrep.transforms.noise_source import (
+    NOISY_DEPTH_KEY,
+    NOISY_MOTION_KEY,
+    Sensed,
+    noise_makers,
+)
 from flowrep.transforms.raw_flow import RawFlow
 from flowrep.transforms.rgb import Rgb
 from flowrep.transforms.segmentation import Segmentation
@@ -82,13 +88,15 @@ def representation_stack(
     dt_s: float | None = None,
     compiled: bool = False,
     flow: str | Mapping[str, Any] = "exact",
+    noise: Mapping[str, float] | None = None,
 ) -> Compose:
     """Returns the transforms that write the representations at the root of the TensorDict.
 
     What several of them need is computed once: `["ego", "obj"]` factorises once, `["seg", "seg2"]`
     encodes once. What is computed on the way and wasn't asked for is dropped again, but for what
-    the next step needs (the pictures behind estimated flow) and `("sensor", "flow")`, estimated
-    flow in px/step.
+    the next step needs (the pictures behind estimated flow) and what the sensors gave:
+    `("sensor", "flow")`, estimated flow in px/step, `("sensor", "noisy_depth")` in metres and
+    `("sensor", "noisy_motion")`.
 
     Args:
         representations: names, or a mapping from name to options (`representation_options`); a
@@ -102,6 +110,10 @@ def representation_stack(
             (`EstimatedFlow`, from `("sensor", "rgb")`), or a mapping with one of them as
             `source` and `EstimatedFlow`'s own options beside it. Ego flow is exact either way:
             it takes depth and the camera's motion alone.
+        noise: errors of the depth camera and of odometry: `depth_sigma_per_m`, `depth_dropout`,
+            `drift_m` and `drift_rad` of `SensorNoise`, 0 where they are left out. Depth, ego and
+            obj are made of what is left; raw flow and classes know nothing of these sensors. The
+            noise is that of the frame that `("sensor", "frame")` names.
 
     Raises:
         ValueError: for an unknown or repeated name, an unknown option, or a missing argument.
@@ -119,14 +131,15 @@ def representation_stack(
     flows = {name: chosen[name] for name in _FLOWS if name in chosen}
     if intrinsics is None and flows and not (estimator is not None and set(flows) == {"raw"}):
         raise ValueError(f"representations {', '.join(_FLOWS)} need intrinsics=, the camera's K")
-    makers = _frame_makers(chosen, num_classes)
+    makers, sensed = noise_makers(noise, chosen)
+    makers += _frame_makers(chosen, num_classes, sensed)
     context = {"dt_s": dt_s, "compiled": compiled}
     if estimator is not None:
-        makers += estimated_flow_makers(flows, estimator, intrinsics, context)
+        makers += estimated_flow_makers(flows, estimator, intrinsics, context, sensed)
     elif intrinsics is not None:
-        makers += exact_flow_makers(flows, intrinsics, context)
+        makers += exact_flow_makers(flows, intrinsics, context, sensed)
     written = [key for maker in makers for key in maker.out_keys]
-    kept = [*chosen, PICTURES_KEY, ESTIMATED_FLOW_KEY]
+    kept = [*chosen, PICTURES_KEY, ESTIMATED_FLOW_KEY, NOISY_DEPTH_KEY, NOISY_MOTION_KEY]
     hidden = [key for key in written if key not in kept]
     return Compose(*makers, *([DropKeys(*hidden)] if hidden else []))
 
@@ -169,7 +182,9 @@ def _with_options(
     return chosen
 
 
-def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) -> list[Transform]:
+def _frame_makers(
+    chosen: dict[str, dict[str, Any]], num_classes: int | None, sensed: Sensed
+) -> list[Transform]:
     """Returns the transforms of all representations but flow."""
     makers: list[Transform] = []
     stacks: list[Transform] = []
@@ -187,5 +202,7 @@ def _frame_makers(chosen: dict[str, dict[str, Any]], num_classes: int | None) ->
                 continue
         if frame == "seg":
             frame_options["num_classes"] = num_classes
+        elif frame == "depth":
+            frame_options["in_keys"] = sensed.depth
         makers.append(recipe.transform(**frame_options, out_keys=key))
     return makers + stacks

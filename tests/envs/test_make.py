@@ -21,6 +21,8 @@ from flowrep.envs import (
 from flowrep.palette import CATEGORY_ID
 from flowrep.transforms import FlowFactorize, RawFlow
 
+NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
+
 
 @pytest.fixture
 def make():
@@ -84,6 +86,15 @@ def test_torchrls_own_checks_pass(make, representations, keep_sensor, num_envs):
     assert env.batch_size == (num_envs,)
 
 
+def test_torchrls_own_checks_pass_with_noise(make):
+    check_env_specs(make(representations=["obj", "depth2"], num_envs=2, noise=NOISE, seed=0))
+    env = make(representations=["obj"], noise=NOISE, keep_sensor=True, seed=0)
+    sensor = env.reset()["sensor"]
+    assert sensor["noisy_depth"].isnan().any()
+    assert not sensor["depth"].isnan().any()
+    assert not torch.equal(sensor["noisy_motion"], sensor["prev_from_curr"])
+
+
 def test_the_tensordict_has_the_representations_and_no_sensor(make):
     env = make(representations=["obj", "seg"], num_envs=2, seed=0)
     reset = env.reset()
@@ -103,6 +114,12 @@ def test_only_what_is_read_is_rendered(make):
         "depth",
         "prev_from_curr",
     )
+    noisy = street_envs(make(representations=["ego"], noise=NOISE))[0]
+    assert noisy.sensing.names == ("depth", "prev_from_curr", "frame")
+    exact = street_envs(make(representations=["raw"], noise=NOISE))[0]
+    assert exact.sensing.names == ("depth", "instance", "instance_motion")
+    kept = street_envs(make(representations=["ego"], keep_sensor=True))[0]
+    assert {"rgb", "frame"}.isdisjoint(kept.sensing.names)
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -160,6 +177,21 @@ def test_a_seed_gives_the_same_steps_in_one_process_and_in_two(make):
         assert torch.equal(first[key], steps[key].flatten(1, 2)), key
 
 
+def test_an_episode_has_the_same_noise_wherever_it_is_driven(make):
+    make = partial(make, representations=["depth2", "obj", "ego"], noise=NOISE)
+    actions = actions_of(6, 3)
+    many, _ = play(make(num_envs=3, seed=4), actions)
+    alone = make(num_envs=1, seed=77)
+    begun = alone.reset(options={"episode_seed": int(many["episode_seed"][0, 2])})
+    one, _ = play(alone, actions[:, 2:], begun)
+    for name in ("depth2", "obj", "ego"):
+        assert torch.equal(one["next", name][:, 0], many["next", name][:, 2]), name
+    holes = many["depth2"] == 0
+    assert 0.08 < holes.float().mean() < 0.12
+    assert not torch.equal(holes[:, 0], holes[:, 1])  # other episodes
+    assert not torch.equal(holes[1, :, 0], holes[1, :, 1])  # other steps of one
+
+
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_workers_give_what_one_process_gives(make, num_workers):
     actions = actions_of(40, 3)
@@ -203,13 +235,15 @@ def test_whether_cores_are_left_for_the_caller(make, monkeypatch, num_workers, t
     assert has_spare_cores(make(num_envs=2, num_workers=num_workers), threads) == fits
 
 
-def test_states_pass_between_workers_and_one_process(make):
+@pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noisy"])
+def test_states_pass_between_workers_and_one_process(make, noise):
     actions = actions_of(30, 3, seed=3)
-    alone = make(representations=["ego"], num_envs=3, seed=0)
+    make = partial(make, representations=["ego"], num_envs=3, noise=noise)
+    alone = make(seed=0)
     _, then = play(alone, actions[:20])
     states, then = get_states(alone), then.clone()
     expected, _ = play(alone, actions[20:], then.clone())
-    shared = make(representations=["ego"], num_envs=3, seed=99, num_workers=2)
+    shared = make(seed=99, num_workers=2)
     shared.reset()
     set_states(shared, states)
     assert get_states(shared) == states

@@ -42,7 +42,9 @@ def test_gymnasiums_own_checks_pass():
 
 def test_the_observation_has_what_was_asked_for(make_street, straight_road):
     camera = replace(straight_road.camera, height_px=20, width_px=30)
-    sensors = ("rgb", "instance", "depth", "semantic", "instance_motion", "prev_from_curr")
+    sensors = (
+        "rgb", "instance", "frame", "depth", "semantic", "instance_motion", "prev_from_curr",
+    )  # fmt: skip
     env = make_street(replace(straight_road, camera=camera), sensors=sensors, render_mode=None)
     observation, _ = env.reset(seed=0)
     parts = 3 * straight_road.num_pedestrians
@@ -50,6 +52,7 @@ def test_the_observation_has_what_was_asked_for(make_street, straight_road):
     assert kinds == {
         "rgb": ((3, 20, 30), "uint8"),
         "instance": ((1, 20, 30), "uint8"),
+        "frame": ((2,), "int64"),
         "depth": ((1, 20, 30), "float32"),
         "semantic": ((1, 20, 30), "uint8"),
         "instance_motion": ((1 + parts, 4, 4), "float32"),
@@ -57,6 +60,17 @@ def test_the_observation_has_what_was_asked_for(make_street, straight_road):
     }
     assert tuple(observation) == sensors
     assert env.K.shape == (3, 3)
+
+
+def test_a_frame_is_named_by_its_episode_and_step(make_street):
+    env = make_street(sensors=("frame",))
+    observation, _ = env.reset(options={"episode_seed": 41})
+    assert observation["frame"].tolist() == [41, 0]
+    for step in (1, 2):
+        observation = env.step(0)[0]
+        assert observation["frame"].tolist() == [41, step]
+    again, _ = env.set_state(env.get_state())
+    assert again["frame"].tolist() == [41, 2]
 
 
 def test_maps_show_sky_road_sidewalk_houses_and_people(make_street):

@@ -62,6 +62,16 @@ STEPS = {
         lambda depth, a, b: noisy_depth(depth, a, b, sigma_per_m=0.1, dropout=0.2),
         [td["sensor", "depth"], td["raw"][:, :1], td["raw"][:, 1:]],
     ),
+    "noise by frame": lambda td: (
+        SensorNoise(
+            depth_sigma_per_m=0.1, depth_dropout=0.2, drift_m=0.1, drift_rad=0.2, frame_key="frame"
+        ).compute,
+        [
+            td["sensor", "depth"],
+            td["sensor", "prev_from_curr"],
+            torch.arange(2 * len(td), device=td.device).reshape(-1, 2),
+        ],
+    ),
     "drift": lambda td: (
         lambda motion, normal: drifted_motion(motion, normal, drift_m=0.1, drift_rad=0.2),
         [td["sensor", "prev_from_curr"], td["raw"][:, 0, 0, :6]],

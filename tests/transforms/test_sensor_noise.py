@@ -15,6 +15,7 @@ from torchrl.envs.transforms import Compose
 
 from flowrep.geometry import check_rigid
 from flowrep.transforms import FlowFactorize, RawFlow, SensorNoise
+from flowrep.transforms.base import MissingKey
 from flowrep.transforms.sensor_noise import drifted_motion, noisy_depth
 from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
 
@@ -141,6 +142,79 @@ def test_a_resumed_run_goes_on_in_the_same_sequence(calls):
     torch.testing.assert_close(unused.state_dict(), saved)  # loaded and saved again before use
 
 
+def frames(count: int) -> torch.Tensor:
+    """Names of frames as a street gives them: its episodes' seeds are large, steps are not."""
+    return torch.stack([2_000_000 + torch.arange(count) // 7, torch.arange(count) % 7], -1)
+
+
+def noisy_by_frame(frame: torch.Tensor, **options) -> tuple[torch.Tensor, ...]:
+    noise = SensorNoise(**ALL, frame_key=("sensor", "frame"), **options)
+    depth, motion, flow = maps()
+    batch = frame.shape[:-1]
+    motion = motion[0].clone()
+    motion[:3, 3] = torch.tensor([0.1, -0.02, 0.8])
+    given = (value.expand(*batch, *value.shape) for value in (depth[0], motion, flow[0]))
+    return noise.compute(*given, frame)
+
+
+def test_a_frame_has_its_noise_in_any_batch_bit_for_bit():
+    order = torch.randperm(500, generator=torch.manual_seed(3))
+    many = noisy_by_frame(frames(500))
+    shuffled = noisy_by_frame(frames(500)[order])
+    square = noisy_by_frame(frames(500).reshape(20, 25, 2))
+    for whole, mixed, folded in zip(many, shuffled, square):
+        assert torch.equal(mixed.nan_to_num(), whole[order].nan_to_num())
+        assert torch.equal(folded.flatten(0, 1).nan_to_num(), whole.nan_to_num())
+    for place in (0, 1, 7, 333):
+        alone = noisy_by_frame(frames(500)[place])
+        row = noisy_by_frame(frames(500)[place : place + 1])
+        for whole, single, first in zip(many, alone, row):
+            assert torch.equal(single.nan_to_num(), whole[place].nan_to_num())
+            assert torch.equal(first[0].nan_to_num(), whole[place].nan_to_num())
+
+
+def test_frames_and_seeds_have_noise_of_their_own():
+    depth, motion, flow = noisy_by_frame(frames(500))
+    assert len(flow.flatten(1).unique(dim=0)) == 500
+    assert len(motion.flatten(1).unique(dim=0)) == 500
+    holes = depth.isnan().float()
+    assert abs(holes.mean() - 0.1) < 0.02  # 6,000 pixels: 5 sigma
+    assert ((holes.mean(0) > 0) & (holes.mean(0) < 0.25)).all()  # no pixel is always or never one
+    error = (depth - maps()[0][0])[depth.isfinite()] / maps()[0][0].square().expand_as(depth)[
+        depth.isfinite()
+    ]
+    assert abs(error.std() - 0.01) < 0.0006
+    assert abs((flow - 1).std() - 0.5) < 0.02
+    assert torch.equal(noisy_by_frame(frames(4), seed=0)[2], flow[:4])  # 0 is the default
+    assert not (noisy_by_frame(frames(4), seed=1)[2] == flow[:4]).any()
+
+
+def test_a_frame_s_sensors_have_noise_of_their_own():
+    same = {"sensors": ["depth", "flow"], "depth_sigma_per_m": 1.0, "flow_sigma_px": 1.0}
+    noise = SensorNoise(**same, frame_key="frame")
+    far = torch.full((1, 1, 40, 50), 10.0)  # an error of 100 m would be behind the camera
+    depth, flow = noise.compute(far, torch.zeros(1, 2, 40, 50), torch.tensor([[5, 6]]))
+    kept = ~depth.isnan()
+    errors = torch.stack([depth[kept] / 100, flow[:, :1][kept]])
+    assert abs(errors.corrcoef()[0, 1]) < 0.12  # some 1,080 pixels: 4 sigma
+
+
+def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next():
+    noise = SensorNoise(**ALL, frame_key=("sensor", "frame"))
+    depth, motion, flow = maps(6)
+
+    def moments(rows: slice) -> TensorDict:
+        sensor = {"depth": depth, "prev_from_curr": motion, "frame": frames(6)}
+        return TensorDict({"sensor": sensor, "raw": flow}, [6])[rows].clone()
+
+    before = noise.state_dict()
+    batch = noise(moments(slice(0, 5)).set("next", moments(slice(1, 6))))
+    assert torch.equal(batch["raw"][1:], batch["next", "raw"][:-1])
+    assert not torch.equal(batch["raw"][:1], batch["next", "raw"][:1])
+    torch.testing.assert_close(noise.state_dict(), before)
+    assert not any(len(value) for value in before.values())
+
+
 def test_what_noise_does_to_object_flow_on_what_stands_still():
     td = FakeSensorEnv((2,)).rollout(3)
     noise = SensorNoise(drift_rad=0.01)
@@ -190,6 +264,12 @@ def test_envs_of_one_function_draw_noise_of_their_own(batched):
     finally:
         env.close()
     assert ((motion[0] - motion[1]).abs() > 1e-4).all()
+
+
+def test_noise_by_frame_needs_the_frame_s_name():
+    noise = SensorNoise(drift_m=0.1, frame_key=["sensor", "frame"])  # as YAML has it
+    with pytest.raises(MissingKey, match=r"needs key \('sensor', 'frame'\); the env offers"):
+        TransformedEnv(FakeSensorEnv((2,)), noise).rollout(1)
 
 
 def test_torch_s_seed_decides_over_noise_without_a_seed():

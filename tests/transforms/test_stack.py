@@ -7,6 +7,7 @@ import functools
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
 
 from flowrep import geometry
@@ -17,7 +18,9 @@ from flowrep.transforms import (
     representation_options,
     representation_stack,
 )
+from flowrep.transforms.base import MissingKey
 from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv
+from tests.transforms.test_base import moments
 
 stack = functools.partial(
     representation_stack, intrinsics=INTRINSICS, num_classes=NUM_CLASSES, dt_s=0.5
@@ -167,3 +170,84 @@ def test_a_missing_sensor_is_reported_under_the_name_that_was_asked_for():
     env = TransformedEnv(NoInstances(), stack(["obj"]))
     with pytest.raises(KeyError, match=r"'obj' needs key \('sensor', 'instance'\)"):
         env.observation_spec  # noqa: B018
+
+
+NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.2, "drift_m": 0.05, "drift_rad": 0.01}
+
+
+def framed(count: int = 6) -> TensorDict:
+    """A trajectory of the fake env's frames with names, as a street gives them."""
+    td = moments(count).exclude("raw").refine_names("time")
+    td["next", "done"] = torch.zeros(count, 1, dtype=torch.bool)
+    td["sensor", "frame"] = torch.stack([torch.arange(count) + 40, torch.arange(count)], -1)
+    return td
+
+
+@pytest.mark.parametrize("noise", [None, {}, dict.fromkeys(NOISE, 0.0)], ids=str)
+def test_without_noise_the_stack_is_what_it_was(noise):
+    names = ["ego", "obj", "raw", "depth2"]
+    assert repr(stack(names, noise=noise)) == repr(stack(names))
+
+
+def test_noise_is_in_what_depth_and_odometry_go_into_and_in_nothing_else():
+    exact, noisy = (stack(list(REPRESENTATIONS), noise=n)(framed()) for n in (None, NOISE))
+    changed = {name for name in REPRESENTATIONS if not torch.equal(exact[name], noisy[name])}
+    assert changed == {"depth", "depth2", "ego", "obj"}
+    given = framed()["sensor"]
+    for key in sorted(given.keys()):
+        assert torch.equal(noisy["sensor", key].nan_to_num(), given[key].nan_to_num()), key
+    # All four see the same errors: holes are holes in each, and raw is known there all the same.
+    hole = noisy["sensor", "noisy_depth"].isnan()
+    assert 0.1 < hole.float().mean() < 0.4
+    assert (noisy["depth"][hole] == 0).all()
+    assert (noisy["ego"][hole.expand(-1, 2, -1, -1)] == 0).all()
+    want = geometry.ego_flow(
+        noisy["sensor", "noisy_depth"], torch.tensor(INTRINSICS), noisy["sensor", "noisy_motion"]
+    )
+    assert torch.equal(noisy["ego"], want.flow)
+    known = want.valid.expand(-1, 2, -1, -1)
+    assert torch.equal(noisy["obj"][known], (noisy["raw"] - noisy["ego"])[known])
+
+
+@pytest.mark.parametrize(
+    ("names", "noise", "read"),
+    [
+        (["raw", "seg", "rgb"], NOISE, None),
+        (["depth2"], {"drift_m": 0.1}, None),
+        (["depth2"], NOISE, ["depth", "frame"]),
+        (["ego"], {"drift_rad": 0.1}, ["prev_from_curr", "frame"]),
+        (["obj", "depth"], NOISE, ["depth", "prev_from_curr", "frame"]),
+    ],
+)
+def test_only_what_is_read_and_wrong_is_drawn(names, noise, read):
+    first = stack(names, noise=noise)[0]
+    if read is None:
+        assert repr(stack(names, noise=noise)) == repr(stack(names))
+    else:
+        assert first.in_keys == [("sensor", name) for name in read]
+
+
+def test_a_second_pass_gives_the_same():
+    names = ["depth", "ego", "obj", "raw"]
+    transform = stack(names, noise=NOISE)
+    once = transform(framed())
+    twice = transform(once.clone())
+    assert all(torch.equal(twice[name], once[name]) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("noise", "expected"),
+    [
+        ({"depth_sigma": 0.1}, "unknown option of noise: 'depth_sigma', did you mean 'depth_si"),
+        ({"flow_sigma_px": 0.1}, "unknown option of noise: 'flow_sigma_px'"),
+        ({"drift_m": -0.1}, "drift_m is a number of at least 0, got -0.1"),
+    ],
+)
+def test_options_of_noise_are_checked_whether_or_not_they_are_used(noise, expected):
+    with pytest.raises(ValueError, match=expected):
+        stack(["raw"], noise=noise)
+
+
+def test_a_frame_without_a_name_is_asked_for():
+    with pytest.raises(MissingKey, match=r"depth2 and obj needs key \('sensor', 'frame'\)"):
+        stack(["depth2", "obj"], noise=NOISE)(moments(2))
