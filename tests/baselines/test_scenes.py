@@ -60,6 +60,11 @@ def test_a_scene_has_the_numbers_of_the_paper(name):
     assert scene.pedestrian_speed_mps == speeds
 
 
+def test_the_scenes_have_one_camera():
+    cameras = [load_scene(name).camera for name in TABLE_1]
+    assert all(camera == cameras[0] for camera in cameras)
+
+
 def test_the_four_scenes_are_those_of_the_paper():
     assert set(scene_names()) == set(SCENE_BY_ID.values()) == set(TABLE_1)
 
