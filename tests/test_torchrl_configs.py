@@ -77,7 +77,7 @@ def test_a_replay_buffer_of_torchrl_s_is_put_together_of_the_parts(env):
     part = {
         group: instantiate(ConfigStore.instance().load(f"{group}/{name}.yaml").node, **options)
         for group, name, options in [
-            ("storage", "rows", {"max_size": 64}),
+            ("storage", "rows", {"max_size": 64, "observation_keys": ["ego", "obj"]}),
             ("sampler", "successor", {"n_steps": 2}),
             ("transform", "pack_steps", {}),
         ]

@@ -52,7 +52,9 @@ class ReplayMemory(TensorDictReplayBuffer):
         gamma: float = 1.0,
     ) -> None:
         super().__init__(
-            storage=RowStorage(capacity, device=device),
+            storage=RowStorage(
+                capacity, device=device, observation_keys=[codec.key for codec in codecs]
+            ),
             sampler=SuccessorSampler(n_steps, gamma),
             writer=RoundRobinWriter(),
             transform=PackSteps(codecs),
@@ -61,9 +63,9 @@ class ReplayMemory(TensorDictReplayBuffer):
 
 
 class PackSteps(Transform):
-    """Turns steps into packed rows on `extend`, pairs of rows into transitions on `sample`.
+    """Turns steps into packed rows on `extend`.
 
-    Maps stay packed in the sample: the networks read them so, and decoding is part of the update.
+    Samples keep their maps packed: the networks read them so, and decoding is part of the update.
 
     | steps, on `extend` | rows |
     | --- | --- |
@@ -96,34 +98,48 @@ class PackSteps(Transform):
         rows["env"] = torch.arange(envs, dtype=torch.int32, device=rows.device).repeat(times)
         return rows
 
-    def forward(self, rows: TensorDictBase) -> TensorDictBase:
-        """Returns `[N]` transitions of `[N, 2]` rows, without outcome; other rows as they are."""
-        if rows.ndim < 2:
-            return rows
-        transitions, following = rows.select(*self.in_keys).unbind(1)
-        transitions["action"], transitions["next"] = rows["action"][:, 0], following
+    def forward(self, transitions: TensorDictBase) -> TensorDictBase:
+        """Returns a sample as it is."""
         return transitions
 
 
 class RowStorage(LazyTensorStorage):
-    """TorchRL's storage, which gathers rows by `index_select` and saves those that are written.
+    """TorchRL's storage, which gathers transitions by `index_select` and saves the rows written.
 
     Indexing a TensorDict by a tensor, as its base class does, takes 2.4 times as long.
+
+    Args:
+        max_size: rows; the oldest is overwritten.
+        observation_keys: what a transition has of both of its rows; it has `action` of the first.
+        device: where the rows are kept.
     """
 
     _storage: Any
 
+    def __init__(
+        self,
+        max_size: int,
+        *,
+        observation_keys: Sequence[NestedKey],
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(max_size, device=device)
+        self.observation_keys = tuple(observation_keys)
+
     def get(self, index: Any) -> TensorDictBase:
-        """Returns the rows of an index; of `[N, 2]`, all `[:, 0]` lie together in memory."""
-        if not (isinstance(index, Tensor) and index.dtype is torch.long and self.initialized):
+        """Returns rows; for pairs of rows `[N, 2]`, transitions `[N]`.
+
+        A transition has the first row's maps and `action`, and the second's maps under `next`.
+        """
+        if not (isinstance(index, Tensor) and index.ndim == 2 and self.initialized):
             return super().get(index)
-        if index.ndim == 1:
-            return self._storage.apply(lambda x: x.index_select(0, index), batch_size=index.shape)
-        flat, shape = index.mT.reshape(-1), index.mT.shape
-        return self._storage.apply(
-            lambda x: x.index_select(0, flat).unflatten(0, shape).transpose(0, 1),
-            batch_size=index.shape,
-        )
+        first, following = index.unbind(1)
+        transitions = TensorDict({}, first.shape, device=self._storage.device)
+        for key in self.observation_keys:
+            maps = self._storage.get(key)
+            transitions.set(key, maps.index_select(0, first))
+            transitions.set(("next", key), maps.index_select(0, following))
+        return transitions.set("action", self._storage.get("action").index_select(0, first))
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the rows written, uncopied, and the capacity."""
