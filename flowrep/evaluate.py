@@ -151,7 +151,8 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
     """
     folder.read_episodes()
     config = {key: asked[key] for key in (*OF_THE_MACHINE, "scene", "representations")}
-    config |= {"flow": asked.get("flow") or {"source": "exact"}, "renderer": "auto"}
+    config |= {"flow": asked.get("flow") or {"source": "exact"}, "noise": asked.get("noise")}
+    config |= {"renderer": "auto"}
     config |= {"speed": "normal", "seed": ""}  # of its training, of which nothing is known
     env = env_from_config(config, num_envs=1, num_workers=0)
     device = choose_device(config["device"])
@@ -166,7 +167,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
         device=device,
     )
     env.close()
-    agent = Agent(load_policy(name, task), config["representations"], config["flow"], device)
+    agent = Agent.from_config(load_policy(name, task), config, device)
     return Subject(folder, config, agent, frames=0)
 
 
@@ -242,7 +243,7 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
             f"other classes than its own ({reason})"
         ) from error
     device = choose_device(config["device"])
-    agent = Agent(policy, config["representations"], config["flow"], device)
+    agent = Agent.from_config(policy, config, device)
     return Subject(run, config, agent, state["frames"])
 
 

@@ -84,6 +84,7 @@ def agent_card(config: Config, env: EnvBase, frames: int) -> dict[str, Any]:
         ],
         "actions": list(ACTIONS),
         "flow": config["flow"],
+        "noise": config["noise"],
         "intrinsics": street.K.tolist(),
         "num_classes": street.num_classes,
         "frame_rate_hz": street.frame_rate_hz,

@@ -69,6 +69,7 @@ def env_from_config(config: Config, **changes: Any) -> EnvBase:
         "scene": config["scene"],
         "representations": config["representations"],
         "flow": config["flow"],
+        "noise": config["noise"],
         "num_envs": num_envs,
         "device": choose_device(config["device"]),
         "speed": config["speed"],

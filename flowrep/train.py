@@ -222,9 +222,7 @@ def run_comparison(
     comparison: Comparison, training: Training, config: Config, stop: StopRequest
 ) -> None:
     """Runs the episodes of the agent that is being trained, on streets made for them."""
-    agent = Agent(
-        training.agent.policy, config["representations"], config["flow"], training.agent.device
-    )
+    agent = Agent.from_config(training.agent.policy, config, training.agent.device)
     make_pool = partial(pool_from_config, config, comparison.rides)
     arena = Arena(load_scene(config["scene"]), [agent], comparison.fps, make_pool)
     try:

@@ -83,7 +83,9 @@ def test_run_folders_are_named_by_scene_representations_and_seed():
     register_resolvers()
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         config = compose("train", ["representations=[ego,obj]", "seed=3"], return_hydra_config=True)
+        noisy = compose("train", ["noise=depth_camera"], return_hydra_config=True)
     assert config.hydra.run.dir.endswith("_straight_road_ego+obj_s3")
+    assert noisy.hydra.run.dir.endswith("_straight_road_ego+obj_noisy_s0")
 
 
 def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
@@ -108,6 +110,13 @@ def test_flow_is_exact_unless_an_estimate_is_asked_for():
         "preset": "fast",
         "min_side_px": 160,
     }
+
+
+def test_sensors_are_exact_unless_noise_is_asked_for():
+    assert not any(composed()["noise"].values())
+    noise = composed("noise=depth_camera", "noise.drift_m=0.1")["noise"]
+    assert all(noise.values())
+    assert noise["drift_m"] == 0.1
 
 
 def test_estimated_flow_spells_out_the_transforms_defaults():

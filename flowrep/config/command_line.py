@@ -1,7 +1,7 @@
 """The command line's manners: a mistake ends in one line that names it and lists what exists."""
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -34,12 +34,20 @@ FOLDERS = ("resume", "run", "input", "output")
 def register_resolvers() -> None:
     """Adds what the paths of run folders are made of, in conf/run_folder.yaml and conf/view.yaml.
 
-    `${run_name:scene,representations,flow,seed}` names a run; `${folder_name:text}` is a text that
-    is one folder's name, whatever it holds; `${run_of_sweep:overrides}` names a run of a sweep.
+    `${run_name:scene,representations,flow,noise,seed}` names a run; `${folder_name:text}` is a text
+    that is one folder's name, whatever it holds; `${run_of_sweep:overrides}` names a run of a
+    sweep.
     """
 
-    def run_name(scene: str, representations: Iterable[str], flow: str, seed: int) -> str:
+    def run_name(
+        scene: str,
+        representations: Iterable[str],
+        flow: str,
+        noise: Mapping[str, float],
+        seed: int,
+    ) -> str:
         source = "" if flow == "exact" else f"_{flow}"
+        source += "_noisy" if any(noise.values()) else ""
         return folder_name(f"{scene}_{'+'.join(representations)}{source}_s{seed}")
 
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)

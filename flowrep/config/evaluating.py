@@ -7,7 +7,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from flowrep.baselines.registry import BASELINES
 from flowrep.config.expectations import Count, CountOrZero, ListOf, Number, OneOf, Seed, Text
-from flowrep.config.representations import BY_SOURCE, Representations
+from flowrep.config.representations import BY_SOURCE, Noise, Representations
 from flowrep.config.section import Section
 from flowrep.config.training import (
     SPEEDS,
@@ -22,7 +22,7 @@ from flowrep.config.violations import ABSENT, broken_rule
 from flowrep.exchange.policies import is_reference
 
 POLICIES = ("greedy", "sampled")
-OF_OWN_POLICIES = ("representations", "flow", "output")
+OF_OWN_POLICIES = ("representations", "flow", "noise", "output")
 
 
 class Policy(OneOf):
@@ -48,6 +48,7 @@ class EvaluateConfig(Section):
     scene: SceneSection | None = None
     representations: Representations | None = None
     flow: Annotated[Any, BY_SOURCE] = None
+    noise: Noise | None = None
     speed: Annotated[Any, ListOf(OneOf(SPEEDS), or_one=True)]
     fps: Annotated[Any, ListOf(Number(above=0), or_one=True)]
     episodes: Count

@@ -1,10 +1,10 @@
-"""The sections `representations` and `flow`: the options of each map, and where flow comes from."""
+"""The sections `representations`, `flow` and `noise`: maps and what they are made of."""
 
 from typing import Annotated, Any
 
 from pydantic import model_validator
 
-from flowrep.config.expectations import Count, Factor, OneOf, Positive, Share, Text
+from flowrep.config.expectations import Count, Factor, NotNegative, OneOf, Positive, Share, Text
 from flowrep.config.section import ChosenBy, Section
 from flowrep.config.violations import broken_rule
 from flowrep.transforms.dis import PRESETS
@@ -95,6 +95,15 @@ class EstimatedFlow(ExactFlow):
                 else f"is missing: estimator={self.estimator} needs flow.weights=<file>",
             )
         return self
+
+
+class Noise(Section):
+    """Errors of the depth camera and of odometry."""
+
+    depth_sigma_per_m: NotNegative
+    depth_dropout: Share
+    drift_m: NotNegative
+    drift_rad: NotNegative
 
 
 BY_SOURCE = ChosenBy("source", {"estimated": EstimatedFlow}, otherwise=ExactFlow)

@@ -18,7 +18,7 @@ from flowrep.config.expectations import (
     Text,
     Whole,
 )
-from flowrep.config.representations import BY_SOURCE, Representations
+from flowrep.config.representations import BY_SOURCE, Noise, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
 from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
@@ -72,6 +72,7 @@ class TrainConfig(Section):
     evaluation: Evaluation
     representations: Representations = Field(examples=["[ego,obj]"])
     flow: Annotated[Any, BY_SOURCE] = Field(examples=["exact"])
+    noise: Noise = Field(examples=["none"])
     scene: SceneSection = Field(examples=["straight_road"])
     algorithm: Annotated[AnyAlgorithm, BY_TARGET] = Field(examples=["dsac"])
 

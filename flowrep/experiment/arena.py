@@ -27,8 +27,26 @@ class Agent(NamedTuple):
 
     policy: Any
     representations: Mapping[str, Any]
-    flow: str | Mapping[str, Any]
+    flow: str | Mapping[str, Any] = "exact"
+    noise: Mapping[str, float] | None = None
     device: torch.device | str = "cpu"
+
+    @classmethod
+    def from_config(cls, policy: Any, config: Mapping[str, Any], device: torch.device) -> "Agent":
+        """Returns a policy that looks at what a run's config says."""
+        seen = {key: config[key] for key in ("representations", "flow", "noise")}
+        return cls(policy, **seen, device=device)
+
+    def eye(self, scene: Scene, frame_rate_hz: float) -> Eye:
+        """Returns what looks for it at streets of a scene."""
+        return Eye(
+            scene,
+            self.representations,
+            frame_rate_hz,
+            flow=self.flow,
+            noise=self.noise,
+            device=self.device,
+        )
 
 
 class Job(NamedTuple):
@@ -72,7 +90,7 @@ class Arena:
         """Makes the pool."""
         self.agents = list(agents)
         self._eyes = {
-            (number, rate): Eye(scene, agent.representations, agent.flow, rate, agent.device)
+            (number, rate): agent.eye(scene, rate)
             for number, agent in enumerate(agents)
             for rate in fps
         }

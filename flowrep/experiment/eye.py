@@ -20,8 +20,9 @@ class Eye:
     Args:
         scene: whose camera and classes they are of.
         representations: names, or a mapping from name to options.
-        flow: where raw and obj come from, see `representation_stack`.
         frame_rate_hz: steps a second.
+        flow: where raw and obj come from, see `representation_stack`.
+        noise: errors of depth and motion, see there.
         device: where they are computed.
     """
 
@@ -29,8 +30,10 @@ class Eye:
         self,
         scene: Scene,
         representations: Sequence[str] | Mapping[str, Any],
-        flow: str | Mapping[str, Any],
         frame_rate_hz: float,
+        *,
+        flow: str | Mapping[str, Any] = "exact",
+        noise: Mapping[str, float] | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         camera = scene.camera
@@ -41,6 +44,7 @@ class Eye:
             num_classes=num_classes(scene.categories),
             dt_s=1.0 / frame_rate_hz,
             flow=flow,
+            noise=noise,
         )
         self.sensors = sensors_read(self._transforms)
         self._device = torch.device(device)
@@ -67,7 +71,7 @@ class Eye:
             else:
                 assert self._latest is not None
                 now = self._transforms._step(self._latest[rows], now)
-            parts.append(now.exclude(*(("sensor", name) for name in self.sensors)))
+            parts.append(now.exclude("sensor"))
             if self._latest is None:
                 num_envs = len(next(iter(seen.values())))
                 self._latest = parts[-1][:1].expand(num_envs).clone()

@@ -12,6 +12,7 @@ _IDENTITY = (
     "scene",
     "representations",
     "flow",
+    "noise",
     "algorithm",
     "speed",
     "seed",

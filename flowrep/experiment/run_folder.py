@@ -33,7 +33,9 @@ EVALUATION_COLUMNS = (
 _EPISODE = ("scene", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
 """The columns that tell which episode of which policy a row is of."""
 
-_NEEDED = ("scene", "representations", "flow", "algorithm", "seed", "total_frames", "num_envs")
+_NEEDED = (
+    "scene", "representations", "flow", "noise", "algorithm", "seed", "total_frames", "num_envs",
+)  # fmt: skip
 """The keys without which a config is none."""
 
 

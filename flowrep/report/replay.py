@@ -16,7 +16,6 @@ from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
 from flowrep.evaluate import load_subject
 from flowrep.experiment.arena import Agent
-from flowrep.experiment.eye import Eye
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.report.drives import Drives, Film, FilmPart, Plan
 from flowrep.report.families import families_of
@@ -113,9 +112,7 @@ class Driver:
         self.run = run
         self._agent: Agent = load_subject(asked, RunFolder.existing(run.path)).agent
         self.scene = load_scene(run.config["scene"])
-        self._eye = Eye(
-            self.scene, self._agent.representations, self._agent.flow, run.fps, self._agent.device
-        )
+        self._eye = self._agent.eye(self.scene, run.fps)
         self._streets = {
             sensors: StreetEnv(
                 self.scene, run.speed, run.fps, sensors, renderer=run.config["renderer"]
@@ -201,6 +198,8 @@ def _film(driver: Driver, seed: int) -> FilmPart:
         told = f"{_TOLD[drive.outcome]} after {drive.steps / run.fps:.1f} s"
         if run.config["flow"]["source"] != "exact":
             told += "; flow is shown exact, the agent sees an estimate"
+        if any(run.config["noise"].values()):
+            told += "; sensors are shown exact, the agent's have noise"
         return FilmPart(_title(run), told, film_uri(path))
 
 

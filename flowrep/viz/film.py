@@ -39,13 +39,15 @@ def maps_of(sensor: Mapping[str, Any], intrinsics: Tensor) -> Maps:
     """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` of what one street's sensors gave.
 
     Flow is in px/step, whatever unit and scale the agent's own representations have. Raw flow is
-    the estimate where the agent lives on one, the exact one otherwise.
+    the estimate, depth and what is made of it have noise, where that is what the agent lives on.
     """
-    depth = sensor["depth"]
     raw = sensor.get("flow", None)
     if raw is None:
-        raw, _ = rigid_flow(depth, sensor["instance"], intrinsics, sensor["instance_motion"])
-    ego, obj, _ = factorize(raw, depth, intrinsics, sensor["prev_from_curr"])
+        exact, instance = sensor["depth"], sensor["instance"]
+        raw, _ = rigid_flow(exact, instance, intrinsics, sensor["instance_motion"])
+    depth = sensor.get("noisy_depth", sensor["depth"])
+    motion = sensor.get("noisy_motion", sensor["prev_from_curr"])
+    ego, obj, _ = factorize(raw, depth, intrinsics, motion)
     return {
         "rgb": sensor["rgb"],
         "semantic": sensor["semantic"],

@@ -12,10 +12,11 @@ from flowrep.config.exporting import ExportConfig
 from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config.recordings import READERS
 from flowrep.config.reporting import ReportConfig
-from flowrep.config.representations import EstimatedFlow, ExactFlow, Representations
+from flowrep.config.representations import EstimatedFlow, ExactFlow, Noise, Representations
 from flowrep.config.training import Evaluation, TrainConfig
 from flowrep.config.viewing import ViewConfig
 from flowrep.config_tree import CONF_DIR, config_groups, group_choices
+from flowrep.transforms.noise_source import NOISE_OPTIONS
 from tests.config.composing import plain
 
 OF_TRAINING = [group for group in config_groups() if group != "format"]
@@ -29,7 +30,13 @@ GROUP_FILES = [(group, name) for group in OF_TRAINING for name in group_choices(
         (
             "evaluate",
             EvaluateConfig,
-            ["policy=a.py:make", "scene=s_turn", "flow=exact", "representations=[ego]"],
+            [
+                "policy=a.py:make",
+                "scene=s_turn",
+                "flow=exact",
+                "noise=none",
+                "representations=[ego]",
+            ],
         ),
         ("export", ExportConfig, ["run=x"]),
         ("view", ViewConfig, []),
@@ -85,6 +92,8 @@ def test_every_section_has_its_file():
 def test_the_other_sections_have_the_keys_of_their_files():
     assert keys_of("flow", "exact") == sorted(ExactFlow.keys())
     assert keys_of("flow", "estimated") == sorted(EstimatedFlow.keys())
+    for name in group_choices("noise"):
+        assert keys_of("noise", name) == sorted(Noise.keys()) == sorted(NOISE_OPTIONS)
     assert sorted(plain("train")["evaluation"]) == sorted(Evaluation.keys())
     for name in group_choices("representations"):
         section = Representations.model_fields[name].annotation

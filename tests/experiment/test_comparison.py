@@ -23,6 +23,7 @@ from tests.test_configs import composed
 pytestmark = pytest.mark.slow
 
 NO_OP = 0
+NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
 ACTIONS = DiscreteActions(3, "categorical", torch.distributions.Categorical)
 
 
@@ -44,16 +45,17 @@ class Weigher(nn.Module):
         return torch.stack([0.5 * torch.cos(self.factor * total + i) for i in range(3)], -1)
 
 
-def agent(*names, factor=1.0):
+def agent(*names, factor=1.0, noise=NOISE):
+    """Looks through noisy sensors: what it sees of an episode must be that of the episode alone."""
     policy = stochastic_policy(Weigher(factor), list(names), ACTIONS)
-    return Agent(policy, {name: {} for name in names}, "exact")
+    return Agent(policy, {name: {} for name in names}, noise=noise)
 
 
 def straight_on():
     def act(tensordict):
         return tensordict.set("action", torch.full(tensordict.batch_size, NO_OP))
 
-    return Agent(act, {"depth": {}}, "exact")
+    return Agent(act, {"depth": {}})
 
 
 def rows_of(scene, agents, num_envs=3, num_workers=0, **asked):
@@ -125,13 +127,17 @@ def test_where_episodes_are_run_is_not_seen_in_what_comes_out(scene, alone, num_
 
 
 def test_agents_that_share_streets_do_not_touch_each_other(scene, alone):
-    agents = [agent("depth2", factor=3.0), agent("obj", "seg2")]
+    agents = [agent("depth2", factor=3.0, noise=None), agent("obj", "seg2")]
     other, same = rows_of(scene, agents, num_envs=4, **ASKED)
     assert same == alone
     assert [row for row in other if row["policy"] == "random"] == [
         row for row in alone if row["policy"] == "random"
     ]
     assert other != alone
+
+
+def test_an_agent_drives_otherwise_with_noise(scene, alone):
+    assert rows_of(scene, [agent("obj", "seg2", noise=None)], **ASKED)[0] != alone
 
 
 def test_more_episodes_begin_with_those_of_fewer(scene, alone):
@@ -154,14 +160,15 @@ def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
     assert [row["episode_seed"] for row in comparison.rows()] == [5 + k for k in range(gap)]
 
 
+@pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noisy"])
 @pytest.mark.parametrize("flow", ["exact", "estimated"])
-def test_an_eye_sees_what_the_env_shows(scene, flow):
+def test_an_eye_sees_what_the_env_shows(scene, flow, noise):
     if flow == "estimated":
         pytest.importorskip("cv2")
     names = ["raw", "obj", "seg2", "depth2"]
-    env = make_env(scene, names, seed=3, flow=flow)
+    env = make_env(scene, names, seed=3, flow=flow, noise=noise)
     tensordict = env.reset()
-    eye = Eye(scene, names, flow, 12.0)
+    eye = Eye(scene, names, 12.0, flow=flow, noise=noise)
     pool = EnvPool(scene, eye.sensors, num_envs=2)
     order = {"episode_seed": int(tensordict["episode_seed"]), "speed": "normal"}
     for step in range(5):

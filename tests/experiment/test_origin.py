@@ -30,6 +30,7 @@ def test_the_same_run_on_another_machine_is_the_same(config):
         ("representations.ego.scale", 0.3, "representations.ego.scale=.* says .*=0.3"),
         ("representations.seg", {}, "representations.seg=absent"),
         ("algorithm.gamma", 0.5, "algorithm.gamma=0.99"),
+        ("noise.drift_m", 0.1, "noise.drift_m=0.0, .* says noise.drift_m=0.1"),
         ("seed", 1, "seed=0"),
     ],
 )

@@ -10,6 +10,7 @@ CONFIG = {
     "scene": {"camera": {"height_px": 48}},
     "representations": {"ego": None},
     "flow": {"source": "exact"},
+    "noise": {"drift_m": 0.0},
     "algorithm": {"gamma": 0.5},
     "seed": 3,
     "num_envs": 2,

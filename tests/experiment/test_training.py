@@ -24,12 +24,15 @@ pytestmark = pytest.mark.slow
 SMALL = {"ppo": ["algorithm.rollout_length=16"]}
 
 
-def new_run(folder, *, resume=False, algorithm="dsac", num_workers=0) -> tuple[Training, dict]:
+def new_run(
+    folder, *, resume=False, algorithm="dsac", noise="none", num_workers=0
+) -> tuple[Training, dict]:
     small = SMALL.get(algorithm, ["algorithm.replay_capacity=64"])
     config = composed(
         "debug=smoke", "num_envs=2", "total_frames=120", "checkpoint_every_frames=60",
         "log_every_frames=20", "evaluation.every_frames=0", "algorithm.precision=fp32",
-        "device=cpu", "seed=7", f"algorithm={algorithm}", f"num_workers={num_workers}", *small,
+        "device=cpu", "seed=7", f"algorithm={algorithm}", f"noise={noise}",
+        f"num_workers={num_workers}", *small,
     )  # fmt: skip
     config["resume"] = str(folder) if resume else None
     return make_training(config, RunFolder(folder)), config
@@ -56,15 +59,13 @@ class StopAfter(StopRequest):
         return self.training.frames >= self.frames
 
 
-def finish(folder, *stops: int, algorithm="dsac") -> Training:
+def finish(folder, *stops: int, **how) -> Training:
     """Trains in as many sessions as there are stops, and one more."""
     for stop in stops:
-        training, config = new_run(
-            folder, resume=(folder / "checkpoint").exists(), algorithm=algorithm
-        )
+        training, config = new_run(folder, resume=(folder / "checkpoint").exists(), **how)
         train(training, config, StopAfter(training, stop), lambda frames: False)
         training.env.close()
-    training, config = new_run(folder, resume=bool(stops), algorithm=algorithm)
+    training, config = new_run(folder, resume=bool(stops), **how)
     train(training, config, StopRequest(), lambda frames: False)
     training.env.close()
     return training
@@ -109,10 +110,13 @@ def logged(training):
     return [{k: v for k, v in row.items() if k not in clock} for row in rows]
 
 
-@pytest.mark.parametrize("algorithm", group_choices("algorithm"))
-def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, algorithm):
-    whole = finish(tmp_path / "whole", algorithm=algorithm)
-    pieces = finish(tmp_path / "pieces", 34, 78, algorithm=algorithm)
+@pytest.mark.parametrize(
+    ("algorithm", "noise"),
+    [*((algorithm, "none") for algorithm in group_choices("algorithm")), ("dsac", "depth_camera")],
+)
+def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, algorithm, noise):
+    whole = finish(tmp_path / "whole", algorithm=algorithm, noise=noise)
+    pieces = finish(tmp_path / "pieces", 34, 78, algorithm=algorithm, noise=noise)
     assert whole.agent.updates == pieces.agent.updates > 5
     assert differing(whole.state(), pieces.state()) == []
     assert logged(whole) == logged(pieces)

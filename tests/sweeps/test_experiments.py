@@ -12,6 +12,7 @@ pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
 from flowrep.config import UsageError
 from flowrep.config.command_line import register_resolvers
 from flowrep.config.composition import Preview, check_command
+from flowrep.config.run_names import run_of_sweep
 from flowrep.config.training import TrainConfig
 from flowrep.config_tree import group_choices
 from flowrep.train import final_episodes
@@ -63,6 +64,17 @@ def test_what_is_typed_replaces_what_the_experiment_sweeps():
 def test_flow_is_estimated_in_half_of_the_runs_that_compare_it():
     flows = Counter(run["flow"] for run in runs_of("experiment=estimated_flow"))
     assert flows == {"exact": 6, "estimated": 6}
+
+
+def test_each_stack_has_noise_in_half_of_the_runs_that_compare_it():
+    runs = runs_of("experiment=sensor_noise", "preset=laptop")
+    cells = Counter((run["noise"], run["representations"]) for run in runs)
+    stacks = ["[ego,obj]", "[raw]", "[depth2]"]
+    assert cells == {(noise, stack): 3 for noise in ("none", "depth_camera") for stack in stacks}
+    assert {run["scene"] for run in runs} == {"straight_road"}
+    names = {run_of_sweep(f"{key}={value}" for key, value in run.items()) for run in runs}
+    assert len(names) == 18
+    assert "sensor_noise_laptop_straight_road_ego+obj_s0_noise-depth_camera" in names
 
 
 @pytest.mark.parametrize("name", group_choices("experiment"))
