@@ -46,8 +46,7 @@ gallery: $(INSTALLED)  ## Make the README's gallery anew
 	  cp outputs/gallery/$$scene/sheet.png docs/images/gallery_$$scene.png; \
 	  cp outputs/gallery/$$scene/plan.png docs/images/plan_$$scene.png; \
 	done
-	$(BIN)/python examples/filmstrip.py docs/images/strip.png
-	$(BIN)/python examples/obj_scale.py docs/images/obj_scale.png
+	$(BIN)/python examples/filmstrip.py docs/images
 	$(BIN)/python examples/transform_pictures.py docs/images/transforms
 
 # A process a core, one thread each. A file stays in one process,

@@ -1,19 +1,29 @@
-"""Writes the README's strip: one step of a planner's drive, each representation side by side.
+"""Writes two of the README's pictures, of one step of a planner's drive.
 
-python examples/filmstrip.py docs/images/strip.png
+python examples/filmstrip.py docs/images
+
+`strip.png` has each representation side by side, `obj_scale.png` explains the scale of object flow.
 """
 
 import sys
+from pathlib import Path
 
 import torch
 
-from flowrep.baselines.planner import Planner
+from flowrep.baselines import Planner
 from flowrep.envs import make_env, street_envs
-from flowrep.viz import representation_strip, write_png
+from flowrep.viz import (
+    FLOW_SCALE_PX,
+    flow_note,
+    flow_to_rgb,
+    representation_strip,
+    strip,
+    write_png,
+)
 from flowrep.viz.film import film_episode
 
 
-def main(path: str, seed: int = 2) -> None:
+def main(folder: Path, seed: int = 2) -> None:
     env = make_env("straight_road", ["rgb"], keep_sensor=True, seed=seed)
     street, planner = street_envs(env)[0], Planner()
 
@@ -22,11 +32,26 @@ def main(path: str, seed: int = 2) -> None:
 
     frames, outcome = film_episode(env, drive)
     env.close()
-    # The step with most of the picture in motion of its own, but nobody right before the lens.
-    chosen = max(frames, key=lambda maps: int(((maps["obj"] != 0) & (maps["depth"] > 6)).sum()))
-    write_png(path, representation_strip(chosen))
-    print(f"{path}: one of {len(frames)} steps of an episode that ended in {outcome}")
+    chosen = liveliest(frames)
+    write_png(folder / "strip.png", representation_strip(chosen))
+    write_png(folder / "obj_scale.png", three_ways(chosen))
+    print(f"{folder}: one of {len(frames)} steps of an episode that ended in {outcome}")
+
+
+def liveliest(frames):
+    """Returns the step with most in motion of its own, but nobody right in front of the camera."""
+    return max(frames, key=lambda maps: int(((maps["obj"] != 0) & (maps["depth"] > 6)).sum()))
+
+
+def three_ways(maps):
+    """Returns raw flow and object flow at raw's scale, and object flow at its own."""
+    raws, own = FLOW_SCALE_PX["raw"], FLOW_SCALE_PX["obj"]
+    shown = {"raw": ("raw", raws), "obj, as raw": ("obj", raws), "obj, its own": ("obj", own)}
+    images = {"RGB": maps["rgb"].numpy().transpose(1, 2, 0)}
+    images |= {label: flow_to_rgb(maps[name], scale) for label, (name, scale) in shown.items()}
+    notes = {label: flow_note(scale) for label, (_, scale) in shown.items()}
+    return strip(images, wheel_for=shown, notes=notes)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(Path(sys.argv[1]))

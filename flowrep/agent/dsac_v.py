@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams
-from torchrl.data import Composite, TensorSpec
 from torchrl.objectives import LossModule
 
 from flowrep.agent.action import DiscreteActions
+from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.dsac_loss import transition_keys
 from flowrep.agent.observation import decode_maps
-from flowrep.agent.off_policy import OffPolicy
 from flowrep.agent.policy import MapNetwork
 
 
@@ -120,7 +119,7 @@ class DiscreteSACValueLoss(LossModule):
         )
 
 
-class DiscreteSACWithValue(OffPolicy):
+class DiscreteSACWithValue(DiscreteSAC):
     """Actor, two Q-functions, a state-value function V and its target V̄, sharing no weights.
 
     One gradient step minimises, over a batch and with Q_i(s, π) = Σ_a π(a|s) Q_i(s, a):
@@ -136,12 +135,7 @@ class DiscreteSACWithValue(OffPolicy):
     costs five sets of encoders where `DiscreteSAC` with a shared one has two. Of transitions of
     several steps, r is the discounted sum of their rewards, without the entropy bonus on the way.
 
-    Args:
-        observation_spec: as `OffPolicy` takes it, like the arguments that follow.
-        action_spec: `Categorical` or `OneHot`.
-        keys: the observation maps to read, in order.
-        alpha_rate_factor: the learning rate of log α is so many times that of the weights.
-        options: of `OffPolicy` and `DiscreteSACValueLoss`.
+    Its arguments are those of `DiscreteSAC`, with the options of `DiscreteSACValueLoss`.
     """
 
     LOSS = DiscreteSACValueLoss
@@ -155,15 +149,3 @@ class DiscreteSACWithValue(OffPolicy):
         "q_mean": "q_mean",
         "value_mean": "value_mean",
     }
-
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        keys: Sequence[NestedKey],
-        *,
-        alpha_rate_factor: float = 1.0,
-        **options: Any,
-    ) -> None:
-        rate_factors = {"log_alpha": alpha_rate_factor}
-        super().__init__(observation_spec, action_spec, keys, rate_factors=rate_factors, **options)
