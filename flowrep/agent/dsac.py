@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 from tensordict import NestedKey
 from torchrl.data import Composite, TensorSpec
+from torchrl.objectives import LossModule
 
 from flowrep.agent.dsac_loss import DiscreteSACMapLoss
 from flowrep.agent.off_policy import OffPolicy
@@ -36,7 +37,7 @@ class DiscreteSAC(OffPolicy):
         options: of `OffPolicy` and `DiscreteSACMapLoss`.
     """
 
-    LOSS = DiscreteSACMapLoss
+    LOSS: ClassVar[Callable[..., LossModule]] = DiscreteSACMapLoss
     METRICS: ClassVar[Mapping[str, str]] = {
         "q_loss": "loss_qvalue",
         "actor_loss": "loss_actor",
