@@ -25,7 +25,7 @@ def choose_device(name: str) -> torch.device:
     """Returns the device of that name, for "auto" a CUDA device where there is one.
 
     Raises:
-        UsageError: torch knows no such device, or this machine has none.
+        UsageError: if torch does not know the device, or this machine lacks it.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -37,13 +37,13 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_workers(num_workers: Any, num_envs: int) -> int:
-    """Returns how many processes drive `num_envs` streets, for "auto" one a core if there are two.
+    """Returns the number of worker processes; for "auto" one per core, if there are several.
 
-    A job of a pool of processes, as `hydra/launcher=joblib` makes one, has no cores but its own:
-    there "auto" is none.
+    Inside a pool of processes, as `hydra/launcher=joblib` makes one, "auto" is 0: the other jobs
+    have the other cores.
 
     Raises:
-        UsageError: it is no such number.
+        UsageError: if it is another value.
     """
     if num_workers == "auto":
         if multiprocessing.current_process().name != "MainProcess":
@@ -59,9 +59,9 @@ def choose_workers(num_workers: Any, num_envs: int) -> int:
 
 
 def env_from_config(config: Config, **changes: Any) -> EnvBase:
-    """Returns the env that the config describes; `changes` go to `make_env` in its place.
+    """Returns the env that the config describes; `changes` override arguments of `make_env`.
 
-    Each observation says whether an episode begins with it, `is_init`, as the replay memory asks.
+    Observations have `is_init`, which the replay memory needs: whether an episode begins there.
     """
     num_envs: int = changes.get("num_envs") or config["num_envs"]
     num_workers = changes.get("num_workers", config["num_workers"])
@@ -146,7 +146,7 @@ def algorithm_class(section: Mapping[str, Any], trust: str | None) -> Any:
 
 
 def _check_options(section: Mapping[str, Any], known: Mapping[str, inspect.Parameter]) -> None:
-    """Refuses options that a class does not have, and the lack of those that it needs."""
+    """Raises UsageError for an unknown option, and for a missing one without a default."""
     options = [key for key in section if key != "_target_"]
     for key in options:
         if key not in known:

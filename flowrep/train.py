@@ -191,9 +191,9 @@ def make_training(config: Config, folder: RunFolder) -> Training:
 
 
 def share_cores(config: Config) -> None:
-    """Has the updates computed by a thread a core, as many as PyTorch would take.
+    """Gives the updates one thread per core, as many as PyTorch would use.
 
-    What is beside them is small and takes one thread, but for flow that is estimated.
+    Everything else is small and gets one thread, except estimated flow.
     """
     if choose_device(config["device"]).type != "cpu":
         return
@@ -203,7 +203,7 @@ def share_cores(config: Config) -> None:
 
 
 def log_evaluation(training: Training, config: Config, stop: StopRequest, frames: int) -> bool:
-    """Adds greedy episodes at the training speed to evaluation.csv; says if it was stopped."""
+    """Adds greedy episodes at the training speed to evaluation.csv; returns if it was stopped."""
     comparison = Comparison(
         speeds=[config["speed"]],
         fps=[config["scene"]["frame_rate_hz"]],

@@ -58,11 +58,11 @@ def run(config: DictConfig) -> None:
 
 
 def check(config: DictConfig) -> None:
-    """Refuses what can't be, by name.
+    """Checks the config.
 
     Raises:
-        UsageError: naming the key, what came and what exists.
-        SceneError: the scene itself can't be.
+        UsageError: if a key is unknown or a value invalid.
+        SceneError: if the scene is invalid.
     """
     plain = plain_config(config)
     validated(ViewConfig, plain, own_keys())

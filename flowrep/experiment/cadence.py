@@ -19,7 +19,7 @@ class Every:
     last: int = 0
 
     def __call__(self, step: int) -> bool:
-        """Says whether `step` passed a new multiple since the last call."""
+        """Returns whether `step` passed a new multiple since the last call."""
         if not self.interval or step // self.interval <= self.last // self.interval:
             return False
         self.last = step

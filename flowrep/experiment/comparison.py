@@ -1,4 +1,4 @@
-"""Agents beside baselines on the same episodes: rows for evaluation.csv and a table to read."""
+"""Agents and baselines on the same episodes: rows for evaluation.csv and a table to read."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -74,7 +74,7 @@ class Comparison:
 
     @property
     def is_complete(self) -> bool:
-        """Says whether all episodes have been run."""
+        """Returns whether all episodes have been run."""
         cells = [*self._rides, *self._drives]
         return all(len(self._done[cell]) == len(self._seeds) for cell in cells)
 

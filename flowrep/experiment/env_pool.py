@@ -1,4 +1,4 @@
-"""Streets that live through episodes one by one, each going on to the next once it is free."""
+"""A pool of environments that run episodes one after another."""
 
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
@@ -20,14 +20,14 @@ Options = dict[str, Any]
 
 
 class EnvPool:
-    """Streets of one scene, in this process or in others; an episode is the same in each of them.
+    """Environments of one scene, in this process or in workers; an episode is the same in all.
 
     Args:
         scene: a loaded scene.
         sensors: what is observed, see `StreetEnv`; none where only baselines drive.
-        num_envs: how many streets.
-        num_workers: how many processes drive them; 0: this one.
-        renderer: who draws, see `StreetEnv`.
+        num_envs: how many environments.
+        num_workers: how many processes step them; 0: this one.
+        renderer: see `StreetEnv`.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class EnvPool:
         num_workers: int = 0,
         renderer: str = "auto",
     ) -> None:
-        """Builds the streets."""
+        """Makes the environments."""
         street = partial(_street, scene, tuple(sensors), renderer)
         self.num_envs = num_envs
         self._workers: WorkerVectorEnv | None = None
@@ -53,11 +53,11 @@ class EnvPool:
             self._seen: Arrays = empty.get("sensor", {})
 
     def advance(self, orders: Sequence[Order]) -> tuple[Arrays, list[tuple[str, str] | None]]:
-        """Lets each street follow its order; see `StreetVectorEnv.advance`.
+        """Executes one order per environment; see `StreetVectorEnv.advance`.
 
         Returns:
-            What is seen, `[num_envs, ...]` by sensor, valid until the next call; how each episode
-            stands.
+            The sensor maps `[num_envs, ...]`, valid until the next call; the status of each
+            episode.
         """
         if self._workers is not None:
             return self._workers.advance(orders)
@@ -65,7 +65,7 @@ class EnvPool:
         return self._seen, standings
 
     def drive(self, jobs: Sequence[tuple[str, Options]]) -> Iterator[tuple[int, Drive]]:
-        """Yields the drives of baselines, which see no picture, as they end.
+        """Yields the episodes of baselines, which need no rendering, as they end.
 
         Args:
             jobs: a baseline's name and the episode for each; its number comes with the drive.
@@ -77,7 +77,7 @@ class EnvPool:
                 yield number, _drive(self._streets.envs[0], job)
 
     def close(self) -> None:
-        """Ends the workers and gives the simulators back."""
+        """Stops the workers and closes the simulators."""
         (self._workers or self._streets).close()
 
 

@@ -26,7 +26,7 @@ class StopRequest:
         return 0 if self.received is None else 128 + self.received
 
     def __bool__(self) -> bool:
-        """Says whether a stop was asked for."""
+        """Returns whether a stop was requested."""
         return self.received is not None
 
     def __enter__(self) -> "StopRequest":

@@ -1,4 +1,4 @@
-"""What a checkpoint belongs to, so that it is not taken for another run's."""
+"""The identity of a checkpoint's run, so that it is not loaded into another."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -25,21 +25,21 @@ _ABSENT = "absent"
 
 
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns what a run's checkpoint belongs to: this version, and what the run is defined by."""
+    """Returns the identity of a run: flowrep's version, and the config keys that define it."""
     parts = {key: config[key] for key in _IDENTITY}
     return {"flowrep": __version__} | json.loads(json.dumps(parts))
 
 
 def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Refuses a checkpoint that belongs to something else.
+    """Checks that a checkpoint belongs to a run.
 
     Args:
-        saved: the origin that the checkpoint carries.
-        expected: that of the config which it lies beside.
+        saved: the origin stored in the checkpoint.
+        expected: the origin of the config in its folder.
         path: the checkpoint, for the message.
 
     Raises:
-        CheckpointError: naming the first difference.
+        CheckpointError: if it belongs to another; names the first difference.
     """
     if saved.get("flowrep") != expected["flowrep"]:
         raise CheckpointError(

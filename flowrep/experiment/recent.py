@@ -19,7 +19,7 @@ class RecentEpisodes:
     """Outcomes, returns and lengths of the last episodes that ended, of all streets together."""
 
     def __init__(self) -> None:
-        """Has seen no episode yet."""
+        """Starts without episodes."""
         self._running: Tensor | None = None  # [2, num_envs]: return and length so far
         self._ended: deque[tuple[int, float, int]] = deque(maxlen=RECENT_EPISODES)
 
@@ -67,7 +67,7 @@ class Means:
     """Means of what updates return, over those since the last row, without waiting for a device."""
 
     def __init__(self) -> None:
-        """Has seen no update yet."""
+        """Starts without updates."""
         self._sums: dict[str, Tensor] = {}
         self._count = 0
 

@@ -89,7 +89,7 @@ class RunFolder:
         return [cls(run) for run in runs] if is_sweep else [cls.existing(path)]
 
     def check_is_new(self) -> None:
-        """Looks whether a run can begin here.
+        """Checks that a run can begin here.
 
         Raises:
             RunFolderError: the folder holds one, or what is left of one.
@@ -195,7 +195,7 @@ class RunFolder:
                 write_rows(path, kept, columns)
 
     def is_evaluated(self, frames: int, episodes: int) -> bool:
-        """Says whether the evaluation that ends a run is in evaluation.csv.
+        """Returns whether the final evaluation is in evaluation.csv.
 
         Args:
             frames: that the run was trained for.

@@ -60,7 +60,7 @@ def _check_columns(path: Path, names: Sequence[str], columns: Sequence[str] | No
 
 
 def is_whole(path: Path) -> bool:
-    """Says whether a table ends with a whole line; one that does not exist lacks nothing."""
+    """Returns whether a table ends with a complete line, or does not exist."""
     return not path.is_file() or path.read_bytes().endswith(b"\n")
 
 

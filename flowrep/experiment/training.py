@@ -1,4 +1,4 @@
-"""The training loop: act, store, learn, and now and then log, evaluate and save."""
+"""The training loop: act, store, learn; at intervals log, evaluate and save."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -29,13 +29,18 @@ from flowrep.experiment.stopwatch import Stopwatch
 
 @dataclass
 class Training:
-    """Everything that a run continues from; `state` and `restore` are its checkpoint.
+    """Everything that a run resumes from; `state` and `restore` are its checkpoint.
 
     Args:
         env: batched TorchRL env.
-        agent: the algorithm, with what it remembers.
+        agent: the algorithm and its memory.
         run: the folder that the run writes to.
         origin: what its checkpoints belong to, see `origin_of`.
+        frames: environment frames so far.
+        evaluation_pending: whether the last evaluation was interrupted and has to be run again.
+        observation: what the policy acts on next; None before the first reset.
+        metrics: means over the updates since the last row of metrics.csv.
+        recent: the latest episodes that ended.
     """
 
     env: EnvBase
@@ -67,7 +72,7 @@ class Training:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continues where `state` was taken."""
+        """Continues from a `state`."""
         self.env.reset()
         self.frames = state["frames"]
         self.evaluation_pending = state["evaluation_pending"]
@@ -84,19 +89,19 @@ class Training:
             torch.cuda.set_rng_state_all(state["cuda_rng"])
 
     def save(self) -> None:
-        """Writes the checkpoint; the last one stays whole until the new one is.
+        """Writes the checkpoint; the previous one stays intact until the new one is complete.
 
         Raises:
-            DivergenceError: as `check`; nothing is written then.
+            DivergenceError: see `check`; nothing is written.
         """
         self.check()
         save_checkpoint(self.run.checkpoint_path, self.state())
 
     def check(self) -> None:
-        """Looks whether the algorithm still learns.
+        """Checks that losses and metrics are finite.
 
         Raises:
-            DivergenceError: a loss became nan or infinite; says where the last good state is.
+            DivergenceError: if one is not; names the last good checkpoint.
         """
         try:
             self.agent.divergence.check()
@@ -104,10 +109,10 @@ class Training:
             raise self._diverged(str(error)) from error
 
     def act(self) -> TensorDictBase:
-        """Returns the present observation with the policy's actions.
+        """Returns the current observation with the policy's actions.
 
         Raises:
-            DivergenceError: there are no actions to draw: the policy's numbers are nan or infinite.
+            DivergenceError: if the policy's outputs are nan or infinite.
         """
         assert self.observation is not None
         try:
@@ -130,10 +135,10 @@ class Training:
         return DivergenceError(f"{what}; {good}")
 
     def load(self) -> None:
-        """Continues from the checkpoint, and forgets what was logged after it.
+        """Continues from the checkpoint, and deletes what was logged after it.
 
         Raises:
-            CheckpointError: it can't be read, or belongs to another run.
+            CheckpointError: if it can't be read, or belongs to another run.
         """
         path = self.run.checkpoint_path
         state = load_checkpoint(path)
@@ -148,22 +153,22 @@ def train(
     stop: StopRequest,
     evaluate: Callable[[int], bool],
 ) -> Stopwatch:
-    """Trains until `total_frames` or until a stop is asked for; the last state is saved.
+    """Trains until `total_frames` or until a stop is requested, and saves the last state.
 
-    Between acting and seeing what came of it, the updates are taken that the frames before allow:
-    where the environments have processes and cores of their own, they drive meanwhile, which
-    TorchRL's `Trainer`, one after the other, has no place for. The order, and so all that comes
-    out, is the same where they don't.
+    The updates that the previous frames allow are taken between choosing an action and waiting for
+    its step. Environments that have processes and cores of their own step meanwhile, which
+    TorchRL's sequential `Trainer` does not support. The order of operations, and so the result, is
+    the same where they do not.
 
     Args:
         training: a new or a restored run.
         config: the resolved config.
-        stop: asked between two steps.
-        evaluate: gets the number of frames; says whether it was cut short, then it is asked again
-            when the run is resumed.
+        stop: checked between two steps.
+        evaluate: takes the number of frames; returns whether it was interrupted and has to be run
+            again when the run is resumed.
 
     Returns:
-        Where the wall time went.
+        The wall time by activity.
     """
     t = training
     clock = Stopwatch()
@@ -192,7 +197,7 @@ def train(
             t.frames += stepped.numel()
             t.recent.add(stepped)
             if t.frames >= total:
-                learn(t, clock)  # no next step is there to drive meanwhile
+                learn(t, clock)  # there is no next step to overlap with
             bar.update(t.frames - bar.n)
             if should_log(t.frames):
                 t.check()
@@ -211,7 +216,7 @@ def train(
 
 
 def learn(training: Training, clock: Stopwatch) -> None:
-    """Takes the updates that the frames so far allow."""
+    """Takes the updates that are due after the frames so far."""
     agent = training.agent
     for _ in range(agent.updates_due(training.frames)):
         with clock("memory"):
@@ -225,9 +230,9 @@ def _is_bad(values: Tensor) -> bool:
 
 
 def metrics_row(training: Training, rate: float | None, clock: Stopwatch) -> dict[str, float]:
-    """Returns one row of metrics.csv, and begins the next; nan stands for what there is none of.
+    """Returns one row of metrics.csv and starts the next; missing values are nan.
 
-    docs/metrics.md says what each column means.
+    docs/metrics.md explains the columns.
     """
     row = training.recent.summary()
     row["updates"] = training.agent.updates
@@ -238,7 +243,7 @@ def metrics_row(training: Training, rate: float | None, clock: Stopwatch) -> dic
 
 
 def progress_text(row: Mapping[str, float]) -> str:
-    """Returns what stands at the end of the progress line; nothing stands for nan."""
+    """Returns the end of the progress line; nan values are left out."""
     losses = [name for name in row if name.endswith("_loss")]
     shown = {"success": f"{row['success']:.0%}"}
     shown |= {name: f"{row[name]:.3g}" for name in ("alpha", "entropy", *losses) if name in row}

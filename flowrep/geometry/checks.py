@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def check_shape(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> None:
-    """Returns nothing; complains unless `tensor` ends in `trailing` and holds floats.
+    """Checks that `tensor` holds floats and its last dims are `trailing`.
 
     Args:
         name: the argument's name, for the message.
@@ -18,8 +18,8 @@ def check_shape(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> N
         trailing: sizes of the last dims; a string stands for any size and names it.
 
     Raises:
-        ValueError: another number or size of trailing dims.
-        TypeError: integers, or not a tensor.
+        ValueError: if the number or a size of the trailing dims differs.
+        TypeError: if it holds integers, or is not a tensor.
     """
     check_is_tensor(name, tensor)
     if not tensor.is_floating_point():
@@ -31,7 +31,7 @@ def check_shape(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> N
 
 
 def check_is_tensor(name: str, tensor: object) -> None:
-    """Returns nothing; complains unless `tensor` is a torch tensor."""
+    """Raises TypeError if `tensor` is not a torch tensor."""
     if not isinstance(tensor, Tensor):
         raise TypeError(
             f"{name} must be a torch.Tensor, got {type(tensor).__name__}; "
@@ -40,7 +40,7 @@ def check_is_tensor(name: str, tensor: object) -> None:
 
 
 def check_trailing(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> None:
-    """Returns nothing; complains unless the last dims of `tensor` are `trailing`."""
+    """Raises ValueError if the last dims of `tensor` are not `trailing`."""
     wanted_dims = len(trailing)
     fits = tensor.ndim >= wanted_dims and all(
         isinstance(want, str) or got == want
@@ -55,7 +55,7 @@ def broadcast_batch(**batches: torch.Size) -> torch.Size:
     """Returns the common leading batch of several arguments.
 
     Raises:
-        ValueError: they do not broadcast; the message lists each argument's batch.
+        ValueError: if they do not broadcast; lists the batch of each argument.
     """
     try:
         return torch.broadcast_shapes(*batches.values())
@@ -67,11 +67,7 @@ def broadcast_batch(**batches: torch.Size) -> torch.Size:
 
 
 def check_name(option: str, name: object, names: Any) -> None:
-    """Returns nothing; complains unless a name is one of a `Literal`'s.
-
-    Raises:
-        ValueError: it is not; the message lists those that are.
-    """
+    """Raises ValueError if `name` is not a value of the `Literal` `names`, and lists its values."""
     known = list(get_args(names))
     if name not in known:
         close = difflib.get_close_matches(str(name), known, n=1)

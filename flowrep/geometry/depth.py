@@ -111,7 +111,7 @@ def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
 def check_depth_options(
     kind: str, has_camera: bool, near_m: float | None, far_m: float | None
 ) -> None:
-    """Returns nothing; complains unless a kind of depth comes with just what it needs."""
+    """Raises ValueError if a kind of depth lacks what it needs, or has what it does not read."""
     check_name("kind", kind, DepthKind)
     if has_camera != (kind == "ray_length"):
         raise ValueError(f"'ray_length' needs K, the other kinds do not read it; kind is {kind!r}")

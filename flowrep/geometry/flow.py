@@ -200,7 +200,7 @@ def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torc
 
 
 def _check_same_size(name: str, image: Tensor, depth: Tensor) -> None:
-    """Returns nothing; complains unless an image has depth's height and width."""
+    """Raises ValueError if an image and depth differ in height or width."""
     if image.shape[-2:] != depth.shape[-2:]:
         raise ValueError(
             f"{name} and depth must have one (height, width), "

@@ -49,7 +49,7 @@ def adapt_flow(
 
 
 def check_flow_options(direction: str, grid: str, channels: str) -> None:
-    """Returns nothing; complains about an unknown name, and about the previous frame's grid."""
+    """Raises ValueError for an unknown name, and for the previous frame's grid."""
     check_name("direction", direction, Direction)
     check_name("grid", grid, Grid)
     check_name("channels", channels, Channels)

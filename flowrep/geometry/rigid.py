@@ -123,9 +123,9 @@ def instance_motion(
 
 
 def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None:
-    """Returns nothing; complains about the first transform that is no rotation and translation.
+    """Checks that every transform is a rotation and a translation.
 
-    It reads the values: on a GPU it waits for them, so it has no place in a loop that must not.
+    It reads the values, which waits for a GPU: keep it out of loops that must not wait.
 
     Args:
         name: the argument's name, for the message.
@@ -133,9 +133,9 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
         tolerance: on each element of R R^T - I and on the last row.
 
     Raises:
-        ValueError: nan or inf, a last row that is not (0, 0, 0, 1), a scale or shear, or a
-            left-handed frame; with the index of the first such transform in the batch.
-        TypeError: no float tensor.
+        ValueError: for nan or inf, a last row other than (0, 0, 0, 1), scale or shear, or a
+            left-handed frame; names the index of the first such transform in the batch.
+        TypeError: if it is not a float tensor.
 
     >>> check_rigid("pose", torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])))
     Traceback (most recent call last):

@@ -108,10 +108,10 @@ class Recording(ABC):
 
 
 def check_frame(frame: Frame) -> None:
-    """Returns nothing; complains about a frame whose parts do not fit one another.
+    """Checks that the parts of a frame fit together.
 
     Raises:
-        SequenceError: pictures of differing sizes, a pose that is not rigid, a K that is none.
+        SequenceError: if sizes differ, the pose is not rigid, or K is not a camera matrix.
     """
     sizes = {"depth": frame.size}
     if frame.rgb is not None:

@@ -67,7 +67,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 
 def check_pixels(path: Path, width: int, height: int) -> None:
-    """Returns nothing; complains about a size that no frame has, before memory is asked for it."""
+    """Raises SequenceError for an impossible size, before memory is allocated for it."""
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise SequenceError(
             path, f"claims {width} x {height} pixels; 1 to {MAX_PIXELS:,} are read (8K)"

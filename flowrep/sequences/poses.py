@@ -53,7 +53,7 @@ def read_pose_lines(path: Path, layout: PoseLayout, frames: int) -> NDArray[np.f
 
 
 def check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
-    """Returns nothing; complains about times that are no numbers or go backwards."""
+    """Raises SequenceError if a time is not a number, or earlier than the one before it."""
     if not np.isfinite(times_s).all():
         raise SequenceError(path, "holds a timestamp that is no number")
     backwards = np.flatnonzero(np.diff(times_s) < 0)

@@ -84,7 +84,7 @@ class MapTransform(Transform):
         self.label = " and ".join(repr(key) for key in self.out_keys)
 
     def _check_layout(self, maps: Sequence[Tensor | TensorSpec]) -> None:
-        """Complains about the first input whose layout is wrong or disagrees with the others."""
+        """Raises ValueError for the first input whose layout is wrong or contradicts the others."""
         agreed: dict[str, int] = {}
         batch = maps[0].shape[: -len(self.reads[0].shape)]
         for key, reads, value in zip(self.in_keys, self.reads, maps):
@@ -169,7 +169,7 @@ def as_keys(keys: Keys) -> list[NestedKey]:
 
 
 def check_own_keys(transform: MapTransform) -> None:
-    """Complains where a transform would overwrite what it reads, and read that the next time."""
+    """Raises ValueError if a transform would overwrite a key that it reads."""
     shared = sorted({str(key) for key in transform.in_keys} & {str(k) for k in transform.out_keys})
     if shared:
         raise ValueError(
@@ -180,7 +180,7 @@ def check_own_keys(transform: MapTransform) -> None:
 
 
 def refuse_n_step(tensordict: TensorDictBase, key: NestedKey) -> None:
-    """Complains about a batch whose next frame isn't the step after its root's.
+    """Raises MissingKey if the next frames of a batch are not one step after its root's.
 
     TorchRL's `MultiStep` and `MultiStepTransform` say how many steps lie between in
     `"steps_to_next_obs"`.

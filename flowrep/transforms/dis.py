@@ -46,7 +46,7 @@ class DIS:
     min_side_px: int = 160
 
     def __post_init__(self) -> None:
-        """Refuses options that cannot be, and a machine without OpenCV, before the first step."""
+        """Raises ValueError for invalid options, and ImportError without OpenCV."""
         if self.preset not in PRESETS:
             raise ValueError(f"preset is one of {list(PRESETS)}, got {self.preset!r}")
         if self.min_side_px < 1:

@@ -43,7 +43,7 @@ def noise_makers(
     for option in given:
         if option not in NOISE_OPTIONS:
             raise ValueError(unknown_name("option of noise:", option, NOISE_OPTIONS))
-    SensorNoise(**given)  # complains about values, whether they are used or not
+    SensorNoise(**given)  # checks all values, used or not
     sensed = Sensed()
     out_keys: dict[str, NestedKey] = {}
     used: dict[str, Any] = {}

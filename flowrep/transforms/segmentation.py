@@ -90,7 +90,7 @@ class Segmentation(MapTransform):
 
 
 def _check_fits_uint8(key: object, ids: Tensor) -> None:
-    """Complains about ids that uint8 would wrap: 300 would become 44."""
+    """Raises ValueError for ids that uint8 would wrap: 300 would become 44."""
     if ids.dtype is torch.uint8 or not ids.numel():
         return
     least, most = (int(bound) for bound in ids.aminmax())
