@@ -29,7 +29,7 @@ class VectorWrapper(GymWrapper):
     """TorchRL's wrapper, with the marks of what to reset brought to where NumPy reads them.
 
     TorchRL 0.14 hands them on from the device of the TensorDict, which fails on CUDA, and expects
-    them of every TensorDict; where they are missing, all streets begin anew.
+    them of every TensorDict; where they are missing, all environments are reset.
     """
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def make_env(
     compiled: bool = False,
     renderer: str = "auto",
 ) -> TransformedEnv:
-    """Returns a TorchRL env of streets stepped side by side, always of batch size [num_envs].
+    """Returns a batched TorchRL env, always of batch size [num_envs].
 
     Reads action (categorical: 0 NO_OP, 1 TURN_LEFT, 2 TURN_RIGHT). Writes the representations,
     `outcome` and `hit` uint8 [1], `episode_seed` int64 [1], `reward` [1] and the done keys. Env
@@ -78,14 +78,14 @@ def make_env(
         scene: a scene's name, file, mapping, or `Scene`.
         representations: names, or a mapping from name to options; only the sensors that they need
             are rendered, none for an empty list.
-        num_envs: how many streets.
-        num_workers: how many processes drive them, see `WorkerVectorEnv`; 0: this one. What comes
-            out is the same.
+        num_envs: how many environments.
+        num_workers: how many processes step them, see `WorkerVectorEnv`; 0: this one. The results
+            are the same.
         device: where the TensorDicts lie.
         speed: the pedestrians' speed mode, or their (lowest, highest) speed in m/s.
         frame_rate_hz: steps a second; the scene's own if None.
         seed: seeds the envs, which draw their episodes from it; None leaves that to `set_seed`.
-        keep_sensor: whether all ("sensor", ...) keys stay beside the representations; rgb and
+        keep_sensor: whether all ("sensor", ...) keys are kept.
             frame only where a representation needs them.
         flow: "exact" or "estimated", where raw and obj come from; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
@@ -93,12 +93,12 @@ def make_env(
             an episode that is driven again looks the same.
         compiled: whether flow is computed through `torch.compile`: some eight times as fast on a
             CPU, equal up to rounding, after up to a minute of compiling.
-        renderer: who draws depth, classes and ids, see `StreetEnv`.
+        renderer: what renders depth, classes and ids, see `StreetEnv`.
 
     Raises:
-        SceneError: the scene can't be.
-        ValueError: there are no streets, or more workers than streets; `compiled=True` without a
-            C++ compiler.
+        SceneError: if the scene is invalid.
+        ValueError: if there are no environments, or more workers than environments, or if
+            `compiled=True` and there is no C++ compiler.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -108,8 +108,8 @@ def make_env(
     counts = isinstance(num_envs, int) and isinstance(num_workers, int)
     if not counts or num_envs < 1 or not 0 <= num_workers <= num_envs:
         raise ValueError(
-            f"num_envs is {num_envs} and num_workers {num_workers}; give whole numbers, one street "
-            "or more, and no more workers than streets"
+            f"num_envs is {num_envs} and num_workers {num_workers}; give whole numbers, at least "
+            "one environment and no more workers than environments"
         )
     loaded = load_scene(scene)
     street = partial(
@@ -119,7 +119,7 @@ def make_env(
         frame_rate_hz=frame_rate_hz,
         renderer=choose_renderer(renderer),
     )
-    # A street that renders nothing is asked for what the transforms need to know.
+    # An environment without sensors tells the transforms K, classes and frame rate.
     probe = street(sensors=())
     transforms = Compose()
     if representations:
@@ -152,11 +152,11 @@ def make_env(
 
 
 def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
-    """Lets the workers begin what `env.step(acted)` will ask for; without any, does nothing.
+    """Starts the step of `env.step(acted)` in the workers; does nothing without workers.
 
     Args:
         env: made by `make_env`.
-        acted: with `action`.
+        acted: has `action`.
     """
     vector = _vector(env)
     if isinstance(vector, WorkerVectorEnv):
@@ -164,10 +164,10 @@ def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
 
 
 def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
-    """Returns whether the env's workers and so many threads of the caller have a core each.
+    """Returns whether the env's workers and `threads` threads of the caller have a core each.
 
-    Where they don't, two kinds of work at once are slower than one after the other: threads that
-    wait for each other at every operation are held up by whatever takes a core from one of them.
+    If not, doing both at once is slower than one after the other: threads that synchronise at
+    every operation all wait when one of them loses its core.
     """
     vector = _vector(env)
     workers = vector.num_workers if isinstance(vector, WorkerVectorEnv) else 0
@@ -175,32 +175,36 @@ def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
 
 
 def street_envs(env: TransformedEnv) -> list[StreetEnv]:
-    """Returns the streets of an env that `make_env` made, in the order of its batch.
+    """Returns the `StreetEnv`s of an env made by `make_env`, in the order of its batch.
 
     Raises:
-        ValueError: they are in worker processes.
+        ValueError: if they are in worker processes.
     """
     vector = _vector(env)
     if isinstance(vector, WorkerVectorEnv):
-        raise ValueError("the streets are in worker processes: make the env with num_workers=0")
+        raise ValueError(
+            "the environments are in worker processes: make the env with num_workers=0"
+        )
     return [street.unwrapped for street in vector.envs]
 
 
 def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
-    """Returns the state of every street, plain data that JSON can hold."""
+    """Returns the state of every environment, as plain data that JSON can hold."""
     return list(_vector(env).call("get_state"))
 
 
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
-    """Takes every street back to a state of `get_states`; goes on from the TensorDict of then.
+    """Restores states of `get_states`; continue from the TensorDict of that time.
 
     Raises:
-        ValueError: for another number of states than of streets.
+        ValueError: if there is not one state for each environment.
     """
     env.reset()
     vector = _vector(env)
     if len(states) != vector.num_envs:
-        raise ValueError(f"{len(states)} states for {vector.num_envs} streets; give one for each")
+        raise ValueError(
+            f"{len(states)} states for {vector.num_envs} environments; give one for each"
+        )
     if isinstance(vector, WorkerVectorEnv):
         vector.call_each("set_state", states)
     else:

@@ -1,4 +1,4 @@
-"""Many streets of one scene in a process: each drives alone, all of them are seen at once."""
+"""Environments of one scene in one process, stepped one by one and rendered together."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -15,16 +15,16 @@ from flowrep.envs.worker_process import Order
 
 
 class StreetVectorEnv(SyncVectorEnv):
-    """Gymnasium's `SyncVectorEnv` of streets, without autoreset and infos, and faster.
+    """Gymnasium's `SyncVectorEnv` for streets, without autoreset and infos, and faster.
 
     What comes out is the same, bit for bit, and belongs to the caller.
 
     Args:
-        env_fns: make `SensorObservation`s of streets of one scene with the same sensors.
+        env_fns: make `SensorObservation`s of one scene with the same sensors.
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
-        """Builds the streets."""
+        """Makes the environments."""
         super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
         self._streets: list[Any] = [env.unwrapped for env in self.envs]
         self._latest: dict[str, Any] = {}
@@ -35,7 +35,7 @@ class StreetVectorEnv(SyncVectorEnv):
         seed: int | list[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begins episodes, in all streets or in those that `options["reset_mask"]` marks."""
+        """Begins episodes in all environments, or in those that `options["reset_mask"]` marks."""
         options = dict(options or {})
         mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
         seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
@@ -47,7 +47,7 @@ class StreetVectorEnv(SyncVectorEnv):
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[dict[str, Any], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Drives all streets one step."""
+        """Steps all environments."""
         for street, action in zip(self._streets, actions.tolist(), strict=True):
             street.drive(action)
         outcomes = [street.episode.outcome for street in self._streets]
@@ -59,7 +59,7 @@ class StreetVectorEnv(SyncVectorEnv):
     def advance(
         self, orders: Sequence[Order], into: Mapping[str, NDArray[Any]]
     ) -> list[tuple[str, str] | None]:
-        """Lets each street follow its order, and looks at those whose episode goes on.
+        """Executes one order per environment, and renders those whose episode continues.
 
         Args:
             orders: one a street: an action to drive a step with, options of `StreetEnv.reset` to
@@ -84,7 +84,7 @@ class StreetVectorEnv(SyncVectorEnv):
         return [episode and (episode.outcome.label, episode.hit) for episode in asked]
 
     def _observe(self, rows: list[int]) -> dict[str, Any]:
-        """Looks at the streets of some rows; the others' are those of before."""
+        """Renders some environments; the others keep their last observation."""
         streets = [self._streets[row] for row in rows]
         episodes = [street.episode for street in streets]
         seen = observe_together([street.sensing for street in streets], episodes)

@@ -255,7 +255,7 @@ def test_states_pass_between_workers_and_one_process(make, noise):
 def test_states_of_another_number_of_streets_are_refused(make):
     env = make(num_envs=2, seed=0)
     env.reset()
-    with pytest.raises(ValueError, match="1 states for 2 streets"):
+    with pytest.raises(ValueError, match="1 states for 2 environments"):
         set_states(env, get_states(env)[:1])
 
 
