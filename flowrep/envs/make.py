@@ -85,8 +85,8 @@ def make_env(
         speed: the pedestrians' speed mode, or their (lowest, highest) speed in m/s.
         frame_rate_hz: steps a second; the scene's own if None.
         seed: seeds the envs, which draw their episodes from it; None leaves that to `set_seed`.
-        keep_sensor: whether all ("sensor", ...) keys are kept.
-            frame only where a representation needs them.
+        keep_sensor: whether the ("sensor", ...) keys are kept; rgb and frame only where a
+            representation needs them.
         flow: "exact" or "estimated", where raw and obj come from; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
         noise: errors of the depth camera and of odometry, see there. They are those of the frame:

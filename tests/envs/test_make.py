@@ -71,8 +71,8 @@ def test_a_tensordict_without_marks_resets_every_street(make):
 
 
 @pytest.mark.parametrize(("num_envs", "num_workers"), [(0, 0), (-1, 0), (2, 3), (2, -1)])
-def test_no_streets_and_too_many_workers_are_refused(num_envs, num_workers):
-    with pytest.raises(ValueError, match=r"one street or more, and no more workers than"):
+def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers):
+    with pytest.raises(ValueError, match="at least one environment and no more workers than"):
         make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
 
 
