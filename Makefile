@@ -56,7 +56,7 @@ PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --dist=lo
 test: $(INSTALLED)  ## Run the tests
 	$(PYTEST) $(ARGS)
 
-test-fast: $(INSTALLED)  ## Run those that take no more than some seconds
+test-fast: $(INSTALLED)  ## Run those that take no more than a second or two
 	$(PYTEST) -m "not slow" $(ARGS)
 
 fuzz: $(INSTALLED)  ## Throw odd inputs at every part: make fuzz ARGS="--parts scenes --mutations 10000"

@@ -3,6 +3,7 @@
 Each imports what it needs: some tests run where no simulator is installed.
 """
 
+import gc
 import signal
 import tempfile
 from dataclasses import replace
@@ -15,6 +16,24 @@ def pytest_configure():
     """Lets Ctrl-C be heard where a shell in the background has it ignored."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Makes the cases after the first slow where a test says so, before `-m` looks."""
+    seen = set()
+    for item in items:
+        if item.get_closest_marker("slow_after_first"):
+            test = item.nodeid.partition("[")[0]
+            if test in seen:
+                item.add_marker("slow")
+            seen.add(test)
+
+
+def pytest_collection_finish():
+    """Has the garbage collector leave alone what is there for good: some 650,000 objects."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 COPIED = ("flowrep", "conf", "tests", "docs", "pyproject.toml", "README.md", "CONVENTIONS.md")
+TESTS = "not slow or slow_after_first"  # with all of their cases
 _NO_TESTS = "none.such"
 _NOTICED = ("🎉", "⏰")  # a test failed, or ran on and on
 
@@ -62,7 +63,7 @@ def copy_to(folder: Path, target: Target) -> None:
         "source_paths": ["flowrep"],
         "only_mutate": [target.files],
         "also_copy": [name for name in COPIED if name != "flowrep"],
-        "pytest_add_cli_args": ["-p", "no:cacheprovider", "-n0", "-m", "not slow"],
+        "pytest_add_cli_args": ["-p", "no:cacheprovider", "-n0", "-m", TESTS],
         "pytest_add_cli_args_test_selection": list(target.tests),
     }
     text = "".join(

@@ -116,6 +116,7 @@ def test_modules_have_a_noun_for_a_name_and_one_reason_to_exist(path):
     assert len(path.read_text(encoding="utf-8").splitlines()) <= 300
 
 
+@pytest.mark.slow
 def test_the_transforms_bring_torch_tensordict_and_torchrl_alone():
     """What torchrl itself imports is its own business; flowrep adds nothing to it."""
     code = (

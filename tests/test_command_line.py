@@ -86,6 +86,7 @@ def test_flags_that_contradict_each_other_or_do_nothing_are_refused(flags, says)
         check_command("train", flags.split(), TrainConfig)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(
     "line",
     [

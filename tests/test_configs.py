@@ -25,6 +25,7 @@ GROUPS = [group for group in config_groups() if group != "format"]
 GROUP_FILES = [(group, name) for group in GROUPS for name in group_choices(group)]
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
 def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
     from flowrep.from_config import agent_from_config, env_from_config

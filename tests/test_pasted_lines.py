@@ -31,6 +31,7 @@ def run_line(line, main, monkeypatch):
     main()
 
 
+@pytest.mark.slow_after_first
 def test_a_run_continues(folder, monkeypatch):
     opened = []
     monkeypatch.setattr(train, "carry_out", lambda config, run: opened.append((config, run)))
@@ -41,6 +42,7 @@ def test_a_run_continues(folder, monkeypatch):
     assert config["resume"] == str(folder.path)
 
 
+@pytest.mark.slow_after_first
 def test_a_run_is_evaluated(folder, monkeypatch):
     opened = []
     monkeypatch.setattr(evaluate, "evaluate", lambda config, runs: opened.extend(runs))
@@ -48,6 +50,7 @@ def test_a_run_is_evaluated(folder, monkeypatch):
     assert [run.path for run in opened] == [folder.path]
 
 
+@pytest.mark.slow_after_first
 def test_a_name_typed_without_hydras_quotes_is_understood(folder, monkeypatch):
     opened = []
     monkeypatch.setattr(evaluate, "evaluate", lambda config, runs: opened.extend(runs))

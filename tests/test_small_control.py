@@ -29,6 +29,7 @@ def test_the_best_policy_reaches_the_return_that_is_called_the_best(small_contro
     assert reward.sum(1).mean().item() == pytest.approx(small_control.BEST, abs=0.02)
 
 
+@pytest.mark.slow
 def test_discrete_sac_learns_to_follow_the_ball(small_control):
     trained = small_control.train(small_control.flowrep_learner, 6000, seed=0)
     # standing still or going one way brings a ninth

@@ -106,6 +106,7 @@ def test_options_reach_the_loss(env_config, env):
     assert loss.value_estimator.gamma.item() == pytest.approx(0.97)
 
 
+@pytest.mark.slow
 def test_no_config_of_torchrl_s_is_replaced():
     code = (
         "import torchrl.trainers.algorithms.configs\n"

@@ -35,6 +35,7 @@ def test_an_update_returns_what_it_says_it_does(make_any, random_steps):
     assert agent.updates > 0
 
 
+@pytest.mark.slow_after_first
 def test_every_trained_weight_moves(make_any, random_steps):
     agent = make_any()
     before = weights(agent)
@@ -55,6 +56,7 @@ def test_a_transition_of_three_steps_is_discounted_three_times(make_any, random_
     assert not torch.isclose(loss, agent.losses(once)["q_loss"])
 
 
+@pytest.mark.slow_after_first
 def test_the_learning_rate_ends_at_zero_with_the_frames(make_any, random_steps):
     agent = make_any(total_frames=200, learning_rate=2**-10)
     metrics = learn(agent, random_steps, 40)
@@ -79,6 +81,7 @@ def test_off_policy_updates_due(make_agent, name, frames_before, frames_after, d
     assert agent.updates_due(frames_after) == due, name
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("steps", [5, 13])  # an on-policy rollout of 8 is cut in its middle
 def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(
     make_any, random_steps, tmp_path, steps
@@ -105,6 +108,7 @@ def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(
     assert [name for name in a if not torch.equal(a[name], b[name])] == []
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_loss_that_is_no_number_stops_the_weights_and_is_named(make_any, random_steps, bad):
     agent = make_any()
@@ -176,6 +180,7 @@ def test_a_policy_is_built_and_loaded_without_its_learner(
         assert torch.equal(expected.argmax(-1), greedy)
 
 
+@pytest.mark.slow_after_first
 def test_actions_are_drawn_as_the_distribution_says(make_any, random_steps, random_maps):
     agent = make_any()
     learn(agent, random_steps, 12)

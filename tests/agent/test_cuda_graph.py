@@ -54,6 +54,7 @@ class Taped:
         return self.out.clone()
 
 
+@pytest.mark.slow_after_first
 def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
     eager, taped = make_any(learning_rate=0.01), make_any(learning_rate=0.01)
     batches = batches_of([eager, taped], random_steps)

@@ -165,6 +165,7 @@ def picture(cell):
     return image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["shared", "separate"])
 def test_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch, encoder):
     spec = Composite(view=Unbounded((1, 36, 40)))

@@ -11,6 +11,7 @@ def relative(value, exact):
     return ((value - exact).norm() / exact.norm()).item()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["shared", "separate"])
 def test_bf16_stays_within_what_was_measured(make_agent, random_steps, as_batch, encoder):
     settings = {"encoder": encoder, "hidden_size": 128, "learning_rate": 1e-3}

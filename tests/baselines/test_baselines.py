@@ -8,6 +8,7 @@ from flowrep.baselines import Planner, RandomActions, drives, never_turn
 from flowrep.scenes.goal_distance import GoalDistance
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
 def test_the_planner_arrives(make_street, speed):
     ended = list(drives(make_street(speed=speed, sensors=()), Planner(), 5, seed=0))

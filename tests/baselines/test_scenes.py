@@ -69,6 +69,7 @@ def test_the_four_scenes_are_those_of_the_paper():
     assert set(scene_names()) == set(SCENE_BY_ID.values()) == set(TABLE_1)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("env_id", SCENE_BY_ID)
 def test_gymnasium_makes_and_checks_every_scene(env_id):
     env = gymnasium.make(env_id)
@@ -77,6 +78,7 @@ def test_gymnasium_makes_and_checks_every_scene(env_id):
     env.close()
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", TURNING)
 def test_every_path_is_drawn_equally_often(make_street, name):
     env = make_street(name, sensors=())
@@ -114,6 +116,7 @@ CLOSED_EXITS = [
 ]
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(("name", "driven", "path", "closed"), CLOSED_EXITS)
 def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, closed):
     env = make_street(replace(load_scene(name), pedestrian_groups=()), sensors=())
@@ -180,6 +183,7 @@ def test_which_exit_is_closed_is_seen_a_second_before_the_turn(make_street, name
         assert closed.sum() == closed[:, half].sum()
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", TABLE_1)
 def test_every_category_is_seen_on_a_drive(make_street, name):
     env = make_street(name, sensors=("semantic",))
@@ -193,6 +197,7 @@ def test_every_category_is_seen_on_a_drive(make_street, name):
     assert seen == set(env.scene.categories)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", TURNING)
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
 def test_the_planner_arrives_and_habit_and_chance_do_not(make_street, name, speed):

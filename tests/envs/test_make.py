@@ -163,6 +163,7 @@ def test_an_episode_that_ends_begins_anew_alone(make):
     assert torch.equal(steps["seg"][first + 1, 1:], steps["next", "seg"][first, 1:])
 
 
+@pytest.mark.slow
 def test_a_seed_gives_the_same_steps_in_one_process_and_in_two(make):
     actions = actions_of(40, 2)
     first, _ = play(make(representations=["ego", "obj"], num_envs=2, seed=7), actions)

@@ -112,6 +112,7 @@ def totals(name, change=lambda frame: frame):
     return counts
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", scene_names())
 def test_each_pixel_is_found_where_its_flow_says_it_was(name):
     for agree, asked, seen in totals(name):

@@ -36,6 +36,7 @@ def assert_agree(pair, count):
     return set.union(*(view.seen for view in found))
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("scene", [*scene_names(), CROSSROADS], ids=lambda name: Path(name).stem)
 def test_views_of_a_scene(Pair, scene):
     seen = assert_agree(Pair(scene), 40)

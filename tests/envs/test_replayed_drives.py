@@ -19,6 +19,7 @@ STACKS = {
 }
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("stack", STACKS)
 @pytest.mark.parametrize("drive", ["straight", "random"])
 def test_every_transition_with_a_successor_is_sampled(straight_road, stack, drive):

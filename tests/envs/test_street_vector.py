@@ -44,6 +44,7 @@ def assert_same(a, b):
             np.testing.assert_array_equal(value, b[key], err_msg=key)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(
     "arguments",
     [

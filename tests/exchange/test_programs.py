@@ -67,6 +67,7 @@ def test_every_algorithms_program_gives_the_scores_of_its_network(algorithm):
     torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_loader_acts_as_the_agent_and_needs_torch_alone(exported, tmp_path):
     policy, folder = exported
     batches = [maps(1), maps(5)]

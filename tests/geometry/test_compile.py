@@ -57,6 +57,7 @@ def test_camera_is_one_graph():
     assert_same(compiled(depth, camera), there_and_back(depth, camera))
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("dt", [1.0, 0.25, torch.tensor([0.5, 2.0])])
 def test_flow_is_one_graph(dt):
     compiled = torch.compile(everything, fullgraph=True, backend="eager")
@@ -71,6 +72,7 @@ def test_sizes_may_change_between_calls():
         assert_same(compiled(depth, K.float(), MOTION.float()), expected)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_compiled_code_gives_the_bits_of_eager():
     compiled = torch.compile(everything, fullgraph=True)
@@ -102,6 +104,7 @@ def test_compiled_code_reads_transposed_memory_right():
     torch.testing.assert_close(got.flow, expected.flow, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_compiled_gradients_are_eager_s():
     compiled = torch.compile(ego_flow, fullgraph=True, backend="aot_eager")
 

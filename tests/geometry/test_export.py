@@ -18,6 +18,7 @@ class Function(torch.nn.Module):
         return tuple(self.function(*given))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dynamic", [False, True])
 @pytest.mark.parametrize("function", [ego_flow, factorize])
 def test_a_saved_program_gives_the_same_flow(function, dynamic):

@@ -117,6 +117,7 @@ def test_memory_stays_flat_over_resets():
     assert grown_kib < 4096
 
 
+@pytest.mark.slow
 def test_memory_stays_flat_over_streets():
     def some(count):
         for _ in range(count):

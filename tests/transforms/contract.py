@@ -70,6 +70,7 @@ class TransformContract:
         makers = [functools.partial(self.make_env, env) for env in (0, 1)]
         self.assert_right_env(SerialEnv(2, makers))
 
+    @pytest.mark.slow
     def test_parallel_trans_env_check(self):
         makers = [functools.partial(self.make_env, env) for env in (0, 1)]
         self.assert_right_env(ParallelEnv(2, makers, mp_start_method="fork"))
@@ -78,6 +79,7 @@ class TransformContract:
         base = SerialEnv(2, [functools.partial(FakeSensorEnv, (), env) for env in (0, 1)])
         self.assert_right_env(TransformedEnv(base, Compose(*self.before(), self.make())))
 
+    @pytest.mark.slow
     def test_trans_parallel_env_check(self):
         makers = [functools.partial(FakeSensorEnv, (), env) for env in (0, 1)]
         base = ParallelEnv(2, makers, mp_start_method="fork")

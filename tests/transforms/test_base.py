@@ -56,6 +56,7 @@ def test_any_batch_equals_a_loop_over_frames(make, batch):
         assert torch.equal(output.reshape(want.shape), want)
 
 
+@pytest.mark.slow_after_first
 @each_transform
 def test_compute_is_pure_and_compiles_to_one_graph(make):
     transform, td = make(), moments(2)

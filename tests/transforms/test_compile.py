@@ -95,6 +95,7 @@ def outputs(result) -> list[torch.Tensor]:
     return [result] if isinstance(result, torch.Tensor) else [*result]
 
 
+@pytest.mark.slow_after_first
 @each_case
 def test_one_graph_for_all_batches(case):
     torch._dynamo.reset()

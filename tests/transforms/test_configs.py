@@ -110,6 +110,7 @@ def test_composed_by_a_project_s_own_config_beside_torchrl_s(tmp_path):
     assert (split.outputs, split.in_keys[-1]) == (("obj",), ("sensor", "K"))
 
 
+@pytest.mark.slow
 def test_no_config_of_torchrl_s_is_replaced():
     code = (
         "import torchrl.trainers.algorithms.configs\n"
