@@ -4,7 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from flowrep.report.comparing import Settings, experiment_section, scenes_of, success_section
-from flowrep.report.experiments import COMPLEMENTARY, FLOW_COMPOSITION, STACKS
+from flowrep.report.experiments import (
+    COMPLEMENTARY,
+    FLOW_COMPOSITION,
+    STACKS,
+    VARIATIONS,
+    Variation,
+)
 from flowrep.report.failing import failure_section
 from flowrep.report.families import Family, families_of
 from flowrep.report.learning import curve_panels, draw_curves
@@ -98,6 +104,10 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
 
 def across(families: Sequence[Family], ask: Settings) -> list[Section]:
     """Returns what stacks do in families whose configs differ, side by side and never pooled."""
+    told = [section for v in VARIATIONS if (section := variation_section(v, families, ask))]
+    table = Section("configs", "Configs that differ", tables=(differing_keys(families),))
+    if told:
+        return [table, *told]
     sections = []
     in_all = [{run.stack for run in family.runs} for family in families]
     for stack in in_order([s for stacks in in_all for s in stacks], STACKS):
@@ -115,10 +125,40 @@ def across(families: Sequence[Family], ask: Settings) -> list[Section]:
             )
     if not sections:
         return []
-    return [
-        Section("configs", "Configs that differ", tables=(differing_keys(families),)),
-        *sections,
-    ]
+    return [table, *sections]
+
+
+def variation_section(
+    variation: Variation, families: Sequence[Family], ask: Settings
+) -> Section | None:
+    """Returns stacks side by side under configs that differ in one part; None if they aren't.
+
+    A variant has one family, or else nothing is told: two would be pooled.
+    """
+    if not variation.is_in(key for family in families for key in family.differences):
+        return None
+    by_variant = {variation.variant_of(family.runs[0]): family for family in families}
+    if len(by_variant) < len(families):
+        return None
+    usable = {
+        variant: [run for run in by_variant[variant].runs if _unusable(run, ask) is None]
+        for variant in in_order(list(by_variant), variation.variants)
+    }
+    first, *others = usable
+    found = [run.stack for runs in usable.values() for run in runs]
+    stacks = in_order(found, variation.stacks)
+    if not found or not others:
+        return None
+    series = {
+        f"{stack}, {variant}": [run for run in runs if run.stack == stack]
+        for stack in stacks
+        for variant, runs in usable.items()
+    }
+    pairs = [(f"{stack}, {v}", f"{stack}, {first}") for stack in stacks for v in others]
+    pairs += [(f"{stacks[0]}, {v}", f"{stack}, {v}") for v in usable for stack in stacks[1:]]
+    section = success_section(variation.name, variation.title, series, pairs, ask)
+    notes = tuple(f"{variant}: {by_variant[variant].label}." for variant in usable)
+    return replace(section, notes=(*notes, *section.notes))
 
 
 def differing_keys(families: Sequence[Family]) -> Table:

@@ -42,6 +42,7 @@ _ADDED = {
 _DARK = {"ego+obj": "#2f8fd6"}  # on black its own blue is too faint for a line
 _OTHERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _HATCHES = ("", "////", "xxxx", "....")
+_OF_VARIANTS = ("", "......", "++++", "||||")  # none of a stack's own
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
 
 _TITLES = {
@@ -69,19 +70,24 @@ class Look:
 def looks(names: Sequence[str], theme: Theme) -> dict[str, Look]:
     """Returns how each series of a figure is drawn.
 
-    The paper's stacks look the same in all figures; where others are among the names, colours are
-    given in turn.
+    The paper's stacks look the same in all figures, and under several configs ("ego, noisy") they
+    keep their colour; where others are among the names, colours are given in turn.
     """
-    known = all(name in _COLOURS or name in _ADDED for name in names)
+    parts = {name: name.partition(", ")[::2] for name in names}
+    known = all(stack in _COLOURS or stack in _ADDED for stack, _ in parts.values())
     places = {name: place for place, name in enumerate((*_COLOURS, *_ADDED))}
+    variants = list(dict.fromkeys(variant for _, variant in parts.values()))
     found = {}
     for turn, name in enumerate(names):
         if known:
-            added = _ADDED.get(name)
-            colour = added[theme.name] if added else _COLOURS[name]
+            stack, variant = parts[name]
+            added = _ADDED.get(stack)
+            colour = added[theme.name] if added else _COLOURS[stack]
             if theme.name == "dark":
-                colour = _DARK.get(name, colour)
-            found[name] = Look(colour, added["hatch"] if added else "", _MARKERS[places[name]])
+                colour = _DARK.get(stack, colour)
+            hatch = _OF_VARIANTS[variants.index(variant) % len(_OF_VARIANTS)]
+            hatch = hatch or (added["hatch"] if added else "")
+            found[name] = Look(colour, hatch, _MARKERS[places[stack]])
         else:
             hatch = _HATCHES[turn // len(_OTHERS) % len(_HATCHES)]
             colour = _OTHERS[turn % len(_OTHERS)]

@@ -29,9 +29,11 @@ def split_mix(state: Tensor) -> Tensor:
     tensor([6457827717110365317])
     """
     z = state + _GAMMA
-    z = (z ^ _shifted(z, 30)) * _FIRST
-    z = (z ^ _shifted(z, 27)) * _SECOND
-    return z ^ _shifted(z, 31)
+    for places, factor in ((30, _FIRST), (27, _SECOND)):
+        z ^= _shifted(z, places)
+        z *= factor
+    z ^= _shifted(z, 31)
+    return z
 
 
 def frame_bits(frame: Tensor, shape: Sequence[int], *, seed: int, stream: int) -> Tensor:
@@ -66,4 +68,6 @@ def uniform(bits: Tensor) -> Tensor:
 
 def _shifted(z: Tensor, places: int) -> Tensor:
     """Returns the bits moved to the right, with zeros on the left: torch repeats the sign."""
-    return (z >> places) & ((1 << (64 - places)) - 1)
+    moved = z >> places
+    moved &= (1 << (64 - places)) - 1
+    return moved

@@ -183,3 +183,71 @@ def test_a_table_is_latex_that_compiles_and_csv_that_reads():
 def test_numbers_are_whole_percent_with_their_sign():
     assert percent(Estimate(0.005, 0.0, 1.0)) == "0 [0–100]"
     assert points(Estimate(-0.004, -0.126, 0.006)) == "0 [−13, +1]"
+
+
+NOISY = {"noise__depth_sigma_per_m": 0.002, "noise__drift_m": 0.02}
+
+
+def test_noise_is_told_stack_by_stack_and_against_the_other_stacks(tmp_path):
+    run_in(tmp_path, "a", "ssss")
+    run_in(tmp_path, "b", "sscc", **NOISY)
+    run_in(tmp_path, "c", "sccc", stack="depth2")
+    run_in(tmp_path, "d", "cccc", stack="depth2", **NOISY)
+    run_in(tmp_path, "e", "sssc", stack="raw")
+    found, report = sections_of(tmp_path)
+    section = found["sensor_noise"]
+    assert section.notes == (
+        "exact: noise.depth_sigma_per_m=0.0, noise.drift_m=0.0.",
+        "noisy: noise.depth_sigma_per_m=0.002, noise.drift_m=0.02.",
+        "Missing in S-Turn: raw, noisy.",
+    )
+    success, differences = section.tables
+    shares = {row[0]: row[1].split()[0] for row in rows_in(success)}
+    assert list(shares.items()) == [
+        ("ego+obj, exact", "100"),
+        ("ego+obj, noisy", "50"),
+        ("raw, exact", "75"),
+        ("raw, noisy", "missing"),
+        ("depth2, exact", "25"),
+        ("depth2, noisy", "0"),
+    ]
+    told = {row[0]: row[2].split()[0] for row in rows_in(differences)}
+    assert told == {
+        "ego+obj, noisy − ego+obj, exact": "−50",
+        "depth2, noisy − depth2, exact": "−25",
+        "ego+obj, exact − raw, exact": "+25",
+        "ego+obj, exact − depth2, exact": "+75",
+        "ego+obj, noisy − depth2, noisy": "+50",
+    }
+    assert not any(name.startswith("across_") for name in found)
+    (drawing,) = section.drawings
+    (axes,) = drawing.whole().axes
+    heights = {round(bar.get_height()) for bar in axes.patches}
+    assert heights == {100, 50, 75, 25, 0}
+    assert len(report.chapters) == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "series"),
+    [
+        ({"flow__source": "estimated"}, "estimated_flow", ["exact", "estimated"]),
+        ({"scene__camera__height_px": 84}, "resolution", ["48 px", "84 px"]),
+    ],
+)
+def test_other_parts_of_a_config_are_told_in_the_same_way(tmp_path, changes, name, series):
+    run_in(tmp_path, "a", "sscc", **changes)
+    run_in(tmp_path, "b", "ssss")
+    found, _ = sections_of(tmp_path)
+    rows = rows_in(found[name].tables[0])
+    assert [row[0] for row in rows] == [f"ego+obj, {variant}" for variant in series]
+    assert [row[1].split()[0] for row in rows] == ["100", "50"]
+
+
+@pytest.mark.parametrize("other", [{"algorithm__tau": 0.1}, {"noise__drift_m": 0.5}], ids=str)
+def test_noise_is_not_told_where_more_differs_or_there_are_two_kinds_of_it(tmp_path, other):
+    run_in(tmp_path, "a", "ssss")
+    run_in(tmp_path, "b", "sscc", **NOISY)
+    run_in(tmp_path, "c", "sccc", **other)
+    found, _ = sections_of(tmp_path)
+    assert "sensor_noise" not in found
+    assert "across_ego+obj" in found
