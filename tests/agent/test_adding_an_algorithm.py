@@ -8,6 +8,7 @@ import torch
 import yaml
 from torchrl.data import Categorical
 
+from flowrep.agent import Algorithm
 from flowrep.config_tree import CONF_DIR
 
 DOCS = Path(__file__).parents[2] / "docs" / "adding_an_algorithm.md"
@@ -44,3 +45,12 @@ def test_the_example_learns_and_its_yaml_spells_out_its_signature(
     assert agent.updates == 9
     assert set(metrics) == set(agent.metric_names())
     assert all(torch.isfinite(value) for value in metrics.values())
+
+
+def test_a_learner_without_a_loss_class_has_the_options_of_its_signature():
+    class Patient(Algorithm):
+        def __init__(self, *, patience: int) -> None:
+            pass
+
+    assert not hasattr(Patient, "LOSS")
+    assert list(Patient.options()) == ["patience"]

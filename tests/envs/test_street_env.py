@@ -187,6 +187,12 @@ def test_a_parked_car_is_hit_as_a_car(make_street, empty_road):
     assert len(rewards) == 45
 
 
+def test_nothing_is_hit_until_something_is(make_street, empty_road):
+    env = make_street(empty_road, sensors=())
+    assert env.reset(seed=0)[1]["hit"] == ""
+    assert env.step(0)[4]["hit"] == ""
+
+
 def test_low_and_high_speed_change_the_people_alone(make_street, straight_road):
     def travelled(speed):
         env = make_street(speed=speed, sensors=())
