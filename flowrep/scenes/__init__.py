@@ -1,10 +1,10 @@
-"""Scenes: what a street is, read from YAML and laid out on the ground, without any simulator."""
+"""Scenes: streets described in YAML and laid out on the ground, without a simulator."""
 
 from flowrep.extras import require
 
 require("flowrep.scenes", "sim", "shapely", "yaml", "pydantic")
 
-from flowrep.scenes.loading import load_scene, scene_names  # noqa: E402 - after what it needs
+from flowrep.scenes.loading import load_scene, scene_names  # noqa: E402 - after the check above
 from flowrep.scenes.scene import Scene  # noqa: E402
 from flowrep.scenes.schema import SceneError  # noqa: E402
 

@@ -1,4 +1,4 @@
-"""What a scene says about the camera on the vehicle."""
+"""The camera on the vehicle, as a scene describes it."""
 
 import math
 from dataclasses import dataclass

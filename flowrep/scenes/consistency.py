@@ -1,4 +1,4 @@
-"""Refuses a scene whose parts contradict each other: names that nobody has, keys that don't fit."""
+"""Checks that the parts of a scene agree: references resolve and keys fit together."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -16,10 +16,10 @@ _KEYS_OF_WALK = {
 
 
 def check_consistency(scene: Scene, source: str) -> None:
-    """Makes sure that every name is known and every part complete.
+    """Checks that every name is known and every part is complete.
 
     Raises:
-        SceneError: names the key and what to do.
+        SceneError: names the key and the remedy.
     """
     _check_camera_and_people(scene, source)
     _check_unique(scene, source)

@@ -1,6 +1,6 @@
-"""Quantities that a scene file may hold: finite, and within what can be laid out and simulated.
+"""Types of the values in a scene file, limited to what can be laid out and simulated.
 
-Pydantic reads the ranges when a file is checked; to everyone else these are floats and ints.
+Pydantic checks the ranges when a file is loaded; other code sees plain floats and ints.
 """
 
 from typing import Annotated, Any, ClassVar
@@ -8,15 +8,15 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, ConfigDict, Field, Strict, StringConstraints
 
 MOST_METRES = 5_000.0
-"""No road is longer and no place further from the origin."""
+"""Greatest length of a road, and greatest coordinate of a place."""
 
 MOST_PARTS = 100
-"""How many roads, rows, closures and so on a scene may list; half as many paths, and five times as
-many single obstacles."""
+"""Most roads, rows, closures and so on in a scene; paths are limited to half as many, single
+obstacles to five times as many."""
 
 
 class Part:
-    """What is read from a mapping whose keys are exactly its fields."""
+    """Base of the dataclasses read from a mapping whose keys are exactly their fields."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
@@ -60,5 +60,5 @@ HouseRange = Annotated[tuple[HouseSide, HouseSide], AfterValidator(_in_order)]
 
 
 def up_to(most: int, least: int = 0) -> Any:
-    """Returns the bounds of a list's length."""
+    """Returns a field constraint on the length of a list."""
     return Field(min_length=least, max_length=most)

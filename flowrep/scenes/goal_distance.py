@@ -1,4 +1,4 @@
-"""How far it is to the ending zone from anywhere on the road, round corners and closures."""
+"""Distance to the ending zone from anywhere on the road, around corners and closures."""
 
 import heapq
 import math
@@ -17,7 +17,7 @@ _NEIGHBOURS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) 
 
 
 def free_ground(layout: Layout, path: Path) -> BaseGeometry:
-    """Returns the road less what stands on it in the episodes of a path."""
+    """Returns the road minus the obstacles and closures of a path's episodes."""
     boxes = [*layout.obstacles, *(layout.closures[name] for name in path.closures)]
     free = layout.drivable.difference(shapely.union_all([box.footprint for box in boxes]))
     shapely.prepare(free)
@@ -25,10 +25,10 @@ def free_ground(layout: Layout, path: Path) -> BaseGeometry:
 
 
 class GoalDistance:
-    """A grid over the free ground with the shortest way from each cell to the ending zone."""
+    """A grid of shortest distances from the free ground to the ending zone."""
 
     def __init__(self, free: BaseGeometry, goal: BaseGeometry) -> None:
-        """Walks the grid outwards from the ending zone (Dijkstra, eight neighbours)."""
+        """Fills the grid outwards from the ending zone (Dijkstra, eight neighbours)."""
         x0, y0, x1, y1 = free.bounds
         self._origin = np.array([x0, y0])
         columns, rows = (math.ceil(size / _CELL_M) for size in (x1 - x0, y1 - y0))
@@ -37,7 +37,7 @@ class GoalDistance:
         grid_x, grid_y = np.meshgrid(x, y, indexing="ij")
         is_free = shapely.contains_xy(free, grid_x, grid_y)
         is_goal = is_free & shapely.contains_xy(goal, grid_x, grid_y)
-        # A margin of cells at infinity stands for everywhere else.
+        # A margin of cells at infinity represents everything outside the grid.
         self._way = np.full((columns + 2, rows + 2), np.inf)
         is_open = np.pad(is_free, 1)
         queue = [(0.0, int(i) + 1, int(j) + 1) for i, j in np.argwhere(is_goal)]
@@ -54,7 +54,10 @@ class GoalDistance:
                     heapq.heappush(queue, (longer, i + di, j + dj))
 
     def __call__(self, x_m: Array, y_m: Array) -> Array:
-        """Returns metres to the ending zone from points of any one shape; inf off the ground."""
+        """Returns the distance to the ending zone in metres, inf off the free ground.
+
+        `x_m` and `y_m` have the same shape, as has the result.
+        """
         cell = np.floor((np.stack([x_m, y_m], -1) - self._origin) / _CELL_M).astype(np.int64) + 1
         limit = np.array(self._way.shape) - 1
         cell = np.clip(cell, 0, limit)

@@ -1,4 +1,4 @@
-"""Refuses a scene that doesn't fit on the ground: off its roads, too large, or without a way."""
+"""Checks that a scene fits on the ground: on its roads, not too large, every path open."""
 
 import math
 from collections.abc import Iterator
@@ -17,14 +17,14 @@ from flowrep.scenes.vehicle import footprint_corners
 _MOST_PIECES = 300
 _MOST_GROUND_M2 = 1e6
 _MOST_BOXES = 1_000
-_BEYOND_M = 100.0  # how far rows may begin before a road and end behind it
+_BEYOND_M = 100.0  # how far rows may extend beyond either end of a road
 
 
 def check_extent(scene: Scene, source: str) -> None:
-    """Makes sure that a scene is small enough to be laid out, and that all lies on its roads.
+    """Checks that a scene is small enough to lay out, and that its parts lie on its roads.
 
     Raises:
-        SceneError: names the key and what to do.
+        SceneError: names the key and the remedy.
     """
     pieces = sum(len(road.pieces) for road in scene.roads)
     if pieces > _MOST_PIECES:
@@ -53,7 +53,7 @@ def check_extent(scene: Scene, source: str) -> None:
 
 
 def _stretches(scene: Scene) -> Iterator[tuple[str, str, tuple[float, ...], float]]:
-    """Yields key, road, distances along it and how far beyond its ends they may lie."""
+    """Yields key, road, distances along the road, and their allowed overhang at its ends."""
     for zone in scene.zones:
         yield f"zones.{zone.name}", zone.road, (zone.from_m, zone.to_m), 0.0
     for closure in scene.closures:
@@ -89,10 +89,10 @@ def _check_numbers_of_boxes(scene: Scene, source: str) -> None:
 
 
 def check_paths(layout: Layout, source: str) -> None:
-    """Makes sure that every path begins on free road and leads to its ending zone.
+    """Checks that every path begins on free road and leads to its ending zone.
 
     Raises:
-        SceneError: names the path and what to do.
+        SceneError: names the path and the remedy.
     """
     for zone in layout.scene.zones:
         if zone.from_m > zone.to_m:
@@ -123,7 +123,8 @@ def _is_built_over(ground: Polygon, boxes: list[Box]) -> bool:
 
 
 def _is_open(layout: Layout, path: Path) -> bool:
-    # Some ground that the vehicle's narrower side fits on holds both the start and the end.
+    # One connected piece of ground, wide enough for the vehicle's narrower side, must hold both
+    # the start and the end.
     vehicle = layout.scene.vehicle
     room = free_ground(layout, path).buffer(-min(vehicle.width_m, vehicle.length_m) / 2)
     start = Point(layout.start_state(path.start)[:2])

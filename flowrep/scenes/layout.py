@@ -39,10 +39,10 @@ _PLOT_STEP_M = 0.5
 
 @dataclass(frozen=True)
 class Box:
-    """What stands upright on the ground and can be hit: kind, centre, heading, size, variant.
+    """An upright box on the ground that can be hit: kind, centre, heading, size, variant.
 
-    Convention: `size_m` is (length, width, height), length runs along the heading. A house shows
-    its front to its right. The variant is any number; it chooses between looks.
+    Convention: `size_m` is (length, width, height), with length along the heading. The front of a
+    house faces its right. Any integer is a valid variant; it selects the appearance.
     """
 
     kind: Kind
@@ -54,7 +54,7 @@ class Box:
 
     @property
     def category(self) -> str:
-        """The class in the semantic map."""
+        """The box's class in the semantic map."""
         return CATEGORY_OF_KIND[self.kind]
 
     @cached_property
@@ -78,7 +78,7 @@ class CrosswalkArea(NamedTuple):
 
 
 def centreline(road: Road) -> LineString:
-    """Returns a road's centreline, arcs sampled every few degrees."""
+    """Returns a road's centreline, with arcs sampled every few degrees."""
     (x, y), heading = road.start_m, math.radians(road.heading_deg)
     points = [(x, y)]
     for piece in road.pieces:
@@ -104,7 +104,7 @@ def centrelines(scene: Scene) -> dict[str, LineString]:
 
 
 def _with_round_corners(ground: BaseGeometry, radius_m: float) -> BaseGeometry:
-    # Widening and narrowing again fills the corners that point inwards.
+    # Growing and then shrinking the ground fills its inward corners.
     return ground.buffer(radius_m).buffer(-radius_m) if radius_m > 0 else ground
 
 
@@ -162,11 +162,11 @@ class Layout:
         )
 
     def width_m(self, road: str) -> float:
-        """Returns how wide a road is, without its sidewalks."""
+        """Returns the width of a road without its sidewalks."""
         return self._roads[road].width_m
 
     def start_state(self, zone_name: str) -> VehicleState:
-        """Returns the vehicle at rest in its yaw, in the middle of a start zone."""
+        """Returns the vehicle in the middle of a start zone, with zero yaw rate."""
         zone = next(zone for zone in self.scene.zones if zone.name == zone_name)
         x, y, heading = self.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
         return VehicleState(x, y, heading + (math.pi if zone.reverse else 0.0), 0.0)
@@ -188,9 +188,9 @@ class Layout:
             return parallel(without_repeats(np.array(part.coords)), walk.offset_m)
         assert walk.at_m is not None
         road = self._roads[walk.road]
-        # A stride is kept from the house fronts.
+        # Keep a stride away from the house fronts.
         reach = road.width_m / 2 + road.sidewalk_m - 0.5
-        # From the right-hand sidewalk to the left-hand one: its left is back along the road.
+        # From right to left across the road; the walk's own left points back along the road.
         ends = [self.pose_at(walk.road, walk.at_m, side * reach) for side in (-1, 1)]
         return np.array([end[:2] for end in ends])
 
@@ -252,7 +252,7 @@ class Layout:
             size = (front, depth, rng.uniform(*row.height_m))
             offset = side * (edge + rng.uniform(0.0, 0.8) + depth / 2)
             variant = int(rng.integers(1 << 16))
-            while at < row.to_m:  # to the next place that is free
+            while at < row.to_m:  # advance to the next free place
                 x, y, heading = self.pose_at(row.road, at + front / 2, offset)
                 facing = heading + (0.0 if row.side == "left" else math.pi)
                 house = Box("house", x, y, facing, size, variant)

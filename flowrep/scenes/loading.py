@@ -1,4 +1,4 @@
-"""Reads a scene from its name, a YAML file or plain data, and refuses one that cannot be."""
+"""Loads a scene from its name, a YAML file or plain data, and checks it."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
             or a `Scene`, which is checked again.
 
     Raises:
-        SceneError: names the file, the key, what was expected and what to do.
+        SceneError: names the file, the key, what was expected and the remedy.
 
     >>> load_scene("straight_road").time_limit_steps
     200
@@ -59,7 +59,7 @@ def _data(scene: str | Path | Mapping[str, Any] | Scene) -> tuple[Any, str]:
     try:
         return read_yaml(path), str(path)
     except PlainDataError as error:
-        raise SceneError(str(path), error.key, str(error), "mend the file") from error
+        raise SceneError(str(path), error.key, str(error), "fix the file") from error
 
 
 def _find(scene: str | Path) -> Path:

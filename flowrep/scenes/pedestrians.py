@@ -1,4 +1,4 @@
-"""People who walk back and forth on their lines: where each stands is a function of time alone."""
+"""People walking back and forth along lines; their positions depend on time alone."""
 
 import math
 from typing import Any
@@ -12,24 +12,24 @@ from flowrep.scenes.walks import draw_lanes
 
 Array = NDArray[Any]
 _TURN_S = 0.6  # about-turn at either end of a walk
-_STRIDE_M = 1.4  # a step with either leg
+_STRIDE_M = 1.4  # one step with each leg
 _SWING_RAD = 0.38  # of a leg, either way: feet 0.6 m apart
-_OUT_OF_STEP_RAD = 2.4  # from person to person, so that a group does not march
+_OUT_OF_STEP_RAD = 2.4  # offset between neighbours, so that a group does not march in step
 
 
 class Crowd:
     """All people of one episode."""
 
     def __init__(self, lines: list[Array], speeds_mps: Array, phases: Array) -> None:
-        """Sets out the crowd.
+        """Places people on their lines.
 
         Args:
-            lines: the walk of each person, points [M, 2].
-            speeds_mps: speed of each [P]; 0 for one who stands.
-            phases: where each is at time 0 [P]: a share of the way there and back, in [0, 1).
+            lines: each person's walk, points [M, 2].
+            speeds_mps: each person's speed [P]; 0 for people standing still.
+            phases: positions at time 0 [P], as a fraction of the round trip, in [0, 1).
         """
         most = max((len(line) for line in lines), default=2)
-        # Short lines end in copies of their last point, which have no length.
+        # Shorter lines are padded with copies of their last point, which add no length.
         padded = [line[np.minimum(np.arange(most), len(line) - 1)] for line in lines]
         self._points = np.array(padded).reshape(len(lines), most, 2)  # [P, M, 2]
         steps = np.diff(self._points, axis=1)
@@ -47,21 +47,21 @@ class Crowd:
         self._out_of_step = _OUT_OF_STEP_RAD * self._people
 
     def __len__(self) -> int:
-        """How many people there are."""
+        """Returns the number of people."""
         return len(self._people)
 
     def positions(self, time_s: float | Array) -> Array:
-        """Returns where everyone is [P, 2] at a time since the episode's start.
+        """Returns everyone's position [P, 2] at a time since the episode's start.
 
-        Times [T, 1] give places [T, P, 2].
+        Times [T, 1] give positions [T, P, 2].
         """
         return self._places(self._along(time_s))[0]
 
     def poses(self, time_s: float | Array) -> Array:
-        """Returns where everyone is, looks and steps: poses [P, 4] of `flowrep.scenes.people`.
+        """Returns everyone's pose [P, 4], as defined in `flowrep.scenes.people`.
 
-        Times [T, 1] give poses [T, P, 4]. Legs swing with the distance walked; who stands has one
-        foot before the other.
+        Times [T, 1] give poses [T, P, 4]. Legs swing with the distance walked; people standing
+        still have one foot in front of the other.
         """
         along = self._along(time_s)
         positions, headings = self._places(along)
@@ -74,7 +74,7 @@ class Crowd:
         return poses
 
     def _along(self, time_s: float | Array) -> Array:
-        # Metres walked since the near end, in [0, there and back).
+        # Metres walked since the near end, in [0, length of the round trip).
         return (self._start + self._speeds * time_s) % self._there_and_back
 
     def _places(self, along: Array) -> tuple[Array, Array]:
@@ -92,7 +92,7 @@ class Crowd:
         return points + (at - marks)[..., None] * directions, headings
 
     def _facing(self, along: Array) -> Array:
-        # 0 on the way there, π on the way back, turned evenly over _TURN_S around either end.
+        # 0 on the way out, π on the way back, with a uniform turn over _TURN_S at either end.
         past_far_end = along - self._length
         is_back = past_far_end > 0
         past_near_end = along - is_back * self._there_and_back
@@ -105,14 +105,14 @@ class Crowd:
 def draw_crowd(
     layout: Layout, groups: tuple[PedestrianGroup, ...], speed_mps: Range, rng: np.random.Generator
 ) -> Crowd:
-    """Returns a crowd with phases, directions, speeds and places drawn for one episode."""
+    """Returns a crowd with phases, directions, speeds and lanes drawn for one episode."""
     lines: list[Array] = []
     speeds: list[float] = []
     phases: list[float] = []
     for group in groups:
         low, high = speed_mps if group.speed_mps is None else group.speed_mps
         draws = 1 if group.draw == "group" else group.count
-        # A uniform phase over the way there and back draws the direction too.
+        # A uniform phase over the round trip draws the direction too.
         phase = np.resize(rng.uniform(0.0, 1.0, draws), group.count)
         speed = np.resize(rng.uniform(low, high, draws), group.count)
         lateral = draw_lanes(group.count, group.spread_m, rng)

@@ -1,7 +1,7 @@
-"""What a person is made of: an upper body and two legs that swing, each a rigid part of its own.
+"""The parts of a person: an upper body and two swinging legs, each a rigid body.
 
-Convention: a person's pose is (x, y, yaw, swing): where it stands, where it looks, and the angle in
-radians by which its left leg is swung backwards and its right leg forwards, about the hips' axis.
+Convention: a person's pose is (x, y, yaw, swing): position, heading, and the angle in radians by
+which the left leg is swung backwards and the right leg forwards about the axis of the hips.
 """
 
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 RADIUS_M, HEIGHT_M = 0.3, 1.75
-"""The cylinder that a vehicle can hit."""
+"""The collision cylinder."""
 
 PARTS = ("upper body", "left leg", "right leg")
 HIP_M, _HIP_ASIDE_M = 0.82, 0.1
@@ -20,14 +20,14 @@ _SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
 
 
 class Parts(NamedTuple):
-    """Where the parts of P people are: positions [P, 3, 3] in metres, quaternions [P, 3, 4]."""
+    """Poses of the parts of P people: positions [P, 3, 3] in metres, quaternions [P, 3, 4]."""
 
     positions: Array
     quaternions_xyzw: Array
 
 
 def place_parts(poses: Array) -> Parts:
-    """Returns where the parts of people at poses [P, 4] are."""
+    """Returns the poses of the parts of people at poses [P, 4]."""
     x, y, yaw, swing = poses.T
     positions = np.zeros((len(poses), len(PARTS), 3))
     positions[:, :, 0] = x[:, None]
@@ -36,7 +36,7 @@ def place_parts(poses: Array) -> Parts:
     positions[:, 1:, 0] -= np.sin(yaw)[:, None] * aside
     positions[:, 1:, 1] += np.cos(yaw)[:, None] * aside
     positions[:, 1:, 2] = HIP_M
-    # The turn about z by yaw after the one about y by a leg's own angle.
+    # Rotation about y by the leg's own angle, then about z by yaw.
     sine_z, cosine_z = np.sin(yaw / 2)[:, None], np.cos(yaw / 2)[:, None]
     half = np.zeros((len(poses), len(PARTS)))
     half[:, 1:] = 0.5 * swing[:, None] * _SIDES

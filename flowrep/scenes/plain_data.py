@@ -1,4 +1,4 @@
-"""Reads YAML into plain data, however it was written, in bounded time and memory."""
+"""Reads any YAML into plain data, in bounded time and memory."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -11,20 +11,20 @@ MOST_BYTES = 100_000
 _MOST_VALUES = 50_000
 _MOST_DEEP = 20
 _LONGEST_TEXT = 1_000
-_LARGEST_WHOLE = 2**53  # up to here every whole number is a float too
+_LARGEST_WHOLE = 2**53  # up to here every whole number is exact as a float
 
 
 class PlainDataError(ValueError):
-    """What was read is no plain data; the message is the problem, `key` says where it lies."""
+    """Input that is not plain data; the message states the problem, `key` its location."""
 
     def __init__(self, problem: str, key: str = "") -> None:
-        """Keeps the place beside the problem."""
+        """Stores the problem and its key."""
         super().__init__(problem)
         self.key = key
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's own, which refuses deep nesting, a key given twice and merges without end."""
+    """PyYAML's safe loader, without deep nesting, duplicate keys and unbounded merges."""
 
     def __init__(self, stream: Any) -> None:
         super().__init__(stream)
@@ -57,10 +57,10 @@ class _Loader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> Any:
-    """Returns what a YAML file holds.
+    """Returns the content of a YAML file.
 
     Raises:
-        PlainDataError: it can't be read, is too large, or is no YAML.
+        PlainDataError: the file can't be read, is too large, or is not YAML.
     """
     try:
         with path.open("rb") as file:
@@ -77,22 +77,22 @@ def read_yaml(path: Path) -> Any:
     except yaml.YAMLError as error:
         raise PlainDataError(f"is not YAML: {' '.join(str(error).split())}") from error
     except (ValueError, OverflowError, TypeError, AttributeError, KeyError, IndexError) as error:
-        # PyYAML hands on what Python says of values like 2001-99-99 or an empty !!int.
-        problem = f"is not YAML: it holds a value that can't be ({error})"
+        # PyYAML passes on Python's errors for values like 2001-99-99 or an empty !!int.
+        problem = f"is not YAML: it holds an invalid value ({error})"
         raise PlainDataError(shortened(problem, 200)) from error
 
 
 def plain(value: Any) -> Any:
-    """Returns a value made of dicts, lists, text, numbers, booleans and None alone.
+    """Returns a value as dicts, lists, strings, numbers, booleans and None.
 
     Raises:
-        PlainDataError: it holds anything else, is nested too deep, or is too large.
+        PlainDataError: the value holds anything else, is nested too deep, or is too large.
     """
     return _Plain().convert(value, "", 0)
 
 
 def shortened(text: str, most: int = 60) -> str:
-    """Returns one line of text, cut where it is longer than `most`."""
+    """Returns text on one line, cut to `most` characters."""
     line = " ".join(text.split())
     return line if len(line) <= most else f"{line[:most]}..."
 
@@ -120,7 +120,7 @@ class _Plain:
     @staticmethod
     def key(name: Any, key: str) -> str:
         if not isinstance(name, str):
-            raise PlainDataError(f"has the key {shortened(repr(name))}, which is no text", key)
+            raise PlainDataError(f"has the key {shortened(repr(name))}, which is not text", key)
         return name
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Ground on which nothing that stands still can end an episode, as a table of small cells."""
+"""A grid of ground on which no static part of the scene can end an episode."""
 
 import math
 
@@ -11,13 +11,13 @@ _CELL_M = 0.25
 
 
 class SafeGround:
-    """Says in no time that a vehicle is on the road, clear of all boxes and of every ending zone.
+    """A fast, conservative test that a vehicle is on the road, clear of boxes and ending zones.
 
-    What it denies is left to exact tests; people are not its business.
+    Where it returns False, exact tests decide. It does not consider people.
     """
 
     def __init__(self, layout: Layout) -> None:
-        """Marks the cells that are safe wherever in them the vehicle stands, whichever way."""
+        """Marks the cells that are safe for any vehicle position and heading in them."""
         vehicle = layout.scene.vehicle
         reach = math.hypot(vehicle.length_m, vehicle.width_m) / 2 + _CELL_M
         ends = [layout.zones[path.end] for path in layout.scene.paths]

@@ -1,4 +1,4 @@
-"""What a scene is: frozen data whose field names are the YAML's keys."""
+"""The data of a scene: frozen dataclasses whose field names are the keys of the YAML file."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
@@ -52,7 +52,7 @@ CATEGORY_OF_KIND: dict[Kind, str] = {
     "traffic_light": "traffic_light",
     "lamp_post": "building",
 }
-"""The class in the semantic map of what stands in a street; there is none for lamp posts alone."""
+"""Semantic class of each kind of box; lamp posts share the class of buildings."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Road(Part):
 class Zone(Part):
     """The whole width of a road between two distances from its start.
 
-    A vehicle that starts here stands in its middle, along the road, or against it if `reverse`.
+    A vehicle starts in the middle of its zone, facing along the road, or against it if `reverse`.
     """
 
     name: Name
@@ -102,7 +102,7 @@ class Path(Part):
 
 @dataclass(frozen=True)
 class Closure(Part):
-    """A building across a road, there in the episodes whose path names it."""
+    """A building across a road, present in episodes whose path names it."""
 
     name: Name
     road: Name
@@ -113,7 +113,7 @@ class Closure(Part):
 
 @dataclass(frozen=True)
 class Walk(Part):
-    """Where a group walks back and forth: across a road, along it, or through given points."""
+    """The walk of a group, back and forth: across a road, along it, or through given points."""
 
     kind: Literal["across", "along", "points"]
     road: Name | None = None
@@ -128,7 +128,8 @@ class Walk(Part):
 class PedestrianGroup(Part):
     """People on one walk; `standing` of them never move.
 
-    `draw` says whether speed, phase and direction are drawn once for the group or for each person.
+    `draw` determines whether speed, phase and direction are drawn once for the group or for each
+    person.
     """
 
     name: Name
@@ -144,7 +145,7 @@ class PedestrianGroup(Part):
 class BuildingRow(Part):
     """House fronts along one side of a road, or one house across its start or end.
 
-    A house of a row stands where no road, no sidewalk and no earlier house is.
+    Houses of a row are placed only where there is no road, sidewalk or earlier house.
     """
 
     road: Name
@@ -159,10 +160,10 @@ class BuildingRow(Part):
 
 @dataclass(frozen=True)
 class Obstacle(Part):
-    """Something that stands still: what it is, where, which way it faces.
+    """A static object: kind, position, heading and size.
 
-    `size_m` is (length, width, height); length runs along the heading. It is what a vehicle can
-    hit: of a tree its trunk, of a light its post, while crown, arm and head hang above.
+    `size_m` is (length, width, height), with length along the heading. It covers the part that a
+    vehicle can hit: the trunk of a tree or the post of a light, not the parts that hang above.
     """
 
     kind: Kind
@@ -175,8 +176,8 @@ class Obstacle(Part):
 class ObstacleRow(Part):
     """Obstacles of one kind along a road, `offset_m` to the left of its middle.
 
-    They face as cars that keep right are parked: on the right along the road, on the left against
-    it. Whatever would stand on another road than its own, or in a house, is left out.
+    They face like parked cars in right-hand traffic: along the road on the right, against it on the
+    left. Obstacles that would stand on another road or in a house are left out.
     """
 
     kind: Kind
@@ -190,7 +191,7 @@ class ObstacleRow(Part):
 
 @dataclass(frozen=True)
 class Crosswalk(Part):
-    """Stripes over the whole width of a road, `depth_m` along it."""
+    """Stripes across the whole width of a road, extending `depth_m` along it."""
 
     road: Name
     at_m: Place
@@ -199,10 +200,10 @@ class Crosswalk(Part):
 
 @dataclass(frozen=True)
 class Scene(Part):
-    """A whole environment as data; `load_scene` reads and checks one.
+    """A complete scene as data; `load_scene` reads and checks one.
 
-    Grass lies between the roads and `terrain_m` beyond their bounds; 0 for none. `corner_radius_m`
-    rounds the kerb where roads meet.
+    Grass covers the ground between the roads and up to `terrain_m` beyond their bounds; 0 for none.
+    `corner_radius_m` rounds the kerb where roads meet.
     """
 
     name: FileName
@@ -227,10 +228,10 @@ class Scene(Part):
 
     @property
     def time_limit_s(self) -> float:
-        """The time limit in seconds, whatever the frame rate."""
+        """The time limit in seconds, at any frame rate."""
         return self.time_limit_steps / self.frame_rate_hz
 
     @property
     def num_pedestrians(self) -> int:
-        """How many people the scene holds."""
+        """The number of people in the scene."""
         return sum(group.count for group in self.pedestrian_groups)

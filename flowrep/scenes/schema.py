@@ -1,4 +1,4 @@
-"""What a scene file may say: `Scene` and its parts as a pydantic schema, also for editors."""
+"""The schema of scene files: `Scene` and its parts, checked by pydantic, exported for editors."""
 
 import dataclasses
 import json
@@ -13,10 +13,10 @@ from flowrep.scenes.scene import Scene
 
 
 class SceneError(ValueError):
-    """A scene that cannot be: says in which file, at which key, what was expected, what to do."""
+    """An invalid scene; the message names the file, the key, the problem and the remedy."""
 
     def __init__(self, source: str, key: str, problem: str, remedy: str) -> None:
-        """Composes the message from where (`source`, `key`), what, and what to do about it."""
+        """Composes the message from the location (`source`, `key`), the problem and the remedy."""
         super().__init__(f"{source}: {key or 'the scene'}: {problem}; {remedy}")
 
 
@@ -26,14 +26,14 @@ def _adapter() -> TypeAdapter[Scene]:
 
 
 def scene_from_data(data: Any, *, source: str) -> Scene:
-    """Returns a scene from a mapping whose keys are exactly a scene's.
+    """Returns a scene from a mapping whose keys are exactly the fields of `Scene`.
 
     Args:
         data: nested mappings, lists and values.
         source: the file, for messages.
 
     Raises:
-        SceneError: a key is unknown or missing, or a value is of another kind or out of range.
+        SceneError: a key is unknown or missing, or a value has the wrong type or is out of range.
     """
     try:
         content = plain(data)
@@ -47,13 +47,13 @@ def scene_from_data(data: Any, *, source: str) -> Scene:
     try:
         return _adapter().validate_python(content)
     except ValidationError as error:
-        # A key with a typo is also missing by its right name: the typo tells more.
+        # A misspelt key is also reported as missing; report the misspelling first.
         told = sorted(error.errors(include_url=False), key=lambda each: each["type"] != _UNKNOWN)
         raise SceneError(source, *_told(told[0])) from error
 
 
 def json_schema() -> str:
-    """Returns the JSON schema of a scene file, as text."""
+    """Returns the JSON schema of scene files, as text."""
     schema = _adapter().json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return json.dumps(schema, indent=1) + "\n"
@@ -78,7 +78,7 @@ _OUR_WORDS = {
 
 
 def _told(error: Any) -> tuple[str, str, str]:
-    """Returns the key, the problem and the remedy of one of pydantic's errors."""
+    """Returns the key, the problem and the remedy for a pydantic error."""
     *parents, last = error["loc"]
     key = ""
     for part in (*parents, last):
@@ -101,7 +101,7 @@ def _told(error: Any) -> tuple[str, str, str]:
 
 
 def _keys_at(location: Sequence[str | int]) -> list[str]:
-    """Returns the keys of the part of a scene that lies at a location."""
+    """Returns the keys of the part of a scene at a location."""
     part: Any = Scene
     for name in location:
         if isinstance(name, str):

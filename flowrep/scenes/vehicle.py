@@ -26,7 +26,7 @@ class VehicleConfig(Part):
 
 
 class VehicleState(NamedTuple):
-    """Pose of the footprint's centre and yaw rate; scalars, or arrays of one shape."""
+    """Pose of the footprint's centre and yaw rate: scalars, or arrays of the same shape."""
 
     x_m: Any
     y_m: Any
@@ -37,7 +37,7 @@ class VehicleState(NamedTuple):
 def turn(state: VehicleState, sign: Any, dt_s: float, vehicle: VehicleConfig) -> VehicleState:
     """Returns the state with its yaw rate changed by `sign`·α·Δt, within its limit.
 
-    `sign` is `YAW_SIGN` of the action; where the state's fields are arrays, so is it.
+    `sign` is the `YAW_SIGN` of the action: a scalar or array like the state's fields.
     """
     limit = math.radians(vehicle.max_yaw_rate_dps)
     rate = state.yaw_rate_rps + sign * (math.radians(vehicle.yaw_acceleration_dps2) * dt_s)
@@ -49,11 +49,11 @@ def turn(state: VehicleState, sign: Any, dt_s: float, vehicle: VehicleConfig) ->
 
 
 def roll(state: VehicleState, dt_s: float, speed_mps: float) -> VehicleState:
-    """Returns the state after `dt_s` on the circular arc of its yaw rate, exactly."""
+    """Returns the exact state after driving for `dt_s` along the arc of its yaw rate."""
     xp: Any = np if isinstance(state.yaw_rate_rps, np.ndarray) else math
     angle = state.yaw_rate_rps * dt_s
-    # The chord of an arc of length d and angle a is d·sin(a/2)/(a/2), along the mean heading. For
-    # no angle a tiny one stands in, whose quotient is 1.
+    # The chord of an arc of length d and angle a is d·sin(a/2)/(a/2), along the mean heading. A
+    # tiny angle replaces 0, so that the quotient is 1.
     half = 0.5 * angle
     half_or_tiny = half + (half == 0.0) * 1e-20
     chord = speed_mps * dt_s * (xp.sin(half_or_tiny) / half_or_tiny)

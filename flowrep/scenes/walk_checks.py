@@ -1,4 +1,4 @@
-"""Refuses people who could not walk where a scene wants them: into houses, or into each other."""
+"""Checks that people can walk their walks without meeting boxes or each other."""
 
 from itertools import combinations
 
@@ -20,10 +20,10 @@ from flowrep.scenes.walks import (
 
 
 def check_walks(layout: Layout, source: str) -> None:
-    """Makes sure that nobody can ever walk into anybody or anything, whatever is drawn.
+    """Checks that no draw of an episode lets anyone walk into a box or another person.
 
     Raises:
-        SceneError: names the group, and what to change.
+        SceneError: names the group and the remedy.
     """
     groups = layout.scene.pedestrian_groups
     grounds = [_ground(layout, group, source) for group in groups]

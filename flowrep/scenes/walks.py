@@ -1,7 +1,7 @@
-"""Lines that people walk on: side by side, so that whoever keeps to one of them meets nobody.
+"""Parallel lanes for people to walk in without meeting each other.
 
-A group's lanes are parallel to one line. Two lanes that are `LANE_M` apart keep two people apart
-whatever their speeds, wherever they turn about: their bodies can't overlap.
+A group's lanes are parallel to one line. People in lanes `LANE_M` apart can't overlap, whatever
+their speeds and wherever they turn around.
 """
 
 from typing import Any
@@ -16,16 +16,16 @@ from flowrep.scenes.people import RADIUS_M
 Array = NDArray[Any]
 
 APART_M = 2 * RADIUS_M
-"""Two people whose centres are so far apart touch, and don't overlap."""
+"""Distance between the centres of two people who touch without overlapping."""
 
 LANE_M = APART_M + 0.01
-"""From the middle of one lane to that of the next."""
+"""Distance between the middles of neighbouring lanes."""
 
 _SHORTEST_M = 1e-3
 
 
 def without_repeats(points: Array) -> Array:
-    """Returns points [M, 2] without those that are hardly a millimetre from the one before."""
+    """Returns points [M, 2] without those within about a millimetre of the previous one."""
     kept = [points[0]]
     for point in points[1:]:
         if np.hypot(*(point - kept[-1])) > _SHORTEST_M:
@@ -38,15 +38,16 @@ def parallel(points: Array, aside_m: float) -> Array:
     steps = np.diff(points, axis=0)
     normals = np.stack([-steps[:, 1], steps[:, 0]], axis=-1) / np.hypot(*steps.T)[:, None]
     before, after = np.vstack([normals[:1], normals]), np.vstack([normals, normals[-1:]])
-    # The corner lies on the bisector, one metre from the line on either side of it.
+    # The corner lies on the bisector, one metre from both adjacent stretches.
     share = np.maximum(1.0 + (before * after).sum(axis=-1), 1e-9)
     return points + aside_m * (before + after) / share[:, None]
 
 
 def keeps_its_stretches(points: Array, aside_m: float) -> bool:
-    """Returns whether a line moved aside still has every stretch, and none of them reversed.
+    """Returns whether a line moved aside keeps every stretch, with none reversed.
 
-    A stretch's length is linear in `aside_m`: what holds at two distances holds between them.
+    The length of a stretch is linear in `aside_m`, so if this holds at two distances, it holds
+    between them.
     """
     steps = np.diff(points, axis=0)
     moved = np.diff(parallel(points, aside_m), axis=0)
@@ -54,11 +55,11 @@ def keeps_its_stretches(points: Array, aside_m: float) -> bool:
 
 
 def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
-    """Returns whether lanes up to half of `spread_m` to either side are as far apart as drawn.
+    """Returns whether lanes up to half of `spread_m` to either side stay as far apart as drawn.
 
-    They are if the strip that holds them and half a person's room around them does not overlap
-    itself: to come from one lane to another, one then crosses all between them, or leaves the strip
-    and enters it again.
+    They do if the strip of all lanes, widened by half a person's room, does not overlap itself: the
+    only way from one lane to another is then across all lanes between them, or out of the strip and
+    in again.
     """
     reach, room = spread_m / 2 + APART_M / 2, APART_M / 2
     first, last = points[1] - points[0], points[-1] - points[-2]
@@ -72,9 +73,9 @@ def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
 
 
 def covered_ground(points: Array, spread_m: float) -> list[BaseGeometry]:
-    """Returns where the lanes of a walk can lie, as convex pieces, one for each of its stretches.
+    """Returns the ground that the lanes of a walk can cover, one convex piece for each stretch.
 
-    A piece is a line where `spread_m` is 0.
+    The pieces are lines if `spread_m` is 0.
     """
     right, left = (parallel(points, side * spread_m / 2) for side in (-1, 1))
     corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
@@ -82,22 +83,22 @@ def covered_ground(points: Array, spread_m: float) -> list[BaseGeometry]:
 
 
 def gap_m(ground: list[BaseGeometry], other: list[BaseGeometry]) -> float:
-    """Returns how far two lists of shapes are from each other."""
+    """Returns the distance in metres between two lists of shapes."""
     tree = shapely.STRtree(other)
     _, distances = tree.query_nearest(ground, all_matches=False, return_distance=True)
     return float(distances.min())
 
 
 def least_spread_m(count: int) -> float:
-    """Returns the room that the lanes of so many people take."""
+    """Returns the least width in metres that the lanes of `count` people take."""
     return round((count - 1) * LANE_M, 6)
 
 
 def draw_lanes(count: int, spread_m: float, rng: np.random.Generator) -> Array:
-    """Returns how far to the left of the walk each person's lane is [P].
+    """Returns each person's lane [P] as its distance in metres to the left of the walk.
 
-    All ways to place the lanes within `spread_m`, each at least `LANE_M` from the next, are equally
-    likely, and so is any order of the people.
+    All placements of lanes within `spread_m` that are at least `LANE_M` apart are equally likely,
+    and so are all orders of the people.
     """
     free = max(spread_m - least_spread_m(count), 0.0)
     lanes = np.sort(rng.uniform(0.0, 1.0, count)) * free + LANE_M * np.arange(count)
