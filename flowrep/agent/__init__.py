@@ -1,4 +1,4 @@
-"""Networks and algorithms: sees specs and keys, never an environment or a representation."""
+"""Networks and algorithms, built from specs and keys alone; they know no environment."""
 
 from flowrep.extras import require
 

@@ -1,4 +1,4 @@
-"""What an agent needs to know of a discrete action space."""
+"""Description of a discrete action space, read from its spec."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchrl.modules import OneHotCategorical
 
 @dataclass(frozen=True)
 class DiscreteActions:
-    """How many actions there are, TorchRL's name of their coding, and a distribution over them."""
+    """The number of actions, TorchRL's name for their encoding and the matching distribution."""
 
     count: int
     space: str
@@ -22,9 +22,9 @@ class DiscreteActions:
         """Reads a `Categorical` or `OneHot` spec.
 
         Raises:
-            TypeError: on any other.
+            TypeError: if the spec is of any other type.
         """
-        if type(spec) is Categorical:  # its subclasses are codings of several choices at once
+        if type(spec) is Categorical:  # its subclasses encode several choices at once
             return cls(int(spec.space.n), "categorical", torch.distributions.Categorical)
         if type(spec) is OneHot:
             return cls(int(spec.space.n), "one-hot", OneHotCategorical)

@@ -1,4 +1,4 @@
-"""What training asks of an algorithm, and what every algorithm here does in the same way."""
+"""The interface between training and an algorithm, and the update that all algorithms share."""
 
 from __future__ import annotations
 
@@ -21,49 +21,49 @@ from flowrep.agent.policy import acting_network, stochastic_policy
 
 
 class Memory(Protocol):
-    """What an algorithm keeps of the frames that it has seen."""
+    """The frames that an algorithm has stored to learn from."""
 
     def extend(self, frames: TensorDictBase) -> object:
         """Stores steps of N environments."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that it holds."""
+        """Returns the complete contents."""
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a `state_dict`."""
 
 
 class Algorithm(ABC):
-    """Acts by `policy`, keeps frames in `memory`, and takes gradient steps on samples of it.
+    """Acts with `policy`, stores frames in `memory` and takes gradient steps on samples from it.
 
     ```
     acted = algorithm.policy(observation)                   # writes `action`
     for _ in range(algorithm.updates_due(frames)):
         metrics = algorithm.update(algorithm.sample())
-    algorithm.remember(steps)                               # with what the action brought
+    algorithm.remember(steps)                               # with reward and next observation
     ```
 
-    What is minimised is a TorchRL `LossModule`; this class has the rest of an update: schedule,
-    Adam, targets, CUDA graph, the watch for divergence. A subclass sets `policy` (by
-    `make_policy`, which makes it for evaluation too) and `memory`, calls this constructor with its
-    loss, and writes `sample` and `updates_due`. Everything it needs to continue then lies in the
-    loss's weights, the memory and Adam's state, which are saved.
+    The objective is a TorchRL `LossModule`. This class adds the rest of an update: learning-rate
+    schedule, Adam, target networks, CUDA graph and divergence check. A subclass sets `policy`
+    (with `make_policy`, which evaluation uses too) and `memory`, passes its loss to this
+    constructor and implements `sample` and `updates_due`. The loss's weights, the memory and
+    Adam's state, all of which are saved, are then enough to resume.
 
     Args:
         loss: its parameters are trained, its target parameters follow them.
         learning_rate: Adam's, falling linearly to 0 over `total_updates`.
-        total_updates: gradient steps of the whole training.
-        tau: share of the online weights in each move of the targets; None if there are none.
-        max_grad_norm: gradients of a larger norm, all weights together, are scaled down to it.
-        rate_factors: by the name of a trained weight, by how much its learning rate differs.
+        total_updates: gradient steps over the whole training.
+        tau: share of the online weights in each move of the targets; None without targets.
+        max_grad_norm: the norm over all gradients is scaled down to this maximum.
+        rate_factors: factors on the learning rate, by name of the trained weight.
     """
 
     METRICS: ClassVar[Mapping[str, str]]
-    """What is logged, with the key under which the loss returns it; those that end in `_loss` are
-    minimised, as a sum."""
+    """Logged metrics, each with its key in the loss's output. The sum of those that end in `_loss`
+    is minimised."""
 
     LOSS: ClassVar[Callable[..., LossModule]]
-    """Makes the loss, of the policy's `MapNetwork` and its `DiscreteActions`."""
+    """Builds the loss from the policy's `MapNetwork` and `DiscreteActions`."""
 
     CAPTURABLE: ClassVar[bool] = True
     """Whether `losses` and `after_update` can be part of a CUDA graph, see `as_cuda_graph`."""
@@ -99,21 +99,21 @@ class Algorithm(ABC):
         losses = [name for name in self.METRICS if name.endswith("_loss")]
         others = [name for name in self.METRICS if name not in losses]
         self.divergence = DivergenceWatch([*losses, "grad_norm"], others, self.device)
-        # the fused step takes no step where it is 1, and asks the device, not the host
+        # the fused optimizer skips its step if this is 1, which it reads on the device
         self.optimizer.found_inf = self.divergence.is_bad  # type: ignore[attr-defined]
         self.updates = 0
         self._is_eager = not self.CAPTURABLE
         self._capture()
 
     def _parameter_groups(self, rate_factors: Mapping[str, float]) -> list[dict[str, Any]]:
-        """Returns Adam's groups: the weights that share a learning rate."""
+        """Returns Adam's parameter groups, one for each learning rate."""
         unknown = rate_factors.keys() - self.trained.keys()
         if unknown:
             raise ValueError(f"rate_factors names {sorted(unknown)}, which training doesn't change")
         groups: dict[float, list[Tensor]] = {}
         for name, weight in self.trained.items():
             groups.setdefault(rate_factors.get(name, 1.0), []).append(weight)
-        # rates are tensors, so that a captured step reads what they are set to
+        # rates are tensors, so that a captured step reads their current values
         return [
             {
                 "params": weights,
@@ -133,17 +133,17 @@ class Algorithm(ABC):
         device: torch.device | str,
         **options: Any,
     ) -> Any:
-        """Returns the acting side alone, untrained: what an agent needs that learns no more.
+        """Returns an untrained policy alone, for an agent that only acts.
 
-        Its `state_dict` is that of `policy`, and the weights of the one fit the other.
+        Its `state_dict` is interchangeable with that of `policy`.
 
         Args:
             observation_spec: the environment's.
             action_spec: `Categorical` or `OneHot`.
             keys: the observation maps to read, in order.
             device: where its networks live.
-            options: those of the constructor, `precision` and `hidden_size` among them; what acting
-                doesn't depend on is not looked at.
+            options: the constructor's, including `precision` and `hidden_size`; those that don't
+                affect acting are ignored.
         """
         network = acting_network(
             observation_spec,
@@ -152,25 +152,25 @@ class Algorithm(ABC):
             device=torch.device(device),
             precision=options["precision"],
             hidden_size=options["hidden_size"],
-            layer_norm=options.get("layer_norm", False),  # not every algorithm has the choice
+            layer_norm=options.get("layer_norm", False),  # not an option of every algorithm
         )
         actions = DiscreteActions.from_spec(action_spec)
         return stochastic_policy(network, list(keys), actions, writes_log_prob=cls.WRITES_LOG_PROB)
 
     @classmethod
     def options(cls) -> dict[str, inspect.Parameter]:
-        """Returns what a config may set, by name.
+        """Returns the parameters that a config may set, by name.
 
-        These are the parameters of the class; where it takes any keyword, those of its bases and
-        of its loss too.
+        These are the parameters of the class and, if it takes arbitrary keywords, those of its
+        bases and its loss.
         """
         owners = [owner for owner in cls.__mro__ if "__init__" in vars(owner)]
         return options_of([*owners[: owners.index(Algorithm)], getattr(cls, "LOSS", None)])
 
     def step_eagerly(self) -> None:
-        """Takes every further update operation by operation, never as a CUDA graph.
+        """Runs all further updates eagerly instead of as a CUDA graph.
 
-        For debugging and for timing: the numbers are the same.
+        The numbers are the same; this is for debugging and timing.
         """
         self._is_eager = True
         self._capture()
@@ -181,40 +181,40 @@ class Algorithm(ABC):
 
     @classmethod
     def metric_names(cls) -> tuple[str, ...]:
-        """Returns the keys of what `update` returns."""
+        """Returns the keys of the metrics that `update` returns."""
         return (*cls.METRICS, "grad_norm", "learning_rate")
 
     def remember(self, steps: TensorDictBase) -> None:
-        """Takes in steps of N environments: observations, actions and what they brought."""
+        """Stores steps of N environments: observations, actions and their outcomes."""
         self.memory.extend(steps)
 
     @abstractmethod
     def updates_due(self, frames: int) -> int:
-        """Returns how many updates to take, now that `frames` have been remembered in all."""
+        """Returns how many updates to take after `frames` frames have been stored in total."""
 
     @abstractmethod
     def sample(self) -> TensorDictBase:
         """Returns the batch for one update."""
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Returns the scalars named in `METRICS`, the losses among them with gradients."""
+        """Returns the scalars named in `METRICS`; the losses among them carry gradients."""
         out = self.loss(batch)
         return {name: out[key] for name, key in self.METRICS.items()}
 
     def other_weights(self) -> Mapping[str, Tensor]:
-        """Returns what training changes beside the weights of the loss, by name."""
+        """Returns tensors that training changes besides the weights of the loss, by name."""
         return {}
 
     def after_update(self) -> None:
-        """Follows each step of the optimizer: moves the targets by `tau` of their distance."""
+        """Moves the targets by `tau` towards the weights; called after each optimizer step."""
         if self.target_updater is not None:
             self.target_updater.step()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Takes one gradient step on a batch from `sample()`; returns detached metrics.
+        """Takes one gradient step on a batch from `sample()` and returns detached metrics.
 
-        From the first update on in which a loss or a gradient is nan or infinite, the weights stay
-        as they are and `divergence.check()` raises.
+        Once a loss or a gradient is nan or infinite, the weights no longer change and
+        `divergence.check()` raises.
         """
         learning_rate = self.learning_rate * max(0.0, 1 - self.updates / self.total_updates)
         for group in self.optimizer.param_groups:
@@ -224,7 +224,7 @@ class Algorithm(ABC):
         return metrics | {"learning_rate": torch.tensor(learning_rate)}
 
     def _take_step(self, batch: TensorDictBase) -> TensorDictBase:
-        """Does on the device all that an update does; returns the metrics."""
+        """Runs the part of an update that is on the device and returns the metrics."""
         self.optimizer.zero_grad(set_to_none=True)
         losses = self.losses(batch)
         minimised = [loss for name, loss in losses.items() if name.endswith("_loss")]
@@ -237,7 +237,7 @@ class Algorithm(ABC):
         return TensorDict(metrics, [])
 
     def _gradient_norm(self) -> Tensor:
-        """Returns the norm of all gradients, which it then scales down to `max_grad_norm`."""
+        """Returns the norm over all gradients, then scales them down to `max_grad_norm`."""
         trained = [w for w in self.trained.values() if w.grad is not None]
         norm = torch.nn.utils.get_total_norm([w.grad for w in trained if w.grad is not None])
         if self.max_grad_norm is not None:
@@ -245,7 +245,7 @@ class Algorithm(ABC):
         return norm
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns weights, Adam's moments and the schedule's position; not the memory."""
+        """Returns weights, Adam's moments and the number of updates, without the memory."""
         moments = {n: dict(self.optimizer.state[w]) for n, w in self.trained.items()}
         return {
             "weights": {name: weight.detach() for name, weight in self.weights.items()},
@@ -258,7 +258,7 @@ class Algorithm(ABC):
         """Continues from a `state_dict`.
 
         Raises:
-            ValueError: if it belongs to another algorithm, or to other maps or sizes.
+            ValueError: if it was saved by another algorithm, or for other maps or sizes.
         """
         saved = state["weights"]
         shapes = {name: tuple(weight.shape) for name, weight in self.weights.items()}
@@ -282,11 +282,11 @@ class Algorithm(ABC):
                 key: value.to(weight.device, copy=True) for key, value in moments.items()
             }
         self.updates = state["updates"]
-        self._capture()  # Adam's moments lie elsewhere now
+        self._capture()  # Adam's moments are at new addresses
 
 
 def weights_of(loss: LossModule) -> dict[str, Tensor]:
-    """Returns a loss's parameters and target parameters by name, those of encoders first."""
+    """Returns a loss's parameters and target parameters by name, the encoders' first."""
     targets = {n: w for n, w in loss.named_buffers() if n.startswith("target_") and "_params." in n}
     weights = dict(loss.named_parameters()) | targets
     encoders = [name for name in weights if "encoder" in name.partition(".")[0]]

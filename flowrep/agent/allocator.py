@@ -15,11 +15,11 @@ def keep_freed_memory() -> bool:
     """Tells glibc to reuse large freed blocks; returns whether it did.
 
     By default glibc maps every block above a threshold (32 MiB at most) afresh and unmaps it when
-    freed: each activation of a large batch is then zeroed by the kernel page by page, every update
-    anew. With both thresholds at 1 GiB the blocks stay in the heap. Where the C library is not
-    glibc, nothing changes and the answer is False.
+    freed, so the kernel zeroes each activation of a large batch page by page in every update. With
+    both thresholds at 1 GiB the blocks stay in the heap. With any other C library, nothing changes
+    and the function returns False.
 
-    Call it once, early: blocks that exist already keep their place.
+    Call it once and early, as blocks already allocated are not moved.
     """
     if platform.libc_ver()[0] != "glibc":
         return False

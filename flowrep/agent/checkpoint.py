@@ -1,10 +1,10 @@
-"""One file that a run continues from: tensors and plain data, written whole or not at all.
+"""Saves and loads checkpoints: tensors and plain data in one file, written atomically.
 
-The file is a safetensors file. Its header's metadata carry one JSON document that mirrors the
-nested state, in which a tensor is `{"tensor": name, "crc32": checksum}`, and the document's own
-checksum. All of them are checked whenever the file is read, for a part of it too: a byte that was
-changed is noticed wherever it is. Nothing in the file can run code. `torchrl.checkpoint` loses the
-last checkpoint if it is killed between its two renames, see docs/upstream.md.
+The file is a safetensors file. The metadata in its header hold a JSON document that mirrors the
+nested state, with each tensor as `{"tensor": name, "crc32": checksum}`, and the checksum of that
+document. Every read, even of a part, verifies all checksums, so any changed byte is noticed.
+Nothing in the file can run code. `torchrl.checkpoint` loses the last checkpoint if it is killed
+between its two renames, see docs/upstream.md.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ FORMAT = "flowrep checkpoint 5"
 
 
 class CheckpointError(Exception):
-    """A checkpoint could not be written or read; the message says which and what to do."""
+    """A checkpoint could not be written or read; the message names it and the remedy."""
 
 
 def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> None:
-    """Writes `state` to `path`; whatever happens on the way, the file there is a whole one.
+    """Writes `state` to `path` atomically: an interruption leaves no incomplete file there.
 
     Args:
-        path: the folder is made if it does not exist.
-        state: dicts with string keys, lists, tensors, str, int, float, bool and None, nested at
-            will. Tuples come back as lists.
+        path: its folder is created if it does not exist.
+        state: dicts with string keys, lists, tensors, str, int, float, bool and None, nested to
+            any depth. Tuples come back as lists.
 
     Raises:
-        TypeError: naming the place of anything else.
-        CheckpointError: if it cannot be written (disk full, read-only); the file that was there
-            before is still there.
+        TypeError: if `state` holds anything else; the message names the place.
+        CheckpointError: if the file cannot be written (disk full, read-only). A previous file is
+            left untouched.
     """
     path = Path(path)
     tensors: dict[str, Tensor] = {}
     document = json.dumps(_without_tensors(state, "", tensors))
-    # safetensors makes temporary files of its own: in a folder, so that a writer that was killed
-    # leaves one place to clear and not a pile of halves
+    # safetensors makes temporary files of its own; in a separate folder, those that a killed
+    # writer leaves behind are easy to remove
     partial = path.with_name(f".{path.name}.partial")
     try:
         shutil.rmtree(partial, ignore_errors=True)
@@ -56,7 +56,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
         checksum = str(zlib.crc32(document.encode()))
         metadata = {"format": FORMAT, "state": document, "state_crc32": checksum}
         save_file(_unshared(tensors), file, metadata=metadata)
-        file.chmod(partial.stat().st_mode & 0o666)  # as any new file, not for the owner alone
+        file.chmod(partial.stat().st_mode & 0o666)  # like any new file, not owner-only
         _flush(file)
         _rename(file, path)
         _flush(path.parent)
@@ -80,7 +80,7 @@ def load_checkpoint(
         parts: the keys of the outermost dict to return; None for all.
 
     Raises:
-        CheckpointError: if there is none, or any byte of it is damaged, or it is something else.
+        CheckpointError: if the file is missing, damaged or not a checkpoint of this version.
     """
     path = Path(path)
     if not path.is_file():
@@ -97,7 +97,7 @@ def load_checkpoint(
             document = json.loads(metadata["state"])
             if not isinstance(document, dict):
                 raise TypeError(f"it holds a {type(document).__name__}, not a dict")
-            # tensors are views of the file: those that nobody asked for cost a look, no memory
+            # tensors are views of the file, so checking those not returned takes no memory
             state = {k: _with_tensors(v, file.get_tensor) for k, v in document["dict"].items()}
             return state if parts is None else {name: state[name] for name in parts}
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -108,7 +108,7 @@ def load_checkpoint(
 
 
 def _rename(file: Path, path: Path) -> None:
-    """Puts a file in another's place, in one step."""
+    """Moves `file` to `path`, atomically replacing any file there."""
     os.replace(file, path)
 
 
@@ -122,7 +122,7 @@ def _flush(path: Path) -> None:
 
 
 def _without_tensors(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
-    """Returns `value` as JSON data; moves its tensors to `tensors`, named by their place."""
+    """Returns `value` as JSON data and adds its tensors to `tensors`, named by their place."""
     if isinstance(value, Tensor):
         tensors[place] = value.detach().cpu().contiguous()
         return {"tensor": place, "crc32": _checksum(tensors[place])}
@@ -145,7 +145,7 @@ def _without_tensors(value: Any, place: str, tensors: dict[str, Tensor]) -> Any:
 
 
 def _unshared(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Returns the tensors, copied where two share memory, which the format refuses."""
+    """Returns the tensors, copied where two share memory, which the format doesn't allow."""
     seen: set[int] = set()
     unshared = {}
     for name, tensor in tensors.items():

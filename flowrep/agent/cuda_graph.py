@@ -1,4 +1,4 @@
-"""A gradient step as one CUDA graph, so that the device waits for no Python between kernels."""
+"""Runs a gradient step as one CUDA graph, without waiting for Python between kernels."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from tensordict.nn import CudaGraphModule
 
 Step = Callable[[TensorDictBase], TensorDictBase]
 
-WARM_UP = 3  # steps taken as they are, in which Adam's moments and TorchRL's caches come to be
+WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
 
 
 def as_cuda_graph(step: Step, device: torch.device) -> Step:
-    """Returns what does the same as `step`, on a CUDA device from its fourth call on as a graph.
+    """Returns an equivalent of `step` that runs as a CUDA graph from its fourth call on.
 
-    The graph runs the same kernels on the same memory again and again: `step` may depend on what
-    changes between two calls only through its argument and through tensors that are changed in
-    place; it asks the device for no number, and brings none to it. On any other device `step`
-    itself is returned.
+    The graph replays the same kernels on the same memory. Values that change between calls must
+    therefore reach `step` through its argument or through tensors changed in place, and `step`
+    must not copy numbers between host and device. On any device but CUDA, `step` itself is
+    returned.
 
     Args:
-        step: takes and returns a TensorDict; on CUDA every one has the first one's keys, shapes and
-            dtypes, and ValueError is raised for another.
-        device: where it computes.
+        step: takes and returns a TensorDict. On CUDA, a batch whose keys, shapes or dtypes differ
+            from the first one's raises ValueError.
+        device: where `step` computes.
     """
     if device.type != "cuda":
         return step
@@ -33,10 +33,10 @@ def as_cuda_graph(step: Step, device: torch.device) -> Step:
 
 
 class OfOneShape:
-    """Passes batches on to `step`, and refuses those that are laid out unlike the first.
+    """Passes batches on to `step` and rejects those whose layout differs from the first one's.
 
-    A graph copies each batch into the first one's memory, where a batch of one row would be spread
-    over all rows, numbers cast and a missing map left as it was, all in silence.
+    A graph copies each batch into the first one's memory. Without the check, a batch of one row
+    would silently be broadcast, numbers be cast and a missing map keep its old values.
     """
 
     def __init__(self, step: Step) -> None:
@@ -44,10 +44,10 @@ class OfOneShape:
         self._expected: dict[Any, tuple[Any, ...]] | None = None
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns what `step` does.
+        """Returns `step(batch)`.
 
         Raises:
-            ValueError: naming the first entry that differs.
+            ValueError: if an entry differs from the first batch's; the message names it.
         """
         layout = {
             key: (tuple(value.shape), value.dtype)
@@ -55,12 +55,12 @@ class OfOneShape:
         }
         if self._expected is None:
             self._expected = layout
-        # a loss may leave something of its own in a batch that then comes again
+        # only the first batch's keys count: a loss may add its own to a batch that is reused
         for key, expected in self._expected.items():
             if layout.get(key) != expected:
                 raise ValueError(
                     f"the update is a CUDA graph of batches with {key!r} {expected}, this one has "
-                    f"it {layout.get(key, 'absent')}: keep batches alike, or call step_eagerly() "
-                    "on the algorithm"
+                    f"it {layout.get(key, 'absent')}: keep the layout of batches fixed, or call "
+                    "step_eagerly() on the algorithm"
                 )
         return self.step(batch)

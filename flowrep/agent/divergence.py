@@ -1,4 +1,4 @@
-"""Notices a loss that stopped being a number, without making the device wait for the host."""
+"""Detects nan and infinite losses without making the device wait for the host."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch import Tensor
 
 
 class DivergenceError(ArithmeticError):
-    """A loss, or what is logged beside it, became nan or infinite; the message says which."""
+    """A loss or another watched metric became nan or infinite; the message names it."""
 
 
 class DivergenceWatch:
-    """Remembers, on the device, the metrics of the first update that went wrong.
+    """Keeps, on the device, the metrics of the first update that diverged.
 
     Args:
         watched: the metrics that have to be finite.
-        others: those to tell with them.
+        others: further metrics to report with them.
         device: where the metrics are.
 
     >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
@@ -39,10 +39,10 @@ class DivergenceWatch:
         self._values = torch.zeros(len(self.names), device=device)
         self._good_updates = torch.zeros((), dtype=torch.long, device=device)
         self.is_bad = torch.zeros((), device=device)
-        """1.0 from the first bad update on and 0.0 before it, on the device."""
+        """0.0 before the first bad update and 1.0 from then on, on the device."""
 
     def look(self, metrics: Mapping[str, Tensor]) -> None:
-        """Takes in an update's metrics; all that it keeps is changed in place."""
+        """Records an update's metrics, changing its own tensors in place."""
         values = torch.stack([metrics[name].float() for name in self.names])
         self._values.copy_(torch.where(self.is_bad.bool(), self._values, values))
         is_good = self._values[: len(self.watched)].isfinite().all()
@@ -50,10 +50,11 @@ class DivergenceWatch:
         self.is_bad.copy_(~is_good)
 
     def check(self) -> None:
-        """Waits for the device and says what went wrong, if anything has.
+        """Waits for the device and raises if an update has diverged.
 
         Raises:
-            DivergenceError: naming the first metric that is not finite, and all of that update's.
+            DivergenceError: if a watched metric is not finite; the message names the first such
+                metric and lists all metrics of that update.
         """
         values = dict(zip(self.names, self._values.tolist()))
         bad = [name for name in self.watched if not math.isfinite(values[name])]

@@ -1,4 +1,4 @@
-"""Double deep Q-learning from maps, by TorchRL's loss."""
+"""Double deep Q-learning from maps, with TorchRL's loss."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flowrep.agent.policy import MapNetwork, PackedNetwork, PolicyNetwork, actin
 
 
 class EpsilonGreedyPolicy(TensorDictSequential):
-    """Writes the action of the largest value, or, with probability ε, one drawn evenly."""
+    """Writes the action of the largest value or, with probability ε, a uniformly random one."""
 
     def __init__(
         self,
@@ -47,12 +47,12 @@ class EpsilonGreedyPolicy(TensorDictSequential):
 
 
 class DoubleDQNMapLoss(DQNLoss):
-    """TorchRL's loss of packed maps, of double Q-learning with a target; see `DoubleDQN`.
+    """TorchRL's double Q-learning loss on packed maps, with a target; see `DoubleDQN`.
 
     Args:
-        network: of the policy.
-        actions: what the policy chooses from.
-        gamma: discount a frame.
+        network: the policy's.
+        actions: the policy's action space.
+        gamma: discount per frame.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class DoubleDQNMapLoss(DQNLoss):
 
 
 class DoubleDQN(OffPolicy):
-    """One Q-function and its target, acting at random with a probability ε that falls.
+    """One Q-function and its target; acts at random with a falling probability ε.
 
     One gradient step minimises, over a batch,
 
@@ -81,14 +81,14 @@ class DoubleDQN(OffPolicy):
     the policy takes the action of the largest value.
 
     Args:
-        observation_spec: as `OffPolicy` takes it, like the arguments that follow.
+        observation_spec: see `OffPolicy`, as for the next three arguments.
         action_spec: `Categorical` or `OneHot`.
         keys: the observation maps to read, in order.
-        total_frames: environment frames of the whole training.
-        initial_epsilon: ε at the start.
-        final_epsilon: ε from `exploration_share` of the frames on; it falls linearly until there.
-        exploration_share: of `total_frames`.
-        options: of `OffPolicy`.
+        total_frames: environment frames over the whole training.
+        initial_epsilon: ε at the start, from which it falls linearly.
+        final_epsilon: ε after `exploration_share` of the frames.
+        exploration_share: share of `total_frames` over which ε falls.
+        options: further arguments of `OffPolicy`.
     """
 
     LOSS = DoubleDQNMapLoss
@@ -127,7 +127,7 @@ class DoubleDQN(OffPolicy):
 
     @property
     def exploration(self) -> EGreedyModule:
-        """The part of the policy that holds ε."""
+        """The policy's module that holds ε."""
         return self.policy[2]
 
     def other_weights(self) -> Mapping[str, Tensor]:
@@ -144,7 +144,7 @@ class DoubleDQN(OffPolicy):
         device: torch.device | str,
         **options: Any,
     ) -> EpsilonGreedyPolicy:
-        """Returns the acting side alone, see `Algorithm.make_policy`; ε lies in its state."""
+        """Returns an untrained policy, see `Algorithm.make_policy`; its state includes ε."""
         device = torch.device(device)
         network = acting_network(
             observation_spec,
@@ -167,14 +167,14 @@ class DoubleDQN(OffPolicy):
         )
 
     def remember(self, steps: TensorDictBase) -> None:
-        """Takes in steps, and lowers ε for each."""
+        """Stores steps and lowers ε for each of them."""
         super().remember(steps)
         e = self.exploration
         fall = (e.eps_init - e.eps_end) / e.annealing_num_steps * steps.numel()
         e.eps.copy_(torch.maximum(e.eps - fall, e.eps_end))
 
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Returns the loss, with gradients, and what it was computed from, without."""
+        """Returns the loss, with gradients, and the TD error and ε, without."""
         out = self.loss(batch)
         squared_error = batch["td_error"]  # the loss leaves it there
         return {

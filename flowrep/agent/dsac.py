@@ -25,16 +25,16 @@ class DiscreteSAC(OffPolicy):
         L_α = mean -log α (Σ_a π(a|s) log π(a|s) + H̄),   H̄ = target_entropy_weight · log n
 
     All gradients are taken at the same weights, then Adam steps once, then the targets move by
-    `tau`. ML-Agents halves L_Q (which Adam does not feel, but for its epsilon) and uses Q1 alone
-    in L_π. Of transitions of several steps, r is the discounted sum of their rewards, without the
-    entropy bonus on the way.
+    `tau`. ML-Agents halves L_Q (which changes Adam's steps only through its epsilon) and uses Q1
+    alone in L_π. For transitions of several steps, r is the discounted sum of their rewards,
+    without the entropy bonus of the steps between.
 
     Args:
-        observation_spec: as `OffPolicy` takes it, like the arguments that follow.
+        observation_spec: see `OffPolicy`, as for the next two arguments.
         action_spec: `Categorical` or `OneHot`.
         keys: the observation maps to read, in order.
-        alpha_rate_factor: the learning rate of log α is so many times that of the weights.
-        options: of `OffPolicy` and `DiscreteSACMapLoss`.
+        alpha_rate_factor: learning rate of log α relative to that of the weights.
+        options: further arguments of `OffPolicy` and `DiscreteSACMapLoss`.
     """
 
     LOSS: ClassVar[Callable[..., LossModule]] = DiscreteSACMapLoss

@@ -1,4 +1,4 @@
-"""TorchRL's loss of discrete SAC on packed maps: encoded once, both Q-functions together."""
+"""TorchRL's discrete SAC loss on packed maps, which encodes each map once for both Q-functions."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ ENCODERS = ("shared", "separate")
 
 
 class DiscreteSACHeadsLoss(DiscreteSACLoss):
-    """`DiscreteSACLoss` of a `Head` as policy and several as Q-functions.
+    """`DiscreteSACLoss` with one `Head` as policy and several as Q-functions.
 
-    TorchRL evaluates Q1 and Q2 one after the other (or by vmap), and those of `s` twice: for L_Q
-    with gradients, for L_π without. Here a hidden layer of twice the width is both, and what L_Q
-    has computed L_π takes: `qvalue_loss` goes first, `actor_loss` follows on the same batch.
+    TorchRL evaluates Q1 and Q2 one after the other (or by vmap), and twice at `s`: for L_Q with
+    gradients, for L_π without. Here both share one hidden layer of twice the width, and L_π reuses
+    the values computed for L_Q, so `qvalue_loss` must be called before `actor_loss` on the same
+    batch.
     """
 
     def _make_vmap(self) -> None:
@@ -45,22 +46,22 @@ class DiscreteSACHeadsLoss(DiscreteSACLoss):
 
 
 class DiscreteSACMapLoss(DiscreteSACHeadsLoss):
-    """Discrete SAC of packed maps, as `ReplayMemory` samples them; see `DiscreteSAC`.
+    """Discrete SAC loss on packed maps, as `ReplayMemory` samples them; see `DiscreteSAC`.
 
     Reads the maps, `action`, `steps_to_next_obs` and, under `next`, the maps, `reward`, `done` and
     `terminated`. Returns `loss_qvalue`, `loss_actor` and `loss_alpha`, to be minimised as a sum,
     with `alpha`, `entropy`, `q_mean` and `td_error`. Its target parameters are those of the
-    Q-functions and their encoder: TorchRL's `SoftUpdate` moves all of them.
+    Q-functions and their encoder, and TorchRL's `SoftUpdate` moves all of them.
 
     Args:
         actor: the policy's network.
-        actions: what the policy chooses from.
-        encoder: `"shared"`: policy and Q-functions read one set of encoders, trained by L_Q alone,
-            and in y both read its target, so that each observation is encoded once; `"separate"`:
-            each its own, and π(·|s') in y reads the policy's.
+        actions: the policy's action space.
+        encoder: with `"shared"`, policy and Q-functions read one set of encoders, trained by L_Q
+            alone, and in y both read its target, so that each observation is encoded once. With
+            `"separate"`, each has its own, and π(·|s') in y reads the policy's.
         initial_alpha: α before the first update.
-        target_entropy_weight: share of the largest entropy, log n, that α steers to.
-        gamma: discount a frame.
+        target_entropy_weight: target entropy as a share of the largest, log n.
+        gamma: discount per frame.
     """
 
     critic_encoder: Encoder
@@ -115,7 +116,7 @@ class DiscreteSACMapLoss(DiscreteSACHeadsLoss):
         self._in_keys = transition_keys(self.codecs)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the losses of a batch, with gradients, and what they are made of, without."""
+        """Returns the losses of a batch, with gradients, and further metrics, without."""
         embedded = self._embed(tensordict)
         loss_qvalue, critic_info = self.qvalue_loss(embedded)
         # the policy loss must not reach the critic's encoder through Q(s, a)
@@ -138,7 +139,7 @@ class DiscreteSACMapLoss(DiscreteSACHeadsLoss):
         )
 
     def _embed(self, batch: TensorDictBase) -> TensorDict:
-        """Returns the batch with maps replaced by embeddings."""
+        """Returns the batch with its maps replaced by embeddings."""
         images = decode_maps(self.codecs, batch)
         critic = self.critic_encoder(images)
         actor = critic.detach() if self.encoder_is_shared else self.actor_encoder(images)
@@ -164,7 +165,7 @@ class DiscreteSACMapLoss(DiscreteSACHeadsLoss):
 
 
 def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
-    """Returns the keys of a sampled transition, as a loss reads them."""
+    """Returns the keys of a sampled transition that a loss reads."""
     maps = [codec.key for codec in codecs]
     outcome = ["reward", "done", "terminated"]
     following: list[NestedKey] = [

@@ -1,4 +1,4 @@
-"""Discrete soft actor-critic with a state-value network: the paper's Eqs. 2-5 as its trainer's."""
+"""Discrete soft actor-critic with a state-value network: Eqs. 2-5 as the paper's trainer does."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from flowrep.agent.policy import MapNetwork
 
 
 class DiscreteSACValueLoss(LossModule):
-    """The losses of `DiscreteSACWithValue`, of packed maps as `ReplayMemory` samples them.
+    """The losses of `DiscreteSACWithValue` on packed maps, as `ReplayMemory` samples them.
 
-    Reads what `DiscreteSACMapLoss` reads. Returns `loss_qvalue`, `loss_value`, `loss_actor` and
-    `loss_alpha`, to be minimised as a sum, with `alpha`, `entropy`, `q_mean` and `value_mean`. Its
-    target parameters are those of V.
+    Reads the same keys as `DiscreteSACMapLoss`. Returns `loss_qvalue`, `loss_value`, `loss_actor`
+    and `loss_alpha`, to be minimised as a sum, with `alpha`, `entropy`, `q_mean` and `value_mean`.
+    Its target parameters are those of V.
 
     Args:
         actor: the policy's network.
-        actions: what the policy chooses from.
+        actions: the policy's action space.
         initial_alpha: α before the first update.
-        target_entropy_weight: share of the largest entropy, log n, that α steers to.
-        gamma: discount a frame.
+        target_entropy_weight: target entropy as a share of the largest, log n.
+        gamma: discount per frame.
     """
 
     actor: MapNetwork
@@ -82,7 +82,7 @@ class DiscreteSACValueLoss(LossModule):
         self.in_keys = transition_keys(self.codecs)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the losses of a batch, with gradients, and what they are made of, without."""
+        """Returns the losses of a batch, with gradients, and further metrics, without."""
         images = decode_maps(self.codecs, tensordict)
         outcome, action = tensordict["next"], tensordict["action"]
         if self.actions_are_one_hot:
@@ -97,7 +97,7 @@ class DiscreteSACValueLoss(LossModule):
         with torch.no_grad():
             with self.target_value_params.to_module(self.value):
                 following = self.value(decode_maps(self.codecs, outcome))
-            # a masked value, not a product: what lies after an end may be anything
+            # masked instead of multiplied: the value after an end may even be nan
             following = following.masked_fill(outcome["terminated"], 0.0)
             discount = self.gamma ** tensordict["steps_to_next_obs"]
             y = (outcome["reward"] + discount * following).squeeze(-1)
@@ -130,12 +130,13 @@ class DiscreteSACWithValue(DiscreteSAC):
         L_π = mean Σ_a π(a|s) [α log π(a|s) - Q1(s, a)]
         L_α = mean -log α (Σ_a π(a|s) log π(a|s) + H̄),   H̄ = target_entropy_weight · log n
 
-    Each loss trains its own network alone. All gradients are taken at the same weights, then Adam
-    steps once, then V̄ moves by `tau`. This is what the paper's trainer, ML-Agents, computes; it
-    costs five sets of encoders where `DiscreteSAC` with a shared one has two. Of transitions of
-    several steps, r is the discounted sum of their rewards, without the entropy bonus on the way.
+    Each loss trains only its own network. All gradients are taken at the same weights, then Adam
+    steps once, then V̄ moves by `tau`. This is what the paper's trainer, ML-Agents, computes. It
+    needs five sets of encoders, against two for `DiscreteSAC` with a shared encoder. For
+    transitions of several steps, r is the discounted sum of their rewards, without the entropy
+    bonus of the steps between.
 
-    Its arguments are those of `DiscreteSAC`, with the options of `DiscreteSACValueLoss`.
+    The arguments are those of `DiscreteSAC`, with the options of `DiscreteSACValueLoss`.
     """
 
     LOSS = DiscreteSACValueLoss

@@ -1,4 +1,4 @@
-"""Nature encoders over packed maps: one a map, embeddings concatenated."""
+"""Nature encoders over packed maps, one per map, with concatenated embeddings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class NatureEncoder(nn.Module):
         self.linear = nn.Linear(64 * rows * columns, EMBEDDING_SIZE)
 
     def convolutions(self) -> list[Tensor]:
-        """Returns weights and biases of the convolutions, the first one's over packed maps."""
+        """Returns weights and biases of the convolutions, the first kernel packed like the maps."""
         kernel = self.codec.pack_weight(self.conv1.weight)
         weights = (kernel, self.conv2.weight, self.conv3.weight)
         biases = (self.conv1.bias, self.conv2.bias, self.conv3.bias)
@@ -42,11 +42,11 @@ class NatureEncoder(nn.Module):
         return [tensor for tensor in both if tensor is not None]
 
     def embed(self, features: Tensor) -> Tensor:
-        """Returns `[N, 512]` of what the convolutions made."""
+        """Returns the embeddings `[N, 512]` of the convolutions' features."""
         return F.leaky_relu_(linear(features, self.linear.weight, self.linear.bias), SLOPE)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Returns `[N, 512]` of a decoded map `[N, 16 * channels, h, w]`."""
+        """Returns the embeddings `[N, 512]` of a decoded map `[N, 16 * channels, h, w]`."""
         (features,) = convolve([image], self.convolutions(), STRIDES)
         return self.embed(features)
 
@@ -56,8 +56,8 @@ class Encoder(nn.Module):
 
     Args:
         codecs: the maps.
-        layer_norm: bring each embedding to mean 0 and variance 1 (without weights of its own), so
-            that no map is louder than another and the head's input keeps its scale.
+        layer_norm: normalise each embedding to mean 0 and variance 1 (without learnt weights), so
+            that all maps have the same scale and the head's input keeps it.
     """
 
     def __init__(self, codecs: Sequence[MapCodec], *, layer_norm: bool = False) -> None:
@@ -71,7 +71,7 @@ class Encoder(nn.Module):
         return EMBEDDING_SIZE * len(self.encoders)
 
     def forward(self, images: Sequence[Tensor]) -> Tensor:
-        """Returns `[N, 512 * maps]` of decoded maps, in the maps' order."""
+        """Returns the embeddings `[N, 512 * maps]` of decoded maps, in the maps' order."""
         encoders: list[NatureEncoder] = list(self.encoders)  # type: ignore[arg-type]
         weights = [w for encoder in encoders for w in encoder.convolutions()]
         features = convolve(images, weights, STRIDES)

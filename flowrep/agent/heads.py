@@ -1,4 +1,4 @@
-"""The small network that turns an embedding into one number an action."""
+"""The small network that maps an embedding to one number per action."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flowrep.agent.encoder import linear
 
 
 class Head(nn.Module):
-    """Returns `[N, n_actions]` float32 of `[N, embedding]`: linear, Swish, linear.
+    """Maps `[N, embedding]` to `[N, n_actions]` float32: linear, Swish, linear.
 
     The hidden layer computes in the dtype of its input, the output layer in float32.
     """
@@ -24,17 +24,17 @@ class Head(nn.Module):
         self.output = nn.Linear(hidden_size, n_actions)
 
     def forward(self, embedding: Tensor) -> Tensor:
-        """Returns one float32 number an action."""
+        """Returns one float32 number per action."""
         hidden = F.silu(linear(embedding, self.hidden.weight, self.hidden.bias))
         return self.output(hidden.float())
 
 
 def heads_together(embedding: Tensor, weights: Mapping[str, Any]) -> Tensor:
-    """Returns `[heads, N, n_actions]` of several heads on one embedding `[N, embedding]`.
+    """Returns the outputs `[heads, N, n_actions]` of several heads on one embedding.
 
     Args:
-        embedding: what all of them read.
-        weights: those of `Head` by module and name, stacked: the first dim is the heads.
+        embedding: `[N, embedding]`, the input of all heads.
+        weights: those of `Head` by module and name, stacked along a first dim of heads.
     """
     hidden, output = weights["hidden"], weights["output"]
     x = linear(embedding, hidden["weight"].flatten(0, 1), hidden["bias"].flatten())

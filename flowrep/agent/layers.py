@@ -1,9 +1,9 @@
-"""The layers of a network on a CPU, a batch cut into parts that a team of threads shares.
+"""The layers of a network on a CPU, with each batch split among a team of threads.
 
-They compute what PyTorch's `conv2d`, `leaky_relu` and `linear` do, in the dtype of their input,
-with gradients for weights in float32. Besides being shared out, they cost less: no cast is taken
-twice, and the weight gradients of strided convolutions are products over unfolded maps, small
-enough to stay in a core's cache.
+They compute the same as PyTorch's `conv2d`, `leaky_relu` and `linear`, in the dtype of their
+input, with float32 gradients for weights. They also do less work: nothing is cast twice, and the
+weight gradients of strided convolutions are products over unfolded maps, small enough to stay in a
+core's cache.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flowrep.agent.team import parts, run_tasks
 
 SLOPE = 0.01  # of LeakyReLU below 0
 ROWS, FEATURES = 128, 128  # of one task
-CACHE_BYTES = 1 << 20  # of a core: what the largest map of a task should fit into
+CACHE_BYTES = 1 << 20  # of a core; the largest map of a task should fit into it
 
 aten = torch.ops.aten
 
@@ -33,12 +33,12 @@ def convolve(
     """Returns the features of several maps: convolutions, LeakyReLU after each, flattened.
 
     Args:
-        images: `[N, C, h, w]`, channels last in memory, one a map.
-        weights: of the first map `[O, C, k, k]` and `[O]` for each stride, then of the next one.
+        images: one per map, `[N, C, h, w]`, channels last in memory.
+        weights: the first map's `[O, C, k, k]` and `[O]` for each stride, then the next map's.
         strides: of the convolutions.
 
     Returns:
-        `[N, rows * columns * O]` a map, rows first, channels last, in the dtype of the images.
+        `[N, rows * columns * O]` per map, rows first, channels last, in the dtype of the images.
     """
     if all(_is_shared_out(image) and not image.requires_grad for image in images):
         keeps = torch.is_grad_enabled()
@@ -53,24 +53,24 @@ def convolve(
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Returns `x Wᵀ + b` of `[N, inputs]`, computed in the dtype of `x`."""
+    """Returns `x Wᵀ + b` for `x` `[N, inputs]`, computed in the dtype of `x`."""
     if _is_shared_out(x):
         return Linear.apply(x, weight, bias)
     return F.linear(x, weight.to(x.dtype), bias.to(x.dtype))
 
 
 def _is_shared_out(x: Tensor) -> bool:
-    # an exported program has a batch of any size, and no team of threads to share it
+    # an exported program takes batches of any size and has no team of threads
     return x.is_cpu and not torch.compiler.is_exporting()
 
 
 class Convolutions(torch.autograd.Function):
-    """Several chains of convolutions, each followed by LeakyReLU, one a map.
+    """Chains of convolutions, each followed by LeakyReLU, one chain per map.
 
     `apply(strides, keeps, maps, *tensors)` takes each map's image `[N, C, h, w]` (channels last,
-    no gradient is computed for it), then each map's weights `[O, C, k, k]` and biases `[O]` in
-    turn; it returns each map's features `[N, rows * columns * O]`, rows first, channels last.
-    `keeps` says whether what `backward` needs is kept.
+    without a gradient), then each map's weights `[O, C, k, k]` and biases `[O]` in turn, and
+    returns each map's features `[N, rows * columns * O]`, rows first, channels last. With `keeps`,
+    the activations that `backward` needs are kept.
     """
 
     @staticmethod
@@ -100,7 +100,7 @@ class Convolutions(torch.autograd.Function):
 
 
 class _Chain:
-    """One map's way through its convolutions."""
+    """The convolutions of one map."""
 
     def __init__(self, image: Tensor, weights: Sequence[Tensor], strides: Sequence[int]) -> None:
         self.image = image
@@ -153,7 +153,7 @@ class _Chain:
 
 
 class Linear(torch.autograd.Function):
-    """`apply(x, weight, bias)` returns `x Wᵀ + b` of `[N, inputs]` in the dtype of `x`."""
+    """`apply(x, weight, bias)` returns `x Wᵀ + b` for `x` `[N, inputs]`, in the dtype of `x`."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -198,14 +198,14 @@ def _sum(tensors: Sequence[Tensor]) -> Tensor:
 
 
 def _cast(weight: Tensor, bias: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    # channels-last weights keep the whole chain in that layout, without reorders in between
+    # channels-last weights keep the whole chain in that layout
     return weight.to(dtype, memory_format=torch.channels_last), bias.to(dtype)
 
 
 def _weight_gradient(g: Tensor, x: Tensor, weight: Tensor, stride: int) -> Tensor:
     """Returns the gradient of a convolution's weight."""
     outputs, channels, height, width = weight.shape
-    if height * width < 9:  # unfolding costs more than the better product brings
+    if height * width < 9:  # unfolding costs more than it saves
         return _convolution_backward(g, x, weight, stride, [False, True])[1]
     product = _channel_rows(g).t() @ _unfold(x, height, width, stride)
     return product.view(outputs, height, width, channels).permute(0, 3, 1, 2)
@@ -214,19 +214,19 @@ def _weight_gradient(g: Tensor, x: Tensor, weight: Tensor, stride: int) -> Tenso
 def _convolution_backward(
     g: Tensor, x: Tensor, weight: Tensor, stride: int, wanted: list[bool]
 ) -> tuple[Tensor, ...]:
-    """Returns the gradients of input and weight, those that are wanted."""
+    """Returns the wanted gradients of input and weight."""
     return aten.convolution_backward(
         g, x, weight, None, [stride] * 2, [0, 0], [1, 1], False, [0, 0], 1, [*wanted, False]
     )
 
 
 def _unfold(x: Tensor, height: int, width: int, stride: int) -> Tensor:
-    """Returns `[N * rows * columns, height * width * C]`: what each output pixel reads."""
+    """Returns the window of each output pixel: `[N * rows * columns, height * width * C]`."""
     x = x.permute(0, 2, 3, 1)
     windows = x.unfold(1, height, stride).unfold(2, width, stride)  # [N, rows, columns, C, h, w]
     return windows.permute(0, 1, 2, 4, 5, 3).reshape(-1, height * width * x.shape[-1])
 
 
 def _channel_rows(x: Tensor) -> Tensor:
-    """Returns `[N * h * w, C]` of `[N, C, h, w]`."""
+    """Returns `[N, C, h, w]` as `[N * h * w, C]`."""
     return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])

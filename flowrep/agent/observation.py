@@ -1,15 +1,15 @@
-"""How observation maps are packed for storage and decoded for a network, from their specs alone.
+"""Packs observation maps for storage and decodes them for a network, given their specs.
 
 | spec | means | the network sees |
 | --- | --- | --- |
-| `Categorical(n)` | a class id a pixel, C stacked frames | one-hot, `C * n` channels |
+| `Categorical(n)` | a class id per pixel, C stacked frames | one-hot, `C * n` channels |
 | `Bounded(0, 255, uint8)` | intensity | `x / 255`, C channels |
 | any float | a quantity | itself, C channels |
 
-Maps are kept *packed*: the first convolution of the Nature encoder has kernel 8 and stride 4, which
-is the same sum as kernel 2 and stride 1 over blocks of 4 × 4 pixels taken as channels. Two input
-channels become 32, what vector units like, and the block order is made once, when a frame is
-stored, instead of at every update.
+Maps are stored *packed*. The first convolution of the Nature encoder has kernel 8 and stride 4,
+which is the same sum as kernel 2 and stride 1 over blocks of 4 × 4 pixels taken as channels. Two
+input channels thus become 32, which suits vector units, and the pixels are reordered once, when a
+frame is stored, instead of in every update.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from torchrl.data import Categorical, Composite, TensorSpec
 
 BLOCK = 4  # the stride of the first convolution
 KERNEL = 2 * BLOCK
-MIN_SIZE = 36  # three convolutions of 8/4, 4/2 and 3/1 leave one pixel of 36
+MIN_SIZE = 36  # convolutions of 8/4, 4/2 and 3/1 reduce 36 pixels to one
 _FLOAT16_MAX = torch.finfo(torch.float16).max
 
 
 @dataclass(frozen=True)
 class MapCodec:
-    """One map: its place in the TensorDict, its size, what its numbers mean and how they are read.
+    """One map: its key in the TensorDict, its size, the meaning of its numbers and their encoding.
 
-    `dtype` is what the network computes in: bfloat16 or float32.
+    The network computes in `dtype`, bfloat16 or float32.
     """
 
     key: NestedKey
@@ -51,16 +51,16 @@ class MapCodec:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Height and width in blocks; rows and columns that no kernel reaches are left out.
+        """Height and width in blocks, without rows and columns that no kernel reaches.
 
-        The second convolution has kernel 4 and stride 2: of an odd number of rows, it skips one.
+        The second convolution has kernel 4 and stride 2, so it skips one of an odd number of rows.
         """
         height, width = ((size - KERNEL) // BLOCK + 1 for size in (self.height, self.width))
         return height // 2 * 2 + 1, width // 2 * 2 + 1
 
     @property
     def stored_dtype(self) -> torch.dtype:
-        """uint8 for ids and intensities; two bytes for the rest, those the network reads best."""
+        """uint8 for ids and intensities, else the two-byte float that suits the network."""
         if self.num_classes or self.is_byte:
             return torch.uint8
         return torch.bfloat16 if self.dtype is torch.bfloat16 else torch.float16
@@ -69,7 +69,7 @@ class MapCodec:
         """Returns the leading dims of a raw map `[*B, C, H, W]`.
 
         Raises:
-            ValueError: if the last three are not those of the spec.
+            ValueError: if the last three dims are not those of the spec.
         """
         expected = (self.channels, self.height, self.width)
         if tuple(x.shape[-3:]) != expected:
@@ -79,7 +79,7 @@ class MapCodec:
         return tuple(x.shape[:-3])
 
     def pack(self, x: Tensor) -> Tensor:
-        """Returns `x` `[*B, C, H, W]` as blocks `[*B, h, w, C * 16]`; values and dtype stay."""
+        """Returns `x` `[*B, C, H, W]` as blocks `[*B, h, w, C * 16]` of the same dtype."""
         rows, columns = self.grid
         x = x[..., : rows * BLOCK, : columns * BLOCK]
         x = x.unflatten(-1, (columns, BLOCK)).unflatten(-3, (rows, BLOCK))  # [*B, C, h, 4, w, 4]
@@ -93,13 +93,13 @@ class MapCodec:
         return x.to(self.stored_dtype)
 
     def store(self, x: Tensor) -> Tensor:
-        """Returns a raw map `[*B, C, H, W]` as it is kept: compact and packed."""
+        """Returns a raw map `[*B, C, H, W]` in its stored form, compact and packed."""
         return self.pack(self.compact(x))
 
     def decode(self, packed: Tensor) -> Tensor:
         """Returns `[N, network_channels * 16, h, w]`, channels last in memory, for the encoder."""
         if self.num_classes:
-            # looking rows of the identity up is several times faster than comparing ids
+            # looking up rows of the identity is several times faster than comparing ids
             one_hot = torch.eye(self.num_classes, device=packed.device, dtype=self.dtype)
             decoded = F.embedding(packed.int(), one_hot).flatten(-2)  # [N, h, w, C * 16 * n]
         elif self.is_byte:
@@ -119,7 +119,7 @@ class MapCodec:
 def map_codecs(
     observation_spec: Composite, keys: Sequence[NestedKey], dtype: torch.dtype
 ) -> tuple[MapCodec, ...]:
-    """Returns one codec a key, in order, read off the specs (their last three dims are C, H, W).
+    """Returns one codec per key, in order, from the specs, whose last three dims are C, H, W.
 
     Raises:
         ValueError: if `keys` is empty, or a map has the wrong rank, type or size.
@@ -164,12 +164,12 @@ def _codec(key: NestedKey, spec: TensorSpec, dtype: torch.dtype) -> MapCodec:
 
 
 def decode_maps(codecs: Sequence[MapCodec], packed: TensorDictBase) -> tuple[Tensor, ...]:
-    """Returns the decoded maps of a batch `[N]` of packed ones."""
+    """Returns the decoded maps of a batch `[N]` of packed maps."""
     return tuple(codec.decode(packed[codec.key]) for codec in codecs)
 
 
 def store_maps(codecs: Sequence[MapCodec], observation: TensorDictBase) -> TensorDictBase:
-    """Returns the observation's maps as they are kept, and nothing else."""
+    """Returns only the observation's maps, in their stored form."""
     stored = observation.empty()
     for codec in codecs:
         stored[codec.key] = codec.store(observation[codec.key])

@@ -1,4 +1,4 @@
-"""What algorithms that learn from a replay memory have in common."""
+"""Base class of algorithms that learn from a replay memory."""
 
 from __future__ import annotations
 
@@ -17,29 +17,30 @@ from flowrep.agent.replay import ReplayMemory
 
 
 class OffPolicy(Algorithm):
-    """One update every `frames_per_update` frames, on a uniform sample of the last frames.
+    """Takes one update every `frames_per_update` frames, on a uniform sample of recent frames.
 
     Args:
-        observation_spec: the environment's; its last three dims of each map are C, H, W.
+        observation_spec: the environment's; the last three dims of each map are C, H, W.
         action_spec: `Categorical` or `OneHot`.
         keys: the observation maps to read, in order.
-        total_frames: environment frames of the whole training; sets the learning rate's end.
+        total_frames: environment frames over the whole training, after which the learning rate
+            is 0.
         device: where networks, replay and updates live.
         precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
         learning_rate: Adam's for all weights, falling linearly to 0.
-        gamma: discount a frame.
+        gamma: discount per frame.
         tau: share of the online weights in each move of the targets.
-        hidden_size: width of the one hidden layer after the embeddings.
-        batch_size: transitions an update.
+        hidden_size: width of the single hidden layer after the embeddings.
+        batch_size: transitions per update.
         replay_capacity: transitions kept.
-        frames_per_update: environment frames for each gradient step.
-        learning_starts: frames before the first update; None: one batch.
+        frames_per_update: environment frames per gradient step.
+        learning_starts: frames before the first update; None for one batch.
         n_steps: frames that a transition spans: r becomes the discounted sum of its rewards, and γ
             becomes γ to that power.
         layer_norm: normalise each map's embedding, see `Encoder`.
-        rate_factors: as `Algorithm` takes them.
-        policy_options: of `make_policy`, beside those above.
-        loss_options: of `LOSS`, beside `gamma`.
+        rate_factors: see `Algorithm`.
+        policy_options: further arguments of `make_policy`.
+        loss_options: arguments of `LOSS` besides `gamma`.
     """
 
     memory: ReplayMemory
@@ -100,7 +101,7 @@ class OffPolicy(Algorithm):
         )
 
     def updates_due(self, frames: int) -> int:
-        """Returns how many updates the frames so far allow, beyond those taken."""
+        """Returns how many updates `frames` frames allow, less those already taken."""
         return max(0, frames - self.learning_starts) // self.frames_per_update - self.updates
 
     def sample(self) -> TensorDictBase:

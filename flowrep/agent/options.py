@@ -1,4 +1,4 @@
-"""What a config may set of an algorithm: read off the signatures of all that make it."""
+"""The options of an algorithm that a config may set, read from its classes' signatures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ GIVEN_BY_THE_CLASS = ("self", "rate_factors", "policy_options", "network", "acto
 
 
 def options_of(makers: Iterable[Any]) -> dict[str, inspect.Parameter]:
-    """Returns the parameters of classes by name, of each as long as those before it take any.
+    """Returns the classes' parameters by name, up to the first class without `**kwargs`.
 
     >>> from flowrep.agent import DoubleDQN
     >>> DoubleDQN.options()["final_epsilon"].default, DoubleDQN.options()["tau"].default

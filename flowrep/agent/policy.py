@@ -1,4 +1,4 @@
-"""The acting side: raw maps in, one action out."""
+"""Policies, which map raw observation maps to one action."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from flowrep.agent.precision import compute_dtype
 
 
 class MapNetwork(nn.Module):
-    """Returns `[N, outputs]` float32 of decoded maps: an encoder a map, then a head.
+    """Maps decoded maps to `[N, outputs]` float32: one encoder per map, then a head.
 
     Args:
         codecs: the maps.
-        hidden_size: width of the one hidden layer after the embeddings.
-        outputs: numbers an observation.
+        hidden_size: width of the single hidden layer after the embeddings.
+        outputs: numbers per observation.
         layer_norm: normalise each map's embedding, see `Encoder`.
     """
 
@@ -46,40 +46,40 @@ class MapNetwork(nn.Module):
         self.head = Head(self.encoder.embedding_size, hidden_size, outputs)
 
     def forward(self, images: Sequence[Tensor]) -> Tensor:
-        """Returns one number an output."""
+        """Returns `[N, outputs]`."""
         return self.head(self.encoder(images))
 
     def another_encoder(self) -> Encoder:
-        """Returns an encoder of the same maps with weights of its own."""
+        """Returns an encoder for the same maps with its own weights."""
         return Encoder(self.codecs, layer_norm=self.encoder.layer_norm)
 
     def another(self, outputs: int) -> MapNetwork:
-        """Returns a network of the same maps and sizes with weights of its own."""
+        """Returns a network for the same maps and sizes with its own weights."""
         layer_norm = self.encoder.layer_norm
         return MapNetwork(self.codecs, self.hidden_size, outputs, layer_norm=layer_norm)
 
 
 class PackedNetwork(nn.Module):
-    """Returns what `network` does of packed maps `[N, h, w, C * 16]`, one argument a map."""
+    """Applies `network` to packed maps `[N, h, w, C * 16]`, one argument per map."""
 
     def __init__(self, codecs: Sequence[MapCodec], network: MapNetwork) -> None:
         super().__init__()
         self.codecs, self.network = tuple(codecs), network
 
     def forward(self, *packed: Tensor) -> Tensor:
-        """Decodes the maps and passes them on."""
+        """Returns the network's output for the decoded maps."""
         return self.network([codec.decode(x) for codec, x in zip(self.codecs, packed)])
 
 
 class PolicyNetwork(nn.Module):
-    """Returns `[*B, n]`, one number an action, of raw maps `[*B, C, H, W]`, one argument a map."""
+    """Maps raw maps `[*B, C, H, W]`, one argument each, to one number per action `[*B, n]`."""
 
     def __init__(self, codecs: Sequence[MapCodec], network: MapNetwork) -> None:
         super().__init__()
         self.codecs, self.network = tuple(codecs), network
 
     def forward(self, *maps: Tensor) -> Tensor:
-        """Returns the network's output; the maps pass the form they are kept in, as in learning."""
+        """Returns the network's output; the maps are stored and decoded first, as in training."""
         images = []
         for codec, x in zip(self.codecs, maps):
             batch = codec.batch_shape(x)
@@ -98,7 +98,7 @@ def acting_network(
     hidden_size: int,
     layer_norm: bool = False,
 ) -> PolicyNetwork:
-    """Returns the untrained network of a policy: an encoder a map, then a head."""
+    """Returns the untrained network of a policy: one encoder per map, then a head."""
     codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
     actions = DiscreteActions.from_spec(action_spec)
     with device:
@@ -115,10 +115,10 @@ def stochastic_policy(
 ) -> ProbabilisticTensorDictSequential:
     """Returns a module that writes `action`, drawn from the softmax of the network's logits.
 
-    With `writes_log_prob` it writes the action's `action_log_prob` too.
+    With `writes_log_prob` it also writes `action_log_prob`.
 
-    It draws at random unless TorchRL's `set_exploration_type(ExplorationType.DETERMINISTIC)` is in
-    force, under which it takes the likeliest action.
+    Under TorchRL's `set_exploration_type(ExplorationType.DETERMINISTIC)` it takes the likeliest
+    action instead.
     """
     draw = ProbabilisticTensorDictModule(
         in_keys=["logits"],

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation from maps, by TorchRL's clipped loss and its GAE."""
+"""Proximal policy optimisation from maps, with TorchRL's clipped loss and GAE."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from flowrep.agent.rollout import Rollout
 
 
 class ClipPPOMapLoss(ClipPPOLoss):
-    """TorchRL's clipped loss of packed maps, with one encoder for policy and V; see `PPO`.
+    """TorchRL's clipped loss on packed maps, with one encoder for policy and V; see `PPO`.
 
-    TorchRL asks the device whether the entropy is finite; here, a policy whose entropy is not stops
-    the run by name, see `Algorithm.update`.
+    TorchRL makes the host wait to check that the entropy is finite. Here the divergence check
+    covers it, see `Algorithm.update`.
 
     Args:
-        network: of the policy; V reads its encoder.
-        actions: what the policy chooses from.
-        clip: how far ρ pays to move from 1.
-        value_weight: of L_V.
-        entropy_weight: of L_H.
+        network: the policy's; V shares its encoder.
+        actions: the policy's action space.
+        clip: distance of ρ from 1 beyond which the objective no longer rewards moving it.
+        value_weight: weight of L_V.
+        entropy_weight: weight of L_H.
     """
 
     encoder: Encoder
@@ -70,12 +70,12 @@ class ClipPPOMapLoss(ClipPPOLoss):
         return self.encoder(decode_maps(self.codecs, maps))
 
     def state_value(self, maps: TensorDictBase) -> Tensor:
-        """Returns V `[n, 1]` of packed maps."""
+        """Returns V `[n, 1]` for packed maps."""
         embedded = TensorDict({"embedding": self.embed(maps)}, maps.batch_size)
         return self.critic_network(embedded)["state_value"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the losses of a batch, with gradients, and what they are made of, without."""
+        """Returns the losses of a batch, with gradients, and further metrics, without."""
         noted = ("action", "action_log_prob", "advantage", "value_target")
         embedded = tensordict.select(*noted).set("embedding", self.embed(tensordict))
         out = super().forward(embedded)
@@ -86,34 +86,35 @@ class ClipPPOMapLoss(ClipPPOLoss):
 
 
 class PPO(Algorithm):
-    """Policy and state-value function on one set of encoders, learning from what just happened.
+    """Policy and state-value function on one set of encoders, learning on-policy.
 
     After every `rollout_length` steps of each environment, `epochs` passes are made over those
-    steps in shuffled batches, with advantages Â (generalised, then normalised over the batch) and
-    value targets R of the weights at the round's beginning. One gradient step minimises, over a
-    batch and with ρ = π(a|s) / π_acted(a|s), where π_acted(a|s) was noted when a was drawn,
+    steps in shuffled batches. Advantages Â (generalised, then normalised over the batch) and value
+    targets R come from the weights at the beginning of the round. One gradient step minimises, over
+    a batch and with ρ = π(a|s) / π_acted(a|s), where π_acted(a|s) was recorded when a was drawn,
 
         L_π = -mean min(ρ Â, clip(ρ, 1 - clip, 1 + clip) Â)
         L_V = value_weight · mean (V(s) - R)²
         L_H = entropy_weight · mean Σ_a π(a|s) log π(a|s)
 
     Args:
-        observation_spec: the environment's; its last three dims of each map are C, H, W, the
+        observation_spec: the environment's; the last three dims of each map are C, H, W, the
             dims before them are the environments.
         action_spec: `Categorical` or `OneHot`.
         keys: the observation maps to read, in order.
-        total_frames: environment frames of the whole training; sets the learning rate's end.
+        total_frames: environment frames over the whole training, after which the learning rate
+            is 0.
         device: where networks, rollout and updates live.
         precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
         learning_rate: Adam's, falling linearly to 0.
         rollout_length: steps of each environment between two rounds of learning.
         epochs: passes over them.
-        batch_size: steps an update; what does not fill a batch is left out of that pass.
-        gamma: discount a frame.
-        gae_lambda: GAE's λ: 0 trusts V, 1 the rewards.
-        max_grad_norm: gradients of a larger norm are scaled down to it.
-        hidden_size: width of the one hidden layer after the embeddings.
-        loss_options: of `ClipPPOMapLoss`.
+        batch_size: steps per update; an incomplete last batch is left out of its pass.
+        gamma: discount per frame.
+        gae_lambda: GAE's λ, from 0 (relies on V) to 1 (relies on the rewards).
+        max_grad_norm: the norm over all gradients is scaled down to this maximum.
+        hidden_size: width of the single hidden layer after the embeddings.
+        loss_options: further arguments of `ClipPPOMapLoss`.
     """
 
     WRITES_LOG_PROB = True
@@ -170,8 +171,8 @@ class PPO(Algorithm):
         network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
         self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, device=device)
         self.memory = Rollout(self.codecs, device, extra_keys=["action_log_prob"])
-        self._round: TensorDictBase = TensorDict()  # the steps that are being learnt from, [n]
-        self._batches: list[Tensor] = []  # rows of it, those to come
+        self._round: TensorDictBase = TensorDict()  # the steps in training, [n]
+        self._batches: list[Tensor] = []  # rows of the batches to come
         super().__init__(
             self.LOSS(network, actions, **loss_options),
             learning_rate=learning_rate,
@@ -183,13 +184,13 @@ class PPO(Algorithm):
         return self.epochs * (steps // self.batch_size)
 
     def updates_due(self, frames: int) -> int:
-        """Returns the updates of one round where a rollout is complete, else 0."""
+        """Returns the number of updates of one round if a rollout is complete, else 0."""
         if len(self.memory) < self.rollout_length:
             return 0
         return self._updates_of(self.memory.steps().numel())
 
     def sample(self) -> TensorDictBase:
-        """Returns the round's next batch; the first one begins the round and clears the memory."""
+        """Returns the round's next batch; the first call begins the round and clears the memory."""
         if not self._batches:
             self._round = self._with_advantages(self.memory.steps()).reshape(-1)
             self.memory.clear()
@@ -206,7 +207,7 @@ class PPO(Algorithm):
         return self._advantage(steps)
 
     def _judge(self, steps: TensorDictBase) -> TensorDictBase:
-        """Returns what the present weights expect of steps: V and V'."""
+        """Returns V and V' of the steps under the current weights."""
         value = self.loss.state_value
         judged = steps.empty().update({"state_value": value(steps)})
         judged["next"] = steps["next"].empty().update({"state_value": value(steps["next"])})

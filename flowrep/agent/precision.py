@@ -1,4 +1,4 @@
-"""Which number format the networks compute in. Weights, losses and optimizer stay in float32."""
+"""The dtype that the networks compute in. Weights, losses and optimizer stay in float32."""
 
 from __future__ import annotations
 

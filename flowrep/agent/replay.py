@@ -1,7 +1,7 @@
-"""Replay of packed maps: a TorchRL replay buffer of a storage, a sampler and a transform.
+"""Replay of packed maps: a storage, a sampler and a transform for a TorchRL replay buffer.
 
-Each observation is stored once. A row holds the maps seen, the action and what it brought; the
-maps that it led to are those of the row that followed.
+Each observation is stored once. A row holds the maps observed, the action and its outcome; the
+next observation is in the row of the following step.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OUTCOME = ("reward", "done", "terminated")
 
 
 class ReplayMemory(TensorDictReplayBuffer):
-    """TorchRL's replay buffer of `RowStorage`, `SuccessorSampler` and `PackSteps`.
+    """TorchRL's replay buffer with `RowStorage`, `SuccessorSampler` and `PackSteps`.
 
     `sample` returns `batch_size` transitions, uniform with replacement: the maps, packed, `action`,
     `steps_to_next_obs` `[batch_size, 1]` and, under `next`, the maps, `reward` (the discounted sum
@@ -31,11 +31,11 @@ class ReplayMemory(TensorDictReplayBuffer):
 
     Args:
         codecs: the maps to keep; see `flowrep.agent.observation`.
-        capacity: rows; the oldest is overwritten.
-        batch_size: transitions a sample.
-        device: where rows are kept and samples appear.
-        n_steps: steps that a transition spans at most.
-        gamma: discount a step of the rewards within it.
+        capacity: rows to keep; beyond that, the oldest is overwritten.
+        batch_size: transitions per sample.
+        device: of rows and samples.
+        n_steps: largest number of steps that a transition spans.
+        gamma: discount per step of the rewards within a transition.
 
     Raises:
         ValueError: if n_steps is below 1.
@@ -65,15 +65,15 @@ class ReplayMemory(TensorDictReplayBuffer):
 class PackSteps(Transform):
     """Turns steps into packed rows on `extend`.
 
-    Samples keep their maps packed: the networks read them so, and decoding is part of the update.
+    Samples keep their maps packed, because networks read packed maps and decode them themselves.
 
     | steps, on `extend` | rows |
     | --- | --- |
     | `[N]`, `[N, T]`, or with a dim named `time` | `[T * N]`, time first |
     | the maps | packed |
-    | `action`, `is_init` | as they are |
+    | `action`, `is_init` | unchanged |
     | `("next", name)` of `reward`, `done`, `terminated` | `name` |
-    | | `env`: which of the N it is |
+    | | `env`: index of the environment, from 0 to N - 1 |
 
     Args:
         codecs: the maps to keep.
@@ -99,18 +99,19 @@ class PackSteps(Transform):
         return rows
 
     def forward(self, transitions: TensorDictBase) -> TensorDictBase:
-        """Returns a sample as it is."""
+        """Returns a sample unchanged."""
         return transitions
 
 
 class RowStorage(LazyTensorStorage):
-    """TorchRL's storage, which gathers transitions by `index_select` and saves the rows written.
+    """A TorchRL storage that gathers transitions with `index_select` and saves only written rows.
 
-    Indexing a TensorDict by a tensor, as its base class does, takes 2.4 times as long.
+    Indexing a TensorDict with a tensor, as the base class does, takes 2.4 times as long.
 
     Args:
-        max_size: rows; the oldest is overwritten.
-        observation_keys: what a transition has of both of its rows; it has `action` of the first.
+        max_size: rows to keep; beyond that, the oldest is overwritten.
+        observation_keys: the maps that a transition takes from both of its rows; `action` comes
+            from the first.
         device: where the rows are kept.
     """
 
@@ -142,7 +143,7 @@ class RowStorage(LazyTensorStorage):
         return transitions.set("action", self._storage.get("action").index_select(0, first))
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the rows written, uncopied, and the capacity."""
+        """Returns the written rows, without a copy, and the capacity."""
         rows = self._storage[: len(self)].to_dict() if self.initialized else None
         return {"capacity": self.max_size, "rows": rows, "size": len(self)}
 
@@ -150,7 +151,7 @@ class RowStorage(LazyTensorStorage):
         """Continues from a `state_dict`.
 
         Raises:
-            ValueError: if it was taken from a storage of another capacity.
+            ValueError: if it comes from a storage of another capacity.
         """
         if state["capacity"] != self.max_size:
             raise ValueError(
@@ -164,20 +165,20 @@ class RowStorage(LazyTensorStorage):
 
 
 class SuccessorSampler(Sampler):
-    """Draws pairs of rows, uniform with replacement: a step, and the one after its transition.
+    """Draws pairs of rows, uniform with replacement: a step and the one after its transition.
 
-    A step can be drawn as soon as the one that follows it in its environment is stored. Where an
-    episode terminated there is none: its value is masked by `terminated`, and the row itself stands
-    in. Where it was cut off (`done` without `terminated`), or the next row `is_init`, the
-    observation that followed was never stored, and the step is left out.
+    A step can be drawn once the next step of its environment is stored. A terminal step has no
+    next step; its own row takes that place, and `terminated` masks the value. If the episode was
+    truncated (`done` without `terminated`) or the next row `is_init`, the next observation was
+    never stored, and the step is not drawn.
 
-    It reads `env`, `is_init`, `reward`, `done` and `terminated` of the rows, of which one `extend`
-    brings whole steps of all environments, as `PackSteps` does.
+    The sampler reads `env`, `is_init`, `reward`, `done` and `terminated` of the rows. Each `extend`
+    must add whole steps of all environments, as with `PackSteps`.
 
     Args:
-        n_steps: steps that a transition spans at most; it ends earlier where its episode does, or
-            where the step that follows is not stored.
-        gamma: discount a step of the rewards within it.
+        n_steps: largest number of steps that a transition spans. It ends earlier with its episode,
+            or where the next step is not stored.
+        gamma: discount per step of the rewards within a transition.
 
     Raises:
         ValueError: if n_steps is below 1.
@@ -190,15 +191,15 @@ class SuccessorSampler(Sampler):
         self._empty()
 
     def _empty(self) -> None:
-        self._next_row = torch.empty(0, dtype=torch.long)  # -1: what followed is not stored
-        self._latest = torch.empty(0, dtype=torch.long)  # each environment's, -1: it was the last
+        self._next_row = torch.empty(0, dtype=torch.long)  # -1: the next step is not stored
+        self._latest = torch.empty(0, dtype=torch.long)  # each environment's, -1: its episode ended
         self._usable = torch.empty(0, dtype=torch.long)
 
     def mark_update(self, index: Tensor, *, storage: Storage) -> None:
-        """Links the rows just written to those that they follow.
+        """Links each row just written to the previous row of its environment.
 
         Raises:
-            ValueError: if they, with the step before them, do not fit into the storage.
+            ValueError: if these rows and the previous step do not fit into the storage.
         """
         rows = storage[:]
         marks = [rows[name].flatten() for name in ("env", "done", "terminated", "is_init")]
@@ -228,7 +229,7 @@ class SuccessorSampler(Sampler):
             )
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[NestedKey, Tensor]]:
-        """Returns the rows `[batch_size, 2]`, and what lies between them.
+        """Returns the rows `[batch_size, 2]`, with reward, end flags and step count between them.
 
         Raises:
             RuntimeError: if no transition is complete yet.
@@ -245,11 +246,11 @@ class SuccessorSampler(Sampler):
         return torch.stack([first, self._next_row[last]]).mT, info
 
     def _look_ahead(self, rewards: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns where transitions that begin in rows `first` [N] end.
+        """Follows the transitions that begin in rows `first` [N] to their ends.
 
         Returns:
-            The rows of their last steps [N], the discounted sums of `rewards` [N, 1], and how many
-            steps they span [N, 1].
+            The rows of their last steps [N], the discounted sums of `rewards` [N, 1] and the
+            numbers of steps [N, 1].
         """
         last, steps = first, torch.ones(len(first), 1)
         reward = rewards.index_select(0, first.to(rewards.device))

@@ -1,4 +1,4 @@
-"""The latest steps, in order: what an on-policy algorithm learns from once and forgets."""
+"""The latest steps in order, from which an on-policy algorithm learns once."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from flowrep.agent.replay import time_first
 
 
 class Rollout:
-    """Keeps steps of N environments until `clear`; maps packed, with those that each step led to.
+    """Keeps steps of N environments until `clear`, with their packed maps and next maps.
 
     Args:
         codecs: the maps to keep; see `flowrep.agent.observation`.
         device: where they are kept.
-        extra_keys: kept beside the maps, `action` and what the action brought.
+        extra_keys: entries kept besides the maps, `action` and its outcome.
     """
 
     def __init__(
@@ -39,9 +39,9 @@ class Rollout:
         """Stores steps of N environments: `[N]`, `[N, T]`, or as a TorchRL collector returns them.
 
         Args:
-            frames: with the maps, `action`, `extra_keys` and, under `next`, the maps,
-                `reward`, `done` and `terminated`. A dim named `time` is taken as such; without
-                one, a single dim is N.
+            frames: with the maps, `action`, `extra_keys` and, under `next`, the maps, `reward`,
+                `done` and `terminated`. A dim named `time` is the time dim; without one, a single
+                dim is N.
         """
         for step in time_first(frames).unbind(0):
             kept = store_maps(self.codecs, step).update(step.select(*self._keys).detach())
@@ -68,7 +68,7 @@ class Rollout:
         """Continues from a `state_dict`.
 
         Raises:
-            ValueError: what this rollout keeps was not kept there.
+            ValueError: if an entry that this rollout keeps is missing.
         """
         self.clear()
         if state["length"]:

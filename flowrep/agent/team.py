@@ -1,11 +1,10 @@
-"""Shares an update out among cores in pieces so large that its threads hardly wait for each other.
+"""Splits an update among cores into tasks large enough that threads hardly wait for each other.
 
-PyTorch's own way is to split every operation, some hundreds an update, and to have each thread wait
-for all others at the end of each. Such threads spin: where a core is busy with something else, they
-burn the time that the thread they are waiting for needs, and an update takes many times as long.
-Here each thread computes whole chains of operations on a part of the batch, and sleeps when there
-is nothing left to take. How the work is cut does not depend on the number of threads, so neither
-do the numbers.
+PyTorch splits each of an update's several hundred operations, and all threads wait for each other
+after each one. They wait in a busy loop: if a core is also used by something else, they take the
+time that the thread they wait for needs, and an update takes many times as long. Here each thread
+computes whole chains of operations on a part of the batch, and sleeps once no task is left. The
+division into tasks does not depend on the number of threads, so neither do the results.
 """
 
 from __future__ import annotations
@@ -23,27 +22,27 @@ Task = Callable[[], object]
 
 
 class Team:
-    """The calling thread and `size - 1` helpers; all compute without gradients.
+    """The calling thread and `size - 1` helper threads, which compute without gradients.
 
-    A team of several takes one thread for each of PyTorch's own operations.
+    In a team of several, each PyTorch operation runs on a single thread.
 
     Args:
-        size: threads that work at the same time, the caller's among them.
+        size: number of threads, including the caller's.
     """
 
     def __init__(self, size: int) -> None:
         if size < 1:
-            raise ValueError(f"a team has one thread at least, got size={size}")
+            raise ValueError(f"a team needs at least one thread, got size={size}")
         self.size = size
         self._calls: list[SimpleQueue[Work | None]] = [SimpleQueue() for _ in range(size - 1)]
         for calls in self._calls:
             Thread(target=_help, args=(calls,), name="flowrep team", daemon=True).start()
 
     def run(self, tasks: Iterable[Task]) -> None:
-        """Carries all tasks out, in any order, and returns when the last one has ended.
+        """Runs all tasks, in any order, and returns when the last one has ended.
 
         Raises:
-            Exception: the first one that a task raised; the others are carried out all the same.
+            Exception: the first one that a task raised; the other tasks still run.
         """
         work = Work(tasks)
         for calls in self._calls[: len(work.tasks) - 1]:
@@ -53,7 +52,7 @@ class Team:
         work.wait()
 
     def dismiss(self) -> None:
-        """Lets the helpers end; the caller works alone from then on."""
+        """Ends the helper threads; from then on the caller works alone."""
         for calls in self._calls:
             calls.put(None)
         self._calls, self.size = [], 1
@@ -68,7 +67,7 @@ class Work:
         self._ended: SimpleQueue[Exception | None] = SimpleQueue()
 
     def take(self) -> None:
-        """Carries out one task after the other until none is left to begin."""
+        """Runs one task after another until none is left to begin."""
         while True:
             try:
                 task = self.tasks.popleft()
@@ -76,7 +75,7 @@ class Work:
                 return
             try:
                 task()
-            except Exception as error:  # it belongs to the thread that waits
+            except Exception as error:  # the waiting thread raises it
                 self._ended.put(error)
             else:
                 self._ended.put(None)
@@ -103,7 +102,7 @@ def _one_thread_an_operation() -> Iterator[None]:
 
 
 def _help(calls: SimpleQueue[Work | None]) -> None:
-    torch.set_num_threads(1)  # both are a thread's own settings
+    torch.set_num_threads(1)  # both settings are per thread
     torch.set_grad_enabled(False)
     while (work := calls.get()) is not None:
         work.take()
@@ -114,10 +113,10 @@ _team = Team(1)
 
 
 def use_threads(count: int) -> None:
-    """Has `count` threads compute this process's updates on the CPU, from now on.
+    """Sets the number of threads that compute this process's updates on the CPU.
 
-    PyTorch goes on splitting operations outside of them. Where those are small, that is slower than
-    `torch.set_num_threads(1)`, and much slower on a machine that is busy with more.
+    PyTorch still splits operations outside of updates. If those are small, that is slower than
+    `torch.set_num_threads(1)`, and much slower on a busy machine.
     """
     global _team
     _team.dismiss()
@@ -130,7 +129,7 @@ def threads_in_use() -> int:
 
 
 def run_tasks(tasks: Iterable[Task]) -> None:
-    """Carries tasks out by the threads that `use_threads` has set; one after the other by default.
+    """Runs tasks on the threads set by `use_threads`, by default one after another.
 
     Raises:
         Exception: the first one that a task raised.
@@ -139,7 +138,7 @@ def run_tasks(tasks: Iterable[Task]) -> None:
 
 
 def parts(length: int, largest: int) -> list[slice]:
-    """Returns slices of about the same size, none above `largest`, that together are `length`."""
+    """Returns slices of about equal size, at most `largest`, that together cover `length`."""
     count = max(1, -(-length // largest))
     bounds = [length * i // count for i in range(count + 1)]
     return [slice(start, end) for start, end in pairwise(bounds)]

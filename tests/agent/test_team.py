@@ -120,7 +120,7 @@ def test_the_number_of_threads_changes_no_bit(
 
 
 def test_a_team_has_one_thread_at_least():
-    with pytest.raises(ValueError, match="one thread at least, got size=0"):
+    with pytest.raises(ValueError, match="at least one thread, got size=0"):
         Team(0)
 
 
