@@ -1,11 +1,11 @@
-"""Where the Hydra tree lies: `conf/` beside the package in a checkout, inside it in a wheel."""
+"""Location of the Hydra tree: `conf/` beside the package in a checkout, inside it in a wheel."""
 
 from pathlib import Path
 
 _IN_WHEEL = Path(__file__).resolve().parent / "conf"
 _IN_CHECKOUT = Path(__file__).resolve().parent.parent / "conf"
 
-# In a checkout the package's is a link to the root's, for `pkg://flowrep.conf`.
+# In a checkout the package's `conf` is a link to the one beside it, for `pkg://flowrep.conf`.
 CONF_DIR: Path = (_IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT).resolve()
 
 
@@ -15,6 +15,6 @@ def group_choices(group: str) -> list[str]:
 
 
 def config_groups() -> list[str]:
-    """Returns the names of flowrep's config groups, sorted: the folders of conf/, save Hydra's."""
+    """Returns the names of flowrep's config groups, sorted: the folders of conf/ except Hydra's."""
     folders = (path for path in CONF_DIR.iterdir() if path.is_dir())
     return sorted(path.name for path in folders if path.name not in ("hydra", "__pycache__"))

@@ -1,4 +1,4 @@
-"""How a command of flowrep's begins and ends; the console scripts `flowrep-train` and so on."""
+"""Starts and ends flowrep's commands; has the console scripts `flowrep-train` and so on."""
 
 import os
 import signal
@@ -52,11 +52,12 @@ def _run(command: str) -> None:
 
 
 def prepare() -> None:
-    """Readies the process for the imports of a command, which take seconds.
+    """Prepares the process for the imports of a command, which take seconds.
 
-    Ctrl-C ends it at once: libraries take an exception in the middle of their imports for another
-    one. Standard streams that the caller closed lead nowhere, rather than to the first file that
-    is opened; what they can't encode is replaced. Lines are written as they come, also to a pipe.
+    Ctrl-C ends it at once, since libraries mistake an exception during their imports for another
+    one. Standard streams that the caller closed go to the null device; otherwise the next opened
+    file would take their place. Characters that they can't encode are replaced. Output is flushed
+    after each line, also to a pipe.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -69,9 +70,9 @@ def prepare() -> None:
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Has Ctrl-C and SIGTERM end the process by `SystemExit`, which closes what it has opened.
+    """Makes Ctrl-C and SIGTERM raise `SystemExit`, so that open resources are closed.
 
-    One that comes meanwhile ends it at once. A signal that the caller ignores stays ignored.
+    A second signal ends the process at once. A signal that the caller ignores stays ignored.
     """
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     for number, handler in before.items():
@@ -91,8 +92,8 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
 
 
 def exit_unread() -> NoReturn:
-    """Ends the process without a word where nobody reads what it prints, as after `| head -1`."""
+    """Ends the process silently when its output is no longer read, as after `| head -1`."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (sys.stdout, sys.stderr):  # what they still hold would be told of at the end
+    for stream in (sys.stdout, sys.stderr):  # flushing them at exit would print an error
         os.dup2(nowhere, stream.fileno())
     sys.exit(128 + signal.SIGPIPE)

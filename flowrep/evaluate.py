@@ -61,18 +61,18 @@ MISTAKES = (
     ImportError,
     OSError,
 )
-OF_THE_MACHINE = ("device", "num_envs", "num_workers", "trust")  # not as the run was trained
+OF_THE_MACHINE = ("device", "num_envs", "num_workers", "trust")  # of the evaluation, not of the run
 
 
 @dataclass(frozen=True)
 class Subject:
-    """An agent that is evaluated: a run's, or a policy of the user's own.
+    """An agent to evaluate: a run's agent, or the user's own policy.
 
     Args:
-        run: the run's folder; the folder for the table of a policy of the user's own.
-        config: the run's own, but for the scene and the machine that were asked for.
-        agent: its policy with what that looks at.
-        frames: that it was trained for.
+        run: the run's folder, or the folder for the table of the user's own policy.
+        config: the run's config with the requested scene and machine settings.
+        agent: its policy and observations.
+        frames: the frames that it was trained for.
     """
 
     run: RunFolder
@@ -83,7 +83,7 @@ class Subject:
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="evaluate")
 def run(config: DictConfig) -> None:
-    """Runs episodes of saved agents and of baselines, prints tables and keeps the rows."""
+    """Runs episodes of saved agents and of baselines, prints tables and saves the rows."""
     try:
         asked = plain_config(config)
         validated(EvaluateConfig, asked, own_keys())
@@ -101,9 +101,9 @@ def run(config: DictConfig) -> None:
 
 
 def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
-    """Does what `run` says, for agents in folders that are held.
+    """Evaluates the agents of runs whose folders are locked.
 
-    Runs of one scene, camera and renderer share the streets; their episodes are the same.
+    Runs with the same scene, camera and renderer share environments and episodes.
     """
     subjects = [load_subject(asked, run) for run in runs]
     by_street: dict[str, list[Subject]] = {}
@@ -123,10 +123,10 @@ def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
 
 
 def evaluate_own(asked: Config, names: Sequence[str]) -> None:
-    """Does what `run` says for policies of the user's own, one after the other.
+    """Evaluates the user's own policies, one after the other.
 
     Raises:
-        PolicyError: one of them can't be had, fails, or gives no actions.
+        PolicyError: a policy can't be loaded, fails, or returns no actions.
     """
     with StopRequest() as stop:
         for name in names:
@@ -144,7 +144,7 @@ def evaluate_own(asked: Config, names: Sequence[str]) -> None:
 
 
 def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
-    """Returns a policy of the user's own with what it looks at.
+    """Returns the user's own policy with its observations.
 
     Raises:
         PolicyError, TableError: as `load_policy` and `RunFolder.read_episodes`.
@@ -153,7 +153,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
     config = {key: asked[key] for key in (*OF_THE_MACHINE, "scene", "representations")}
     config |= {"flow": asked.get("flow") or {"source": "exact"}, "noise": asked.get("noise")}
     config |= {"renderer": "auto"}
-    config |= {"speed": "normal", "seed": ""}  # of its training, of which nothing is known
+    config |= {"speed": "normal", "seed": ""}  # of its training, which is unknown
     env = env_from_config(config, num_envs=1, num_workers=0)
     device = choose_device(config["device"])
     task = Task(
@@ -172,7 +172,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
 
 
 def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> None:
-    """Runs the episodes of agents of one scene; keeps those that were run, however it ends."""
+    """Runs the episodes of agents of one scene; keeps finished ones even if interrupted."""
     speeds, policies, baselines = (as_list(asked[key]) for key in ("speed", "policy", "baselines"))
     rates = [float(rate) for rate in as_list(asked["fps"])]
     comparison = Comparison(
@@ -197,7 +197,7 @@ def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> No
 
 
 def keep(subject: Subject, rows: list[Row]) -> None:
-    """Prints what the episodes of one run say and adds them to its table."""
+    """Prints the results of one run's episodes and adds them to its table."""
     run = subject.run
     rows = with_origin(rows, subject.config, subject.frames, "evaluate")
     run.log_episodes(rows)
@@ -209,16 +209,16 @@ def keep(subject: Subject, rows: list[Row]) -> None:
 
 
 def as_list(value: Any) -> list[Any]:
-    """Returns a list as it is, and a single value as a list of one."""
+    """Returns a list unchanged, and a single value as a list of one."""
     return value if isinstance(value, list) else [value]
 
 
 def load_subject(asked: Config, run: RunFolder) -> Subject:
-    """Returns a run's agent, in the scene that was asked for, else in its own.
+    """Returns a run's agent in the requested scene, by default its own.
 
     Raises:
-        UsageError, TableError: its config or its table is damaged; that is better known before
-            episodes are run than after.
+        UsageError, TableError: its config or its table is damaged; both are checked before any
+            episode is run.
         CheckpointError: there is no checkpoint, it is damaged, or belongs to another run.
     """
     own = validated_run(run.read_config(), f"{run.path}/config.yaml")
@@ -228,7 +228,7 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
     check_origin(state["origin"], origin_of(own), path)
     here = {key: asked[key] for key in OF_THE_MACHINE}
     scene = asked.get("scene")
-    if scene is not None:  # the camera is the agent's, and goes where it goes
+    if scene is not None:  # the agent keeps its camera in other scenes
         here["scene"] = scene | {"camera": own["scene"]["camera"]}
     config = own | here
     env = env_from_config(config, num_envs=1, num_workers=0)
@@ -263,7 +263,7 @@ def film(asked: Config, subject: Subject) -> None:
 
 
 def main() -> None:
-    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    """Entry point; a mistake on the command line ends in one line that lists the choices."""
     run_command("evaluate", run, EvaluateConfig)
 
 

@@ -1,4 +1,4 @@
-"""Gives a trained agent away: `python -m flowrep.export run=outputs/...`."""
+"""Exports a trained agent: `python -m flowrep.export run=outputs/...`."""
 
 from pathlib import Path
 from typing import Any
@@ -28,12 +28,12 @@ from flowrep.experiment.run_folder import RunFolder
 from flowrep.from_config import Config, env_from_config, policy_from_config
 from flowrep.scenes import load_scene
 
-ACTIONS = ("no_op", "turn_left", "turn_right")  # by their numbers in flowrep.scenes.vehicle
+ACTIONS = ("no_op", "turn_left", "turn_right")  # by their indices in flowrep.scenes.vehicle
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="export")
 def run(config: DictConfig) -> None:
-    """Writes the agent of a run as files that need nothing of flowrep's."""
+    """Writes the agent of a run as files that can be used without flowrep."""
     try:
         asked = plain_config(config)
         validated(ExportConfig, asked, own_keys())
@@ -68,7 +68,7 @@ def export(asked: Config, run: RunFolder) -> Path:
 
 
 def agent_card(config: Config, env: EnvBase, frames: int) -> dict[str, Any]:
-    """Returns what others need to know to show an agent what it was trained on."""
+    """Returns the description that others need to give the agent its observations."""
     spec, (street,) = env.observation_spec, street_envs(env)
     scene = load_scene(config["scene"])
     return {
@@ -95,7 +95,7 @@ def agent_card(config: Config, env: EnvBase, frames: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    """Entry point; a mistake on the command line ends in one line that lists the choices."""
     run_command("export", run, ExportConfig)
 
 

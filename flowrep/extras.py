@@ -1,4 +1,4 @@
-"""What to say where the packages of an extra are missing."""
+"""The error for missing packages of an extra."""
 
 import sys
 from importlib.util import find_spec
@@ -8,13 +8,13 @@ def require(what: str, extra: str, *packages: str, module: str = "") -> None:
     """Checks that packages are installed, before a module imports them.
 
     Args:
-        what: needs them, e.g. "training".
-        extra: of flowrep's, that has them.
-        packages: by the names that they are imported by.
-        module: `__name__` of the module; one that is run as a command ends in one line.
+        what: the feature that needs them, e.g. "training".
+        extra: the extra of flowrep that installs them.
+        packages: their import names.
+        module: `__name__` of the module; if it runs as a command, the process ends in one line.
 
     Raises:
-        ImportError: naming the first that is missing, and the extra.
+        ImportError: a package is missing; names the first one and the extra.
     """
     for package in packages:
         if find_spec(package) is None:

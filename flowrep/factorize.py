@@ -35,7 +35,7 @@ MISTAKES = (SequenceError, ValueError, ImportError, OSError)
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="factorize")
 def run(config: DictConfig) -> None:
     """Writes raw, ego and object flow of a recording."""
-    # OpenCV's own words about broken files would stand beside the one line that matters.
+    # OpenCV's messages about broken files would clutter the one-line error.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         settings = plain_config(config)
@@ -54,8 +54,8 @@ def factorize_recording(settings: dict[str, Any]) -> int:
     """Runs the job that a config asks for; returns the exit code.
 
     Raises:
-        UsageError: a value that can't be.
-        SequenceError: a file that can't be read.
+        UsageError: a value is invalid.
+        SequenceError: a file can't be read.
     """
     options = job_options(settings)
     stream = open_stream(settings)
@@ -113,7 +113,7 @@ def open_stream(settings: dict[str, Any]) -> Stream:
 
 
 def open_flow_source(settings: dict[str, Any], stream: Stream) -> FlowSource:
-    """Returns where raw flow comes from."""
+    """Returns the source of raw flow."""
     options = dict(settings["flow"])
     if options.pop("source") == "exact":
         if not stream.has_flow:
@@ -127,7 +127,7 @@ def open_flow_source(settings: dict[str, Any], stream: Stream) -> FlowSource:
 
 
 def main() -> None:
-    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    """Entry point; a mistake on the command line ends in one line that lists the choices."""
     run_command("factorize", run, FactorizeConfig)
 
 

@@ -1,4 +1,4 @@
-"""From a resolved config to the env and the agent that it describes."""
+"""Builds the env and the agent that a resolved config describes."""
 
 import inspect
 import multiprocessing
@@ -22,7 +22,7 @@ Config = Mapping[str, Any]
 
 
 def choose_device(name: str) -> torch.device:
-    """Returns the device of that name, for "auto" a CUDA device where there is one.
+    """Returns the named device; "auto" is a CUDA device if there is one, else the CPU.
 
     Raises:
         UsageError: if torch does not know the device, or this machine lacks it.
@@ -39,11 +39,11 @@ def choose_device(name: str) -> torch.device:
 def choose_workers(num_workers: Any, num_envs: int) -> int:
     """Returns the number of worker processes; for "auto" one per core, if there are several.
 
-    Inside a pool of processes, as `hydra/launcher=joblib` makes one, "auto" is 0: the other jobs
-    have the other cores.
+    Inside a process pool, such as that of `hydra/launcher=joblib`, "auto" is 0, since other jobs
+    use the other cores.
 
     Raises:
-        UsageError: if it is another value.
+        UsageError: if it is neither "auto" nor a whole number from 0 to `num_envs`.
     """
     if num_workers == "auto":
         if multiprocessing.current_process().name != "MainProcess":
@@ -61,7 +61,7 @@ def choose_workers(num_workers: Any, num_envs: int) -> int:
 def env_from_config(config: Config, **changes: Any) -> EnvBase:
     """Returns the env that the config describes; `changes` override arguments of `make_env`.
 
-    Observations have `is_init`, which the replay memory needs: whether an episode begins there.
+    Observations include `is_init`, which marks the beginning of an episode for the replay memory.
     """
     num_envs: int = changes.get("num_envs") or config["num_envs"]
     num_workers = changes.get("num_workers", config["num_workers"])
@@ -96,11 +96,11 @@ def pool_from_config(
 
 
 def agent_from_config(config: Config, env: EnvBase, trust: str | None = None) -> Algorithm:
-    """Returns the config's algorithm, untrained, on what the env emits.
+    """Returns the config's algorithm, untrained, for the env's specs.
 
     Args:
-        config: of a run.
-        env: that the run's config describes.
+        config: the config of a run.
+        env: the env that the config describes.
         trust: a class outside flowrep that may be imported, see `algorithm_class`.
     """
     arguments, options = _arguments(config, env)
@@ -116,15 +116,15 @@ def policy_from_config(config: Config, env: EnvBase, trust: str | None = None) -
 def algorithm_class(section: Mapping[str, Any], trust: str | None) -> Any:
     """Returns the class that a config's `_target_` names, one of flowrep's or the trusted one.
 
-    Importing a module runs its code. A config may come from somebody else, so only what the person
-    at the command line names is imported.
+    Importing a module runs its code, and a config may come from somebody else. A class outside
+    flowrep is therefore imported only if the command line names it.
 
     Args:
         section: a config's `algorithm`.
         trust: the full name of a class outside flowrep that may be imported.
 
     Raises:
-        UsageError: it is another class, or no algorithm, or its options are not those given.
+        UsageError: the class is not trusted, is no algorithm, or has other options.
     """
     target = section["_target_"]
     if target not in ALGORITHMS and target != trust:

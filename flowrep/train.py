@@ -60,10 +60,10 @@ from flowrep.sweeps.sweep import run_sweep
 from flowrep.viz.curves import draw_learning_curve
 from flowrep.viz.film import record_episode
 
-OF_THE_MACHINE = ("device", "num_workers", "trust")  # a resumed run's, from its new command line
-FINAL_POLICIES = ("greedy", "sampled")  # of the agent, beside the baselines
-EVALUATION_SEED = 1_000_000  # of the first episode that is evaluated while training
-FINAL_SEED = 1_500_000  # other episodes than those that were watched in training
+OF_THE_MACHINE = ("device", "num_workers", "trust")  # from the command line that resumes a run
+FINAL_POLICIES = ("greedy", "sampled")  # the agent's, evaluated beside the baselines
+EVALUATION_SEED = 1_000_000  # of the first episode evaluated during training
+FINAL_SEED = 1_500_000  # not the episodes evaluated during training
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="train")
@@ -71,8 +71,8 @@ def run(config: DictConfig) -> float:
     """Trains, evaluates and films one agent, or continues a run with `resume=`.
 
     Returns:
-        The final evaluation's share of greedy episodes that succeed, over all its speeds and frame
-        rates: what a sweeper such as Optuna maximises.
+        The share of greedy episodes in the final evaluation that succeed, over all its speeds and
+        frame rates. A sweeper such as Optuna maximises it.
     """
     try:
         plain = plain_config(config)
@@ -95,8 +95,8 @@ def run(config: DictConfig) -> float:
 
 
 def carry_out(config: Config, folder: RunFolder) -> float:
-    """Does what is left to do of a run: training, evaluation, video; returns its success."""
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces each storage it makes
+    """Does what remains of a run (training, evaluation, video) and returns its success."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
     try:
         training = make_training(config, folder)
         folder.log_to_wandb(config["wandb"], config)
@@ -121,7 +121,7 @@ def carry_out(config: Config, folder: RunFolder) -> float:
         except WorkerError as error:
             exit_with(f"after {training.frames} frames: {error}\nContinue with: {how_to_go_on}")
         except BrokenPipeError:
-            raise  # of what is printed: no disk is full
+            raise  # from printing: the disk is not full
         except OSError as error:
             exit_with(
                 f"after {training.frames} frames: {error}. Free some space or make the folder "
@@ -138,7 +138,7 @@ def carry_out(config: Config, folder: RunFolder) -> float:
 
 
 def final_success(folder: RunFolder, frames: int) -> float:
-    """Returns the share of greedy episodes, of those that ended a run of `frames`, that succeed."""
+    """Returns the share of final greedy episodes of a run of `frames` frames that succeed."""
     outcomes = [
         row["outcome"]
         for row in folder.read_episodes()
@@ -148,14 +148,14 @@ def final_success(folder: RunFolder, frames: int) -> float:
 
 
 def how_to_resume(config: Config, folder: RunFolder) -> str:
-    """Returns the line that continues a run."""
+    """Returns the command line that continues a run."""
     target = config["algorithm"]["_target_"]
     trust = {} if target in ALGORITHMS else {"trust": target}
     return line_for("train", resume=str(folder.path), **trust)
 
 
 def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
-    """Returns the config of the run to resume, on this machine."""
+    """Returns the config of the run to resume, with the settings of this machine."""
     others = [
         o
         for o in HydraConfig.get().overrides.task
@@ -171,14 +171,14 @@ def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
 
 
 def make_training(config: Config, folder: RunFolder) -> Training:
-    """Returns the run at its start, or at its checkpoint where it has one."""
+    """Returns the run at its checkpoint, or at its start if it has none."""
     keep_freed_memory()
     share_cores(config)
     torch.manual_seed(config["seed"])
     env = env_from_config(config, compiled=config["compiled"])
     env.set_seed(config["seed"] * config["num_envs"])
     is_new = config["resume"] is None
-    # of a new run the person who typed the command named the class
+    # the class of a new run was named on the command line
     trusted = config["algorithm"]["_target_"] if is_new else config["trust"]
     agent = agent_from_config(config, env, trust=trusted)
     training = Training(env, agent, folder, origin_of(config))
@@ -203,7 +203,7 @@ def share_cores(config: Config) -> None:
 
 
 def log_evaluation(training: Training, config: Config, stop: StopRequest, frames: int) -> bool:
-    """Adds greedy episodes at the training speed to evaluation.csv; returns if it was stopped."""
+    """Adds greedy episodes at the training speed to evaluation.csv; returns whether it stopped."""
     comparison = Comparison(
         speeds=[config["speed"]],
         fps=[config["scene"]["frame_rate_hz"]],
@@ -221,7 +221,7 @@ def log_evaluation(training: Training, config: Config, stop: StopRequest, frames
 def run_comparison(
     comparison: Comparison, training: Training, config: Config, stop: StopRequest
 ) -> None:
-    """Runs the episodes of the agent that is being trained, on streets made for them."""
+    """Runs the episodes of the agent in training, in environments made for them."""
     agent = Agent.from_config(training.agent.policy, config, training.agent.device)
     make_pool = partial(pool_from_config, config, comparison.rides)
     arena = Arena(load_scene(config["scene"]), [agent], comparison.fps, make_pool)
@@ -232,7 +232,7 @@ def run_comparison(
 
 
 def final_episodes(config: Config) -> int:
-    """Returns how many episodes the evaluation that ends a run has."""
+    """Returns the number of episodes in the final evaluation."""
     evaluation = config["evaluation"]
     policies = len(FINAL_POLICIES) + len(evaluation["baselines"])
     conditions = len(evaluation["speeds"]) * len(evaluation["fps"])
@@ -269,7 +269,7 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
 
 
 def main() -> None:
-    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    """Entry point; a mistake on the command line ends in one line that lists the choices."""
     resumed = typed_value("resume")
     if resumed is not None:
         try:

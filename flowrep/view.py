@@ -1,4 +1,4 @@
-"""Looks at a scene: `python -m flowrep.view scene=s_turn`, or drives it: `interactive=true`."""
+"""Shows a scene: `python -m flowrep.view scene=s_turn`, or drives it: `interactive=true`."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -72,7 +72,7 @@ def check(config: DictConfig) -> None:
 
 
 def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
-    """Drives the episodes and writes all that there is to see of them."""
+    """Drives the episodes and writes their pictures, plan, video and tables."""
     frames, first, counts, fps = film(config, street)
     others = drive_on(config, street, config.episodes - 1)
     episodes = [first, *others]
@@ -86,7 +86,7 @@ def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
     layout = Layout(StreetEnv(**street, sensors=()).scene)
     tracks = [Track(episode.points_m, episode.outcome) for episode in episodes]
     paths = {episode.path for episode in episodes}
-    # The exits closed on the one path that was driven; of several, none is everybody's.
+    # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = paths.pop() if len(paths) == 1 else None
     draw_plan(layout, tracks, path=path).savefig(folder / "plan.png", dpi=110)
     for name, rows in (
@@ -102,7 +102,7 @@ def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
 def film(
     config: DictConfig, street: dict[str, Any]
 ) -> tuple[list[Maps], Viewed, CategoryCount, float]:
-    """Returns the first episode's maps, how it went, what was seen of it, and its frame rate."""
+    """Returns the first episode's maps, the drive, its category counts and its frame rate."""
     env = StreetEnv(**street, sensors=SENSORS)
     intrinsics, frames = torch.as_tensor(env.K), []
     counts = CategoryCount(env.scene.categories)
@@ -121,7 +121,7 @@ def film(
 
 
 def drive_on(config: DictConfig, street: dict[str, Any], episodes: int) -> list[Viewed]:
-    """Returns the episodes after the first, driven without a picture."""
+    """Returns the episodes after the first, driven without rendering."""
     env, baseline = StreetEnv(**street, sensors=()), BASELINES[config.policy]()
     env.reset(seed=config.seed)
     viewed = [
@@ -133,12 +133,12 @@ def drive_on(config: DictConfig, street: dict[str, Any], episodes: int) -> list[
 
 
 def moving_pixels(maps: Maps) -> int:
-    """Returns how many pixels move by themselves and are not right before the lens."""
+    """Returns the number of pixels that move by themselves and are not close to the camera."""
     return int(((maps["obj"] != 0).any(0) & (maps["depth"][0] > 4.0)).sum())
 
 
 def moments(motion: list[int], count: int) -> list[int]:
-    """Returns numbers of frames for a contact sheet: of each of `count` stretches the liveliest.
+    """Returns frame indices for a contact sheet: the one with most motion in each of `count` parts.
 
     >>> moments([0, 0, 3, 1, 0, 0, 0, 2], 2)
     [2, 7]
@@ -158,7 +158,7 @@ def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    """Entry point; a mistake on the command line ends in one line that lists the choices."""
     run_command("view", run, ViewConfig)
 
 

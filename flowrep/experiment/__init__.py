@@ -1,1 +1,1 @@
-"""What a run is made of: its folder, its cadences, its evaluation, its way to stop."""
+"""The parts of a run: folder, training loop, cadences, evaluation and interruption."""

@@ -1,4 +1,4 @@
-"""Runs episodes of agents on a pool of streets, each street busy until the last of them."""
+"""Runs episodes of agents in a pool of environments, all of them busy until the last jobs."""
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,11 +19,11 @@ from flowrep.scenes.scene import Scene
 
 _REWARD = {outcome.label: reward(outcome) for outcome in Outcome}
 _RUNNING = Outcome.RUNNING.label
-_DRAWS = 1  # sets an agent's draws apart from what else is drawn from an episode's seed
+_DRAWS = 1  # separates an agent's draws from other draws of an episode's seed
 
 
 class Agent(NamedTuple):
-    """A policy and what it looks at."""
+    """A policy and its observations."""
 
     policy: Any
     representations: Mapping[str, Any]
@@ -33,12 +33,12 @@ class Agent(NamedTuple):
 
     @classmethod
     def from_config(cls, policy: Any, config: Mapping[str, Any], device: torch.device) -> "Agent":
-        """Returns a policy that looks at what a run's config says."""
+        """Returns a policy with the observations of a run's config."""
         seen = {key: config[key] for key in ("representations", "flow", "noise")}
         return cls(policy, **seen, device=device)
 
     def eye(self, scene: Scene, frame_rate_hz: float) -> Eye:
-        """Returns what looks for it at streets of a scene."""
+        """Returns the `Eye` that computes its observations in a scene."""
         return Eye(
             scene,
             self.representations,
@@ -50,7 +50,7 @@ class Agent(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One episode that an agent is to drive: which agent, how, and which episode."""
+    """One episode for an agent to drive."""
 
     agent: int
     is_greedy: bool
@@ -61,7 +61,7 @@ class Job(NamedTuple):
 
 @dataclass
 class _Ride:
-    """A job that a street is at."""
+    """A job that an environment is running."""
 
     number: int
     job: Job
@@ -71,13 +71,13 @@ class _Ride:
 
 
 class Arena:
-    """Agents and the streets of one scene.
+    """Agents and the environments of one scene.
 
     Args:
         scene: a loaded scene.
-        agents: those that will drive.
-        fps: frame rates at which they will.
-        make_pool: gets the scene and the sensors that the agents need.
+        agents: the agents that will drive.
+        fps: the frame rates of their episodes, Hz.
+        make_pool: called with the scene and the sensors that the agents need.
     """
 
     def __init__(
@@ -100,9 +100,9 @@ class Arena:
     def run(self, jobs: Sequence[Job]) -> Iterator[tuple[int, Episode]]:
         """Yields the jobs' episodes with their numbers, as they end.
 
-        An episode depends on its job alone: not on how many streets there are, nor on what else
-        they do. A free street takes the next job, in the order of `jobs`; those that share an
-        agent and a frame rate, one after the other, are computed together.
+        An episode depends on its job alone, not on the number of environments or their other
+        episodes. A free environment takes the next job, in the order of `jobs`; environments that
+        share an agent and a frame rate are computed together.
         """
         waiting = deque(enumerate(jobs))
         rides: list[_Ride | None] = [None] * self.pool.num_envs
@@ -141,7 +141,7 @@ class Arena:
     def _act(
         self, seen: Mapping[str, Any], rides: Sequence[_Ride | None], begun: set[int]
     ) -> dict[int, int]:
-        """Returns an action for each street that is at a job."""
+        """Returns an action for each environment that is running a job."""
         groups: dict[tuple[int, float], list[int]] = defaultdict(list)
         for street, ride in enumerate(rides):
             if ride is not None:
@@ -152,7 +152,7 @@ class Arena:
             later = [street for street in streets if street not in begun]
             maps = self._eyes[agent, rate].look(seen, first, later)
             order = [*first, *later]
-            # for policies that remember what they saw of a street
+            # for policies that remember what they saw in an environment
             maps["street"] = torch.tensor(order, device=maps.device)
             maps["is_init"] = (torch.arange(len(order)) < len(first)).unsqueeze(-1)
             policy = self.agents[agent].policy
@@ -176,7 +176,7 @@ def _likeliest(policy: Any, maps: TensorDictBase, rides: Sequence[Any]) -> list[
 
 
 def _drawn(policy: Any, maps: TensorDictBase, rides: Sequence[Any]) -> list[int]:
-    """Draws each action by its episode's own generator, whichever others are drawn beside it."""
+    """Draws each action from its episode's own generator, whatever else is in the batch."""
     shares = policy.get_dist(maps).probs.double().cumsum(-1).cpu().numpy()
     drawn = np.array([ride.rng.random() for ride in rides])[:, None]
     return (drawn * shares[:, -1:] >= shares[:, :-1]).sum(axis=-1).tolist()

@@ -1,4 +1,4 @@
-"""When things happen in a training loop, as objects whose names say what for."""
+"""Intervals in a training loop, as callable objects."""
 
 from dataclasses import dataclass
 

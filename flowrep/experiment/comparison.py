@@ -18,7 +18,7 @@ Row = dict[str, Any]
 
 
 class _Cell(NamedTuple):
-    """Whose episodes, how driven, in which conditions; a baseline's are everybody's."""
+    """A group of episodes: the agent (None for a baseline), policy, speed and frame rate."""
 
     agent: int | None
     policy: str
@@ -27,19 +27,19 @@ class _Cell(NamedTuple):
 
 
 class Comparison:
-    """Which episodes are to be run, and those that have been.
+    """The episodes to run, and the results so far.
 
-    Episode k of each policy, speed and frame rate is the one of `seed + k`.
+    Episode k of each policy, speed and frame rate has the seed `seed + k`.
 
     Args:
         speeds: pedestrians' speed modes.
         fps: frame rates in Hz.
-        episodes: for each policy, speed and frame rate.
-        seed: of the first episode.
-        policies: "greedy" and / or "sampled", in which every agent is run, or the name of a policy
-            that knows one way to act.
+        episodes: their number for each policy, speed and frame rate.
+        seed: the seed of the first episode.
+        policies: "greedy", "sampled" or both, applied to every agent, or the name of a policy with
+            only one way to act.
         baselines: names in `flowrep.envs.BASELINES`, run on the same episodes.
-        agents: how many there are.
+        agents: the number of agents.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Comparison:
     ) -> None:
         self.fps = [*fps]
         self._seeds = [(seed + k) % (1 << 31) for k in range(episodes)]
-        # one agent and frame rate after the other, so that streets which share them do so for long
+        # ordered by agent and frame rate, so that environments share a batch for long
         self._rides = [
             _Cell(agent, policy, speed, rate)
             for agent, rate, speed, policy in product(range(agents), fps, speeds, policies)
@@ -69,7 +69,7 @@ class Comparison:
 
     @property
     def rides(self) -> int:
-        """How many episodes agents are to drive."""
+        """The number of episodes that agents are to drive."""
         return len(self._rides) * len(self._seeds)
 
     @property
@@ -79,11 +79,11 @@ class Comparison:
         return all(len(self._done[cell]) == len(self._seeds) for cell in cells)
 
     def run(self, arena: Arena, should_stop: Callable[[], bool] = lambda: False) -> None:
-        """Runs the episodes; what is done is kept, however it ends.
+        """Runs the episodes; finished ones are kept even if it is interrupted.
 
         Args:
-            arena: with as many agents.
-            should_stop: asked after each episode.
+            arena: an arena with as many agents.
+            should_stop: called after each episode.
         """
         count = len(self._seeds)
         rides = [(cell, k) for cell in self._rides for k in range(count)]
@@ -110,8 +110,8 @@ class Comparison:
     def rows(self, agent: int = 0) -> list[Row]:
         """Returns a row for each episode of an agent and of the baselines, in their order.
 
-        Of what was not run to its end, those before the first gap: whichever are done first are
-        short ones, and would say too little of the others.
+        Of an incomplete group, only the episodes before the first gap are returned: short episodes
+        finish first, so taking all that are done would bias the result.
         """
         rows = []
         policies, baselines = self._names
@@ -136,12 +136,12 @@ class Comparison:
 def with_origin(
     rows: Sequence[Row], config: Mapping[str, Any], frames: int, evaluation: str
 ) -> list[Row]:
-    """Returns the rows with the columns that say whose they are, in evaluation.csv's order.
+    """Returns the rows with the columns that identify the run, in evaluation.csv's order.
 
     Args:
-        rows: from `compare`.
-        config: of the run whose agent was evaluated.
-        frames: that it had been trained for.
+        rows: from `Comparison.rows`.
+        config: the config of the evaluated agent's run.
+        frames: the frames that the agent was trained for.
         evaluation: "training", "final" or "evaluate".
     """
     origin = {

@@ -20,13 +20,13 @@ Options = dict[str, Any]
 
 
 class EnvPool:
-    """Environments of one scene, in this process or in workers; an episode is the same in all.
+    """Environments of one scene, in this process or in workers; an episode is the same in each.
 
     Args:
         scene: a loaded scene.
-        sensors: what is observed, see `StreetEnv`; none where only baselines drive.
-        num_envs: how many environments.
-        num_workers: how many processes step them; 0: this one.
+        sensors: the observed sensors, see `StreetEnv`; none if only baselines drive.
+        num_envs: the number of environments.
+        num_workers: the number of processes that step them; 0 steps them in this one.
         renderer: see `StreetEnv`.
     """
 
@@ -68,7 +68,7 @@ class EnvPool:
         """Yields the episodes of baselines, which need no rendering, as they end.
 
         Args:
-            jobs: a baseline's name and the episode for each; its number comes with the drive.
+            jobs: a baseline's name and an episode each; a drive is yielded with its job's index.
         """
         if self._workers is not None:
             yield from self._workers.apply(_drive, jobs)
@@ -87,7 +87,7 @@ def _street(scene: Scene, sensors: tuple[str, ...], renderer: str) -> SensorObse
 
 @cache
 def _baseline(name: str) -> Baseline:
-    """One of each in a process: the planner remembers the ways through a scene."""
+    """Returns a baseline, one per process: the planner remembers the ways through a scene."""
     return BASELINES[name]()
 
 

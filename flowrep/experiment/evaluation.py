@@ -1,4 +1,4 @@
-"""How well a policy drives: outcomes of whole episodes, with intervals."""
+"""Outcomes of whole episodes, with intervals."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -17,7 +17,7 @@ OUTCOMES = tuple(outcome.label for outcome in Outcome)
 
 @dataclass(frozen=True)
 class Episode:
-    """One finished episode: which it was, how it ended, what was hit, return, length in steps."""
+    """One finished episode: seed, outcome, what was hit, return and length in steps."""
 
     episode_seed: int
     outcome: str
@@ -44,7 +44,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
 
 
 def outcome_shares(outcomes: Iterable[str]) -> dict[str, tuple[float, float, float]]:
-    """Returns for each way to end an episode its share with its 95 % Wilson interval."""
+    """Returns the share of each outcome that ends an episode, with its 95 % Wilson interval."""
     counts = Counter(outcomes)
     trials = counts.total()
     return {

@@ -1,4 +1,4 @@
-"""What one agent sees of a pool of streets: its representations, from what their cameras give."""
+"""One agent's representations of a pool of environments, computed from their sensors."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,13 +15,13 @@ from flowrep.transforms import representation_stack
 
 
 class Eye:
-    """An agent's representations of every street, kept from step to step for those that need it.
+    """An agent's representations of every environment, kept between steps if they need it.
 
     Args:
-        scene: whose camera and classes they are of.
+        scene: the scene, which gives the camera and the classes.
         representations: names, or a mapping from name to options.
-        frame_rate_hz: steps a second.
-        flow: where raw and obj come from, see `representation_stack`.
+        frame_rate_hz: steps per second.
+        flow: the source of raw and obj, see `representation_stack`.
         noise: errors of depth and motion, see there.
         device: where they are computed.
     """
@@ -53,12 +53,12 @@ class Eye:
     def look(
         self, seen: Mapping[str, NDArray[Any]], begun: Sequence[int], going_on: Sequence[int]
     ) -> TensorDictBase:
-        """Returns what it sees of the streets `[*begun, *going_on]`.
+        """Returns the maps of the environments `[*begun, *going_on]`.
 
         Args:
-            seen: what their cameras give, `[num_envs, ...]` by sensor.
-            begun: streets whose episode has just begun.
-            going_on: streets of which the step before was looked at.
+            seen: the sensor maps of all environments, `[num_envs, ...]` by sensor.
+            begun: environments whose episode has just begun.
+            going_on: environments whose previous step was passed to `look` as well.
         """
         parts = []
         for rows in (begun, going_on):

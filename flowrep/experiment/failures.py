@@ -1,4 +1,4 @@
-"""Why episodes fail: the paper's Table III, as a table to read and one to compute with."""
+"""Causes of failure as in the paper's Table III, printed and as CSV."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,13 +29,13 @@ def cause_of(outcome: str, hit: str) -> str | None:
 
 
 def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Returns for each scene, policy and speed how many episodes failed, and of what in %.
+    """Returns the number of failures and their causes in % for each scene, policy and speed.
 
     Shares are of the failures, as in the paper's Table III, and empty where nothing failed.
     Evaluations after different numbers of training frames are kept apart.
 
     Args:
-        rows: of evaluation.csv.
+        rows: rows of evaluation.csv.
     """
     groups: dict[tuple[str, ...], list[str | None]] = defaultdict(list)
     for row in rows:

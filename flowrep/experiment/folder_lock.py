@@ -1,4 +1,4 @@
-"""One process at a time works in a run's folder."""
+"""A lock that lets one process at a time work in a run's folder."""
 
 import errno
 import fcntl
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of some network file systems
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some network file systems
 
 
 class FolderInUseError(OSError):
@@ -20,16 +20,16 @@ class FolderInUseError(OSError):
 
 @contextmanager
 def folder_lock(folder: Path, doing: str) -> Iterator[None]:
-    """Holds a folder, so that no other process that asks for it gets it meanwhile.
+    """Locks a folder against other processes.
 
-    The lock lies with the process: however it ends, the folder is free again.
+    The lock is released when the process ends, however it ends.
 
     Args:
-        folder: exists; `.lock` in it is made and kept.
-        doing: what is done in it, for those who are refused, e.g. "training".
+        folder: an existing folder; `.lock` is created in it and kept.
+        doing: the activity, for the error that other processes get, e.g. "training".
 
     Raises:
-        FolderInUseError: another process holds the folder; says which, where and since when.
+        FolderInUseError: another process holds the folder; gives its id, host and start time.
     """
     with (folder / ".lock").open("a+", encoding="utf-8") as file:
         try:
@@ -54,9 +54,9 @@ def folder_lock(folder: Path, doing: str) -> Iterator[None]:
 
 
 def _holder(lock: str) -> str:
-    """Returns in words who wrote into a lock file."""
+    """Describes the process that wrote a lock file."""
     try:
         holder = json.loads(Path(lock).read_text(encoding="utf-8"))
         return "process {pid} on {host} has been {doing} in it since {since}".format(**holder)
-    except (ValueError, KeyError, TypeError):  # it has begun, and not yet written who it is
+    except (ValueError, KeyError, TypeError):  # it has not written its description yet
         return "another process has just begun in it"

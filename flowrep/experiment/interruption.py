@@ -1,4 +1,4 @@
-"""Stopping a run so that nothing is lost: Ctrl-C and SIGTERM ask, the loop answers."""
+"""Stops a run on Ctrl-C or SIGTERM without losing anything."""
 
 import signal
 from types import FrameType
@@ -6,17 +6,17 @@ from typing import Any
 
 
 class StopRequest:
-    """Turns SIGINT and SIGTERM into a question that the loop asks between two steps.
+    """Turns SIGINT and SIGTERM into a flag that the loop checks between two steps.
 
-    The first signal sets `received`. Ctrl-C after it ends the process at once, as it would have
-    without this; SIGTERM doesn't, since schedulers send it to each process of a job and more than
-    once. Use it as a context manager: the previous handlers come back at its end.
+    The first signal sets `received`. Another Ctrl-C ends the process at once; another SIGTERM
+    doesn't, since schedulers send it to each process of a job and more than once. Use it as a
+    context manager; the previous handlers are restored on exit.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self) -> None:
-        """Prepares; handlers are installed on entering."""
+        """Starts without a signal; handlers are installed on entering."""
         self.received: signal.Signals | None = None
         self._previous: dict[signal.Signals, Any] = {}
 
@@ -35,7 +35,7 @@ class StopRequest:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Gives the handlers back."""
+        """Restores the previous handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 

@@ -19,7 +19,7 @@ _IDENTITY = (
     "num_envs",
     "total_frames",
 )
-"""The parts of a config that its weights are a function of."""
+"""The parts of a config that determine the weights."""
 
 _ABSENT = "absent"
 

@@ -1,4 +1,4 @@
-"""What a training has seen lately: episodes that ended, and updates since the last row."""
+"""Recent statistics of a training: finished episodes, and updates since the last row."""
 
 import math
 from collections import deque
@@ -16,7 +16,7 @@ RECENT_EPISODES = 100
 
 
 class RecentEpisodes:
-    """Outcomes, returns and lengths of the last episodes that ended, of all streets together."""
+    """Outcomes, returns and lengths of the latest finished episodes of all environments."""
 
     def __init__(self) -> None:
         """Starts without episodes."""
@@ -24,7 +24,7 @@ class RecentEpisodes:
         self._ended: deque[tuple[int, float, int]] = deque(maxlen=RECENT_EPISODES)
 
     def add(self, stepped: TensorDictBase) -> None:
-        """Takes in a step of every street, `[num_envs]`, as the env gave it."""
+        """Adds a step of every environment, `[num_envs]`, as the env returned it."""
         after = stepped["next"]
         rewards = after["reward"].flatten().double()
         if self._running is None:
@@ -39,7 +39,7 @@ class RecentEpisodes:
             self._running[:, done] = 0.0
 
     def summary(self) -> dict[str, float]:
-        """Returns the share of each outcome, and the mean return and length; nan without any."""
+        """Returns the share of each outcome, mean return and mean length; nan without episodes."""
         if not self._ended:
             return dict.fromkeys([*OUTCOMES[1:], "return", "length"], math.nan)
         outcomes, returns, lengths = zip(*self._ended)
@@ -49,12 +49,12 @@ class RecentEpisodes:
         return shares | {"return": fmean(returns), "length": fmean(lengths)}
 
     def state(self) -> dict[str, Any]:
-        """Returns what `restore` goes on from."""
+        """Returns the state that `restore` takes."""
         running = torch.zeros(2, 0) if self._running is None else self._running
         return {"running": running, "ended": [list(episode) for episode in self._ended]}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on where `state` was taken."""
+        """Continues from a `state`."""
         running = state["running"]
         self._running = running.clone() if running.numel() else None
         self._ended.clear()
@@ -64,7 +64,7 @@ class RecentEpisodes:
 
 
 class Means:
-    """Means of what updates return, over those since the last row, without waiting for a device."""
+    """Means of the updates' metrics since the last row, without waiting for a device."""
 
     def __init__(self) -> None:
         """Starts without updates."""
@@ -72,7 +72,7 @@ class Means:
         self._count = 0
 
     def add(self, metrics: Mapping[str, Tensor]) -> None:
-        """Takes in what one update returned."""
+        """Adds the metrics of one update."""
         if not self._count:
             self._sums = {name: value.detach().clone() for name, value in metrics.items()}
         else:
@@ -81,16 +81,16 @@ class Means:
         self._count += 1
 
     def take(self) -> dict[str, float]:
-        """Returns the means, none without an update, and begins anew."""
+        """Returns the means, none without an update, and starts again."""
         means = {name: float(total) / self._count for name, total in self._sums.items()}
         self._sums, self._count = {}, 0
         return means
 
     def state(self) -> dict[str, Any]:
-        """Returns what `restore` goes on from."""
+        """Returns the state that `restore` takes."""
         return {"sums": dict(self._sums), "count": self._count}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on where `state` was taken."""
+        """Continues from a `state`."""
         self._sums = {name: total.clone() for name, total in state["sums"].items()}
         self._count = state["count"]

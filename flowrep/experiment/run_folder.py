@@ -31,16 +31,16 @@ EVALUATION_COLUMNS = (
     "length",
 )
 _EPISODE = ("scene", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
-"""The columns that tell which episode of which policy a row is of."""
+"""The columns that identify a row's policy and episode."""
 
 _NEEDED = (
     "scene", "representations", "flow", "noise", "algorithm", "seed", "total_frames", "num_envs",
 )  # fmt: skip
-"""The keys without which a config is none."""
+"""The keys that every run's config has."""
 
 
 class RunFolderError(ValueError):
-    """A folder is not what a run leaves, or holds one where none is wanted."""
+    """A folder is not that of a run, or holds a run where none is wanted."""
 
 
 class RunFolder:
@@ -58,14 +58,14 @@ class RunFolder:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Creates the folder where it is missing."""
+        """Creates the folder if it is missing."""
         self.path = Path(path)
         self.path.mkdir(parents=True, exist_ok=True)
         self._loggers: list[Any] = []
 
     @classmethod
     def existing(cls, path: str | Path) -> "RunFolder":
-        """Opens a folder that holds a run, and creates none.
+        """Opens the folder of an existing run.
 
         Raises:
             RunFolderError: there is no run at `path`.
@@ -79,10 +79,10 @@ class RunFolder:
 
     @classmethod
     def all_in(cls, path: str | Path) -> list["RunFolder"]:
-        """Opens a folder that holds a run, or those of a sweep's folder that do.
+        """Opens a run's folder, or all run folders in a sweep's folder.
 
         Raises:
-            RunFolderError: there is no run at `path`, nor right below it.
+            RunFolderError: there is no run at `path` or directly below it.
         """
         runs = sorted(config.parent for config in Path(path).glob("*/config.yaml"))
         is_sweep = runs and not (Path(path) / "config.yaml").is_file()
@@ -92,7 +92,7 @@ class RunFolder:
         """Checks that a run can begin here.
 
         Raises:
-            RunFolderError: the folder holds one, or what is left of one.
+            RunFolderError: the folder holds a run, or remains of one.
         """
         config, checkpoint = self.path / "config.yaml", self.checkpoint_path
         files = (config, self.metrics_path, self.evaluation_path, checkpoint)
@@ -105,7 +105,7 @@ class RunFolder:
             )
 
     def held(self, doing: str) -> AbstractContextManager[None]:
-        """Holds the folder against other processes; see `folder_lock`."""
+        """Locks the folder against other processes; see `folder_lock`."""
         return folder_lock(self.path, doing)
 
     @property
@@ -120,7 +120,7 @@ class RunFolder:
 
     @property
     def failures_path(self) -> Path:
-        """The table of why episodes failed."""
+        """The table of causes of failure."""
         return self.path / "failures.csv"
 
     @property
@@ -134,7 +134,7 @@ class RunFolder:
         return self.path / "videos" / f"{name}.mp4"
 
     def write_config(self, config: Mapping[str, Any], overrides: Iterable[str] = ()) -> None:
-        """Writes the resolved config, and what was typed beside it, where Hydra has it."""
+        """Writes the resolved config, and the typed overrides where Hydra keeps them."""
         (self.path / ".hydra").mkdir(exist_ok=True)
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
         (self.path / ".hydra" / "overrides.yaml").write_text(typed, encoding="utf-8")
@@ -165,7 +165,7 @@ class RunFolder:
         return config
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
-        """Appends one row to metrics.csv and gives the same values to TensorBoard and wandb."""
+        """Appends one row to metrics.csv and logs the same values to TensorBoard and wandb."""
         append_rows(self.metrics_path, [{"frames": frames, **metrics}])
         self._plot(frames, metrics)
 
@@ -176,7 +176,7 @@ class RunFolder:
             logger.log_metrics(dict(values), frames)
 
     def log_to_wandb(self, mode: str, config: Mapping[str, Any]) -> None:
-        """Gives what is logged from now on to Weights & Biases as well, unless `mode` is "off".
+        """Sends everything logged from now on to Weights & Biases too, unless `mode` is "off".
 
         Raises:
             ImportError: wandb is not installed.
@@ -185,7 +185,7 @@ class RunFolder:
             self._loggers.append(open_wandb(self.path, mode, config))
 
     def forget_after(self, frames: int) -> None:
-        """Drops what was logged after `frames`: a resumed run writes those rows again."""
+        """Drops the rows logged after `frames`; a resumed run writes them again."""
         for path, rows, columns in (
             (self.metrics_path, self.read_metrics(), None),
             (self.evaluation_path, self.read_episodes(), EVALUATION_COLUMNS),
@@ -198,8 +198,8 @@ class RunFolder:
         """Returns whether the final evaluation is in evaluation.csv.
 
         Args:
-            frames: that the run was trained for.
-            episodes: that this evaluation has, of all policies and speeds together.
+            frames: the frames that the run was trained for.
+            episodes: the evaluation's episodes, over all policies and speeds.
         """
         final = [
             row
@@ -209,10 +209,10 @@ class RunFolder:
         return len(final) >= episodes
 
     def read_metrics(self) -> list[dict[str, str]]:
-        """Returns the rows of metrics.csv, none where there is no such file.
+        """Returns the rows of metrics.csv, none if there is no such file.
 
         Raises:
-            TableError: the table was changed by something else.
+            TableError: another program changed the table.
         """
         rows = read_rows(self.metrics_path)
         for number, row in enumerate(rows, start=2):
@@ -220,10 +220,10 @@ class RunFolder:
         return rows
 
     def read_episodes(self) -> list[dict[str, str]]:
-        """Returns the rows of evaluation.csv, none where there is no such file.
+        """Returns the rows of evaluation.csv, none if there is no such file.
 
         Raises:
-            TableError: the table was changed by something else, or is of another version.
+            TableError: another program changed the table, or is of another version.
         """
         path = self.evaluation_path
         rows = read_rows(path, EVALUATION_COLUMNS)
@@ -234,10 +234,10 @@ class RunFolder:
         return rows
 
     def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Adds evaluated episodes to evaluation.csv, and what they say to TensorBoard and wandb.
+        """Adds evaluated episodes to evaluation.csv, and their means to TensorBoard and wandb.
 
-        An episode that is there already, of the same policy after as many frames, speed and frame
-        rate, is replaced in its place: evaluated again, it leaves the table as it was.
+        An episode that the table already has, with the same policy, frames, speed and frame rate,
+        is replaced in place, so that evaluating it again leaves the table unchanged.
 
         Raises:
             TableError: as `read_episodes`; nothing is written then.

@@ -7,14 +7,14 @@ from typing import Any
 
 from flowrep.experiment.evaluation import OUTCOMES
 
-_TITLES = {"training": "evaluation"}  # of training itself there are scalars too
+_TITLES = {"training": "evaluation"}  # training itself has scalars too
 
 
 def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
     """Returns shares of outcomes, mean return and mean length of each evaluation, by frames.
 
     Args:
-        rows: of evaluation.csv.
+        rows: rows of evaluation.csv.
 
     >>> row = {"scene": "s_turn", "evaluation": "final", "policy": "greedy", "speed": "low"}
     >>> row |= {"fps": 12.0, "frames": 100, "outcome": "success", "return": 7.5, "length": 90}

@@ -1,4 +1,4 @@
-"""Where the wall time of a run goes."""
+"""The wall time of a run by section."""
 
 import time
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, section: str) -> Iterator[None]:
-        """Counts what runs inside to `section`."""
+        """Adds the time spent inside to `section`."""
         start = time.perf_counter()
         try:
             yield
@@ -30,7 +30,7 @@ class Stopwatch:
             self.seconds[section] = self.seconds.get(section, 0.0) + elapsed
 
     def share(self, *sections: str) -> float:
-        """Returns the share of all counted time that the sections took; 0 before any."""
+        """Returns the share of all counted time that the sections took; 0 at first."""
         total = sum(self.seconds.values())
         return sum(self.seconds.get(name, 0.0) for name in sections) / total if total else 0.0
 

@@ -1,4 +1,4 @@
-"""CSV tables that are appended to, and stay readable when a writer was killed on the way."""
+"""CSV tables that rows are appended to, readable even after a writer was killed."""
 
 import csv
 import io
@@ -9,18 +9,18 @@ from typing import Any
 
 
 class TableError(ValueError):
-    """A table is not what was written; the message says where, and what to do."""
+    """A table was changed or damaged; the message says where, and what to do."""
 
 
 def read_rows(path: Path, columns: Sequence[str] | None = None) -> list[dict[str, str]]:
-    """Returns a table's rows, none where there is no file; half a last line is left out.
+    """Returns a table's rows, none if there is no file; an incomplete last line is left out.
 
     Args:
         path: the table, as `append_rows` writes it.
-        columns: those that it has to have, and no other, in any order; None for any.
+        columns: exactly the columns that it should have, in any order; None for any.
 
     Raises:
-        TableError: it was changed by something else, such as a spreadsheet.
+        TableError: another program changed it, such as a spreadsheet.
     """
     if not path.is_file():
         return []
@@ -67,9 +67,9 @@ def is_whole(path: Path) -> bool:
 def write_rows(
     path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:
-    """Replaces a table as a whole; without rows, there is none.
+    """Replaces a whole table; without rows, the file is removed.
 
-    Whatever happens on the way, the file is the old table or the new one.
+    If it is interrupted, the file is the old table or the new one.
     """
     rows = list(rows)
     if not rows:
@@ -89,9 +89,9 @@ def write_rows(
 def append_rows(
     path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:
-    """Appends rows to a table, writing its header first where the file is new.
+    """Appends rows to a table, writing its header first if the file is new.
 
-    All go to the file in one call, so that a process that is killed leaves all of them or none.
+    They are written in one call, so that a killed process leaves all of them or none.
 
     Raises:
         ValueError: a row's columns are not those of the table.
@@ -113,5 +113,5 @@ def append_rows(
     with path.open("ab", buffering=0) as raw:
         data = text.getvalue().encode("utf-8")
         written = raw.write(data)
-        while written < len(data):  # a disk that is nearly full takes a part, then says so
+        while written < len(data):  # a nearly full disk takes a part, then raises
             written += raw.write(data[written:])

@@ -35,7 +35,7 @@ class Training:
         env: batched TorchRL env.
         agent: the algorithm and its memory.
         run: the folder that the run writes to.
-        origin: what its checkpoints belong to, see `origin_of`.
+        origin: the identity of the run that its checkpoints belong to, see `origin_of`.
         frames: environment frames so far.
         evaluation_pending: whether the last evaluation was interrupted and has to be run again.
         observation: what the policy acts on next; None before the first reset.
@@ -54,7 +54,7 @@ class Training:
     recent: RecentEpisodes = field(default_factory=RecentEpisodes)
 
     def state(self) -> dict[str, Any]:
-        """Returns all that the rest of the run depends on, as nested plain data and tensors."""
+        """Returns everything that the rest of the run depends on: nested plain data and tensors."""
         assert self.observation is not None
         return {
             "origin": self.origin,
@@ -119,7 +119,7 @@ class Training:
             with torch.no_grad():
                 return self.agent.policy(self.observation)
         except RuntimeError as error:
-            self.check()  # an update may have seen it first, and says more
+            self.check()  # an update may have seen it first, and its error says more
             if "probability tensor" not in str(error):
                 raise
             maps = [key for key in self.agent.policy.in_keys if _is_bad(self.observation[key])]

@@ -1,4 +1,4 @@
-"""Drives through a street to be looked at: where each went, what it saw, how it ended."""
+"""Drives for viewing a scene: path, observations and outcome of each."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Viewed:
     points_m: NDArray[np.float64]
 
     def row(self) -> dict[str, Any]:
-        """Returns what a table says of it."""
+        """Returns its row in a table."""
         return {
             "episode_seed": self.episode_seed,
             "path": self.path,
@@ -46,14 +46,14 @@ def view_episode(
     seed: int | None = None,
     path: str | None = None,
 ) -> Viewed:
-    """Returns an episode, driven to its end.
+    """Drives one episode to its end and returns it.
 
     Args:
-        env: the street.
+        env: the environment.
         baseline: chooses the actions.
-        look: is given every observation, that of the reset first.
-        seed: as of `StreetEnv.reset`; None goes on in the env's own episodes.
-        path: one of the scene's, drawn if None.
+        look: called with every observation, that of the reset first.
+        seed: as for `StreetEnv.reset`; None continues with the env's own episodes.
+        path: one of the scene's paths, drawn if None.
     """
     observation, info = env.reset(seed=seed, options=None if path is None else {"path": path})
     points, total, ended = [env.episode.now.vehicle[:2]], 0.0, False
@@ -77,7 +77,7 @@ def view_episode(
 
 
 class CategoryCount:
-    """Counts the pixels of every category, and the pictures that show it."""
+    """Counts the pixels of each category and the pictures that show it."""
 
     def __init__(self, categories: tuple[str, ...]) -> None:
         """Starts at 0 for the categories of a scene."""

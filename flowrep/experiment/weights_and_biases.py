@@ -1,4 +1,4 @@
-"""The run's metrics in Weights & Biases, for those who ask for it."""
+"""Logs a run's metrics to Weights & Biases."""
 
 import uuid
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ def open_wandb(folder: Path, mode: str, config: Mapping[str, Any]) -> Any:
     """Returns a TorchRL logger to the folder's own wandb run, the same one whenever it is resumed.
 
     Args:
-        folder: of the run; wandb's files lie in `wandb/` under it.
+        folder: the run's folder; wandb writes its files to `wandb/` in it.
         mode: "offline" keeps them there for `wandb sync`, "online" sends them.
         config: shown beside the run.
 
@@ -39,7 +39,7 @@ def open_wandb(folder: Path, mode: str, config: Mapping[str, Any]) -> Any:
 
 
 def run_id(folder: Path) -> str:
-    """Returns the name under which wandb knows the run, made up once and kept in its folder."""
+    """Returns wandb's id of the run, generated once and kept in its folder."""
     kept = folder / "wandb_id"
     if not kept.is_file():
         fresh = folder / "wandb_id.tmp"
