@@ -1,4 +1,4 @@
-"""Which sections the runs of some folders make."""
+"""Assembles the sections of a report from runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from flowrep.report.tables import Table
 
 @dataclass(frozen=True)
 class Chapter:
-    """The sections of runs that may be compared; `label` says what sets them apart from others."""
+    """The sections of comparable runs; `label` says what distinguishes them from other runs."""
 
     label: str
     runs: tuple[Run, ...]
@@ -32,7 +32,7 @@ class Chapter:
 
 @dataclass(frozen=True)
 class Report:
-    """All that a page shows of runs, besides pictures of their drives."""
+    """Everything that a page shows of runs, except pictures of their drives."""
 
     runs: tuple[Run, ...]
     complaints: tuple[str, ...]
@@ -40,7 +40,7 @@ class Report:
 
 
 def assemble(runs: Sequence[Run], complaints: Sequence[str], ask: Settings) -> Report:
-    """Returns the sections that runs make, family by family, and what is wrong with runs."""
+    """Returns the sections for runs, family by family, and the problems found in runs."""
     families = families_of(runs)
     wrong = [*complaints, *(w for w in (_unusable(run, ask) for run in runs) if w)]
     chapters = []
@@ -55,7 +55,7 @@ def assemble(runs: Sequence[Run], complaints: Sequence[str], ask: Settings) -> R
 
 
 def _unusable(run: Run, ask: Settings) -> str | None:
-    """Says why a run fills no cell, None where it does."""
+    """Returns why a run fills no cell, None if it does."""
     if not run.is_finished:
         return (
             f"{run.path} is not finished, at {run.frames:,} of {run.total_frames:,} frames: only "
@@ -103,7 +103,7 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
 
 
 def across(families: Sequence[Family], ask: Settings) -> list[Section]:
-    """Returns what stacks do in families whose configs differ, side by side and never pooled."""
+    """Returns the results of stacks in families whose configs differ, side by side, not pooled."""
     told = [section for v in VARIATIONS if (section := variation_section(v, families, ask))]
     table = Section("configs", "Configs that differ", tables=(differing_keys(families),))
     if told:
@@ -133,7 +133,7 @@ def variation_section(
 ) -> Section | None:
     """Returns stacks side by side under configs that differ in one part; None if they aren't.
 
-    A variant has one family, or else nothing is told: two would be pooled.
+    Also returns None if a variant has more than one family, since they would be pooled.
     """
     if not variation.is_in(key for family in families for key in family.differences):
         return None
@@ -162,7 +162,7 @@ def variation_section(
 
 
 def differing_keys(families: Sequence[Family]) -> Table:
-    """Returns the keys in which families differ, a column each."""
+    """Returns a table of the keys in which families differ, with a column per family."""
     keys = list(dict.fromkeys(key for family in families for key in family.differences))
     letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[: len(families)]
     rows = tuple((key, *(f.differences.get(key, "") for f in families)) for key in keys)

@@ -1,4 +1,4 @@
-"""Runs of one stack in one scene under one condition, as outcomes to compute with."""
+"""Outcomes of the runs of one stack in one scene under one condition, as arrays."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ Judge = Callable[[Mapping[str, str]], float]
 
 @dataclass(frozen=True)
 class Cell:
-    """What the runs of one stack did in one scene and condition.
+    """The outcomes of the runs of one stack in one scene and condition.
 
     Args:
-        seeds: of the runs, in the rows' order.
-        episodes: their seeds, in the columns' order.
-        outcomes: `[R, E]`, what the judge says of each episode, nan where it was not driven.
+        seeds: the runs' seeds, in the order of rows.
+        episodes: the episodes' seeds, in the order of columns.
+        outcomes: `[R, E]`, the judge's value of each episode, nan where it was not driven.
     """
 
     seeds: tuple[int, ...]
@@ -29,7 +29,7 @@ class Cell:
 
     @property
     def counts(self) -> str:
-        """How many seeds and episodes, as text: `3 × 192`."""
+        """The numbers of seeds and episodes, as text: `3 × 192`."""
         of_each = (~np.isnan(self.outcomes)).sum(axis=1)
         low, high = of_each.min(), of_each.max()
         return f"{len(self.seeds)} × {low}" + (f"–{high}" if high > low else "")
@@ -41,14 +41,14 @@ def success(row: Mapping[str, str]) -> float:
 
 
 def out_of_bounds_of_both(row: Mapping[str, str]) -> float:
-    """Judges a failure as the paper's Table III does: 1 out of bounds, 0 collision, nan others."""
+    """Judges a failure as in the paper's Table III: 1 out of bounds, 0 collision, else nan."""
     return {"out_of_bounds": 1.0, "collision": 0.0}.get(row["outcome"], np.nan)
 
 
 def cell_of(runs: Iterable[Run], condition: Condition, judge: Judge = success) -> Cell | None:
-    """Returns what runs of one stack and scene did; None where none was evaluated so.
+    """Returns the outcomes of runs of one stack and scene; None if the condition has none.
 
-    Episodes are columns, so that those which several runs drove stand in one.
+    An episode has one column, whichever runs drove it.
     """
     found: list[tuple[int, dict[int, float]]] = []
     for run in sorted(runs, key=lambda run: run.seed):
@@ -77,14 +77,14 @@ def side_by_side(first: Cell, second: Cell) -> tuple[Array, Array]:
 
 
 def shared_episodes(first: Cell, second: Cell) -> int:
-    """Returns how many episodes both drove."""
+    """Returns the number of episodes that both drove."""
     return len({*first.episodes} & {*second.episodes})
 
 
 def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:
-    """Returns how often a baseline, the condition's policy, succeeded; None where it did not drive.
+    """Returns the success rate of a baseline, the condition's policy; None if it did not drive.
 
-    It drives an episode as it does whichever agent it is compared with, so each counts once.
+    Its drive of an episode doesn't depend on the agent beside it, so each episode counts once.
     """
     driven = {
         int(row["episode_seed"]): success(row)

@@ -45,7 +45,7 @@ def run(config: DictConfig) -> None:
 
 
 def report_on(asked: dict[str, Any]) -> Path:
-    """Does what `run` says; returns the page's path.
+    """Writes the report; returns the page's path.
 
     Raises:
         UsageError: nothing in the folders can be read.
@@ -97,7 +97,7 @@ def show(table: Table, title: str) -> None:
 def _drives(runs: Sequence[Any], asked: dict[str, Any]) -> Drives:
     if not asked["trajectories"] and not asked["videos"]:
         return Drives()
-    # the simulator is needed for these alone
+    # only these need the simulator
     from flowrep.report.replay import drive_again
 
     return drive_again(
@@ -110,7 +110,7 @@ def _drives(runs: Sequence[Any], asked: dict[str, Any]) -> Drives:
 
 
 def with_folders_named(arguments: Sequence[str]) -> list[str]:
-    """Returns a command line in which folders that were given bare are the value of `run`.
+    """Returns a command line in which folders given without a key are the value of `run`.
 
     >>> with_folders_named(["outputs/a", "outputs/b", "videos=1", "--cfg", "job"])
     ['run=[outputs/a,outputs/b]', 'videos=1', '--cfg', 'job']
@@ -130,6 +130,6 @@ def _is_folder(text: str) -> bool:
 
 
 def main() -> None:
-    """Entry point; mistakes on the command line end in one line that lists what exists."""
+    """Entry point; a mistake on the command line ends in one line that lists the choices."""
     sys.argv[1:] = with_folders_named(sys.argv[1:])
     run_command("report", run, ReportConfig)

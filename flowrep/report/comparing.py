@@ -33,11 +33,11 @@ _MOST_PAIRS = 15
 
 @dataclass(frozen=True)
 class Settings:
-    """What a report asks of evaluations.
+    """A report's choice of evaluations and intervals.
 
     Args:
         policy: "greedy" or "sampled".
-        bootstrap: makes the intervals.
+        bootstrap: computes the intervals.
     """
 
     policy: str
@@ -72,12 +72,12 @@ def success_section(
     """Returns bars, a table of success and one of differences for series of runs.
 
     Args:
-        name: of the section.
-        title: its heading.
-        series: runs by what they are compared by.
-        pairs: series whose differences are told; None for all, as long as they are few.
+        name: the section's name.
+        title: the section's heading.
+        series: the runs of each series.
+        pairs: series whose differences are listed; None for all, as long as they are few.
         ask: policy and intervals.
-        shown: speed modes in the figure, all that were evaluated if None; the tables have all.
+        shown: speed modes in the figure, None for all evaluated ones; the tables have all.
     """
     runs = [run for members in series.values() for run in members]
     fps = runs[0].fps
@@ -152,7 +152,7 @@ def difference_table(
     pairs: Sequence[tuple[str, str]],
     bootstrap: Bootstrap,
 ) -> Table | None:
-    """Returns what each pair differs by and what that is worth; None where nothing is there."""
+    """Returns the difference of each pair with its verdict; None if there is no pair to compare."""
     places = [(words(grid.scene), [grid]) for grid in grids]
     if len(grids) > 1:
         places.append((f"All {len(grids)} scenes", list(grids)))

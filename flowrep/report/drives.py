@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Plan:
-    """A scene from above with the drives of one agent: whose, how they ended, a data URI."""
+    """A scene from above with one agent's drives: its name, the outcomes, a data URI."""
 
     title: str
     told: str
@@ -14,7 +14,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class FilmPart:
-    """One agent's film of an episode: whose, how it ended, a data URI."""
+    """One agent's film of an episode: its name, the outcome, a data URI."""
 
     title: str
     told: str
@@ -31,12 +31,12 @@ class Film:
 
 @dataclass(frozen=True)
 class Drives:
-    """What is seen of drives.
+    """Plans and films of drives.
 
     Args:
-        plans: by the scene's title.
+        plans: plans by the scene's title.
         films: episodes, each driven by several agents.
-        complaints: a line for each agent that could not be driven.
+        complaints: a line for each agent that could not drive.
     """
 
     plans: dict[str, list[Plan]] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The experiments: what each compares, and how to know it in a folder of runs."""
+"""The experiments: what each compares, and how to recognise it among runs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ class Experiment:
     """A comparison of stacks.
 
     Args:
-        name: as in conf/experiment/ and in the names of files.
-        title: as a heading.
-        stacks: what is compared, in the figure's order.
-        pairs: whose differences the paper speaks of: the first is said to do better.
+        name: the name in conf/experiment/ and of files.
+        title: the heading.
+        stacks: the compared stacks, in the figure's order.
+        pairs: the differences that the paper discusses; it says that the first does better.
         speeds: pedestrians' speed modes of the figure; None for all that were evaluated.
     """
 
@@ -28,7 +28,7 @@ class Experiment:
     speeds: tuple[str, ...] | None = None
 
     def is_in(self, runs: Sequence[Run]) -> bool:
-        """Says whether runs are of it, by what they see; its name alone will do for the first."""
+        """Returns whether runs have two of its stacks, or one if they were made as this one."""
         found = {run.stack for run in runs} & set(self.stacks)
         named = any(run.config.get("experiment") == self.name for run in runs)
         return len(found) > 1 or bool(found and named)
@@ -64,12 +64,12 @@ class Variation:
     """A comparison of configs that differ in one part: stacks with it and without it.
 
     Args:
-        name: as in conf/experiment/ and in the names of files.
-        title: as a heading.
-        part: what the keys of `Run.identity` begin with in which its runs may differ.
-        stacks: in the figure's order; others come after them.
-        variants: what a run can be, in the figure's order; others come after them.
-        variant_of: says which of them a run is.
+        name: the name in conf/experiment/ and of files.
+        title: the heading.
+        part: the prefix of those keys of `Run.identity` in which its runs may differ.
+        stacks: the stacks in the figure's order; others come after them.
+        variants: the variants in the figure's order; others come after them.
+        variant_of: returns the variant of a run.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Variation:
     variant_of: Callable[[Run], str]
 
     def is_in(self, differing: Iterable[str]) -> bool:
-        """Says whether configs are of it, by the keys in which they differ."""
+        """Returns whether configs belong to it, by the keys in which they differ."""
         keys = list(differing)
         return bool(keys) and all(key.startswith(self.part) for key in keys)
 

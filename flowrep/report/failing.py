@@ -1,4 +1,4 @@
-"""The paper's Table III: why episodes failed, out of bounds against collisions."""
+"""The paper's Table III: failures out of bounds against collisions."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ _PAPERS_SCENE = "s_turn"
 
 
 def failure_section(runs: Sequence[Run], ask: Settings) -> Section:
-    """Returns Table III for the paper's scene, or for those in which there are runs.
+    """Returns Table III for the scenes of the runs, the paper's scene first.
 
     At the speed and frame rate of training; time-outs are left out, as in the paper.
     """

@@ -1,4 +1,4 @@
-"""Sorts runs into families within which no config key has two values, save what is compared."""
+"""Sorts runs into families that agree in every config key except what is compared."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Any
 from flowrep.report.runs import Run
 
 _SHOWN = 3  # keys in a label
-_LONG = 24  # characters of a value; what is longer is said to differ
+_LONG = 24  # characters of a value; a longer one is shown as a version number
 
 
 @dataclass(frozen=True)
@@ -15,8 +15,8 @@ class Family:
     """Runs that may be compared: they differ in scene, representations and seed alone.
 
     Args:
-        runs: of the family; one that lacks a key, as `ego` does `representations.obj.scale`, may
-            be in several.
+        runs: the family's runs; one that lacks a key, as `ego` lacks `representations.obj.scale`,
+            may be in several families.
         differences: the keys in which families differ, with this one's values as text.
     """
 
@@ -25,7 +25,7 @@ class Family:
 
     @property
     def label(self) -> str:
-        """Names it by what sets it apart; empty where there is one family alone."""
+        """What distinguishes it from other families; empty if it is the only one."""
         shown = [f"{key}={value}" for key, value in self.differences.items()]
         rest = [f"{len(shown) - _SHOWN} more keys"] if len(shown) > _SHOWN + 1 else []
         return ", ".join(shown[:_SHOWN] + rest if rest else shown)
@@ -57,7 +57,7 @@ Signature = dict[str, str]
 
 
 def _widest(signatures: Sequence[Signature]) -> list[Signature]:
-    """Returns signatures joined with all that they do not contradict, none inside another."""
+    """Returns signatures merged with all that they don't contradict, none contained in another."""
     joined: list[Signature] = []
     for signature in sorted(signatures, key=len, reverse=True):
         for place, other in enumerate(joined):

@@ -21,7 +21,7 @@ _WIDEST_BAR = 0.3  # of a group
 
 
 def canvas(panels: int, theme: Theme, *, for_page: bool) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with panels in rows, of a paper's width or of a web page's."""
+    """Returns a figure with panels in rows, sized for a paper or for a web page."""
     columns = min(panels, _MOST_IN_A_ROW)
     rows = -(-panels // columns)
     if for_page:
@@ -42,7 +42,7 @@ def style_for(theme: Theme, *, for_page: bool) -> Any:
 
 
 def draw_bars(grids: Sequence[Grid], theme: Theme, *, for_page: bool = False) -> Figure:
-    """Returns grouped bars: a panel a scene, a group a speed mode, a bar a stack.
+    """Returns grouped bars: a panel per scene, a group per speed mode, a bar per stack.
 
     Whiskers are the intervals, small dots the seeds, dotted lines the baselines.
     """
@@ -114,7 +114,7 @@ def _bar_handles(series: Sequence[str], baselines: set[str], theme: Theme) -> li
 
 
 def draw_rates(grids: Sequence[Grid], theme: Theme, *, for_page: bool = False) -> Figure:
-    """Returns success over frame rates: a panel a scene, a line a stack, named at its right end."""
+    """Returns success over frame rates: a panel per scene, a line per stack, named at its end."""
     with style_for(theme, for_page=for_page):
         figure, panels = canvas(len(grids), theme, for_page=for_page)
         for axes, grid in zip(panels, grids):
@@ -130,7 +130,7 @@ def _rate_lines(axes: Axes, grid: Grid, theme: Theme) -> None:
     at = [condition.fps for condition in grid.conditions]
     step = min((b - a for a, b in pairwise(at)), default=1.0)
     for place, name in enumerate(grid.series):
-        # beside one another, so that whiskers of equal scores are all seen
+        # side by side, so that whiskers of equal scores are all visible
         aside = (place - (len(grid.series) - 1) / 2) * 0.08 * step
         found = [(c.fps + aside, grid.scores[name, c]) for c in grid.conditions]
         points = [(x, score.estimate) for x, score in found if score is not None]
@@ -170,7 +170,7 @@ def percent_axis(panels: Sequence[Axes]) -> None:
 
 
 def legend(figure: Figure, handles: Sequence[Any]) -> None:
-    """Puts a legend above the panels, to be read line by line."""
+    """Puts a legend above the panels, in reading order."""
     em_in = mpl.rcParams["font.size"] / 72
     longest = max(len(handle.get_label()) for handle in handles)
     entry_in = (0.5 * longest + 3.5) * em_in  # half an em a letter, 3.5 for the sign and gaps

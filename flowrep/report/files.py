@@ -1,4 +1,4 @@
-"""Writes the files of a report: a folder a section, and the page."""
+"""Writes the files of a report: a folder per section, and the page."""
 
 from pathlib import Path
 

@@ -15,7 +15,7 @@ from flowrep.report.style import Theme, looks, words
 
 
 class Curve(NamedTuple):
-    """What one run learned: (frames, share of success) of evaluations and of training episodes."""
+    """One run's (frames, share of success) in evaluations and in training episodes."""
 
     evaluated: list[tuple[int, float]]
     training: list[tuple[int, float]]
@@ -44,7 +44,7 @@ def curve_of(run: Run) -> Curve:
 
 
 def curve_panels(runs: Mapping[str, Sequence[Run]], scenes: Sequence[str]) -> list[CurvePanel]:
-    """Returns the curves of each scene in which there are any."""
+    """Returns the curves of each scene that has any."""
     panels = []
     for scene in scenes:
         curves = {
@@ -57,7 +57,7 @@ def curve_panels(runs: Mapping[str, Sequence[Run]], scenes: Sequence[str]) -> li
 
 
 def draw_curves(panels: Sequence[CurvePanel], theme: Theme, *, for_page: bool = False) -> Figure:
-    """Returns a panel a scene: bold, the seeds' mean of evaluations; thin, each seed's training."""
+    """Draws a panel per scene: bold, the seeds' mean of evaluations; thin, each seed's training."""
     with style_for(theme, for_page=for_page):
         figure, all_axes = canvas(len(panels), theme, for_page=for_page)
         names = list(dict.fromkeys(name for panel in panels for name in panel.curves))

@@ -1,4 +1,4 @@
-"""One HTML page that needs nothing else: pictures and films lie in it, styles too."""
+"""One self-contained HTML page: pictures, films and styles are embedded."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +18,8 @@ def render_page(report: Report, drives: Drives, sources: Sequence[Path]) -> str:
     """Returns the page.
 
     Args:
-        report: what the runs say.
-        drives: plans and films of some of their episodes, of none perhaps.
+        report: the report on the runs.
+        drives: plans and films of some of their episodes, possibly none.
         sources: the folders that were read, for the heading.
     """
     folder = Path(__file__).parent
@@ -42,7 +42,7 @@ def render_page(report: Report, drives: Drives, sources: Sequence[Path]) -> str:
 
 
 def summary(runs: Sequence[Run]) -> str:
-    """Returns a sentence on what was read."""
+    """Returns a sentence on the runs that were read."""
     finished = sum(run.is_finished for run in runs)
     stacks = sorted({run.stack for run in runs})
     scenes = [words(scene) for scene in dict.fromkeys(run.scene for run in runs)]

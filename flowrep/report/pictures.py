@@ -1,4 +1,4 @@
-"""Figures and films as text, so that a page holds them itself."""
+"""Figures and films as data URIs, for embedding in a page."""
 
 import base64
 import io
@@ -10,7 +10,7 @@ from flowrep.report.style import saving
 
 
 def svg_uri(figure: Figure) -> str:
-    """Returns a figure as a data URI of an SVG; the same figure, the same text."""
+    """Returns a figure as a data URI of an SVG; the same figure gives the same text."""
     data = io.BytesIO()
     with saving():
         figure.savefig(data, format="svg", metadata={"Date": None})

@@ -20,7 +20,7 @@ _MOST_LINES = 6  # in one panel
 
 
 def has_rates(runs: Sequence[Run], ask: Settings) -> bool:
-    """Says whether runs were evaluated at more frame rates than one."""
+    """Returns whether runs were evaluated at more than one frame rate."""
     return bool(runs) and len(rates_tested(runs, ask.policy, runs[0].speed)) > 1
 
 
@@ -45,7 +45,7 @@ def rate_section(runs: Sequence[Run], ask: Settings) -> Section:
 
 
 def _drawings(grids: Sequence[Grid], caption: str) -> Iterator[Drawing]:
-    """Yields the paper's figure, and another where there are more stacks than one can show."""
+    """Yields the paper's figure, and another if there are more stacks than it can show."""
     series = grids[0].series
     papers = [name for name in series if name in COMPLEMENTARY.stacks]
     others = [name for name in series if name not in papers]
@@ -81,7 +81,7 @@ def rate_table(grids: Sequence[Grid], caption: str, ask: Settings) -> Table:
 
 
 def change(before: Cell | None, after: Cell | None) -> Array | None:
-    """Returns `[R, E]`, what changed for each run and episode of both; None where none is."""
+    """Returns `[R, E]`, the change for each run and episode of both; None if they share none."""
     if before is None or after is None:
         return None
     seeds = [seed for seed in before.seeds if seed in after.seeds]

@@ -28,7 +28,7 @@ from flowrep.viz.film import Maps, maps_of
 from flowrep.viz.maps import representation_strip, write_video
 from flowrep.viz.plan import Track, draw_plan
 
-_SEED = 2_000_000  # of the episodes where none was evaluated by all
+_SEED = 2_000_000  # of the episodes if the runs were evaluated on none in common
 _MAP_OF = {"seg": "semantic", "seg2": "semantic", "depth2": "depth"}
 _PLAN_DPI = 100
 _TOLD = {
@@ -42,7 +42,7 @@ Look = Callable[[dict[str, Any]], None]
 
 
 class Drive(NamedTuple):
-    """One greedy episode: where the vehicle was [T + 1, 2] in metres, how it ended, steps."""
+    """One greedy episode: the vehicle's positions [T + 1, 2] in metres, outcome, steps."""
 
     episode_seed: int
     points_m: np.ndarray
@@ -56,10 +56,10 @@ def drive_again(
     """Returns plans and films of one finished agent for each scene, stack and family.
 
     Args:
-        runs: of a report.
-        trajectories: how many episodes a plan shows.
-        videos: how many episodes of a scene are filmed.
-        device: where the agents compute.
+        runs: the runs of a report.
+        trajectories: the number of episodes in a plan.
+        videos: the number of episodes filmed in each scene.
+        device: the agents' device.
         trust: a class outside flowrep that a run's algorithm may be.
     """
     drives = Drives()
@@ -85,7 +85,7 @@ def drive_again(
 
 
 def _one_of_each(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Returns by scene the finished run of the lowest seed of each stack in each family."""
+    """Returns the finished run of the lowest seed of each stack in each family, by scene."""
     by_scene: dict[str, list[Run]] = {}
     for family in families_of(runs):
         found: dict[tuple[str, str], Run] = {}
@@ -99,11 +99,11 @@ def _one_of_each(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 class Driver:
-    """A run's agent in a street of its own, at its training speed and frame rate.
+    """A run's agent in an environment of its own, at its training speed and frame rate.
 
     Args:
-        run: whose checkpoint is loaded.
-        device: where it computes.
+        run: the run whose checkpoint is loaded.
+        device: the agent's device.
         trust: a class outside flowrep that its algorithm may be.
     """
 
@@ -125,9 +125,9 @@ class Driver:
         """Drives one episode, greedily.
 
         Args:
-            episode_seed: names it.
-            look: is given all that the sensors see, frame by frame; without it the street draws
-                only what the agent needs.
+            episode_seed: identifies the episode.
+            look: called with all sensor maps of each frame; without it only the sensors that the
+                agent needs are rendered.
         """
         street = self._streets[SENSORS if look else tuple(self._eye.sensors)]
         seen, info = street.reset(options={"episode_seed": episode_seed})
@@ -147,7 +147,7 @@ class Driver:
         return Drive(episode_seed, np.array(points, float), info["outcome"], street.episode.steps)
 
     def film(self, episode_seed: int) -> tuple[Drive, list[Maps]]:
-        """Drives one episode and returns what the sensors saw of it as maps."""
+        """Drives one episode and returns it with the maps of its sensors."""
         frames: list[Maps] = []
         intrinsics = torch.as_tensor(self._streets[SENSORS].K)
 
@@ -158,13 +158,13 @@ class Driver:
         return self.drive(episode_seed, look), frames
 
     def close(self) -> None:
-        """Gives the simulator back."""
+        """Closes the simulator."""
         for street in self._streets.values():
             street.close()
 
 
 def _common_seeds(runs: Sequence[Run], count: int) -> list[int]:
-    """Returns episodes that all runs were evaluated on, else ones of their own choosing."""
+    """Returns seeds of episodes that all runs were evaluated on, or fixed ones if none are."""
     driven = []
     for run in runs:
         rows = run.by_condition.get(Condition("greedy", run.speed, run.fps), [])
@@ -204,7 +204,7 @@ def _film(driver: Driver, seed: int) -> FilmPart:
 
 
 def _differences(run: Run, drives: Sequence[Drive]) -> list[str]:
-    """Returns a line where an agent drives otherwise than its evaluation.csv says."""
+    """Returns a line if an agent drives differently from its evaluation.csv."""
     rows = run.by_condition.get(Condition("greedy", run.speed, run.fps), [])
     then = {int(row["episode_seed"]): (row["outcome"], int(row["length"])) for row in rows}
     changed = [

@@ -1,4 +1,4 @@
-"""What runs of a family did, scene by scene: estimates for each stack and condition."""
+"""Results of a family's runs by scene: estimates for each stack and condition."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ SPEEDS = ("low", "normal", "high")
 
 
 class Score(NamedTuple):
-    """An estimate of success, each seed's own, and how many seeds and episodes that were."""
+    """An estimate of success, each seed's success, and the numbers of seeds and episodes."""
 
     estimate: Estimate
     of_seeds: tuple[float, ...]
@@ -25,8 +25,8 @@ class Grid:
     """Success in one scene: a score for each series and condition, None where it is missing.
 
     Args:
-        scene: its name.
-        series: what is compared, in the order of the figure: stacks, or stacks of families.
+        scene: the scene's name.
+        series: the compared stacks, or stacks of families, in the figure's order.
         conditions: groups of bars, or points of a line.
         cells: the outcomes behind the scores.
         scores: by series and condition.
@@ -42,7 +42,7 @@ class Grid:
 
     @property
     def is_empty(self) -> bool:
-        """Says whether nothing at all was evaluated so."""
+        """Returns whether it has no score at all."""
         return all(score is None for score in self.scores.values())
 
 
@@ -55,10 +55,10 @@ def grid_of(
     """Returns the success of several series of runs in a scene.
 
     Args:
-        scene: its name; runs of others are left out.
-        runs: by series, which may have none.
-        conditions: in which they are compared.
-        bootstrap: makes the intervals.
+        scene: the scene's name; runs of other scenes are left out.
+        runs: the runs of each series, possibly none.
+        conditions: the conditions in which they are compared.
+        bootstrap: computes the intervals.
     """
     here = {name: [run for run in members if run.scene == scene] for name, members in runs.items()}
     cells = {(name, c): cell_of(here[name], c) for name, c in product(runs, conditions)}
@@ -86,7 +86,7 @@ def by_stack(runs: Sequence[Run], stacks: Sequence[str]) -> dict[str, list[Run]]
 
 
 def in_order(found: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Returns the names that were found, once each, the known ones first and in their order."""
+    """Returns the found names without repeats, the known ones first and in their order."""
     first = [name for name in known if name in found]
     return first + sorted(set(found) - set(first))
 

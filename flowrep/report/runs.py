@@ -1,4 +1,4 @@
-"""Reads run folders: what each was, what its episodes were, and what can't be read."""
+"""Reads run folders: configs, episodes and metrics, and a list of what can't be read."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ Rows = list[dict[str, str]]
 
 
 class Condition(NamedTuple):
-    """How agents were evaluated: policy, pedestrians' speed mode, frames a second."""
+    """How agents were evaluated: policy, pedestrians' speed mode, frames per second."""
 
     policy: str
     speed: str
@@ -24,7 +24,7 @@ class Condition(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run folder, read.
+    """The content of a run folder.
 
     Args:
         path: the folder.
@@ -40,10 +40,10 @@ class Run:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What its weights are a function of, by dotted key; the seed is not among it.
+        """The settings that determine its weights, by dotted key, without the seed.
 
-        Keys of the scene that every scene has for its own are under its name, and options of a
-        representation under that one's, so that two runs differ in them only where both have them.
+        Keys that are specific to a scene are under the scene's name, and options of a
+        representation under its name, so that two runs differ in them only if both have them.
         """
         parts = origin_of(self.config)
         del parts["flowrep"], parts["seed"]
@@ -59,12 +59,12 @@ class Run:
 
     @property
     def stack(self) -> str:
-        """What the agent sees, e.g. `ego+obj`, in one order whatever that of the config."""
+        """What the agent sees, e.g. `ego+obj`, in a fixed order."""
         return stack_of(self.config["representations"])
 
     @property
     def seed(self) -> int:
-        """Of the training."""
+        """The seed of the training."""
         return self.config["seed"]
 
     @property
@@ -79,22 +79,22 @@ class Run:
 
     @property
     def total_frames(self) -> int:
-        """How long it was to be trained."""
+        """The frames that it should be trained for."""
         return self.config["total_frames"]
 
     @property
     def frames(self) -> int:
-        """How long it has been trained, as its tables say."""
+        """The frames that it has been trained for, from its tables."""
         return max((int(row["frames"]) for row in (*self.metrics, *self.episodes)), default=0)
 
     @property
     def is_finished(self) -> bool:
-        """Says whether it was trained for as long as it was to be."""
+        """Returns whether it was trained for `total_frames`."""
         return self.frames >= self.total_frames
 
     @cached_property
     def tested(self) -> Rows:
-        """Rows of the finished agent in its own scene, drawn for no decision in training."""
+        """Rows of the finished agent in its own scene, which no decision in training used."""
         return [
             row
             for row in self.episodes
@@ -105,7 +105,7 @@ class Run:
 
     @cached_property
     def by_condition(self) -> dict[Condition, Rows]:
-        """The tested rows, by how they were evaluated."""
+        """The tested rows by condition."""
         rows: dict[Condition, Rows] = {}
         for row in self.tested:
             condition = Condition(row["policy"], row["speed"], float(row["fps"]))
@@ -117,7 +117,7 @@ _OF_EVERY_SCENE = ("camera", "frame_rate_hz")
 
 
 def stack_of(representations: Iterable[str]) -> str:
-    """Returns the name of a set of representations, whatever their order.
+    """Returns the name of a set of representations, in any order.
 
     >>> stack_of(["seg2", "obj", "ego"]), stack_of(["raw"])
     ('ego+obj+seg2', 'raw')
@@ -128,10 +128,10 @@ def stack_of(representations: Iterable[str]) -> str:
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
-    """Returns the runs in folders, however deep, and a line for each that was left out.
+    """Returns the runs in folders at any depth, and a line for each that was left out.
 
     Raises:
-        RunFolderError: there is none at all in one of the folders.
+        RunFolderError: one of the folders holds no run at all.
     """
     runs: dict[Path, Run] = {}
     complaints: list[str] = []
@@ -199,7 +199,7 @@ def _parts(run: Run) -> list[tuple[str, Any, tuple[type, ...]]]:
 
 
 def _without_repeats(runs: list[Run], complaints: list[str]) -> list[Run]:
-    """Keeps one run of a config and seed: two would count as two seeds."""
+    """Keeps one run per config and seed, since two would count as two seeds."""
     kept: dict[Any, Run] = {}
     for run in runs:
         key = (run.stack, run.seed, repr(sorted(run.identity.items(), key=lambda item: item[0])))

@@ -1,4 +1,4 @@
-"""The parts of a report: headings, notes, figures and tables, whichever medium shows them."""
+"""The parts of a report: headings, notes, figures and tables, independent of the medium."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ MISSING = "missing"
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure that can be drawn as a whole, for a paper, or panel by panel, for a page.
+    """A figure that can be drawn whole for a paper, or panel by panel for a page.
 
     Args:
-        name: of its files.
-        caption: what is shown, and what its intervals are.
-        panels: what each panel shows.
-        draw: draws panels beside one another.
+        name: the name of its files.
+        caption: describes the figure and its intervals.
+        panels: the data of each panel.
+        draw: draws panels side by side.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Drawing:
         return self.draw(self.panels, LIGHT)
 
     def parts(self, theme: Theme) -> list[Figure]:
-        """Returns a figure a panel, for a page."""
+        """Returns one figure per panel, for a page."""
         return [self.draw([panel], theme, for_page=True) for panel in self.panels]
 
     def to_latex(self) -> str:
@@ -62,9 +62,9 @@ class Section:
     """One part of a report.
 
     Args:
-        name: of the folder of its files.
+        name: the name of the folder of its files.
         title: its heading.
-        notes: sentences before its figures: what is missing, what is left out.
+        notes: sentences before its figures on what is missing or left out.
         drawings: its figures.
         tables: its tables.
     """
@@ -111,7 +111,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def what_is_missing(grids: Sequence[Grid]) -> tuple[str, ...]:
-    """Returns a sentence for each scene on the cells that no finished run fills."""
+    """Returns a sentence per scene on the cells that no finished run fills."""
     notes = []
     for grid in grids:
         empty: dict[str, list[Condition]] = {}

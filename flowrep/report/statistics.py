@@ -1,9 +1,9 @@
-"""What the scores of a few runs say: interquartile means, bootstrap intervals, comparisons.
+"""Statistics of the scores of a few runs: interquartile means, bootstrap intervals, comparisons.
 
-As rliable does it (Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical
-Precipice, NeurIPS 2021): scores are aggregated by their interquartile mean over runs and scenes,
+As in rliable (Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical
+Precipice, NeurIPS 2021), scores are aggregated by their interquartile mean over runs and scenes,
 and runs are resampled within their scene. Two things differ. A run's score is itself a share of a
-few hundred episodes, so the episodes are resampled too, the same ones for all runs: otherwise two
+few hundred episodes, so the episodes are resampled too, the same ones for all runs; otherwise two
 seeds that happen to agree would have an interval of no width. And scenes may have different numbers
 of runs, or lack some.
 """
@@ -20,14 +20,14 @@ from flowrep.experiment.evaluation import wilson_interval
 
 Array = NDArray[np.float64]
 
-_OF_RUNS, _OF_EPISODES = 0, 1  # set the two draws apart
+_OF_RUNS, _OF_EPISODES = 0, 1  # keep the two draws independent
 
 FEWEST_SEEDS = 3
-"""With fewer a side, a difference is said of the agents, not of what they were trained on."""
+"""With fewer per side, a difference is stated for these agents only, not for their stacks."""
 
 
 class Estimate(NamedTuple):
-    """A number with the ends of its interval."""
+    """A number with the bounds of its interval."""
 
     value: float
     low: float
@@ -35,13 +35,13 @@ class Estimate(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """How much better one side does than another, from score to score.
+    """How much better one side does than another.
 
     Args:
         difference: of the interquartile means, with its bootstrap interval.
         improvement: the probability that a run of the first side beats one of the second.
         p_value: of Welch's t-test over the runs' scores; nan where a side has one run alone.
-        runs: how many of each side; of one scene alone where a scene has one run of a side.
+        runs: the number of runs per side; that of one scene if a scene has one run of a side.
     """
 
     difference: Estimate
@@ -51,17 +51,17 @@ class Comparison(NamedTuple):
 
     @property
     def is_noise(self) -> bool:
-        """Says whether the difference can't be told from noise.
+        """Returns whether the difference can't be told from noise.
 
-        Its interval has 0 inside; or the t-test sees nothing, since a bootstrap over two or three
-        runs is too sure of itself.
+        That is so if its interval contains 0, or if the t-test finds nothing: a bootstrap over two
+        or three runs gives intervals that are too narrow.
         """
         has_zero = self.difference.low <= 0 <= self.difference.high
         return has_zero or self.p_value >= 0.05
 
     @property
     def verdict(self) -> str:
-        """Says in words what the difference is worth."""
+        """Returns in words how far the difference can be trusted."""
         if self.is_noise:
             return "can't be told from noise"
         word = "higher" if self.difference.value > 0 else "lower"
@@ -81,16 +81,16 @@ def interquartile_mean(scores: Any, axis: int = -1) -> Any:
 
 
 def rates(outcomes: Array, weights: Array | None = None) -> Array:
-    """Returns each run's share of episodes that have it.
+    """Returns each run's share of episodes with a property, such as success.
 
     Args:
         outcomes: [R, E], 1 where run r's episode e has it, 0 where not, nan where the run did not
             drive that episode.
-        weights: [N, E], how often each episode counts in each of N resamples; all once if None.
+        weights: [N, E], how often each episode counts in each of N resamples; once if None.
 
     Returns:
-        [N, R], or [R] without weights. A run none of whose episodes is in a resample keeps its own
-        rate there.
+        [N, R], or [R] without weights. A run without episodes in a resample keeps its own rate
+        there.
     """
     there = ~np.isnan(outcomes)
     found = np.where(there, outcomes, 0.0)
@@ -105,10 +105,9 @@ class Bootstrap:
     """Resamples runs and episodes; the same seed gives the same intervals.
 
     Args:
-        resamples: how many.
-        confidence: share of them inside an interval.
-        seed: of the generator; each estimate starts from it anew, whatever was estimated
-            before.
+        resamples: the number of resamples.
+        confidence: the share of them inside an interval.
+        seed: the generator's seed; each estimate starts from it, whatever was estimated before.
     """
 
     def __init__(self, resamples: int = 2000, confidence: float = 0.95, seed: int = 0) -> None:
@@ -133,7 +132,7 @@ class Bootstrap:
         )
 
     def pooled_share(self, outcomes: Array) -> Estimate:
-        """Returns the share of all runs' episodes together that have it; nan without episodes.
+        """Returns the share over the pooled episodes of all runs; nan without episodes.
 
         Args:
             outcomes: [R, E], nan where an episode does not count.
@@ -156,8 +155,8 @@ class Bootstrap:
         """Returns how much better the first of each pair does than the second.
 
         Args:
-            scenes: for each scene two sides, [R1, E] and [R2, E]: column e is the same episode in
-                both, so that what makes an episode hard is no part of the difference.
+            scenes: two sides for each scene, [R1, E] and [R2, E]. Column e is the same episode in
+                both, so that an episode's difficulty is not part of the difference.
         """
         own = [(rates(a), rates(b)) for a, b in scenes]
         drawn = [
@@ -183,9 +182,9 @@ class Bootstrap:
         """Returns rates [N, R] of resampled runs of each side, over the same drawn episodes.
 
         Args:
-            scene: its number, so that scenes are drawn from one by one.
-            outcomes: of all sides, below one another.
-            sides: how many runs each side has.
+            scene: the scene's number, so that each scene has draws of its own.
+            outcomes: [R, E] of all sides, stacked.
+            sides: the number of runs of each side.
         """
         rng = np.random.default_rng((self.seed, scene, _OF_RUNS))
         weights = _episode_weights(self.seed, scene, outcomes.shape[1], self.resamples)
@@ -223,7 +222,7 @@ def _improvement(ours: Array, theirs: Array) -> Any:
 
 
 def _runs_a_side(scenes: Sequence[tuple[Array, Array]]) -> int:
-    """Runs of all scenes together, where each tells how runs differ; else of the poorest."""
+    """The runs per side over all scenes if each scene has several; else the fewest of a scene."""
     fewest = min(len(side) for pair in scenes for side in pair)
     return fewest if fewest < 2 else min(sum(len(pair[side]) for pair in scenes) for side in (0, 1))
 

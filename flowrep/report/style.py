@@ -1,4 +1,4 @@
-"""How figures look: one colour a stack in every figure, told apart by colour-blind people too."""
+"""The look of figures: one colour per stack in every figure, safe for colour-blind readers."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -24,8 +24,8 @@ class Theme:
 LIGHT = Theme("light", "#ffffff", "#1b1f24", "#6b7480")
 DARK = Theme("dark", "#16191d", "#e6e9ec", "#98a2ad")
 
-# Okabe and Ito's colours for single maps and for the two flows. What is added to the flows has its
-# own map's hue, darker on white and lighter on black, and a hatch or a dashed line.
+# Okabe and Ito's colours for single maps and for the two flows. A map added to the flows has its
+# own hue, darker on white and lighter on black, and a hatch or a dashed line.
 _COLOURS = {
     "ego": "#e69f00",
     "raw": "#56b4e9",
@@ -42,7 +42,7 @@ _ADDED = {
 _DARK = {"ego+obj": "#2f8fd6"}  # on black its own blue is too faint for a line
 _OTHERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _HATCHES = ("", "////", "xxxx", "....")
-_OF_VARIANTS = ("", "......", "++++", "||||")  # none of a stack's own
+_OF_VARIANTS = ("", "......", "++++", "||||")  # no stack uses them
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
 
 _TITLES = {
@@ -63,15 +63,15 @@ class Look:
 
     @property
     def dashes(self) -> Literal["-", "--"]:
-        """The line's style; what is hatched as a bar is dashed as a line."""
+        """The line's style, dashed if the bar is hatched."""
         return "--" if self.hatch else "-"
 
 
 def looks(names: Sequence[str], theme: Theme) -> dict[str, Look]:
     """Returns how each series of a figure is drawn.
 
-    The paper's stacks look the same in all figures, and under several configs ("ego, noisy") they
-    keep their colour; where others are among the names, colours are given in turn.
+    The paper's stacks look the same in all figures, and keep their colour under several configs
+    ("ego, noisy"). If other names are among them, colours are assigned in turn.
     """
     parts = {name: name.partition(", ")[::2] for name in names}
     known = all(stack in _COLOURS or stack in _ADDED for stack, _ in parts.values())
@@ -96,7 +96,7 @@ def looks(names: Sequence[str], theme: Theme) -> dict[str, Look]:
 
 
 def saving() -> AbstractContextManager[None]:
-    """Writes figures so that the same one gives the same file, with text as text in PDF."""
+    """Makes saved figures reproducible byte for byte, with text as text in PDF."""
     settings: Any = {"svg.hashsalt": "flowrep", "pdf.fonttype": 42, "hatch.linewidth": 0.7}
     return mpl.rc_context(settings)
 
@@ -133,7 +133,7 @@ def styled(theme: Theme, font_pt: float) -> Iterator[None]:
 
 
 def words(name: str) -> str:
-    """Returns a name of the configs as a heading; the paper's scenes are spelt as there.
+    """Returns a config name as a heading; the paper's scenes are spelt as in the paper.
 
     >>> words("s_turn"), words("my_crossing")
     ('S-Turn', 'My crossing')

@@ -40,11 +40,11 @@ class Table:
     """Text in rows.
 
     Args:
-        name: of its files.
-        caption: says what the numbers are; goes with the table everywhere.
-        header: of the columns; the first is aligned left, the others right.
+        name: the name of its files.
+        caption: describes the numbers; shown with the table everywhere.
+        header: the columns' names; the first column is aligned left, the others right.
         blocks: (heading, rows) of one or several groups of rows; a heading may be empty.
-        words: columns of text, by their place, aligned left as well.
+        words: indices of further text columns, aligned left as well.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Table:
     words: tuple[int, ...] = ()
 
     def is_text(self, column: int) -> bool:
-        """Says whether a column is aligned left."""
+        """Returns whether a column is aligned left."""
         return column == 0 or column in self.words
 
     def to_latex(self) -> str:
@@ -91,7 +91,7 @@ class Table:
         return text.getvalue()
 
     def draw(self, theme: Theme) -> Figure:
-        """Returns the table as a figure of the size that its text takes."""
+        """Returns the table as a figure that fits its text."""
         rows = [row for _, members in self.blocks for row in (self.header, *members)]
         widths = [
             max(len(row[i]) for row in rows) * _CHARACTER_IN + _GAP_IN
@@ -142,14 +142,14 @@ class _Pen:
         self.y += _ROW_IN
 
     def _text(self, text: str, x: float, align: str, **style: Any) -> None:
-        # no mathtext: a $ is a dollar
+        # no mathtext: $ is literal
         self.axes.text(
             x, self.y + _ROW_IN / 2, text, ha=align, va="center", parse_math=False, **style
         )
 
 
 def latex_text(text: str) -> str:
-    r"""Returns text with what LaTeX would take for its own escaped.
+    r"""Returns text with LaTeX's special characters escaped.
 
     >>> print(latex_text("85 % of ego_x"))
     85 \% of ego\_x
