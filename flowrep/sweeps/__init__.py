@@ -1,1 +1,1 @@
-"""Many runs by one command: each a process and a folder of its own, so that a sweep can go on."""
+"""Many runs by one command, each with its own process and folder, so that sweeps can continue."""

@@ -3,9 +3,9 @@
     {"folder": ..., "config": {...}, "machine": {"device": ..., "num_workers": ...},
      "overrides": [...]}
 
-The run stops, and saves, when stdin is closed: when the process that asked for it is gone. SIGUSR1
-and SIGUSR2, by which SLURM tells all processes of a job that its time is nearly over, are for that
-process alone.
+The run saves and stops when stdin is closed, that is, when the requesting process has ended. It
+ignores SIGUSR1 and SIGUSR2, which SLURM sends to all processes of a job whose time is nearly over;
+only the requesting process handles them.
 """
 
 import json
@@ -30,11 +30,11 @@ from flowrep.sweeps.job import definition
 from flowrep.sweeps.stopping import stop_when_closed
 from flowrep.train import carry_out
 
-PATIENCE_S = 60.0  # with a run of the same sweep that was told to stop, and saves
+PATIENCE_S = 60.0  # to wait for a run of the same sweep that is saving after a stop
 
 
 def main() -> None:
-    """Does what is left of the run; what goes wrong is said in a line of its log."""
+    """Does what remains of the run; an error becomes a line of its log."""
     for number in (signal.SIGUSR1, signal.SIGUSR2):
         signal.signal(number, signal.SIG_IGN)
     request = json.loads(sys.stdin.buffer.readline())
@@ -51,7 +51,7 @@ def main() -> None:
 
 @contextmanager
 def held_soon(folder: RunFolder) -> Iterator[None]:
-    """Holds a run's folder; one that is in use is waited for a while."""
+    """Locks a run's folder, waiting for a while if it is in use."""
     until = time.monotonic() + PATIENCE_S
     with ExitStack() as stack:
         while True:
@@ -66,15 +66,15 @@ def held_soon(folder: RunFolder) -> Iterator[None]:
 
 
 def started_or_found(folder: RunFolder, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the config of the run in a folder, once that is there and the one asked for.
+    """Returns the config of the requested run, after writing it to its folder if it is new.
 
     Raises:
         RunFolderError: the folder holds another run.
-        UsageError, SceneError: there can't be such a run.
+        UsageError, SceneError: the requested config is invalid.
     """
     asked = request["config"]
     target = asked["algorithm"]["_target_"]
-    # it was named by the person who started the sweep
+    # it was named on the sweep's command line
     trust = {} if target in ALGORITHMS else {"trust": target}
     if not (folder.path / "config.yaml").is_file():
         own_keys = asked.keys() - TrainConfig.keys()

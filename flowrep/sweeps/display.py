@@ -1,4 +1,4 @@
-"""A sweep's progress in one place, while its runs write logs of their own."""
+"""Shows a sweep's progress in one place, while its runs write logs of their own."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -14,14 +14,14 @@ EVERY_S = 1.0
 
 
 class Display:
-    """Shows how runs stand: bars on a terminal, elsewhere a line for each that begins or ends.
+    """Shows the state of runs: bars on a terminal, else a line whenever a run begins or ends.
 
     Use it as a context manager around the sweep.
 
     Args:
-        standings: gives how all runs stand now.
-        total: how many runs there will be, None where that is unknown.
-        console: where to.
+        standings: returns the current state of all runs.
+        total: the number of runs of the sweep, None if unknown.
+        console: the console to write to.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Display:
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> "Display":
-        """Begins to watch; what had ended before is no news."""
+        """Begins to watch; runs that ended before are not announced."""
         self._states = {s.name: s.state for s in self._standings() if s.state != RUNNING}
         self._progress.start()
         self._thread.start()
@@ -62,14 +62,14 @@ class Display:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Looks once more, and leaves the terminal as it was."""
+        """Updates once more and restores the terminal."""
         self._over.set()
         self._thread.join()
         self.look()
         self._progress.stop()
 
     def look(self) -> None:
-        """Shows how the runs stand now."""
+        """Shows the current state of the runs."""
         standings = self._standings()
         for standing in standings:
             if self._states.get(standing.name, WAITING) != standing.state:
@@ -87,7 +87,7 @@ class Display:
         self._progress.update(self._all, completed=len(over), note=note)
 
     def _draw_bar(self, standing: Standing) -> None:
-        """Keeps a bar for a run while it runs."""
+        """Shows a bar for a run while it runs."""
         bar = self._bars.get(standing.name)
         if standing.state != RUNNING:
             if bar is not None:
@@ -108,7 +108,7 @@ class Display:
 
 
 def said(standing: Standing) -> str:
-    """Returns how a run stands in one line.
+    """Returns the state of a run in one line.
 
     >>> said(Standing("s_turn_ego_s0", "finished", success=0.25))
     's_turn_ego_s0: finished, success 25 %'

@@ -1,4 +1,4 @@
-"""How a run of a sweep ended, kept in its folder."""
+"""The ending of a sweep's run, kept in its folder."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -16,9 +16,9 @@ class Ending:
     """How the last attempt at a run ended.
 
     Args:
-        how: "finished" is final; the others are tried again when the sweep is.
+        how: "finished" is final; other runs are tried again when the sweep is continued.
         success: a finished run's share of greedy episodes that succeed.
-        message: of a run that failed, in one line.
+        message: the error of a failed run, in one line.
     """
 
     how: Literal["finished", "failed", "stopped"]
@@ -26,14 +26,14 @@ class Ending:
     message: str = ""
 
     def write(self, folder: Path) -> None:
-        """Keeps it in a run's folder."""
+        """Writes it to a run's folder."""
         whole = folder / "ending.json.tmp"
         whole.write_text(json.dumps(asdict(self)) + "\n", encoding="utf-8")
         whole.replace(folder / "ending.json")
 
     @classmethod
     def read(cls, folder: Path) -> "Ending | None":
-        """Returns what a run's folder holds, None while it has not ended."""
+        """Returns the ending in a run's folder, None while the run has not ended."""
         try:
             return cls(**json.loads((folder / "ending.json").read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
@@ -41,5 +41,5 @@ class Ending:
 
     @staticmethod
     def forget(folder: Path) -> None:
-        """Makes the run one that has not ended."""
+        """Removes the ending from a run's folder."""
         (folder / "ending.json").unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""One run of a sweep, as a launcher's worker sees it: a process to start and to wait for.
+"""Runs one job of a sweep in a launcher's worker: starts a process and waits for it.
 
 Workers import this module alone, so it imports no torch.
 """
@@ -29,7 +29,7 @@ register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker re
 
 POLL_S = 0.5
 PARENT = os.getppid()
-BUSY = threading.Lock()  # while there is a run to wait for
+BUSY = threading.Lock()  # held while a run is waited for
 RUN = (sys.executable, "-m", "flowrep.sweeps")
 _BASIC_SWEEPER = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
 
@@ -39,21 +39,21 @@ class RunFailedError(RuntimeError):
 
 
 def job(config: DictConfig) -> float:
-    """Does what is left of one run in a process of its own; what Hydra's launchers call.
+    """Does what remains of one run in a process of its own; called by Hydra's launchers.
 
     Returns:
-        Its share of final greedy episodes that succeed; nan where a grid's run has none, so that
-        the others go on.
+        Its share of final greedy episodes that succeed; nan if a run of a grid has none, so that
+        the other runs go on.
 
     Raises:
-        RunFailedError: the run has no result, and a sweeper asked for it that has to know.
+        RunFailedError: the run has no result, and its sweeper needs one.
     """
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
     is_worker = multiprocessing.current_process().name != "MainProcess"  # of a pool, as joblib's
     plain = plain_config(config)
     machine = {key: plain[key] for key in ("device", "num_workers")}
-    if is_worker and plain["num_workers"] == "auto":  # it has no core but its own
+    if is_worker and plain["num_workers"] == "auto":  # it has only its own core
         machine["num_workers"] = 0
     request = {
         "folder": str(folder),
@@ -78,7 +78,7 @@ def job(config: DictConfig) -> float:
 
 @cache
 def _end_with_launcher() -> None:
-    """Has a pool's worker end once the launching process is gone, which it would outlive."""
+    """Makes a pool's worker end with the launching process, which it would otherwise outlive."""
 
     def watch() -> None:
         while os.getppid() == PARENT:
@@ -90,11 +90,11 @@ def _end_with_launcher() -> None:
 
 
 def supervised(request: Mapping[str, Any], should_stop: Callable[[], bool]) -> Ending:
-    """Runs what a request says, unless it is done, and returns how that ended.
+    """Runs the requested run, unless it is finished, and returns its ending.
 
     Args:
-        request: for `flowrep.sweeps.__main__`.
-        should_stop: asked now and then; the run then saves and ends.
+        request: the request for `flowrep.sweeps.__main__`.
+        should_stop: polled; once it returns true, the run saves and ends.
     """
     folder = Path(request["folder"])
     ending = Ending.read(folder)
@@ -118,7 +118,7 @@ def supervised(request: Mapping[str, Any], should_stop: Callable[[], bool]) -> E
 
 
 def _wait(run: subprocess.Popen[bytes], request: str, should_stop: Callable[[], bool]) -> int:
-    """Returns a run's exit code; whatever ends this process first, the run saves and ends too."""
+    """Returns a run's exit code; if this process ends first, the run saves and ends too."""
     assert run.stdin is not None
     is_told = False
     try:
@@ -129,7 +129,7 @@ def _wait(run: subprocess.Popen[bytes], request: str, should_stop: Callable[[], 
                 run.terminate()
                 is_told = True
             time.sleep(POLL_S)
-    except BrokenPipeError:  # it ended before it read; its log says why
+    except BrokenPipeError:  # it ended before reading; its log says why
         pass
     finally:
         if run.poll() is None and not is_told:
@@ -138,7 +138,7 @@ def _wait(run: subprocess.Popen[bytes], request: str, should_stop: Callable[[], 
 
 
 def _without_result(log: Path, begin: int, code: int) -> Ending:
-    """Returns the ending of a run that left none: stopped by a signal it heeds, or failed."""
+    """Returns the ending of a run that wrote none: stopped by a signal it handles, or failed."""
     if code in (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGTERM):
         return Ending(STOPPED)
     if code < 0:
@@ -152,7 +152,7 @@ def _without_result(log: Path, begin: int, code: int) -> Ending:
 
 
 def _is_same(folder: Path, config: Mapping[str, Any]) -> bool:
-    """Says whether a run is defined by `config`; `flowrep.sweeps.__main__` says what differs."""
+    """Returns whether `config` defines a run; `flowrep.sweeps.__main__` reports a difference."""
     try:
         stored = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError):
@@ -161,14 +161,14 @@ def _is_same(folder: Path, config: Mapping[str, Any]) -> bool:
 
 
 def definition(config: Any) -> Any:
-    """Returns what of a config makes a run what it is, as JSON has it."""
+    """Returns the part of a config that defines a run, as plain JSON data."""
     machine = ("device", "num_workers", "trust", "resume")
     kept = {k: v for k, v in config.items() if k not in machine} if config else config
     return json.loads(json.dumps(kept))
 
 
 def _leave_ctrl_c_to_the_launcher() -> None:
-    """Ignores Ctrl-C in a worker, for good: it may wait for its next job when that is pressed.
+    """Ignores Ctrl-C in a worker permanently, since it may be waiting for its next job.
 
     The launching process has a handler of its own, which stays, and marks the sweep as stopped.
     """

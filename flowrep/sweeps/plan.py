@@ -1,4 +1,4 @@
-"""What a sweep will do, before Hydra begins: its folder, and its runs where they are settled."""
+"""The plan of a sweep before Hydra begins: its folder, and its runs if they are known."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from flowrep.config.run_names import run_of_sweep
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep to be started or gone on with.
+    """A sweep to start or continue.
 
     Args:
-        folder: that holds a folder for each run.
-        total: how many runs there will be, None where only the sweeper knows.
-        names: of the runs' folders, none where a sweeper such as Optuna's makes them up.
-        options: overrides of the chosen plugins that a sweep of runs wants and nobody typed.
+        folder: the folder that holds a folder for each run.
+        total: the number of runs, None if only the sweeper knows it.
+        names: names of the runs' folders, empty if a sweeper such as Optuna's chooses them.
+        options: overrides of the chosen plugins that a sweep needs and that were not typed.
     """
 
     folder: Path
@@ -32,21 +32,21 @@ class Plan:
     options: tuple[str, ...] = ()
 
     def folders(self) -> list[Path]:
-        """Returns the folders of its runs; of those that a sweeper made up, what is there."""
+        """Returns the folders of its runs, only the existing ones if a sweeper names them."""
         if self.names:
             return [self.folder / name for name in self.names]
         return sorted(path for path in self.folder.glob("*/") if (path / "job.log").is_file())
 
 
 def is_sweep(arguments: Sequence[str]) -> bool:
-    """Says whether a command line asks for several runs, not only for a look at their config."""
+    """Returns whether a command line asks for several runs, and not only shows their config."""
     args = get_args_parser().parse_args([*arguments])
     modes = [text for text in args.overrides if text.startswith("hydra.mode=")]
     return not only_shows(args) and (args.multirun or modes[-1:] == ["hydra.mode=MULTIRUN"])
 
 
 def plan_of(config_name: str, arguments: Sequence[str]) -> Plan:
-    """Returns the sweep that a command line, found to be right, asks for.
+    """Returns the sweep that a valid command line asks for.
 
     Args:
         config_name: a file of conf/, without its ending.
@@ -82,9 +82,9 @@ def plan_of(config_name: str, arguments: Sequence[str]) -> Plan:
 
 
 _OPTIONS = {
-    # jobs that are done already take no time: batches would grow, and hold those that are not
+    # finished jobs take no time, so batches would grow and delay the unfinished ones
     "JoblibLauncher": ("hydra.launcher.batch_size=1",),
-    # what a run returns is its success, and one that fails is no reason to end the study
+    # a run returns its success, and a failed run should not end the study
     "OptunaSweeper": ("hydra.sweeper.direction=maximize", "hydra.sweeper.max_failure_rate=1.0"),
 }
 

@@ -1,4 +1,4 @@
-"""How a sweep stands, read from the folders of its runs."""
+"""The state of a sweep, read from the folders of its runs."""
 
 import json
 import os
@@ -15,15 +15,15 @@ WAITING, RUNNING = "waiting", "running"
 
 
 class Standing(NamedTuple):
-    """How one run stands.
+    """The state of one run.
 
     Args:
-        name: of its folder.
+        name: the name of its folder.
         state: "waiting", "running", or how it ended.
-        frames: trained for so far, of `total`; 0 of 0 while that is unknown.
+        frames: training frames so far, of `total`; 0 of 0 while unknown.
         success: the share of its last training episodes that succeed, or of the final greedy ones
-            where it has finished; None while that is unknown.
-        message: of a run that failed.
+            if it has finished; None while unknown.
+        message: the error of a failed run.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Standing(NamedTuple):
 
 
 def standing_of(run: Path) -> Standing:
-    """Returns how the run in this folder stands, which may not exist yet."""
+    """Returns the state of the run in a folder, which may not exist yet."""
     ending = Ending.read(run)
     if ending is not None:
         return Standing(run.name, ending.how, 0, 0, ending.success, ending.message)
@@ -49,12 +49,12 @@ def standing_of(run: Path) -> Standing:
 
 
 def standings_of(runs: Sequence[Path]) -> list[Standing]:
-    """Returns how runs stand, in their order."""
+    """Returns the states of runs, in their order."""
     return [standing_of(run) for run in runs]
 
 
 def _is_held(run: Path) -> bool:
-    """Says whether a process works in a run's folder, by what it left in the lock."""
+    """Returns whether a process works in a run's folder, judged by its lock file."""
     try:
         holder = json.loads((run / ".lock").read_text(encoding="utf-8"))
         if holder["host"] != platform.node():
@@ -66,7 +66,7 @@ def _is_held(run: Path) -> bool:
 
 
 def _last_row(table: Path) -> dict[str, str]:
-    """Returns the last whole row of a table by its columns, empty where there is none."""
+    """Returns the last complete row of a table by its columns, empty if there is none."""
     try:
         with table.open("rb") as file:
             names = file.readline().decode().strip().split(",")

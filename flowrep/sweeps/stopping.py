@@ -1,4 +1,4 @@
-"""Ending a sweep so that every run saves: launching process, workers and runs pass it on."""
+"""Stops a sweep so that every run saves, from the launching process through workers to runs."""
 
 import os
 import signal
@@ -12,15 +12,15 @@ _MARK = ".stop"
 
 
 def is_stopped(sweep: Path) -> bool:
-    """Says whether the sweep in this folder is to end."""
+    """Returns whether the sweep in this folder should stop."""
     return (sweep / _MARK).exists()
 
 
 class SweepStop:
-    """Turns SIGINT and SIGTERM to the launching process into a mark in the sweep's folder.
+    """Turns SIGINT and SIGTERM in the launching process into a marker file in the sweep's folder.
 
-    Workers, on whatever machine, look for it. A second signal ends this process at once. Use it as
-    a context manager.
+    Workers on any machine look for it. A second signal ends this process at once. Use it as a
+    context manager.
 
     Args:
         sweep: the sweep's folder, which exists.
@@ -39,7 +39,7 @@ class SweepStop:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Gives the handlers back."""
+        """Restores the handlers and removes the marker."""
         self._give_back()
         self._mark.unlink(missing_ok=True)
 
@@ -55,9 +55,9 @@ class SweepStop:
 
 
 def stop_when_closed(descriptor: int) -> None:
-    """Has this process asked to stop, by SIGTERM, when the other end of a pipe is closed.
+    """Sends SIGTERM to this process when the other end of a pipe is closed.
 
-    A pipe's other end is closed however the process that holds it ends.
+    The other end is closed however the process that holds it ends.
     """
 
     def watch() -> None:

@@ -1,4 +1,4 @@
-"""A sweep from the command line: started, watched, and summed up."""
+"""Starts, watches and sums up a sweep from the command line."""
 
 import sys
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ from flowrep.sweeps.stopping import SweepStop
 
 
 def run_sweep(config_name: str) -> None:
-    """Runs the sweep of `sys.argv`, which is found to be right, and ends the process.
+    """Runs the sweep of `sys.argv`, which has been checked, and ends the process.
 
-    The exit code is 0 if all runs have finished, 1 if not, and that of the signal which stopped it.
+    The exit code is 0 if all runs have finished, that of a signal that stopped it, else 1.
     """
     try:
         plan = plan_of(config_name, sys.argv[1:])
@@ -47,7 +47,7 @@ def run_sweep(config_name: str) -> None:
                 command()
         except KeyboardInterrupt:
             failure = 130
-        except SystemExit as end:  # a launcher's own trouble, which Hydra has told
+        except SystemExit as end:  # the launcher failed, and Hydra has reported it
             failure = end.code if isinstance(end.code, int) else 1
     standings = standings_of(plan.folders())
     is_whole = all(s.state == FINISHED for s in standings) and not failure
@@ -63,10 +63,10 @@ def sum_up(
     """Prints how a sweep ended.
 
     Args:
-        plan: of the sweep.
-        standings: of its runs.
-        again: the command that goes on with it; empty where nothing is left to do.
-        console: where to.
+        plan: the sweep's plan.
+        standings: the states of its runs.
+        again: the command that continues it; empty if nothing is left to do.
+        console: the console to write to.
     """
     console = console or Console()
     finished = [s for s in standings if s.state == FINISHED]
