@@ -1,8 +1,7 @@
-"""A privileged baseline: sees every pose, knows where everyone will walk, and searches ahead.
+"""A privileged baseline that knows every pose, present and future, and searches ahead.
 
-It is the upper bound that a scene is measured by, not an agent: it plays the episode's own
-clockwork forward, from the present to the ending zone, and keeps a broad beam of drives that
-touch nothing.
+It is not an agent but an upper bound for a scene: a beam search that simulates the episode from
+the present to the ending zone and keeps only drives without a collision.
 """
 
 from collections.abc import Sequence
@@ -20,19 +19,19 @@ from flowrep.scenes.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corn
 
 Array = NDArray[Any]
 _ACTIONS = np.array([0, 1, 2])
-_HOLD_STEPS = 2  # one decision of the search, in steps
-_MARGIN_M = 0.1  # kept from people and from the road's edge
+_HOLD_STEPS = 2  # steps for which each decision of the search is held
+_MARGIN_M = 0.1  # distance kept from people and from the road's edge
 _LOOK_AHEAD_M = 6.0
-# States of one cell are as good as one another: x, y in metres, yaw and yaw rate in degrees.
+# States in the same cell are interchangeable: x, y in metres, yaw and yaw rate in degrees.
 _CELL = np.array([0.5, 0.5, 4.0, 6.0])
 
 
 class Planner:
-    """Chooses the action of a planned drive; plans anew where its actions were not taken.
+    """Follows a planned drive, and plans again if its actions were not taken.
 
     Args:
-        beams: how many drives are kept side by side; a broader beam is tried where all of a
-            narrower one's end before the ending zone.
+        beams: beam widths; a wider beam is tried if no drive of a narrower one reaches the ending
+            zone.
     """
 
     def __init__(self, beams: Sequence[int] = (100, 600)) -> None:
@@ -41,10 +40,10 @@ class Planner:
         self._ways: dict[tuple[Rules, str], GoalDistance] = {}
         self._plan: dict[int, int] = {}
         self._episode: Episode | None = None
-        self._expected = (0, 0.0)  # steps and yaw rate, should the action be taken
+        self._expected = (0, 0.0)  # steps and yaw rate if the action is taken
 
     def __call__(self, env: StreetEnv) -> int:
-        """Returns the action for the env's running episode."""
+        """Returns the next action in the env's current episode."""
         episode = env.episode
         state = episode.now.vehicle
         is_followed = episode is self._episode and self._expected == (
@@ -62,7 +61,7 @@ class Planner:
         return action
 
     def search(self, episode: Episode) -> list[int]:
-        """Returns the actions of a drive to the ending zone, else of the longest one found."""
+        """Returns the actions of a drive to the ending zone, or of the longest drive found."""
         search = _Search(episode, self._way(episode))
         actions: list[int] = []
         for beam in self.beams:
@@ -81,7 +80,7 @@ class Planner:
 
 
 class _Search:
-    """The clockwork of one episode for many vehicles at once."""
+    """Simulates one episode for many vehicles at once."""
 
     def __init__(self, episode: Episode, way: GoalDistance) -> None:
         self.episode, self.way = episode, way
@@ -112,7 +111,7 @@ class _Search:
     def drive(
         self, state: VehicleState, actions: Array, ticks: int
     ) -> tuple[VehicleState, Array, Array]:
-        """Returns the states after one decision, who is unharmed, and who has arrived."""
+        """Returns the states after one decision, and which are unharmed and which have arrived."""
         alive = np.ones(actions.size, dtype=bool)
         arrived = np.zeros(actions.size, dtype=bool)
         signs = np.array(YAW_SIGN)[actions]
@@ -129,7 +128,7 @@ class _Search:
         return state, alive, arrived
 
     def best(self, state: VehicleState, alive: Array, most: int) -> Array:
-        """Returns the numbers of the most promising states, one of each cell."""
+        """Returns the indices of the most promising states, one for each cell."""
         index = np.flatnonzero(alive)
         x, y, yaw, rate = (value[index] for value in state)
         ahead = [_LOOK_AHEAD_M * share for share in (0.5, 1.0)]
@@ -146,7 +145,7 @@ class _Search:
         low = np.array([state.x_m.min(), state.y_m.min()]) - reach
         high = np.array([state.x_m.max(), state.y_m.max()]) + reach
         people = people[((people > low) & (people < high)).all(axis=-1)]
-        # How far each person is from each footprint, in the vehicle's axes.
+        # Distance of each person from each footprint, in the vehicle's axes.
         dx = people[:, 0] - state.x_m[:, None]
         dy = people[:, 1] - state.y_m[:, None]
         cosine, sine = np.cos(state.yaw_rad)[:, None], np.sin(state.yaw_rad)[:, None]

@@ -1,4 +1,4 @@
-"""Baselines to compare an agent with: policies that learn nothing and see the street itself."""
+"""Baselines to compare an agent with: policies without learning that may read the env's state."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from flowrep.envs.street_env import StreetEnv
 from flowrep.scenes.vehicle import NO_OP
 
 Baseline = Callable[[StreetEnv], int]
-"""Returns the next action; may read the whole state of the street."""
+"""Returns the next action; may read the env's whole state."""
 
 
 def never_turn(env: StreetEnv) -> int:
@@ -21,10 +21,10 @@ def never_turn(env: StreetEnv) -> int:
 
 
 class RandomActions:
-    """Draws actions uniformly; an episode gets the same ones whichever episodes came before it."""
+    """Draws actions uniformly; those of an episode don't depend on earlier episodes."""
 
     def __init__(self, seed: int = 0) -> None:
-        """Takes a seed that sets it apart from other instances."""
+        """Takes a seed; other seeds give other actions."""
         self._seed = seed
         self._rng = np.random.default_rng(seed)
 
@@ -37,7 +37,7 @@ class RandomActions:
 
 @dataclass(frozen=True)
 class Drive:
-    """One finished episode: which one, how it ended, what was hit, its return and its steps."""
+    """A finished episode: its seed, outcome, category hit, return and number of steps."""
 
     episode_seed: int
     outcome: str
@@ -50,9 +50,9 @@ def drive_episode(env: StreetEnv, baseline: Baseline, options: dict[str, Any]) -
     """Drives one episode to its end without rendering, and returns it.
 
     Args:
-        env: the street.
+        env: the environment.
         baseline: chooses the actions.
-        options: of `StreetEnv.reset`, which choose the episode.
+        options: passed to `StreetEnv.reset`; they select the episode.
     """
     env.begin(options=options)
     return _drive_on(env, baseline)
@@ -61,9 +61,9 @@ def drive_episode(env: StreetEnv, baseline: Baseline, options: dict[str, Any]) -
 def drives(
     env: StreetEnv, baseline: Baseline, episodes: int, *, seed: int | None = None
 ) -> Iterator[Drive]:
-    """Yields finished episodes, the same ones for every baseline; nothing is rendered.
+    """Yields finished episodes, the same for every baseline, without rendering.
 
-    With `seed` None the env's own sequence of episodes goes on.
+    If `seed` is None, the env continues its own sequence of episodes.
 
     >>> env = StreetEnv("straight_road", sensors=())
     >>> [drive.outcome in ("success", "collision") for drive in drives(env, never_turn, 2, seed=0)]

@@ -1,1 +1,1 @@
-"""A street as bodies and triangles: collisions and pictures by PyBullet, maps by a rasteriser."""
+"""A street in PyBullet, which tests collisions and draws pictures, and in a rasteriser for maps."""

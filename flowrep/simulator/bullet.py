@@ -1,6 +1,6 @@
-"""PyBullet, and the only file that knows of it: bodies, collisions, pictures.
+"""Bodies, collisions and pictures by PyBullet; no other module imports it.
 
-One DIRECT client a simulator, given back by `close()` or when the simulator is collected.
+Each simulator has a DIRECT client of its own, disconnected by `close()` or at garbage collection.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from flowrep.simulator.meshes import Mesh
 
 @contextlib.contextmanager
 def _without_greeting() -> Iterator[None]:
-    """Keeps stderr clean while PyBullet, whose import prints when it was built, is loaded."""
+    """Suppresses the build time that PyBullet prints to stderr when it is imported."""
     stderr = os.dup(2)
     try:
         with open(os.devnull, "w") as nowhere:
@@ -53,18 +53,18 @@ def _shared(value: Any) -> Any:
 
 
 class Picture(NamedTuple):
-    """What one look of the camera gives, all [H, W] but `rgba` [H, W, 4]."""
+    """The camera's images, all [H, W] except `rgba` [H, W, 4]."""
 
     rgba: NDArray[np.uint8]
     zbuffer: NDArray[np.float32]
-    body: NDArray[np.int32]  # -1 where there is none
+    body: NDArray[np.int32]  # -1 for no body
 
 
 class Simulator:
-    """A world of bodies that stand where they are put; nothing falls, nothing is integrated."""
+    """A world of bodies that stay where they are placed; no dynamics are simulated."""
 
     def __init__(self, texture_rgb: NDArray[np.uint8]) -> None:
-        """Connects, and loads the picture [S, S, 3] that colours every mesh."""
+        """Connects, and loads the texture [S, S, 3] shared by all meshes."""
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError("PyBullet gave no client: close some environments first")
@@ -76,7 +76,7 @@ class Simulator:
         self._vehicle_half_height_m = 0.0
 
     def close(self) -> None:
-        """Gives the client back; a second call does nothing."""
+        """Disconnects the client; further calls do nothing."""
         self._finalizer()
 
     def add_body(
@@ -90,10 +90,10 @@ class Simulator:
         """Returns the number of a new body at the origin.
 
         Args:
-            mesh: what is seen.
+            mesh: its visible geometry.
             category: its class in the semantic map.
             instance: its id in the instance map; 0 for the static world.
-            boxes_m: collision boxes (x, y, yaw, length, width, height) that stand on the ground.
+            boxes_m: collision boxes (x, y, yaw, length, width, height), standing on the ground.
         """
         arrays = {
             "vertices": [_shared(tuple(row)) for row in mesh.vertices],
@@ -107,8 +107,8 @@ class Simulator:
             physicsClientId=self._client,
             **arrays,
         )
-        # PyBullet never lets go of the lists it is given, nor of what is in them: these it keeps
-        # empty, and the numbers are the same objects for every client of the process.
+        # PyBullet leaks the lists that it is given and their items. These lists end up empty, and
+        # the numbers are the same objects for every client of the process.
         for array in arrays.values():
             array.clear()
         collision = self._collision_shape(boxes_m)
@@ -122,7 +122,7 @@ class Simulator:
         return body
 
     def add_vehicle(self, length_m: float, width_m: float, height_m: float) -> None:
-        """Adds the vehicle: a box that collides and that no camera sees."""
+        """Adds the vehicle: a collision box that is invisible to cameras."""
         half = [length_m / 2, width_m / 2, height_m / 2]
         collision = pybullet.createCollisionShape(
             pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._client
@@ -131,7 +131,7 @@ class Simulator:
         self._vehicle_half_height_m = height_m / 2
 
     def add_cylinder(self, radius_m: float, height_m: float) -> int:
-        """Returns the number of an upright cylinder that collides and that no camera sees."""
+        """Returns the number of an upright collision cylinder, invisible to cameras."""
         return self._add_unseen(
             pybullet.createCollisionShape(
                 pybullet.GEOM_CYLINDER,
@@ -143,7 +143,7 @@ class Simulator:
         )
 
     def _add_unseen(self, collision: int) -> int:
-        # PyBullet draws the collision shape of a body without a visual one: give it a point.
+        # PyBullet draws a body's collision shape if it has no visual one, so it gets a point.
         point = pybullet.createVisualShape(
             pybullet.GEOM_MESH,
             vertices=[[0.0, 0.0, 0.0]] * 3,
@@ -165,7 +165,7 @@ class Simulator:
         return np.array([*self._instance_of_body, 0], dtype=np.uint8)
 
     def place(self, body: int, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Puts a body on the ground at a planar pose."""
+        """Places a body on the ground at a planar pose."""
         half = 0.5 * yaw_rad
         pybullet.resetBasePositionAndOrientation(
             body,
@@ -180,19 +180,19 @@ class Simulator:
         positions: NDArray[np.float64],
         quaternions_xyzw: NDArray[np.float64],
     ) -> None:
-        """Puts N bodies at positions [N, 3] and orientations [N, 4]."""
+        """Places N bodies at positions [N, 3] and orientations [N, 4]."""
         put, client = pybullet.resetBasePositionAndOrientation, self._client
         for body, position, turn in zip(bodies, positions.tolist(), quaternions_xyzw.tolist()):
             put(body, position, turn, client)
 
     def hide(self, body: int) -> None:
-        """Puts a body where neither the camera nor the vehicle meets it."""
+        """Moves a body out of reach of the camera and the vehicle."""
         pybullet.resetBasePositionAndOrientation(
             body, (0.0, 0.0, _HIDDEN_Z_M), (0.0, 0.0, 0.0, 1.0), physicsClientId=self._client
         )
 
     def place_vehicle(self, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Puts the vehicle's footprint at a planar pose."""
+        """Places the vehicle's footprint at a planar pose."""
         half = 0.5 * yaw_rad
         pybullet.resetBasePositionAndOrientation(
             self._vehicle,
@@ -202,7 +202,7 @@ class Simulator:
         )
 
     def vehicle_touches(self, body: int) -> bool:
-        """Returns whether the vehicle and a body overlap where they now stand."""
+        """Returns whether the vehicle and a body overlap at their current poses."""
         return bool(
             pybullet.getClosestPoints(self._vehicle, body, 0.0, physicsClientId=self._client)
         )
@@ -210,7 +210,7 @@ class Simulator:
     def look(
         self, view: list[float], projection: list[float], height_px: int, width_px: int
     ) -> Picture:
-        """Returns the picture of the software renderer, without shadows."""
+        """Returns the software renderer's images, without shadows."""
         _, _, rgba, zbuffer, body = pybullet.getCameraImage(
             width_px, height_px, view, projection, physicsClientId=self._client, **_LIGHT
         )
@@ -237,15 +237,15 @@ class Simulator:
         )
 
     def _register(self, body: int, category: str, instance: int) -> None:
-        # PyBullet numbers the bodies of a client from 0, so that lists can be lookup tables.
+        # PyBullet numbers a client's bodies from 0, so the lists serve as lookup tables.
         if body != len(self._class_of_body):
             raise RuntimeError(f"PyBullet numbered body {len(self._class_of_body)} as {body}")
         self._class_of_body.append(CATEGORY_ID[category])
         self._instance_of_body.append(instance)
 
     def _load_texture(self, rgb: NDArray[np.uint8]) -> int:
-        # PyBullet reads textures from files alone, and counts v from the bottom row upwards. TGA is
-        # 18 bytes and the pixels, as BGR.
+        # PyBullet reads textures only from files, with v counted upwards from the bottom row. A TGA
+        # file is an 18-byte header and the pixels as BGR.
         height, width, _ = rgb.shape
         size = width.to_bytes(2, "little") + height.to_bytes(2, "little")
         header = bytes([0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0]) + size + bytes([24, 0x20])

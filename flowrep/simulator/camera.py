@@ -18,10 +18,10 @@ _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 def sampled_intrinsics(fx_px: float, fy_px: float, height_px: int, width_px: int) -> Matrix:
     """Returns the K [3, 3] at which PyBullet's software renderer takes its samples.
 
-    Convention: pixel (column i, row j) is asked for at (i + 0.5, j + 0.5). The renderer takes its
-    sample at (i, j + 1) of a camera whose principal point is (W / 2, H / 2), so that the K which
-    puts unprojected points on the true surfaces has its principal point moved by (+0.5, -0.5).
-    `tests/envs/test_camera.py` measures that.
+    Convention: the centre of pixel (column i, row j) is (i + 0.5, j + 0.5). The renderer samples
+    it at (i, j + 1) of a camera with principal point (W / 2, H / 2). The K that unprojects onto
+    the true surfaces therefore has its principal point shifted by (+0.5, -0.5);
+    `tests/envs/test_camera.py` measures this.
     """
     return np.array(
         [
@@ -54,7 +54,7 @@ def gl_view(cam_from_world: Matrix) -> list[float]:
 
 
 def vehicle_from_camera(camera: CameraConfig) -> Matrix:
-    """Returns the camera's mount [4, 4]: camera axes into the vehicle's (x forward, z up)."""
+    """Returns the camera's mount [4, 4], from camera axes to the vehicle's (x forward, z up)."""
     pitch = math.radians(camera.pitch_deg)
     sine, cosine = math.sin(pitch), math.cos(pitch)
     return np.array(
@@ -70,7 +70,7 @@ def vehicle_from_camera(camera: CameraConfig) -> Matrix:
 def depth_from_zbuffer(
     zbuffer: NDArray[np.float32], near_m: float, far_m: float
 ) -> NDArray[np.float32]:
-    """Returns metres along z for OpenGL depth-buffer values in [0, 1], of the same shape."""
+    """Returns depth along z in metres from OpenGL depth-buffer values in [0, 1]."""
     # far - (far - near)·z would cancel near z = 1, where 1 - z is exact in float32.
     gap = np.float32(1.0) - zbuffer
     gap *= np.float32(far_m - near_m)

@@ -1,6 +1,6 @@
-"""What stands beside a road, as low-polygon meshes: cars, trees, fences, lights, lamps, houses.
+"""Low-polygon meshes of roadside objects: cars, trees, fences, lights, lamp posts, houses.
 
-A box's size is what can be hit; crowns, arms and heads hang above it.
+A box covers only the part that can be hit; crowns, arms and lamp heads may extend above it.
 """
 
 import math
@@ -18,15 +18,15 @@ _CROWN_SIDES = 6
 
 
 def mesh_of(box: Box, *, both_sides: bool = False) -> Mesh:
-    """Returns the mesh of what stands at a box; with `both_sides` a house has two fronts."""
+    """Returns the mesh for a box; with `both_sides` a house has two fronts."""
     mesh = house(box, both_sides=both_sides) if box.kind == "house" else _SHAPES[box.kind](box)
     return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
 
 
 def house(box: Box, *, both_sides: bool = False) -> Mesh:
-    """Returns what a street shows of a house: a front with a door to its right, its side walls.
+    """Returns the walls of a house visible from a street: a front on its right, and the sides.
 
-    With `both_sides` there is a front to its left too. No one looks at its roof.
+    With `both_sides` it has a front on its left too. Roofs are never visible and are left out.
     """
     length, width, height = box.size_m
     windows, side = front(box.variant), upper_storeys(box.variant)
@@ -37,7 +37,7 @@ def house(box: Box, *, both_sides: bool = False) -> Mesh:
 
 
 def car(box: Box) -> Mesh:
-    """Returns a car that looks along x: body, windows all around, roof, wheels, lights."""
+    """Returns a car facing along x: body, windows all around, roof, wheels, lights."""
     (length, width, height), paint = box.size_m, swatch(_CAR_PAINTS[box.variant % 4])
     x, y = length / 2, width / 2
     belt = 0.6 * height
@@ -59,7 +59,7 @@ def car(box: Box) -> Mesh:
 
 
 def tree(box: Box) -> Mesh:
-    """Returns a trunk with a crown of its height's proportions: a broad one, or a fir's."""
+    """Returns a trunk with a crown in proportion to its height, either broad or a fir's."""
     length, width, height = box.size_m
     mesh = Mesh()
     is_fir = box.variant % 3 == 2
@@ -79,7 +79,7 @@ def tree(box: Box) -> Mesh:
 
 
 def fence(box: Box) -> Mesh:
-    """Returns a stretch of fence along x: a post at either end, two rails between them."""
+    """Returns a stretch of fence along x: a post at either end and two rails."""
     length, width, height = box.size_m
     paint, x, y = swatch("wood"), length / 2, width / 2
     mesh = Mesh()
@@ -93,7 +93,7 @@ def fence(box: Box) -> Mesh:
 
 
 def traffic_light(box: Box) -> Mesh:
-    """Returns a post with a head of three lamps, the lowest lit, for those who drive along x."""
+    """Returns a post with a head of three lamps, the lowest lit, facing traffic along x."""
     length, width, height = box.size_m
     head_m, reach = 0.95, 0.17
     mesh = Mesh()
@@ -107,7 +107,7 @@ def traffic_light(box: Box) -> Mesh:
 
 
 def lamp_post(box: Box) -> Mesh:
-    """Returns a post with a lamp on an arm to its left, where the road is."""
+    """Returns a post with a lamp on an arm to its left, over the road."""
     length, width, height = box.size_m
     metal = swatch("metal")
     mesh = Mesh()

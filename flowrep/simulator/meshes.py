@@ -1,4 +1,4 @@
-"""Low-polygon shapes as flat-shaded triangles with a colour each, and what is on the ground."""
+"""Low-polygon meshes of flat-shaded, coloured triangles, and the markings on the ground."""
 
 import math
 from collections.abc import Sequence
@@ -13,15 +13,15 @@ from flowrep.simulator.paint import Patch, swatch
 
 Array = NDArray[np.float64]
 Point3 = tuple[float, float, float]
-_CELL_M = 15.0  # ground is cut into cells: the renderer interpolates short triangles better
+_CELL_M = 15.0  # cells that the ground is cut into: small triangles are interpolated better
 _DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M = 2.0, 6.0, 0.15
 _STRIPE_M = 0.5
 _KERB_M = 0.25
-_RISE_M = 0.004  # of what is painted on the ground
+_RISE_M = 0.004  # height of markings above the ground
 
 
 class Mesh:
-    """Triangles with normals and texture coordinates, in the order that PyBullet wants them."""
+    """Triangles with normals and texture coordinates, in PyBullet's order."""
 
     def __init__(self) -> None:
         """Starts without triangles."""
@@ -33,7 +33,7 @@ class Mesh:
     def polygon(self, corners: Array, uvs: list[list[float]]) -> None:
         """Adds a flat convex polygon [M, 3], counter-clockwise seen from outside."""
         (ax, ay, az), (bx, by, bz) = (corners[1:3] - corners[0]).tolist()
-        # numpy.cross takes most of the time that a street takes to build
+        # numpy.cross would take most of the time to build a street
         normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
         normal /= np.linalg.norm(normal)
         base = len(self.vertices)
@@ -49,7 +49,7 @@ class Mesh:
         self.polygon(corners, [[u0, v1], [u1, v1], [u1, v0], [u0, v0]])
 
     def box(self, low: Point3, high: Point3, side: Patch, *, lid: bool = True) -> None:
-        """Adds a box without its floor, and without its lid unless asked for."""
+        """Adds a box without its floor; `lid` adds its top."""
         self.walls(low, high, (side,) * 4)
         if lid:
             (x0, y0, _), (x1, y1, z1) = low, high
@@ -57,7 +57,7 @@ class Mesh:
             self.quad(np.array(ring), side)
 
     def walls(self, low: Point3, high: Point3, sides: Sequence[Patch | None]) -> None:
-        """Adds the upright faces of a box that have a patch: -y, +x, +y, -x."""
+        """Adds the upright faces of a box for which a patch is given: -y, +x, +y, -x."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
         for i, patch in enumerate(sides):
@@ -77,7 +77,7 @@ class Mesh:
         *,
         floor: Patch | None = None,
     ) -> None:
-        """Adds a body between two level rings [M, 2], counter-clockwise from above, and its lid."""
+        """Adds the sides and top between two level rings [M, 2], counter-clockwise from above."""
         low = np.column_stack([bottom, np.full(len(bottom), bottom_m)])
         high = np.column_stack([top, np.full(len(top), top_m)])
         for i in range(len(low)):
@@ -88,14 +88,14 @@ class Mesh:
             self.polygon(low[::-1], [list(floor[:2])] * len(low))
 
     def disc(self, centre: Point3, normal: Point3, radius_m: float, patch: Patch) -> None:
-        """Adds an upright disc of eight sides that is seen from where its normal points."""
+        """Adds an upright octagonal disc, visible from the side its normal points to."""
         across = np.array([-normal[1], normal[0], 0.0])
         angles = np.arange(8) * (math.pi / 4)
         rim = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * np.array([0.0, 0.0, 1.0])
         self.polygon(np.array(centre) + radius_m * rim, [list(patch[:2])] * len(rim))
 
     def ground(self, area: BaseGeometry, height_m: float, paint: str) -> None:
-        """Adds an area of the plan, level, cut into cells."""
+        """Adds an area of the ground plan as a level surface, cut into cells."""
         if area.is_empty:
             return
         uv = [list(swatch(paint)[:2])] * 3
@@ -127,11 +127,11 @@ class Mesh:
 
 
 def lane_marks(line: LineString, clear_of: BaseGeometry) -> Mesh:
-    """Returns dashes along the middle of a road, a hair above it.
+    """Returns dashes along the middle of a road, slightly above it.
 
     Args:
         line: the road's centreline.
-        clear_of: ground without dashes: crosswalks, and where other roads meet this one.
+        clear_of: ground without dashes, such as crosswalks and junctions.
     """
     mesh = Mesh()
     for at in np.arange(0.0, line.length - _DASH_M, _DASH_PERIOD_M):
@@ -143,10 +143,10 @@ def lane_marks(line: LineString, clear_of: BaseGeometry) -> Mesh:
 
 
 def kerb(drivable: BaseGeometry, paved: BaseGeometry) -> Mesh:
-    """Returns the stones along the edge of a sidewalk, a hair above it.
+    """Returns the kerbstones along the edge of a sidewalk, slightly above it.
 
-    The paving runs on below them: the renderer leaves out thin triangles far away, and what
-    shows there then is the same category.
+    The paving continues below them: the renderer omits thin triangles in the distance, where the
+    same category then shows instead.
     """
     mesh = Mesh()
     edge = drivable.buffer(_KERB_M, quad_segs=4, join_style="mitre")

@@ -1,11 +1,11 @@
-"""One small picture that colours every mesh: a row of plain paints, then house fronts."""
+"""The small texture shared by all meshes: a row of plain colours, then house fronts."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 SIZE_PX = 256
 _SWATCH_PX = 8
-_FRONT_PX = (60, 64)  # height, width of one house front in the picture
+_FRONT_PX = (60, 64)  # height, width of one house front in the texture
 _FLOORS = (2, 3, 4, 5)
 
 PAINTS: dict[str, tuple[int, int, int]] = {
@@ -42,19 +42,19 @@ SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
 _WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))
 NUM_FRONTS = len(_WALLS) * len(_FLOORS)
 
-# (u0, v0, u1, v1): a rectangle of the picture, v downwards.
+# (u0, v0, u1, v1): a rectangle of the texture, v downwards.
 Patch = tuple[float, float, float, float]
 
 
 def swatch(name: str) -> Patch:
-    """Returns the middle of a plain paint, as a patch without extent."""
+    """Returns the middle of a plain colour, as a patch of zero size."""
     u = (list(PAINTS).index(name) + 0.5) * _SWATCH_PX / SIZE_PX
     v = 0.5 * _SWATCH_PX / SIZE_PX
     return (u, v, u, v)
 
 
 def front(variant: int) -> Patch:
-    """Returns the patch of house front number `variant` (taken modulo their number)."""
+    """Returns the patch of house front `variant`, modulo the number of fronts."""
     row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
     top = _SWATCH_PX + row * _FRONT_PX[0]
     left = column * _FRONT_PX[1]
@@ -71,7 +71,7 @@ def upper_storeys(variant: int) -> Patch:
 
 
 def picture() -> NDArray[np.uint8]:
-    """Returns the picture [SIZE_PX, SIZE_PX, 3]."""
+    """Returns the texture [SIZE_PX, SIZE_PX, 3]."""
     image = np.zeros((SIZE_PX, SIZE_PX, 3), dtype=np.uint8)
     for i, rgb in enumerate(PAINTS.values()):
         image[:_SWATCH_PX, i * _SWATCH_PX : (i + 1) * _SWATCH_PX] = rgb

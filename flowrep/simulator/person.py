@@ -6,10 +6,10 @@ from flowrep.simulator.paint import SHIRTS, swatch
 
 
 def person_meshes(variant: int) -> tuple[Mesh, ...]:
-    """Returns the meshes of a person's `PARTS`; `variant` chooses the shirt.
+    """Returns the meshes of a person's `PARTS`, facing along x; `variant` selects the shirt.
 
-    Looking along x. Seen from the side, as a vehicle sees who crosses, the arms alone are 0.6 m
-    apart. A leg hangs from its hip, which is its origin.
+    Seen from the side, as a vehicle sees people crossing, the arms alone span 0.6 m. The origin of
+    a leg is its hip.
     """
     shirt, skin = swatch(SHIRTS[variant % len(SHIRTS)]), swatch("skin")
     body = Mesh()

@@ -1,12 +1,12 @@
-"""Depth, class and instance of every pixel, from triangles: PyBullet's picture without its price.
+"""A fast rasteriser for depth, class and instance maps, in place of PyBullet's renderer.
 
-Numba compiles `draw` at its first call and keeps the machine code in its cache. The module is
-imported where something is drawn, never before.
+Numba compiles it at the first call and caches the machine code. The module is imported only when
+something is drawn.
 
-A vertex is taken to q = z · (u, v, 1): pixel coordinates times depth. In this frame the edges of a
+A vertex becomes q = z · (u, v, 1): pixel coordinates times depth. In this frame the edges of a
 triangle are planes through the camera, e_a = q_b × q_c, and pixel r = (u, v, 1) lies inside if
 e_a · r ≥ 0 for all three. With d = q_a · e_a the inverse depth is (e_a + e_b + e_c) · r / d, affine
-in u and v. That holds for corners behind the camera too, so that nothing has to be clipped.
+in u and v. This also holds for corners behind the camera, so nothing needs to be clipped.
 """
 
 import math
@@ -19,18 +19,18 @@ from numpy.typing import NDArray
 
 from flowrep.simulator.triangles import Triangles
 
-_LEAST_AREA_PX = 0.01  # twice the area of triangles that PyBullet's renderer leaves out
+_LEAST_AREA_PX = 0.01  # twice the area below which PyBullet's renderer omits triangles
 
 
 def _compiled(function: Callable[..., None]) -> Any:
     try:
         return njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # no folder for a cache can be written: each process compiles anew
+    except RuntimeError:  # no writable cache folder: each process compiles again
         return njit(nogil=True)(function)
 
 
 class Maps(NamedTuple):
-    """What N views show, all [N, H, W]: inf, class 0 and instance 0 where nothing is seen."""
+    """Maps of N views, all [N, H, W]: inf, class 0 and instance 0 for pixels without a surface."""
 
     depth: NDArray[np.float32]  # metres along z
     semantic: NDArray[np.uint8]
@@ -38,13 +38,13 @@ class Maps(NamedTuple):
 
 
 class Rasteriser:
-    """A camera that sees depth and ids; triangles are seen from outside alone.
+    """A camera for depth and ids; triangles are visible only from outside.
 
     Args:
         triangles: the bodies.
         K: intrinsics [3, 3] without skew; pixel (0, 0)'s centre is (0.5, 0.5).
         size: height and width in pixels.
-        range_m: the nearest and the farthest depth that is seen.
+        range_m: the nearest and the farthest visible depth.
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class Rasteriser:
         size: tuple[int, int],
         range_m: tuple[float, float],
     ) -> None:
-        """Compiles what draws, if this machine has not done so before."""
-        # Column i is seen along u = i + 0.5.
+        """Compiles the drawing functions unless they are in the cache."""
+        # Column i is sampled at u = i + 0.5.
         K_of_index = K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
         self._world = (*triangles, K_of_index, *map(float, range_m))
         self._size = size
@@ -69,12 +69,12 @@ class Rasteriser:
         world_from_body: NDArray[np.float64],
         is_shown: NDArray[np.bool_],
     ) -> Maps:
-        """Returns N views of the same bodies, which stand otherwise in each.
+        """Returns N views of the same bodies at poses of their own.
 
         Args:
-            cam_from_world: [N, 4, 4], with camera axes of OpenCV.
-            world_from_body: poses [N, M, 4, 4] of the M bodies that move.
-            is_shown: which bodies are there, [N, B].
+            cam_from_world: [N, 4, 4], with OpenCV camera axes.
+            world_from_body: poses [N, M, 4, 4] of the M moving bodies.
+            is_shown: which bodies are present, [N, B].
         """
         shape = (len(cam_from_world), *self._size)
         maps = Maps(*(np.empty(shape, kind) for kind in (np.float32, np.uint8, np.uint8)))
@@ -114,7 +114,7 @@ def _draw(
 
 @_compiled
 def _side_planes(K, height, width):
-    # Unit normals, inwards, of the four planes through the outermost samples.
+    # Inward unit normals of the four planes through the outermost samples.
     planes = np.empty((4, 3))
     left, right = -K[0, 2] / K[0, 0], (width - 1 - K[0, 2]) / K[0, 0]
     top, bottom = -K[1, 2] / K[1, 1], (height - 1 - K[1, 2]) / K[1, 1]
@@ -172,11 +172,11 @@ def _cross(p, q):
 
 @_compiled
 def _fill(p, q, r, near_m, far_m, number, inverse, body):
-    """Draws the triangle of corners p, q, r; clockwise in a picture whose y points down."""
+    """Draws the triangle with corners p, q, r, clockwise in an image whose y points down."""
     e, f, g = _cross(r, q), _cross(p, r), _cross(q, p)
     det = p[0] * e[0] + p[1] * e[1] + p[2] * e[2]
     if det <= 0.0:
-        return  # seen from behind, or edge on
+        return  # facing away, or edge-on
     height, width = inverse.shape
     x0, x1, y0, y1 = 0.0, width - 1.0, 0.0, height - 1.0
     nearest = min(p[2], q[2], r[2])

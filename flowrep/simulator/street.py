@@ -1,4 +1,4 @@
-"""A laid-out scene as bodies in the simulator: what the camera sees and the vehicle can hit."""
+"""A laid-out scene as bodies in the simulator, visible to the camera and solid to the vehicle."""
 
 import math
 import pickle
@@ -24,41 +24,41 @@ from flowrep.simulator.person import person_meshes
 from flowrep.simulator.triangles import Body, gather
 
 Array = NDArray[Any]
-_BEHIND_M = 2.0  # behind the vehicle nobody is seen, wherever on it the camera is
-_TWO_LANES_M = 5.0  # a narrower road has no marks along its middle
+_BEHIND_M = 2.0  # people further behind are out of view, wherever on the vehicle the camera is
+_TWO_LANES_M = 5.0  # narrower roads have no lane marks
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
 class Solid(NamedTuple):
-    """Boxes that stand still and are one body."""
+    """Static boxes that form one body."""
 
     body: int
     category: str
     boxes: tuple[Box, ...]
-    number: int  # of `Street.bodies`
+    number: int  # index in `Street.bodies`
 
 
 class Solids(NamedTuple):
-    """What can be hit while some exits are closed, box by box, and which bodies are there."""
+    """The boxes that can be hit, and the bodies present, for one set of closed exits."""
 
     owners: tuple[Solid, ...]
     centres: Array  # [B, 2]
-    reaches_m: Array  # [B], within which the vehicle may touch a box
-    is_shown: Array  # of `Street.bodies`
+    reaches_m: Array  # [B], distance from a box within which the vehicle may touch it
+    is_shown: Array  # for each of `Street.bodies`
 
 
 class Street:
-    """The bodies of one scene, for all environments of a process that drive through it.
+    """The bodies of one scene, shared by all environments of a process with that scene.
 
-    It keeps no account of an episode: who asks says where the vehicle and everyone is and which
-    exits are closed. A PyBullet client of its own takes 28 MB, so that each environment shares one.
+    It holds no state of an episode: callers pass the poses of the vehicle and of everyone else, and
+    the closed exits. Environments share one because a PyBullet client takes 28 MB.
     """
 
     def __init__(self, layout: Layout) -> None:
         """Builds every body of the scene in a simulator."""
         self.layout = layout
         self.is_safe = SafeGround(layout)
-        self.lock = threading.RLock()  # held from placing bodies to looking at them
+        self.lock = threading.RLock()  # held from placing bodies to rendering them
         self.users = 0
         self.simulator = Simulator(paint.picture())
         self.bodies: list[Body] = []
@@ -78,7 +78,7 @@ class Street:
             for number, mesh in enumerate(meshes_of_all, start=1)
         ]
         self._parts = np.array(parts, dtype=int).reshape(count, len(people.PARTS))
-        self._placed = np.full((count, 4), np.nan)  # where everyone's parts were last put
+        self._placed = np.full((count, 4), np.nan)  # where everyone's parts were last placed
         self.triangles = gather(self.bodies)
         self._solids_while_closed: dict[tuple[str, ...], Solids] = {}
         self._closed: tuple[str, ...] | None = None
@@ -86,7 +86,7 @@ class Street:
 
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
-        """Returns the street that all open environments of the process with this scene share."""
+        """Returns the street shared by all open environments of the process with this scene."""
         key = pickle.dumps(scene)
         street = _STREETS.get(key)
         if street is None:
@@ -95,7 +95,7 @@ class Street:
         return street
 
     def leave(self) -> None:
-        """Gives the simulator's client back when the last environment that shares it leaves."""
+        """Disconnects the simulator's client when the last environment that shares it leaves."""
         self.users -= 1
         if self.users == 0:
             self.simulator.close()
@@ -103,7 +103,7 @@ class Street:
                 del _STREETS[key]
 
     def solids(self, closures: tuple[str, ...]) -> Solids:
-        """Returns what can be hit and seen while the closures of these names are up."""
+        """Returns the boxes that can be hit and the bodies shown with the named closures."""
         if closures not in self._solids_while_closed:
             solids = [*self._solids, *(self._closures[name] for name in closures)]
             boxes = [box for solid in solids for box in solid.boxes]
@@ -120,7 +120,7 @@ class Street:
         return self._solids_while_closed[closures]
 
     def close_exits(self, closures: tuple[str, ...]) -> None:
-        """Puts up the closures that are named and takes away all others."""
+        """Places the named closures and hides all others."""
         if closures == self._closed:
             return
         for name, solid in self._closures.items():
@@ -131,7 +131,7 @@ class Street:
         self._closed = closures
 
     def place_pedestrians(self, poses: Array, viewer: VehicleState) -> None:
-        """Puts everyone at their pose [P, 4] who has moved and is, or was last put, in view."""
+        """Places people at poses [P, 4] who have moved and are, or were last placed, in view."""
         ahead = np.array([math.cos(viewer.yaw_rad), math.sin(viewer.yaw_rad)])
         eye = np.array([viewer.x_m, viewer.y_m])
         behind = ((poses[:, :2] - eye) @ ahead < -_BEHIND_M) & (
@@ -148,25 +148,25 @@ class Street:
             self._placed[due] = poses[due]
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
-        """Returns when someone is near enough to be touched [T].
+        """Returns at which times someone is near enough to be touched [T].
 
         Args:
-            track: where the vehicle is, T times.
-            poses: where everyone is then, poses [T, P, 4].
+            track: states of the vehicle at T times.
+            poses: everyone's poses [T, P, 4] at those times.
         """
         centres = np.array([state[:2] for state in track])
         gaps = poses[..., :2] - centres[:, None]
         return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)
 
     def hit(self, state: VehicleState, poses: Array, closures: tuple[str, ...]) -> str:
-        """Returns the category of what the vehicle overlaps, or "".
+        """Returns the category of the body that the vehicle overlaps, or "".
 
-        Only what is near enough to be touched is put before the simulator's collision oracle.
+        Only bodies near enough to be touched are passed to PyBullet's collision test.
 
         Args:
-            state: where the vehicle is.
-            poses: where everyone is, poses [P, 4].
-            closures: names of those that are up.
+            state: the vehicle's state.
+            poses: everyone's poses [P, 4].
+            closures: names of the closures in place.
         """
         gaps = np.hypot(poses[:, 0] - state.x_m, poses[:, 1] - state.y_m)
         people_near = np.flatnonzero(gaps <= self._person_reach_m).tolist()
@@ -194,7 +194,7 @@ class Street:
             crosswalks.add(meshes.crosswalk(*area))
         paved = layout.sidewalks
         if layout.terrain.is_empty:
-            # The paving runs on under the houses, so that no gap opens between them.
+            # The paving continues under the houses, so that no gap opens between them.
             paved = paved.buffer(2.0).difference(layout.drivable)
         paving, grass = meshes.Mesh(), meshes.Mesh()
         paving.ground(paved, 0.0, "paving")

@@ -1,4 +1,4 @@
-"""Rigid bodies as flat arrays of triangles, cut into chunks that a camera can leave out whole."""
+"""Rigid bodies as flat arrays of triangles, in chunks that can be culled as a whole."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ class Body:
     Args:
         vertices: [V, 3], metres, in the body's own frame.
         triangles: [T, 3], indices of vertices, counter-clockwise seen from outside.
-        semantic: what the semantic map shows of it.
-        instance: what the instance map shows of it.
+        semantic: its id in the semantic map.
+        instance: its id in the instance map.
         moves: whether it has a pose of its own; if not, its frame is the world's.
     """
 
@@ -30,22 +30,22 @@ class Body:
 
 
 class Triangles(NamedTuple):
-    """All bodies, C chunks of them, as `flowrep.simulator.rasteriser.draw` wants them."""
+    """All bodies, in C chunks, as arrays for the rasteriser."""
 
     points: NDArray[np.float64]  # [V, 3], in the frames of their bodies
     corners: NDArray[np.int32]  # [T, 3], indices of a chunk's own points
-    point_bounds: NDArray[np.int32]  # [C + 1], the points of chunk c are those from c to c + 1
-    corner_bounds: NDArray[np.int32]  # [C + 1], the same of its triangles
-    centres: NDArray[np.float64]  # [C, 3] of spheres around chunks
+    point_bounds: NDArray[np.int32]  # [C + 1], chunk c has the points from entry c to c + 1
+    corner_bounds: NDArray[np.int32]  # [C + 1], the same for triangles
+    centres: NDArray[np.float64]  # [C, 3], of the chunks' bounding spheres
     radii: NDArray[np.float64]  # [C]
-    bodies: NDArray[np.int32]  # [C], whose it is
-    poses: NDArray[np.int32]  # [C], which of the moving bodies it is; -1 for the static world
+    bodies: NDArray[np.int32]  # [C], the body of each chunk
+    poses: NDArray[np.int32]  # [C], index among the moving bodies; -1 for the static world
     semantic: NDArray[np.uint8]  # [B], by body
     instance: NDArray[np.uint8]  # [B]
 
 
 def gather(bodies: Sequence[Body]) -> Triangles:
-    """Returns the triangles of bodies, which are numbered in their order."""
+    """Returns the triangles of all bodies, numbered in the given order."""
     points: list[NDArray[np.float64]] = [np.empty((0, 3))]
     corners: list[NDArray[np.int32]] = [np.empty((0, 3), dtype=np.int32)]
     owners: list[int] = []

@@ -1,7 +1,7 @@
 """Pictures: of representations, of scenes from above, of episodes and of learning.
 
-What draws representations is handed on here; `flowrep.viz.plan`, `film`, `curves` and `window`
-need the packages of an extra.
+Functions that draw representations are exported here; `flowrep.viz.plan`, `film`, `curves` and
+`window` need the packages of an extra.
 """
 
 from flowrep.viz.maps import (

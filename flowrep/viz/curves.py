@@ -11,8 +11,8 @@ from flowrep.experiment.run_folder import RunFolder
 def draw_learning_curve(run: RunFolder) -> None:
     """Draws success over frames into learning_curve.png, from metrics.csv and evaluation.csv.
 
-    The line is the share of the last training episodes (sampled actions); the points are greedy
-    evaluations at the training speed and frame rate, with 95 % Wilson intervals.
+    The line is the success rate over the last training episodes (sampled actions); the points are
+    greedy evaluations at the training speed and frame rate, with 95 % Wilson intervals.
     """
     metrics = run.read_metrics()
     figure = Figure(figsize=(7, 4), layout="constrained")
@@ -37,9 +37,9 @@ def draw_learning_curve(run: RunFolder) -> None:
 
 
 def _evaluated(run: RunFolder) -> list[tuple[int, float, float, float]]:
-    """Frames, lower end, share of success, upper end for each of the run's greedy evaluations.
+    """Returns frames, lower end, success rate and upper end of the run's greedy evaluations.
 
-    What flowrep.evaluate added, at whatever frame rate and in whatever scene, is left out.
+    Rows added by flowrep.evaluate, at any frame rate and in any scene, are left out.
     """
     config = run.read_config()
     trained_at = config["speed"], float(config["scene"]["frame_rate_hz"])

@@ -1,4 +1,4 @@
-"""Films an episode: what the camera sees and every representation of it, side by side."""
+"""Videos of an episode: the camera's picture and every representation, side by side."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,10 +19,10 @@ Maps = dict[str, Tensor]
 
 @torch.no_grad()
 def film_episode(env: EnvBase, policy: Policy) -> tuple[list[Maps], str]:
-    """Returns the maps of every frame of one greedy episode, and how it ended.
+    """Returns the maps of every frame of one greedy episode, and its outcome.
 
     Args:
-        env: of one street, with all sensors and rgb kept.
+        env: a batch of one environment that keeps all sensors and rgb.
         policy: writes `action`.
     """
     intrinsics = torch.as_tensor(street_envs(env)[0].K)
@@ -36,10 +36,10 @@ def film_episode(env: EnvBase, policy: Policy) -> tuple[list[Maps], str]:
 
 
 def maps_of(sensor: Mapping[str, Any], intrinsics: Tensor) -> Maps:
-    """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` of what one street's sensors gave.
+    """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` from one env's sensors.
 
-    Flow is in px/step, whatever unit and scale the agent's own representations have. Raw flow is
-    the estimate, depth and what is made of it have noise, where that is what the agent lives on.
+    Flow is in px/step, whatever the unit and scale of the agent's own representations. If the agent
+    uses estimated flow or noisy depth, so do these maps.
     """
     raw = sensor.get("flow", None)
     if raw is None:
@@ -66,14 +66,14 @@ def record_episode(
     *,
     seed: int,
 ) -> str:
-    """Writes the video of one greedy episode to `path`; returns how it ended.
+    """Writes the video of one greedy episode to `path`; returns its outcome.
 
     Args:
         make_env: called with `representations`, `keep_sensor`, `num_envs` and `num_workers`.
         policy: writes `action`.
-        representations: what the policy reads, a mapping from name to options.
+        representations: the policy's inputs, a mapping from name to options.
         path: the mp4 file.
-        seed: of the environment, which draws the episode.
+        seed: seeds the environment, which draws the episode.
     """
     seen = dict(representations) | {"rgb": {}}
     env = make_env(representations=seen, keep_sensor=True, num_envs=1, num_workers=0)

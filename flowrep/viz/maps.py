@@ -21,7 +21,7 @@ Image = NDArray[np.uint8]
 Note = str | Callable[[int], Image]
 
 FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 5.0}
-"""Flow, in pixels, at which a representation's colour is full."""
+"""Flow magnitude in pixels at which a representation's colour is fully saturated."""
 
 DEPTH_RANGE_M = 100.0
 
@@ -31,8 +31,8 @@ _DEPTH_COLOURS = np.array(
     [(252, 253, 191), (254, 176, 120), (241, 96, 93), (183, 55, 121), (104, 28, 129), (40, 16, 80)],
     dtype=np.float32,
 )
-# What a direction at full saturation takes away from white. HSV to RGB at full value: each channel
-# is a trapezoid over hue, a third of a turn apart.
+# Subtracted from white for each direction at full saturation. In HSV to RGB at full value, each
+# channel is a trapezoid over hue, a third of a turn apart.
 _HUES = 6 * 4096
 _OFF_WHITE = 255 * (
     1 - np.clip(np.abs((6 * np.arange(_HUES)[:, None] / _HUES + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
@@ -48,12 +48,12 @@ def flow_to_rgb(flow: Any, scale_px: float) -> Image:
     """Returns flow as colour: direction is hue, magnitude is saturation on white.
 
     Convention: right is red, down is yellow-green, left is cyan, up is violet. Saturation is the
-    square root of magnitude over `scale_px`, full from there on, so that a tenth of a pixel still
-    shows beside tens of pixels. Flow that is not finite is grey.
+    square root of magnitude over `scale_px`, clipped at 1, so that a tenth of a pixel is visible
+    beside tens of pixels. Flow that is not finite is grey.
 
     Args:
         flow: `[2, H, W]`, (u right, v down), pixels.
-        scale_px: magnitude of full colour.
+        scale_px: magnitude at full saturation.
 
     Raises:
         ValueError: flow is not `[2, H, W]`, or the scale is not positive.
@@ -99,7 +99,7 @@ def classes_to_rgb(semantic: Any) -> Image:
 def depth_to_rgb(depth: Any, range_m: float = DEPTH_RANGE_M) -> Image:
     """Returns depth `[1, H, W]` in metres as colour, near light and far dark, logarithmically.
 
-    From `range_m` on the colour stays; inf (no surface) is black, nan (missing) is grey.
+    The colour is constant beyond `range_m`; inf (no surface) is black, nan (missing) is grey.
     """
     metres = _channels("depth", depth, 1)[0].astype(np.float32)
     surface = np.isfinite(metres)
@@ -117,16 +117,16 @@ def representation_strip(
     flow_scale_px: Mapping[str, float] = FLOW_SCALE_PX,
     depth_range_m: float = DEPTH_RANGE_M,
 ) -> Image:
-    """Returns what the camera sees and its representations side by side, labelled.
+    """Returns the camera's picture and its representations side by side, labelled.
 
     Args:
         maps: any of rgb (uint8), semantic (ids), depth (metres), raw, ego, obj (pixels), each
-            `[C, H, W]`; drawn in this order, other keys are left out.
-        flow_scale_px: flow of full colour for raw, ego and obj; printed in the label.
-        depth_range_m: where depth's colours end; printed in the label.
+            `[C, H, W]`; drawn in this order, other keys are ignored.
+        flow_scale_px: flow at full saturation for raw, ego and obj; printed in the label.
+        depth_range_m: end of the depth colours; printed in the label.
 
     Raises:
-        ValueError: a map's shape does not fit, or none of the names is there.
+        ValueError: a map has the wrong shape, or none of the names is present.
     """
     tiles: list[tuple[str, Callable[[Any], Image]]] = [
         ("rgb", lambda rgb: np.moveaxis(_channels("rgb", rgb, 3), 0, -1).astype(np.uint8)),
@@ -152,7 +152,7 @@ def representation_strip(
 
 
 def flow_note(scale_px: float) -> str:
-    """Returns what saturation means at a scale: it goes with the square root of the magnitude.
+    """Returns the legend of saturation at a scale; it is the square root of the magnitude.
 
     >>> flow_note(20.0)
     'full at 20 px, half at 5 px'
@@ -161,7 +161,7 @@ def flow_note(scale_px: float) -> str:
 
 
 def depth_bar(range_m: float, width: int) -> Image:
-    """Returns the colours of depth from 0 m to `range_m`, evenly in metres' logarithm, named."""
+    """Returns a labelled bar of the depth colours from 0 m to `range_m`, on a logarithmic scale."""
     metres = np.expm1(np.linspace(0, np.log1p(range_m), width))
     bar = depth_to_rgb(metres[None, None].repeat(_NOTE_PX - 2, axis=1), range_m)
     ends = {2: ("near", "lm", (0, 0, 0)), width - 2: (f"{range_m:g} m", "rm", (255, 255, 255))}
@@ -174,14 +174,14 @@ def strip(
     wheel_for: Iterable[str] = (),
     notes: Mapping[str, Note] = MappingProxyType({}),
 ) -> Image:
-    """Returns images of one size side by side, each under its label, small ones enlarged.
+    """Returns images of the same size side by side, each under its label.
 
-    Enlarged by a whole factor and without interpolation: a pixel stays a square of one colour.
+    Small images are enlarged by a whole factor without interpolation.
 
     Args:
         images: label to image `[H, W, 3]`.
-        wheel_for: labels that get the flow wheel beside them.
-        notes: by label, what stands below it: a text, or a legend that is drawn for a width.
+        wheel_for: labels with the flow wheel beside them.
+        notes: by label, the note below it: a text, or a function that draws a legend of a width.
 
     Raises:
         ValueError: the images differ in size.
@@ -204,7 +204,7 @@ def strip(
 
 
 def contact_sheet(rows: Iterable[Image]) -> Image:
-    """Returns images below one another, narrower ones filled up with white."""
+    """Returns images stacked vertically, with narrower ones padded with white."""
     rows = list(rows)
     width = max(row.shape[1] for row in rows)
     filled = [
@@ -215,7 +215,7 @@ def contact_sheet(rows: Iterable[Image]) -> Image:
 
 
 def write_png(path: str | Path, image: Image) -> None:
-    """Writes an image `[H, W, 3]`, and the folders above it."""
+    """Writes an image `[H, W, 3]`, creating its folder if needed."""
     from PIL import Image as pillow
 
     Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -223,9 +223,9 @@ def write_png(path: str | Path, image: Image) -> None:
 
 
 def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
-    """Writes frames `[H, W, 3]` of one size as an mp4 (H.264) that browsers play.
+    """Writes frames `[H, W, 3]` of the same size as an mp4 (H.264) that browsers play.
 
-    Odd sizes, which the codec refuses, gain a white row or column.
+    Odd sizes, which the codec does not support, are padded with a white row or column.
     """
     import imageio.v2 as imageio
 
@@ -258,7 +258,7 @@ def _note_bar(note: Note, width: int) -> Image:
 
 
 def _written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, size: int) -> Image:
-    """Returns an image with texts in it: by place (x, y), each with its anchor and colour."""
+    """Returns an image with texts drawn at positions (x, y), each with its anchor and colour."""
     from PIL import Image as pillow
     from PIL import ImageDraw, ImageFont
 

@@ -1,4 +1,4 @@
-"""A scene from above: roads, zones, what stands there, where people walk, and how drives went."""
+"""A scene from above: roads, zones, obstacles, walks of people, and the tracks of drives."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ OUTCOME_COLOURS = {
     "out_of_bounds": "#cc79a7",
     "timeout": "#f0c000",
 }
-"""One colour an outcome in every figure, told apart by colour-blind people too (Okabe and Ito)."""
+"""Colour of each outcome in every figure, safe for colour-blind readers (Okabe and Ito)."""
 
 _WALK_COLOUR = "black"
-_ZONE_COLOURS = {"end": "#56b4e9", "start": "#009e73"}  # starts last: they lie on top
+_ZONE_COLOURS = {"end": "#56b4e9", "start": "#009e73"}  # starts are drawn last, on top
 _CLOSED_COLOUR = "#303030"
-_LAMP_POST_COLOUR = "#7a7a7a"  # a building in the semantic map, but nobody takes it for one
-_TINT = 0.55  # of the classes' colours on white, so that drives stand out
+_LAMP_POST_COLOUR = "#7a7a7a"  # in the semantic map it is a building
+_TINT = 0.55  # strength of the class colours on white, so that drives stand out
 _MARGIN_M = 4.0
-_SMALL_M = 1.0  # what is thinner is drawn with an edge, else it is a speck
-_LABEL_PT = 30  # from the middle of a road to the name of a zone
+_SMALL_M = 1.0  # thinner objects are drawn with an edge to stay visible
+_LABEL_PT = 30  # distance of a zone's name from the middle of the road
 _WIDTH_IN = 9.0
 
 
 class Track(NamedTuple):
-    """Where a vehicle drove, points [T, 2] in metres, and how that ended."""
+    """A vehicle's track, points [T, 2] in metres, and its outcome."""
 
     points_m: NDArray[np.float64]
     outcome: str
@@ -50,9 +50,9 @@ def draw_plan(layout: Layout, tracks: Iterable[Track] = (), *, path: str | None 
     """Returns a figure of a scene from above, x to the right, y upwards, metres on both axes.
 
     Args:
-        layout: of the scene.
+        layout: the scene's layout.
         tracks: drives, coloured by their outcome.
-        path: whose closures are drawn in full; all are drawn faintly where it is None.
+        path: the path whose closures are drawn in full; if None, all are drawn faintly.
     """
     standing = [box.footprint for box in (*layout.buildings, *layout.obstacles)]
     shown = shapely.union_all([layout.drivable, layout.sidewalks, *standing])
@@ -145,7 +145,7 @@ def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
 
 
 def _name_zones(axes: Axes, layout: Layout, names: Iterable[str]) -> None:
-    # Starts to the left of their road and ends to its right: a place may be both.
+    # Names of starts go to the left of the road and of ends to its right: a zone may be both.
     for name in names:
         zone = next(zone for zone in layout.scene.zones if zone.name == name)
         x, y, heading = layout.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)

@@ -17,14 +17,14 @@ HELP = "← → steer    R new episode    Q quit"
 
 
 class NoScreenError(RuntimeError):
-    """There is nowhere to open a window."""
+    """A window can't be opened."""
 
 
 class KeyboardDriver:
-    """What the keys do, and what is shown, apart from any window.
+    """Turns key presses into actions and returns the pictures to show, independent of any window.
 
-    A key acts for as long as it is held; of both, none does. An episode that has ended stays in
-    view until R begins the next.
+    A key acts while it is held; both together cancel out. A finished episode stays visible until R
+    begins the next.
     """
 
     def __init__(self, env: StreetEnv, *, seed: int | None = None, path: str | None = None) -> None:
@@ -37,7 +37,7 @@ class KeyboardDriver:
         self._begin(seed)
 
     def press(self, key: str | None) -> None:
-        """Takes note of a key that goes down."""
+        """Handles a key press."""
         if key in ACTION_OF_KEY:
             self._held.add(key)
         elif key in ("r", "R"):
@@ -46,12 +46,12 @@ class KeyboardDriver:
             self.is_over = True
 
     def release(self, key: str | None) -> None:
-        """Takes note of a key that comes up."""
+        """Handles a key release."""
         self._held.discard(key or "")
 
     @property
     def action(self) -> int:
-        """What the held keys ask for."""
+        """The action for the held keys."""
         actions = [ACTION_OF_KEY[key] for key in self._held]
         return actions[0] if len(actions) == 1 else NO_OP
 
@@ -63,14 +63,14 @@ class KeyboardDriver:
 
     @property
     def title(self) -> str:
-        """How the episode stands."""
+        """The window's title: the state of the episode."""
         episode = self.env.episode
         hit = f" ({self._info['hit']})" if self._info["hit"] else ""
         state = f"{episode.outcome.label.replace('_', ' ')}{hit}"
         return f"{state}   step {episode.steps}   return {self._return:.2f}   {HELP}"
 
     def picture(self) -> Image:
-        """Returns what the camera sees and its representations, side by side."""
+        """Returns the camera's picture and its representations, side by side."""
         sensor: Mapping[str, Any] = {
             name: torch.as_tensor(value) for name, value in self._observation.items()
         }
@@ -82,18 +82,18 @@ class KeyboardDriver:
 
 
 def drive_by_hand(driver: KeyboardDriver, show: Callable[[], None] | None = None) -> None:
-    """Opens a window and drives at the street's frame rate until it is closed.
+    """Opens a window and drives at the scene's frame rate until it is closed.
 
     Args:
-        driver: whose keys drive.
+        driver: handles the keys.
         show: blocks while the window is open; matplotlib's own by default.
 
     Raises:
-        NoScreenError: there is no screen, or no toolkit that draws windows.
+        NoScreenError: there is no screen, or no GUI toolkit.
     """
     import matplotlib.pyplot as plt
 
-    # Matplotlib's own shortcuts (left: back, r: home, q: quit) give way to the driver's.
+    # Disable Matplotlib's own shortcuts for the driver's keys (left: back, r: home, q: quit).
     shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
     with plt.rc_context(shortcuts):
         figure = plt.figure(figsize=(15, 3.2))
@@ -101,7 +101,7 @@ def drive_by_hand(driver: KeyboardDriver, show: Callable[[], None] | None = None
             plt.close(figure)
             raise NoScreenError(
                 "interactive=true needs a screen, and tkinter or PyQt to open a window on it "
-                f"(matplotlib found the backend {plt.get_backend()!r} alone)"
+                f"(matplotlib found only the backend {plt.get_backend()!r})"
             )
         run_window(figure, driver)
         (show or plt.show)()
@@ -109,7 +109,7 @@ def drive_by_hand(driver: KeyboardDriver, show: Callable[[], None] | None = None
 
 
 def run_window(figure: Any, driver: KeyboardDriver) -> Any:
-    """Connects a matplotlib figure to a driver; returns the timer that drives."""
+    """Connects a matplotlib figure to a driver; returns the timer that steps it."""
     import matplotlib.pyplot as plt
 
     axes = figure.add_axes((0, 0, 1, 0.92))
@@ -121,7 +121,7 @@ def run_window(figure: Any, driver: KeyboardDriver) -> Any:
     def tick() -> None:
         if driver.is_over:
             timer.stop()
-            # Not the manager's own destroy: pyplot would wait on for a window that is gone.
+            # Not the manager's own destroy: pyplot would keep waiting for the closed window.
             plt.close(figure)
             return
         driver.step()
