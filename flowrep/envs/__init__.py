@@ -1,6 +1,6 @@
 """Streets with pedestrians in PyBullet: gymnasium environments and `make_env` for TorchRL."""
 
-from flowrep.envs import availability as availability  # before all that it speaks of
+from flowrep.envs import availability as availability  # before imports that need PyBullet
 from flowrep.envs.make import (
     begin_step,
     get_states,

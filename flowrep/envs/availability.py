@@ -1,4 +1,4 @@
-"""Says in one line what to do where the simulator's packages are missing."""
+"""Raises a one-line error with the remedy if the simulator's packages are missing."""
 
 from importlib.util import find_spec
 

@@ -1,7 +1,6 @@
-"""One drive through a scene: where everything is and how the drive stands, without any picture.
+"""One drive through a scene: positions and outcome, without rendering.
 
-All of an episode is a function of the scene, the speed range, the frame rate, the episode's seed
-and the actions.
+An episode is a function of the scene, the speed range, the frame rate, its seed and the actions.
 """
 
 import math
@@ -21,24 +20,24 @@ from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, ro
 from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
-# Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't pass anyone by.
+# Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't skip anyone.
 _CHECKS_HZ = 24.0
-_STEPS_FORESEEN = 16  # people do not mind the vehicle: where they will be is computed at one go
+_STEPS_FORESEEN = 16  # people ignore the vehicle, so their positions are computed in batches
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Where the vehicle and the pedestrians' clock stand; ticks count the footprint's checks."""
+    """The vehicle's state and the pedestrians' clock; ticks count the footprint's checks."""
 
     vehicle: VehicleState
     ticks: int
 
 
 class Rules:
-    """What does not change between the episodes of a scene: its plan, its clock, its limits."""
+    """The constants of a scene's episodes: ground plan, clock and limits."""
 
     def __init__(self, layout: Layout, frame_rate_hz: float) -> None:
-        """Prepares the tests for a layout at a frame rate."""
+        """Prepares the checks for a layout and a frame rate."""
         self.layout, self.frame_rate_hz = layout, frame_rate_hz
         self.dt_s = 1.0 / frame_rate_hz
         self.ticks_a_step = math.ceil(_CHECKS_HZ / frame_rate_hz - 1e-9)
@@ -64,7 +63,7 @@ class Episode:
         path: str | None = None,
         vehicle_speed_mps: float | None = None,
     ) -> None:
-        """Draws the path and the pedestrians from the episode's seed, and stands at the start."""
+        """Draws the path and the pedestrians from the seed; the vehicle is at its start."""
         scene = rules.layout.scene
         rng = np.random.default_rng(episode_seed)
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
@@ -88,14 +87,14 @@ class Episode:
         self._foreseen_from = 0
 
     def resume(self, before: Moment, now: Moment) -> None:
-        """Goes to a later step: where the vehicle was, where it is, and everyone else with it."""
+        """Jumps to a later step, given its moment and the one before it."""
         self.before, self.now = before, now
         self.poses_before, self.poses = (
             self.crowd.poses(moment.ticks * self.rules.tick_s) for moment in (before, now)
         )
 
     def step(self, action: int, street: Street) -> None:
-        """Drives one step; it ends early where the episode does."""
+        """Drives one step, or part of it if the episode ends."""
         rules = self.rules
         turned = turn(self.now.vehicle, YAW_SIGN[action], rules.dt_s, rules.layout.scene.vehicle)
         track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in rules.tick_times_s]
@@ -113,7 +112,7 @@ class Episode:
             self.outcome = Outcome.TIMEOUT
 
     def _poses_ahead(self) -> Array:
-        """Returns where everyone is at the checks of the step to come, poses [T, P, 4]."""
+        """Returns everyone's poses at the checks of the next step, [T, P, 4]."""
         count, first = self.rules.ticks_a_step, self.now.ticks + 1
         at = first - self._foreseen_from
         if not 0 <= at <= len(self._foreseen) - count:

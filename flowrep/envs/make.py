@@ -1,4 +1,4 @@
-"""The street as a TorchRL environment, with the transforms that write its representations."""
+"""TorchRL environments of streets, with the transforms that write representations."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -22,14 +22,14 @@ from flowrep.scenes.scene import Range, Scene, SpeedMode
 from flowrep.simulator.renderer import choose_renderer
 from flowrep.transforms import representation_stack
 
-_SELDOM = ("rgb", "frame")  # sensors that are kept only where something reads them
+_SELDOM = ("rgb", "frame")  # sensors that are kept only if something reads them
 
 
 class VectorWrapper(GymWrapper):
-    """TorchRL's wrapper, with the marks of what to reset brought to where NumPy reads them.
+    """TorchRL's wrapper, with reset masks moved to the CPU and optional.
 
-    TorchRL 0.14 hands them on from the device of the TensorDict, which fails on CUDA, and expects
-    them of every TensorDict; where they are missing, all environments are reset.
+    TorchRL 0.14 passes them on from the TensorDict's device, which fails on CUDA, and requires them
+    in every TensorDict; here, all environments are reset if they are missing.
     """
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -40,10 +40,10 @@ class VectorWrapper(GymWrapper):
 
 
 class DropSensor(ExcludeTransform):
-    """Drops all ("sensor", ...) keys, once the representations have been made from them."""
+    """Drops all ("sensor", ...) keys after the representations have been computed from them."""
 
     def __init__(self) -> None:
-        """Excludes the whole of "sensor"."""
+        """Excludes "sensor"."""
         super().__init__("sensor")
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
@@ -72,33 +72,33 @@ def make_env(
 
     Reads action (categorical: 0 NO_OP, 1 TURN_LEFT, 2 TURN_RIGHT). Writes the representations,
     `outcome` and `hit` uint8 [1], `episode_seed` int64 [1], `reward` [1] and the done keys. Env
-    i's k-th episode is the same whatever the policy.
+    i's k-th episode does not depend on the policy.
 
     Args:
         scene: a scene's name, file, mapping, or `Scene`.
         representations: names, or a mapping from name to options; only the sensors that they need
             are rendered, none for an empty list.
-        num_envs: how many environments.
-        num_workers: how many processes step them, see `WorkerVectorEnv`; 0: this one. The results
-            are the same.
-        device: where the TensorDicts lie.
+        num_envs: number of environments.
+        num_workers: number of processes that step them, see `WorkerVectorEnv`; 0 steps them in this
+            process. The results are the same.
+        device: device of the TensorDicts.
         speed: the pedestrians' speed mode, or their (lowest, highest) speed in m/s.
         frame_rate_hz: steps a second; the scene's own if None.
         seed: seeds the envs, which draw their episodes from it; None leaves that to `set_seed`.
-        keep_sensor: whether the ("sensor", ...) keys are kept; rgb and frame only where a
+        keep_sensor: whether the ("sensor", ...) keys are kept; rgb and frame are kept only if a
             representation needs them.
-        flow: "exact" or "estimated", where raw and obj come from; a mapping gives options, see
+        flow: "exact" or "estimated", the source of raw and obj; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
-        noise: errors of the depth camera and of odometry, see there. They are those of the frame:
-            an episode that is driven again looks the same.
-        compiled: whether flow is computed through `torch.compile`: some eight times as fast on a
-            CPU, equal up to rounding, after up to a minute of compiling.
+        noise: errors of the depth camera and of odometry, see `representation_stack`. They are
+            drawn by frame, so that a repeated episode looks the same.
+        compiled: whether flow is computed through `torch.compile`: about eight times as fast on a
+            CPU and equal up to rounding, after up to a minute of compilation.
         renderer: what renders depth, classes and ids, see `StreetEnv`.
 
     Raises:
         SceneError: if the scene is invalid.
-        ValueError: if there are no environments, or more workers than environments, or if
-            `compiled=True` and there is no C++ compiler.
+        ValueError: if there are no environments or more workers than environments, or if
+            `compiled=True` and no C++ compiler is found.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -119,7 +119,7 @@ def make_env(
         frame_rate_hz=frame_rate_hz,
         renderer=choose_renderer(renderer),
     )
-    # An environment without sensors tells the transforms K, classes and frame rate.
+    # An environment without sensors gives the transforms K, classes and frame rate.
     probe = street(sensors=())
     transforms = Compose()
     if representations:
@@ -152,11 +152,11 @@ def make_env(
 
 
 def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
-    """Starts the step of `env.step(acted)` in the workers; does nothing without workers.
+    """Starts `env.step(acted)` in the workers; does nothing without workers.
 
     Args:
         env: made by `make_env`.
-        acted: has `action`.
+        acted: holds `action`.
     """
     vector = _vector(env)
     if isinstance(vector, WorkerVectorEnv):
@@ -166,7 +166,7 @@ def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
 def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
     """Returns whether the env's workers and `threads` threads of the caller have a core each.
 
-    If not, doing both at once is slower than one after the other: threads that synchronise at
+    If not, running both at once is slower than one after the other: threads that synchronise at
     every operation all wait when one of them loses its core.
     """
     vector = _vector(env)
@@ -189,15 +189,15 @@ def street_envs(env: TransformedEnv) -> list[StreetEnv]:
 
 
 def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
-    """Returns the state of every environment, as plain data that JSON can hold."""
+    """Returns the state of every environment as JSON-serialisable data."""
     return list(_vector(env).call("get_state"))
 
 
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
-    """Restores states of `get_states`; continue from the TensorDict of that time.
+    """Restores states from `get_states`; continue with the TensorDict of the same time.
 
     Raises:
-        ValueError: if there is not one state for each environment.
+        ValueError: if the number of states is not the number of environments.
     """
     env.reset()
     vector = _vector(env)

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 
 def planar(x_m: float | Array, y_m: float | Array, yaw_rad: float | Array) -> Array:
-    """Returns the transforms [..., 4, 4] of planar poses: body axes into the world's."""
+    """Returns the transforms [..., 4, 4] of planar poses, from body to world axes."""
     sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
     transforms = np.zeros((*np.shape(yaw_rad), 4, 4))
     transforms[..., 0, 0] = transforms[..., 1, 1] = cosine
@@ -21,7 +21,7 @@ def planar(x_m: float | Array, y_m: float | Array, yaw_rad: float | Array) -> Ar
 
 
 def rigid_inverse(transforms: Array) -> Array:
-    """Returns the inverses of rigid transforms [..., 4, 4]: of (R, t) it is (Rᵀ, -Rᵀt)."""
+    """Returns the inverses of rigid transforms [..., 4, 4]: (Rᵀ, -Rᵀt) for (R, t)."""
     inverse = np.zeros_like(transforms)
     rotation = transforms[..., :3, :3].swapaxes(-1, -2)
     inverse[..., :3, :3] = rotation
@@ -31,19 +31,19 @@ def rigid_inverse(transforms: Array) -> Array:
 
 
 class CameraPose:
-    """Where cameras on vehicles stand, both ways: one of them, or an array of them."""
+    """The pose of a camera on a vehicle and its inverse, or arrays of them."""
 
     def __init__(
         self, x_m: float | Array, y_m: float | Array, yaw_rad: float | Array, mount: Array
     ) -> None:
-        """Puts the mount, vehicle_from_cam [4, 4], on vehicles at planar poses."""
+        """Applies the mount, vehicle_from_cam [4, 4], to vehicles at planar poses."""
         self.planar = np.stack([x_m, y_m, yaw_rad], axis=-1)
         self.world_from_cam = planar(x_m, y_m, yaw_rad) @ mount
         self.cam_from_world = rigid_inverse(self.world_from_cam)
 
 
 def relative_camera(before: CameraPose, now: CameraPose) -> Array:
-    """Returns prev_from_curr [..., 4, 4]; the exact identity for a camera that stood still."""
+    """Returns prev_from_curr [..., 4, 4]; exactly the identity if the camera did not move."""
     motion = before.cam_from_world @ now.world_from_cam
     motion[(before.planar == now.planar).all(axis=-1)] = np.eye(4)
     return motion
@@ -54,9 +54,9 @@ def instance_motion(
 ) -> Array:
     """Returns prev_from_curr by instance [..., 1 + M, 4, 4] for bodies [..., M, 4, 4].
 
-    Row 0 is the static world's. Row i takes a point that rides on body i, seen now in the current
-    camera's frame, to where the previous camera saw it. A body that kept its pose has row 0's very
-    numbers, so that its object flow is exactly zero.
+    Row 0 is the static world's. Row i maps a point fixed to body i from the current camera's frame
+    to its position in the previous camera's frame. A body that kept its pose has exactly the
+    numbers of row 0, so that its object flow is exactly zero.
     """
     static = relative_camera(before, now)[..., None, :, :]
     body_from_cam = rigid_inverse(world_from_body) @ now.world_from_cam[..., None, :, :]

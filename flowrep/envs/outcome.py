@@ -1,4 +1,4 @@
-"""How an episode stands, what was hit, and what a step is worth."""
+"""The outcome of an episode, the category hit, and the reward of a step."""
 
 from enum import IntEnum
 
@@ -6,7 +6,7 @@ from flowrep.palette import CATEGORY_ID
 
 
 class Outcome(IntEnum):
-    """How an episode stands; the code is what the TensorDict carries."""
+    """The state of an episode; the TensorDict holds its code."""
 
     RUNNING = 0
     SUCCESS = 1
@@ -21,7 +21,7 @@ class Outcome(IntEnum):
 
 
 NOTHING_HIT = 255
-"""The code of `hit` where nothing was hit: no class has this id."""
+"""The code of `hit` if nothing was hit; no class has this id."""
 
 _CATEGORIES = tuple(CATEGORY_ID)
 
@@ -45,7 +45,7 @@ def reward(outcome: Outcome) -> float:
 
 
 def hit_code(category: str) -> int:
-    """Returns what the TensorDict carries for what was hit: its class id, `NOTHING_HIT` for "".
+    """Returns the TensorDict's code for the category hit: its class id, or `NOTHING_HIT` for "".
 
     >>> hit_code("pedestrian"), hit_code("")
     (4, 255)
@@ -54,7 +54,7 @@ def hit_code(category: str) -> int:
 
 
 def hit_name(code: int) -> str:
-    """Returns the category that `hit_code` gave this code, "" for nothing.
+    """Returns the category of a code of `hit_code`, or "" for nothing.
 
     >>> hit_name(4), hit_name(255)
     ('pedestrian', '')

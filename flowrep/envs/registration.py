@@ -1,4 +1,4 @@
-"""The names under which `gymnasium.make` finds the streets."""
+"""Registration of the environments with `gymnasium.make`."""
 
 import gymnasium
 

@@ -1,4 +1,4 @@
-"""Representations as plain numpy maps, for learners that know gymnasium and no TorchRL."""
+"""Representations as plain numpy maps, for gymnasium learners without TorchRL."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,21 +27,20 @@ Maps = NDArray[Any] | dict[str, NDArray[Any]]
 class RepresentationObservation(gym.Wrapper):
     """Turns an environment's sensor maps into representations, channels first and finite.
 
-    Joined, the observation is one `Box` `[C, H, W]`: float32, the representations' channels in the
-    order of their names, ids one-hot and colours divided by 255. Where all are uint8 (rgb alone)
-    they stay so. Not joined, it is a `Dict` with a map under each name as `make_env` gives it.
+    If joined, the observation is one `Box` `[C, H, W]`: float32, with the representations' channels
+    in the given order, ids one-hot and colours divided by 255. If all maps are uint8 (rgb alone),
+    they stay uint8. If not joined, it is a `Dict` of maps by name, as `make_env` gives them.
 
     Args:
-        env: gives a dict of sensor maps, as `StreetEnv` does; `prev_from_curr` and its like
-            among them.
+        env: gives a dict of sensor maps and motions, as `StreetEnv` does.
         representations: names, or a mapping from name to options.
-        joined: whether the maps are joined on their channels.
+        joined: whether the maps are joined along their channels.
         intrinsics: K `[3, 3]` of the maps in pixels; the environment's own `K` if None.
-        num_classes: of `semantic`; the environment's own if None.
+        num_classes: number of classes in `semantic`; the environment's own if None.
         dt_s: seconds a step; from the environment's `frame_rate_hz` if None and known.
 
     Raises:
-        ValueError: for an unknown representation, or one that lacks what it needs.
+        ValueError: if a representation is unknown or lacks an input.
 
     >>> env = gym.make("flowrep/StraightRoad-v0", representations=["ego", "obj"])
     >>> observation, info = env.reset(seed=0)
@@ -102,7 +101,7 @@ class RepresentationObservation(gym.Wrapper):
 
     def _space(self, sensors: spaces.Space) -> spaces.Space:
         if not isinstance(sensors, spaces.Dict):
-            raise ValueError(f"representations are made of a dict of sensor maps, got {sensors}")
+            raise ValueError(f"representations need a dict of sensor maps, got {sensors}")
         spec = Composite(sensor=Composite({key: _spec(box) for key, box in sensors.items()}))
         spec = self._stack.transform_observation_spec(spec)
         boxes = {name: _box(spec[name]) for name in self.names}
@@ -118,19 +117,19 @@ class RepresentationObservation(gym.Wrapper):
 
 
 class NumericInfo(gym.Wrapper):
-    """Gives `info` of numbers alone, and time-outs as truncations where that is wanted.
+    """Reduces `info` to numbers, and optionally reports time-outs as truncations.
 
-    | key | what |
+    | key | meaning |
     | --- | --- |
     | `outcome` | code of `flowrep.envs.Outcome`; 0 while the episode runs |
     | `hit` | class id of what was hit; 255 for nothing |
-    | `episode_seed` | names the episode, see `StreetEnv.reset` |
-    | `path` | position of the episode's path among the scene's |
-    | `is_success` | whether the episode ended well, as Stable-Baselines3 reads it |
+    | `episode_seed` | identifies the episode, see `StreetEnv.reset` |
+    | `path` | index of the episode's path in the scene |
+    | `is_success` | whether the episode succeeded, as Stable-Baselines3 reads it |
 
     Args:
         env: a `StreetEnv`, wrapped or not.
-        truncate_timeouts: whether running out of time is `truncated` and not `terminated`.
+        truncate_timeouts: whether a time-out is `truncated` instead of `terminated`.
     """
 
     def __init__(self, env: gym.Env, *, truncate_timeouts: bool = False) -> None:
@@ -172,17 +171,17 @@ def make_street(
     truncate_timeouts: bool = False,
     **options: Any,
 ) -> gym.Env:
-    """Returns what `gymnasium.make` gives: a `StreetEnv`, or its representations.
+    """Returns the environment for `gymnasium.make`: a `StreetEnv`, or its representations.
 
-    Without representations nor `truncate_timeouts` it is the plain `StreetEnv`, with its sensors
-    and with words in `info`.
+    With neither representations nor `truncate_timeouts` it is the plain `StreetEnv`, with its
+    sensors and strings in `info`.
 
     Args:
         scene: as in `StreetEnv`.
         representations: names, or a mapping from name to options.
         joined: as in `RepresentationObservation`.
         truncate_timeouts: as in `NumericInfo`.
-        options: of `StreetEnv`.
+        options: passed to `StreetEnv`.
     """
     if representations and "sensors" not in options:
         options["sensors"] = _sensors_for(representations)
@@ -195,7 +194,7 @@ def make_street(
 
 
 def _sensors_for(representations: Representations) -> list[str]:
-    """Returns the sensors that representations read: K and classes don't matter for that."""
+    """Returns the sensors that representations read; they don't depend on K and classes."""
     stack: Compose = representation_stack(
         representations, intrinsics=torch.eye(3), num_classes=1, dt_s=1.0
     )
@@ -204,7 +203,7 @@ def _sensors_for(representations: Representations) -> list[str]:
 
 
 def _onehot(representations: Representations) -> dict[str, dict[str, Any]]:
-    """Returns the representations with ids one-hot: a class's number is no intensity."""
+    """Returns the representations with one-hot ids: a class id is not an intensity."""
     given = representations if isinstance(representations, Mapping) else {}
     return {
         name: {"encoding": "onehot", **(given.get(name) or {})}

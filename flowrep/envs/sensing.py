@@ -1,4 +1,4 @@
-"""What the street's camera observes: maps of what it sees, motion from two poses."""
+"""Observations of an env's camera: sensor maps, and motion from two poses."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -31,12 +31,12 @@ _MOTIONS = frozenset({"prev_from_curr", "instance_motion"})
 
 
 class Sensing:
-    """The camera of one street and the sensors that were asked for."""
+    """The camera of one environment and the requested sensors."""
 
     def __init__(
         self, scene: Scene, street: Street, sensors: Sequence[str], renderer: str = "auto"
     ) -> None:
-        """Computes what stays the same from picture to picture."""
+        """Precomputes the constants of all pictures."""
         unknown = [name for name in sensors if name not in SENSORS]
         if unknown:
             raise ValueError(f"unknown sensors {unknown}; they are: {', '.join(SENSORS)}")
@@ -58,18 +58,18 @@ class Sensing:
         self._picture: Picture | None = None
 
     def observe(self, episode: Episode) -> dict[str, Any]:
-        """Returns the observation of an episode's present; nothing is rendered for no map."""
+        """Returns an episode's current observation; renders only if a map is requested."""
         return {name: stack[0] for name, stack in observe_together([self], [episode]).items()}
 
     def rgb(self, episode: Episode) -> NDArray[np.uint8]:
-        """Returns the colour picture [H, W, 3] of an episode's present, last observed."""
+        """Returns the colour picture [H, W, 3] of an episode's last observed step."""
         picture = self._seen(episode)
         rgb = picture.rgba[..., :3].copy()
         rgb[picture.body < 0] = CLASS_COLOURS["sky"]
         return rgb
 
     def look(self, episode: Episode) -> Picture:
-        """Returns a picture from an episode's camera of what was last put into the street."""
+        """Returns a picture from an episode's camera of the bodies as last placed."""
         camera, pose = self._camera, self._camera_poses([episode.now])
         return self._street.simulator.look(
             gl_view(pose.cam_from_world[0]), self._projection, camera.height_px, camera.width_px
@@ -106,7 +106,7 @@ class Sensing:
     def _pictured(self, episode: Episode) -> Arrays:
         picture = self._seen(episode)
         maps: Arrays = {}
-        body = picture.body.astype(np.intp)  # what take() wants
+        body = picture.body.astype(np.intp)  # index type of take()
         if "depth" in self.names:
             depth = depth_from_zbuffer(picture.zbuffer, self._camera.near_m, self._camera.far_m)
             np.putmask(depth, body < 0, np.inf)
@@ -119,9 +119,9 @@ class Sensing:
 
 
 def observe_together(sensings: Sequence[Sensing], episodes: Sequence[Episode]) -> Arrays:
-    """Returns the observations of the presents of N episodes on streets of one scene, [N, ...].
+    """Returns the current observations of N episodes of one scene, [N, ...].
 
-    Each is what its street observes alone, to the last bit.
+    Each is identical, bit for bit, to the observation of its environment alone.
     """
     for sensing in sensings:
         sensing._picture = None
@@ -161,6 +161,6 @@ def observe_together(sensings: Sequence[Sensing], episodes: Sequence[Episode]) -
 
 
 def _parts(poses: Sequence[Array]) -> Array:
-    """Returns the transforms [N, M, 4, 4] of people's parts for poses [P, 4], N times."""
+    """Returns the transforms [N, M, 4, 4] of people's parts for N arrays of poses [P, 4]."""
     stacked = np.stack(poses)
     return world_from_parts(stacked.reshape(-1, 4)).reshape(len(poses), -1, 4, 4)

@@ -1,4 +1,4 @@
-"""The street's observation as `make_env` returns it: sensors, and the status of the episode."""
+"""Observations as `make_env` returns them: sensors, and the status of the episode."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,12 +15,12 @@ _OUTCOME_CODE = {outcome.label: outcome.value for outcome in Outcome}
 class SensorObservation(gym.Wrapper):
     """Nests the observation under "sensor" and adds the status of the episode.
 
-    | key | shape | dtype | what |
+    | key | shape | dtype | meaning |
     | --- | --- | --- | --- |
     | `sensor` | | | the wrapped environment's observation |
     | `outcome` | [1] | uint8 | code of `flowrep.envs.Outcome`; 0 while the episode runs |
     | `hit` | [1] | uint8 | class id of what was hit; 255 for nothing |
-    | `episode_seed` | [1] | int64 | names the episode, see `StreetEnv.reset` |
+    | `episode_seed` | [1] | int64 | identifies the episode, see `StreetEnv.reset` |
     """
 
     def __init__(self, env: gym.Env) -> None:
@@ -49,7 +49,7 @@ class SensorObservation(gym.Wrapper):
         return self.arrange(observation, info), float(reward), terminated, truncated, {}
 
     def arrange(self, observation: dict[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the observation as this wrapper gives it."""
+        """Returns the observation in this wrapper's layout."""
         code = _OUTCOME_CODE[info["outcome"]]
         status = episode_status([code], [info["hit"]], [info["episode_seed"]])
         return dict.fromkeys(self._names, observation) | {k: v[0] for k, v in status.items()}

@@ -22,13 +22,13 @@ _OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz
 
 
 class StreetEnv(gym.Env):
-    """A vehicle drives through a street of pedestrians at constant speed, and steers.
+    """A vehicle is steered at constant speed through a street with pedestrians.
 
-    Actions: 0 keeps the yaw rate, 1 adds α·Δt to it (left), 2 takes it off (right).
+    Actions: 0 keeps the yaw rate, 1 adds α·Δt to it (left), 2 subtracts α·Δt (right).
 
-    Observation: a dict with the `sensors` that were asked for.
+    Observation: a dict of the requested `sensors`.
 
-    | key | shape | dtype | what |
+    | key | shape | dtype | meaning |
     | --- | --- | --- | --- |
     | `depth` | [1, H, W] | float32 | metres along z; sky is inf |
     | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.palette` |
@@ -36,19 +36,19 @@ class StreetEnv(gym.Env):
     | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
     | `instance_motion` | [1 + 3·P, 4, 4] | float32 | the same by instance; row 0: static world |
     | `rgb` | [3, H, W] | uint8 | |
-    | `frame` | [2] | int64 | its name: the episode's seed, and the steps since its start |
+    | `frame` | [2] | int64 | its identifier: the episode's seed, and the steps since its start |
 
-    At reset the previous pose is the current one. `info` holds `outcome`, `hit` (the category of
-    what was hit, or ""), `episode_seed` and `path`.
+    At reset the previous pose is the current one. `info` holds `outcome`, `hit` (the category hit,
+    or ""), `episode_seed` and `path`.
 
     Args:
         scene: a scene's name, file, mapping, or `Scene`.
         speed: the pedestrians' speed mode, or their (lowest, highest) speed in m/s.
         frame_rate_hz: steps a second; the scene's own if None. The time limit keeps its seconds.
-        sensors: the keys of the observation; with none nothing is rendered.
+        sensors: the keys of the observation; nothing is rendered if empty.
         render_mode: "rgb_array" or None.
-        renderer: who draws depth, classes and ids: "rasteriser", "pybullet", or "auto", the
-            rasteriser where numba is installed. Colours are PyBullet's.
+        renderer: of depth, classes and ids: "rasteriser", "pybullet", or "auto", which is the
+            rasteriser if numba is installed. Colours always come from PyBullet.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - gymnasium declares it so
@@ -74,7 +74,7 @@ class StreetEnv(gym.Env):
         self.num_classes = num_classes(self.scene.categories)
         self._street = Street.shared(self.scene)
         self._is_open = True
-        self._rules: dict[float, Rules] = {}  # of each frame rate that was asked for
+        self._rules: dict[float, Rules] = {}  # by frame rate
         self.sensing = Sensing(self.scene, self._street, sensors, renderer)
         self.K = self.sensing.K
         self._episode: Episode | None = None
@@ -83,9 +83,9 @@ class StreetEnv(gym.Env):
 
     @property
     def episode(self) -> Episode:
-        """The running episode, with every pose: what a privileged policy may see."""
+        """The current episode with every pose, for privileged policies."""
         if self._episode is None:
-            raise RuntimeError("there is no episode yet: call reset() first")
+            raise RuntimeError("no episode has begun: call reset() first")
         return self._episode
 
     def reset(
@@ -95,27 +95,27 @@ class StreetEnv(gym.Env):
 
         Args:
             seed: seeds the generator that draws the episodes' seeds.
-            options: `episode_seed` (int) names the episode, `path` (str) its path,
-                `vehicle_speed_mps` (float) another speed than the scene's: 0 holds the camera;
-                `speed` and `frame_rate_hz`, of this episode, are others than the env's.
+            options: `episode_seed` (int) selects the episode and `path` (str) its path;
+                `vehicle_speed_mps` (float) replaces the scene's speed, with 0 for a still camera;
+                `speed` and `frame_rate_hz` replace the env's for this episode.
         """
         self.begin(seed=seed, options=options)
         return self.sensing.observe(self.episode), self._info()
 
     def begin(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Begins an episode as `reset` does, and does not look at it."""
+        """Begins an episode as `reset` does, without an observation."""
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(1 << 31))
         self._begin({"episode_seed": drawn} | (options or {}))
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drives one step. Every end of an episode is `terminated`, the time-out too."""
+        """Drives one step. Every end of an episode is `terminated`, including the time-out."""
         outcome = self.drive(action)
         observation = self.sensing.observe(self.episode)
         return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
 
     def drive(self, action: int) -> Outcome:
-        """Drives one step as `step` does, and does not look at it.
+        """Drives one step as `step` does, without an observation.
 
         Raises:
             ValueError: the action is not 0, 1 or 2.
@@ -128,19 +128,19 @@ class StreetEnv(gym.Env):
         return self.episode.outcome
 
     def render(self) -> Any:
-        """Returns what the camera sees, [H, W, 3] uint8, if the render mode is "rgb_array"."""
+        """Returns the camera's picture, [H, W, 3] uint8, if the render mode is "rgb_array"."""
         if self.render_mode is None:
             return None
         return self.sensing.rgb(self.episode)
 
     def close(self) -> None:
-        """Leaves the street; the last one to do so gives the simulator's client back."""
+        """Leaves the street; the last environment to do so disconnects the simulator's client."""
         if self._is_open:
             self._is_open = False
             self._street.leave()
 
     def get_state(self) -> dict[str, Any]:
-        """Returns all that the future depends on, as plain data that JSON can hold."""
+        """Returns the complete state as JSON-serialisable data."""
         episode = self.episode
         return {
             "np_random": self.np_random.bit_generator.state,
@@ -157,7 +157,7 @@ class StreetEnv(gym.Env):
         }
 
     def set_state(self, state: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Goes back to a state of `get_state`; returns its observation and info."""
+        """Restores a state from `get_state`; returns its observation and info."""
         self.np_random.bit_generator.state = state["np_random"]
         self._begin({name: state[name] for name in _OPTIONS})
         episode = self.episode
@@ -192,7 +192,7 @@ class StreetEnv(gym.Env):
 
 def _action(action: Any) -> int:
     try:
-        number = operator.index(action)  # of any whole number, NumPy's and torch's too
+        number = operator.index(action)  # accepts integers of NumPy and torch too
     except TypeError:
         number = -1
     if number not in range(len(YAW_SIGN)):

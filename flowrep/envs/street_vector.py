@@ -15,9 +15,9 @@ from flowrep.envs.worker_process import Order
 
 
 class StreetVectorEnv(SyncVectorEnv):
-    """Gymnasium's `SyncVectorEnv` for streets, without autoreset and infos, and faster.
+    """A faster `SyncVectorEnv` for `StreetEnv`s, without autoreset and infos.
 
-    What comes out is the same, bit for bit, and belongs to the caller.
+    Its results are identical, bit for bit, and belong to the caller.
 
     Args:
         env_fns: make `SensorObservation`s of one scene with the same sensors.
@@ -35,7 +35,7 @@ class StreetVectorEnv(SyncVectorEnv):
         seed: int | list[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begins episodes in all environments, or in those that `options["reset_mask"]` marks."""
+        """Begins episodes in all environments, or in those marked by `options["reset_mask"]`."""
         options = dict(options or {})
         mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
         seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
@@ -62,12 +62,13 @@ class StreetVectorEnv(SyncVectorEnv):
         """Executes one order per environment, and renders those whose episode continues.
 
         Args:
-            orders: one a street: an action to drive a step with, options of `StreetEnv.reset` to
-                begin an episode with, or None, which leaves it alone.
-            into: arrays `[num_envs, ...]` by sensor, of which their rows are written.
+            orders: one for each environment: an action to take a step, options of `StreetEnv.reset`
+                to begin an episode, or None to do nothing.
+            into: arrays `[num_envs, ...]` by sensor, in which the rendered rows are written.
 
         Returns:
-            How the episode stands, its outcome's name and what was hit, of each that had an order.
+            The outcome's name and the category hit for each environment with an order, None for the
+            others.
         """
         for street, order in zip(self._streets, orders, strict=True):
             if isinstance(order, Mapping):
@@ -94,7 +95,7 @@ class StreetVectorEnv(SyncVectorEnv):
             [episode.seed for episode in episodes],
         )
         if len(rows) < self.num_envs:
-            # What was given away before is the caller's: it is copied, and stays as it is.
+            # Arrays returned before belong to the caller: copy them instead of writing to them.
             seen = _replaced(self._latest.get("sensor", {}), seen, rows)
             status = _replaced(self._latest, status, rows)
         self._latest = ({"sensor": seen} if seen else {}) | status

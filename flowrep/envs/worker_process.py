@@ -1,4 +1,4 @@
-"""A process that holds several environments and answers one command after the other."""
+"""A process that holds several environments and executes commands one at a time."""
 
 import os
 import signal
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 EnvFactory = Callable[[], gym.Env]
 VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 Order = int | Mapping[str, Any] | None  # an action, reset options, or nothing
-Arrays = dict[str, Any]  # arrays, or such dicts of them, as a Dict space holds them
+Arrays = dict[str, Any]  # arrays, nested like a Dict space
 
 
 class WorkerError(RuntimeError):
-    """A worker process failed or is gone; the message says which environments it held."""
+    """A worker process failed or died; the message names its environments."""
 
 
 class Worker:
@@ -44,12 +44,12 @@ class Worker:
 
     @property
     def name(self) -> str:
-        """Which environments it holds, in words."""
+        """The environments that it holds, in words."""
         first, last = self.rows.start, self.rows.stop - 1
         return f"environment {first}" if first == last else f"environments {first} to {last}"
 
     def send(self, command: str, arguments: tuple[Any, ...]) -> None:
-        """Hands a command on; an answer that nobody waited for to the end is dropped before."""
+        """Sends a command, after dropping any answer that was not fully received."""
         if self._owes_answer:
             self.receive()
         try:
@@ -59,7 +59,7 @@ class Worker:
             raise self._gone() from error
 
     def receive(self) -> Any:
-        """Waits for the answer to the last command; the first one names the code that it runs."""
+        """Waits for the answer to the last command; the first answer names the code it runs."""
         try:
             failure, answer = self.pipe.recv()
             self._owes_answer = False
@@ -70,7 +70,7 @@ class Worker:
         return answer
 
     def end(self) -> None:
-        """Waits until the process has noticed that its pipe is closed; not for long."""
+        """Waits briefly for the process to notice that its pipe is closed."""
         self.process.join(timeout=5.0)
         if self.process.is_alive():
             self.process.kill()
@@ -98,7 +98,7 @@ def _work(
     num_envs: int,
     in_each: VectorFactory,
 ) -> None:
-    """Answers commands until the other end of the pipe is closed."""
+    """Executes commands until the other end of the pipe is closed."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     vector = None
@@ -167,13 +167,13 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
 
 
 def views(space: gym.Space, memory: Any, num_envs: int) -> Arrays:
-    """Returns the shared memory of a `Dict` space as arrays [num_envs, ...] that can be written."""
+    """Returns the shared memory of a `Dict` space as writable arrays [num_envs, ...]."""
     views: Any = read_from_shared_memory(space, memory, num_envs)
     return _map(np.asarray, views)
 
 
 def sliced(arrays: Arrays, rows: slice) -> Arrays:
-    """Returns views of those rows."""
+    """Returns views of the given rows."""
     return _map(lambda array: array[rows], arrays)
 
 

@@ -1,4 +1,4 @@
-"""The process that workers are forked from: what it imports, and what it leaves behind."""
+"""The fork server of the workers: its imports, signals and temporary files."""
 
 import atexit
 import multiprocessing
@@ -15,14 +15,13 @@ _LONGEST_FOLDER = 107 - len("/listener-12345678")  # bytes: a socket's path has 
 
 
 def server_context(module: str) -> Any:
-    """Returns a context of multiprocessing whose fork server runs.
+    """Returns a multiprocessing context with a running fork server.
 
-    SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, reach neither
-    the server nor what it forks, from their first moment on: they end when the caller closes, or is
-    gone.
+    SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, never reach the
+    server or the processes that it forks. They end when the caller closes them or dies.
 
     Args:
-        module: is imported by the server, once for all workers, with all that it imports.
+        module: imported by the server once for all workers, with its own imports.
 
     Raises:
         OSError: the path of the folder for temporary files is too long.
@@ -37,10 +36,10 @@ def server_context(module: str) -> Any:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Has SIGINT and SIGTERM wait for the end of the block; what begins in it never hears them.
+    """Blocks SIGINT and SIGTERM during the block, permanently in processes started in it.
 
-    A process inherits the mask, and multiprocessing leaves it as it is. A worker whose caller ends
-    while it is begun would tell of the half of its task that it was given.
+    A process inherits the mask, and multiprocessing does not change it. A worker whose caller is
+    interrupted while starting it would print an error about its incomplete arguments.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     try:
@@ -62,6 +61,6 @@ def _folder_told() -> Iterator[None]:
 
 
 if _FOLDER in os.environ:
-    # This is the server. Its socket lies in a folder that the caller removes; a caller that is
-    # killed can't, and is outlived by its server for a moment.
+    # This runs in the server. The caller removes the folder of its socket; a killed caller can't,
+    # and its server outlives it for a moment.
     atexit.register(shutil.rmtree, os.environ.pop(_FOLDER), ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Environments stepped side by side in several processes, several in each."""
+"""Environments stepped in parallel in several processes, several in each."""
 
 import atexit
 import os
@@ -37,29 +37,29 @@ _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.
 class WorkerVectorEnv(VectorEnv):
     """Several environments in each of several processes, behind gymnasium's vector interface.
 
-    To its user it is a `SyncVectorEnv` with autoreset disabled: the same seeds and actions give the
-    same numbers, bit for bit, whatever the number of workers. Infos are not handed on. Gymnasium's
+    It behaves like a `SyncVectorEnv` with autoreset disabled: the same seeds and actions give the
+    same numbers, bit for bit, for any number of workers. Infos are not passed on. Gymnasium's
     `AsyncVectorEnv` made 386 to 403 frames/s where this one made 464 to 524, and Ctrl-C kills its
     workers.
 
-    Observations come back through shared memory, the rest through pipes. `step_async` begins a
-    step, so that the caller can do other work until it asks for the outcome with `step`.
+    Observations come back through shared memory, everything else through pipes. `step_async` begins
+    a step, so that the caller can do other work until it calls `step` for the outcome.
 
-    Workers are forked from a server process that has imported what they need and nothing of the
-    caller's threads or CUDA state. They ignore SIGINT and SIGTERM, which terminals and schedulers
-    send to whole process groups: the caller decides, and they end when it closes or is gone. Only
-    a script that defines its own environments in itself, not in a module that can be imported, is
-    run again by each worker, and keeps its work under `if __name__ == "__main__":`.
+    Workers are forked from a server process that has imported the modules they need and holds none
+    of the caller's threads or CUDA state. They ignore SIGINT and SIGTERM, which terminals and
+    schedulers send to whole process groups, and end when the caller closes them or dies. A script
+    that defines its own environments, instead of importing them from a module, is run again by each
+    worker and needs an `if __name__ == "__main__":` guard.
 
     Args:
-        env_factories: one for each environment; they can be pickled, and all have the same spaces,
-            a `Dict` of observations.
-        num_workers: how many processes, one environment each at least.
-        in_each: makes a vector without autoreset of the environments of one worker.
+        env_factories: one picklable factory for each environment; all environments have the same
+            spaces, with a `Dict` of observations.
+        num_workers: number of processes, at most one for each environment.
+        in_each: makes a vector env without autoreset from the environments of one worker.
 
     Raises:
-        ValueError: for fewer environments than workers.
-        WorkerError: a worker could not begin. Later, from any method, as it stops.
+        ValueError: if there are fewer environments than workers.
+        WorkerError: if a worker could not start; any method raises it once a worker has stopped.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class WorkerVectorEnv(VectorEnv):
         memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
         self._shared = views(self.single_observation_space, memory, self.num_envs)
         self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
-        # processes that ignore signals would hold up an interpreter that waits for them
+        # The interpreter would wait at exit for processes that ignore signals.
         self._at_exit = partial(_call, weakref.WeakMethod(self._shut_down))
         atexit.register(self._at_exit)
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
@@ -99,12 +99,12 @@ class WorkerVectorEnv(VectorEnv):
                     self._workers.append(Worker(context, env_factories, rows, memory, in_each))
             self._check_code(self._receive())
         except BaseException:
-            self._shut_down()  # while the memory is there, which they may be about to open
+            self._shut_down()  # before the memory that they may be about to open is released
             raise
 
     @property
     def num_workers(self) -> int:
-        """How many processes there are."""
+        """The number of processes."""
         return len(self._workers)
 
     def reset(
@@ -113,13 +113,13 @@ class WorkerVectorEnv(VectorEnv):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Arrays, dict[str, Any]]:
-        """Begins episodes, in all environments or in those that `options["reset_mask"]` marks.
+        """Begins episodes in all environments, or in those marked by `options["reset_mask"]`.
 
-        The outcome of a step that is under way is dropped.
+        The outcome of a step under way is dropped.
 
         Args:
-            seed: of the first environment, the next one's is one more; or one for each.
-            options: go to every environment's `reset`, but for `reset_mask`, bool [num_envs].
+            seed: of the first environment, with consecutive seeds for the others; or one for each.
+            options: passed to every environment's `reset`, except `reset_mask`, bool [num_envs].
         """
         self.drop_step()
         options = dict(options or {})
@@ -157,29 +157,29 @@ class WorkerVectorEnv(VectorEnv):
         return copied(self._shared), rewards, terminated, truncated, {}
 
     def drop_step(self) -> None:
-        """Waits for a step that is under way and forgets its outcome."""
+        """Waits for a step under way and discards its outcome."""
         if self._begun is not None:
             self._begun = None
             self._receive()
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Returns what each environment's method of that name returns, or its attribute."""
+        """Returns the result of a method, or the value of an attribute, for each environment."""
         self.drop_step()
         self._send("call", lambda rows: (name, args, kwargs))
         return tuple(result for results in self._receive() for result in results)
 
     def call_each(self, name: str, arguments: Sequence[Any]) -> tuple[Any, ...]:
-        """Returns what each environment's method returns for an argument of its own."""
+        """Returns the result of a method called with one argument for each environment."""
         self.drop_step()
         self._send("call_each", lambda rows: (name, list(arguments[rows])))
         return tuple(result for results in self._receive() for result in results)
 
     def advance(self, orders: Sequence[Order]) -> tuple[Arrays, list[Any]]:
-        """Lets each environment follow its order, where workers hold `StreetVectorEnv`s.
+        """Executes one order per environment; requires workers with `StreetVectorEnv`s.
 
         Returns:
-            What is seen, `[num_envs, ...]` by sensor, in memory that the next call writes to; how
-            each episode stands. See `StreetVectorEnv.advance`.
+            Observations `[num_envs, ...]` by sensor, in memory that the next call overwrites, and
+            the state of each episode. See `StreetVectorEnv.advance`.
         """
         self.drop_step()
         self._send("advance", lambda rows: (orders[rows],))
@@ -189,10 +189,10 @@ class WorkerVectorEnv(VectorEnv):
     def apply(
         self, function: Callable[[gym.Env, Any], Any], arguments: Iterable[Any]
     ) -> Iterator[tuple[int, Any]]:
-        """Yields each argument's number and what the function made of it, as they are done.
+        """Yields the index and result of each call, in order of completion.
 
         Args:
-            function: can be pickled; called with an environment of whichever worker is free.
+            function: picklable; called with an environment of any free worker.
             arguments: one for each call.
         """
         self.drop_step()
@@ -248,7 +248,7 @@ class WorkerVectorEnv(VectorEnv):
 
     @contextmanager
     def _ending_with_a_failure(self) -> Iterator[None]:
-        # The others' answers are of no use without the failed one's.
+        # The other workers' answers are useless without the failed one's.
         try:
             yield
         except WorkerError:
@@ -257,13 +257,13 @@ class WorkerVectorEnv(VectorEnv):
 
 
 def available_cores() -> int:
-    """Returns how many cores this process may use."""
+    """Returns the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def _without_main_module() -> Iterator[None]:
-    """Lets processes begin without running the main module again, which multiprocessing would."""
+    """Stops multiprocessing from running the main module again in new processes."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
