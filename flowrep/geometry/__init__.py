@@ -1,4 +1,4 @@
-"""Cameras, rigid motions and the flow they cause: pure batched functions that need torch alone."""
+"""Cameras, rigid motions and the flow they cause, as pure batched functions on torch tensors."""
 
 from flowrep.geometry.camera import project, unproject
 from flowrep.geometry.depth import DepthKind, adapt_depth, z_from_ray_length, z_from_z_buffer

@@ -1,4 +1,4 @@
-"""The pinhole camera: points in the camera's frame to pixels and back."""
+"""Pinhole camera: projection of points in the camera's frame to pixels, and back."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def project(points_cam: Tensor, K: Tensor) -> Tensor:
 
 
 def unproject(depth: Tensor, K: Tensor) -> Tensor:
-    """Returns the point in the camera's frame that each pixel shows, `[*B, H, W, 3]`.
+    """Returns the point that each pixel shows, in the camera's frame, `[*B, H, W, 3]`.
 
     Convention: OpenCV camera (x right, y down, z forward), metres; depth is z along the optical
     axis (not the ray's length); pixel (column i, row j) is seen through its centre
@@ -85,7 +85,7 @@ def unproject(depth: Tensor, K: Tensor) -> Tensor:
 
 
 def centred_pixels(height: int, width: int, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns pixel centres from the principal point: x `[*B, 1, W]` and y `[*B, H, 1]`."""
+    """Returns pixel centres relative to the principal point: x `[*B, 1, W]`, y `[*B, H, 1]`."""
     cx, cy = K[..., 0, 2, None, None], K[..., 1, 2, None, None]
     u = torch.arange(width, dtype=K.dtype, device=K.device) + 0.5
     v = torch.arange(height, dtype=K.dtype, device=K.device) + 0.5

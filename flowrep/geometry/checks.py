@@ -1,4 +1,4 @@
-"""Shape and dtype checks of geometry's arguments: static, so they cost nothing once compiled."""
+"""Shape and dtype checks of arguments; they are static, so compiled code doesn't run them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def check_shape(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> N
     Args:
         name: the argument's name, for the message.
         tensor: the argument.
-        trailing: sizes of the last dims; a string stands for any size and names it.
+        trailing: sizes of the last dims; a string is the name of a dim of any size.
 
     Raises:
         ValueError: if the number or a size of the trailing dims differs.
-        TypeError: if it holds integers, or is not a tensor.
+        TypeError: if it is not a float tensor.
     """
     check_is_tensor(name, tensor)
     if not tensor.is_floating_point():

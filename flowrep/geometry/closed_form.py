@@ -1,19 +1,19 @@
-"""The closed form behind the flow functions, written so that compiled it is one pass.
+"""The closed form behind the flow functions, which compiles to a single pass over the pixels.
 
-With x~ = p - c the pixel from the principal point, K' the intrinsics without it, and
+With x~ = p - c the pixel relative to the principal point c, K' the intrinsics without it, and
 `prev_from_curr` = (R, T), the point that pixel p shows at depth Z was seen at
 
     p' ~ (I + A) x~ + e / Z,    A = K' (R - I) K'^-1,    e = K' T        (homogeneous)
 
-so that with q = A x~ + e / Z the flow p - p' is (x~ qz - qx, y~ qz - qy) / (1 + qz). Nothing
-large is subtracted from anything large: float32 stays an order of magnitude nearer to float64
-than p - p' by the homography K R K^-1 does, and no motion gives exactly 0.
+so that with q = A x~ + e / Z the flow p - p' is (x~ qz - qx, y~ qz - qy) / (1 + qz). No two large
+numbers are subtracted: the float32 result is an order of magnitude closer to float64 than p - p'
+computed with the homography K R K^-1, and without motion flow is exactly 0.
 
-1 + qz is the point's depth in the previous camera over that in the current one. As it falls to 0
-flow grows without bound, so a pixel counts as seen before only where it is above `MIN_DEPTH_RATIO`.
+1 + qz is the point's depth in the previous camera over that in the current one. Flow grows without
+bound as it falls to 0, so a pixel counts as seen before only if it is above `MIN_DEPTH_RATIO`.
 
-Valid flow is finite, at no cost a pixel: what could overflow in float32 on the way from the inputs
-to flow is taken out before, by the bounds below (in the worst case 3e34 is reached).
+Valid flow is finite, without a check per pixel: the bounds below exclude inputs for which an
+intermediate result could overflow in float32 (the worst case reaches 3e34).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from torch import Tensor
 
 from flowrep.geometry.camera import centred_pixels
 
-# Of the depth in the previous camera over the depth in the current one.
+# Lower bound on the depth in the previous camera over the depth in the current one.
 MIN_DEPTH_RATIO = 0.01
 
-LARGEST = 1e8  # of an entry of K, A and e, in pixels, metres and their products
-SMALLEST = 1e-8  # of depth in metres, and of dt
+LARGEST = 1e8  # bound on the entries of K, A and e, in pixels, metres and their products
+SMALLEST = 1e-8  # bound on depth in metres, and on dt
 
 Planes = tuple[Tensor, Tensor, Tensor]  # u, v, valid: [*B, H, W] each
 
@@ -51,7 +51,7 @@ def camera_planes(
     by_motion = coefficients[..., None, None, :]  # [*B, 1, 1, 12]
     axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = by_motion.unbind(-1)
     x, y = centred_pixels(depth.shape[-2], depth.shape[-1], K)
-    # A x~ is a column's share plus a row's. Tables of them leave each pixel an addition.
+    # A x~ is the sum of a term per column and one per row, tabulated to save work per pixel.
     x, *columns = _table(x, axx * x, ayx * x, azx * x)
     y, *rows = _table(y, axy * y + ax, ayy * y + ay, azy * y + az)
     q_far = [column + row for column, row in zip(columns, rows)]
@@ -66,7 +66,7 @@ def body_planes(
     dt: float | Tensor,
     dtypes: tuple[torch.dtype, torch.dtype],
 ) -> Planes:
-    """Returns the flow planes of a motion for each instance, `depth` and `instance` in batch."""
+    """Returns the flow planes of one motion per instance; `depth` and `instance` share a batch."""
     dtype, compute = dtypes
     K, dt, known = _known_camera(K.to(compute), dt)
     motions = prev_from_curr_by_instance.to(compute)
@@ -78,7 +78,7 @@ def body_planes(
         for rows in by_instance.unbind(-1)
     )
     x, y = centred_pixels(height, width, K)
-    # The same operations in the same order as camera_planes: equal motions give equal bits.
+    # The same operations in the same order as camera_planes, for bitwise equal results.
     q_far = [
         axx * x + (axy * y + ax),
         ayx * x + (ayy * y + ay),
@@ -88,9 +88,9 @@ def body_planes(
 
 
 def _known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor, Tensor]:
-    """Returns K and dt with what makes no sense replaced, and where they made sense, `[*B]`.
+    """Returns K and dt with invalid values replaced, and where they were valid, `[*B]`.
 
-    Replaced and not only masked: else gradients would meet nan.
+    They are replaced, not only masked, to keep nan out of gradients.
     """
     known = _within_bounds(K, (-2, -1)) & (K[..., 0, 0] != 0) & (K[..., 1, 1] != 0)
     K = torch.where(known[..., None, None], K, torch.eye(3, dtype=K.dtype, device=K.device))
@@ -102,18 +102,18 @@ def _known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor
 
 
 def _within_bounds(tensor: Tensor, dims: tuple[int, ...]) -> Tensor:
-    """Returns where all entries along some dims are finite and small enough to compute with."""
+    """Returns where all entries along `dims` are finite and at most `LARGEST`."""
     return (tensor.abs() <= LARGEST).all(dims)  # nan compares False
 
 
 def _coefficients(K: Tensor, prev_from_curr: Tensor, known: Tensor) -> Tensor:
     """Returns A (row by row) and e, `[*B, 12]`.
 
-    Where something isn't known they send every point behind the previous camera, so that no pixel
-    is valid, without a look at it.
+    Where an input isn't known, they place every point behind the previous camera, so that no pixel
+    is valid, without a check per pixel.
 
-    Written out instead of multiplied as matrices: a batched product may round differently from a
-    single one, and then a body that stands still would not have the camera's flow exactly.
+    The products are written out because a batched matrix product may round differently from a
+    single one, and a static body would then not have exactly the camera's flow.
     """
     bounded = _within_bounds(prev_from_curr, (-2, -1))
     motion = torch.where(bounded[..., None, None], prev_from_curr, 0.0)
@@ -133,13 +133,13 @@ def _coefficients(K: Tensor, prev_from_curr: Tensor, known: Tensor) -> Tensor:
     coefficients = torch.stack(torch.broadcast_tensors(*a, *e), -1)
     known = (known & bounded & _within_bounds(coefficients, (-1,))).unsqueeze(-1)
     behind = (0.0, -2.0, 0.0)  # 1 + qz = -1
-    # Joined again, which makes inductor keep the result instead of choosing again at every pixel.
+    # Concatenated, so that inductor stores the result instead of repeating `where` at every pixel.
     parts = zip(coefficients.split([8, 1, 3], -1), behind)
     return torch.cat([torch.where(known, part, otherwise) for part, otherwise in parts], -1)
 
 
 def _table(*entries: Tensor) -> tuple[Tensor, ...]:
-    """Returns the entries as slices of one tensor, which inductor keeps instead of recomputing."""
+    """Returns the entries as slices of one tensor, which inductor stores and doesn't recompute."""
     return torch.stack(torch.broadcast_tensors(*entries)).unbind()
 
 
@@ -155,7 +155,7 @@ def _planes(
     """Returns u, v and valid, from depth `[*B, 1, H, W]`; q is `q_far` at infinity."""
     depth = depth.squeeze(-3).to(x.dtype)
     has_depth = depth >= SMALLEST  # nan compares False
-    # Masked before and after each division, so that no gradient meets a nan.
+    # Masked before and after each division, to keep nan out of gradients.
     inverse_depth = torch.where(has_depth, depth, 1.0).reciprocal()  # 0 at infinity
     qx, qy, qz = (far + near * inverse_depth for far, near in zip(q_far, e))
     z_ratio = 1.0 + qz  # depth in the previous camera over depth in the current one
@@ -176,7 +176,7 @@ def _planes(
 def stack_planes(u: Tensor, v: Tensor) -> Tensor:
     """Returns `[*B, 2, H, W]` from `[*B, H, W]` planes.
 
-    Joined along the rows and split again: torch.stack makes inductor interleave the channels.
+    Concatenated along the rows and split, as torch.stack makes inductor interleave the channels.
     """
     return torch.cat([u, v], -2).unflatten(-2, (2, -1))
 
@@ -184,9 +184,9 @@ def stack_planes(u: Tensor, v: Tensor) -> Tensor:
 def mask_channel(valid: Tensor) -> Tensor:
     """Returns bool `[*B, 1, H, W]` from a `[*B, H, W]` plane.
 
-    Compiled, the mask is written as bytes and then read as bool: inductor's CPU code stores a
-    bool a lane at a time, which took three quarters of the whole pass. as_strided is what makes
-    it write the bytes before it renames them.
+    When compiled, the mask is written as bytes and then viewed as bool: inductor's CPU code stores
+    bools one lane at a time, which took three quarters of the whole pass. as_strided makes it
+    write the bytes before the view.
     """
     if torch.compiler.is_compiling():
         ones = torch.where(valid, 1.0, 0.0).to(torch.uint8)

@@ -1,4 +1,4 @@
-"""Depth as simulators and cameras give it, into depth along the optical axis."""
+"""Conversion of depth from simulators and cameras to depth along the optical axis."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ def adapt_depth(
 ) -> Tensor:
     """Returns depth along the optical axis, `[*B, 1, H, W]`, metres.
 
-    Convention: `"z"` is that already; `"ray_length"` is the distance from the camera's centre to
-    the surface, metres (lidar, "distance to camera"); `"z_buffer"` is OpenGL's depth buffer in
-    [0, 1], 0 at `near_m` and 1 where nothing was drawn or at `far_m`. A reversed buffer is
-    `1 - depth` first. inf stays inf and nan stays nan.
+    Convention: `"z"` is depth along the optical axis and returned unchanged; `"ray_length"` is the
+    distance from the camera's centre to the surface, metres (lidar, "distance to camera");
+    `"z_buffer"` is OpenGL's depth buffer in [0, 1], 0 at `near_m` and 1 at `far_m` or where nothing
+    was drawn. Pass `1 - depth` for a reversed buffer. inf stays inf and nan stays nan.
 
     Args:
         depth: `[*B, 1, H, W]`, of that kind.
         kind: `"z"`, `"ray_length"` or `"z_buffer"`.
-        K: `[*B, 3, 3]`, pixels; for `"ray_length"` alone.
-        near_m: the near plane; for `"z_buffer"` alone.
-        far_m: the far plane, `math.inf` if the projection has none; for `"z_buffer"` alone.
+        K: `[*B, 3, 3]`, pixels; only for `"ray_length"`.
+        near_m: the near plane; only for `"z_buffer"`.
+        far_m: the far plane, `math.inf` if the projection has none; only for `"z_buffer"`.
 
     Raises:
-        ValueError: an unknown kind, a shape that does not fit, an argument that the kind needs and
-            lacks, or one that it does not read.
+        ValueError: an unknown kind, a shape that does not fit, or an argument that the kind needs
+            and lacks or does not use.
         TypeError: no float tensor.
 
     >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
@@ -78,14 +78,14 @@ def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
     K = K[..., None, None, :, :]
     y = y_px / K[..., 1, 1]
     x = (x_px - K[..., 0, 1] * y) / K[..., 0, 0]
-    per_z = (1.0 + x.square() + y.square()).sqrt()  # length of the ray that is 1 along z
+    per_z = (1.0 + x.square() + y.square()).sqrt()  # length of the ray per metre of z
     return (ray_length / per_z.unsqueeze(-3)).to(ray_length.dtype)
 
 
 def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
     """Returns depth along the optical axis from OpenGL's depth buffer of a perspective camera.
 
-    Where the buffer is 1 nothing was drawn: inf. Outside of [0, 1] there is no depth: nan.
+    The result is inf where the buffer is 1 (nothing was drawn) and nan where it is outside [0, 1].
 
     Args:
         z_buffer: `[*B, 1, H, W]`, 0 at the near plane, 1 at the far plane.
@@ -111,7 +111,7 @@ def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
 def check_depth_options(
     kind: str, has_camera: bool, near_m: float | None, far_m: float | None
 ) -> None:
-    """Raises ValueError if a kind of depth lacks what it needs, or has what it does not read."""
+    """Raises ValueError if an argument that `kind` needs is missing, or an unused one is given."""
     check_name("kind", kind, DepthKind)
     if has_camera != (kind == "ray_length"):
         raise ValueError(f"'ray_length' needs K, the other kinds do not read it; kind is {kind!r}")

@@ -1,7 +1,7 @@
-"""Flow that rigid motion causes: of a static world, of moving bodies, and the difference.
+"""Flow caused by rigid motion: of a static world, of moving bodies, and the difference.
 
-Every function is the closed form of `flowrep.geometry.closed_form`: one pass over the pixels, no
-point cloud in memory.
+Every function uses the closed form of `flowrep.geometry.closed_form`, which takes one pass over
+the pixels and stores no point cloud.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from flowrep.geometry.checks import broadcast_batch, check_is_tensor, check_shap
 
 
 class Flow(NamedTuple):
-    """Flow `[*B, 2, H, W]` on the current frame's grid, and where it is known.
+    """Flow `[*B, 2, H, W]` on the current frame's grid, with a mask of known flow.
 
     `valid` is bool `[*B, 1, H, W]`; flow is 0 where it is False.
     """
@@ -27,10 +27,10 @@ class Flow(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Raw flow split in the camera's share and the objects' own, `[*B, 2, H, W]` each.
+    """Raw flow split into the camera's and the objects' share, `[*B, 2, H, W]` each.
 
-    `valid` is bool `[*B, 1, H, W]`; where it is False, `obj` is 0 and `raw = ego + obj` is not
-    claimed.
+    `valid` is bool `[*B, 1, H, W]`; where it is False, `obj` is 0 and `raw = ego + obj` need not
+    hold.
     """
 
     ego: Tensor
@@ -42,11 +42,11 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
     """Returns the flow of a static world under the camera's motion.
 
     Convention: (p_t - p_t') / dt on the current frame's grid, t' the previous frame; u right,
-    v down, pixels. A camera that drives forward sees the world stream outwards. Depth inf moves
-    by rotation only. Invalid (flow 0): depth nan or <= 0; points that were not in front of the
-    previous camera, at a hundredth of their depth now at least (closer to it flow grows without
-    bound); everything where K, the motion or a tensor `dt` isn't finite, `dt` isn't positive or an
-    entry is beyond 1e8. Valid flow is finite.
+    v down, pixels. If the camera drives forward, flow points outwards. Depth inf moves by rotation
+    only. Flow is invalid, and 0, where depth is nan or <= 0; where the point was not in front of
+    the previous camera at a hundredth of its current depth or more (closer to it, flow grows
+    without bound); and everywhere if K, the motion or a tensor `dt` isn't finite, `dt` isn't
+    positive or an entry is beyond 1e8. Valid flow is finite.
 
     Equations 7 to 11 of the paper. Floats narrower than float32 are computed in float32.
 
@@ -63,9 +63,9 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> prev_from_curr = torch.eye(4)
-    >>> prev_from_curr[0, 3] = 0.5  # the camera went half a metre to the right
+    >>> prev_from_curr[0, 3] = 0.5  # the camera moved half a metre to the right
     >>> flow, valid = ego_flow(torch.full((1, 1, 2), 4.0), K, prev_from_curr)
-    >>> flow[0], valid[0]  # everything went fx * 0.5 m / 4 m = 0.5 px to the left
+    >>> flow[0], valid[0]  # everything moved fx * 0.5 m / 4 m = 0.5 px to the left
     (tensor([[-0.5000, -0.5000]]), tensor([[True, True]]))
     """
     batch = _check(depth, K, prev_from_curr, dt)
@@ -85,11 +85,11 @@ def rigid_flow(
 ) -> Flow:
     """Returns the flow of a world of rigid bodies: the simulator's exact raw flow.
 
-    Convention: as `ego_flow`, with a motion of its own for each pixel. Row i of
-    `prev_from_curr_by_instance` takes a point that rides on instance i from the current camera's
-    frame to where it was in the previous camera's frame; row 0 is the static world's. Where a
-    pixel's row equals `prev_from_curr`, the result is `ego_flow`'s to the last bit. A row that
-    isn't known makes the pixels of its own instance invalid.
+    Convention: as in `ego_flow`, with one motion per instance. Row i of
+    `prev_from_curr_by_instance` maps a point fixed to instance i from the current camera's frame to
+    its place in the previous camera's frame; row 0 is the static world's. Where a pixel's row
+    equals `prev_from_curr`, the result is bitwise equal to that of `ego_flow`. A row that isn't
+    known makes only the pixels of its instance invalid.
 
     Args:
         depth: `[*B, 1, H, W]`, metres along the optical axis.
@@ -101,7 +101,7 @@ def rigid_flow(
     Raises:
         ValueError: a shape does not fit.
         TypeError: an argument is no float tensor, or `instance` holds no integers.
-        RuntimeError: an id in `instance` has no row (raised by torch).
+        RuntimeError: an id in `instance` without a row (raised by torch).
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> motions = torch.eye(4).repeat(2, 1, 1)
@@ -130,10 +130,10 @@ def factorize(
 ) -> Factors:
     """Returns raw flow split into ego flow and object flow.
 
-    Convention: raw = ego + obj, all (p_t - p_t') / dt on the current frame's grid. A raw flow
-    that an estimator gives from the current to the previous frame has to be negated first; one
-    from the previous to the current frame lies on the wrong grid. Invalid (obj 0): where ego
-    flow is invalid, and where raw is not finite. The factors have the widest of all float types.
+    Convention: raw = ego + obj, all (p_t - p_t') / dt on the current frame's grid. Estimated flow
+    from the current to the previous frame has to be negated first; flow from the previous to the
+    current frame lies on the wrong grid. The result is invalid, and obj 0, where ego flow is
+    invalid or raw is not finite. The factors have the widest of the arguments' float types.
 
     Equation 6 of the paper.
 
@@ -161,7 +161,7 @@ def factorize(
     batch = _check(depth, K, prev_from_curr, dt)
     _check_same_size("raw", raw, depth)
     batch = broadcast_batch(others=batch, raw=raw.shape[:-3])
-    # Raw flow doesn't change how ego flow is rounded: widened, it still leaves exactly no obj.
+    # Ego flow is rounded regardless of raw's dtype, so that static pixels have exactly 0 obj.
     own, compute = _dtypes(depth, K, prev_from_curr)
     dtype = torch.promote_types(own, raw.dtype)
     depth = depth.expand(*batch, -1, -1, -1)
@@ -169,12 +169,12 @@ def factorize(
     raw_u, raw_v = raw.to(dtype).expand(*batch, -1, -1, -1).unbind(-3)
     u, v = u.to(dtype), v.to(dtype)
     obj_u, obj_v = raw_u - u, raw_v - v
-    # Finite, and small enough for the difference to be so.
+    # Finite, and small enough for a finite difference.
     largest = torch.finfo(compute).max / 4
     measured = raw_u.to(compute).abs() + raw_v.to(compute).abs() < largest
     if torch.finfo(dtype).max < torch.finfo(compute).max:
         measured = measured & obj_u.isfinite() & obj_v.isfinite()
-    # Two masks in turn, not their conjunction: inductor would spill that one to memory.
+    # Two masks in turn, because inductor would spill their conjunction to memory.
     obj_u, obj_v = (
         torch.where(valid, torch.where(measured, difference, 0.0), 0.0)
         for difference in (obj_u, obj_v)
@@ -184,7 +184,7 @@ def factorize(
 
 
 def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torch.Size:
-    """Returns the common leading batch of arguments whose shapes fit."""
+    """Checks the arguments' shapes and returns their common leading batch."""
     check_shape("depth", depth, (1, "H", "W"))
     check_shape("K", K, (3, 3))
     check_shape("prev_from_curr", motion, (4, 4))
@@ -209,7 +209,7 @@ def _check_same_size(name: str, image: Tensor, depth: Tensor) -> None:
 
 
 def _dtypes(*tensors: Tensor) -> tuple[torch.dtype, torch.dtype]:
-    """Returns the result's dtype (the widest) and the one to compute in (at least float32)."""
+    """Returns the dtypes of the result (the widest) and of the computation (at least float32)."""
     dtype = tensors[0].dtype
     for tensor in tensors[1:]:
         dtype = torch.promote_types(dtype, tensor.dtype)

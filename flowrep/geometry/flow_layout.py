@@ -1,4 +1,4 @@
-"""Flow as estimators and data sets give it, into p_t - p_t' on the current frame's grid."""
+"""Conversion of flow from estimators and data sets to p_t - p_t' on the current frame's grid."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def adapt_flow(
 ) -> Tensor:
     """Returns flow p_t - p_t' on the current frame's grid, (u right, v down), `[*B, 2, H, W]`.
 
-    Convention: `direction` says what the vectors are: `"forward"` p_t - p_t', from where a point
-    was to where it is; `"backward"` p_t' - p_t, from where it is to where it was. `grid` says which
-    frame's pixels they belong to. An estimator called with (current, previous) gives backward flow
-    on the current grid.
+    Convention: `direction` is that of the vectors: `"forward"` is p_t - p_t', from a point's
+    previous to its current position; `"backward"` is p_t' - p_t. `grid` is the frame whose pixels
+    they belong to. An estimator called with (current, previous) gives backward flow on the current
+    grid.
 
-    Flow on the previous frame's grid is refused: its pixels have moved since, several onto one and
-    none onto others, so that any flow on the current grid made of it would be a guess.
+    Flow on the previous frame's grid raises ValueError: its pixels have moved, several of them to
+    the same pixel and none to others, so flow on the current grid would be a guess.
 
     Args:
         flow: `[*B, 2, H, W]`, pixels.

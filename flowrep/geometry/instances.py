@@ -1,4 +1,4 @@
-"""Segmentation ids as simulators count them, into rows of `instance_motion`."""
+"""Conversion of a simulator's segmentation ids to rows of `instance_motion`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from flowrep.geometry.checks import check_is_tensor
 
 
 def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
-    """Returns the row of `instance_motion` that each pixel's body has, of the shape of `ids`.
+    """Returns each pixel's row of `instance_motion`, in the shape of `ids`.
 
-    Convention: id `body_ids[i]` becomes 1 + i; any other id, negative ones among them, becomes 0,
-    the static world.
+    Convention: id `body_ids[i]` becomes 1 + i; any other id, also a negative one, becomes 0, the
+    static world.
 
     Args:
-        ids: integers of any shape, as the simulator draws them.
+        ids: integers of any shape, as the simulator renders them.
         body_ids: `[N]`, integers, in the order of the bodies' poses.
 
     Raises:
@@ -36,7 +36,7 @@ def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
     dtype = torch.uint8 if count < 256 else torch.int32
     if count == 0:
         return torch.zeros_like(ids, dtype=dtype)
-    # Sorted and searched, not tabulated: ids may be as large as a packed colour.
+    # Sorted and searched instead of tabulated, as ids may be as large as a packed colour.
     ascending, order = body_ids.long().sort()
     ids = ids.long()
     nearest = torch.searchsorted(ascending, ids.contiguous()).clamp(max=count - 1)

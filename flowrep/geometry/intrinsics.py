@@ -1,4 +1,4 @@
-"""The intrinsics K from what a simulator or a calibration says about its camera."""
+"""The intrinsics K from a simulator's field of view or from a calibration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def intrinsics_from_fov(
 ) -> Tensor:
     """Returns K `[3, 3]` of a camera with square pixels and a centred principal point.
 
-    Convention: `axis` says across what `fov_deg` spans, from border to border of the picture:
+    Convention: `axis` is the side of the picture that `fov_deg` spans from border to border:
     `"horizontal"` its width (Habitat's hfov), `"vertical"` its height (MuJoCo's fovy, OpenGL's
     perspective).
 
@@ -35,7 +35,7 @@ def intrinsics_from_fov(
         dtype: of the result.
 
     Raises:
-        ValueError: an unknown axis, no angle of a pinhole camera, or no size.
+        ValueError: an unknown axis, or an angle or a size out of range.
 
     >>> intrinsics_from_fov(90.0, axis="vertical", height=4, width=6)
     tensor([[2., 0., 3.],
@@ -54,10 +54,10 @@ def intrinsics_from_fov(
 
 
 def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
-    """Returns K with pixel (0, 0)'s centre at (0.5, 0.5), from a calibration that has it at (0, 0).
+    """Returns K with pixel (0, 0)'s centre at (0.5, 0.5), given one with it at (0, 0).
 
     Args:
-        K_opencv: `[*B, 3, 3]`, as OpenCV's calibration and most data sets write it.
+        K_opencv: `[*B, 3, 3]`, in the convention of OpenCV's calibration and most data sets.
 
     Raises:
         ValueError: not `[*B, 3, 3]`.

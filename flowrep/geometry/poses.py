@@ -1,4 +1,4 @@
-"""Poses as simulators and robots give them, into `world_from_cam` of an OpenCV camera."""
+"""Conversion of poses from simulators and robots to `world_from_cam` of an OpenCV camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PoseLayout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz"]
 PoseDirection: TypeAlias = Literal["camera_to_world", "world_to_camera"]
 CameraAxes: TypeAlias = Literal["opencv", "opengl", "ned", "x_forward_z_up"]
 
-# Where the other convention's axes point: the columns are OpenCV's right, down and forward in it.
+# The columns are OpenCV's right, down and forward, expressed in the other convention.
 _GIVEN_FROM_OPENCV: dict[str, list[list[float]]] = {
     "opencv": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     "opengl": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],  # x right, y up, z backward
@@ -33,20 +33,19 @@ def adapt_pose(
 ) -> Tensor:
     """Returns `world_from_cam` `[*B, 4, 4]`, float64, of a camera with OpenCV's axes.
 
-    Convention: `axes` says where the camera's own axes point: `"opencv"` x right, y down,
-    z forward; `"opengl"` (Blender's too) x right, y up, z backward; `"ned"` x forward, y right,
-    z down; `"x_forward_z_up"` x forward, y left, z up. The world's axes stay the giver's: they
+    Convention: `axes` are the directions of the camera's own axes: `"opencv"` x right, y down,
+    z forward; `"opengl"` (also Blender) x right, y up, z backward; `"ned"` x forward, y right,
+    z down; `"x_forward_z_up"` x forward, y left, z up. The world's axes are left unchanged, as they
     cancel in every relative motion.
 
     Args:
         pose: `[*B, 4, 4]`, or `[*B, 7]`: translation, then the unit quaternion.
-        layout: `"matrix"`, `"xyz_xyzw"` (quaternion with its real part last) or `"xyz_wxyz"`
-            (first).
-        direction: `"camera_to_world"` takes points of the camera into the world;
-            `"world_to_camera"` (extrinsics) the other way.
-        axes: of the camera.
-        check: whether an ill-formed pose is refused. That reads the values: on a GPU it waits for
-            them.
+        layout: `"matrix"`, `"xyz_xyzw"` (real part of the quaternion last) or `"xyz_wxyz"`
+            (real part first).
+        direction: `"camera_to_world"` maps points in the camera's frame to the world's;
+            `"world_to_camera"` (extrinsics) is the inverse.
+        axes: the camera's.
+        check: whether an ill-formed pose raises ValueError. The check waits for a GPU.
 
     Raises:
         ValueError: an unknown name, a shape that does not fit, a pose that is not rigid.
@@ -70,8 +69,8 @@ def adapt_pose(
     if direction == "world_to_camera":
         matrix = invert_rigid(matrix)
     rotation, rest = matrix[..., :3], matrix[..., 3:]
-    # Each column is one of the given ones or its opposite: picked, since a product would round
-    # and constants made here would be copied to a GPU at every call.
+    # Each column is a given one or its opposite. They are picked, as a product would round and
+    # constants created here would be copied to a GPU in every call.
     return torch.cat([*_columns(rotation, axes), rest], -1)
 
 
@@ -92,8 +91,8 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
     Args:
         pose: `[*B, 7]`, x, y, z, then the quaternion.
         layout: `"xyz_xyzw"` or `"xyz_wxyz"`.
-        check: whether a quaternion whose length is not 1 is refused (it is normalised in any
-            case, from rounding).
+        check: whether a quaternion whose length is not 1 raises ValueError. Rounding errors are
+            normalised away in either case.
 
     Raises:
         ValueError: not `[*B, 7]`, or a quaternion that is not of unit length.

@@ -32,11 +32,11 @@ def invert_rigid(a_from_b: Tensor) -> Tensor:
 def relative_motion(
     world_from_prev: Tensor, world_from_curr: Tensor, *, dtype: torch.dtype = torch.float32
 ) -> Tensor:
-    """Returns `prev_from_curr` `[*B, 4, 4]`, composed in float64 and handed on as `dtype`.
+    """Returns `prev_from_curr` `[*B, 4, 4]`, composed in float64 and returned as `dtype`.
 
-    Convention: it takes a point in the current camera's frame into the previous camera's frame
-    (R and T of equation 11 of the paper). A world kilometres wide costs no precision, since the
-    large coordinates cancel before the result is rounded. Equal poses give exactly the identity.
+    Convention: it maps a point from the current camera's frame to the previous camera's frame
+    (R and T of equation 11 of the paper). A world kilometres wide costs no precision, since large
+    coordinates cancel before the result is rounded. Equal poses give exactly the identity.
 
     Args:
         world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world).
@@ -64,7 +64,7 @@ def relative_motion(
     translation = rotation_prev_from_world @ baseline_world
     bottom = world_from_curr[..., 3:, :].double().expand(*rotation.shape[:-2], 1, 4)
     motion = torch.cat([torch.cat([rotation, translation], -1), bottom], -2).to(dtype)
-    # The product of a rotation and its transpose is the identity but for rounding.
+    # The product of a rotation and its transpose is the identity up to rounding.
     still = (world_from_prev == world_from_curr).flatten(-2).all(-1)
     identity = torch.eye(4, dtype=dtype, device=motion.device)
     return torch.where(still[..., None, None], identity, motion)
@@ -78,18 +78,18 @@ def instance_motion(
     *,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Returns the motion of each body as its camera sees it, `[*B, 1 + N, 4, 4]`.
+    """Returns the motion of each body relative to the camera, `[*B, 1 + N, 4, 4]`.
 
-    Convention: row 0 is the static world's, `prev_from_curr`; row 1 + i takes a point that rides on
-    body i from the current camera's frame to where it was in the previous camera's frame. Where a
-    body's pose has not changed, its row equals row 0 to the last bit. Composed in float64. A body's
-    own axes and origin do not matter, as long as they stay with it.
+    Convention: row 0 is the static world's, `prev_from_curr`; row 1 + i maps a point fixed to body
+    i from the current camera's frame to its place in the previous camera's frame. If a body's pose
+    has not changed, its row is bitwise equal to row 0. Motions are composed in float64. The choice
+    of a body's axes and origin doesn't matter, as long as they are fixed to it.
 
     Args:
         world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world).
         world_from_curr: `[*B, 4, 4]`, pose of the current camera.
         world_from_prev_body: `[*B, N, 4, 4]`, poses of the bodies at the previous frame.
-        world_from_curr_body: `[*B, N, 4, 4]`, the same bodies, in the same order, now.
+        world_from_curr_body: `[*B, N, 4, 4]`, poses of the same bodies, in the same order, now.
         dtype: of the result.
 
     Raises:
@@ -97,7 +97,7 @@ def instance_motion(
         TypeError: an argument is no float tensor.
 
     >>> camera, before, now = torch.eye(4), torch.eye(4), torch.eye(4)
-    >>> now[0, 3] = 0.5  # the body went half a metre along x
+    >>> now[0, 3] = 0.5  # the body moved half a metre along x
     >>> instance_motion(camera, camera, before[None], now[None])[:, 0, 3]
     tensor([ 0.0000, -0.5000])
     """
@@ -109,7 +109,7 @@ def instance_motion(
             f"and {world_from_curr_body.shape[-3]}"
         )
     camera = relative_motion(world_from_prev, world_from_curr, dtype=dtype).unsqueeze(-3)
-    # Where each point was: prev_from_world, then what the body did in the world, backwards.
+    # A point's previous place: the inverse of the body's motion, in the cameras' frames.
     prev_body_from_prev = relative_motion(
         world_from_prev_body, world_from_prev.unsqueeze(-3), dtype=torch.float64
     )
@@ -125,7 +125,7 @@ def instance_motion(
 def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None:
     """Checks that every transform is a rotation and a translation.
 
-    It reads the values, which waits for a GPU: keep it out of loops that must not wait.
+    The check waits for a GPU.
 
     Args:
         name: the argument's name, for the message.
