@@ -1,4 +1,4 @@
-"""What the commands' configs may hold; see `flowrep.config.section` and docs/configs.md."""
+"""Schemas of the commands' configs; see `flowrep.config.section` and docs/configs.md."""
 
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError

@@ -23,21 +23,21 @@ from flowrep.config.violations import broken_rule
 
 
 class Run(Protocol):
-    """What rules between an algorithm and the rest of a run ask for."""
+    """The parts of a run that rules for its algorithm depend on."""
 
     total_frames: int
     num_envs: int
 
 
 class AnyAlgorithm(Section):
-    """What every algorithm has: the class that it is."""
+    """The key that every algorithm has: its class."""
 
     target: Annotated[str, Text("the name of a class, package.module.Class")] = Field(
         alias="_target_", examples=["flowrep.agent.DiscreteSAC"]
     )
 
     def check_with(self, run: Run) -> None:
-        """Checks what an algorithm's options have to do with the rest of the run.
+        """Checks an algorithm's options against the rest of the run.
 
         Raises:
             PydanticCustomError: from `broken_rule`, naming the key from the top level on.
@@ -51,7 +51,7 @@ class OwnAlgorithm(AnyAlgorithm):
 
 
 class Learner(AnyAlgorithm):
-    """What the algorithms of `flowrep.agent` have in common."""
+    """The options that the algorithms of `flowrep.agent` have in common."""
 
     precision: Annotated[str, OneOf(PRECISIONS)]
     learning_rate: Positive
@@ -61,7 +61,7 @@ class Learner(AnyAlgorithm):
 
 
 class OffPolicy(Learner):
-    """What those that learn from a replay memory have in common."""
+    """The options that algorithms with a replay memory have in common."""
 
     tau: PositiveShare
     replay_capacity: Count
@@ -71,7 +71,7 @@ class OffPolicy(Learner):
     layer_norm: Switch
 
     def check_with(self, run: Run) -> None:
-        """Checks that the memory holds what is asked of it, and that there is time to learn."""
+        """Checks that the memory is large enough, and that the run is long enough to learn."""
         steps = self.n_steps + 1
         for name, least in (
             (f"batch_size={self.batch_size}", self.batch_size),
@@ -148,7 +148,7 @@ class PPO(Learner):
     max_grad_norm: Positive
 
     def check_with(self, run: Run) -> None:
-        """Checks that a rollout fills a batch, and that there is time for one."""
+        """Checks that a rollout fills a batch, and that the run is long enough for one."""
         rollout = self.rollout_length * run.num_envs
         steps = (
             f"{rollout} frames of a rollout ({self.rollout_length} steps of {run.num_envs} envs)"
@@ -171,6 +171,6 @@ ALGORITHMS: dict[str, type[AnyAlgorithm]] = {
     f"flowrep.agent.{section.__name__}": section
     for section in (DiscreteSAC, DiscreteSACWithValue, DoubleDQN, PPO)
 }
-"""The sections of flowrep's own algorithms, by what `_target_` says."""
+"""The sections of flowrep's own algorithms, by `_target_`."""
 
 BY_TARGET = ChosenBy("_target_", ALGORITHMS, otherwise=OwnAlgorithm)

@@ -1,4 +1,4 @@
-"""The command line's manners: a mistake ends in one line that names it and lists what exists."""
+"""Runs a command from its command line; a mistake ends in one line that lists the choices."""
 
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -32,11 +32,10 @@ FOLDERS = ("resume", "run", "input", "output")
 
 
 def register_resolvers() -> None:
-    """Adds what the paths of run folders are made of, in conf/run_folder.yaml and conf/view.yaml.
+    """Adds the resolvers for paths of run folders in conf/run_folder.yaml and conf/view.yaml.
 
-    `${run_name:scene,representations,flow,noise,seed}` names a run; `${folder_name:text}` is a text
-    that is one folder's name, whatever it holds; `${run_of_sweep:overrides}` names a run of a
-    sweep.
+    `${run_name:scene,representations,flow,noise,seed}` names a run; `${folder_name:text}` makes any
+    text the name of a single folder; `${run_of_sweep:overrides}` names a run of a sweep.
     """
 
     def run_name(
@@ -56,7 +55,7 @@ def register_resolvers() -> None:
 
 
 def folder_name(text: str) -> str:
-    """Returns a text as the name of one folder, which leads nowhere else.
+    """Returns a text as the name of a single folder, without path separators.
 
     >>> folder_name("s_turn"), folder_name("../../etc"), folder_name("..")
     ('s_turn', '.._.._etc', '_')
@@ -66,9 +65,9 @@ def folder_name(text: str) -> str:
 
 
 def exit_with(problem: str | Exception) -> NoReturn:
-    """Ends the process with the exit code of a wrong command, each line saying what is wrong.
+    """Ends the process with the exit code of a usage error, printing each line of the problem.
 
-    Where the problem is that nobody reads what the process prints, it says nothing.
+    Prints nothing if the problem is that the process's output is no longer read.
     """
     if isinstance(problem, BrokenPipeError):
         exit_unread()
@@ -78,11 +77,11 @@ def exit_with(problem: str | Exception) -> NoReturn:
 
 
 def line_for(command: str, **values: str) -> str:
-    """Returns a line to paste into a shell: a command of flowrep's, called as this one was.
+    """Returns a shell line for a flowrep command, called in the same way as this one.
 
     Args:
-        command: e.g. "train".
-        values: what its keys are to hold, whatever characters are in it.
+        command: the command's name, e.g. "train".
+        values: the values of its keys, with any characters.
     """
     is_script = Path(sys.argv[0]).name.startswith("flowrep-")
     program = [f"flowrep-{command}"] if is_script else ["python", "-m", f"flowrep.{command}"]
@@ -90,9 +89,9 @@ def line_for(command: str, **values: str) -> str:
 
 
 def own_keys() -> set[str]:
-    """Returns the top level's keys that were added to the running job's config: `+note=pilot`.
+    """Returns the top-level keys that were added to the running job's config (`+note=pilot`).
 
-    Outside of a job there are none.
+    Outside a job there are none.
     """
     if not HydraConfig.initialized():
         return set()
@@ -100,7 +99,7 @@ def own_keys() -> set[str]:
 
 
 def typed_value(key: str) -> Any:
-    """Returns what a key was given on the command line, None where it was not."""
+    """Returns a key's value on the command line, None if it was not given."""
     typed = [a for a in taken_as_typed(sys.argv[1:], FOLDERS) if a.startswith(f"{key}=")]
     if not typed:
         return None
@@ -108,16 +107,16 @@ def typed_value(key: str) -> Any:
         (last,) = parse(typed[-1:])
         return OmegaConf.create([last.value()])[0]
     except (HydraException, OmegaConfBaseException):
-        return None  # the check of the whole line says what is wrong
+        return None  # the check of the whole line reports the error
 
 
 def run_command(config_name: str, command: Callable[[], Any], schema: type[Section]) -> None:
-    """Runs a Hydra entry point once its command line is found right, so that mistakes read well.
+    """Runs a Hydra entry point after checking its command line, so that mistakes read well.
 
     Args:
         config_name: a file of conf/, without its ending.
         command: the entry point.
-        schema: what the composed config may hold.
+        schema: the schema of the composed config.
     """
     register_resolvers()
     sys.argv[1:] = taken_as_typed(sys.argv[1:], FOLDERS)

@@ -1,8 +1,8 @@
-"""A look at what Hydra will compose, before it runs anything: mistakes are then said in one line.
+"""Previews what Hydra will compose before it runs anything, to report mistakes in one line.
 
-Hydra is asked, with the same search path and overrides that it will run with, so that whatever it
-accepts is accepted: plugins' groups, a user's own configs, `+key=` and `~key`. Only what it refuses
-is looked at again, to say what is wrong and what there is instead.
+The preview uses Hydra itself, with the search path and overrides of the run, and so accepts
+whatever Hydra accepts: plugins' groups, a user's own configs, `+key=` and `~key`. Only what Hydra
+refuses is examined again, to say what is wrong and what exists instead.
 """
 
 import argparse
@@ -32,24 +32,24 @@ from flowrep.config.quoting import override as quoted_override
 from flowrep.config.quoting import shell_line
 from flowrep.config_tree import CONF_DIR
 
-VERSION_BASE = "1.3"  # of Hydra's behaviour; what the commands' entry points say too
+VERSION_BASE = "1.3"  # of Hydra's behaviour, as in the commands' entry points
 REFUSALS = (HydraException, OmegaConfBaseException, ValueError)  # the last for `scene=null`
 
 
 def check_command(
     config_name: str, arguments: Sequence[str], schema: type[Section] | None = None
 ) -> None:
-    """Refuses a command line that Hydra would, or whose config the schema does.
+    """Refuses a command line that Hydra would refuse, or whose config violates the schema.
 
-    Every value of a sweep is looked at, before any of its jobs starts.
+    Every value of a sweep is checked before any of its jobs starts.
 
     Args:
         config_name: a file of conf/, without its ending.
         arguments: as typed, e.g. `["-m", "representations=[ego],[raw]", "seed=1"]`.
-        schema: what a job's config may hold.
+        schema: the schema of a job's config.
 
     Raises:
-        UsageError: a line for each thing that is wrong.
+        UsageError: a line for each mistake.
     """
     args = get_args_parser().parse_args(list(arguments))
     check_flags(args)
@@ -66,10 +66,10 @@ def check_command(
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
-    """Returns a composed config as plain data, interpolations resolved, `???` left as it is.
+    """Returns a composed config as plain data, with interpolations resolved but `???` unchanged.
 
     Raises:
-        UsageError: an interpolation leads nowhere.
+        UsageError: an interpolation can't be resolved.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
@@ -79,7 +79,7 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
 
 
 def keys_added(overrides: Iterable[Override]) -> set[str]:
-    """Returns the top level's keys that overrides add: `+note=pilot`."""
+    """Returns the top-level keys that overrides add (`+note=pilot`)."""
     added = [o for o in overrides if o.is_add() or o.is_force_add()]
     return {(o.package or o.key_or_group).split(".")[0] for o in added}
 
@@ -90,11 +90,11 @@ def parse(overrides: Iterable[str]) -> list[Override]:
 
 
 class Preview:
-    """Hydra as the command will run it, and a person's words for what it says.
+    """Hydra as the command will run it, with readable versions of its errors.
 
     Args:
-        args: of the command line.
-        config_name: of the primary config, unless the command line names another.
+        args: the parsed command line.
+        config_name: the primary config, unless the command line names another.
     """
 
     def __init__(self, args: argparse.Namespace, config_name: str) -> None:
@@ -131,9 +131,9 @@ class Preview:
         return parsed
 
     def with_sweepers(self, parsed: Sequence[Override]) -> list[Override]:
-        """Returns overrides with those of `hydra.sweeper.params`, which an experiment gives.
+        """Returns overrides together with those of `hydra.sweeper.params` in an experiment.
 
-        What is typed wins.
+        Typed overrides take precedence.
         """
         if not self.is_multirun:
             return [*parsed]
@@ -143,11 +143,11 @@ class Preview:
         return [*self.parse(added), *parsed]
 
     def hydra_config(self, parsed: Sequence[Override]) -> DictConfig:
-        """Returns Hydra's own part of the config, as it is for the first of a sweep's jobs."""
+        """Returns Hydra's own part of the config for the first of a sweep's jobs."""
         return self._explained_config([self._values(override)[0] for override in parsed]).hydra
 
     def configs(self, parsed: Sequence[Override]) -> Iterator[dict[str, Any]]:
-        """Yields plain configs of jobs, so that each value of each sweep is in one of them."""
+        """Yields plain configs of jobs that together contain each value of each sweep."""
         values = [self._values(override) for override in parsed]
         job = [texts[0] for texts in values]
         first = self.compose(job)
@@ -162,7 +162,7 @@ class Preview:
                     yield _changed(first, one.key_or_group.split("."), one.value())
 
     def _values(self, override: Override) -> list[str]:
-        """Returns an override once for each value that it stands for, the ends of an interval."""
+        """Returns an override for each of its values, or for both ends of an interval."""
         if not override.is_sweep_override():
             return [str(override.input_line)]
         key = override.get_key_element()
@@ -179,7 +179,7 @@ class Preview:
         return plain_config(config)
 
     def _explained_config(self, job: list[str]) -> DictConfig:
-        """Returns the config of a job; what Hydra refuses is said in words."""
+        """Returns the config of a job; explains what Hydra refuses."""
         try:
             config = self._compose(job)
         except REFUSALS as error:
@@ -193,7 +193,7 @@ class Preview:
         )
 
     def _explained(self, error: Exception, overrides: Sequence[Override]) -> str:
-        """Returns what is wrong with overrides that Hydra refuses, and what there is instead."""
+        """Returns what is wrong with overrides that Hydra refuses, and what exists instead."""
         if isinstance(error, MissingConfigException) and error.options is not None:
             group, _, name = str(error.missing_cfg_file).rpartition("/")
             return unknown_choice(group, name, error.options)
@@ -223,7 +223,7 @@ class Preview:
         return one_line(error)
 
     def _options(self, group: str) -> list[str]:
-        """Returns the choices of a group, none where there is no such group."""
+        """Returns the choices of a group, none if there is no such group."""
         return self._loader.get_group_options(
             group, config_name=self.config_name, overrides=self._searchpath()
         )
@@ -233,7 +233,7 @@ class Preview:
 
 
 def _changed(config: dict[str, Any], keys: Sequence[str], value: Any) -> dict[str, Any]:
-    """Returns a config in which `value` is at `keys`; what does not change is shared."""
+    """Returns a config with `value` at `keys`; unchanged parts are shared."""
     key, *rest = keys
     if not rest:
         return config | {key: value}
@@ -242,7 +242,7 @@ def _changed(config: dict[str, Any], keys: Sequence[str], value: Any) -> dict[st
 
 
 def _search_path(args: argparse.Namespace) -> ConfigSearchPathImpl:
-    """Returns where Hydra will look: conf/, plugins, and the folder of `--config-dir`."""
+    """Returns Hydra's search path: conf/, plugins, and the folder of `--config-dir`."""
     path: Any = create_config_search_path(args.config_path or str(CONF_DIR))
     if args.config_dir is not None:
         folder = f"file://{Path(args.config_dir).absolute()}"

@@ -26,7 +26,7 @@ OF_OWN_POLICIES = ("representations", "flow", "noise", "output")
 
 
 class Policy(OneOf):
-    """One of some names, or a policy of the user's own."""
+    """One of some names, or the user's own policy."""
 
     def _schema(self) -> CoreSchema:
         text = core_schema.str_schema(strict=True)
@@ -80,7 +80,7 @@ class EvaluateConfig(Section):
         return self
 
     def _fits_own_policies(self, name: str) -> None:
-        """Checks that it is said where a policy drives and what it sees."""
+        """Checks that the scene and the observations of a policy are given."""
         if self.run is not None:
             raise broken_rule("run", f"and policy={name} are agents of two kinds: give one of them")
         for key, example in (("scene", "straight_road"), ("representations", "[ego,obj]")):

@@ -1,4 +1,4 @@
-"""What a value of a config may be, checked by pydantic and said in words.
+"""The permitted values of a config, checked by pydantic and described in words.
 
 Each class here annotates a field of a section:
 
@@ -11,8 +11,8 @@ Traceback (most recent call last):
     ...
 flowrep.config.violations.UsageError: gamma should be a number from 0 to 1, not 2
 
-Types are taken strictly: `true` is no number, 1.5 no count, and nan and infinity are nothing at
-all.
+Types are strict: `true` is not a number, 1.5 is not a whole number, and nan and infinity are always
+invalid.
 """
 
 from abc import ABC, abstractmethod
@@ -25,12 +25,12 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from flowrep.config.violations import EXPECTED
 
-LARGEST = 2**53  # whole numbers beyond it are not exact everywhere they go
+LARGEST = 2**53  # larger whole numbers are not exact as floats
 
 
 @dataclass(frozen=True)
 class Expectation(ABC):
-    """What a value should be; `also` are single values that may stand in its place."""
+    """The permitted values of a field; `also` are further single values that it may have."""
 
     also: tuple[str | None, ...] = field(default=(), kw_only=True)
 
@@ -43,7 +43,7 @@ class Expectation(ABC):
         """Returns what follows "should be", without `also`."""
 
     def _names(self) -> tuple[str, ...]:
-        """Returns the names that can be meant, for "did you mean"."""
+        """Returns the candidate names for "did you mean"."""
         return tuple(name for name in self.also if name is not None)
 
     def __get_pydantic_core_schema__(
@@ -79,7 +79,7 @@ class Whole(Expectation):
 
 @dataclass(frozen=True)
 class Number(Expectation):
-    """A finite number within bounds; `above` is not part of the range, `least` and `most` are."""
+    """A finite number within bounds; `above` is exclusive, `least` and `most` are inclusive."""
 
     above: float | None = None
     least: float | None = None
@@ -123,7 +123,7 @@ class Flag(Expectation):
 
 @dataclass(frozen=True)
 class Text(Expectation):
-    """A text that is not empty, `pattern` matches all of it; `what` names it."""
+    """A non-empty text that `pattern` matches completely; `what` describes it."""
 
     what: str
     pattern: str | None = None
@@ -155,7 +155,7 @@ class OneOf(Expectation):
 
 @dataclass(frozen=True)
 class ListOf(Expectation):
-    """A list of values, each once; `or_one`: a single one may stand without its brackets."""
+    """A list of distinct values; with `or_one`, also a single value without brackets."""
 
     each: Expectation
     least: int = 1

@@ -1,4 +1,4 @@
-"""What Hydra's flags ask for, and which of them go together."""
+"""The meaning of Hydra's flags, and which of them go together."""
 
 import argparse
 from pathlib import Path
@@ -7,15 +7,15 @@ from flowrep.config import UsageError
 
 
 def only_shows(args: argparse.Namespace) -> bool:
-    """Says whether a command line asks for a look at configs, and for no job."""
+    """Returns whether a command line only shows configs and starts no job."""
     return bool(args.help or args.hydra_help or args.cfg or args.info or args.shell_completion)
 
 
 def check_flags(args: argparse.Namespace) -> None:
-    """Refuses flags that contradict each other, or of which nothing would be seen.
+    """Refuses flags that contradict each other or would have no effect.
 
     Args:
-        args: of the command line, as Hydra's parser reads it.
+        args: the command line, as Hydra's parser reads it.
 
     Raises:
         UsageError: names the flags, and what to leave out.

@@ -1,4 +1,4 @@
-"""What to say of overrides that Hydra refuses."""
+"""Messages about overrides that Hydra refuses."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from flowrep.config.violations import closest
 
 
 def unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
-    """Returns that a group has no such choice, and which it has.
+    """Returns the message that a group has no such choice, with its choices.
 
     >>> unknown_choice("scene", "s_turm", ["s_turn", "straight_road"])
     "unknown scene 's_turm' (did you mean 's_turn'?); there are: s_turn, straight_road"
@@ -19,7 +19,7 @@ def unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
 
 
 def needs_a_choice(group: str, options: Sequence[str]) -> str:
-    """Returns that nothing of a group was chosen, and what there is.
+    """Returns the message that nothing of a group was chosen, with its choices.
 
     >>> needs_a_choice("format", ["tum", "frames"])
     "'format' needs a value: format=...; there are: frames, tum"
@@ -28,12 +28,12 @@ def needs_a_choice(group: str, options: Sequence[str]) -> str:
 
 
 def unknown_key(key: str, config: DictConfig, groups: Sequence[str]) -> str | None:
-    """Walks a dotted key down a config; returns what to say of a part that isn't there.
+    """Walks a dotted key down a config; returns the message about a part that doesn't exist.
 
     Args:
-        key: as typed, e.g. "scene.camera.heigth_px".
-        config: composed without the override of that key.
-        groups: those whose choices are overridden by their name.
+        key: the key as typed, e.g. "scene.camera.heigth_px".
+        config: the config composed without the override of that key.
+        groups: the groups whose choices are overridden by their name.
     """
     node: Any = config
     parts = key.split(".")
@@ -52,7 +52,7 @@ def unknown_key(key: str, config: DictConfig, groups: Sequence[str]) -> str | No
 
 
 def one_line(error: Exception) -> str:
-    """Returns what Hydra or OmegaConf say, without the lines on where in the config it is."""
+    """Returns the message of Hydra or OmegaConf, without the lines on the place in the config."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     place = ("full_key:", "object_type=", "See http", "Config search path:")
     return " ".join([line for line in lines if not line.startswith(place)][:2])

@@ -1,4 +1,4 @@
-"""Texts with any characters in them, as Hydra and the shell have to be given them."""
+"""Quotes texts with any characters for Hydra and the shell."""
 
 import re
 import shlex
@@ -11,7 +11,7 @@ from hydra.errors import HydraException
 
 
 def override(key: str, text: str) -> str:
-    """Returns an override after which `key` holds exactly `text`, quoted only where it must be.
+    """Returns an override that sets `key` to exactly `text`, quoted only if necessary.
 
     >>> print(override("resume", "outputs/a"), override("resume", "a=b, c"))
     resume=outputs/a resume='a=b, c'
@@ -30,11 +30,11 @@ def shell_line(*words: str) -> str:
 
 
 def taken_as_typed(arguments: Iterable[str], keys: Collection[str]) -> list[str]:
-    """Returns arguments in which a folder that was typed without Hydra's quotes has them.
+    """Returns arguments with Hydra's quotes added to folders that were typed without them.
 
     Args:
-        arguments: of the command line.
-        keys: those whose values are folders.
+        arguments: the arguments of the command line.
+        keys: the keys whose values are folders.
     """
     return [_as_typed(argument, keys) for argument in arguments]
 
@@ -45,7 +45,7 @@ def _as_typed(argument: str, keys: Collection[str]) -> str:
 
 
 def _reads_as(line: str, text: str) -> bool:
-    if "${" in text:  # which OmegaConf would replace
+    if "${" in text:  # OmegaConf would replace it
         return False
     try:
         (parsed,) = OverridesParser.create().parse_overrides([line])
@@ -55,9 +55,9 @@ def _reads_as(line: str, text: str) -> bool:
 
 
 def _quoted(text: str) -> str:
-    """Returns text in Hydra's single quotes, with what OmegaConf would replace escaped."""
+    """Returns text in Hydra's single quotes, with OmegaConf's interpolations escaped."""
     text = re.sub(r"(\\*)\$\{", lambda found: found[1] * 2 + r"\${", text)
-    # backslashes count as escapes before a quote alone, the closing one included
+    # backslashes escape only before a quote, including the closing one
     text = re.sub(r"(\\*)(')", lambda found: found[1] * 2 + r"\'", text)
     text = re.sub(r"(\\+)$", lambda found: found[1] * 2, text)
     return f"'{text}'"

@@ -24,7 +24,7 @@ PREFIX = "flowrep.sequences."
 
 @dataclass(frozen=True)
 class Vector(Expectation):
-    """A list of just so many finite numbers."""
+    """A list of finite numbers of a given length."""
 
     what: str
     size: int

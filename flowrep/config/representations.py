@@ -1,4 +1,4 @@
-"""The sections `representations`, `flow` and `noise`: maps and what they are made of."""
+"""The sections `representations`, `flow` and `noise`: maps and their sources."""
 
 from typing import Annotated, Any
 
@@ -21,7 +21,7 @@ class Rgb(Section):
 
 
 class Segmentation(Section):
-    """A class id a pixel."""
+    """A class id per pixel."""
 
     encoding: Annotated[str, OneOf(ENCODINGS)]
 
@@ -41,13 +41,13 @@ class Flow(Section):
 
 
 class SegmentationStack(Segmentation):
-    """The last `k` frames of it."""
+    """The same maps of the last `k` frames."""
 
     k: Count
 
 
 class DepthStack(Depth):
-    """The last `k` frames of it."""
+    """The same maps of the last `k` frames."""
 
     k: Count
 

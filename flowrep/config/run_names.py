@@ -1,4 +1,4 @@
-"""The name of a sweep's run, which is the same whenever its overrides are."""
+"""The name of a sweep's run, which depends only on its overrides."""
 
 import re
 from collections.abc import Iterable
@@ -12,12 +12,13 @@ _LONGEST = 100
 
 
 def run_of_sweep(overrides: Iterable[str]) -> str:
-    """Returns a folder's name for a run, of letters that need no quotes in a shell or in Hydra.
+    """Returns a run's folder name, of characters that need no quotes in a shell or in Hydra.
 
-    What names itself is said by its value alone; where a run is computed is left out.
+    Overrides whose value is clear by itself are shortened to it; settings of the machine are left
+    out.
 
     Args:
-        overrides: of the run, in any order.
+        overrides: the run's overrides, in any order.
 
     >>> run_of_sweep(["seed=0", "scene=s_turn", "representations=[ego,obj]", "device=cpu"])
     's_turn_ego+obj_s0'

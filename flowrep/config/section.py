@@ -1,4 +1,4 @@
-"""What every section of a config has in common: its keys are known, and none is missing."""
+"""The base of all sections of a config: no key is unknown, and none is missing."""
 
 from collections.abc import Collection, Mapping
 from typing import Any, TypeVar
@@ -28,9 +28,9 @@ S = TypeVar("S", bound="Section")
 
 
 class Section(BaseModel):
-    """Keys of a config; a subclass annotates each with what its value may be.
+    """Keys of a config; a subclass annotates each with its permitted values.
 
-    Nothing has a default here: defaults lie in conf/.
+    Nothing has a default here, since defaults belong in conf/.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, validate_default=False)
@@ -61,12 +61,12 @@ class Section(BaseModel):
 
 
 class ChosenBy:
-    """The section that one of its own keys chooses, for a field's annotation.
+    """Annotates a field whose section is chosen by one of the section's own keys.
 
     Args:
-        key: e.g. `_target_`.
-        sections: by the key's value.
-        otherwise: the section where the value is none of those.
+        key: the key that chooses, e.g. `_target_`.
+        sections: the sections by the key's value.
+        otherwise: the section for any other value.
     """
 
     def __init__(
@@ -88,15 +88,15 @@ class ChosenBy:
 
 
 def validated(schema: type[S], config: Mapping[str, Any], own_keys: Collection[str] = ()) -> S:
-    """Returns the config as its schema, once everything in it is found right.
+    """Returns a valid config as its schema.
 
     Args:
-        schema: of the whole config.
-        config: resolved, as plain data.
-        own_keys: the top level's keys that a user added for themselves (`+note=pilot`).
+        schema: the schema of the whole config.
+        config: the resolved config as plain data.
+        own_keys: top-level keys that the user added (`+note=pilot`).
 
     Raises:
-        UsageError: a line for each key that is unknown, missing, or not what it should be.
+        UsageError: a line for each key that is unknown, missing or invalid.
     """
     not_checked = set(own_keys) - set(schema.keys())
     if not_checked:

@@ -47,7 +47,7 @@ class Evaluation(Section):
 
 
 class SceneSection(Section):
-    """A scene; what it holds is for `flowrep.envs.load_scene` to check."""
+    """A scene; `flowrep.envs.load_scene` checks its content."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -84,14 +84,14 @@ class TrainConfig(Section):
 
 
 def validated_run(config: Any, source: str) -> dict[str, Any]:
-    """Returns the config that a run folder holds, once it is found to be one.
+    """Returns the config of a run folder after checking it.
 
     Args:
-        config: what was read from the folder.
+        config: the config as read from the folder.
         source: the file, for messages.
 
     Raises:
-        UsageError: it is none; a line for each key that is not what it should be.
+        UsageError: it is not a run's config; has a line for each invalid key.
     """
     own_keys = config.keys() - TrainConfig.keys() if isinstance(config, Mapping) else ()
     try:
@@ -103,7 +103,7 @@ def validated_run(config: Any, source: str) -> dict[str, Any]:
 
 
 def check_workers(num_workers: int | str, num_envs: int) -> None:
-    """Checks that each process has an environment to drive.
+    """Checks that each process has an environment to step.
 
     Raises:
         PydanticCustomError: from `broken_rule`.

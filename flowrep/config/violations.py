@@ -1,4 +1,4 @@
-"""What is wrong with a config, in lines that a person can act on."""
+"""Violations of a config's schema, as lines that a user can act on."""
 
 import difflib
 import reprlib
@@ -9,10 +9,10 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 EXPECTED = "expected"
-"""Type of the errors that `flowrep.config.expectations` raises: their text says what should be."""
+"""Type of the errors of `flowrep.config.expectations`; their text says what is expected."""
 
 RULE = "rule"
-"""Type of the errors of rules between keys: their text is the whole line."""
+"""Type of the errors of rules between keys; their text is the whole line."""
 
 UNKNOWN = "unknown"
 """Type of the errors of keys that a section does not have."""
@@ -22,26 +22,26 @@ ABSENT = "absent"
 
 
 class UsageError(Exception):
-    """A mistake of the person who typed the command; its text is all they need to read."""
+    """A mistake on the command line; the message is all that the user needs to read."""
 
 
 def broken_rule(key: str, problem: str) -> PydanticCustomError:
     """Returns the error of a rule between several keys, for a section's validators to raise.
 
     Args:
-        key: the one to change first, from the section on, e.g. "batch_size"; "" is the section.
-        problem: what follows the key in the line, e.g. "should be at most 5, not 6".
+        key: the key to change first, relative to the section, e.g. "batch_size"; "" is the section.
+        problem: the text after the key in the line, e.g. "should be at most 5, not 6".
     """
     return PydanticCustomError(RULE, "{problem}", {"key": key, "problem": problem})
 
 
 def lines_of(error: ValidationError) -> list[str]:
-    """Returns one line for each thing that is wrong."""
+    """Returns one line for each violation."""
     return [_line(details) for details in error.errors(include_url=False)]
 
 
 def shown(value: Any) -> str:
-    """Returns a value as it is written in a config, cut where it is long.
+    """Returns a value as it is written in a config, shortened if it is long.
 
     >>> shown(None), shown(True), shown("low"), shown(0.5)
     ('null', 'true', "'low'", '0.5')
@@ -52,7 +52,7 @@ def shown(value: Any) -> str:
 
 
 def closest(name: str, known: Sequence[str]) -> str:
-    """Returns a question after the known name that is most like `name`, or nothing.
+    """Returns "did you mean" with the known name most similar to `name`, or an empty text.
 
     >>> closest("sed", ["speed", "seed"])
     " (did you mean 'seed'?)"
@@ -81,7 +81,7 @@ def _line(details: ErrorDetails) -> str:
 
 
 def _path(location: Iterable[int | str]) -> Iterable[str]:
-    """Yields the keys down to a value; what pydantic says of unions (`@...`) is no key."""
+    """Yields the keys down to a value, without pydantic's marks of unions (`@...`)."""
     for part in location:
         if not (isinstance(part, str) and part.startswith("@")):
             yield str(part)
