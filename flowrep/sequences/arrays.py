@@ -1,4 +1,4 @@
-"""Arrays of floats from .npy files, whose header is believed only as far as the file is long."""
+"""Reads arrays of floats from .npy files whose headers may be wrong."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from flowrep.sequences.pictures import check_pixels
 
 
 def read_npy(path: Path, *, channels: int | None = None) -> NDArray[np.float32]:
-    """Returns an array of floats, `[H, W]`, or `[H, W, channels]` where that is given.
+    """Returns an array of floats, `[H, W]`, or `[H, W, channels]` if that is given.
 
     Raises:
-        SequenceError: no .npy file, objects in it, another shape or type, or a file that is
+        SequenceError: the file is no .npy file, holds objects or another shape or type, or is
             shorter or longer than its header says.
     """
     return _read(path, channels, ("f",)).astype(np.float32, copy=False)

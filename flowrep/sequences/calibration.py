@@ -1,4 +1,4 @@
-"""A camera's intrinsics, as a list of four numbers or a JSON file says them."""
+"""A camera's intrinsics from a list of four numbers or a JSON file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) ->
 
 
 def opencv_intrinsics(numbers: Sequence[float]) -> NDArray[np.float64]:
-    """Returns K from fx, fy, cx, cy of a calibration that has pixel (0, 0)'s centre at (0, 0).
+    """Returns K from fx, fy, cx, cy of a calibration with the centre of pixel (0, 0) at (0, 0).
 
     >>> opencv_intrinsics([525.0, 525.0, 319.5, 239.5])[:2, 2]
     array([320., 240.])
@@ -45,7 +45,7 @@ def opencv_intrinsics(numbers: Sequence[float]) -> NDArray[np.float64]:
 
 
 def four_intrinsics(name: str, numbers: Sequence[float]) -> tuple[float, float, float, float]:
-    """Returns fx, fy, cx, cy of an option; anything else is refused with the option's name."""
+    """Returns fx, fy, cx, cy of an option; the error for anything else names the option."""
     values = [float(number) for number in numbers]
     if len(values) != 4 or not np.isfinite(values).all() or min(values[:2]) <= 0:
         raise SequenceError(name, f"should be [fx, fy, cx, cy] in pixels, not {list(numbers)}")
@@ -53,12 +53,12 @@ def four_intrinsics(name: str, numbers: Sequence[float]) -> tuple[float, float, 
 
 
 def read_cameras(path: Path) -> tuple[Camera, Camera | None, NDArray[np.float64] | None]:
-    """Returns the depth camera, the colour camera if it is another, and `colour_from_depth`.
+    """Returns the depth camera, the colour camera if it is different, and `colour_from_depth`.
 
     The file is the `intrinsics.json` of `frames` and `zed` folders, see docs/factorize.md.
 
     Raises:
-        SequenceError: a key is missing, or what it holds can't be.
+        SequenceError: a key is missing, or its value is invalid.
     """
     content = read_json(path)
     camera = _camera(path, content)

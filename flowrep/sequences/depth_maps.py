@@ -1,4 +1,4 @@
-"""Depth maps as files hold them, into metres with nan for missing."""
+"""Converts stored depth maps into metres with nan for missing."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def depth_from_integers(
 
     Args:
         values: `[H, W]`, as stored.
-        unit_m: what 1 stands for, metres.
-        missing: values that stand for "not measured": nan.
-        no_surface: the value that stands for "nothing there": inf.
+        unit_m: the length of a stored 1, metres.
+        missing: values that mean "not measured", which become nan.
+        no_surface: the value that means "no surface", which becomes inf.
 
     >>> stored = np.array([[0, 1500, 65535]], np.uint16)
     >>> depth_from_integers(stored, 0.001, missing=(0, 65535))
@@ -46,7 +46,7 @@ def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
 
     Args:
         path: a .png, or a .npy of float metres, in which nan is missing and inf no surface.
-        unit_m: of the .png.
+        unit_m: the unit of the .png, metres.
     """
     if path.suffix.lower() == ".npy":
         return read_npy(path)

@@ -1,9 +1,9 @@
-"""The convention doctor: finds out that poses, depth or flow are not what they are taken for.
+"""The convention doctor: detects poses, depth or flow in another convention than assumed.
 
-A wrong convention runs without any error and gives wrong flow. In most recordings most of what is
-seen stands still, and there raw flow is ego flow, so that the median of |raw - ego| is small. Where
-it is not, the doctor computes ego flow again under each of the usual mistakes, and names the one
-that would make most of the rest go away.
+A wrong convention raises no error and gives wrong flow. In most recordings, most of the picture is
+static, and there raw flow is ego flow, so that the median of |raw - ego| is small. If it is not,
+the doctor computes ego flow again under each of the usual mistakes, and names the one that would
+remove most of the residual.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from torch import Tensor
 from flowrep.geometry import ego_flow, relative_motion
 from flowrep.sequences.mistakes import MISTAKES, on_command_line
 
-# Below this nothing is to be complained about: rounding of pixels, of estimators, of poses.
+# Residuals below these are normal: rounding of pixels, of estimators, of poses.
 _SMALL_PX, _SMALL_SHARE = 0.05, 0.05
 _SHRINKS = 0.5
-_LEAST_RAW_PX = 0.25  # what hardly moves tells nothing
+_LEAST_RAW_PX = 0.25  # pairs that hardly move say nothing
 _SAMPLED_PIXELS = 6000
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What the doctor found.
+    """The doctor's findings.
 
     Attributes:
-        pairs: pairs of frames that moved enough to be looked at.
+        pairs: the number of pairs of frames that moved enough to be examined.
         raw_px: median length of raw flow, the mean over the pairs.
         residual_px: median of |raw - ego|, the mean over the pairs.
-        rivals_px: the same under each of `MISTAKES`.
+        rivals_px: `residual_px` under each of `MISTAKES`.
         suspects: the mistakes that would shrink the residual by half, the likeliest first, and
             others that would do as well.
     """
@@ -69,7 +69,7 @@ class Diagnosis:
 
 @dataclass
 class Doctor:
-    """Looks at pairs of frames, one after the other, and says what it thinks.
+    """Examines pairs of frames, one after the other, and gives a diagnosis.
 
     >>> depth = torch.full((1, 8, 10), 4.0)
     >>> K = torch.tensor([[20.0, 0.0, 5.0], [0.0, 20.0, 4.0], [0.0, 0.0, 1.0]])
@@ -87,7 +87,7 @@ class Doctor:
 
     @property
     def pairs(self) -> int:
-        """Returns how many pairs moved enough to be looked at."""
+        """The number of pairs that moved enough to be examined."""
         return len(self._raw_px)
 
     @torch.no_grad()
@@ -101,16 +101,16 @@ class Doctor:
         *,
         static: Tensor | None = None,
     ) -> None:
-        """Takes a pair of frames into account, unless hardly anything moves in it.
+        """Examines a pair of frames, unless hardly anything moves in it.
 
         Args:
-            raw: `[2, H, W]`, pixels a step, taken for p_t - p_t' on the current grid; nan unknown.
-            depth: `[1, H, W]`, of the current frame, taken for z in metres.
+            raw: `[2, H, W]`, pixels per step, assumed p_t - p_t' on the current grid; nan unknown.
+            depth: `[1, H, W]`, of the current frame, assumed z in metres.
             K: `[3, 3]`, pixels.
-            world_from_prev: `[4, 4]`, taken for camera-to-world with OpenCV's axes.
-            world_from_curr: `[4, 4]`, the same of the current frame.
-            static: `[1, H, W]` bool, what is known to stand still; without it most of the picture
-                has to.
+            world_from_prev: `[4, 4]`, assumed camera-to-world with OpenCV's axes.
+            world_from_curr: `[4, 4]`, the same for the current frame.
+            static: `[1, H, W]` bool, pixels known to be static; without it most of the picture
+                has to be.
         """
         raw, depth, K, known, step = _sampled(raw, depth, K, static)
         raw_px = step * _median_length(raw, known)
@@ -121,7 +121,7 @@ class Doctor:
         self._residuals.append(step * _residuals(raw, depth, K, poses, known))
 
     def diagnosis(self) -> Diagnosis:
-        """Returns what all pairs so far say together."""
+        """Returns the diagnosis from all pairs so far."""
         if not self.pairs:
             return Diagnosis(0, float("nan"), float("nan"), {}, ())
         residual, *rivals = torch.stack(self._residuals).mean(0).tolist()
@@ -146,7 +146,7 @@ def diagnose(
     *,
     static: Tensor | None = None,
 ) -> Diagnosis:
-    """Returns what one pair of frames says about its conventions, see `Doctor.look`."""
+    """Returns the diagnosis from a single pair of frames, see `Doctor.look`."""
     doctor = Doctor()
     doctor.look(raw, depth, K, world_from_prev, world_from_curr, static=static)
     return doctor.diagnosis()
@@ -155,7 +155,7 @@ def diagnose(
 def _residuals(
     raw: Tensor, depth: Tensor, K: Tensor, poses: tuple[Tensor, Tensor], known: Tensor
 ) -> Tensor:
-    """Returns the median of |raw - ego| as things are, then under each mistake."""
+    """Returns the median of |raw - ego| as given, then under each mistake."""
     residuals = []
     for mistake in (None, *MISTAKES.values()):
         there, z, flow = poses, depth, raw
@@ -166,7 +166,7 @@ def _residuals(
         if mistake is not None and mistake.flow:
             flow = mistake.flow(raw)
         ego, valid = ego_flow(z, K, relative_motion(*there))
-        # What a convention puts behind the camera it does not explain.
+        # A convention does not explain the points that it puts behind the camera.
         left = torch.where(valid, flow - ego, torch.inf)
         residuals.append(_median_length(left, known))
     return torch.tensor(residuals, dtype=torch.float64).clamp(max=1e6)
@@ -175,10 +175,10 @@ def _residuals(
 def _sampled(
     raw: Tensor, depth: Tensor, K: Tensor, static: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
-    """Returns the maps and K on a grid coarser by a step, where all is known, and the step.
+    """Returns the maps and K on a coarser grid, where all is known, and the grid's step.
 
-    Pixel j of the coarser grid is pixel s j + o of the finer one. The centre of that one,
-    s j + o + 0.5, is to lie at j + 0.5: u' = (u - o - 0.5) / s + 0.5. Flow is in coarse pixels.
+    Pixel j of the coarser grid is pixel s j + o of the finer one. The centre of the latter,
+    s j + o + 0.5, maps to j + 0.5: u' = (u - o - 0.5) / s + 0.5. Flow is in coarse pixels.
     """
     height, width = depth.shape[-2:]
     step = max(1, int((height * width / _SAMPLED_PIXELS) ** 0.5))

@@ -15,8 +15,8 @@ from flowrep.sequences.flow_files import Flow
 from flowrep.sequences.frame import Frame, SequenceError
 from flowrep.transforms.estimated_flow import Estimator
 
-# A point that goes there and back lands where it was, but for a hundredth of its way and half a
-# pixel: Sundaram, Brox and Keutzer, "Dense point trajectories", 2010.
+# The squared error of going there and back is below a hundredth of the squared lengths plus half a
+# square pixel: Sundaram, Brox and Keutzer, "Dense point trajectories", 2010.
 _CONSISTENT_SHARE, _CONSISTENT_PX2 = 0.01, 0.5
 
 
@@ -32,7 +32,7 @@ class FactorizedFrame:
         raw: `[2, H, W]`, nan where unknown.
         ego: `[2, H, W]`, 0 where depth is missing.
         obj: `[2, H, W]`, raw - ego where both are known and trusted, 0 elsewhere.
-        valid: `[H, W]`, where they are.
+        valid: `[H, W]`, where raw and ego are known and trusted.
     """
 
     frame: Frame
@@ -48,10 +48,10 @@ FlowSource = Callable[[Frame, Frame], Flow]
 
 
 def recorded_flow(previous: Frame, current: Frame) -> Flow:
-    """Returns the flow that the recording itself brings.
+    """Returns the recording's own flow.
 
     Raises:
-        SequenceError: it brings none for this frame, or it is measured from another frame.
+        SequenceError: it has none for this frame, or it is measured from another frame.
     """
     if current.raw is None:
         raise SequenceError(current.source, "has no flow of its own: use flow=estimated")
@@ -65,12 +65,12 @@ def recorded_flow(previous: Frame, current: Frame) -> Flow:
 
 
 class EstimatedFlowSource:
-    """Flow that an estimator sees from the current picture back to the one before, negated.
+    """Flow estimated from the current picture back to the previous one, negated.
 
     Args:
         estimator: see `flowrep.transforms.EstimatedFlow`.
         check_consistency: whether flow is estimated both ways and marked as unknown where a pixel
-            that goes back and forth does not come home: at what was covered, and at mistakes.
+            does not return to its place: at occlusions and at errors.
     """
 
     def __init__(self, estimator: Estimator, *, check_consistency: bool = True) -> None:
@@ -80,7 +80,7 @@ class EstimatedFlowSource:
     def __call__(self, previous: Frame, current: Frame) -> Flow:
         """Returns raw flow, nan where unknown.
 
-        A picture that repeats the one before while the pose moved says nothing: all is unknown.
+        If the picture repeats the previous one although the pose moved, all flow is unknown.
         """
         if previous.rgb is None or current.rgb is None:
             raise SequenceError(current.source, "has no picture to estimate flow from")
@@ -101,7 +101,7 @@ class EstimatedFlowSource:
 
 
 def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
-    """Returns where a pixel that goes back and then forth comes home, `[H, W]`.
+    """Returns where a pixel that goes back and then forth returns to its place, `[H, W]`.
 
     Args:
         back: `[2, H, W]`, from a first picture to a second one, on the first's grid.
@@ -125,7 +125,9 @@ def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
 def factorize_frames(
     frames: Iterable[Frame], flow_source: FlowSource
 ) -> Iterator[FactorizedFrame | None]:
-    """Yields the factorisation of each frame, None where none came before it; two are held.
+    """Yields the factorisation of each frame, None for a frame without a previous one.
+
+    Two frames are held in memory.
 
     Raises:
         SequenceError: a frame can't be read or lacks what the flow source needs.

@@ -1,4 +1,4 @@
-"""Bytes, text and numbers from files that nobody vouches for: bounded, and named when wrong."""
+"""Reads bytes, text and numbers from untrusted files, with limits and errors that name the file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
-    """Returns the lines that say something, each after its number; `#` starts a comment."""
+    """Returns the non-empty lines, each after its number; `#` starts a comment."""
     try:
         text = read_bytes(path, MAX_TEXT_BYTES).decode("utf-8")
     except UnicodeDecodeError:
@@ -50,15 +50,15 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def read_table(path: Path, columns: Iterable[int], *, header: bool = False) -> NDArray[np.float64]:
-    """Returns the numbers of a text file, a row a line, `[N, columns]`.
+    """Returns the numbers of a text file, one row per line, `[N, columns]`.
 
     Args:
         path: the file; numbers are separated by blanks or commas.
-        columns: the counts of numbers that a line may have, the same on every line.
-        header: whether the first line is names.
+        columns: the permitted numbers of columns; every line has the same one.
+        header: whether the first line has names.
 
     Raises:
-        SequenceError: no numbers, or a line with another count of them.
+        SequenceError: there are no numbers, or a line has another number of columns.
     """
     allowed = tuple(columns)
     rows: list[list[float]] = []
@@ -94,7 +94,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def list_files(folder: Path, suffixes: Iterable[str], prefix: str = "") -> list[Path]:
-    """Returns a folder's files with one of the suffixes, by their numbers, then their names.
+    """Returns a folder's files with one of the suffixes, sorted by number, then by name.
 
     Raises:
         SequenceError: no such folder, or no such file in it.
@@ -117,7 +117,7 @@ def path_inside(folder: Path, relative: str, index: Path) -> Path:
     """Returns the path that an index file names.
 
     Raises:
-        SequenceError: it leads out of the folder, or is longer than any path.
+        SequenceError: it leads out of the folder, or is too long for a path.
     """
     if len(relative) > _MAX_PATH:
         raise SequenceError(index, f"names a file by {len(relative):,} characters")
@@ -140,7 +140,7 @@ def _number(path: Path, line: int, word: str) -> float:
 
 
 def finite_number(path: Path, name: str, value: Any) -> float:
-    """Returns a number that a file gives under a name; anything else is refused."""
+    """Returns a file's value if it is a finite number; otherwise raises SequenceError."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise SequenceError(path, f"{name} should be a number, not {str(value)[:40]!r}")
     return float(value)

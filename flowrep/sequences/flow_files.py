@@ -15,7 +15,7 @@ from flowrep.sequences.pictures import check_pixels, read_png16_rgb
 
 FLO_TAG = 202021.25
 FLO_UNKNOWN = 1e10
-_FLO_LARGEST = 1e9  # what is larger means unknown, says the format
+_FLO_LARGEST = 1e9  # larger values mean unknown in this format
 
 Flow = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
@@ -24,7 +24,7 @@ def read_flo(path: Path) -> Flow:
     """Returns a .flo file's flow `[2, H, W]`, nan where unknown.
 
     Raises:
-        SequenceError: another file, or one that is not as long as its header says.
+        SequenceError: it is another file, or not as long as its header says.
     """
     width, height, values = read_tagged_floats(path, channels=2)
     flow = values.reshape(height, width, 2).transpose(2, 0, 1)
@@ -48,7 +48,7 @@ def read_tagged_floats(path: Path, channels: int) -> tuple[int, int, NDArray[np.
 
 
 def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
-    """Writes flow `[2, H, W]`; where it is not valid, the format's mark for unknown."""
+    """Writes flow `[2, H, W]`; invalid pixels get the format's mark for unknown."""
     _, height, width = flow.shape
     pairs = np.empty((height, width, 2), dtype="<f4")
     pairs[..., 0], pairs[..., 1] = flow

@@ -1,4 +1,4 @@
-"""The formats by name, and what is opened for each."""
+"""The formats by name, with the reader of each."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Stream(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know, a sentence each."""
+        """Notes for the user, a sentence each."""
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields the frames in order."""

@@ -1,4 +1,4 @@
-"""What a recording is made of: frames in flowrep's conventions, read one at a time."""
+"""Recordings and their frames, in flowrep's conventions, read one at a time."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ class Frame:
     at (0.5, 0.5), depth is z in metres (nan: missing, inf: no surface), all on one pixel grid.
 
     Attributes:
-        name: unique in the recording; what is written of the frame is named by it.
-        source: the file that errors about the frame name.
+        name: unique in the recording; names the files written for the frame.
+        source: the file that is named in errors about the frame.
         world_from_cam: `[4, 4]` float64, the camera's pose.
         K: `[3, 3]` float64, pixels.
         depth: `[H, W]` float32, metres.
         rgb: `[H, W, 3]` uint8, None where the recording has no pictures.
         timestamp_s: seconds, None where the recording has no clock.
-        raw: `[2, H, W]` float32, p_t - p_t' as the recording itself knows it, t' the frame before
-            in the recording's order; nan where unknown; None where it has none for this frame.
-        raw_since: name of the frame t' that `raw` is measured from.
-        starts_clip: whether what came before belongs to another shot.
+        raw: `[2, H, W]` float32, the recording's own p_t - p_t', with t' the previous frame in the
+            recording's order; nan where unknown; None if it has none for this frame.
+        raw_since: the name of the frame t' that `raw` is measured from.
+        starts_clip: whether the previous frames belong to another shot.
     """
 
     name: str
@@ -61,11 +61,11 @@ class Frame:
 
 
 class Recording(ABC):
-    """Frames on a disk. They are read when they are asked for, and none is kept.
+    """Frames on disk, read on demand and not kept.
 
     Attributes:
         has_flow: whether frames may bring flow of their own.
-        notes: what a user should know about this recording, a sentence each.
+        notes: notes for the user about this recording, a sentence each.
         one_size: whether all frames must have one size.
     """
 
@@ -76,7 +76,7 @@ class Recording(ABC):
 
     @abstractmethod
     def __len__(self) -> int:
-        """Returns how many frames there are."""
+        """Returns the number of frames."""
 
     @abstractmethod
     def _read(self, index: int) -> Frame:

@@ -1,4 +1,4 @@
-"""The plain layout: what everybody's recording can be written as."""
+"""The plain layout, which any recording can be written in."""
 
 from __future__ import annotations
 
@@ -41,21 +41,22 @@ class Frames(Recording):
     order of their numbers. `timestamps.txt` is optional. docs/factorize.md shows every file.
 
     Args:
-        folder: of the recording.
-        pose_layout: of a line, see `flowrep.geometry.adapt_pose`; a matrix has 12 or 16 numbers.
+        folder: the recording's folder.
+        pose_layout: layout of a line, see `flowrep.geometry.adapt_pose`; a matrix has 12 or 16
+            numbers.
         pose_direction: see there.
         pose_axes: see there.
-        depth_unit_m: metres that 1 stands for in a .png.
+        depth_unit_m: the length of 1 in a .png, metres.
         depth_kind: see `flowrep.geometry.adapt_depth`.
-        near_m: for `"z_buffer"` alone.
-        far_m: for `"z_buffer"` alone.
-        flow_direction: of `flow/`, see `flowrep.geometry.adapt_flow`.
+        near_m: only for `"z_buffer"`.
+        far_m: only for `"z_buffer"`.
+        flow_direction: direction of `flow/`, see `flowrep.geometry.adapt_flow`.
         flow_grid: see there.
         flow_channels: see there.
 
     Raises:
-        SequenceError: naming the file and what is wrong with it.
-        ValueError: for an unknown name, or an option that the kind of depth doesn't read.
+        SequenceError: a file is missing or invalid; names the file and the cause.
+        ValueError: a name is unknown, or an option doesn't apply to the kind of depth.
     """
 
     def __init__(
@@ -118,7 +119,7 @@ class Frames(Recording):
             self.K = colour.K
 
     def __len__(self) -> int:
-        """Returns how many depth maps there are."""
+        """Returns the number of depth maps."""
         return len(self._depths)
 
     def _read(self, index: int) -> Frame:

@@ -1,4 +1,4 @@
-"""Factorises a recording from its first frame to its last, and can be stopped at any."""
+"""Factorises a recording from its first frame to its last; can be stopped at any frame."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ VIDEO_CHUNKS = "video_chunks"
 
 @dataclass(frozen=True)
 class JobOptions:
-    """What a job does with a recording.
+    """The options of a job.
 
     Attributes:
         start: index of the first frame.
         stop: index after the last frame, None for all.
-        stride: of so many frames one is taken.
-        moving_px: object flow from which a pixel counts as moving by itself.
-        video_fps: frames a second of the video, None for no video.
+        stride: every `stride`-th frame is used.
+        moving_px: the object flow from which a pixel counts as moving by itself, pixels.
+        video_fps: the video's frames per second, None for no video.
         rerun: whether a rerun recording is written.
-        output: what else is written.
+        output: other outputs.
     """
 
     start: int = 0
@@ -57,13 +57,13 @@ class JobOptions:
 
 
 class Job:
-    """One recording on its way through.
+    """The factorisation of one recording.
 
     Args:
-        stream: where frames come from.
-        flow_source: where raw flow comes from.
-        folder: where things go.
-        options: which things.
+        stream: the source of frames.
+        flow_source: the source of raw flow.
+        folder: the output folder.
+        options: the job's options.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Job:
         self.done = 0
 
     def run(self) -> Diagnosis | None:
-        """Returns what the doctor says, or None if the job was stopped before its end."""
+        """Returns the doctor's diagnosis, or None if the job was stopped before its end."""
         resumed_after = self._resume()
         total = self._total(resumed_after)
         with StopRequest() as stop, tqdm(total=total, unit="frame", desc="factorising") as bar:
@@ -95,11 +95,11 @@ class Job:
 
     @property
     def _ends_by_hand(self) -> bool:
-        """A camera has no last frame: Ctrl-C is its end."""
+        """Whether the job ends with Ctrl-C, since a camera has no last frame."""
         return not isinstance(self.stream, Recording)
 
     def summary(self) -> dict[str, Any]:
-        """Returns medians over the frames, the doctor's words and where the time went."""
+        """Returns medians over the frames, the doctor's diagnosis and the times."""
         rows = self.folder.rows()
         columns = [name for name in (rows[0] if rows else {}) if name.endswith(("_px", "_share"))]
         medians = {}
@@ -136,14 +136,14 @@ class Job:
         return _Writers(folder, self.options.output, self.video, rerun)
 
     def _total(self, resumed_after: int | None) -> int | None:
-        """Returns how many frames there are to be read, None of a camera."""
+        """Returns the number of frames to read, None for a camera."""
         if isinstance(self.stream, Recording):
             return len(self._indices(resumed_after))
         stop = self.options.stop
         return None if stop is None else len(range(self.options.start, stop, self.options.stride))
 
     def _indices(self, resumed_after: int | None) -> range:
-        """Returns what is read: from the frame on that is the previous one of the next."""
+        """Returns the indices to read, beginning with the previous frame of the next one."""
         assert isinstance(self.stream, Recording)
         first = self.options.start if resumed_after is None else resumed_after
         last = len(self.stream) if self.options.stop is None else self.options.stop
@@ -187,7 +187,7 @@ class Job:
         self.done += 1
 
     def _ask_doctor(self, made: FactorizedFrame, bar: tqdm) -> None:
-        """Shows the doctor the first pairs that move, and says what is found at once."""
+        """Shows the doctor the first moving pairs, and prints a warning at once."""
         if self.doctor.pairs >= DOCTOR_PAIRS:
             return
         before = self.doctor.pairs
@@ -203,7 +203,7 @@ class Job:
 
 
 class _Writers:
-    """All that is written frame by frame."""
+    """Everything that is written frame by frame."""
 
     def __init__(
         self,
@@ -215,7 +215,7 @@ class _Writers:
         self.folder, self.options, self.video, self.rerun = folder, options, video, rerun
 
     def append(self, index: int, made: FactorizedFrame) -> None:
-        """Writes one frame everywhere."""
+        """Writes one frame to all outputs."""
         write_frame(self.folder, index, made, self.options)
         if self.video is not None:
             self.video.append(video_frame(made, self.options))
@@ -223,7 +223,7 @@ class _Writers:
             self.rerun.append(index, made)
 
     def close(self) -> None:
-        """Leaves what was written readable."""
+        """Closes all outputs, so that what was written is readable."""
         if self.video is not None:
             self.video.close()
         if self.rerun is not None:
@@ -231,5 +231,5 @@ class _Writers:
 
 
 def as_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns what a job is continued under: everything that was asked for but `resume`."""
+    """Returns the settings that a continued job must share: all but `resume`."""
     return {key: value for key, value in config.items() if key != "resume"}

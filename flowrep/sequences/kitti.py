@@ -19,7 +19,7 @@ from flowrep.sequences.poses import Pose, as_pose
 
 EARTH_RADIUS_M = 6378137.0
 _OXTS_NUMBERS = 30
-_MAX_DIGITS = 10  # of a frame's number in a raw recording
+_MAX_DIGITS = 10  # of a frame number in a raw recording
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class _Calibration:
 
 
 class Kitti(Recording):
-    """The `training` folder of the benchmark, with the raw recordings that it was cut from.
+    """The `training` folder of the benchmark, with the raw recordings that it was taken from.
 
     Flow and disparity are given on the first picture of each pair (`_10`) and lead to the second
     (`_11`). Time is therefore read backwards: each pair is a clip of two frames, `_11` first, then
@@ -46,7 +46,7 @@ class Kitti(Recording):
             pair n.
 
     Raises:
-        SequenceError: naming the file and what is wrong with it.
+        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     has_flow = True
@@ -64,7 +64,7 @@ class Kitti(Recording):
             self.notes = (f"{left_out} of {len(firsts)} pairs have no raw recording, so no poses",)
 
     def __len__(self) -> int:
-        """Returns how many frames there are: two a pair."""
+        """Returns the number of frames: two per pair."""
         return 2 * len(self._pairs)
 
     def _read(self, index: int) -> Frame:
@@ -152,11 +152,11 @@ def pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float, source: Pat
 
     Args:
         packet: latitude, longitude (degrees), altitude (m), roll, pitch, yaw (rad), and more.
-        latitude_deg: at which the map is true to scale.
+        latitude_deg: the latitude at which the map is true to scale.
         source: the file, for the message.
 
     Raises:
-        SequenceError: numbers that are none.
+        SequenceError: a number is not finite, or a latitude is out of range.
     """
     if not np.isfinite(packet[:6]).all() or abs(packet[0]) >= 90 or not abs(latitude_deg) < 90:
         raise SequenceError(source, f"holds no position and attitude: {packet[:6].tolist()}")
@@ -173,7 +173,7 @@ def pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float, source: Pat
 
 
 def read_calibration(path: Path) -> dict[str, list[float]]:
-    """Returns the numbers of a KITTI calibration file by their names."""
+    """Returns the numbers of a KITTI calibration file by name."""
     entries: dict[str, list[float]] = {}
     for _, line in read_lines(path):
         name, _, values = line.partition(":")

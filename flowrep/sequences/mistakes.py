@@ -1,4 +1,4 @@
-"""The usual mistakes about poses, depth and flow, and what would mend each."""
+"""The usual mistakes about poses, depth and flow, and how to correct each."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Mistake:
     Attributes:
         says: what the data would have to be, to complete "if ...".
         options: the options of `frames` that say so, as on a command line.
-        poses: what makes the right poses of the given ones, or None.
-        depth: the right depth from depth and K, or None.
-        flow: the right raw flow, or None.
+        poses: returns the correct poses from the given ones, or None.
+        depth: returns the correct depth from depth and K, or None.
+        flow: returns the correct raw flow from the given flow, or None.
     """
 
     says: str
@@ -41,7 +41,7 @@ def _axes_undone(name: Any) -> Callable[[Tensor], Tensor]:
 
 
 def _inverted(then: Callable[[Tensor], Tensor] = lambda pose: pose) -> Callable[[Tensor], Tensor]:
-    """Poses that are world-to-camera, of a camera whose axes `then` mends."""
+    """Corrects poses that are world-to-camera, of a camera whose axes `then` corrects."""
     return lambda pose: then(invert_rigid(pose))
 
 
@@ -111,7 +111,7 @@ MISTAKES: Mapping[str, Mistake] = {
 
 
 def on_command_line(name: str) -> str:
-    """Returns the options of `frames` that say what a mistake says, as they are typed."""
+    """Returns the options of `frames` that correct a mistake, as they are typed."""
     options = MISTAKES[name].options.split()
     if name.startswith("depth_times_"):
         return f"format.{options[0]} times {name.removeprefix('depth_times_')}"

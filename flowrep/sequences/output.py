@@ -1,4 +1,4 @@
-"""What a factorisation leaves on the disk: flow files, pictures, a video, a table."""
+"""The files of a factorisation: flow, pictures and frames of the video."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ FLOW_NAMES = ("raw", "ego", "obj")
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What is written.
+    """The outputs to write.
 
     Attributes:
-        flow_files: of `FLOW_FORMATS`.
-        pictures_every: a colour picture of each flow every so many frames; 0 for none.
-        scale_px: flow of full colour, by name.
-        depth_range_m: where depth's colours end, in the video.
+        flow_files: formats of flow files, from `FLOW_FORMATS`.
+        pictures_every: the number of frames from one set of flow pictures to the next; 0 for none.
+        scale_px: the flow of full colour by name, pixels.
+        depth_range_m: the depth at which the video's colours end, metres.
     """
 
     flow_files: Sequence[str] = ("flo",)
@@ -64,18 +64,18 @@ def write_frame(
 
 
 def known(kind: str, factorized: FactorizedFrame) -> NDArray[np.bool_]:
-    """Returns where a flow is known: raw by itself, ego where depth is, obj where both are."""
+    """Returns where a flow is known: ego needs a known depth, obj needs raw and ego."""
     if kind == "obj":
         return factorized.valid
     measured: NDArray[np.bool_] = np.isfinite(factorized.raw[0]) & np.isfinite(factorized.raw[1])
     if kind == "raw":
         return measured
-    # Where raw is known, invalid pixels are those that were behind the camera: no ego flow there.
+    # Where raw is known, a pixel is invalid if it was behind the camera, where ego is unknown.
     return (factorized.frame.depth > 0) & (factorized.valid | ~measured)  # nan compares False
 
 
 def arrays(factorized: FactorizedFrame) -> dict[str, NDArray[Any]]:
-    """Returns what a .npz file holds."""
+    """Returns the content of a .npz file."""
     previous, current = factorized.previous, factorized.frame
     return {
         "raw": factorized.raw,
@@ -95,7 +95,7 @@ def flow_picture(kind: str, factorized: FactorizedFrame, scale_px: float) -> Ima
 
 
 def shown(kind: str, factorized: FactorizedFrame) -> NDArray[np.float32]:
-    """Returns a flow with nan, which is drawn grey, where it is unknown."""
+    """Returns a flow with nan, which is drawn in grey, where it is unknown."""
     flow = getattr(factorized, kind)
     return np.where(known(kind, factorized), flow, np.float32(np.nan))
 
@@ -113,7 +113,7 @@ def video_frame(factorized: FactorizedFrame, options: OutputOptions) -> Image:
 
 
 def write_picture(path: Path, image: Image) -> None:
-    """Writes a picture as a PNG, quickly rather than small."""
+    """Writes a picture as a PNG with fast rather than strong compression."""
     whole, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not whole:
         raise OSError(f"{path}: OpenCV can't encode it")

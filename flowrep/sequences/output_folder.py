@@ -1,4 +1,4 @@
-"""The folder of a job: under a temporary name until it is whole, and able to be continued."""
+"""The output folder of a job: has a temporary name until complete, and can be continued."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ TABLE, JOB, SUMMARY = "frames.csv", "job.json", "summary.json"
 
 
 class OutputFolder:
-    """`<output>.partial` while the job runs, `<output>` once it is whole.
+    """`<output>.partial` while the job runs, `<output>` once it is complete.
 
-    `job.json` holds the job's settings, `frames.csv` a row for each frame whose files are all
-    there; whoever continues goes on after the last of them.
+    `job.json` holds the job's settings, `frames.csv` a row for each frame whose files are complete;
+    a continued job starts after the last of them.
 
     Args:
-        path: the folder to be.
-        settings: what the job was asked for; a job continues under the same alone.
+        path: the final folder.
+        settings: the job's settings; a job can only be continued with the same ones.
         resume: whether an unfinished job is continued.
 
     Raises:
-        SequenceError: the folder is there already, or holds a job that can't be continued.
+        SequenceError: the folder exists already, or holds a job that can't be continued.
     """
 
     def __init__(self, path: str | Path, settings: Mapping[str, Any], *, resume: bool) -> None:
@@ -54,7 +54,7 @@ class OutputFolder:
         return self.partial / TABLE
 
     def last_index(self) -> int | None:
-        """Returns the index of the last frame whose files are all there."""
+        """Returns the index of the last frame whose files are complete."""
         try:
             rows = read_rows(self.table)
             return int(rows[-1]["index"]) if rows else None
@@ -62,7 +62,7 @@ class OutputFolder:
             raise SequenceError(self.table, "is not a table of frames: remove the job") from None
 
     def keep_rows(self, count: int) -> None:
-        """Drops the rows after the first so many, and half a line at the end."""
+        """Keeps the first `count` rows, and drops an incomplete line at the end."""
         rows = read_rows(self.table)
         if len(rows) > count or not is_whole(self.table):
             write_rows(self.table, rows[:count], COLUMNS)
@@ -72,16 +72,16 @@ class OutputFolder:
         return read_rows(self.table)
 
     def log(self, row: Mapping[str, Any]) -> None:
-        """Appends a row: the frame's files are all there."""
+        """Appends the row of a frame whose files are complete."""
         append_rows(self.table, [row], COLUMNS)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
-        """Gives the folder its name."""
+        """Writes the summary and gives the folder its final name."""
         write_json(self.partial / SUMMARY, summary)
         self.partial.replace(self.path)
 
     def discard_if_empty(self) -> None:
-        """Removes the folder if it was made just now and not a frame in it is whole."""
+        """Removes the folder if it is new and holds no complete frame."""
         if self._is_new and not self.table.exists():
             shutil.rmtree(self.partial)
 
@@ -102,7 +102,7 @@ class OutputFolder:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes a JSON file whole or not at all."""
+    """Writes a JSON file atomically."""
     fresh = path.with_name(f"{path.name}.tmp")
     fresh.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     fresh.replace(path)

@@ -1,4 +1,4 @@
-"""Pictures from files: whole ones of a sane size, decoded by OpenCV, or none at all."""
+"""Reads pictures from files with OpenCV; refuses damaged ones and excessive sizes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flowrep.sequences.frame import SequenceError
 PICTURES = (".png", ".jpg", ".jpeg")
 MAX_PIXELS = 7680 * 4320
 
-_SILENCE = threading.Lock()  # two that end in the other order would leave stderr closed
+_SILENCE = threading.Lock()  # overlapping calls could leave stderr closed
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _JPEG_SIZES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
@@ -31,7 +31,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     """Returns a colour picture `[H, W, 3]`; a grey one has three equal channels.
 
     Raises:
-        SequenceError: no picture, a broken one, or not 8 bits a channel.
+        SequenceError: the file is no picture, is damaged, or doesn't have 8 bits per channel.
     """
     picture = _decode(path, cv2.IMREAD_UNCHANGED)
     if picture.dtype != np.uint8:
@@ -43,7 +43,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
 
 
 def read_png16(path: Path) -> NDArray[np.uint16]:
-    """Returns a picture of one channel of 16 bits, `[H, W]`: depth or disparity."""
+    """Returns a 16-bit picture with one channel, `[H, W]`: depth or disparity."""
     picture = _decode(path, cv2.IMREAD_UNCHANGED)
     if picture.dtype != np.uint16 or picture.ndim != 2:
         raise SequenceError(path, f"should have one channel of 16 bits, has {_kind(picture)}")
@@ -51,7 +51,7 @@ def read_png16(path: Path) -> NDArray[np.uint16]:
 
 
 def read_png16_rgb(path: Path) -> NDArray[np.uint16]:
-    """Returns a picture of three channels of 16 bits, `[H, W, 3]`, red first: flow."""
+    """Returns a 16-bit picture with three channels, `[H, W, 3]`, red first: flow."""
     picture = _decode(path, cv2.IMREAD_UNCHANGED)
     if picture.dtype != np.uint16 or picture.ndim != 3 or picture.shape[2] != 3:
         raise SequenceError(path, f"should have three channels of 16 bits, has {_kind(picture)}")
@@ -59,7 +59,7 @@ def read_png16_rgb(path: Path) -> NDArray[np.uint16]:
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Returns where a grey picture of 8 bits is not black, `[H, W]`."""
+    """Returns where an 8-bit grey picture is not black, `[H, W]`."""
     picture = _decode(path, cv2.IMREAD_UNCHANGED)
     if picture.dtype != np.uint8 or picture.ndim != 2:
         raise SequenceError(path, f"should have one channel of 8 bits, has {_kind(picture)}")
@@ -94,14 +94,14 @@ def _decode(path: Path, flags: int) -> NDArray:
 
 @contextmanager
 def _native_silence() -> Iterator[None]:
-    """Keeps libpng and libjpeg from writing about broken files beside the line that refuses them.
+    """Keeps libpng and libjpeg from printing about damaged files beside the error.
 
-    They write to the process's file number 2, whatever Python has made of its stderr.
+    They write to file descriptor 2 of the process, not to Python's stderr.
     """
     with _SILENCE:
         try:
             stderr = os.dup(2)
-        except OSError:  # closed: nobody hears them
+        except OSError:  # it is closed, so nothing is printed
             yield
             return
         nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -115,7 +115,7 @@ def _native_silence() -> Iterator[None]:
 
 
 def _check_png(path: Path, data: bytes) -> None:
-    """Walks the chunks: OpenCV decodes what is left of a picture that was cut off."""
+    """Walks the chunks, since OpenCV decodes the rest of a truncated picture without an error."""
     place, named = len(_PNG), b""
     while named != b"IEND":
         if place + 12 > len(data):
@@ -134,7 +134,7 @@ def _check_png(path: Path, data: bytes) -> None:
 
 
 def _check_jpeg(path: Path, data: bytes) -> None:
-    """Walks the segments to the size, and looks for the marker that ends a picture."""
+    """Walks the segments to find the size, and looks for the end marker."""
     place = 2
     while True:
         while data[place : place + 2] == b"\xff\xff":

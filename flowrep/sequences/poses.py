@@ -1,4 +1,4 @@
-"""Camera poses of recordings: tables of them, and their times."""
+"""Camera poses of recordings: tables and timestamps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def as_pose(
     """Returns `world_from_cam` from the 7, 12 or 16 numbers of one pose.
 
     Raises:
-        SequenceError: nan, a quaternion that is none, or a matrix that is not rigid.
+        SequenceError: the pose has nan, an invalid quaternion, or a matrix that is not rigid.
     """
     values = torch.from_numpy(np.array(numbers, dtype=np.float64).reshape(-1))
     if layout == "matrix":
@@ -41,10 +41,10 @@ def as_pose(
 
 
 def read_pose_lines(path: Path, layout: PoseLayout, frames: int) -> NDArray[np.float64]:
-    """Returns the numbers of a pose a line, for a known number of frames.
+    """Returns the numbers of one pose per line, for a known number of frames.
 
     Raises:
-        SequenceError: too few or too many lines, or numbers in a line.
+        SequenceError: there are too few or too many lines, or numbers in a line.
     """
     table = read_table(path, [12, 16] if layout == "matrix" else [7])
     if len(table) != frames:
@@ -65,7 +65,7 @@ def check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
 def nearest(
     times_s: NDArray[np.float64], wanted_s: NDArray[np.float64], tolerance_s: float
 ) -> NDArray[np.int64]:
-    """Returns for each wanted time the index of the nearest one, -1 where none is near enough.
+    """Returns the index of the time nearest to each wanted one, -1 if none is near enough.
 
     >>> nearest(np.array([0.0, 1.0, 2.0]), np.array([0.98, 1.5, 2.03]), 0.05).tolist()
     [1, -1, 2]
@@ -78,7 +78,7 @@ def nearest(
 
 
 def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
-    """Returns the pose at a share of the way: on a line, and about one axis at one speed.
+    """Returns the pose at a share of the way, with constant velocity and angular velocity.
 
     >>> before, after = np.eye(4), np.eye(4)
     >>> after[0, 3] = 2.0

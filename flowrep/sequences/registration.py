@@ -1,4 +1,4 @@
-"""Depth from one camera onto the pixels of another: what a Kinect leaves to its user."""
+"""Registers depth from one camera to the pixels of another, as a Kinect's recordings need."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ _LARGEST_FOOTPRINT_PX = 8
 
 
 class Registration:
-    """Brings depth onto the colour camera's pixels.
+    """Registers depth to the colour camera's pixels.
 
     Each depth pixel becomes a square that faces the camera, as large as the pixel is at its
-    distance and at least one colour pixel; where several fall on one colour pixel the nearest is
-    seen. What no square reaches (hidden from the depth camera, or outside of its picture) is
-    missing, nan.
+    distance and at least one colour pixel; if several fall on one colour pixel, the nearest is
+    visible. Colour pixels that no square reaches (hidden from the depth camera, or outside its
+    picture) are missing, nan.
 
     Args:
-        K_depth: `[3, 3]`, pixels, of the depth camera.
-        K_colour: `[3, 3]` of the colour camera.
+        K_depth: `[3, 3]` of the depth camera, pixels.
+        K_colour: `[3, 3]` of the colour camera, pixels.
         colour_from_depth: `[4, 4]`, takes points of the depth camera into the colour camera's
             frame, metres.
         size: height and width of the colour pictures.
@@ -42,16 +42,16 @@ class Registration:
         self.K_colour, self.size = K_colour, size
         self.depth_from_colour = np.linalg.inv(colour_from_depth)
         self._depth_focal = float(min(K_depth[0, 0], K_depth[1, 1]))
-        # p_colour ~ z (to_colour @ pixel) + shift: a product for each pixel is all that is left.
+        # p_colour ~ z (to_colour @ pixel) + shift, so only one product per pixel is left to do.
         self._to_colour = K_colour @ colour_from_depth[:3, :3] @ np.linalg.inv(K_depth)
         self._shift = K_colour @ colour_from_depth[:3, 3]
         self._rays: NDArray[np.float32] | None = None  # [3, H, W] of the last size seen
 
     def __call__(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns depth of the colour camera, `[height, width]`, metres, nan where missing.
+        """Returns the colour camera's depth, `[height, width]`, metres, nan where missing.
 
         Args:
-            depth: `[H, W]` of the depth camera. Neither nan nor inf is a surface.
+            depth: `[H, W]` of the depth camera, metres; nan and inf are no surface.
         """
         rays = self._rays_of(depth.shape)
         surface = np.isfinite(depth) & (depth > 0)
@@ -69,7 +69,7 @@ class Registration:
         z: NDArray[np.float32],
         footprint: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Returns the nearest of the squares about (u, v) in each pixel."""
+        """Returns the depth of the nearest square around (u, v) in each pixel."""
         height, width = self.size
         seen = np.full(height * width + 1, np.inf, dtype=np.float32)  # the last: outside
         # The pixels whose centres lie in [u - side / 2, u + side / 2).

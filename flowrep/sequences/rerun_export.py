@@ -1,4 +1,4 @@
-"""A recording and its flow as a rerun recording (.rrd), to scrub through in 3-D."""
+"""Exports a recording and its flow as a rerun recording (.rrd), to scrub through in 3-D."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _JPEG_QUALITY = 80
 
 
 class RerunExport:
-    """Writes camera, picture, depth and flow of each frame.
+    """Writes the camera, picture, depth and flow of each frame.
 
     Args:
         path: the .rrd file. Several files of one recording open as one.
         recording: its name, the same for all files of it.
-        scale_px: flow of full colour, by name.
+        scale_px: the flow of full colour by name, pixels.
 
     Raises:
         SequenceError: rerun is not installed.

@@ -1,4 +1,4 @@
-"""What the table says of a frame: medians, shares and the error against known flow."""
+"""The scores of a frame: medians, shares and the error against known flow."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def score(index: int, factorized: FactorizedFrame, *, moving_px: float) -> dict[
     """Returns a row of frames.csv: medians over valid pixels, shares in [0, 1].
 
     Args:
-        index: of the frame in the recording.
+        index: the frame's index in the recording.
         factorized: its flow.
-        moving_px: object flow from which a pixel counts as moving by itself.
+        moving_px: the object flow from which a pixel counts as moving by itself, pixels.
     """
     valid, frame = factorized.valid, factorized.frame
     obj = squared_lengths(factorized.obj, valid)
@@ -49,7 +49,7 @@ def score(index: int, factorized: FactorizedFrame, *, moving_px: float) -> dict[
 
 
 def _error_px(factorized: FactorizedFrame) -> float:
-    """Returns the error against the recording's own flow, nan where it has none of this pair."""
+    """Returns the error against the recording's own flow, nan if it has none for this pair."""
     truth, since = factorized.frame.raw, factorized.frame.raw_since
     if truth is None or since != factorized.previous.name:
         return math.nan
@@ -57,24 +57,24 @@ def _error_px(factorized: FactorizedFrame) -> float:
 
 
 def squared_lengths(flow: Flow, where: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Returns the squared lengths of the vectors at the chosen pixels, `[N]`, square pixels."""
+    """Returns the squared lengths of the vectors at chosen pixels, `[N]`, square pixels."""
     u, v = flow
     return (u * u + v * v)[where]
 
 
 def end_point_error(flow: Flow, truth: Flow) -> float:
-    """Returns the mean distance from the truth, where both are known, pixels; nan where nowhere."""
+    """Returns the mean distance in pixels from the truth where both are known; nan if nowhere."""
     error = np.sqrt(np.square(flow - truth).sum(0))
     known = error[np.isfinite(error)]
     return float(known.mean()) if len(known) else math.nan
 
 
 def _median_px(squares: NDArray[np.float32]) -> float:
-    """Returns the median length, of an even count the lower of the two in the middle."""
+    """Returns the median length, for an even count the lower of the two in the middle."""
     if not len(squares):
         return math.nan
-    # The bits of floats from 0 on sort as the floats do. Counting their upper halves leaves few to
-    # be sorted, in a third of the time that a partition of all of them takes.
+    # Non-negative floats sort like their bits. Counting the upper halves of the bits leaves few to
+    # sort, in a third of the time of a partition of all of them.
     middle = (len(squares) - 1) // 2
     upper = squares.view(np.uint32) >> 16
     up_to = np.bincount(upper).cumsum()
@@ -86,7 +86,7 @@ def _median_px(squares: NDArray[np.float32]) -> float:
 
 
 def _text(value: Any) -> Any:
-    """What is unknown is empty in the table, a number has six digits."""
+    """Returns a table cell: empty for an unknown value, six digits for a number."""
     if not isinstance(value, float):
         return value
     return f"{value:.6g}" if math.isfinite(value) else ""

@@ -22,18 +22,18 @@ _COLOUR = (".color.png", ".color.jpg")
 class SevenScenes(Recording):
     """A folder with `frame-000000.color.png`, `.depth.png` and `.pose.txt`.
 
-    Depth is registered to the colour camera, whose intrinsics the data set does not say: those of
-    an uncalibrated Kinect by default. The poses are the depth camera's.
+    Depth is registered to the colour camera, whose intrinsics the data set does not give; the
+    default is those of an uncalibrated Kinect. The poses are the depth camera's.
 
     Args:
-        folder: of one sequence, e.g. `chess/seq-01`.
+        folder: the folder of one sequence, e.g. `chess/seq-01`.
         depth_intrinsics: fx, fy, cx, cy of the depth camera, pixel (0, 0)'s centre at (0.5, 0.5).
         colour_intrinsics: those of the colour camera.
-        colour_from_depth_m: where a point lies in the colour camera's frame less where it lies in
-            the depth camera's: x, y, z in metres. The data set does not say it either.
+        colour_from_depth_m: a point's position in the colour camera's frame minus that in the depth
+            camera's: x, y, z in metres. The data set does not give it either.
 
     Raises:
-        SequenceError: naming the file and what is wrong with it.
+        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class SevenScenes(Recording):
         self._registration: Registration | None = None
 
     def __len__(self) -> int:
-        """Returns how many colour pictures there are."""
+        """Returns the number of colour pictures."""
         return len(self._colours)
 
     def _read(self, index: int) -> Frame:

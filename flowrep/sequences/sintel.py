@@ -19,17 +19,17 @@ class Sintel(Recording):
     """One scene of the `training` folder, with depth and camera data unpacked into it.
 
     Its flow leads from each frame to the next, on the frame's own grid. Read from the last frame
-    to the first (`backwards`), the next frame is the one seen before, and flow is exact; forwards
-    it would lie on the wrong grid and is not used.
+    to the first (`backwards`), the next frame comes before, and flow is exact; forwards it would
+    be on the wrong grid and is not used.
 
     Args:
         folder: `training`, with `final/`, `depth/`, `camdata_left/` and `flow/`.
         scene: e.g. `alley_1`.
-        render: `"final"` or `"clean"`, the pass that pictures are taken from.
+        render: the pass of the pictures, `"final"` or `"clean"`.
         backwards: whether time runs backwards.
 
     Raises:
-        SequenceError: naming the file and what is wrong with it.
+        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Sintel(Recording):
         self.has_flow = bool(backwards) and (self.folder / "flow" / scene).is_dir()
 
     def __len__(self) -> int:
-        """Returns how many pictures there are."""
+        """Returns the number of pictures."""
         return len(self._pictures)
 
     def _read(self, index: int) -> Frame:
@@ -66,7 +66,7 @@ class Sintel(Recording):
         return self.folder / kind / self.scene / f"{picture.stem}{suffix}"
 
     def _flow(self, picture: Path) -> NDArray[np.float32]:
-        """Returns p_t - p_t+1, nan where the data set calls its flow invalid."""
+        """Returns p_t - p_t+1, nan where the data set marks its flow as invalid."""
         flow = -read_flo(self._file("flow", picture, ".flo"))
         invalid = self._file("invalid", picture, ".png")
         if invalid.is_file():

@@ -18,16 +18,16 @@ from flowrep.sequences.poses import as_pose, read_pose_lines
 class TartanAir(Recording):
     """A trajectory's folder, e.g. `abandonedfactory/Easy/P000`.
 
-    Its flow leads from each frame to the next and is the camera's alone, even where things moved.
-    Read from the last frame to the first (`backwards`) it lies on the right grid and is used;
-    forwards it is not.
+    Its flow leads from each frame to the next and contains only the camera's motion, even where
+    objects moved. It is used if frames are read from the last to the first (`backwards`), which
+    puts it on the right grid; forwards it is not.
 
     Args:
-        folder: holds `image_left/`, `depth_left/`, `pose_left.txt` and, for flow, `flow/`.
+        folder: the folder of `image_left/`, `depth_left/`, `pose_left.txt` and, for flow, `flow/`.
         backwards: whether time runs backwards.
 
     Raises:
-        SequenceError: naming the file and what is wrong with it.
+        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(self, folder: str | Path, *, backwards: bool = False) -> None:
@@ -38,7 +38,7 @@ class TartanAir(Recording):
         self.has_flow = self.backwards and (self.folder / "flow").is_dir()
 
     def __len__(self) -> int:
-        """Returns how many pictures there are."""
+        """Returns the number of pictures."""
         return len(self._pictures)
 
     def _read(self, index: int) -> Frame:
@@ -53,7 +53,7 @@ class TartanAir(Recording):
             world_from_cam=as_pose(
                 self._poses[place], self._poses_path, layout="xyz_xyzw", axes="ned"
             ),
-            # 90 degrees across the width and a centred axis: 320, 320, 320, 240 at 640 x 480.
+            # 90 degrees of horizontal view, a centred axis: 320, 320, 320, 240 at 640 x 480.
             K=intrinsics(width / 2, width / 2, width / 2, height / 2),
             depth=depth,
             rgb=read_rgb(picture),
@@ -65,7 +65,7 @@ class TartanAir(Recording):
         return self._pictures[place].stem.removesuffix("_left")
 
     def _flow(self, place: int) -> NDArray[np.float32]:
-        """Returns p_t - p_t+1, nan where the next frame does not see the point."""
+        """Returns p_t - p_t+1, nan where the point is not visible in the next frame."""
         pair = f"{self._number(place)}_{self._number(place + 1)}"
         path = self.folder / "flow" / f"{pair}_flow.npy"
         flow = -read_npy(path, channels=2).transpose(2, 0, 1)

@@ -1,4 +1,4 @@
-"""TUM RGB-D: pictures and poses by their timestamps."""
+"""TUM RGB-D: pictures, depth maps and poses matched by timestamp."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ DEPTH_UNIT_M = 1 / 5000
 class Tum(Recording):
     """A folder with `rgb.txt`, `depth.txt` and `groundtruth.txt`.
 
-    The picture sets the time of a frame. The nearest depth map and the nearest pose belong to it
-    if they are near enough; a picture that lacks either is left out.
+    The picture sets the time of a frame. It gets the nearest depth map and the nearest pose if they
+    are near enough; a picture that lacks either is left out.
 
     Args:
-        folder: of one recording.
-        intrinsics: fx, fy, cx, cy as OpenCV calibrates.
-        tolerance_s: the largest distance in time of a depth map or a pose from its picture.
-        interpolate: whether the pose at the picture's very time is interpolated between the poses
-            before and after it, which then have to be no further than `tolerance_s` each.
+        folder: the folder of one recording.
+        intrinsics: fx, fy, cx, cy in OpenCV's convention.
+        tolerance_s: the largest time difference of a depth map or a pose from its picture.
+        interpolate: whether the pose is interpolated to the picture's time between the poses before
+            and after it, each of which must be within `tolerance_s`.
 
     Raises:
-        SequenceError: naming the file and what is wrong with it.
+        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Tum(Recording):
             )
 
     def __len__(self) -> int:
-        """Returns how many pictures have depth and a pose."""
+        """Returns the number of pictures with depth and a pose."""
         return len(self._files)
 
     def _read(self, index: int) -> Frame:
@@ -136,7 +136,7 @@ class Tum(Recording):
 def _one_to_one(
     chosen: NDArray[np.int64], times_s: NDArray[np.float64], wanted_s: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Returns `chosen` where each is taken once, by the nearest in time; -1 for the others."""
+    """Returns `chosen` with each index only where it is nearest in time; -1 for the others."""
     alone = np.full_like(chosen, -1)
     taken: dict[int, int] = {}
     for i, choice in enumerate(chosen.tolist()):

@@ -14,17 +14,17 @@ from flowrep.sequences.pictures import check_pixels
 
 
 class StillVideo:
-    """Frames of a camera that does not move: all flow in them is object flow.
+    """Frames of a camera that does not move, so that all flow is object flow.
 
-    A camera that moves needs its poses and depth to tell its own flow apart, which neither a
-    webcam nor a video file gives. Standing still has to be said, so that nobody is misled.
+    The flow of a moving camera can't be factorised without poses and depth, which neither a webcam
+    nor a video file gives. The user has to declare explicitly that the camera stands still.
 
     Args:
         source: a camera's number (`0`), or a video file that OpenCV reads.
         still: whether the camera stands still.
 
     Raises:
-        SequenceError: it is not said to stand still, or can't be opened.
+        SequenceError: `still` is false, or the source can't be opened.
     """
 
     has_flow = False
@@ -44,7 +44,7 @@ class StillVideo:
             raise SequenceError(source, "no such file; give a video file or a camera's number")
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields frames until the file ends, or for ever from a camera."""
+        """Yields frames until the file ends, or endlessly from a camera."""
         capture: Any = cv2.VideoCapture(
             int(str(self.source)) if self._is_camera else str(self.source)
         )
@@ -70,7 +70,7 @@ class StillVideo:
 
     def _frame(self, number: int, picture: Any) -> Frame:
         height, width = picture.shape[:2]
-        # Neither matters to a camera that stands still: any depth, any K, no ego flow.
+        # A camera that stands still has no ego flow with any depth and any K.
         K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float64)
         frame = Frame(
             name=f"{number:06d}",

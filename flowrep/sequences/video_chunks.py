@@ -1,4 +1,4 @@
-"""An mp4 that can be continued after any stop: written in chunks, joined at the end."""
+"""An mp4 that can be continued after any interruption: written in chunks, joined at the end."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ CHUNK_FRAMES = 100
 
 
 class VideoChunks:
-    """Writes the frames of a video into files of some frames each, whole ones alone named so.
+    """Writes a video in chunks of some frames each; only complete chunks get their final name.
 
     Args:
-        folder: where the chunks go, `<first frame>-<frames>.mp4`.
-        fps: frames a second.
-        continue_after: frames of an interrupted video that are to be kept at most; `frames` says
-            how many were.
+        folder: the folder of the chunks, `<first frame>-<frames>.mp4`.
+        fps: frames per second.
+        continue_after: the most frames of an interrupted video to keep; `frames` is the number
+            that was kept.
     """
 
     def __init__(self, folder: Path, *, fps: float, continue_after: int = 0) -> None:
@@ -31,7 +31,7 @@ class VideoChunks:
         self._in_chunk = 0
 
     def append(self, image: Image) -> None:
-        """Adds a frame; one of another size than the first is cut or filled with white."""
+        """Adds a frame; if its size differs from the first one's, it is cut or padded in white."""
         if self._writer is None:
             self._open(image)
         assert self._size is not None
@@ -44,7 +44,7 @@ class VideoChunks:
             self.close()
 
     def close(self) -> None:
-        """Ends the chunk that is being written, so that its frames are kept."""
+        """Completes the current chunk, so that its frames are kept."""
         if self._writer is None:
             return
         self._writer.close()
@@ -80,7 +80,7 @@ class VideoChunks:
         import imageio.v2 as imageio
 
         self.folder.mkdir(parents=True, exist_ok=True)
-        if self._size is None:  # even, as the codec asks for
+        if self._size is None:  # even, as the codec requires
             self._size = (image.shape[0] + 1) // 2 * 2, (image.shape[1] + 1) // 2 * 2
         self._writer = imageio.get_writer(
             self._part,
@@ -89,13 +89,13 @@ class VideoChunks:
             quality=8,
             pixelformat="yuv420p",
             macro_block_size=1,
-            # Frames in the order they are shown: chunks join without a gap in time.
+            # Frames in display order, so that chunks join without a gap in time.
             output_params=["-bf", "0"],
         )
 
 
 def _keep_whole(folder: Path, at_most: int) -> int:
-    """Returns how many frames the whole chunks hold; what goes beyond `at_most` is removed."""
+    """Returns the number of frames in complete chunks, after removing those beyond `at_most`."""
     frames = 0
     for unfinished in folder.glob("*.part.mp4"):
         unfinished.unlink()

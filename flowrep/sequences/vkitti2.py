@@ -22,15 +22,15 @@ DEPTH_UNIT_M = 0.01
 class VKitti2(Recording):
     """The folder of one variation of one scene, e.g. `Scene01/clone`.
 
-    Its `backwardFlow` leads from each frame to the one before, on the frame's own grid: raw flow
+    Its `backwardFlow` leads from each frame to the previous one, on the frame's own grid; raw flow
     is its negative.
 
     Args:
-        folder: holds `extrinsic.txt`, `intrinsic.txt` and `frames/`.
-        camera: 0 is the left one, 1 the right one.
+        folder: the folder of `extrinsic.txt`, `intrinsic.txt` and `frames/`.
+        camera: 0 for the left camera, 1 for the right one.
 
     Raises:
-        SequenceError: naming the file and what is wrong with it.
+        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(self, folder: str | Path, *, camera: int = 0) -> None:
@@ -42,7 +42,7 @@ class VKitti2(Recording):
         self.has_flow = self._maps("backwardFlow").is_dir()
 
     def __len__(self) -> int:
-        """Returns how many pictures there are."""
+        """Returns the number of pictures."""
         return len(self._pictures)
 
     def _read(self, index: int) -> Frame:

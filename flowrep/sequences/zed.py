@@ -20,19 +20,19 @@ DEPTH_UNIT_M = 0.001
 
 
 class Zed(Recording):
-    """A folder with `left000000.png`, `depth000000.png` (or `.npy`), and two files beside them.
+    """A folder with `left000000.png`, `depth000000.png` (or `.npy`), and two other files.
 
-    `poses.txt` has a line for each picture, `tx ty tz qx qy qz qw`, the left camera in the world;
-    `intrinsics.json` is that of the rectified left camera, as in `frames`.
+    `poses.txt` has a line for each picture, `tx ty tz qx qy qz qw`, the left camera's pose in the
+    world; `intrinsics.json` describes the rectified left camera, as in `frames`.
 
     Args:
-        folder: of the export.
-        pose_axes: the coordinate system that poses were exported in: `"opencv"` for the SDK's
+        folder: the exported folder.
+        pose_axes: the coordinate system of the exported poses: `"opencv"` for the SDK's
             IMAGE, `"opengl"` for RIGHT_HANDED_Y_UP, `"x_forward_z_up"` for RIGHT_HANDED_Z_UP_X_FWD.
 
     Raises:
-        SequenceError: naming the file and what is wrong with it.
-        ValueError: for unknown axes.
+        SequenceError: a file is missing or invalid; names the file and the cause.
+        ValueError: the axes are unknown.
     """
 
     def __init__(self, folder: str | Path, *, pose_axes: CameraAxes = "opencv") -> None:
@@ -52,7 +52,7 @@ class Zed(Recording):
         self.K = camera.K
 
     def __len__(self) -> int:
-        """Returns how many left pictures there are."""
+        """Returns the number of left pictures."""
         return len(self._pictures)
 
     def _read(self, index: int) -> Frame:
@@ -75,6 +75,6 @@ class Zed(Recording):
 def measured(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     """Returns depth with nan where the SDK has none: nan, -inf (too near) and inf (too far).
 
-    Too far is not the sky: the surface is somewhere beyond the range, and nobody knows where.
+    Too far does not mean sky: the surface is at an unknown distance beyond the range.
     """
     return np.where(np.isfinite(depth), depth, np.float32(np.nan))

@@ -17,7 +17,7 @@ from flowrep.sequences.zed import measured
 class ZedLive:
     """Frames of a ZED as they come, with depth and poses from the SDK (`pyzed`).
 
-    Where tracking is lost frames are left out, and the next one starts a clip of its own.
+    Frames without tracking are left out, and the next frame starts a new clip.
 
     Args:
         source: `"live"` for a connected camera, or an .svo or .svo2 file.
@@ -37,7 +37,7 @@ class ZedLive:
         self._is_live = str(source) == "live"
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields frames until the file ends, or for ever from a camera."""
+        """Yields frames until the file ends, or endlessly from a camera."""
         sl = self._sl
         camera = sl.Camera()
         options = sl.InitParameters()
