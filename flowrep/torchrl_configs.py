@@ -23,9 +23,10 @@ loss: {gamma: 0.97, initial_alpha: 0.05}
 memory: {capacity: 50_000, batch_size: 256, device: cpu, n_steps: 3, gamma: 0.97}
 ```
 
-What reads objects that only code can give, a network or codecs, is partial: `instantiate` returns
-a function of them, `instantiate(config.loss)(network, actions)` and
-`instantiate(config.memory)(network.codecs)`. Names and defaults are those of the signatures.
+Configs of classes that take a network or codecs, which a config can't hold, are partial:
+`instantiate` returns a function of these arguments, as in
+`instantiate(config.loss)(network, actions)` and `instantiate(config.memory)(network.codecs)`. Names
+and defaults come from the signatures.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ CONFIGS: dict[tuple[str, str], type] = {
 
 
 def register() -> None:
-    """Stores each config in its group; importing the module has done it already."""
+    """Stores each config in its group; importing the module calls this."""
     store = ConfigStore.instance()
     for (group, name), config in CONFIGS.items():
         store.store(group=group, name=name, node=config, provider="flowrep")

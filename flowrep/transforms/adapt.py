@@ -1,4 +1,4 @@
-"""Sensor data as other simulators and robots give them, into what flowrep's transforms read."""
+"""Conversion of other simulators' and robots' sensor data to the inputs of flowrep's transforms."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ VECTOR = Reads((7,), "float")
 
 
 class AdaptDepth(CameraTransform):
-    """Depth of any kind as depth along the optical axis.
+    """Converts depth of any kind to depth along the optical axis.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
@@ -38,14 +38,14 @@ class AdaptDepth(CameraTransform):
 
     Args:
         kind: `"z"`, `"ray_length"` or `"z_buffer"` (OpenGL's, in [0, 1]).
-        intrinsics: K `[3, 3]` in pixels or the key where it lies; for `"ray_length"` alone.
-        near_m: the near plane; for `"z_buffer"` alone.
-        far_m: the far plane; for `"z_buffer"` alone.
-        in_keys: where the env's depth lies.
-        out_keys: where depth in metres goes; another key, so that nothing is adapted twice.
+        intrinsics: K `[3, 3]` in pixels or its key; only for `"ray_length"`.
+        near_m: the near plane; only for `"z_buffer"`.
+        far_m: the far plane; only for `"z_buffer"`.
+        in_keys: key of the env's depth.
+        out_keys: key of depth in metres; must differ, so that nothing is adapted twice.
 
     Raises:
-        ValueError: for an unknown kind, or an argument that it lacks or doesn't read.
+        ValueError: for an unknown kind, or an argument that it lacks or doesn't use.
 
     Example:
         >>> import torch
@@ -82,25 +82,25 @@ class AdaptDepth(CameraTransform):
 
 
 class AdaptPose(MapTransform):
-    """Poses of any convention as `world_from_cam` of a camera with OpenCV's axes.
+    """Converts poses of any convention to `world_from_cam` of a camera with OpenCV's axes.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | a pose | `("sensor", "world_from_cam")` | float64 `[*B, 4, 4]` | rigid | m |
 
-    Convention: see `flowrep.geometry.adapt_pose`; what is read is `[*B, 4, 4]` or `[*B, 7]`. Poses
-    of bodies go through it too, `[*B, N, 7]` for instance, with `axes="opencv"`: a body's own axes
-    do not matter.
+    Convention: see `flowrep.geometry.adapt_pose`; the input is `[*B, 4, 4]` or `[*B, 7]`. It also
+    converts poses of bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, as a body's own axes do not
+    matter.
 
     Args:
         layout: `"matrix"`, `"xyz_xyzw"` or `"xyz_wxyz"`.
         direction: `"camera_to_world"` or `"world_to_camera"`.
         axes: `"opencv"`, `"opengl"` (Blender's), `"ned"` or `"x_forward_z_up"`.
-        check: whether ill-formed poses are refused at resets and on batches. Steps aren't checked,
-            and a check waits for a GPU: switch it off where resets or replay samples have to be
+        check: whether ill-formed poses raise ValueError at resets and on batches; steps aren't
+            checked. A check waits for a GPU: switch it off if resets or replay samples have to be
             fast there.
-        in_keys: where the env's pose lies.
-        out_keys: where the pose goes; another key, so that nothing is adapted twice.
+        in_keys: key of the env's pose.
+        out_keys: key of the result; must differ, so that nothing is adapted twice.
 
     Raises:
         ValueError: for an unknown name, and at resets for a pose that is not rigid.
@@ -169,21 +169,21 @@ class AdaptPose(MapTransform):
 
 
 class AdaptFlow(MapTransform):
-    """Measured flow of any convention as p_t − p_t' on the current frame's grid.
+    """Converts measured flow of any convention to p_t − p_t' on the current frame's grid.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | flow | `"raw"` | float `[*B, 2, H, W]` | any | px/step |
 
-    Convention: see `flowrep.geometry.adapt_flow`. Flow on the previous frame's grid is refused: it
-    can't be brought onto the current one exactly.
+    Convention: see `flowrep.geometry.adapt_flow`. Flow on the previous frame's grid raises
+    ValueError, as it can't be converted to the current grid exactly.
 
     Args:
         direction: `"forward"` (p_t − p_t') or `"backward"` (p_t' − p_t).
-        grid: `"current"`; `"previous"` is refused with what to do instead.
+        grid: `"current"`; `"previous"` raises an error that names the remedy.
         channels: `"uv"` or `"row_column"`.
-        in_keys: where the env's flow lies.
-        out_keys: where raw flow goes; another key, so that nothing is adapted twice.
+        in_keys: key of the env's flow.
+        out_keys: key of raw flow; must differ, so that nothing is adapted twice.
 
     Raises:
         ValueError: for an unknown name, and for flow on the previous frame's grid.

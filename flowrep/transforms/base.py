@@ -1,4 +1,4 @@
-"""One pure `compute` behind the four entries that TorchRL calls on a transform."""
+"""Base class of transforms, with one pure `compute` behind TorchRL's four entry points."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs.transforms import Transform
 
-# One key (a string, or a tuple of strings where it is nested) or a list of keys, as TorchRL has it.
+# One key (a string, or a tuple of strings if nested) or a list of keys, as in TorchRL.
 Keys: TypeAlias = NestedKey | list[NestedKey]
 
 
 class MissingKey(KeyError):
-    """A key that a representation needs and the env does not offer."""
+    """A representation needs a key that the env does not offer."""
 
     def __str__(self) -> str:
-        """Returns the sentence as it was written: KeyError would print its repr."""
+        """Returns the message itself, of which KeyError would return the repr."""
         return str(self.args[0])
 
 
 class Reads(NamedTuple):
-    """What a transform expects under one input key, whatever the leading batch.
+    """The layout that a transform expects under one input key, after any leading batch.
 
-    `shape` holds the trailing sizes: numbers are fixed, letters only have to agree between inputs.
+    `shape` holds the trailing sizes: numbers are fixed, letters must agree between inputs.
     """
 
     shape: tuple[int | str, ...]
     kind: Literal["float", "integer", "any"] = "any"
 
     def __str__(self) -> str:
-        """Returns the layout as the documentation writes it, e.g. `float [*B, 1, H, W]`."""
+        """Returns the layout in the documentation's notation, e.g. `float [*B, 1, H, W]`."""
         sizes = ", ".join(str(size) for size in self.shape)
         return f"{'' if self.kind == 'any' else self.kind + ' '}[*B, {sizes}]"
 
@@ -51,25 +51,25 @@ MOTIONS = Reads(("N", 4, 4), "float")
 
 
 class MapTransform(Transform):
-    """Reads tensors under `in_keys`, writes what `compute` makes of them under `out_keys`.
+    """Reads tensors under `in_keys`, applies `compute` and writes the results under `out_keys`.
 
-    A subclass states what it reads (`reads`, one entry an input key), the pure function `compute`
-    and the specs of what it writes (`output_specs`). It keeps no state between calls, so it gives
-    the same answer in an env, at a reset and on shuffled samples of a replay buffer.
+    A subclass defines the layout of its inputs (`reads`, one entry per input key), the pure
+    function `compute` and the specs of its outputs (`output_specs`). It keeps no state between
+    calls, so the results are the same in an env, at a reset and on shuffled samples of a replay
+    buffer.
 
     Args:
         reads: the expected layout of each input, in the order of `in_keys`.
-        in_keys: keys that are read.
-        out_keys: keys that are written.
+        in_keys: keys to read.
+        out_keys: keys to write.
 
     Attributes:
-        label: the representations that it serves, as errors name them; its out_keys unless whoever
-            builds a stack knows better.
+        label: the representations that it serves, for error messages; by default its out_keys.
     """
 
-    # Pure: one tensor an input key in, one tensor an output key out.
+    # Pure: takes one tensor per input key, returns one per output key.
     compute: Callable[..., tuple[Tensor, ...]]
-    # The specs of the input keys in, those of the output keys out.
+    # Takes the specs of the input keys, returns those of the output keys.
     output_specs: Callable[..., tuple[TensorSpec, ...]]
 
     def __init__(self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys) -> None:
@@ -132,10 +132,10 @@ class MapTransform(Transform):
 
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the outputs of a batch of any shape, at its root and under `"next"`.
+        """Writes the outputs for a batch of any shape, at its root and under `"next"`.
 
-        `"next"` is left alone where it holds none of the inputs (a buffer that stores only the
-        reward there, for instance).
+        `"next"` is left unchanged if it holds none of the inputs, for example in a buffer that
+        stores only the reward there.
         """
         tensordict = self._call(tensordict)
         following = tensordict.get("next", None)
@@ -144,7 +144,7 @@ class MapTransform(Transform):
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Returns the specs with those of the outputs added."""
+        """Returns the specs including those of the outputs."""
         offered = observation_spec.keys(True, True)
         for key in self.in_keys:
             if key not in offered:
@@ -157,12 +157,12 @@ class MapTransform(Transform):
         return observation_spec
 
     def __repr__(self) -> str:
-        """Returns the keys that are read and written."""
+        """Returns the class name with the input and output keys."""
         return f"{type(self).__name__}({self.in_keys} -> {self.out_keys})"
 
 
 def as_keys(keys: Keys) -> list[NestedKey]:
-    """Returns a list of keys; a nested one may be a list itself, as YAML has no tuples."""
+    """Returns a list of keys; a nested key may be given as a list, as YAML has no tuples."""
     if isinstance(keys, (str, tuple)):
         return [keys]
     return [key if isinstance(key, str) else tuple(key) for key in keys]
@@ -180,14 +180,14 @@ def check_own_keys(transform: MapTransform) -> None:
 
 
 def refuse_n_step(tensordict: TensorDictBase, key: NestedKey) -> None:
-    """Raises MissingKey if the next frames of a batch are not one step after its root's.
+    """Raises MissingKey if a batch's next frames are more than one step after its root's.
 
-    TorchRL's `MultiStep` and `MultiStepTransform` say how many steps lie between in
+    TorchRL's `MultiStep` and `MultiStepTransform` write the number of steps to
     `"steps_to_next_obs"`.
 
     Args:
         tensordict: a replay batch that lacks `("next", key)`.
-        key: what would be computed under `"next"` from two consecutive steps.
+        key: the entry that needs two consecutive steps.
     """
     steps = tensordict.get("steps_to_next_obs", None)
     if steps is not None and bool((steps != 1).any()):
@@ -200,7 +200,7 @@ def refuse_n_step(tensordict: TensorDictBase, key: NestedKey) -> None:
 
 @functools.cache
 def _compiled(compute: Callable[..., tuple[Tensor, ...]]) -> Callable[..., tuple[Tensor, ...]]:
-    """Returns a class's compiled `compute`, kept outside of instances: those stay picklable."""
+    """Returns a class's compiled `compute`, cached outside of instances to keep them picklable."""
     return torch.compile(compute, fullgraph=True)
 
 
@@ -213,7 +213,7 @@ def _is_kind(dtype: torch.dtype, kind: str) -> bool:
 
 
 def unknown_name(what: str, name: str, known: Sequence[str] | Mapping[str, Any]) -> str:
-    """Returns the sentence about a name that isn't known, with the closest of those that are."""
+    """Returns an error message for an unknown name, with the closest known one."""
     close = difflib.get_close_matches(str(name), list(known), n=1)
     hint = f", did you mean {close[0]!r}?" if close else "."
     return f"unknown {what} {name!r}{hint} There are {list(known)}"

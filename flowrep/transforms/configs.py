@@ -14,9 +14,8 @@ split: {intrinsics: [sensor, K], outputs: [obj]}
 stack: {transforms: ["${raw}", "${split}"]}
 ```
 
-A nested key is a list inside of a list of keys, as in TorchRL's configs: `in_keys: [[a, b]]` is one
-key, `in_keys: [a, b]` are two. Names and defaults are those of the classes, read from their
-signatures.
+As in TorchRL's configs, a nested key is a list within the list of keys: `in_keys: [[a, b]]` is one
+key, `in_keys: [a, b]` are two. Names and defaults come from the signatures of the classes.
 """
 
 from __future__ import annotations
@@ -44,14 +43,14 @@ def config_class(
     """Returns the config of a class or function: a dataclass with a field for each parameter.
 
     Args:
-        target: what Hydra instantiates.
+        target: the class or function that Hydra instantiates.
         base: TorchRL's config class of the group.
         partial: whether Hydra returns a function of the arguments that are still missing.
 
     >>> config_class(transforms.Depth)().range_m
     100.0
     """
-    # Of a class, that of its constructor: TorchRL's metaclasses hide it.
+    # TorchRL's metaclasses hide the constructor's signature.
     made_by = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
     fields: list[tuple[str, Any, Any]] = [
         (name, Any, _field(name, parameter.default))
@@ -59,7 +58,7 @@ def config_class(
         if name != "self"
     ]
     place = f"{target.__module__}.{target.__qualname__}"
-    # Lists and mappings reach the target as Python's own, not as OmegaConf's.
+    # Lists and mappings reach the target as Python's own types, not as OmegaConf's.
     fields += [("_target_", str, place), ("_convert_", str, "all"), ("_partial_", bool, partial)]
     return dataclasses.make_dataclass(
         f"{target.__name__}Config",
@@ -115,7 +114,7 @@ CONFIGS: dict[str, type[TransformConfig]] = {
 
 
 def register() -> None:
-    """Stores each config in the group `transform`; importing the module has done it already."""
+    """Stores each config in the group `transform`; importing the module calls this."""
     store = ConfigStore.instance()
     for name, config in CONFIGS.items():
         store.store(group="transform", name=name, node=config, provider="flowrep")

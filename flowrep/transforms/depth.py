@@ -1,4 +1,4 @@
-"""Metric depth squeezed into [0, 1]."""
+"""Metric depth scaled to [0, 1]."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from flowrep.transforms.base import DEPTH, Keys, MapTransform
 
 
 class Depth(MapTransform):
-    """Depth along the optical axis over `range_m`, clipped to [0, 1].
+    """Depth along the optical axis divided by `range_m`, clipped to [0, 1].
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "depth")`, m | `"depth"` | float32 `[*B, 1, H, W]` | 0 … 1 | `range_m` |
 
-    Sky (`inf`) and everything beyond `range_m` is 1, a hole (`nan`) is `missing`.
+    Sky (`inf`) and everything beyond `range_m` becomes 1, a hole (`nan`) becomes `missing`.
 
     Args:
         range_m: depth in metres that becomes 1.
         missing: value for `nan`, in [0, 1].
-        in_keys: where metric depth lies.
-        out_keys: where the representation goes.
+        in_keys: key of metric depth.
+        out_keys: key of the representation.
 
     Raises:
         ValueError: for a range that is not positive and finite, or `missing` outside [0, 1].

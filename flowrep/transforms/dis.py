@@ -1,4 +1,4 @@
-"""Optical flow by dense inverse search (DIS), as OpenCV computes it on the CPU."""
+"""Optical flow by dense inverse search (DIS), computed by OpenCV on the CPU."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ PRESETS = ("ultrafast", "fast", "medium")  # OpenCV's numbers 0, 1, 2
 
 @dataclass(frozen=True)
 class DIS:
-    """Dense inverse search: flow in a few milliseconds a picture on a CPU, without weights.
+    """Dense inverse search: flow in a few milliseconds per picture on a CPU, without weights.
 
-    Small pictures are enlarged by a whole factor and the flow is brought back to their pixels: the
-    preset "medium" matches patches of 8 px at half of the size, too coarse for a picture of 48 px
-    (`benchmarks/estimated_flow.py` shows what that costs). The faster presets choose their scale by
-    the picture's width and gain less from it, or nothing.
+    Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels,
+    because the preset "medium" matches patches of 8 px at half size, too coarse for a picture of
+    48 px (`benchmarks/estimated_flow.py` measures the effect). The faster presets choose their
+    scale by the picture's width and gain less, or nothing.
 
-    Pictures of a batch are shared out among as many threads as torch uses
-    (`torch.set_num_threads`), since OpenCV runs outside of Python's lock. Pictures on another
-    device than the CPU travel there and their flow back: that waits for the device.
+    The pictures of a batch are split among as many threads as torch uses
+    (`torch.set_num_threads`), since OpenCV releases Python's lock. Pictures on another device are
+    copied to the CPU and their flow back, which waits for the device.
 
     Args:
         preset: `"ultrafast"`, `"fast"` or `"medium"`, OpenCV's own.
-        min_side_px: pictures whose shorter side is less are enlarged to at least that; 1 leaves
-            all as they are.
+        min_side_px: pictures with a shorter side below this are enlarged to at least this; 1
+            enlarges none.
 
     Raises:
         ValueError: for an unknown preset or a size below 1.
@@ -54,7 +54,7 @@ class DIS:
         _opencv()
 
     def __call__(self, first: Tensor, second: Tensor) -> Tensor:
-        """Returns where each pixel of the first picture went in the second, minus where it was.
+        """Returns the displacement of each pixel from the first picture to the second.
 
         Convention: `[N, 2, H, W]` float32, (u right, v down), pixels, on the first picture's grid.
 
@@ -77,7 +77,7 @@ class DIS:
         if factor > 1:
             size = (width * factor, height * factor)
             grey = [cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC) for picture in grey]
-        # One estimator a call: it holds buffers that threads may not share, and costs microseconds.
+        # One estimator per call: its buffers aren't thread-safe, and creating it is cheap.
         flow = cv2.DISOpticalFlow_create(PRESETS.index(self.preset)).calc(*grey, None)
         if factor > 1:
             flow = cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) / factor
@@ -85,7 +85,7 @@ class DIS:
 
 
 def whole_factor(height: int, width: int, min_side_px: int) -> int:
-    """Returns the smallest whole factor that brings both sides to `min_side_px` at least.
+    """Returns the smallest whole factor that makes both sides at least `min_side_px`.
 
     >>> whole_factor(48, 84, 160), whole_factor(200, 300, 160)
     (4, 1)
@@ -94,7 +94,7 @@ def whole_factor(height: int, width: int, min_side_px: int) -> int:
 
 
 def _channels_last(pictures: Tensor) -> Any:
-    """Returns the pictures as numpy [N, H, W, 3], which OpenCV reads."""
+    """Returns the pictures as a numpy array [N, H, W, 3], which OpenCV reads."""
     return pictures.movedim(-3, -1).contiguous().cpu().numpy()
 
 

@@ -1,4 +1,4 @@
-"""Optical flow where nobody knows it: estimated from two pictures."""
+"""Optical flow estimated from two pictures, for envs without exact flow."""
 
 from __future__ import annotations
 
@@ -17,47 +17,47 @@ from flowrep.transforms.raft import NETWORKS, RAFT, SMALLEST_SIDE_PX
 
 PICTURE_PAIR = Reads((6, "H", "W"), "integer")
 
-# uint8 [N, 3, H, W] and the same in, flow float [N, 2, H, W] from the first to the second out.
+# Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
 Estimator = Callable[[Tensor, Tensor], Tensor]
 
 
 class EstimatedFlow(FlowTransform):
-    """Optical flow that an estimator sees between the last two pictures.
+    """Optical flow estimated between the last two pictures.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `"rgb2"`, uint8 `[*B, 6, H, W]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` × `scale` |
     | | `"unscaled"` if asked for | as above | any | px/step |
 
-    Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the prior
-    step, as `RawFlow`. The estimator therefore runs from the current picture to the previous one
+    Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
+    step, as in `RawFlow`. The estimator therefore runs from the current picture to the previous one
     and its flow is negated; from the previous to the current one it would lie on the wrong grid.
 
-    What is read is the previous picture and, after it on the channels, the current one:
-    `FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])` writes them, right across
-    resets and in a replay buffer, where the current picture comes twice and flow is exactly 0.
-    This transform itself remembers nothing.
+    The input is the previous picture and, after it on the channels, the current one.
+    `FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])` writes them, correctly across
+    resets and in a replay buffer. After a reset the current picture comes twice and flow is
+    exactly 0. This transform itself keeps no state.
 
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
             from two batches of pictures, uint8 `[N, 3, H, W]`, to the flow from the first to the
             second, float `[N, 2, H, W]`, e.g. a configured `flowrep.transforms.DIS`.
-        weights: file of RAFT's, see `flowrep.transforms.RAFT`.
+        weights: file with RAFT's weights, see `flowrep.transforms.RAFT`.
         preset: of DIS, see `flowrep.transforms.DIS`.
-        min_side_px: smaller pictures are enlarged to that; for RAFT to 128 at least.
-        outputs: of `"raw"` and `"unscaled"`, those that are written.
+        min_side_px: smaller pictures are enlarged to this; for RAFT to at least 128.
+        outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw.
         unit: of raw, `"px_per_step"` or `"px_per_s"`.
-        dt_s: seconds a step lasts; needed for `"px_per_s"` alone.
+        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
         in_keys: the pair of pictures.
-        out_keys: one key an output; their names by default.
+        out_keys: one key per output; their names by default.
 
     Raises:
         ValueError: for an unknown estimator, output or unit, or options of another estimator.
-        ImportError: what the estimator needs is not installed.
+        ImportError: if a library that the estimator needs is not installed.
 
     Example:
-        A texture that went 2 px to the right since the previous picture.
+        A texture that moved 2 px to the right since the previous picture.
 
         >>> import torch
         >>> from tensordict import TensorDict
@@ -101,17 +101,17 @@ class EstimatedFlow(FlowTransform):
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
 
     def compute(self, pair: Tensor) -> tuple[Tensor, ...]:
-        """Returns the outputs asked for."""
+        """Returns the chosen outputs."""
         batch, size = pair.shape[:-3], pair.shape[-2:]
         previous, current = pair.to(torch.uint8).reshape(-1, 6, *size).chunk(2, -3)
         flow = -self.estimator(current, previous).to(torch.float32)
-        # After a reset the picture is its own predecessor, and nothing has moved.
+        # After a reset both pictures are the same, and nothing has moved.
         differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
         flow = torch.where(differs, flow, 0.0).reshape(*batch, 2, *size)
         return tuple(self._in_unit(name, flow) for name in self.outputs)
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns an unbounded spec an output."""
+        """Returns one unbounded spec per output."""
         (pair,) = specs
         shape = torch.Size([*pair.shape[:-3], 2, *pair.shape[-2:]])
         return tuple(Unbounded(shape, device=pair.device) for _ in self.outputs)

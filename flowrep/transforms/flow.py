@@ -1,4 +1,4 @@
-"""What the transforms that write optical flow share: intrinsics, outputs and units."""
+"""Base classes of transforms that write optical flow: intrinsics, outputs and units."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 
 
 class CameraTransform(MapTransform):
-    """Holds K, in the float type it was given in, whatever the transform is cast to.
+    """Holds K in its original float type, even if the transform is cast to another.
 
     Args:
-        intrinsics: K `[3, 3]`, the key under which the TensorDict holds it, `[*B, 3, 3]`, or None
-            where K isn't needed. With a key, K is read after all other keys.
-        reads: as in `MapTransform`.
-        in_keys: as in `MapTransform`.
-        out_keys: as in `MapTransform`.
+        intrinsics: K `[3, 3]`, its key in the TensorDict, where it is `[*B, 3, 3]`, or None if K
+            isn't needed. A key is read after all other keys.
+        reads: see `MapTransform`.
+        in_keys: see `MapTransform`.
+        out_keys: see `MapTransform`.
     """
 
     K: Tensor | None
@@ -51,7 +51,7 @@ class CameraTransform(MapTransform):
         self.register_buffer("K", as_intrinsics(intrinsics) if given else None, persistent=False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CameraTransform:
-        """Moves K between devices, but leaves its type: in bfloat16, 319.5 px would be 320."""
+        """Moves K between devices but keeps its type, as bfloat16 would round 319.5 px to 320."""
         exact = self.K
         super()._apply(fn, recurse)
         if exact is not None and self.K is not None:
@@ -60,20 +60,19 @@ class CameraTransform(MapTransform):
 
 
 class FlowTransform(CameraTransform):
-    """What flow transforms share: the intrinsics K, the outputs chosen and their unit.
+    """Base of flow transforms, with the intrinsics K, the chosen outputs and their unit.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps that are read, in pixels, or the key under which the
-            TensorDict holds it, `[*B, 3, 3]`: it is then read after all other keys. None where
-            flow needs none.
-        reads: as in `MapTransform`.
-        outputs: which of the class's outputs are written, in this order.
-        scale: factor on every flow, or one an output.
+        intrinsics: K `[3, 3]` of the input maps, in pixels, or its key in the TensorDict, where it
+            is `[*B, 3, 3]`; a key is read after all other keys. None if K isn't needed.
+        reads: see `MapTransform`.
+        outputs: which of the class's outputs to write, in this order.
+        scale: factor on every flow, or one per output.
         unit: `"px_per_step"` or `"px_per_s"`.
-        dt_s: seconds a step lasts; needed for `"px_per_s"` alone.
+        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
         compiled: whether `compute` runs through `torch.compile`.
-        in_keys: as in `MapTransform`.
-        out_keys: one key an output.
+        in_keys: see `MapTransform`.
+        out_keys: one key per output.
 
     Raises:
         ValueError: for a number of keys, a unit or a `dt_s` that does not fit, and for
@@ -111,7 +110,7 @@ class FlowTransform(CameraTransform):
         self.compiled = bool(compiled)
 
     def _with_camera(self, maps: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
-        """Returns the maps and K, which is the last of them unless the transform was given it."""
+        """Returns the maps and K, which is the last of them if it is read from a key."""
         return ([*maps], self.K) if self.K is not None else ([*maps[:-1]], maps[-1])
 
     def _in_unit(self, name: str, flow: Tensor) -> Tensor:
@@ -119,15 +118,16 @@ class FlowTransform(CameraTransform):
         return flow if factor == 1.0 else flow * factor
 
     def _at_one_precision(self, *maps: Tensor, depth: Tensor, K: Tensor) -> list[Tensor]:
-        """Returns the maps, depth and K in depth's float type, float32 at least.
+        """Returns the maps, depth and K in depth's float type, at least float32.
 
-        Raw flow and ego flow have to round alike: else obj were rounding noise where nothing moves.
+        Raw and ego flow have to round alike; otherwise obj would be rounding noise on static
+        pixels.
         """
         dtype = torch.promote_types(depth.dtype, torch.float32)
         return [tensor.to(dtype) for tensor in (*maps, depth, K)]
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns an unbounded spec a flow and a boolean one for the mask."""
+        """Returns an unbounded spec per flow and a boolean one for the mask."""
         depth = next(spec for spec, reads in zip(specs, self.reads) if reads == DEPTH)
         batch, size, device = depth.shape[:-3], depth.shape[-2:], depth.device
         dtype = torch.promote_types(depth.dtype, torch.float32)
@@ -140,7 +140,7 @@ class FlowTransform(CameraTransform):
 
 
 def checked_outputs(outputs: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:
-    """Returns the outputs as a tuple, each of them known and named once."""
+    """Returns the outputs as a tuple; raises ValueError if one is unknown or named twice."""
     unknown = [name for name in outputs if name not in known]
     if isinstance(outputs, str) or unknown or not outputs or len(set(outputs)) != len(outputs):
         raise ValueError(f"outputs is a list of some of {list(known)}, each once; got {outputs!r}")
@@ -169,7 +169,7 @@ def _factor(scale: object, unit: object, dt_s: float | None) -> float:
 
 
 def intrinsics_key(intrinsics: Intrinsics) -> NestedKey | None:
-    """Returns the key that intrinsics name, or None where they are K itself."""
+    """Returns the key of the intrinsics, or None if they are K itself."""
     if isinstance(intrinsics, str):
         return intrinsics
     if isinstance(intrinsics, (tuple, list)) and all(isinstance(part, str) for part in intrinsics):

@@ -22,38 +22,37 @@ class FlowFactorize(FlowTransform):
     | --- | --- | --- | --- | --- |
     | `"raw"`, px/step | `"ego"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
     | `("sensor", "depth")`, m | `"obj"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
-    | `("sensor", "prev_from_curr")` | `"raw"` if asked for | as above | any | as above |
-    | | `"valid"` if asked for | bool `[*B, 1, H, W]` | | |
+    | `("sensor", "prev_from_curr")` | `"raw"` if chosen | as above | any | as above |
+    | | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
 
     Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the
-    paper), obj = raw − ego is what moves by itself (Eq. 6), both p_t − p_t' on the current frame's
-    grid, channels (u right, v down). `prev_from_curr` `[*B, 4, 4]` takes a point in the current
-    camera's frame into the previous camera's. Where flow isn't known it is 0: depth `nan`, a point
-    that was not in front of the previous camera, a motion or K that isn't finite, such a raw flow.
-    With the simulator's raw flow obj is exactly 0 on what stands still.
+    paper), obj = raw − ego is the objects' own flow (Eq. 6), both p_t − p_t' on the current frame's
+    grid, channels (u right, v down). `prev_from_curr` `[*B, 4, 4]` maps a point from the current
+    camera's frame to the previous camera's. Flow is 0 where it isn't known: where depth is `nan`,
+    the point was not in front of the previous camera, or the motion, K or raw flow isn't finite.
+    With the simulator's raw flow, obj is exactly 0 on everything static.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the key under
-            which the env gives it, `[*B, 3, 3]`.
-        outputs: of `"ego"`, `"obj"`, `"raw"` (the raw flow itself, in the unit asked for, 0 where
-            it isn't finite) and `"valid"`, those that are written. With ego alone raw flow isn't
-            read at all.
+        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
+            it, `[*B, 3, 3]`.
+        outputs: which of `"ego"`, `"obj"`, `"raw"` (the raw flow itself, in the chosen unit, 0
+            where it isn't finite) and `"valid"` to write. With ego alone, raw flow isn't read.
         scale: factor on the flows, or a mapping from output to factor.
         unit: `"px_per_step"` or `"px_per_s"`, or a mapping from output to unit.
-        dt_s: seconds a step lasts; needed for `"px_per_s"` alone.
-        compiled: whether `compute` runs through `torch.compile`: some eight times as fast on a
-            CPU, equal up to rounding; compiling takes up to a minute, later processes find the
-            result in torch's cache.
-        in_keys: raw flow (in px/step, unscaled), depth, camera motion; without the first for ego
+        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
+        compiled: whether `compute` runs through `torch.compile`, which is some eight times as fast
+            on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
+            the result in torch's cache.
+        in_keys: raw flow (in px/step, unscaled), depth and camera motion; without raw flow for ego
             alone.
-        out_keys: one key an output; their names by default.
+        out_keys: one key per output; their names by default.
 
     Raises:
         ValueError: for an unknown output or unit, or `"px_per_s"` without `dt_s`.
 
     Example:
-        The camera went 0.1 m to the right, so a wall a metre away streams by fx · 0.1 = 5 px to
-        the left; a pixel that was measured to stay where it is has object flow of +5 px.
+        The camera moved 0.1 m to the right, so a wall a metre away moves by fx · 0.1 = 5 px to the
+        left; a pixel with a measured flow of 0 has an object flow of +5 px.
 
         >>> import torch
         >>> from tensordict import TensorDict
@@ -96,7 +95,7 @@ class FlowFactorize(FlowTransform):
         )
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
-        """Returns the outputs asked for, from (raw,) depth and camera motion (and K)."""
+        """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""
         (*raw, depth, motion), K = self._with_camera(maps)
         *raw, motion, depth, K = self._at_one_precision(*raw, motion, depth=depth, K=K)
         made: dict[str, Tensor] = {}

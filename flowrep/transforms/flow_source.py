@@ -1,4 +1,4 @@
-"""Where raw flow comes from: the transforms behind raw, ego and obj, by source."""
+"""Builds the transforms behind raw, ego and obj, depending on the source of raw flow."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from flowrep.transforms.noise_source import Sensed
 from flowrep.transforms.raw_flow import RawFlow
 
 _UNSCALED = "_raw"  # raw flow in px/step, nan where unknown: what FlowFactorize reads
-PICTURES_KEY = "_rgb2"  # the previous picture and this one: stays, since the next step needs it
-ESTIMATED_FLOW_KEY = ("sensor", "flow")  # the same as _UNSCALED where raw flow is estimated
+PICTURES_KEY = "_rgb2"  # the previous and the current picture, kept for the next step
+ESTIMATED_FLOW_KEY = ("sensor", "flow")  # takes the place of _UNSCALED for estimated flow
 
 FLOW_SOURCES = ("exact", "estimated")
 _ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px")
 
 
 def estimator_options(flow: str | Mapping[str, Any]) -> dict[str, Any] | None:
-    """Returns `EstimatedFlow`'s options, None where flow is exact."""
+    """Returns `EstimatedFlow`'s options, or None if flow is exact."""
     options: dict[str, Any] = {"source": flow} if isinstance(flow, str) else dict(flow)
     source = options.pop("source", None)
     if source not in FLOW_SOURCES:
@@ -45,7 +45,7 @@ def estimated_flow_makers(
     context: dict[str, Any],
     sensed: Sensed,
 ) -> list[Transform]:
-    """Returns what `exact_flow_makers` does, with raw flow from the pictures."""
+    """Returns the counterparts of `exact_flow_makers`, with raw flow estimated from pictures."""
     makers: list[Transform] = []
     factors = {name: options for name, options in flows.items() if name != "raw"}
     if "raw" in flows or "obj" in flows:
@@ -82,7 +82,7 @@ def exact_flow_makers(
     context: dict[str, Any],
     sensed: Sensed,
 ) -> list[Transform]:
-    """Returns one RawFlow, if raw flow is needed, and one FlowFactorize, if a factor is."""
+    """Returns one RawFlow if raw flow is needed, and one FlowFactorize if ego or obj is."""
     if "obj" in flows:
         raw = RawFlow(intrinsics, invalid=math.nan, out_keys=_UNSCALED, **context)
         raw.label = "'obj'"

@@ -1,7 +1,7 @@
-"""Random numbers that a frame's name decides: the same whatever else is drawn, and when, and where.
+"""Random numbers that depend only on a frame's name, not on any other draw.
 
-SplitMix64 (Steele, Lea and Flood 2014) gives the n-th number of a stream at one go, so that a batch
-is computed as a whole and no generator has a state to be kept.
+SplitMix64 (Steele, Lea and Flood 2014) gives direct access to the n-th number of a stream, so a
+batch is computed at once and no generator state has to be saved.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-# Those of SplitMix64, as the signed integers that torch has; products wrap around.
+# SplitMix64's constants as signed integers, torch's only 64-bit type; products wrap around.
 _GAMMA, _FIRST, _SECOND = (
     number - (1 << 64) for number in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 )
-_DIGITS = 24  # of a float32: half of 48 bits of a number each
+_DIGITS = 24  # of a float32; `normal` and `uniform` use 24 bits of a number each
 
 
 def split_mix(state: Tensor) -> Tensor:
-    """Returns the number that follows a state of SplitMix64, element by element.
+    """Returns the number that SplitMix64 generates from a state, element by element.
 
     Args:
-        state: int64; the state after it is larger by the generator's gamma.
+        state: int64; the next state is this plus the generator's gamma.
 
     >>> split_mix(torch.tensor([1234567]))
     tensor([6457827717110365317])
@@ -41,9 +41,9 @@ def frame_bits(frame: Tensor, shape: Sequence[int], *, seed: int, stream: int) -
 
     Args:
         frame: integers `[*B, N]` that name a frame.
-        shape: of what each frame has.
-        seed: another one gives other numbers for all frames.
-        stream: a small number, by which one frame's different uses are told apart.
+        shape: shape of the elements of one frame.
+        seed: a different seed gives different numbers for all frames.
+        stream: a small number that distinguishes the uses of one frame's numbers.
     """
     start = torch.full_like(frame[..., 0], seed, dtype=torch.int64)
     for number in (torch.full_like(start, stream), *frame.long().unbind(-1)):
@@ -55,19 +55,19 @@ def frame_bits(frame: Tensor, shape: Sequence[int], *, seed: int, stream: int) -
 
 
 def normal(bits: Tensor) -> Tensor:
-    """Returns standard normal numbers, float32, within 5.5 of 0, by the low bits."""
+    """Returns standard normal numbers from the low bits, float32, within 5.5 of 0."""
     # An odd number over 2^24: exact in float32, symmetric about 0, never at an end of (-1, 1).
     odd = 2 * (bits & ((1 << _DIGITS) - 1)) + 1 - (1 << _DIGITS)
     return math.sqrt(2.0) * torch.erfinv(odd.float() * 2.0**-_DIGITS)
 
 
 def uniform(bits: Tensor) -> Tensor:
-    """Returns uniform numbers in [0, 1), float32, by the high bits: `normal` has others."""
+    """Returns uniform numbers in [0, 1) from the high bits, float32; `normal` uses others."""
     return _shifted(bits, 64 - _DIGITS).float() * 2.0**-_DIGITS
 
 
 def _shifted(z: Tensor, places: int) -> Tensor:
-    """Returns the bits moved to the right, with zeros on the left: torch repeats the sign."""
+    """Returns the bits shifted right and filled with zeros, where torch repeats the sign."""
     moved = z >> places
     moved &= (1 << (64 - places)) - 1
     return moved

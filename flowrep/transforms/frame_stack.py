@@ -19,35 +19,35 @@ class FrameStack(MapTransform):
     | --- | --- | --- | --- | --- |
     | a map `[*B, C, H, W]` | its stack | same type, `[*B, k·C, H, W]` | the map's | the map's |
 
-    After a reset all k frames are the episode's first. The stack of the step before is read from
-    the TensorDict that goes into `step`, where the env declares it as part of its state, as
-    TorchRL's `StepCounter` does: nothing is remembered between calls, so stacks can't bleed from
-    one episode or one env into another. TorchRL's `CatFrames` remembers: in a replay buffer it
-    stacks what lies side by side in a sample, which is wrong where samples are shuffled.
+    After a reset all k frames are the episode's first. The previous step's stack is read from the
+    TensorDict passed to `step`, where the env declares it as part of its state, as TorchRL's
+    `StepCounter` does. No state is kept between calls, so stacks can't mix episodes or envs.
+    TorchRL's `CatFrames` keeps state: in a replay buffer it stacks neighbours in a sample, which is
+    wrong if samples are shuffled.
 
     In a replay buffer the stored root stack and the next frame give the next stack exactly,
-    shuffled or not: leave `("next", out_key)` out of what is stored, and a transition costs k + 1
-    frames instead of 2 k. A stack that is stored under `"next"` stays as it is; n-step returns
-    need it stored, since their next frame is several steps ahead.
+    shuffled or not. If `("next", out_key)` is not stored, a transition takes k + 1 frames instead
+    of 2 k. A stack stored under `"next"` is left unchanged; n-step returns need it stored, since
+    their next frame is several steps ahead.
 
     A batch without a stored stack has to be a trajectory, with a dimension named "time" and
     `("next", "done")`; its first frame counts as an episode's first. A buffer may thus store single
-    frames (two a transition, or one where `next` is looked up) and sample slices of an episode:
-    from the k-th step of a slice on, stacks are exact, `batch[:, k - 1:]`.
+    frames (two per transition, or one if `next` is looked up) and sample slices of an episode.
+    Stacks are exact from the k-th step of a slice on, `batch[:, k - 1:]`.
 
     Args:
         k: number of frames, at least 1.
         in_keys: maps to stack.
-        out_keys: where each stack goes; may not be its map's key.
+        out_keys: keys of the stacks; must differ from the maps' keys.
 
     Raises:
-        ValueError: for k < 1 or an output key that is also read.
+        ValueError: for k < 1 or an output key that is also an input key.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> frames = torch.arange(3.0).reshape(3, 1, 1, 1)
-        >>> done = torch.tensor([[False], [True], [False]])  # the third frame starts anew
+        >>> done = torch.tensor([[False], [True], [False]])  # the third frame begins an episode
         >>> td = TensorDict({"depth": frames, "next": {"depth": frames + 1, "done": done}}, [3])
         >>> td.names = ["time"]
         >>> FrameStack(k=2, in_keys=["depth"], out_keys=["depth2"])(td)["depth2"].flatten(1)
@@ -70,7 +70,7 @@ class FrameStack(MapTransform):
         self.k = int(k)
 
     def compute(self, *frames: Tensor) -> tuple[Tensor, ...]:
-        """Returns the stacks at an episode's first frames: k times the frame."""
+        """Returns the stacks at an episode's first frame, which is repeated k times."""
         return tuple(torch.cat([frame] * self.k, -3) for frame in frames)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -80,7 +80,7 @@ class FrameStack(MapTransform):
                 raise self._missing(frame_key, next_tensordict)
             if stack is None:
                 raise MissingKey(
-                    f"representation {stack_key!r} needs the stack of the step before: give step "
+                    f"representation {stack_key!r} needs the stack of the previous step: pass step "
                     f"the TensorDict of reset or step_mdp, which holds {stack_key!r}"
                 )
             next_tensordict.set(stack_key, push_frame(stack, frame))
@@ -89,7 +89,7 @@ class FrameStack(MapTransform):
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        """Starts the stacks anew in the envs that have just reset themselves."""
+        """Restarts the stacks of the envs that have just reset themselves."""
         reset = tensordict.get("_reset")
         for stack_key in self.out_keys:
             stack = tensordict_reset.get(stack_key)
@@ -109,7 +109,7 @@ class FrameStack(MapTransform):
                 stack = self._stack_from_trajectory(tensordict, frame_key, stack_key)
                 tensordict.set(stack_key, stack)
             if following is None or following.get(stack_key, None) is not None:
-                continue  # stored: right even where the next frame is several steps ahead
+                continue  # stored: correct even if the next frame is several steps ahead
             frame = following.get(frame_key, None)
             if frame is not None:
                 refuse_n_step(tensordict, stack_key)
@@ -137,7 +137,7 @@ class FrameStack(MapTransform):
         return tuple(_stacked(spec, self.k) for spec in specs)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Returns the specs of what `step` reads, with the stacks of the step before added."""
+        """Returns the input specs of `step`, including the previous step's stacks."""
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
@@ -148,16 +148,16 @@ class FrameStack(MapTransform):
 
 
 def push_frame(stack: Tensor, frame: Tensor) -> Tensor:
-    """Returns the stack `[*B, k·C, H, W]` one frame `[*B, C, H, W]` later."""
+    """Returns the stack `[*B, k·C, H, W]` with `frame` appended and the oldest frame dropped."""
     return torch.cat([stack[..., frame.shape[-3] :, :, :], frame], -3)
 
 
 def stack_trajectory(frames: Tensor, done: Tensor, k: int, time_dim: int) -> Tensor:
-    """Returns the stack at every step of a trajectory, as the env made it step by step.
+    """Returns the stack at every step of a trajectory, equal to the env's.
 
     Args:
         frames: `[*B, C, H, W]`, with time at `time_dim` of the batch.
-        done: `[*B]`, whether the episode ended with the step that follows the frame.
+        done: `[*B]`, whether the episode ended with the step after the frame.
         k: number of frames.
         time_dim: position of time in the batch.
     """

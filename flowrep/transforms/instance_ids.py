@@ -1,4 +1,4 @@
-"""A simulator's own segmentation ids, counted the way flow needs them."""
+"""Conversion of a simulator's segmentation ids to the ids that raw flow reads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flowrep.transforms.base import IDS, Keys, MapTransform, check_own_keys
 
 
 class InstanceIds(MapTransform):
-    """A simulator's segmentation ids as the rows of `instance_motion`.
+    """Converts a simulator's segmentation ids to rows of `instance_motion`.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
@@ -21,12 +21,12 @@ class InstanceIds(MapTransform):
 
     Args:
         body_ids: the ids of the bodies, in the order of their poses: the first becomes 1. Every
-            other id, negative ones too, is the static world's 0.
-        in_keys: where the env's ids lie.
-        out_keys: where the rows go; another key, so that nothing is adapted twice.
+            other id, also a negative one, becomes 0, the static world.
+        in_keys: key of the env's ids.
+        out_keys: key of the rows; must differ, so that nothing is adapted twice.
 
     Raises:
-        ValueError: for an id that is named twice.
+        ValueError: for a repeated id.
 
     Example:
         >>> import torch

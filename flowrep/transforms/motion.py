@@ -1,4 +1,4 @@
-"""Poses of the camera and of bodies, at every step, to the motions that flow is computed from."""
+"""Motions of the camera and of bodies, for flow, computed from their poses at every step."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _BODIES: NestedKey = ("sensor", "world_from_body")
 
 
 class PoseTransform(MapTransform):
-    """A motion between the poses of two steps.
+    """Base of transforms that write the motion between the poses of two steps.
 
-    The poses of the step before are read where they are: in the TensorDict that goes into `step`,
-    where the env declares them as part of its state. Nothing is remembered between calls, so that
-    episodes and envs can't mix. A subclass says what the motion between two sets of poses is.
+    The previous step's poses are read from the TensorDict passed to `step`, where the env declares
+    them as part of its state. No state is kept between calls, so episodes and envs can't mix. A
+    subclass defines the motion between two sets of poses.
 
     Args:
-        reads: as in `MapTransform`.
-        in_keys: as in `MapTransform`.
+        reads: see `MapTransform`.
+        in_keys: see `MapTransform`.
         out_keys: one key.
     """
 
@@ -47,10 +47,10 @@ class PoseTransform(MapTransform):
 
     @abstractmethod
     def between(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> Tensor:
-        """Returns the motion, from the poses of the step before and those of now."""
+        """Returns the motion from the previous step's poses to the current ones."""
 
     def compute(self, *poses: Tensor) -> tuple[Tensor]:
-        """Returns the motion at an episode's first frame: none."""
+        """Returns the motion at an episode's first frame, where nothing moves."""
         return (self.between(poses, poses),)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -59,7 +59,7 @@ class PoseTransform(MapTransform):
         for key, pose in zip(self.in_keys, before):
             if pose is None:
                 raise MissingKey(
-                    f"{self.label} needs {key!r} of the step before: give step the TensorDict of "
+                    f"{self.label} needs {key!r} of the previous step: pass step the TensorDict of "
                     f"reset or step_mdp, which holds {key!r}"
                 )
         return next_tensordict.set(self.out_keys[0], self.between(before, now))
@@ -75,7 +75,7 @@ class PoseTransform(MapTransform):
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        """Stops the motion in the envs that have just reset themselves."""
+        """Resets the motion of the envs that have just reset themselves."""
         key = self.out_keys[0]
         (first,) = self.compute(*self._poses(tensordict_reset))
         mask = tensordict.get("_reset").reshape(tensordict.batch_size)
@@ -91,7 +91,7 @@ class PoseTransform(MapTransform):
             tensordict.set(key, self._along_trajectory(tensordict, now))
         following = tensordict.get("next", None)
         if following is None or following.get(key, None) is not None:
-            return tensordict  # stored: right even where the next frame is several steps ahead
+            return tensordict  # stored: correct even if the next frame is several steps ahead
         if any(k in following.keys(True) for k in self.in_keys):
             refuse_n_step(tensordict, key)
             following.set(key, self.between(now, self._poses(following)))
@@ -99,7 +99,7 @@ class PoseTransform(MapTransform):
         return tensordict
 
     def _along_trajectory(self, tensordict: TensorDictBase, now: Sequence[Tensor]) -> Tensor:
-        """Returns the motion into each step of a trajectory, none where an episode begins."""
+        """Returns the motion to each step of a trajectory, without motion at an episode's start."""
         done = tensordict.get(("next", "done"), None)
         if done is None or "time" not in tensordict.names:
             raise MissingKey(
@@ -121,7 +121,7 @@ class PoseTransform(MapTransform):
         return self.between(before, now)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Returns the specs of what `step` reads, with the poses of the step before added."""
+        """Returns the input specs of `step`, including the previous step's poses."""
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
@@ -131,26 +131,26 @@ class PoseTransform(MapTransform):
 
 
 class CameraMotion(PoseTransform):
-    """The camera's motion, for envs that only say where the camera is.
+    """The camera's motion, for envs that give only its pose.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "world_from_cam")` | `("sensor", "prev_from_curr")` | float32 `[*B, 4, 4]` | | m |
 
-    Convention: `prev_from_curr` takes a point in the current camera's frame into the previous
-    camera's (Eq. 11 of the paper). Poses are camera-to-world of a camera with OpenCV's axes
-    (`AdaptPose` makes them so), any float type, float64 where the world is wide: the motion is
-    composed in float64 and handed on in float32. After a reset it is exactly the identity.
+    Convention: `prev_from_curr` maps a point from the current camera's frame to the previous
+    camera's (Eq. 11 of the paper). Poses are camera-to-world of a camera with OpenCV's axes (see
+    `AdaptPose`), of any float type; use float64 for large worlds. The motion is composed in float64
+    and returned in float32. After a reset it is exactly the identity.
 
-    The pose of the step before is read from the TensorDict that goes into `step`; nothing is
-    remembered between calls. In a replay buffer the stored root motion and the two poses give the
-    next motion, shuffled or not; one that is stored under `"next"` stays as it is, and n-step
-    returns need it stored. A batch without a stored motion has to be a trajectory, with a
-    dimension named "time" and `("next", "done")`; its first frame counts as an episode's first.
+    The previous step's pose is read from the TensorDict passed to `step`; no state is kept between
+    calls. In a replay buffer the stored root motion and the two poses give the next motion,
+    shuffled or not. A motion stored under `"next"` is left unchanged; n-step returns need it
+    stored. A batch without a stored motion has to be a trajectory, with a dimension named "time"
+    and `("next", "done")`; its first frame counts as an episode's first.
 
     Args:
-        in_keys: where the pose lies.
-        out_keys: where the motion goes.
+        in_keys: key of the pose.
+        out_keys: key of the motion.
 
     Example:
         >>> import torch
@@ -182,30 +182,31 @@ class CameraMotion(PoseTransform):
 
 
 class InstanceMotion(PoseTransform):
-    """The bodies' motions as the camera sees them, for simulators that know their bodies' poses.
+    """The bodies' motions relative to the camera, for simulators that give their bodies' poses.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "world_from_cam")` | `("sensor", "instance_motion")` | float32 | | m |
     | `("sensor", "world_from_body")` | | `[*B, 1 + N, 4, 4]` | | |
 
-    Convention: row 0 is the static world's, the camera's own motion; row 1 + i takes a point that
-    rides on body i from the current camera's frame to where it was in the previous camera's. The
-    row of a body that stands still equals row 0 to the last bit. `InstanceIds` turns a simulator's
-    segmentation ids into these rows; the two are what `RawFlow` reads.
+    Convention: row 0 is the static world's, the camera's own motion; row 1 + i maps a point fixed
+    to body i from the current camera's frame to its place in the previous camera's. A static body's
+    row is bitwise equal to row 0. `InstanceIds` converts a simulator's segmentation ids to these
+    rows, and `RawFlow` reads both.
 
-    Where a body's own origin and axes lie does not matter. As `CameraMotion`, it reads the poses of
-    the step before from the TensorDict that goes into `step`, and remembers nothing.
+    The choice of a body's own origin and axes doesn't matter. Like `CameraMotion`, it reads the
+    previous step's poses from the TensorDict passed to `step` and keeps no state.
 
     Args:
-        in_keys: the camera's pose `[*B, 4, 4]`, the bodies' poses `[*B, N, 4, 4]`, metres.
-        out_keys: where the motions go.
+        in_keys: keys of the camera's pose `[*B, 4, 4]` and the bodies' poses `[*B, N, 4, 4]`,
+            metres.
+        out_keys: key of the motions.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> camera, body = torch.eye(4).repeat(2, 1, 1), torch.eye(4).repeat(2, 1, 1, 1)
-        >>> body[1, 0, 0, 3] = 0.5  # the only body went half a metre along x
+        >>> body[1, 0, 0, 3] = 0.5  # the only body moved half a metre along x
         >>> sensor = {"world_from_cam": camera, "world_from_body": body}
         >>> td = TensorDict({"sensor": sensor, "next": {"done": torch.zeros(2, 1).bool()}}, [2])
         >>> td.names = ["time"]

@@ -1,4 +1,4 @@
-"""What the sensors give to representations: the truth, or depth and motion with errors."""
+"""The depth and camera motion that representations read, exact or with sensor noise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _READ_MOTION = {"ego", "obj"}
 
 
 class Sensed(NamedTuple):
-    """The keys under which representations find depth and the camera's motion."""
+    """The keys under which representations read depth and the camera's motion."""
 
     depth: NestedKey = ("sensor", "depth")
     motion: NestedKey = ("sensor", "prev_from_curr")
@@ -31,13 +31,13 @@ class Sensed(NamedTuple):
 def noise_makers(
     noise: Mapping[str, float] | None, representations: Collection[str]
 ) -> tuple[list[Transform], Sensed]:
-    """Returns one `SensorNoise`, if a representation reads what has noise, and where to read.
+    """Returns one `SensorNoise`, if a representation reads a noisy sensor, and the keys to read.
 
-    The truth stays where it is, so that raw flow is computed from it and a second pass over the
-    same frames begins there; a frame's noise depends on its name alone.
+    The exact values keep their keys, so that raw flow and a second pass over the same frames start
+    from them. A frame's noise depends only on its name.
 
     Raises:
-        ValueError: for an unknown option, or a value that is none.
+        ValueError: for an unknown option or an invalid value.
     """
     given: dict[str, Any] = dict(noise or {})
     for option in given:

@@ -12,29 +12,29 @@ from torch.nn import functional
 
 from flowrep.transforms.dis import whole_factor
 
-SMALLEST_SIDE_PX = 128  # the network's coarsest correlation level has 1 / 64 of it
-_MULTIPLE_PX = 8  # it works on an eighth of the size
+SMALLEST_SIDE_PX = 128  # the network's coarsest correlation level has 1 / 64 of this
+_MULTIPLE_PX = 8  # the network works at an eighth of the size
 NETWORKS = ("raft_small", "raft_large")
 
 
 class RAFT(nn.Module):
-    """Recurrent all-pairs field transforms: a network's flow, on whatever device it is put.
+    """Recurrent all-pairs field transforms: flow by a network, on any device.
 
-    Small pictures are enlarged by a whole factor and the flow is brought back to their pixels;
-    sides that are no multiple of 8 are padded by repeating the border, which is cut off again.
-    On pairs in which next to nothing moves it is noisier than DIS.
+    Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels.
+    Sides that are not a multiple of 8 are padded by repeating the border, and the padding is
+    cropped again. On pairs with hardly any motion it is noisier than DIS.
 
     Args:
-        weights: a file with the network's state dict, `.safetensors` or `.pth`; it is read without
-            unpickling objects. Those that torchvision publishes fit.
-        network: `"raft_small"` or `"raft_large"`, whichever the weights are of.
-        updates: refinements of the flow, of which more are slower and closer.
-        min_side_px: pictures whose shorter side is less are enlarged to at least that; no less
-            than 128.
+        weights: a file with the network's state dict, `.safetensors` or `.pth`, read without
+            unpickling objects. The weights published by torchvision fit.
+        network: `"raft_small"` or `"raft_large"`, matching the weights.
+        updates: number of refinements of the flow; more are slower and more accurate.
+        min_side_px: pictures with a shorter side below this are enlarged to at least this; not
+            below 128.
 
     Raises:
-        ImportError: torchvision is missing, or was built for another torch.
-        FileNotFoundError: there are no weights at that path.
+        ImportError: torchvision is missing or was built for another torch.
+        FileNotFoundError: there is no file at that path.
         ValueError: for an unknown network, a size that is too small, or weights that do not fit.
     """
 
@@ -50,7 +50,7 @@ class RAFT(nn.Module):
             raise ValueError(f"network is one of {list(NETWORKS)}, got {network!r}")
         if min_side_px < SMALLEST_SIDE_PX or updates < 1:
             raise ValueError(
-                f"RAFT needs min_side_px of at least {SMALLEST_SIDE_PX} and an update or more, "
+                f"RAFT needs min_side_px of at least {SMALLEST_SIDE_PX} and at least one update, "
                 f"got {min_side_px} and {updates}"
             )
         self.updates, self.min_side_px = int(updates), int(min_side_px)
@@ -66,7 +66,7 @@ class RAFT(nn.Module):
 
     @torch.no_grad()
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """Returns where each pixel of the first picture went in the second, minus where it was.
+        """Returns the displacement of each pixel from the first picture to the second.
 
         Convention: `[N, 2, H, W]` float32, (u right, v down), pixels, on the first picture's grid.
 
@@ -82,7 +82,7 @@ class RAFT(nn.Module):
         return functional.avg_pool2d(flow, factor) / factor if factor > 1 else flow
 
     def train(self, mode: bool = True) -> RAFT:
-        """Leaves the network as it was trained, whatever mode its env is put into."""
+        """Keeps the network in evaluation mode, even if its env is put into training mode."""
         return super().train(False)
 
     @staticmethod
@@ -113,15 +113,15 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
 
 
 def _state_of(path: Path, read: Callable[[], Any]) -> dict[str, Tensor]:
-    """Returns what a reader finds; its own words are left out, which advise to trust the file."""
+    """Returns a reader's state dict; hides its error message, which advises trusting the file."""
     try:
         state = read()
     except Exception as error:  # readers fail on garbage in as many ways as there is garbage
         if isinstance(error, OSError):
             raise
         raise ValueError(
-            f"'{path}' is no readable file of weights ({type(error).__name__}): it is damaged, or "
-            "holds more than a state dict. Save the network's state_dict() again, best as "
+            f"'{path}' is not a readable weights file ({type(error).__name__}): it is damaged, or "
+            "holds more than a state dict. Save the network's state_dict() again, preferably as "
             ".safetensors"
         ) from None
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):

@@ -1,4 +1,4 @@
-"""The exact optical flow of a simulated world."""
+"""Exact optical flow of a simulated world."""
 
 from __future__ import annotations
 
@@ -20,35 +20,34 @@ _KEYS: list[NestedKey] = [
 
 
 class RawFlow(FlowTransform):
-    """Exact optical flow of a world of rigid bodies, as a simulator knows it.
+    """Exact optical flow of a world of rigid bodies, from a simulator's state.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "depth")`, m | `"raw"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
-    | `("sensor", "instance")` | `"valid"` if asked for | bool `[*B, 1, H, W]` | | |
+    | `("sensor", "instance")` | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
     | `("sensor", "instance_motion")` | | | | |
 
-    Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the
-    prior step (Eq. 1 of the paper).
-    Row i of `instance_motion` `[*B, N, 4, 4]` takes a point that rides on instance i from the
-    current camera's frame to where it was in the previous camera's frame; row 0 is the static
-    world's. Everything of the previous step that flow needs is thus in the observation: nothing is
-    remembered, and shuffled samples of a replay buffer give what the env gave.
+    Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
+    step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, N, 4, 4]` maps a point fixed to
+    instance i from the current camera's frame to its place in the previous camera's frame; row 0 is
+    the static world's. The observation thus holds everything that flow needs of the previous step.
+    No state is kept, and shuffled samples of a replay buffer give the same flow as the env.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the key under
-            which the env gives it, `[*B, 3, 3]`.
-        outputs: of `"raw"` and `"valid"`, those that are written.
+        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
+            it, `[*B, 3, 3]`.
+        outputs: which of `"raw"` and `"valid"` to write.
         scale: factor on the flow.
         unit: `"px_per_step"` or `"px_per_s"`.
-        dt_s: seconds a step lasts; needed for `"px_per_s"` alone.
-        compiled: whether `compute` runs through `torch.compile`: some eight times as fast on a
-            CPU, equal up to rounding; compiling takes up to a minute, later processes find the
-            result in torch's cache.
+        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
+        compiled: whether `compute` runs through `torch.compile`, which is some eight times as fast
+            on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
+            the result in torch's cache.
         invalid: value, before scaling, where flow isn't known (depth `nan`, or a point behind the
             previous camera).
-        in_keys: depth, instance ids, motion an instance.
-        out_keys: one key an output; their names by default.
+        in_keys: depth, instance ids and one motion per instance.
+        out_keys: one key per output; their names by default.
 
     Raises:
         ValueError: for an unknown output or unit, or `"px_per_s"` without `dt_s`.
@@ -98,12 +97,12 @@ class RawFlow(FlowTransform):
         self.invalid = float(invalid)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
-        """Returns the outputs asked for, from depth, instance ids and motions (and K)."""
+        """Returns the chosen outputs, from depth, instance ids and motions (and K)."""
         (depth, instance, motions), K = self._with_camera(maps)
         motions, depth, K = self._at_one_precision(motions, depth=depth, K=K)
         flow, valid = geometry.rigid_flow(depth, instance, K, motions)
         if self.invalid != 0.0:
-            # Read as bytes: inductor's CPU code fails to compile a `where` on a bool view.
+            # Viewed as bytes, as inductor's CPU code fails to compile a `where` on a bool view.
             flow = torch.where(valid.view(torch.uint8) != 0, flow, self.invalid)
         return tuple(
             valid if name == "valid" else self._in_unit(name, flow) for name in self.outputs

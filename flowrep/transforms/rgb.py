@@ -10,18 +10,18 @@ from flowrep.transforms.base import RGB, Keys, MapTransform
 
 
 class Rgb(MapTransform):
-    """The colour picture as the camera gives it.
+    """The camera's colour picture, unchanged.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "rgb")` | `"rgb"` | uint8 `[*B, 3, H, W]` | 0 … 255 | |
 
-    It stays uint8, a quarter of float in a replay buffer: the spec's bounds tell a network what to
-    divide by.
+    It stays uint8, which takes a quarter of the memory of float32 in a replay buffer. A network can
+    read the divisor from the spec's bounds.
 
     Args:
-        in_keys: where the picture lies.
-        out_keys: where the representation goes.
+        in_keys: key of the picture.
+        out_keys: key of the representation.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Semantic classes as ids or as one map a class."""
+"""Semantic classes as ids or as one map per class."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ class Segmentation(MapTransform):
     | `("sensor", "semantic")` | `"seg"`, ids | uint8 `[*B, 1, H, W]` | 0 … n − 1 | class |
     | | `"seg"`, onehot | float32 `[*B, n, H, W]` | 0 or 1 | |
 
-    Ids are an eighth of a one-hot float map of two classes in a replay buffer. Their spec is a
-    `Categorical` that knows n, which is all that a network needs to expand them. An id outside
-    0 … n − 1 is a pixel of no class: all zeros in the one-hot encoding.
+    In a replay buffer, ids take an eighth of the memory of a one-hot float map of two classes.
+    Their spec is a `Categorical` with n, so a network can expand them. An id outside 0 … n − 1 is a
+    pixel without a class, all zeros in the one-hot encoding.
 
-    Ids of a wider type, or a signed one, are looked at before they become uint8, at each call,
-    which waits for a GPU: give uint8 where that counts.
+    In each call, ids of a wider or signed type are checked before conversion to uint8, which waits
+    for a GPU. Pass uint8 to avoid that.
 
     Args:
         num_classes: number n of classes, 1 to 256.
         encoding: `"ids"` or `"onehot"`.
-        in_keys: where the ids lie.
-        out_keys: where the representation goes.
+        in_keys: key of the ids.
+        out_keys: key of the representation.
 
     Raises:
-        ValueError: for an unknown encoding or a number of classes that uint8 can't hold, and at
-            each call for ids that it can't.
+        ValueError: for an unknown encoding or a number of classes that uint8 can't hold, and in
+            each call for ids that it can't hold.
 
     Example:
         >>> import torch
@@ -72,7 +72,7 @@ class Segmentation(MapTransform):
         return super()._call(next_tensordict)
 
     def compute(self, ids: Tensor) -> tuple[Tensor]:
-        """Returns the classes, encoded as asked for."""
+        """Returns the classes in the chosen encoding."""
         if self.encoding == "ids":
             return (ids.to(torch.uint8),)
         classes = torch.arange(self.num_classes, device=ids.device)[:, None, None]
@@ -90,13 +90,13 @@ class Segmentation(MapTransform):
 
 
 def _check_fits_uint8(key: object, ids: Tensor) -> None:
-    """Raises ValueError for ids that uint8 would wrap: 300 would become 44."""
+    """Raises ValueError for ids that wrap in uint8, where 300 would become 44."""
     if ids.dtype is torch.uint8 or not ids.numel():
         return
     least, most = (int(bound) for bound in ids.aminmax())
     if least < 0 or most > 255:
         raise ValueError(
-            f"{key!r} holds class ids from {least} to {most}, uint8 those "
-            "from 0 to 255; give pixels of no class an id in that range, e.g. "
-            "ids.where((ids >= 0) & (ids < num_classes), 255), or take encoding='onehot'"
+            f"{key!r} holds class ids from {least} to {most}, but uint8 only ids "
+            "from 0 to 255; give pixels without a class an id in that range, e.g. "
+            "ids.where((ids >= 0) & (ids < num_classes), 255), or use encoding='onehot'"
         )

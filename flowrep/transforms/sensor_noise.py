@@ -1,4 +1,4 @@
-"""What real sensors do to depth, camera motion and flow."""
+"""Noise of real sensors on depth, camera motion and flow."""
 
 from __future__ import annotations
 
@@ -31,48 +31,47 @@ _STREAMS = {sensor: number for number, sensor in enumerate(_READS)}
 
 
 class SensorNoise(MapTransform):
-    """Depth, camera motion and flow as a real sensor would give them; unchanged by default.
+    """Adds a real sensor's noise to depth, camera motion and flow; none by default.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "depth")` | the same, noisy | float `[*B, 1, H, W]` | > 0, inf, nan | m |
     | `("sensor", "prev_from_curr")` | the same, noisy | float `[*B, 4, 4]` | rigid | m |
-    | `"raw"` if asked for | the same, noisy | float `[*B, 2, H, W]` | any | px/step |
+    | `"raw"` if chosen | the same, noisy | float `[*B, 2, H, W]` | any | px/step |
     | `frame_key` if given | | integer `[*B, F]` | | |
 
-    Convention: depth z gets a normal error of standard deviation `depth_sigma_per_m` · z², as
-    stereo and structured light have; what would not be in front of the camera becomes a hole
+    Convention: depth z gets a normal error of standard deviation `depth_sigma_per_m` · z², as in
+    stereo and structured light. Depth that would not be in front of the camera becomes a hole
     (`nan`), and so does each pixel with probability `depth_dropout`. Camera motion is followed by a
-    small rigid motion of the current camera, so that poses added up from it drift like odometry.
-    Each sensor with all of its options at 0 comes out bit for bit as it came in.
+    small rigid motion of the current camera, so that integrated poses drift like odometry. A sensor
+    with all of its options at 0 is passed through bitwise unchanged.
 
-    Put it into the env, after `RawFlow` and before `FlowFactorize`: stored samples then hold what
-    the agent saw. Resets get noise like any frame.
+    Put it into the env, after `RawFlow` and before `FlowFactorize`, so that stored samples hold
+    what the agent saw. Resets get noise like any frame.
 
-    With `frame_key` noise is a function of the frame that these integers name, e.g. episode and
-    step: a frame gets the same noise in whatever batch, order, process or session, at the root
-    and under `"next"`, and nothing is to be saved. Frames have to be named differently to get
-    noise of their own.
+    With `frame_key`, noise is a function of the integers that name a frame, e.g. episode and step:
+    a frame gets the same noise in any batch, order, process or session, at the root and under
+    `"next"`, and there is no state to save. Frames with the same name get the same noise.
 
-    Without it a call draws new noise each time, which on a replay buffer is augmentation: the
-    root and `"next"` get errors of their own. The generator is the transform's own, on the device
-    of the maps; its state is part of `state_dict`, so that a resumed run goes on in the same
-    sequence. Each env of a `SerialEnv` or `ParallelEnv` draws noise of its own unless all are
-    given one seed.
+    Without it, every call draws new noise, which on a replay buffer is augmentation: the root and
+    `"next"` get independent errors. The transform has its own generator, on the device of the
+    maps. Its state is part of `state_dict`, so that a resumed run continues the sequence. The envs
+    of a `SerialEnv` or `ParallelEnv` draw independent noise unless all are given one seed.
 
     Args:
-        sensors: of `"depth"`, `"motion"` and `"flow"`, those that are read and written.
-        depth_sigma_per_m: standard deviation of depth over z², 1/m; a depth camera's is some 0.002.
+        sensors: which of `"depth"`, `"motion"` and `"flow"` to read and write.
+        depth_sigma_per_m: standard deviation of depth over z², 1/m; some 0.002 for a depth camera.
         depth_dropout: probability that a pixel's depth is missing.
-        drift_m: standard deviation of the motion's translation a step, along each axis, metres.
-        drift_rad: the same of its rotation, about each axis, radians.
-        flow_sigma_px: standard deviation of each flow channel, pixels a step.
-        seed: of the generator: envs with the same seed have the same noise. None draws one from
+        drift_m: standard deviation per step of the motion's translation along each axis, metres.
+        drift_rad: standard deviation per step of its rotation about each axis, radians.
+        flow_sigma_px: standard deviation of each flow channel, pixels per step.
+        seed: the generator's; envs with the same seed have the same noise. None derives one from
             torch's global generator (`torch.manual_seed` makes it reproducible) and the name of
             the worker process; with `frame_key` it is 0.
-        frame_key: where integers lie that name the frame, as `("sensor", "frame")` of the street.
-        in_keys: one key a sensor; the table's by default.
-        out_keys: one key a sensor; `in_keys` by default.
+        frame_key: key of the integers that name the frame, such as StreetEnv's
+            `("sensor", "frame")`.
+        in_keys: one key per sensor; the table's by default.
+        out_keys: one key per sensor; `in_keys` by default.
 
     Raises:
         ValueError: for an unknown sensor, an option of a sensor that isn't read, or a negative one.
@@ -123,11 +122,11 @@ class SensorNoise(MapTransform):
         self.options = options
         self.seed = None if seed is None else int(seed)
         self.has_frames = bool(frame)
-        self._state: Tensor | None = None  # of a generator that is yet to be made
+        self._state: Tensor | None = None  # for the generator, which is created on first use
         self._generator: torch.Generator | None = None
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
-        """Returns the sensors' maps with noise: new noise, or that of the frames, the last map."""
+        """Returns the sensors' maps with noise; with `frame_key`, frames are the last map."""
         frame = maps[-1] if self.has_frames else None
         return tuple(self._noisy(*named, frame) for named in zip(self.sensors, maps))
 
@@ -146,7 +145,7 @@ class SensorNoise(MapTransform):
         return value + used["flow_sigma_px"] * normals
 
     def _numbers(self, sensor: str, value: Tensor, frame: Tensor | None) -> list[Tensor]:
-        """Returns normal numbers, one a pixel or six a motion; for depth uniform ones as well."""
+        """Returns normal numbers, one per pixel or six per motion, and for depth uniform ones."""
         rank, is_depth = len(_READS[sensor].shape), sensor == "depth"
         shape = (6,) if sensor == "motion" else tuple(value.shape[-rank:])
         if frame is not None:
@@ -165,7 +164,7 @@ class SensorNoise(MapTransform):
         return [normals.to(value.dtype), *uniforms]
 
     def _generator_on(self, device: torch.device) -> torch.Generator:
-        """Returns the generator, made at the first use on a device."""
+        """Returns the generator, created on first use on a device."""
         if self._generator is None or self._generator.device != device:
             self._generator = torch.Generator(device=device)
             if self._state is not None:
@@ -182,20 +181,20 @@ class SensorNoise(MapTransform):
         return torch.empty(0, dtype=torch.uint8) if self._state is None else self._state.clone()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Goes on from a `state_dict` at the next use, on a device of the same kind."""
+        """Continues from a `state_dict` at the next use, on a device of the same kind."""
         self._generator = None
         self._state = state.clone().cpu() if len(state) else None
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns unbounded specs: an error knows no bounds."""
+        """Returns unbounded specs, as errors are unbounded."""
         return tuple(Unbounded(s.shape, device=s.device, dtype=s.dtype) for s in specs)
 
 
 def _drawn_seed() -> int:
     """Returns a seed that differs between envs in one process and between worker processes.
 
-    Forked workers share the state of torch's generator, spawned ones its default seed: their names
-    tell them apart.
+    Forked workers share the state of torch's generator and spawned ones its default seed, so the
+    seed also depends on the name of the process.
     """
     drawn = int(torch.randint(2**62, ()))
     return drawn ^ zlib.crc32(multiprocessing.current_process().name.encode())
@@ -221,7 +220,7 @@ def noisy_depth(
 def drifted_motion(
     prev_from_curr: Tensor, normal: Tensor, *, drift_m: float, drift_rad: float
 ) -> Tensor:
-    """Returns a motion that starts from a slightly wrong current camera; it stays rigid.
+    """Returns the motion from a slightly displaced current camera, which is still rigid.
 
     Args:
         prev_from_curr: `[*B, 4, 4]`.

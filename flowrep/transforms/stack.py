@@ -1,4 +1,4 @@
-"""A list of representations' names to the transforms that write them, each thing computed once."""
+"""Builds the transforms for a list of representations, without computing anything twice."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FLOW_OPTIONS = ("scale", "unit")
 
 
 class _Recipe(NamedTuple):
-    """What writes a representation, and which of its parameters a user may set."""
+    """A representation's transform and the parameters of it that a user may set."""
 
     transform: type[Transform]
     options: tuple[str, ...] = ()
@@ -92,28 +92,27 @@ def representation_stack(
 ) -> Compose:
     """Returns the transforms that write the representations at the root of the TensorDict.
 
-    What several of them need is computed once: `["ego", "obj"]` factorises once, `["seg", "seg2"]`
-    encodes once. What is computed on the way and wasn't asked for is dropped again, but for what
-    the next step needs (the pictures behind estimated flow) and what the sensors gave:
-    `("sensor", "flow")`, estimated flow in px/step, `("sensor", "noisy_depth")` in metres and
-    `("sensor", "noisy_motion")`.
+    Shared results are computed once: `["ego", "obj"]` factorises once, `["seg", "seg2"]` encodes
+    once. Intermediate results are dropped, except the pictures behind estimated flow, which the
+    next step needs, and the sensors' measurements: `("sensor", "flow")`, estimated flow in px/step,
+    `("sensor", "noisy_depth")` in metres and `("sensor", "noisy_motion")`.
 
     Args:
         representations: names, or a mapping from name to options (`representation_options`); a
             name is one of `REPRESENTATIONS`, its key in the TensorDict is the same.
-        intrinsics: K `[3, 3]` of the sensor maps in pixels; raw, ego and obj need it, save for
+        intrinsics: K `[3, 3]` of the sensor maps in pixels; raw, ego and obj need it, except for
             estimated raw flow.
         num_classes: number of semantic classes; seg and seg2 need it.
-        dt_s: seconds a step lasts; flow in `px_per_s` needs it.
+        dt_s: duration of a step in seconds; flow in `px_per_s` needs it.
         compiled: whether flow is computed through `torch.compile`, see `RawFlow`.
-        flow: where raw flow, and with it obj, comes from: `"exact"` (`RawFlow`), `"estimated"`
-            (`EstimatedFlow`, from `("sensor", "rgb")`), or a mapping with one of them as
-            `source` and `EstimatedFlow`'s own options beside it. Ego flow is exact either way:
-            it takes depth and the camera's motion alone.
+        flow: source of raw flow, and thus of obj: `"exact"` (`RawFlow`), `"estimated"`
+            (`EstimatedFlow`, from `("sensor", "rgb")`), or a mapping with one of them as `source`
+            and further options of `EstimatedFlow`. Ego flow doesn't depend on it, as it is computed
+            from depth and the camera's motion alone.
         noise: errors of the depth camera and of odometry: `depth_sigma_per_m`, `depth_dropout`,
-            `drift_m` and `drift_rad` of `SensorNoise`, 0 where they are left out. Depth, ego and
-            obj are made of what is left; raw flow and classes know nothing of these sensors. The
-            noise is that of the frame that `("sensor", "frame")` names.
+            `drift_m` and `drift_rad` of `SensorNoise`, 0 by default. Depth, ego and obj are
+            computed from the noisy values; raw flow and classes don't use these sensors. The noise
+            depends on the frame that `("sensor", "frame")` names.
 
     Raises:
         ValueError: for an unknown or repeated name, an unknown option, or a missing argument.
@@ -145,7 +144,7 @@ def representation_stack(
 
 
 class DropKeys(ExcludeTransform):
-    """Drops keys that served other transforms, at the root and under `"next"`."""
+    """Drops intermediate results of other transforms, at the root and under `"next"`."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns a batch without the keys."""
@@ -185,7 +184,7 @@ def _with_options(
 def _frame_makers(
     chosen: dict[str, dict[str, Any]], num_classes: int | None, sensed: Sensed
 ) -> list[Transform]:
-    """Returns the transforms of all representations but flow."""
+    """Returns the transforms of all representations except flow."""
     makers: list[Transform] = []
     stacks: list[Transform] = []
     for name, options in chosen.items():

@@ -277,7 +277,7 @@ def test_transitions_without_past_are_refused():
 def test_stepping_without_the_stack_of_the_step_before_is_refused():
     env = TransformedEnv(FakeSensorEnv(), stack_of_three())
     td = env.reset().exclude(STACK).set("action", torch.tensor(0))
-    with pytest.raises(KeyError, match="'depth3' needs the stack of the step before"):
+    with pytest.raises(KeyError, match="'depth3' needs the stack of the previous step"):
         env.step(td)
 
 

@@ -131,7 +131,7 @@ def test_stepping_without_the_pose_of_the_step_before_is_refused():
     env = moving(0)
     td = env.reset().set("action", torch.tensor(0))
     del td[POSE]
-    with pytest.raises(KeyError, match=r"needs .* of the step before"):
+    with pytest.raises(KeyError, match=r"needs .* of the previous step"):
         env.step(td)
 
 

@@ -127,7 +127,7 @@ def test_weights_that_are_garbage_are_named_without_advice_to_trust_them(tmp_pat
     pytest.importorskip("safetensors")
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=f"'{path}' is no readable file of weights") as caught:
+    with pytest.raises(ValueError, match=f"'{path}' is not a readable weights file") as caught:
         RAFT(path)
     assert "weights_only" not in str(caught.value)
     assert caught.value.__cause__ is None
