@@ -101,6 +101,6 @@ def camera_of(run):
 def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text("def make(task):\n    return lambda maps: None\n")
-    with pytest.raises(PolicyError, match="gave a NoneType; expected 1 whole numbers"):
+    with pytest.raises(PolicyError, match="returned a NoneType; expected 1 whole numbers"):
         own(f"{path}:make", tmp_path / "out", "representations=[seg]", "num_envs=1", "episodes=1")
     assert not (tmp_path / "out" / "videos").exists()

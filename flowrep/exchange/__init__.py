@@ -1,1 +1,1 @@
-"""Policies that were made elsewhere, and agents that are to run elsewhere."""
+"""Runs external policies in flowrep and exports trained agents to run without it."""

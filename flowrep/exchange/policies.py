@@ -1,4 +1,4 @@
-"""Others' policies on flowrep's streets: what they are told, what they see, what they give back."""
+"""External policies in flowrep's environments: their task, observations and actions."""
 
 import sys
 import traceback
@@ -16,24 +16,24 @@ from torchrl.data import Composite, TensorSpec
 
 PROGRAM = ".pt2"
 MEMORY_KEYS = ("street", "is_init")
-"""What a policy that remembers needs: which row is which street, and which has just begun."""
+"""Keys for policies with state: each row's environment, and whether its episode just began."""
 
 
 class PolicyError(Exception):
-    """A policy of somebody else's is missing, fails, or gives no actions; the message names it."""
+    """An external policy is missing, fails or returns no actions; the message names it."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What the maker of a policy is told of what it is to do.
+    """The task, as described to the function that makes a policy.
 
     Args:
         scene: its name.
-        representations: the maps' names, in the order that was asked for, with their options.
-        observation_spec: of the maps of one street, `[C, H, W]` each.
-        action_spec: of one street: 0 goes on, 1 turns left, 2 turns right.
+        representations: the maps' names, in the requested order, with their options.
+        observation_spec: of the maps of one environment, `[C, H, W]` each.
+        action_spec: of one environment: 0 goes straight on, 1 turns left, 2 turns right.
         intrinsics: K `[3, 3]` of the maps, pixels.
-        device: where the maps lie.
+        device: of the maps.
     """
 
     scene: str
@@ -45,16 +45,16 @@ class Task:
 
 
 class ForeignPolicy:
-    """Writes `action` `[N]` by a function of somebody else's.
+    """Writes `action` `[N]`, computed by an external function.
 
-    The function is given a TensorDict of batch `[N]` that holds the task's maps `[N, C, H, W]`,
-    `street` int64 `[N]` and `is_init` bool `[N, 1]`, and nothing else. It returns N whole numbers
-    (a tensor, an array, a list), or the TensorDict with `action`.
+    The function takes a TensorDict of batch `[N]` that holds only the task's maps `[N, C, H, W]`,
+    `street` int64 `[N]` and `is_init` bool `[N, 1]`. It returns N integers (a tensor, an array or a
+    list), or the TensorDict with `action`.
 
     Args:
-        name: of the policy, for messages.
+        name: of the policy, for error messages.
         act: the function.
-        task: what it does.
+        task: the policy's task.
     """
 
     def __init__(self, name: str, act: Callable[[TensorDictBase], Any], task: Task) -> None:
@@ -64,7 +64,7 @@ class ForeignPolicy:
         """Returns the maps with `action`.
 
         Raises:
-            PolicyError: the function fails, or gives something else than actions.
+            PolicyError: if the function fails or returns anything but actions.
         """
         seen = maps.select(*self._task.representations, *MEMORY_KEYS)
         with _named(self.name):
@@ -74,7 +74,7 @@ class ForeignPolicy:
         return maps.set("action", self._checked(given, len(maps)))
 
     def alone(self) -> Callable[[TensorDictBase], TensorDictBase]:
-        """Returns the policy for one episode on one street of an env, from its reset on."""
+        """Returns the policy for one episode of a single environment, from its reset on."""
         begun = False
 
         def act(tensordict: TensorDictBase) -> TensorDictBase:
@@ -89,34 +89,36 @@ class ForeignPolicy:
 
     def _checked(self, given: Any, count: int) -> Tensor:
         n = int(self._task.action_spec.space.n)
-        expected = f"{count} whole numbers from 0 to {n - 1}, an action a street"
+        expected = f"{count} whole numbers from 0 to {n - 1}, one action per environment"
         try:
             actions = torch.as_tensor(given).cpu()
         except (TypeError, ValueError, RuntimeError):
             raise PolicyError(
-                f"policy '{self.name}' gave a {type(given).__name__}; expected {expected}"
+                f"policy '{self.name}' returned a {type(given).__name__}; expected {expected}"
             ) from None
         if actions.is_floating_point() or actions.is_complex() or actions.shape != (count,):
             raise PolicyError(
-                f"policy '{self.name}' gave {actions.dtype} of shape {tuple(actions.shape)}; "
+                f"policy '{self.name}' returned {actions.dtype} of shape {tuple(actions.shape)}; "
                 f"expected {expected}"
             )
         if not ((actions >= 0) & (actions < n)).all():
-            raise PolicyError(f"policy '{self.name}' gave {actions.tolist()}; expected {expected}")
+            raise PolicyError(
+                f"policy '{self.name}' returned {actions.tolist()}; expected {expected}"
+            )
         return actions.long()
 
 
 def load_policy(reference: str, task: Task) -> ForeignPolicy:
-    """Returns a policy of somebody else's.
+    """Returns an external policy.
 
     Args:
         reference: `path.py:make` or `package.module:make`, a function that is called with the task
             and returns the policy's function; or `path.pt2`, a program saved by `torch.export.save`
-            that takes the maps as arguments, in the task's order, and returns a score an action.
-        task: what it is to do.
+            that takes the maps as arguments, in the task's order, and returns a score per action.
+        task: the policy's task.
 
     Raises:
-        PolicyError: there is no such file, module or function, or it fails.
+        PolicyError: if the file, module or function doesn't exist or fails.
     """
     if reference.endswith(PROGRAM):
         return ForeignPolicy(reference, _program(reference, task), task)
@@ -140,7 +142,7 @@ def load_policy(reference: str, task: Task) -> ForeignPolicy:
 
 
 def is_reference(text: str) -> bool:
-    """Returns whether a text names a policy of somebody else's, as `load_policy` takes it.
+    """Returns whether `text` is a reference to an external policy, see `load_policy`.
 
     >>> is_reference("mine.py:make"), is_reference("a.b:make"), is_reference("agent.pt2")
     (True, True, True)
@@ -193,20 +195,20 @@ def _is_own(value: Any, module: Any) -> bool:
 
 
 class _named:
-    """Turns whatever somebody else's code raises into one line with the place in it."""
+    """Turns any exception in external code into a PolicyError of one line, with its location."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
     def __enter__(self) -> None:
-        """Begins somebody else's code."""
+        """Does nothing."""
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        """Ends it."""
+        """Raises PolicyError if the block raised another exception."""
         if error is None or isinstance(error, PolicyError) or not isinstance(error, Exception):
             return
         frames = traceback.extract_tb(trace)
-        # where its author may mend it, rather than deep in a library
+        # the last line of the author's own code, rather than one deep in a library
         own = [frame for frame in frames if "site-packages" not in frame.filename]
         text = str(error).strip().splitlines()
         raise PolicyError(

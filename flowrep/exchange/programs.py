@@ -1,4 +1,4 @@
-"""A trained policy as a program of torch's own, that runs where flowrep is not."""
+"""Exports a trained policy as a torch program, which runs without flowrep."""
 
 import json
 import shutil
@@ -18,27 +18,27 @@ PROGRAM, WEIGHTS, CARD, LOADER = "agent.pt2", "agent.safetensors", "agent.json",
 
 
 class ExportError(ValueError):
-    """A policy has no form in which it could be given away; the message says why."""
+    """A policy can't be exported; the message says why."""
 
 
 def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> ExportedProgram:
-    """Returns the network of a policy, traced: maps `[N, C, H, W]` in, a score an action out.
+    """Returns a policy's traced network, from maps `[N, C, H, W]` to one score per action.
 
-    The maps are arguments in the policy's order, of the types that the specs have; N is any number.
-    The greedy action has the largest score. Of policies that draw, the scores are logits.
+    The maps are arguments in the policy's order, with the dtypes of the specs, for any N. The
+    greedy action has the largest score. For stochastic policies, the scores are logits.
 
     Args:
         policy: of one of flowrep's algorithms.
-        observation_spec: of the env that it was built for.
+        observation_spec: of the env that the policy was built for.
 
     Raises:
-        ExportError: it is not made of one `PolicyNetwork`.
+        ExportError: if the policy doesn't contain exactly one `PolicyNetwork`.
     """
     networks = [module for module in policy.modules() if isinstance(module, PolicyNetwork)]
     if len(networks) != 1:
         raise ExportError(
-            f"a policy is exported by its flowrep.agent.policy.PolicyNetwork, of which "
-            f"{type(policy).__name__} has {len(networks)}; build it by acting_network()"
+            f"a policy is exported through its one flowrep.agent.policy.PolicyNetwork, of which "
+            f"{type(policy).__name__} has {len(networks)}; build it with acting_network()"
         )
     (network,) = networks
     maps = []
@@ -53,19 +53,19 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
 
 
 def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any]) -> None:
-    """Writes what others need to run an agent.
+    """Writes the files needed to run an agent without flowrep.
 
     ```
     agent.pt2            the program, for torch.export.load
-    agent.safetensors    its weights alone, those of ordinary convolutions and linear layers
-    agent.json           what it reads and what its actions are
-    load_agent.py        reads the first and the third; needs torch alone
+    agent.safetensors    only its weights, those of ordinary convolutions and linear layers
+    agent.json           its inputs and actions
+    load_agent.py        loads agent.pt2 and agent.json; needs only torch
     ```
 
     Args:
-        folder: is made if it does not exist.
+        folder: created if it does not exist.
         program: from `acting_program`.
-        card: what goes into agent.json.
+        card: contents of agent.json.
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.export.save(program, folder / PROGRAM)

@@ -27,7 +27,7 @@ class EstimatedFlow(FlowTransform):
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `"rgb2"`, uint8 `[*B, 6, H, W]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` × `scale` |
-    | | `"unscaled"` if asked for | as above | any | px/step |
+    | | `"unscaled"` if chosen | as above | any | px/step |
 
     Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
     step, as in `RawFlow`. The estimator therefore runs from the current picture to the previous one

@@ -103,12 +103,12 @@ def test_a_program_that_torch_saved_is_a_policy(tmp_path):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ([0.5, 0.0], "gave torch.float32 of shape (2,); expected 2 whole numbers from 0 to 2"),
-        ([[0], [1]], "gave torch.int64 of shape (2, 1); expected 2 whole numbers"),
-        ([0, 3], "gave [0, 3]; expected 2 whole numbers from 0 to 2, an action a street"),
-        ([0, -1], "gave [0, -1]; expected"),
-        (None, "gave a NoneType; expected"),
-        (TensorDict(), "gave a NoneType; expected"),
+        ([0.5, 0.0], "returned torch.float32 of shape (2,); expected 2 whole numbers from 0 to 2"),
+        ([[0], [1]], "returned torch.int64 of shape (2, 1); expected 2 whole numbers"),
+        ([0, 3], "returned [0, 3]; expected 2 whole numbers from 0 to 2, one action per env"),
+        ([0, -1], "returned [0, -1]; expected"),
+        (None, "returned a NoneType; expected"),
+        (TensorDict(), "returned a NoneType; expected"),
     ],
 )
 def test_what_is_no_action_is_named(given, said):

@@ -117,7 +117,7 @@ def test_the_weights_are_those_of_ordinary_layers(exported):
 
 
 def test_a_policy_of_another_making_is_refused_by_name():
-    with pytest.raises(ExportError, match="of which Sequential has 0; build it by acting_network"):
+    with pytest.raises(ExportError, match="of which Sequential has 0; build it with acting_net"):
         acting_program(torch.nn.Sequential(torch.nn.Linear(2, 3)), SPEC)
 
 
