@@ -1,4 +1,4 @@
-"""flowrep's configs, for others to compose: `hydra.searchpath=[pkg://flowrep.conf]`.
+"""flowrep's configs; other projects compose them with `hydra.searchpath=[pkg://flowrep.conf]`.
 
 Hydra takes a folder for a package's configs only where this file is.
 """

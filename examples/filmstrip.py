@@ -1,4 +1,4 @@
-"""Writes two of the README's pictures, of one step of a planner's drive.
+"""Writes two of the README's pictures, from one step of a planner's drive.
 
 python examples/filmstrip.py docs/images
 
@@ -39,12 +39,12 @@ def main(folder: Path, seed: int = 2) -> None:
 
 
 def liveliest(frames):
-    """Returns the step with most in motion of its own, but nobody right in front of the camera."""
+    """Returns the step with the most moving pixels, but nobody right in front of the camera."""
     return max(frames, key=lambda maps: int(((maps["obj"] != 0) & (maps["depth"] > 6)).sum()))
 
 
 def three_ways(maps):
-    """Returns raw flow and object flow at raw's scale, and object flow at its own."""
+    """Returns raw and object flow at raw's scale, and object flow at its own."""
     raws, own = FLOW_SCALE_PX["raw"], FLOW_SCALE_PX["obj"]
     shown = {"raw": ("raw", raws), "obj, as raw": ("obj", raws), "obj, its own": ("obj", own)}
     images = {"RGB": maps["rgb"].numpy().transpose(1, 2, 0)}

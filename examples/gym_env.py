@@ -1,7 +1,7 @@
-"""Ego and object flow in a gymnasium env of one's own, through TorchRL's GymEnv.
+"""Ego and object flow in a gymnasium env of your own, through TorchRL's GymEnv.
 
-The env below knows a wall, a square that rises before it, and where its camera is: it says depth,
-ids and poses, and nothing of flow. That is all that flowrep's transforms ask for.
+The env below has a wall, a square rising in front of it, and a moving camera. It returns depth, ids
+and poses, but no flow. flowrep's transforms need nothing else.
 
     python examples/gym_env.py
 """
@@ -23,7 +23,7 @@ DRIFT_M, RISE_M = 0.06, 0.12  # a step
 
 
 class Drift(gym.Env):
-    """A camera that looks along z, x right and y down, and goes right (1) or left (0)."""
+    """A camera facing along z, with x right and y down, that moves right (1) or left (0)."""
 
     def __init__(self) -> None:
         pose = spaces.Box(-np.inf, np.inf, (4, 4), np.float64)

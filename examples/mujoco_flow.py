@@ -1,16 +1,16 @@
 """Ego and object flow in a simulator that knows nothing of flowrep: MuJoCo.
 
-A camera rides through a yard in which a ball rolls, a door swings and a crate slides. MuJoCo draws
-depth and segmentation off-screen and says where camera and bodies are; flowrep's transforms make
-flow of that.
+A camera moves through a yard in which a ball rolls, a door swings and a crate slides. MuJoCo
+renders depth and segmentation off-screen and gives the poses of the camera and bodies, from which
+flowrep's transforms compute flow.
 
     pip install '.[examples]'
     apt-get install libegl1 libgl1-mesa-dri     # off-screen, on a CPU; or libosmesa6
     MUJOCO_GL=egl python examples/mujoco_flow.py strip.png
 
-What MuJoCo's numbers mean, as tests/examples/test_mujoco_flow.py measures it:
+MuJoCo's conventions, as measured by tests/examples/test_mujoco_flow.py:
 
-- depth is metres along the optical axis already; where there is no surface it holds the far plane;
+- depth is already metres along the optical axis; pixels without a surface hold the far plane;
 - pixels are sampled at their centres, so K has cx = W / 2, cy = H / 2 (with `offsamples="0"`);
 - camera axes are OpenGL's (x right, y up, z backward), poses are camera-to-world;
 - a body's pose is a position and a quaternion (w, x, y, z);
@@ -82,11 +82,11 @@ SCENE = f"""
 </mujoco>
 """  # noqa: E501
 START_VELOCITIES = {"ball": (-1.0, 0.4, 0.0), "hinge": -1.0, "rail": -1.2}
-BODIES = ("ball", "door", "crate")  # those that move; all the rest is the static world
+BODIES = ("ball", "door", "crate")  # the moving bodies; the rest is the static world
 
 
 class Yard(gym.Env):
-    """Drives ahead; actions 0, 1, 2 go straight, turn left, turn right."""
+    """A camera that drives ahead; actions 0, 1, 2 go straight, turn left, turn right."""
 
     def __init__(self) -> None:
         self.model = mujoco.MjModel.from_xml_string(SCENE)
@@ -128,7 +128,7 @@ class Yard(gym.Env):
         return self.observe(), 0.0, False, self.data.time > 2.0, {}
 
     def observe(self) -> dict[str, Any]:
-        """Returns what MuJoCo knows, as it knows it."""
+        """Returns MuJoCo's maps and poses in its own conventions."""
         rgb, depth, body = self.pictures()
         eye, moving = self.data.camera("eye"), self.body_ids
         camera_pose = np.eye(4)
@@ -160,7 +160,7 @@ class Yard(gym.Env):
 
 
 def make_env() -> TransformedEnv:
-    """Returns the yard as a TorchRL env that writes raw, ego and obj beside what MuJoCo says."""
+    """Returns the yard as a TorchRL env that writes raw, ego and obj beside MuJoCo's data."""
     yard = Yard()
     transforms = Compose(
         AdaptPose(axes="opengl", in_keys="camera_pose"),

@@ -1,23 +1,23 @@
-"""A policy of one's own on flowrep's benchmark: it steers away from what moves before it.
+"""A policy of your own on flowrep's benchmark: it steers away from moving objects ahead.
 
     python -m flowrep.evaluate policy=examples/own_policy.py:make representations=[obj,depth] \
         scene=straight_road
 
-No learning: where something moves by itself within 12 m, it turns to the other side, and back
-once the way is clear. It remembers how often it has turned, for each street.
+It does not learn. If something moves on its own within 12 m, it turns to the other side, and back
+once the way is clear. It counts its turns separately for each environment.
 """
 
 import torch
 
 GO_ON, LEFT, RIGHT = 0, 1, 2
-NEAR = 0.12  # of depth's range of 100 m
+NEAR = 0.12  # fraction of depth's range of 100 m
 
 
 def make(task):
-    """Returns a function of maps [N, C, H, W] that gives actions [N]."""
+    """Returns a function from maps [N, C, H, W] to actions [N]."""
     width = task.observation_spec["obj"].shape[-1]
     ahead = slice(width // 4, width - width // 4)
-    turned = {}  # by street: actions to the left less those to the right
+    turned = {}  # by environment: left turns minus right turns
 
     def act(maps):
         actions = []

@@ -1,7 +1,7 @@
-"""Draws what sensor noise does to object flow where nothing moves: it would be 0 everywhere.
+"""Draws the effect of sensor noise on object flow in a static scene, where it should be 0.
 
-A camera drives at 10 m/s and 12 frames/s over a plane between two walls, all of it at rest. Each
-picture shows the length of object flow under one kind of noise, in one scale of pixels.
+A camera drives at 10 m/s and 12 frames/s over a plane between two walls. Each picture shows the
+magnitude of object flow under one kind of noise; all have the same scale in pixels.
 
 python examples/sensor_noise.py docs/images/sensor_noise.png
 """
@@ -56,7 +56,7 @@ def main(path: str) -> None:
 
 
 def street() -> TensorDict:
-    """Returns depth of a plane, two walls and a house ahead, and a step of 10/12 m ahead."""
+    """Returns the depth of a plane, two walls and a house ahead, and a motion of 10/12 m ahead."""
     v, u = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
     plane = torch.where(y > 0, CAMERA_HEIGHT_M / y, torch.inf)

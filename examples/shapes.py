@@ -1,4 +1,4 @@
-"""Writes a sheet of close-ups: everything that stands or walks in a street.
+"""Writes a sheet of close-ups of all objects and people in a street.
 
 python examples/shapes.py docs/images/shapes.png
 """

@@ -1,11 +1,11 @@
-"""Stable-Baselines3's PPO on ego and object flow, out of the box.
+"""Stable-Baselines3's PPO, unmodified, on ego and object flow.
 
     pip install '.[train,learners]'
     python examples/stable_baselines3_ppo.py --steps 200000
     python -m flowrep.evaluate policy=examples/stable_baselines3_ppo.py:make \
         representations=[ego,obj] scene=straight_road
 
-A few thousand steps show that it runs; to learn to cross the street takes some 100,000.
+A few thousand steps show that it runs; learning to drive through the street takes about 100,000.
 """
 
 import argparse
@@ -29,7 +29,7 @@ def train(steps: int, num_envs: int = 4, rollout_length: int = 128, seed: int = 
         envs,
         n_steps=rollout_length,
         batch_size=rollout_length,
-        # Flow is no picture of bytes: it needs no division by 255.
+        # Flow is not a uint8 picture and must not be divided by 255.
         policy_kwargs={"normalize_images": False},
         seed=seed,
         device="auto",
@@ -41,7 +41,7 @@ def train(steps: int, num_envs: int = 4, rollout_length: int = 128, seed: int = 
 
 
 def make(task, path: str = "ppo_street"):
-    """Returns the saved learner as a policy that `flowrep.evaluate` takes."""
+    """Returns the saved learner as a policy for `flowrep.evaluate`."""
     learner = PPO.load(path, device="auto")
 
     def act(maps):

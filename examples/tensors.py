@@ -1,6 +1,6 @@
 """Ego and object flow of two frames, with pure functions on tensors: no env, no TensorDict.
 
-A camera drives half a metre ahead while a person before it takes a step to the right.
+A camera drives half a metre ahead while a person in front of it takes a step to the right.
 
     python examples/tensors.py
 """
@@ -20,7 +20,7 @@ def main() -> None:
     world_from_prev_person = world_from_prev_person.clone()
     world_from_prev_person[0, 0, 3] = -1.0
 
-    # What the camera sees now: a wall 6 m away, and the person (row 1) in the two middle columns.
+    # The current view: a wall 6 m away, and the person (row 1) in the two middle columns.
     depth, instance = torch.full((1, 6, 8), 6.0), torch.zeros(1, 6, 8, dtype=torch.uint8)
     depth[..., 3:5], instance[..., 3:5] = 3.0, 1
 

@@ -28,7 +28,7 @@ EPOCHS, MINIBATCH = 4, 128
 
 
 def networks(env: TransformedEnv) -> ActorValueOperator:
-    """Returns an actor and a critic on one convolutional body."""
+    """Returns an actor and a critic that share a convolutional body."""
     body = nn.Sequential(
         ConvNet(
             num_cells=[32, 64, 64],
@@ -58,7 +58,7 @@ def networks(env: TransformedEnv) -> ActorValueOperator:
 def train(steps: int, num_envs: int = 4, rollout_length: int = 128, seed: int = 0) -> nn.Module:
     """Returns the trained policy."""
     torch.manual_seed(seed)
-    # Whatever TorchRL has goes on top: here ego and obj are joined on their channels.
+    # TorchRL's own transforms go on top: here ego and obj are joined along their channels.
     join = CatTensors(["ego", "obj"], "maps", dim=-3, del_keys=False)
     env = make_env("straight_road", ["ego", "obj"], num_envs=num_envs, seed=seed)
     env = env.append_transform(join)

@@ -1,10 +1,10 @@
-"""flowrep's street, replay memory and loss in TorchRL's Collector and Trainer.
+"""flowrep's env, replay memory and loss in TorchRL's Collector and Trainer.
 
     pip install '.[train]'
     python examples/torchrl_trainer.py --frames 100000
 
-Run it again with more frames and it goes on where it stopped, bit for bit: what TorchRL's collector
-doesn't save, the observation that it acts on next and the state of its env, `StreetCollector` does.
+Run again with more frames, it continues where it stopped, bit for bit: `StreetCollector` also saves
+the next observation and the state of the env, which TorchRL's collector does not.
 """
 
 import argparse
@@ -30,10 +30,10 @@ GAMMA, N_STEPS = 0.97, 3
 
 
 class StreetCollector(Collector):
-    """A `Collector` of streets that continues in the middle of an episode."""
+    """A `Collector` of street envs that can resume in the middle of an episode."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns what TorchRL's has, the next observation, the streets and torch's generator."""
+        """Returns TorchRL's state, the next observation, the envs' states and torch's generator."""
         return super().state_dict() | {
             "carrier": self._carrier.to_dict(),
             "streets": get_states(self.env),
@@ -52,7 +52,7 @@ class StreetCollector(Collector):
 
 
 def make_trainer(frames: int, num_envs: int, side: int, batch_size: int, seed: int) -> Trainer:
-    """Returns a trainer of discrete SAC: one update for each 10 frames, about."""
+    """Returns a trainer of discrete SAC with about one update for each 10 frames."""
     torch.manual_seed(seed)
     scene = load_scene("straight_road")
     scene = replace(scene, camera=replace(scene.camera, height_px=side, width_px=side))
@@ -69,7 +69,7 @@ def make_trainer(frames: int, num_envs: int, side: int, batch_size: int, seed: i
         network.codecs, capacity=50_000, batch_size=batch_size, device="cpu", n_steps=N_STEPS,
         gamma=GAMMA,
     )  # fmt: skip
-    steps = 10  # of each street between two rounds of updates
+    steps = 10  # of each env between two rounds of updates
     trainer = Trainer(
         collector=StreetCollector(
             env, policy, frames_per_batch=steps * num_envs, total_frames=frames
@@ -90,13 +90,13 @@ def train(
     file: Path, frames: int, num_envs: int = 32, side: int = 48, batch_size: int = 256,
     seed: int = 0,
 ) -> Trainer:  # fmt: skip
-    """Trains until `frames`, from what `file` has where there is one, and writes it."""
+    """Trains until `frames`, resuming from `file` if it exists, and writes `file`."""
     trainer = make_trainer(frames, num_envs, side, batch_size, seed)
     if file.exists():
         trainer.load_state_dict(torch.load(file, weights_only=True))
 
     def save() -> None:
-        if trainer.collected_frames >= frames:  # the trainer closes its streets when it returns
+        if trainer.collected_frames >= frames:  # the trainer closes its envs when it returns
             torch.save(trainer.state_dict(), file)
 
     trainer.register_op("post_steps", save)

@@ -1,4 +1,4 @@
-"""Writes a picture of what each transform gives, for its page in docs/.
+"""Writes a picture of each transform's output, for its page in docs/.
 
 python examples/transform_pictures.py docs/images/transforms
 """
@@ -49,7 +49,7 @@ def main(folder: str) -> None:
     view_episode(env, Planner(), look=look, seed=SEED)
     env.close()
     maps = [maps_of(step, K) for step in steps]
-    # The liveliest step, but nobody right before the lens.
+    # The step with the most motion, but nobody right in front of the camera.
     motion = [int(((frame["obj"] != 0) & (frame["depth"] > 5)).sum()) for frame in maps]
     at = max(range(1, len(maps)), key=lambda i: motion[i])
     for name, images in pictures(steps[at - 1], steps[at], maps[at - 1], maps[at], K).items():
@@ -60,7 +60,7 @@ def main(folder: str) -> None:
 
 
 def pictures(step_before, step, before, now, K):
-    """Returns for each page its pictures by label."""
+    """Returns the pictures of each page, by label."""
     flows = {name: flow_to_rgb(now[name], scale) for name, scale in FLOW_SCALE_PX.items()}
     rgb = now["rgb"].numpy().transpose(1, 2, 0)
     return {
