@@ -1,10 +1,10 @@
-"""Frames per second of the ways to step many streets, against what one simulator alone draws.
+"""Frames per second of several ways to step many envs, against drawing in one simulator alone.
 
     python benchmarks/env_layouts.py [--num-envs 1 2 4 8] [--size 84] [--rounds 3]
 
-Each line adds something to the one above: a step to the picture, a vector, TorchRL's wrapper, the
-transforms (ego and obj), worker processes, TorchRL's collector. TorchRL's `ParallelEnv`, with a
-street in each process, stands beside. All take turns, round by round; medians are shown.
+Each line adds a layer to the one above: a step to the picture, a vector env, TorchRL's wrapper, the
+transforms (ego and obj), worker processes, TorchRL's collector. TorchRL's `ParallelEnv`, with one
+env in each process, is measured for comparison. All take turns; medians are shown.
 """
 
 import argparse
@@ -26,8 +26,8 @@ from flowrep.scenes import Scene, load_scene
 
 SENSORS = ("depth", "instance", "prev_from_curr", "instance_motion")  # what ego and obj read
 MAPS = ("ego", "obj")
-MOST_PROCESSES = 8  # of TorchRL's, each of which holds all of torch
-Stepper = Callable[[int], Any]  # takes so many frames
+MOST_PROCESSES = 8  # of TorchRL, each of which imports torch
+Stepper = Callable[[int], Any]  # steps a number of frames
 
 
 def pictures(scene: Scene) -> tuple[Stepper, Callable[[], None]]:

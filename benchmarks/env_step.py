@@ -1,9 +1,9 @@
-"""What a step of a street costs beside PyBullet's picture of the same view.
+"""Time of an env step beside PyBullet's picture of the same view.
 
 python benchmarks/env_step.py --scenes s_turn three_way_junction --size 84
 
-The two take turns, so that both see the same machine, and each view is drawn by both. A planner
-drives, so that whole episodes are seen; what it thinks is not counted.
+The two take turns, so that both run under the same load, and each view is drawn by both. A planner
+drives, so that whole episodes are covered; its own time is not counted.
 """
 
 import argparse

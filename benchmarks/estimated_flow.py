@@ -1,9 +1,9 @@
-"""How far estimated flow is from the exact one, on flowrep's own streets.
+"""Error of estimated flow against exact flow, on flowrep's own scenes.
 
 A planner drives; at every fourth step each estimator sees the last two pictures and is compared
-with the simulator's flow. End-point error in pixels a step, over all pixels whose flow is known
-and over people alone; "no flow" is what an estimator has to beat. The second table says where the
-error lies. RAFT takes part where it is given weights.
+with the simulator's flow. The tables show the end-point error in pixels a step, over all pixels
+with known flow and over people alone; "no flow" is the baseline to beat. The second table breaks
+the error down. RAFT takes part if weights are given.
 
 python benchmarks/estimated_flow.py --scenes straight_road s_turn --sizes 48 84 --steps 60
 """
@@ -27,7 +27,7 @@ SEE_EVERY = 4
 
 
 class Seen(NamedTuple):
-    """Pairs of pictures [N, 6, H, W], the exact flow between them and what the pixels show."""
+    """Pairs of pictures [N, 6, H, W], the exact flow between them and the pixels' classes."""
 
     pairs: Tensor
     truth: Tensor
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def contenders(raft_weights: str | None) -> dict[str, Callable[[Tensor], Tensor]]:
-    """Returns by name what makes raw flow of pairs of pictures."""
+    """Returns functions from pairs of pictures to raw flow, by name."""
     estimators: dict[str, EstimatedFlow] = {
         f"DIS {preset}, {'enlarged' if side > 1 else 'as it is'}": EstimatedFlow(DIS(preset, side))
         for preset in ("ultrafast", "fast", "medium")

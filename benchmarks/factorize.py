@@ -1,13 +1,13 @@
-"""What factorize costs beside the same maths composed from kornia, and beside a copy of its bytes.
+"""Time of factorize beside the same maths composed from kornia, and a copy of the same bytes.
 
 Bounds, compiled on the CPU: at least 30 x kornia, and 70 % of the machine's copy bandwidth at
 28 bytes a pixel (raw and depth read, ego and obj written; the mask's byte is not counted). The
-contenders take turns, so that all see the same machine; a ratio is the median over the turns.
-Freed memory is kept in the process for all of them, as training does: else page faults are what
-is measured.
+contenders take turns, so that all run under the same load; a ratio is the median over the turns.
+Freed memory is kept in the process for all of them, as in training; otherwise page faults would
+dominate.
 
-A table follows: factorize, compiled with a dynamic batch, at batch 1 to 4096 and both sizes, as far
-as memory reaches. `--device cuda` runs that table alone on a GPU.
+A table follows: factorize, compiled with a dynamic batch, at batch 1 to 4096 and both sizes, as
+memory permits. `--device cuda` runs only that table on a GPU.
 
 python benchmarks/factorize.py --rounds 40
 python benchmarks/factorize.py --device cuda
@@ -31,7 +31,7 @@ SWEEP_SIZES = [(84, 84), (720, 1280)]
 SWEEP_BATCHES = [1, 4, 16, 64, 256, 1024, 4096]
 BYTES_PER_PIXEL = 28
 KORNIA_BOUND, COPY_BOUND = 30.0, 0.7
-LARGE_COPY_BYTES = 512 * 2**20  # read and written together; past every cache
+LARGE_COPY_BYTES = 512 * 2**20  # read and written together; larger than any cache
 
 
 def main() -> None:
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def cuda_clock() -> float:
-    """Returns seconds at which the GPU has done all that it was given."""
+    """Returns the time in seconds after the GPU has finished all its work."""
     torch.cuda.synchronize()
     return time.perf_counter()
 
@@ -81,7 +81,7 @@ def sweep(
     for height, width in SWEEP_SIZES:
         for batch in SWEEP_BATCHES:
             pixels = batch * height * width
-            # Inputs, outputs and the results of the call before, whose memory may not be free yet.
+            # Inputs, outputs and the previous call's results, whose memory may not be free yet.
             needed = pixels * (BYTES_PER_PIXEL + 20)
             if needed > limit:
                 print(
@@ -101,7 +101,7 @@ def row(
     rounds: int,
     clock: Callable[[], float],
 ) -> None:
-    """Prints what one batch costs; the copy takes turns with it."""
+    """Prints the time of one batch; the copy takes turns with it."""
     batch, height, width = shape
     given = [tensor.to(device) for tensor in inputs(batch, height, width)]
     calls = {"factorize": lambda: compiled(*given), "copy": copy}
@@ -122,7 +122,7 @@ def row(
 
 
 def free_bytes(device: torch.device) -> int:
-    """Returns how much memory the device has to give."""
+    """Returns the free memory of the device in bytes."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info()[0]
     for line in Path("/proc/meminfo").read_text().splitlines():
@@ -210,7 +210,7 @@ def kornia_factorize(
 ) -> tuple[Tensor, Tensor]:
     """Returns ego and obj by kornia's unproject, transform and project.
 
-    Its pixel centres lie at whole numbers: K's principal point moves by half a pixel.
+    Its pixel centres are at integers, so K's principal point is shifted by half a pixel.
     """
     from kornia.geometry import create_meshgrid
     from kornia.geometry import depth as kornia_depth
@@ -230,7 +230,7 @@ def kornia_factorize(
 
 
 def check_equal(given: tuple[Tensor, ...], compiled: Callable[..., tuple[Tensor, ...]]) -> None:
-    """Raises AssertionError unless all three give one answer, to kornia's float32 error."""
+    """Raises AssertionError unless all three agree, up to kornia's float32 error."""
     exact = kornia_factorize(*(tensor.double() for tensor in given))
     for factors in (compiled(*given), factorize(*given), kornia_factorize(*given)):
         for part, expected in zip(factors[:2], exact):
@@ -253,7 +253,7 @@ def repeats_for(
 
 
 def timed(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
-    """Returns seconds a call, the first of the turn left out: it finds another's data cached."""
+    """Returns seconds a call without the first of the turn, which finds another's data cached."""
     call()
     started = clock()
     for _ in range(repeats):

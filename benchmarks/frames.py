@@ -1,10 +1,10 @@
-"""Frames a second of 32 streets in one process with ego and obj, and where their time goes.
+"""Frames a second of 32 envs in one process with ego and obj, and a breakdown of their time.
 
     python benchmarks/frames.py [--scenes straight_road ...] [--sizes 84 48] [--num-envs 32]
 
-Two ways take turns: the streets seen all at once by the rasteriser, and each by itself by PyBullet.
-Policy and replay memory are not part of it: actions are random. Times are of the processor, so that
-other work on the machine does not count.
+Two ways take turns: the rasteriser drawing all envs at once, and PyBullet drawing each on its own.
+Policy and replay memory are left out; actions are random. Times are CPU times, so that other work
+on the machine does not count.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def one_by_one(scene: Scene, num_envs: int) -> EnvBase:
 
 
 def stepper(env: EnvBase) -> Callable[[int], float]:
-    """Returns what takes so many steps of every street and gives milliseconds a frame."""
+    """Returns a function that takes a number of steps in every env and returns ms a frame."""
     observation = [env.reset()]
 
     def take(steps: int) -> float:
@@ -68,7 +68,7 @@ def row(name: str, size: int, num_envs: int, steps: int, rounds: int) -> str:
 
 
 def shares(env: EnvBase, take: Callable[[int], float], steps: int) -> list[float]:
-    """Returns milliseconds a frame of driving, seeing, representations and of TorchRL."""
+    """Returns milliseconds a frame for driving, sensing, representations and TorchRL."""
     owners = [
         (Episode, "step"), (StreetVectorEnv, "_observe"), (Compose, "_step"), (GymWrapper, "_step"),
         (TransformedEnv, "_step"),

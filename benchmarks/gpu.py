@@ -1,14 +1,14 @@
-"""Measures on a GPU all that training waits for, and what the paper's run would take.
+"""Measures the parts of training on a GPU, and projects the time of the paper's run.
 
     python benchmarks/gpu.py [--output outputs/gpu] [--rounds 20] [--parts update transforms ...]
 
 Four parts, each a table: an update (as a CUDA graph and eager, bf16 and fp32, against TorchRL's
-stock recipe and the floor at the measured rate of products), factorising flow (against kornia,
-where installed, and a copy), frames a second of the streets by number of worker processes, and a
-short training at the paper's size, from which the wall time of the whole one is projected. The
-report is printed, and written as report.md and report.json after every part. Without PyBullet, or
-with `--recorded`, made-up sensor maps stand in for the streets and the report says so. `--device
-cpu --quick` runs all of it in a tiny version, whose numbers mean nothing.
+stock recipe and the floor at the measured rate of matrix products), factorising flow (against
+kornia, if installed, and a copy), frames a second of the envs by number of worker processes, and a
+short training at the paper's size, from which the wall time of the full one is projected. The
+report is printed, and written to report.md and report.json after every part. Without PyBullet, or
+with `--recorded`, synthetic sensor maps replace the simulator and the report says so. `--device cpu
+--quick` runs a tiny version of everything, whose numbers are meaningless.
 """
 
 import argparse
@@ -50,7 +50,7 @@ STOCK = "TorchRL stock, separate fp32"
 
 @dataclass
 class Part:
-    """One table of the report, and what has to be said beside it."""
+    """One table of the report and its notes."""
 
     title: str
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -72,7 +72,7 @@ def text_of(value: Any) -> str:
 
 
 def updates(args: argparse.Namespace) -> Part:
-    """An update by size, encoder, precision and whether it is a graph."""
+    """Measures updates by size, encoder, precision and whether they are CUDA graphs."""
     part = Part("An update of discrete SAC")
     if args.device.type != "cuda":
         part.notes.append("There are no graphs on a CPU: both kinds are eager here.")
@@ -87,7 +87,7 @@ def updates(args: argparse.Namespace) -> Part:
 def updates_of_a_size(
     args: argparse.Namespace, side: int, batch: int
 ) -> tuple[list[dict[str, Any]], dict[str, float]]:
-    """Returns a row an update, and the measured rates of products in operations a second."""
+    """Returns a row for each update, and the measured rates of products in operations a second."""
     torch.manual_seed(0)
     steps = random_steps(side, batch, args.device)
     variants = {
@@ -98,7 +98,7 @@ def updates_of_a_size(
         for precision in ("bf16", "fp32")
         for kind in ("graph", "eager")
     }
-    # counted in the first call: what a graph does later can't be seen from here
+    # counted in the first call: operations inside a graph are invisible later
     counts = {variant: operations(update) for variant, update in variants.items()}
     width = 256 if args.quick else 8192
     types = {"bf16 products": torch.bfloat16, "fp32 products": torch.float32}
@@ -118,7 +118,7 @@ def updates_of_a_size(
 
 @torch.no_grad()
 def transforms(args: argparse.Namespace) -> Part:
-    """Factorising flow, beside kornia and a copy."""
+    """Measures factorising flow beside kornia and a copy."""
     part = Part("Factorising flow, float32")
     clock = cuda_clock if args.device.type == "cuda" else time.perf_counter
     copied_bytes = 2**20 if args.quick else 2**30
@@ -152,7 +152,7 @@ def seconds_of(call: Callable[[], object], clock: Callable[[], float]) -> float:
 
 
 def streets(args: argparse.Namespace) -> Part:
-    """Frames a second, by number of worker processes."""
+    """Measures frames a second by number of worker processes."""
     rows = street_rates(args.device, recorded=args.recorded, quick=args.quick)
     part = Part("Streets with ego and obj, random actions", rows)
     part.notes += [RECORDED_NOTE] if args.recorded else []
@@ -160,13 +160,13 @@ def streets(args: argparse.Namespace) -> Part:
 
 
 def whole_training(args: argparse.Namespace) -> Part:
-    """What the paper's 2,000,000 frames would take, without evaluations."""
+    """Projects the time of the paper's 2,000,000 frames, without evaluations."""
     row, notes = training(args.device, recorded=args.recorded, quick=args.quick)
     return Part("A training at the paper's size, projected", [row], notes)
 
 
 def write(folder: Path, machine: str, parts: dict[str, Part]) -> str:
-    """Writes the report as far as it has come; returns it as Markdown."""
+    """Writes the finished parts of the report; returns them as Markdown."""
     folder.mkdir(parents=True, exist_ok=True)
     text = "\n".join([f"# {machine}\n", *(part.markdown() for part in parts.values())])
     (folder / "report.md").write_text(text, encoding="utf-8")

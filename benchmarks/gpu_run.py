@@ -1,8 +1,8 @@
-"""The parts of gpu.py that drive: streets by number of workers, and a short training.
+"""The parts of gpu.py that run envs: their speed by number of workers, and a short training.
 
-Where the simulator is not to be had, `RecordedStreets` gives made-up sensor maps at no cost,
-brought to the device at each step as a simulator's are: transforms, memory and updates are then
-measured, and of the streets nothing.
+Without the simulator, `RecordedStreets` provides synthetic sensor maps at no cost, moved to the
+device at each step like a simulator's. Transforms, memory and updates are then measured, but not
+the envs.
 """
 
 import tempfile
@@ -26,13 +26,13 @@ NUM_ENVS, SIDE, INSTANCES = 32, 84, 16
 
 
 class RecordedStreets(EnvBase):
-    """Goes round a few random sensor readings, which lie on the CPU; ends one episode in a hundred.
+    """Cycles through random sensor readings on the CPU; each step ends one episode in a hundred.
 
     Args:
         num_envs: size of the batch.
         side: height and width of the maps.
-        device: where the readings are handed out.
-        readings: how many there are.
+        device: device of the returned readings.
+        readings: number of readings.
     """
 
     def __init__(self, num_envs: int, side: int, device: torch.device, readings: int = 8) -> None:
@@ -82,7 +82,7 @@ class RecordedStreets(EnvBase):
 
 
 def recorded_env(num_envs: int, side: int, device: torch.device) -> TransformedEnv:
-    """Returns made-up streets with ego and obj."""
+    """Returns envs with synthetic sensor maps, ego and obj."""
     K = torch.tensor([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1.0]])
     stack = representation_stack(MAPS, intrinsics=K, num_classes=5, dt_s=1 / 12)
     env = TransformedEnv(RecordedStreets(num_envs, side, device), stack)
@@ -90,7 +90,7 @@ def recorded_env(num_envs: int, side: int, device: torch.device) -> TransformedE
 
 
 def street_env(num_envs: int, side: int, num_workers: int, device: torch.device) -> EnvBase:
-    """Returns simulated streets with ego and obj; the one place that says what `make_env` takes."""
+    """Returns simulated envs with ego and obj; the only call of `make_env` here."""
     import dataclasses
 
     from flowrep.envs import make_env
@@ -103,14 +103,14 @@ def street_env(num_envs: int, side: int, num_workers: int, device: torch.device)
 
 
 def finish(device: torch.device) -> float:
-    """Returns the time at which the device has done all that it was given."""
+    """Returns the time after the device has finished all its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def street_rates(device: torch.device, *, recorded: bool, quick: bool) -> list[dict[str, Any]]:
-    """Returns frames a second, a row for each number of workers; 0 drives in this process."""
+    """Returns frames a second, a row for each number of workers; 0 is this process alone."""
     num_envs, side, steps = (2, 40, 3) if quick else (NUM_ENVS, SIDE, 60)
     workers = (0, 1) if quick else WORKERS
     rows = []
@@ -134,7 +134,7 @@ def street_rates(device: torch.device, *, recorded: bool, quick: bool) -> list[d
 def training(
     device: torch.device, *, recorded: bool, quick: bool
 ) -> tuple[dict[str, Any], list[str]]:
-    """Returns one row: the rate of a short training's second half, and the whole one projected."""
+    """Returns a row with the rate of a short training's second half and the projected time."""
     measure = recorded_training if recorded else simulated_training
     (frames, seconds), notes = measure(device, quick)
     minutes = PAPER_FRAMES / frames * seconds / 60
@@ -163,7 +163,7 @@ def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, fl
 
     register_resolvers()
     size = ["debug=smoke"] if quick else ["preset=paper", "total_frames=20_000"]
-    # the hook of evaluations reads the clock, in the middle and at the end
+    # the evaluation hook reads the clock in the middle and at the end
     total = 256 if quick else 20_000
     cadence = [f"evaluation.every_frames={total // 2}", "checkpoint_every_frames=1_000_000_000"]
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
@@ -187,7 +187,7 @@ def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, fl
 
 
 def recorded_training(device: torch.device, quick: bool) -> tuple[tuple[int, float], list[str]]:
-    """Acts, remembers and learns as training does; logs nothing."""
+    """Acts, stores and learns as training does, without logging."""
     num_envs, side, total, batch = (4, 40, 256, 16) if quick else (NUM_ENVS, SIDE, 20_000, 1024)
     env = recorded_env(num_envs, side, device)
     agent = agent_for(env.observation_spec, env.action_spec, MAPS, device=device, batch_size=batch)

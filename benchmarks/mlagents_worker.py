@@ -1,9 +1,8 @@
 """Runs updates of ML-Agents' own SAC on request; started by update_against_mlagents.py.
 
-It runs in an environment of its own, with the `mlagents` package and nothing of flowrep, and
-answers each line on stdin with the seconds that one update took. mlagents 0.28 was written for
-torch 1.8, numpy 1.2x and Python 3.9: what it misses in newer ones is given to it here; its trainer
-is untouched.
+It runs in its own environment, with the `mlagents` package and without flowrep, and answers each
+line on stdin with the seconds of one update. mlagents 0.28 was written for torch 1.8, numpy 1.2x
+and Python 3.9; names missing in newer versions are added here, and its trainer is unchanged.
 """
 # ruff: noqa: E402
 

@@ -1,9 +1,9 @@
-"""Where the milliseconds of one frame go, from the street's physics to the replay memory.
+"""A breakdown of the time of one frame, from the simulation to the replay memory.
 
     python benchmarks/profile_step.py [--scene straight_road] [--size 84] [--num-envs 32]
 
-Functions along the way are timed, each without what it calls of the others; a training's own loop
-is run, without updates. Times are of the processor.
+Functions along the way are timed, each excluding the others that it calls. The training loop is run
+without updates. Times are CPU times.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from flowrep.envs.episode import Episode
 from flowrep.envs.street_vector import StreetVectorEnv
 from flowrep.scenes import load_scene
 
-WARM_UP = 20  # steps of every street
+WARM_UP = 20  # steps of every env
 PARTS: list[tuple[str, Any, str]] = [
     ("maps and motions of all streets", StreetVectorEnv, "_observe"),
     ("driving, people's clock, collisions", Episode, "step"),
@@ -87,7 +87,7 @@ def main() -> None:
     scene = dataclasses.replace(scene, camera=camera)
     names = ["ego", "obj"]
     env = make_env(scene, names, num_envs=args.num_envs, seed=0).append_transform(InitTracker())
-    # a memory that is soon full: a run of any length has touched all its pages
+    # a small memory fills soon, so that all its pages have been touched
     capacity = WARM_UP * args.num_envs
     agent = agent_for(env.observation_spec, env.action_spec, names, replay_capacity=capacity)
     timer = SelfTimer()

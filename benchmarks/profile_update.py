@@ -1,11 +1,11 @@
-"""Where the milliseconds of a gradient step of discrete SAC go, and how near each is to its floor.
+"""A breakdown of the time of a gradient step of discrete SAC, beside each part's floor.
 
     python benchmarks/profile_update.py [--size paper] [--encoder shared] [--rounds 9]
 
-Every operation is timed on its own while the update runs. Its floor is the larger of two: its
-operations at the machine's measured rate of matrix products in its dtype, and the bytes that it
-reads and writes at the measured bandwidth of a copy. What is left of the update's own time, taken
-without any of this, passes between the operations: Python, autograd, dispatch.
+Every operation is timed on its own while the update runs. Its floor is the larger of two times: its
+arithmetic at the machine's measured rate of matrix products in its dtype, and the bytes that it
+reads and writes at the measured bandwidth of a copy. The rest of the update's time, measured
+without profiling, is spent between the operations: Python, autograd, dispatch.
 """
 
 import argparse
@@ -48,7 +48,7 @@ FREE = ("detach", "alias", "unbind")
 
 @dataclass
 class Cost:
-    """What the calls of one group took, and what they can't take less of."""
+    """The measured cost of one group of calls, and its lower bound."""
 
     calls: int = 0
     seconds: float = 0.0
@@ -145,7 +145,7 @@ def main() -> None:
 
 
 def print_table(timed: list[dict[str, Cost]], whole: float) -> None:
-    """Prints the median over several updates of each group, the largest first."""
+    """Prints each group's median over several updates, the largest first."""
     seconds = {name: statistics.median(c[name].seconds for c in timed) for name in timed[0]}
     print("| where | calls | ms | GFLOP | MB | floor, ms | x floor |")
     print("| --- | --- | --- | --- | --- | --- | --- |")

@@ -1,9 +1,9 @@
-"""The rasteriser's maps beside those of PyBullet's picture: where they differ, what they cost.
+"""The rasteriser's maps beside those of PyBullet's picture: differences and times.
 
     python benchmarks/rasterise.py [--views 1000] [--sizes 48 84 168] [--scenes s_turn ...]
 
-Half of the views are from anywhere on the road, half from a few steps before a person. The two take
-turns; times are of the processor, medians, so that other work on the machine hides no millisecond.
+Half of the views are from anywhere on the road, half from a few steps in front of a person. The two
+take turns. Times are medians of CPU times, so that other work on the machine does not count.
 """
 
 import argparse
@@ -29,9 +29,9 @@ TOUCHING = 1e-5  # relative difference in depth of surfaces that lie in one plan
 
 
 class Difference(NamedTuple):
-    """What two renderers make of one view, in pixels."""
+    """Differences between two renderers in one view, in pixels."""
 
-    ids: int  # of another class or instance
+    ids: int  # pixels of another class or instance
     inside: int  # of those, away from every border and not where two surfaces coincide
     depth: float  # median relative error where both see the same body
     seen: set[int]  # classes
@@ -48,7 +48,7 @@ class Pair:
         )
 
     def views(self, count: int, seed: int = 0) -> Iterator[None]:
-        """Puts both streets before the same view, and does so `count` times."""
+        """Sets both streets to the same view, `count` times."""
         rng = np.random.default_rng(seed)
         for number in range(count):
             if number % VIEWS_AN_EPISODE == 0:
@@ -61,7 +61,7 @@ class Pair:
             yield
 
     def difference(self) -> Difference:
-        """Compares the two in the view before which they stand."""
+        """Compares the two renderers in the current view."""
         pictured, drawn = (env.sensing.observe(env.episode) for env in (self.pictured, self.drawn))
         bodies = [256 * o["semantic"][0].astype(int) + o["instance"][0] for o in (pictured, drawn)]
         differ = bodies[0] != bodies[1]
@@ -98,7 +98,7 @@ def viewpoint(env: StreetEnv, rng: np.random.Generator, *, before_a_person: bool
 
 
 def borders(bodies: np.ndarray) -> np.ndarray:
-    """Marks the pixels with another body among the 3 × 3 around, and the picture's rim."""
+    """Returns a mask of pixels with another body in their 3 × 3 neighbourhood, and of the rim."""
     marked = np.ones(bodies.shape, dtype=bool)
     windows = np.lib.stride_tricks.sliding_window_view(bodies, (3, 3))
     marked[1:-1, 1:-1] = (windows != bodies[1:-1, 1:-1, None, None]).any(axis=(-2, -1))

@@ -1,7 +1,7 @@
-"""Frames a second of `flowrep.factorize` on a recording of 640 x 480, and whether memory is flat.
+"""Frames a second of `flowrep.factorize` on a recording of 640 x 480, and its memory over time.
 
 `python benchmarks/recorded_video.py` writes a recording of a textured room, factorises it on one
-core (pictures and flow files written, no video) and prints where the time went.
+core (pictures and flow files written, no video) and prints a breakdown of the time.
 `python benchmarks/recorded_video.py memory` reads and factorises 10,000 small frames and prints the
 memory in use along the way.
 """
@@ -31,7 +31,7 @@ FOCAL_PX, WALL_M = 525.0, 2.5
 
 
 def write_recording(folder: Path, frames: int, height: int, width: int) -> None:
-    """Writes a camera that moves along a wall and nears it, as JPEG and 16-bit PNG."""
+    """Writes a recording of a camera moving along and towards a wall, as JPEG and 16-bit PNG."""
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True)
     noise = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
@@ -43,7 +43,7 @@ def write_recording(folder: Path, frames: int, height: int, width: int) -> None:
         pose[:3, 3] = 0.3 * np.sin(i / 9), 0.1 * np.cos(i / 7), 0.3 * np.sin(i / 15)
         poses.append(pose)
         z = WALL_M - pose[2, 3]
-        # The wall's picture has `focal / WALL_M` pixels a metre about its middle.
+        # The wall's picture has `focal / WALL_M` pixels a metre around its middle.
         size = z / WALL_M
         left = 2 * width + pose[0, 3] * focal / WALL_M - size * width / 2
         top = 2 * height + pose[1, 3] * focal / WALL_M - size * height / 2
@@ -96,7 +96,7 @@ def as_seven_scenes(folder: Path) -> None:
 
 
 def memory(frames: int = 10_000) -> None:
-    """Prints memory in use while a long recording goes through, flow files and all."""
+    """Prints the memory in use while a long recording is processed, including flow files."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         write_recording(folder / "in", 20, 48, 64)
@@ -115,7 +115,7 @@ def memory(frames: int = 10_000) -> None:
 
 
 class WatchedJob(Job):
-    """Says now and then how much memory is in use."""
+    """Prints the memory in use from time to time."""
 
     def _take(self, index, made, writers, bar) -> None:
         super()._take(index, made, writers, bar)

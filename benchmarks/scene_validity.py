@@ -1,4 +1,4 @@
-"""Is a scene a fair task? The planner must reach the ending zone, chance and habit must not.
+"""Checks that scenes are fair tasks: the planner reaches the ending zone, simple baselines don't.
 
 python benchmarks/scene_validity.py --scenes straight_road --episodes 500
 """

@@ -1,7 +1,7 @@
-"""How early people are seen: pixels they cover and frames in which they cover none, by distance.
+"""Visibility of people by distance: the pixels they cover and the share of frames without any.
 
-A planner drives; every fourth frame is seen again by each camera. Counted is whoever stands within
-5 m of the line straight ahead, hidden people and those outside the field of view included.
+A planner drives; every fourth frame is rendered by each camera. People within 5 m of the line
+straight ahead are counted, including those hidden or outside the field of view.
 """
 
 import argparse
@@ -24,7 +24,7 @@ EVERY = 4
 
 
 def states(scene: Scene, episodes: int) -> Iterator[dict[str, Any]]:
-    """Yields where everyone is, every few frames of a planner's drives."""
+    """Yields the env's state every few frames of a planner's drives."""
     env, planner = StreetEnv(scene, sensors=()), Planner()
     for episode in range(episodes):
         env.reset(seed=episode if not episode else None)
@@ -37,7 +37,7 @@ def states(scene: Scene, episodes: int) -> Iterator[dict[str, Any]]:
 
 
 def seen(env: StreetEnv, state: dict[str, Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Returns of everyone near the line ahead the metres to them and the pixels they cover."""
+    """Returns distances in metres to people near the line ahead, and the pixels they cover."""
     observation, _ = env.set_state(state)
     vehicle, poses = env.episode.now.vehicle, env.episode.poses
     away = poses[:, :2] - (vehicle.x_m, vehicle.y_m)

@@ -1,8 +1,8 @@
 """Return on a small control problem: flowrep's discrete SAC beside TorchRL's stock recipe.
 
-A ball falls through a picture of 36 x 36 pixels in eight steps, a paddle at the bottom goes left,
-stays or goes right; each step that it ends below the ball brings 1/8. Both learners see the same
-pictures, have the same networks, batch, replay size, learning rate and number of updates.
+A ball falls through a picture of 36 x 36 pixels in eight steps, and a paddle at the bottom goes
+left, stays or goes right. Each step that it ends below the ball gives a reward of 1/8. Both
+learners have the same pictures, networks, batch, replay size, learning rate and number of updates.
 
     python benchmarks/small_control.py --seeds 3 --frames 12000
 """
@@ -43,7 +43,7 @@ BEST = statistics.mean((CELLS - max(1, d)) / (CELLS - 1) for d in DISTANCES)
 
 
 class Follow(EnvBase):
-    """Games side by side."""
+    """A batch of games."""
 
     def __init__(self, envs: int = ENVS) -> None:
         super().__init__(batch_size=[envs])
@@ -92,7 +92,7 @@ Learner = tuple[Policy, Callable[[TensorDictBase], object], Callable[[], object]
 def flowrep_learner(
     env: EnvBase, frames: int, precision: str = "fp32", encoder: str = "separate"
 ) -> Learner:
-    """Returns a policy, what takes in steps, and one update."""
+    """Returns a policy, a function that stores steps, and one that makes an update."""
     agent = DiscreteSAC(
         env.observation_spec, env.action_spec, ["view"], total_frames=frames, device="cpu",
         encoder=encoder, precision=precision, learning_rate=LEARNING_RATE, initial_alpha=ALPHA,
@@ -112,7 +112,7 @@ def plain_network() -> nn.Module:
 
 
 def stock_learner(env: EnvBase, frames: int) -> Learner:
-    """TorchRL's `DiscreteSACLoss`, replay buffer and Adam, as its examples put them together."""
+    """Returns a learner of TorchRL's loss, replay buffer and Adam, combined as in its examples."""
     actor = Sequential(
         TensorDictModule(plain_network(), ["view"], ["logits"]),
         ProbabilisticTensorDictModule(
@@ -146,7 +146,7 @@ def stock_learner(env: EnvBase, frames: int) -> Learner:
 
 
 def train(make_learner: Callable[[EnvBase, int], Learner], frames: int, seed: int) -> float:
-    """Returns the mean greedy return over 512 games after so many frames."""
+    """Returns the mean greedy return over 512 games after training on `frames` frames."""
     torch.manual_seed(seed)
     env = TransformedEnv(Follow(), InitTracker())
     policy, remember, update = make_learner(env, frames)

@@ -1,13 +1,13 @@
-"""Times one gradient step of discrete SAC, against TorchRL's stock recipe and the machine's floor.
+"""Times a gradient step of discrete SAC against TorchRL's stock recipe and the machine's floor.
 
     python benchmarks/update.py [--device cuda] [--rounds 5] [--threads 2] [--default-malloc]
         [--busy]
 
 All variants learn from the same transitions; each round times every variant once, in turn, and the
-machine's matrix products between them, so that a change of load hits all alike. The floor is the
+machine's matrix products between them, so that a change of load affects all alike. The floor is the
 update's own count of operations at the measured rate of bfloat16 products. `--default-malloc`
-leaves glibc's allocator as it is, to show what `keep_freed_memory` is worth. On a machine that is
-busy with more, `--busy` runs on one thread and counts its processor time, not the clock's.
+keeps glibc's default allocator settings, to show the effect of `keep_freed_memory`. For machines
+under other load, `--busy` runs on one thread and measures CPU time instead of wall time.
 """
 
 import argparse
@@ -33,7 +33,7 @@ SIZES = {"laptop": (48, 256), "paper": (84, 1024)}  # pixels a side, batch
 
 
 def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
-    """Steps that all terminate, so that each is a transition at once."""
+    """Returns steps that all terminate, so that each is a complete transition."""
 
     def maps() -> dict[str, torch.Tensor]:
         return {name: torch.randn(batch, CHANNELS, side, side, device=device) for name in MAPS}
@@ -49,12 +49,12 @@ def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
 def agent_for(
     spec: Composite, actions: Categorical, keys: Sequence[str], **changes: object
 ) -> DiscreteSAC:
-    """Discrete SAC with the paper's hyperparameters."""
+    """Returns discrete SAC with the paper's hyperparameters."""
     return DiscreteSAC(spec, actions, list(keys), total_frames=10**9, **changes)
 
 
 def flowrep_agent(steps: TensorDict, encoder: str, precision: str) -> DiscreteSAC:
-    """An agent that has seen these steps, and learns from all of them at once."""
+    """Returns an agent that has stored these steps and learns from all of them at once."""
     side, batch = steps["ego"].shape[-1], len(steps)
     spec = Composite({name: Unbounded((CHANNELS, side, side)) for name in MAPS})
     agent = agent_for(
@@ -74,7 +74,7 @@ def flowrep_update(
     sample = agent.sample()
 
     def update() -> None:
-        """Takes threads as training does: a team for the update, one for all beside it."""
+        """Uses threads as training does: all for the update, one for everything else."""
         threads = torch.get_num_threads()
         if steps.device.type == "cpu":
             torch.set_num_threads(1)
@@ -85,7 +85,7 @@ def flowrep_update(
 
 
 class StockNetwork(nn.Module):
-    """Nature encoders, a hidden layer and one number an action, as anyone would write it."""
+    """A plain network: Nature encoders, a hidden layer and one output for each action."""
 
     def __init__(self, side: int) -> None:
         super().__init__()
@@ -107,7 +107,7 @@ class StockNetwork(nn.Module):
 
 
 def stock_update(steps: TensorDict) -> Callable[[], object]:
-    """TorchRL's `DiscreteSACLoss` as its examples use it: float32, two Q-networks under vmap."""
+    """Returns an update of TorchRL's `DiscreteSACLoss` as in its examples, in float32."""
     side = steps["ego"].shape[-1]
     with torch.device(steps.device):
         actor = TensorDictModule(StockNetwork(side), in_keys=[*MAPS], out_keys=["logits"])
@@ -144,7 +144,7 @@ def interleaved(
     device: torch.device,
     clock: Callable[[], float],
 ) -> dict[str, float]:
-    """Returns each action's median seconds over rounds in which all take turns."""
+    """Returns each function's median seconds over rounds in which all take turns."""
     seconds: dict[str, list[float]] = {name: [] for name in actions}
     for turn in range(rounds + WARM_UP):
         for name, act in actions.items():
@@ -158,9 +158,9 @@ def interleaved(
 
 
 class NoModules:
-    """Stands in for PyTorch's tracker of modules, which trips over those of a LossModule.
+    """Replaces PyTorch's module tracker, which fails on the modules of a LossModule.
 
-    See docs/upstream.md; only the total is asked for.
+    See docs/upstream.md; only the total is needed.
     """
 
     parents = ("Global",)
@@ -206,7 +206,7 @@ def main() -> None:
         width = 8192 if args.device.type == "cuda" else 2048
         types = {"bf16": torch.bfloat16, "fp32": torch.float32}
         products = {n: matrix_product(t, args.device, width) for n, t in types.items()}
-        # counted first: what a CUDA graph or another thread does can't be seen from here
+        # counted first: operations of a CUDA graph or another thread are invisible later
         use_threads(1)
         counts = {n: None if "stock" in n else operations(u) for n, u in updates.items()}
         use_threads(threads)

@@ -6,9 +6,9 @@
     /tmp/mlagents/bin/pip install --no-deps mlagents==0.28.0 mlagents_envs==0.28.0
     python benchmarks/update_against_mlagents.py /tmp/mlagents/bin/python
 
-All take turns in one run, on maps of one size and batches of one size: five separate networks in
-float32 there, one or two sets of encoders here. ML-Agents runs twice: as it comes, and with glibc's
-allocator set as flowrep sets its own (GLIBC_TUNABLES).
+All take turns in one run, with the same map and batch sizes: ML-Agents has five separate networks
+in float32, flowrep one or two sets of encoders. ML-Agents runs twice: by default, and with glibc's
+allocator configured as in flowrep (GLIBC_TUNABLES).
 """
 
 import argparse
@@ -29,7 +29,7 @@ KEEPING = {
 
 
 class Rival:
-    """ML-Agents in a process of its own, which updates when it is asked to."""
+    """ML-Agents in a separate process that makes an update on request."""
 
     def __init__(self, python: str, side: int, batch: int, environment: dict[str, str]) -> None:
         worker = Path(__file__).with_name("mlagents_worker.py")
