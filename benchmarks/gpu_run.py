@@ -26,7 +26,7 @@ NUM_ENVS, SIDE, INSTANCES = 32, 84, 16
 
 
 class RecordedStreets(EnvBase):
-    """Cycles through random sensor readings on the CPU; each step ends one episode in a hundred.
+    """Cycles through random sensor readings on the CPU; an episode ends after 100 steps on average.
 
     Args:
         num_envs: size of the batch.
