@@ -223,7 +223,7 @@ def _as_float(values: NDArray[Any]) -> NDArray[np.float32]:
 
 def _spec(box: spaces.Space) -> Bounded | Unbounded:
     if not isinstance(box, spaces.Box):
-        raise ValueError(f"representations are made of sensor maps in a Box, got {box}")
+        raise ValueError(f"representations need sensor maps in a Box, got {box}")
     dtype = torch.as_tensor(np.empty(0, box.dtype)).dtype
     if dtype.is_floating_point:
         return Unbounded(box.shape, dtype=dtype)
