@@ -72,4 +72,4 @@ def check_name(option: str, name: object, names: Any) -> None:
     if name not in known:
         close = difflib.get_close_matches(str(name), known, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"{option} is one of {known}, got {name!r}{hint}")
+        raise ValueError(f"{option} must be one of {known}, got {name!r}{hint}")

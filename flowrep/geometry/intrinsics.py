@@ -44,9 +44,9 @@ def intrinsics_from_fov(
     """
     check_name("axis", axis, FovAxis)
     if not 0 < fov_deg < 180:
-        raise ValueError(f"fov_deg lies between 0 and 180 degrees, got {fov_deg}")
+        raise ValueError(f"fov_deg must lie between 0 and 180 degrees, got {fov_deg}")
     if height < 1 or width < 1:
-        raise ValueError(f"height and width are at least 1 pixel, got {height} and {width}")
+        raise ValueError(f"height and width must be at least 1 pixel, got {height} and {width}")
     half_size = (width if axis == "horizontal" else height) / 2
     focal = half_size / math.tan(math.radians(fov_deg) / 2)
     rows = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]

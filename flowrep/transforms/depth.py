@@ -47,9 +47,9 @@ class Depth(MapTransform):
     ) -> None:
         super().__init__([DEPTH], in_keys, out_keys)
         if not 0 < range_m < math.inf:
-            raise ValueError(f"range_m is a positive number of metres, got {range_m}")
+            raise ValueError(f"range_m must be a positive number of metres, got {range_m}")
         if not 0 <= missing <= 1:
-            raise ValueError(f"missing is the value in [0, 1] that nan becomes, got {missing}")
+            raise ValueError(f"missing must be in [0, 1], the value for nan, got {missing}")
         self.range_m = float(range_m)
         self.missing = float(missing)
 

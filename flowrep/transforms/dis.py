@@ -48,9 +48,9 @@ class DIS:
     def __post_init__(self) -> None:
         """Raises ValueError for invalid options, and ImportError without OpenCV."""
         if self.preset not in PRESETS:
-            raise ValueError(f"preset is one of {list(PRESETS)}, got {self.preset!r}")
+            raise ValueError(f"preset must be one of {list(PRESETS)}, got {self.preset!r}")
         if self.min_side_px < 1:
-            raise ValueError(f"min_side_px is at least 1, got {self.min_side_px}")
+            raise ValueError(f"min_side_px must be at least 1, got {self.min_side_px}")
         _opencv()
 
     def __call__(self, first: Tensor, second: Tensor) -> Tensor:

@@ -130,4 +130,6 @@ def _estimator(
         return DIS(preset, min_side_px)
     if callable(estimator):
         return estimator
-    raise ValueError(f"estimator is one of {['dis', *NETWORKS]} or a function, got {estimator!r}")
+    raise ValueError(
+        f"estimator must be one of {['dis', *NETWORKS]} or a function, got {estimator!r}"
+    )

@@ -143,7 +143,9 @@ def checked_outputs(outputs: Sequence[str], known: tuple[str, ...]) -> tuple[str
     """Returns the outputs as a tuple; raises ValueError if one is unknown or named twice."""
     unknown = [name for name in outputs if name not in known]
     if isinstance(outputs, str) or unknown or not outputs or len(set(outputs)) != len(outputs):
-        raise ValueError(f"outputs is a list of some of {list(known)}, each once; got {outputs!r}")
+        raise ValueError(
+            f"outputs must be a list with some of {list(known)}, each once; got {outputs!r}"
+        )
     return tuple(outputs)
 
 
@@ -157,10 +159,10 @@ def _per_output(option: str, value: object, flows: Sequence[str]) -> dict[str, o
 
 def _factor(scale: object, unit: object, dt_s: float | None) -> float:
     if unit not in UNITS:
-        raise ValueError(f"unit is one of {list(UNITS)}, got {unit!r}")
+        raise ValueError(f"unit must be one of {list(UNITS)}, got {unit!r}")
     factor = float(scale)  # type: ignore[arg-type]
     if not math.isfinite(factor) or factor == 0.0:
-        raise ValueError(f"scale is a finite number other than 0, got {scale}")
+        raise ValueError(f"scale must be a finite number other than 0, got {scale}")
     if unit == "px_per_step":
         return factor
     if dt_s is None or not dt_s > 0:

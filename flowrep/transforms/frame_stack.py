@@ -61,7 +61,7 @@ class FrameStack(MapTransform):
         reads = [Reads((f"C{i}", f"H{i}", f"W{i}")) for i in range(maps)]
         super().__init__(reads, in_keys, out_keys)
         if k < 1:
-            raise ValueError(f"k is the number of frames, at least 1; got {k}")
+            raise ValueError(f"k, the number of frames, must be at least 1; got {k}")
         if len(self.out_keys) != len(self.in_keys) or set(self.in_keys) & set(self.out_keys):
             raise ValueError(
                 f"FrameStack needs an output key of its own for each input key; "

@@ -49,7 +49,7 @@ class InstanceIds(MapTransform):
         super().__init__([IDS], in_keys, out_keys)
         check_own_keys(self)
         if len(set(body_ids)) != len(body_ids):
-            raise ValueError(f"body_ids names each body once, got {list(body_ids)}")
+            raise ValueError(f"body_ids must name each body once, got {list(body_ids)}")
         ids = torch.tensor(list(body_ids), dtype=torch.long)
         self.register_buffer("body_ids", ids, persistent=False)
 

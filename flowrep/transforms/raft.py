@@ -47,7 +47,7 @@ class RAFT(nn.Module):
     ) -> None:
         super().__init__()
         if network not in NETWORKS:
-            raise ValueError(f"network is one of {list(NETWORKS)}, got {network!r}")
+            raise ValueError(f"network must be one of {list(NETWORKS)}, got {network!r}")
         if min_side_px < SMALLEST_SIDE_PX or updates < 1:
             raise ValueError(
                 f"RAFT needs min_side_px of at least {SMALLEST_SIDE_PX} and at least one update, "

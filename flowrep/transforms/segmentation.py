@@ -58,9 +58,9 @@ class Segmentation(MapTransform):
     ) -> None:
         super().__init__([IDS], in_keys, out_keys)
         if encoding not in ENCODINGS:
-            raise ValueError(f"encoding is one of {list(ENCODINGS)}, got {encoding!r}")
+            raise ValueError(f"encoding must be one of {list(ENCODINGS)}, got {encoding!r}")
         if not 1 <= num_classes <= 256:
-            raise ValueError(f"num_classes is 1 to 256 (ids are uint8), got {num_classes}")
+            raise ValueError(f"num_classes must be 1 to 256 (ids are uint8), got {num_classes}")
         self.num_classes = int(num_classes)
         self.encoding = encoding
 

@@ -248,12 +248,14 @@ def drifted_motion(
 def _check(sensors: Sequence[str], options: dict[str, float]) -> None:
     unknown = [sensor for sensor in sensors if sensor not in _READS]
     if isinstance(sensors, str) or unknown or not sensors or len(set(sensors)) != len(sensors):
-        raise ValueError(f"sensors is a list of some of {list(_READS)}, each once; got {sensors!r}")
+        raise ValueError(
+            f"sensors must be a list with some of {list(_READS)}, each once; got {sensors!r}"
+        )
     for name, value in options.items():
         if not 0.0 <= value < math.inf:
-            raise ValueError(f"{name} is a number of at least 0, got {value}")
+            raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
     if options["depth_dropout"] > 1.0:
-        raise ValueError(f"depth_dropout is a probability, got {options['depth_dropout']}")
+        raise ValueError(f"depth_dropout must be a probability, got {options['depth_dropout']}")
     for sensor, names in _OPTIONS.items():
         idle = [name for name in names if options[name] and sensor not in sensors]
         if idle:

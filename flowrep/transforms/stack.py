@@ -157,7 +157,7 @@ def _with_options(
     representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None],
 ) -> dict[str, dict[str, Any]]:
     if isinstance(representations, str):
-        raise ValueError(f"representations is a list of names, e.g. [{representations!r}]")
+        raise ValueError(f"representations must be a list of names, e.g. [{representations!r}]")
     names = list(representations)
     for name in names:
         if names.count(name) > 1:

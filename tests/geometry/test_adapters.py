@@ -101,7 +101,7 @@ def test_field_of_view_across_the_width_or_the_height():
 @pytest.mark.parametrize(
     ("changed", "expected"),
     [
-        ({"axis": "diagonal"}, r"axis is one of \['horizontal', 'vertical'\], got 'diagonal'"),
+        ({"axis": "diagonal"}, r"axis must be one of \['horizontal', 'vertical'\], got 'diagonal'"),
         ({"fov_deg": 180.0}, "between 0 and 180 degrees, got 180"),
         ({"height": 0}, "at least 1 pixel, got 0 and 6"),
     ],
@@ -185,9 +185,12 @@ def test_a_quarter_turn_about_each_axis(axis, moves, to):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"layout": "xyzw"}, r"layout is one of \['matrix', 'xyz_xyzw', 'xyz_wxyz'\]"),
+        ({"layout": "xyzw"}, r"layout must be one of \['matrix', 'xyz_xyzw', 'xyz_wxyz'\]"),
         ({"direction": "cam2world"}, r"\['camera_to_world', 'world_to_camera'\], got 'cam2world'"),
-        ({"axes": "blender"}, r"axes is one of \['opencv', 'opengl', 'ned', 'x_forward_z_up'\]"),
+        (
+            {"axes": "blender"},
+            r"axes must be one of \['opencv', 'opengl', 'ned', 'x_forward_z_up'\]",
+        ),
         ({"layout": "xyz_xyzw"}, r"pose must be \[\*B, 7\], got \[4, 4\]"),
     ],
 )

@@ -49,12 +49,12 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
         (lambda: AdaptDepth("ray_length"), "needs K"),
         (lambda: AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
         (lambda: AdaptPose(axes="gl"), r"'x_forward_z_up'\], got 'gl'"),
-        (lambda: AdaptPose(layout="rpy"), "layout is one of"),
-        (lambda: AdaptPose(direction="inverse"), "direction is one of"),
+        (lambda: AdaptPose(layout="rpy"), "layout must be one of"),
+        (lambda: AdaptPose(direction="inverse"), "direction must be one of"),
         (lambda: AdaptPose(in_keys=POSE), "reads and writes"),
         (lambda: AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
         (lambda: AdaptFlow(direction="forward", grid="current", out_keys="flow"), "second pass"),
-        (lambda: InstanceIds([3, 1, 3]), r"names each body once, got \[3, 1, 3\]"),
+        (lambda: InstanceIds([3, 1, 3]), r"must name each body once, got \[3, 1, 3\]"),
     ],
 )
 def test_options_are_checked(make, expected):

@@ -110,9 +110,9 @@ def test_spec_of_depth_is_bounded():
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"range_m": 0.0}, "range_m is a positive"),
-        ({"range_m": math.inf}, "range_m is a positive"),
-        ({"missing": 1.5}, r"missing is the value in \[0, 1\]"),
+        ({"range_m": 0.0}, "range_m must be a positive"),
+        ({"range_m": math.inf}, "range_m must be a positive"),
+        ({"missing": 1.5}, r"missing must be in \[0, 1\]"),
     ],
 )
 def test_depth_refuses(options, expected):

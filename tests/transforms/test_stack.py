@@ -240,7 +240,7 @@ def test_a_second_pass_gives_the_same():
     [
         ({"depth_sigma": 0.1}, "unknown option of noise: 'depth_sigma', did you mean 'depth_si"),
         ({"flow_sigma_px": 0.1}, "unknown option of noise: 'flow_sigma_px'"),
-        ({"drift_m": -0.1}, "drift_m is a number of at least 0, got -0.1"),
+        ({"drift_m": -0.1}, "drift_m must be a finite number of at least 0, got -0.1"),
     ],
 )
 def test_options_of_noise_are_checked_whether_or_not_they_are_used(noise, expected):
