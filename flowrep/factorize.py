@@ -61,7 +61,7 @@ def factorize_recording(settings: dict[str, Any]) -> int:
     stream = open_stream(settings)
     flow_source = open_flow_source(settings, stream)
     if settings["resume"] and not isinstance(stream, Recording):
-        raise UsageError("a camera can't be resumed: what it saw is gone")
+        raise UsageError("a job from a camera can't be resumed: its frames are not kept")
     for note in stream.notes:
         print(f"note: {note}")
     folder = OutputFolder(settings["output"], as_settings(settings), resume=settings["resume"])
@@ -76,7 +76,7 @@ def factorize_recording(settings: dict[str, Any]) -> int:
         return 130
     if not job.done:
         folder.discard_if_empty()
-        raise SequenceError(settings["input"], "has no two frames in a row")
+        raise SequenceError(settings["input"], "has no two consecutive frames")
     folder.finish(job.summary())
     warning = "warning: " if diagnosis.suspects else ""
     print(f"{warning}{diagnosis.words}")
@@ -118,8 +118,8 @@ def open_flow_source(settings: dict[str, Any], stream: Stream) -> FlowSource:
     if options.pop("source") == "exact":
         if not stream.has_flow:
             raise UsageError(
-                f"flow=exact: {settings['input']} brings no flow on the current frame's grid; "
-                "use flow=estimated, or where the format has it format.backwards=true"
+                f"flow=exact: {settings['input']} has no flow on the current frame's grid; "
+                "use flow=estimated, or format.backwards=true if the format has it"
             )
         return recorded_flow
     estimator = EstimatedFlow(**options).estimator

@@ -139,7 +139,9 @@ def algorithm_class(section: Mapping[str, Any], trust: str | None) -> Any:
             f"algorithm._target_={target} can't be imported: {error}; is its folder in PYTHONPATH?"
         ) from None
     if not (isinstance(found, type) and issubclass(found, Algorithm)):
-        raise UsageError(f"algorithm._target_={target} is no subclass of flowrep.agent.Algorithm")
+        raise UsageError(
+            f"algorithm._target_={target} is not a subclass of flowrep.agent.Algorithm"
+        )
     if target not in ALGORITHMS:
         _check_options(section, found.options())
     return found

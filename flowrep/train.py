@@ -130,7 +130,7 @@ def carry_out(config: Config, folder: RunFolder) -> float:
     training.env.close()
     if stop:
         print(
-            f"\nstopped after {training.frames} frames; all is saved. Continue with\n"
+            f"\nstopped after {training.frames} frames; the run is saved. Continue with\n"
             f"  {how_to_go_on}"
         )
         sys.exit(stop.exit_code)

@@ -241,7 +241,7 @@ def test_a_first_frame_that_is_broken_leaves_nothing_at_all(moments, tmp_path):
 
 
 def test_one_frame_alone_has_no_flow(moments, tmp_path):
-    with pytest.raises(SequenceError, match="has no two frames in a row"):
+    with pytest.raises(SequenceError, match="has no two consecutive frames"):
         factorize(tmp_path, "start=2", "video=false")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 

@@ -56,8 +56,8 @@ def test_a_class_that_was_vouched_for_is_found(own_module):
 @pytest.mark.parametrize(
     ("section", "says"),
     [
-        ({"_target_": "os.system"}, "algorithm._target_=os.system is no subclass of"),
-        ({"_target_": "collections.OrderedDict"}, "is no subclass of flowrep.agent.Algorithm"),
+        ({"_target_": "os.system"}, "algorithm._target_=os.system is not a subclass of"),
+        ({"_target_": "collections.OrderedDict"}, "is not a subclass of flowrep.agent.Algorithm"),
         ({"_target_": "nowhere.Learner"}, "can't be imported: No module named 'nowhere'; is its"),
         ({"_target_": "someones.Nobody", "patience": 3}, "can't be imported: "),
         ({"_target_": "someones.Learner"}, "'algorithm.patience' needs a value"),

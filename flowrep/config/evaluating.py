@@ -82,7 +82,7 @@ class EvaluateConfig(Section):
     def _fits_own_policies(self, name: str) -> None:
         """Checks that the scene and the observations of a policy are given."""
         if self.run is not None:
-            raise broken_rule("run", f"and policy={name} are agents of two kinds: give one of them")
+            raise broken_rule("run", f"and policy={name} can't be combined: give one of them")
         for key, example in (("scene", "straight_road"), ("representations", "[ego,obj]")):
             if getattr(self, key) is None:
                 raise broken_rule(key, f"is needed for policy={name}: {key}={example}")

@@ -44,12 +44,12 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
     if saved.get("flowrep") != expected["flowrep"]:
         raise CheckpointError(
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
-            "install that version, or start the run anew"
+            "install that version, or start a new run"
         )
     for place, there, here in differences(saved, expected):
         raise CheckpointError(
             f"{path} belongs to a run with {place}={there}, the config.yaml of its folder says "
-            f"{place}={here}: put back the file that was there, or start a run of its own"
+            f"{place}={here}: restore the file that was there, or start a new run"
         )
 
 

@@ -101,7 +101,7 @@ class RunFolder:
             how = f"continue it with resume={self.path}, or " if found[0] == config else ""
             raise RunFolderError(
                 f"'{self.path}' holds a run already ({found[0].name}): {how}give the new one a "
-                "folder of its own by hydra.run.dir="
+                "folder of its own with hydra.run.dir="
             )
 
     def held(self, doing: str) -> AbstractContextManager[None]:
@@ -150,7 +150,7 @@ class RunFolder:
             RunFolderError: the file is damaged; names what is missing.
         """
         path = self.path / "config.yaml"
-        remedy = "put back the file that the run was started with"
+        remedy = "restore the file that the run was started with"
         try:
             config = yaml.safe_load(path.read_text(encoding="utf-8"))
         except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -257,8 +257,8 @@ def _check_cell(
     try:
         read(row[column])
     except KeyError:
-        raise TableError(f"{path} has no column {column}; put back what was there") from None
+        raise TableError(f"{path} has no column {column}; restore the column") from None
     except ValueError:
         raise TableError(
-            f"{path}, line {line}: {column} can't be {row[column]!r}; mend or delete the line"
+            f"{path}, line {line}: {column} can't be {row[column]!r}; correct or delete the line"
         ) from None

@@ -37,7 +37,7 @@ def read_rows(path: Path, columns: Sequence[str] | None = None) -> list[dict[str
             if len(cells) != len(names):
                 raise TableError(
                     f"{path}, line {lines.line_num}: {len(cells)} cells in a table of "
-                    f"{len(names)} columns; mend or delete the line"
+                    f"{len(names)} columns; correct or delete the line"
                 )
             rows.append(dict(zip(names, cells)))
     except (UnicodeDecodeError, csv.Error) as error:

@@ -161,7 +161,7 @@ def _is_of_a_run(config: Path) -> bool:
 def _read(path: Path) -> Run:
     folder = RunFolder.existing(path)
     run = Run(path, folder.read_config(), folder.read_episodes(), folder.read_metrics())
-    remedy = "put back the file that the run was started with"
+    remedy = "restore the file that the run was started with"
     try:
         wrong = [
             f"{key} is {value!r}" for key, value, kind in _parts(run) if type(value) not in kind
@@ -179,8 +179,8 @@ def _read(path: Path) -> Run:
             float(row.get("success") or 0)
         except ValueError:
             raise TableError(
-                f"{folder.metrics_path}, line {number}: success can't be {row['success']!r}; mend "
-                "or delete the line"
+                f"{folder.metrics_path}, line {number}: success can't be {row['success']!r}; "
+                "correct or delete the line"
             ) from None
     return run
 

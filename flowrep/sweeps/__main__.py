@@ -87,7 +87,7 @@ def started_or_found(folder: RunFolder, request: Mapping[str, Any]) -> dict[str,
     for place, there, here in differences(definition(stored), definition(asked)):
         raise RunFolderError(
             f"'{folder.path}' holds a run with {place}={there}, the sweep asks for {here}: give "
-            "the sweep another folder by hydra.sweep.dir=, or move that run away"
+            "the sweep another folder with hydra.sweep.dir=, or move that run away"
         )
     return stored | request["machine"] | trust | {"resume": str(folder.path)}
 

@@ -61,7 +61,7 @@ def plan_of(config_name: str, arguments: Sequence[str]) -> Plan:
         parsed = preview.with_sweepers(preview.parse(args.overrides))
         if any(override.key_or_group == "resume" for override in parsed):
             raise UsageError(
-                "resume= continues one run; a sweep goes on by its own command and "
+                "resume= continues one run; continue a sweep with its own command and "
                 "hydra.sweep.dir=<its folder>"
             )
         hydra = preview.hydra_config(parsed)
@@ -77,7 +77,7 @@ def plan_of(config_name: str, arguments: Sequence[str]) -> Plan:
     names = tuple(run_of_sweep(job) for job in jobs)
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise UsageError(f"two runs would have one folder, {twice[0]}: does a value stand twice?")
+        raise UsageError(f"two runs would share the folder {twice[0]}: is a value repeated?")
     return Plan(folder, len(names), names, options)
 
 

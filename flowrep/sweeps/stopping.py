@@ -47,7 +47,7 @@ class SweepStop:
         self.received = signal.Signals(number)
         self._mark.touch()
         self._give_back()
-        print("stopping: each run saves; once more to end at once", file=sys.stderr)
+        print("stopping once each run has saved; repeat to end at once", file=sys.stderr)
 
     def _give_back(self) -> None:
         for each, handler in self._previous.items():

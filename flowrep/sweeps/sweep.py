@@ -78,6 +78,6 @@ def sum_up(
     for standing in failed:
         lines += [f"  {said(standing)}", f"    log: {plan.folder / standing.name / LOG}"]
     if again:
-        lines += ["Go on with what is left by", f"  {again}"]
+        lines += ["Continue the remaining runs with", f"  {again}"]
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True, markup=False)

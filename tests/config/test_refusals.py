@@ -271,7 +271,7 @@ def test_everything_that_is_wrong_is_said_at_once():
         ),
         (
             "run=here policy=mine.py:make scene=s_turn representations=[ego]",
-            "run and policy=mine.py:make are agents of two kinds: give one of them",
+            "run and policy=mine.py:make can't be combined: give one of them",
         ),
         ("run=here output=out", "output is for a policy of your own; run= has it in its config"),
         ("speed=[]", "speed should be low, normal or high, or a list of such values, not []"),

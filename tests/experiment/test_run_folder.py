@@ -107,7 +107,7 @@ def test_config_comes_back_as_written(tmp_path):
 )
 def test_a_damaged_config_is_named(tmp_path, text, says):
     (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(RunFolderError, match=rf"config\.yaml {says}.*; put back the file"):
+    with pytest.raises(RunFolderError, match=rf"config\.yaml {says}.*; restore the file"):
         RunFolder.existing(tmp_path).read_config()
 
 

@@ -79,6 +79,6 @@ def test_the_summary_says_what_failed_where_its_log_is_and_how_to_go_on(tmp_path
         "1 failed:",
         "  b: failed: error: [x]",
         f"    log: {tmp_path}/b/job.log",
-        "Go on with what is left by",
+        "Continue the remaining runs with",
         "  python -m flowrep.train -m",
     ]

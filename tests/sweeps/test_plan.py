@@ -55,7 +55,7 @@ def test_a_sweepers_own_runs_are_counted_and_found_by_their_logs(tmp_path):
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("-m seed=0,0", "two runs would have one folder, s0"),
+        ("-m seed=0,0", "two runs would share the folder s0"),
         ("-m resume=outputs/a", "resume= continues one run"),
     ],
 )
