@@ -124,7 +124,7 @@ def algorithm_class(section: Mapping[str, Any], trust: str | None) -> Any:
         trust: the full name of a class outside flowrep that may be imported.
 
     Raises:
-        UsageError: the class is not trusted, is no algorithm, or has other options.
+        UsageError: the class is not trusted, is not an algorithm, or has other options.
     """
     target = section["_target_"]
     if target not in ALGORITHMS and target != trust:

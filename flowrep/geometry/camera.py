@@ -25,7 +25,7 @@ def project(points_cam: Tensor, K: Tensor) -> Tensor:
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor.
+        TypeError: an argument is not a float tensor.
 
     >>> K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
     >>> project(torch.tensor([1.0, 2.0, 4.0]), K)
@@ -66,7 +66,7 @@ def unproject(depth: Tensor, K: Tensor) -> Tensor:
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor.
+        TypeError: an argument is not a float tensor.
 
     >>> K = torch.tensor([[2.0, 0.0, 1.0], [0.0, 4.0, 0.5], [0.0, 0.0, 1.0]])
     >>> unproject(torch.tensor([[[8.0, 8.0]]]), K)

@@ -64,7 +64,7 @@ def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor.
+        TypeError: an argument is not a float tensor.
 
     >>> K = torch.tensor([[4.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]])
     >>> z_from_ray_length(torch.full((1, 1, 1), 5.0), K)  # it looks along (0.75, 0, 1)

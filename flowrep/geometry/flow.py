@@ -59,7 +59,7 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor.
+        TypeError: an argument is not a float tensor.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> prev_from_curr = torch.eye(4)
@@ -100,7 +100,7 @@ def rigid_flow(
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor, or `instance` holds no integers.
+        TypeError: an argument is not a float tensor, or `instance` is not an integer tensor.
         RuntimeError: an id in `instance` without a row (raised by torch).
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
@@ -146,7 +146,7 @@ def factorize(
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor.
+        TypeError: an argument is not a float tensor.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> prev_from_curr = torch.eye(4)

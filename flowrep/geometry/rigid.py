@@ -45,7 +45,7 @@ def relative_motion(
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor.
+        TypeError: an argument is not a float tensor.
 
     >>> prev, curr = torch.eye(4), torch.eye(4)
     >>> curr[2, 3] = 0.5  # half a metre forward along the camera's z
@@ -94,7 +94,7 @@ def instance_motion(
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor.
+        TypeError: an argument is not a float tensor.
 
     >>> camera, before, now = torch.eye(4), torch.eye(4), torch.eye(4)
     >>> now[0, 3] = 0.5  # the body moved half a metre along x
@@ -171,7 +171,7 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
 
     Raises:
         ValueError: a shape does not fit.
-        TypeError: an argument is no float tensor.
+        TypeError: an argument is not a float tensor.
 
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])

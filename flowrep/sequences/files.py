@@ -28,7 +28,7 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     try:
         size = path.stat().st_size
         if not path.is_file():
-            raise SequenceError(path, "is no file")
+            raise SequenceError(path, "is not a file")
         if size > limit:
             raise SequenceError(path, f"has {size:,} bytes, more than the {limit:,} expected here")
         data = path.read_bytes()
@@ -44,7 +44,7 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     try:
         text = read_bytes(path, MAX_TEXT_BYTES).decode("utf-8")
     except UnicodeDecodeError:
-        raise SequenceError(path, "is no text") from None
+        raise SequenceError(path, "is not text") from None
     lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
@@ -87,7 +87,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(read_bytes(path, MAX_TEXT_BYTES))
     except (ValueError, RecursionError) as error:
-        raise SequenceError(path, f"is no JSON ({str(error).splitlines()[0]})") from None
+        raise SequenceError(path, f"is not JSON ({str(error).splitlines()[0]})") from None
     if not isinstance(value, dict):
         raise SequenceError(path, f"should be a JSON object, not {type(value).__name__}")
     return value
@@ -136,7 +136,7 @@ def _number(path: Path, line: int, word: str) -> float:
     try:
         return float(word)
     except ValueError:
-        raise SequenceError(path, f"line {line}: {word[:40]!r} is no number") from None
+        raise SequenceError(path, f"line {line}: {word[:40]!r} is not a number") from None
 
 
 def finite_number(path: Path, name: str, value: Any) -> float:
@@ -147,5 +147,5 @@ def finite_number(path: Path, name: str, value: Any) -> float:
 
 
 def _reason(error: OSError, what: str = "file") -> str:
-    known = {FileNotFoundError: f"no such {what}", NotADirectoryError: "is no folder"}
+    known = {FileNotFoundError: f"no such {what}", NotADirectoryError: "is not a folder"}
     return known.get(type(error), (error.strerror or str(error)).lower())

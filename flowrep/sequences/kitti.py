@@ -96,7 +96,7 @@ class Kitti(Recording):
         text = {number: line.split() for number, line in read_lines(mapping)}
         for number, words in text.items():
             if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > _MAX_DIGITS:
-                raise SequenceError(mapping, f"line {number} is no date, recording and frame")
+                raise SequenceError(mapping, f"line {number} is not a date, recording and frame")
             drive = path_inside(self.raw_data, f"{words[0]}/{words[1]}", mapping)
             found[number - 1] = drive / "oxts" / "data", int(words[2])
         return found

@@ -31,7 +31,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     """Returns a colour picture `[H, W, 3]`; a grey one has three equal channels.
 
     Raises:
-        SequenceError: the file is no picture, is damaged, or doesn't have 8 bits per channel.
+        SequenceError: the file is not a picture, is damaged, or doesn't have 8 bits per channel.
     """
     picture = _decode(path, cv2.IMREAD_UNCHANGED)
     if picture.dtype != np.uint8:

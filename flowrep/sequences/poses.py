@@ -55,7 +55,7 @@ def read_pose_lines(path: Path, layout: PoseLayout, frames: int) -> NDArray[np.f
 def check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
     """Raises SequenceError if a time is not a number, or earlier than the one before it."""
     if not np.isfinite(times_s).all():
-        raise SequenceError(path, "holds a timestamp that is no number")
+        raise SequenceError(path, "holds a timestamp that is not a number")
     backwards = np.flatnonzero(np.diff(times_s) < 0)
     if len(backwards):
         before, after = times_s[backwards[0]], times_s[backwards[0] + 1]

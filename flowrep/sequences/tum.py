@@ -101,7 +101,9 @@ class Tum(Recording):
                 times.append(float(words[0]))
                 files.append(path_inside(self.folder, words[1], path))
             except (ValueError, IndexError):
-                raise SequenceError(path, f"line {number} is no timestamp and file name") from None
+                raise SequenceError(
+                    path, f"line {number} is not a timestamp and file name"
+                ) from None
         if not times:
             raise SequenceError(path, "names no pictures")
         check_ascending(path, np.array(times))

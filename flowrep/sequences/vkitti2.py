@@ -75,7 +75,7 @@ class VKitti2(Recording):
     def _of_camera(self, path: Path, columns: int) -> dict[int, NDArray[np.float64]]:
         table = read_table(path, [columns], header=True)
         if not np.isfinite(table[:, :2]).all():
-            raise SequenceError(path, "holds a frame or camera that is no number")
+            raise SequenceError(path, "holds a frame or camera that is not a number")
         rows = table[table[:, 1] == self.camera]
         if not len(rows):
             raise SequenceError(path, f"says nothing of camera {self.camera}")

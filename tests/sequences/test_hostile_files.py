@@ -199,7 +199,7 @@ NAN_ROTATION = "nan nan nan 0 nan nan nan 0 nan nan nan 0 0 0 0 1"
         (["1 0 0 0 0 1 0 0 0 0 1 0 5 6 7 1"] * 3, "last row"),
         (["1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"] * 2, "has 2 poses for 3 frames"),
         (["1 0 0"] * 3, "line 1 has 3 numbers, expected 12 or 16"),
-        (["1 0 0 0 0 1 0 0 0 0 1 0", "one"], "line 2: 'one' is no number"),
+        (["1 0 0 0 0 1 0 0 0 0 1 0", "one"], "line 2: 'one' is not a number"),
     ],
 )
 def test_poses(lines, says, tmp_path):
@@ -231,9 +231,9 @@ def test_a_quaternion_that_is_none(tmp_path):
         ("rgb.txt", ["1.0 " + 5000 * "9"], "names a file by 5,000 characters"),
         ("rgb.txt", ["2.0 rgb/b.png", "1.0 rgb/a.png"], "timestamps go backwards: 1.000000"),
         ("groundtruth.txt", ["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], "timestamps go backwards"),
-        ("groundtruth.txt", ["nan 0 0 0 0 0 0 1"], "a timestamp that is no number"),
+        ("groundtruth.txt", ["nan 0 0 0 0 0 0 1"], "a timestamp that is not a number"),
         ("groundtruth.txt", ["1.0 0 0 0"], "line 1 has 4 numbers, expected 8"),
-        ("depth.txt", ["1.0"], "line 1 is no timestamp and file name"),
+        ("depth.txt", ["1.0"], "line 1 is not a timestamp and file name"),
         ("depth.txt", ["# none"], "names no pictures"),
     ],
 )
@@ -246,7 +246,7 @@ def test_tum_index_files(name, lines, says, tmp_path):
 def test_binary_where_text_should_be(tmp_path):
     synthetic.write_tum(tmp_path)
     (tmp_path / "rgb.txt").write_bytes(b"\xff\xfe\x00\x80" * 9)
-    assert "is no text" in refusal(lambda: Tum(tmp_path), "rgb.txt")
+    assert "is not text" in refusal(lambda: Tum(tmp_path), "rgb.txt")
 
 
 @pytest.mark.parametrize(
@@ -269,8 +269,8 @@ def test_intrinsics(change, says, tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "says"),
-    [("{", "is no JSON"), ("[]", "should be a JSON object"), ("{}", "lacks width, height, fx"),
-     ("[" * 100_000, "is no JSON")],
+    [("{", "is not JSON"), ("[]", "should be a JSON object"), ("{}", "lacks width, height, fx"),
+     ("[" * 100_000, "is not JSON")],
     ids=["half", "list", "empty", "deep"],
 )  # fmt: skip
 def test_intrinsics_that_are_none(content, says, tmp_path):
@@ -333,7 +333,7 @@ def test_a_kitti_frame_number_without_end(tmp_path):
     path = tmp_path / "train_mapping.txt"
     path.write_text(path.read_text().replace("0000000059", 5000 * "9"))
     said = refusal(lambda: open_kitti(tmp_path), "train_mapping.txt")
-    assert "line 1 is no date, recording and frame" in said
+    assert "line 1 is not a date, recording and frame" in said
 
 
 def test_kitti_flow_png_of_another_kind(tmp_path):
