@@ -83,6 +83,27 @@ def load_checkpoint(
         CheckpointError: if the file is missing, damaged or not a checkpoint of this version.
     """
     path = Path(path)
+    while True:
+        before = _version(path)
+        try:
+            return _read(path, parts)
+        except CheckpointError:
+            # safetensors opens the file twice: a run that saved in between is no damage
+            if _version(path) == before:
+                raise
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """Returns what changes whenever the file is replaced; None without a file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
+
+
+def _read(path: Path, parts: Collection[str] | None) -> dict[str, Any]:
+    """Reads the file once, see `load_checkpoint`."""
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}: name a run folder that has saved one")
     try:

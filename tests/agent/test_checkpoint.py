@@ -8,6 +8,7 @@ import zlib
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
@@ -209,6 +210,24 @@ def test_a_folder_that_cannot_be_written_is_one_error(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(CheckpointError, match=r"cannot write the checkpoint .*file/c"):
         save_checkpoint(tmp_path / "file" / "c", {"a": 1})
+
+
+def test_a_checkpoint_replaced_while_it_is_read_is_read_again(tmp_path, monkeypatch):
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, {"a": torch.zeros(3)})
+    module = sys.modules[load_checkpoint.__module__]
+    opened = []
+
+    def open_then_replace(*args, **kwargs):
+        opened.append(args)
+        if len(opened) == 1:
+            save_checkpoint(path, {"a": torch.ones(3)})
+            raise ValueError("half of each version")
+        return safe_open(*args, **kwargs)
+
+    monkeypatch.setattr(module, "safe_open", open_then_replace)
+    assert load_checkpoint(path)["a"].tolist() == [1.0, 1.0, 1.0]
+    assert len(opened) == 2
 
 
 def test_a_writer_killed_at_any_instant_leaves_a_whole_checkpoint(tmp_path):
