@@ -9,13 +9,13 @@ PAGE = (Path(__file__).parents[1] / "docs" / "upstream.md").read_text("utf-8")
 BUGS = dict(re.findall(r"^## (.*?)$.*?```python\n(.*?)```", PAGE, re.DOTALL | re.MULTILINE))
 
 
-def test_each_bug_has_a_reproduction_that_can_fail():
+def test_each_bug_has_a_reproduction():
     titles = re.findall(r"^## (.*)$", PAGE, re.MULTILINE)
     assert titles
     assert list(BUGS) == titles
-    assert all("assert " in code for code in BUGS.values())
 
 
 @pytest.mark.parametrize("title", BUGS)
 def test_the_bug_is_still_there(title):
+    assert "assert " in BUGS[title]  # what is run below can fail
     exec(compile(BUGS[title], title, "exec"), {"__name__": "bug"})

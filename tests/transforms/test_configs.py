@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -108,17 +106,3 @@ def test_composed_by_a_project_s_own_config_beside_torchrl_s(tmp_path):
     raw, split = hydra.utils.instantiate(config.stack)
     assert (raw.outputs, raw.factors) == (("raw", "valid"), {"raw": 0.5})
     assert (split.outputs, split.in_keys[-1]) == (("obj",), ("sensor", "K"))
-
-
-@pytest.mark.slow
-def test_no_config_of_torchrl_s_is_replaced():
-    code = (
-        "import torchrl.trainers.algorithms.configs\n"
-        "from hydra.core.config_store import ConfigStore\n"
-        "before = set(ConfigStore.instance().list('transform'))\n"
-        "from flowrep.transforms import configs\n"
-        "print(sorted(before & {name + '.yaml' for name in configs.CONFIGS}))"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.strip() == "[]"
