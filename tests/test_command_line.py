@@ -26,7 +26,7 @@ from flowrep.train import carry_out
         ("-m representations=[ego],[raw,eggo]", ["unknown representations 'eggo'"]),
         ("sed=3", ["unknown key 'sed'", "did you mean 'seed'", "total_frames", "preset"]),
         ("scene=straight", ["unknown scene 'straight'", "straight_road"]),
-        ("preset=desktop", ["unknown preset 'desktop'", "laptop, laptop_long, paper"]),
+        ("preset=desktop", ["unknown preset 'desktop'", "laptop, laptop_long, overnight, paper"]),
         ("algorithm=dqm", ["unknown algorithm 'dqm'", "dsac"]),
         ("representations.ego.scal=2", ["unknown key 'scal' of 'representations.ego'", "'scale'"]),
         ("scene.camera.heigth_px=84", ["unknown key 'heigth_px' of 'scene.camera'", "height_px"]),

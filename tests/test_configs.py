@@ -80,6 +80,39 @@ def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():
     assert composed("preset=laptop", "algorithm.n_steps=2")["algorithm"]["n_steps"] == 2
 
 
+def test_the_longer_presets_change_laptop_in_the_documented_keys():
+    laptop = flat(composed("preset=laptop"))
+    changes = {
+        "laptop_long": {
+            "total_frames": 200_000,
+            "checkpoint_every_frames": 50_000,
+            "evaluation.every_frames": 50_000,
+            "algorithm.replay_capacity": 100_000,
+            "algorithm.initial_alpha": 0.3,
+            "algorithm.alpha_rate_factor": 4.0,
+        },
+        "overnight": {
+            "total_frames": 1_000_000,
+            "checkpoint_every_frames": 50_000,
+            "evaluation.every_frames": 100_000,
+            "scene.camera.height_px": 84,
+            "scene.camera.width_px": 84,
+            "algorithm.frames_per_update": 32,
+        },
+    }
+    for preset, expected in changes.items():
+        config = flat(composed(f"preset={preset}"))
+        assert {k: v for k, v in config.items() if v != laptop.get(k)} == expected
+
+
+def flat(config, prefix=""):
+    leaves = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        leaves |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return leaves
+
+
 def test_run_folders_are_named_by_scene_representations_and_seed():
     register_resolvers()
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
