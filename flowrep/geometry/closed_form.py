@@ -46,8 +46,8 @@ def camera_planes(
     `dtypes` are those of the result and of the computation.
     """
     dtype, compute = dtypes
-    K, dt, known = _known_camera(K.to(compute), dt)
-    coefficients = _coefficients(K, prev_from_curr.to(compute), known)
+    K, dt, known = known_camera(K.to(compute), dt)
+    coefficients = motion_coefficients(K, prev_from_curr.to(compute), known)
     by_motion = coefficients[..., None, None, :]  # [*B, 1, 1, 12]
     axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = by_motion.unbind(-1)
     x, y = centred_pixels(depth.shape[-2], depth.shape[-1], K)
@@ -55,39 +55,12 @@ def camera_planes(
     x, *columns = _table(x, axx * x, ayx * x, azx * x)
     y, *rows = _table(y, axy * y + ax, ayy * y + ay, azy * y + az)
     q_far = [column + row for column, row in zip(columns, rows)]
-    return _planes(depth, x, y, q_far, e, dt, dtype)
+    if isinstance(dt, Tensor):
+        dt = dt[..., None, None]
+    return flow_planes(depth.squeeze(-3), x, y, q_far, e, dt, dtype)
 
 
-def body_planes(
-    depth: Tensor,
-    instance: Tensor,
-    K: Tensor,
-    prev_from_curr_by_instance: Tensor,
-    dt: float | Tensor,
-    dtypes: tuple[torch.dtype, torch.dtype],
-) -> Planes:
-    """Returns the flow planes of one motion per instance; `depth` and `instance` share a batch."""
-    dtype, compute = dtypes
-    K, dt, known = _known_camera(K.to(compute), dt)
-    motions = prev_from_curr_by_instance.to(compute)
-    *batch, _, height, width = depth.shape
-    row_of_pixel = instance.long().flatten(-3)  # [*B, H * W]
-    by_instance = _coefficients(K.unsqueeze(-3), motions, known.unsqueeze(-1))  # [*B, N, 12]
-    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = (
-        rows.expand(*batch, -1).gather(-1, row_of_pixel).unflatten(-1, (height, width))
-        for rows in by_instance.unbind(-1)
-    )
-    x, y = centred_pixels(height, width, K)
-    # The same operations in the same order as camera_planes, for bitwise equal results.
-    q_far = [
-        axx * x + (axy * y + ax),
-        ayx * x + (ayy * y + ay),
-        azx * x + (azy * y + az),
-    ]
-    return _planes(depth, x, y, q_far, e, dt, dtype)
-
-
-def _known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor, Tensor]:
+def known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor, Tensor]:
     """Returns K and dt with invalid values replaced, and where they were valid, `[*B]`.
 
     They are replaced, not only masked, to keep nan out of gradients.
@@ -106,7 +79,7 @@ def _within_bounds(tensor: Tensor, dims: tuple[int, ...]) -> Tensor:
     return (tensor.abs() <= LARGEST).all(dims)  # nan compares False
 
 
-def _coefficients(K: Tensor, prev_from_curr: Tensor, known: Tensor) -> Tensor:
+def motion_coefficients(K: Tensor, prev_from_curr: Tensor, known: Tensor) -> Tensor:
     """Returns A (row by row) and e, `[*B, 12]`.
 
     Where an input isn't known, they place every point behind the previous camera, so that no pixel
@@ -143,7 +116,7 @@ def _table(*entries: Tensor) -> tuple[Tensor, ...]:
     return torch.stack(torch.broadcast_tensors(*entries)).unbind()
 
 
-def _planes(
+def flow_planes(
     depth: Tensor,
     x: Tensor,
     y: Tensor,
@@ -152,18 +125,21 @@ def _planes(
     dt: float | Tensor,
     dtype: torch.dtype,
 ) -> Planes:
-    """Returns u, v and valid, from depth `[*B, 1, H, W]`; q is `q_far` at infinity."""
-    depth = depth.squeeze(-3).to(x.dtype)
+    """Returns u, v and valid of depth's shape; q is `q_far` at infinity.
+
+    Planes `[*B, H, W]` or a list of pixels, with which all other arguments broadcast.
+    """
+    depth = depth.to(x.dtype)
     has_depth = depth >= SMALLEST  # nan compares False
-    # Masked before and after each division, to keep nan out of gradients.
-    inverse_depth = torch.where(has_depth, depth, 1.0).reciprocal()  # 0 at infinity
+    # Masked before each division too, to keep nan out of gradients.
+    has_gradient = any(tensor.requires_grad for tensor in (depth, x, y, *q_far, *e))
+    is_masked = has_gradient or torch.compiler.is_compiling()
+    inverse_depth = (torch.where(has_depth, depth, 1.0) if is_masked else depth).reciprocal()
     qx, qy, qz = (far + near * inverse_depth for far, near in zip(q_far, e))
     z_ratio = 1.0 + qz  # depth in the previous camera over depth in the current one
     in_front = has_depth & (z_ratio > MIN_DEPTH_RATIO)
-    per_z = torch.where(in_front, z_ratio, 1.0).reciprocal()
-    if isinstance(dt, Tensor):
-        per_z = per_z / dt[..., None, None]
-    elif dt != 1.0:
+    per_z = (torch.where(in_front, z_ratio, 1.0) if is_masked else z_ratio).reciprocal()
+    if isinstance(dt, Tensor) or dt != 1.0:
         per_z = per_z / dt
     u = ((x * qz - qx) * per_z).to(dtype)
     v = ((y * qz - qy) * per_z).to(dtype)

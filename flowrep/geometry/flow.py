@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from flowrep.geometry import closed_form
+from flowrep.geometry.bodies import body_planes
 from flowrep.geometry.checks import broadcast_batch, check_is_tensor, check_shape, check_trailing
 
 
@@ -101,7 +102,7 @@ def rigid_flow(
     Raises:
         ValueError: a shape does not fit.
         TypeError: an argument is not a float tensor, or `instance` is not an integer tensor.
-        RuntimeError: an id in `instance` without a row (raised by torch).
+        RuntimeError: an id in `instance` without a row.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> motions = torch.eye(4).repeat(2, 1, 1)
@@ -121,7 +122,7 @@ def rigid_flow(
     batch = broadcast_batch(others=batch, instance=instance.shape[:-3])
     dtypes = _dtypes(depth, K, motions)
     depth, instance = (image.expand(*batch, -1, -1, -1) for image in (depth, instance))
-    u, v, valid = closed_form.body_planes(depth, instance, K, motions, dt, dtypes)
+    u, v, valid = body_planes(depth, instance, K, motions, dt, dtypes)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
