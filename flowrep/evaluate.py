@@ -185,7 +185,8 @@ def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> No
         agents=len(subjects),
     )
     config = subjects[0].config
-    make_pool = partial(pool_from_config, config, comparison.rides)
+    num_envs = min(comparison.rides, config["num_envs"])
+    make_pool = partial(pool_from_config, config, num_envs)
     agents = [subject.agent for subject in subjects]
     arena = Arena(load_scene(config["scene"]), agents, rates, make_pool)
     try:

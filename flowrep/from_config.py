@@ -83,8 +83,7 @@ def env_from_config(config: Config, **changes: Any) -> EnvBase:
 def pool_from_config(
     config: Config, num_envs: int, scene: Scene, sensors: Sequence[str]
 ) -> EnvPool:
-    """Returns environments for evaluation, at most `num_envs`."""
-    num_envs = min(num_envs, config["num_envs"])
+    """Returns environments for evaluation."""
     workers = choose_workers(config["num_workers"], config["num_envs"])
     return EnvPool(
         scene,

@@ -62,6 +62,7 @@ from flowrep.viz.film import record_episode
 
 OF_THE_MACHINE = ("device", "num_workers", "trust")  # from the command line that resumes a run
 FINAL_POLICIES = ("greedy", "sampled")  # the agent's, evaluated beside the baselines
+EVALUATION_ENVS = 96  # side by side at least: more make a step of each cheaper
 EVALUATION_SEED = 1_000_000  # of the first episode evaluated during training
 FINAL_SEED = 1_500_000  # not the episodes evaluated during training
 
@@ -223,7 +224,8 @@ def run_comparison(
 ) -> None:
     """Runs the episodes of the agent in training, in environments made for them."""
     agent = Agent.from_config(training.agent.policy, config, training.agent.device)
-    make_pool = partial(pool_from_config, config, comparison.rides)
+    num_envs = min(comparison.rides, max(EVALUATION_ENVS, config["num_envs"]))
+    make_pool = partial(pool_from_config, config, num_envs)
     arena = Arena(load_scene(config["scene"]), [agent], comparison.fps, make_pool)
     try:
         comparison.run(arena, lambda: bool(stop))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -13,6 +14,7 @@ from tensordict.nn import (
     TensorDictModule,
 )
 from torch import Tensor, nn
+from torch.compiler import is_exporting
 from torchrl.data import Composite, TensorSpec
 
 from flowrep.agent.action import DiscreteActions
@@ -20,6 +22,9 @@ from flowrep.agent.encoder import Encoder
 from flowrep.agent.heads import Head
 from flowrep.agent.observation import MapCodec, map_codecs
 from flowrep.agent.precision import compute_dtype
+
+# Products of fewer rows are rounded differently, and actions would depend on the size of the batch.
+SMALLEST_BATCH = 8
 
 
 class MapNetwork(nn.Module):
@@ -72,7 +77,10 @@ class PackedNetwork(nn.Module):
 
 
 class PolicyNetwork(nn.Module):
-    """Maps raw maps `[*B, C, H, W]`, one argument each, to one number per action `[*B, n]`."""
+    """Maps raw maps `[*B, C, H, W]`, one argument each, to one number per action `[*B, n]`.
+
+    On a CPU the numbers of an observation are the same, bit for bit, in a batch of any size.
+    """
 
     def __init__(self, codecs: Sequence[MapCodec], network: MapNetwork) -> None:
         super().__init__()
@@ -84,8 +92,19 @@ class PolicyNetwork(nn.Module):
         for codec, x in zip(self.codecs, maps):
             batch = codec.batch_shape(x)
             packed = codec.store(x.reshape(-1, *x.shape[-3:]))
-            images.append(codec.decode(packed))
-        return self.network(images).reshape(*batch, -1)
+            images.append(codec.decode(packed if is_exporting() else _padded(packed)))
+        outputs = self.network(images)
+        if not is_exporting():
+            outputs = outputs[: math.prod(batch)]
+        return outputs.reshape(*batch, -1)
+
+
+def _padded(packed: Tensor) -> Tensor:
+    """Returns at least `SMALLEST_BATCH` rows, the last one repeated."""
+    missing = SMALLEST_BATCH - len(packed)
+    if missing <= 0 or not len(packed):
+        return packed
+    return torch.cat([packed, packed[-1:].expand(missing, *packed.shape[1:])])
 
 
 def acting_network(

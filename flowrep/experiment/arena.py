@@ -159,7 +159,8 @@ class Arena:
             for is_greedy, choose in ((True, _likeliest), (False, _drawn)):
                 rows = [i for i, s in enumerate(order) if _job(rides, s).is_greedy is is_greedy]
                 if rows:
-                    chosen = choose(policy, maps[rows], [rides[order[row]] for row in rows])
+                    part = maps if len(rows) == len(order) else maps[rows]
+                    chosen = choose(policy, part, [rides[order[row]] for row in rows])
                     actions |= zip((order[row] for row in rows), chosen)
         return actions
 

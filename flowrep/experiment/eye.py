@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.transforms import Transform
 
 from flowrep.envs.make import sensors_read
 from flowrep.palette import num_classes
@@ -48,32 +49,41 @@ class Eye:
         )
         self.sensors = sensors_read(self._transforms)
         self._device = torch.device(device)
+        # what transforms with a step of their own have written, which the next step needs
+        self._kept = [
+            key
+            for transform in self._transforms.transforms
+            if type(transform)._step is not Transform._step
+            for key in transform.out_keys
+        ]
         self._latest: TensorDictBase | None = None  # [num_envs]
 
     def look(
         self, seen: Mapping[str, NDArray[Any]], begun: Sequence[int], going_on: Sequence[int]
     ) -> TensorDictBase:
-        """Returns the maps of the environments `[*begun, *going_on]`.
+        """Returns the maps of the environments `[*begun, *going_on]`, all computed together.
 
         Args:
             seen: the sensor maps of all environments, `[num_envs, ...]` by sensor.
             begun: environments whose episode has just begun.
             going_on: environments whose previous step was passed to `look` as well.
         """
-        parts = []
-        for rows in (begun, going_on):
-            if not rows:
-                continue
-            sensor = {name: torch.from_numpy(seen[name][rows]) for name in self.sensors}
-            now: TensorDictBase = TensorDict({"sensor": sensor}, [len(rows)]).to(self._device)
-            if rows is begun:
-                now = self._transforms._reset(now.empty(), now)
-            else:
-                assert self._latest is not None
-                now = self._transforms._step(self._latest[rows], now)
-            parts.append(now.exclude("sensor"))
+        rows = [*begun, *going_on]
+        sensor = {name: torch.from_numpy(seen[name][rows]) for name in self.sensors}
+        now: TensorDictBase = TensorDict({"sensor": sensor}, [len(rows)]).to(self._device)
+        if going_on:
+            before = now.empty() if self._latest is None else self._latest[rows]
+            before["_reset"] = torch.arange(len(rows), device=self._device) < len(begun)
+            for transform in self._transforms.transforms:
+                now = transform._step(before, now)
+                # begins anew what it has taken from an earlier episode
+                now = transform._reset_on_native_autoreset(before, now)
+        else:
+            now = self._transforms._reset(now.empty(), now)
+        if self._kept:
+            latest = now.select(*self._kept)
             if self._latest is None:
                 num_envs = len(next(iter(seen.values())))
-                self._latest = parts[-1][:1].expand(num_envs).clone()
-            self._latest[rows] = parts[-1]
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
+                self._latest = latest[:1].expand(num_envs).clone()
+            self._latest[rows] = latest
+        return now.exclude("sensor")

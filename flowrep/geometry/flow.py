@@ -175,13 +175,13 @@ def factorize(
     measured = raw_u.to(compute).abs() + raw_v.to(compute).abs() < largest
     if torch.finfo(dtype).max < torch.finfo(compute).max:
         measured = measured & obj_u.isfinite() & obj_v.isfinite()
-    # Two masks in turn, because inductor would spill their conjunction to memory.
-    obj_u, obj_v = (
-        torch.where(valid, torch.where(measured, difference, 0.0), 0.0)
-        for difference in (obj_u, obj_v)
-    )
+    known = valid & measured
+    # When compiled, two masks in turn, because inductor would spill their conjunction to memory.
+    masks = [measured, valid] if torch.compiler.is_compiling() else [known]
+    for mask in masks:
+        obj_u, obj_v = torch.where(mask, obj_u, 0.0), torch.where(mask, obj_v, 0.0)
     ego, obj = closed_form.stack_planes(u, v), closed_form.stack_planes(obj_u, obj_v)
-    return Factors(ego, obj, closed_form.mask_channel(valid & measured))
+    return Factors(ego, obj, closed_form.mask_channel(known))
 
 
 def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torch.Size:

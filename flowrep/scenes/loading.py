@@ -1,7 +1,9 @@
 """Loads a scene from its name, a YAML file or plain data, and checks it."""
 
 import dataclasses
+import pickle
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,20 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
     >>> load_scene("straight_road").time_limit_steps
     200
     """
+    if isinstance(scene, Scene):
+        return _checked(pickle.dumps(scene))
     data, source = _data(scene)
+    return _loaded(data, source)
+
+
+@lru_cache(maxsize=8)
+def _checked(pickled: bytes) -> Scene:
+    """Returns a checked scene; each of many environments is given the same one."""
+    scene = pickle.loads(pickled)
+    return _loaded(dataclasses.asdict(scene), f"scene {shortened(repr(scene.name))}")
+
+
+def _loaded(data: Any, source: str) -> Scene:
     loaded = scene_from_data(data, source=source)
     check_consistency(loaded, source)
     try:
@@ -49,9 +64,7 @@ def scene_names() -> list[str]:
     return sorted(path.stem for path in (CONF_DIR / "scene").glob("*.yaml"))
 
 
-def _data(scene: str | Path | Mapping[str, Any] | Scene) -> tuple[Any, str]:
-    if isinstance(scene, Scene):
-        return dataclasses.asdict(scene), f"scene {shortened(repr(scene.name))}"
+def _data(scene: str | Path | Mapping[str, Any]) -> tuple[Any, str]:
     if isinstance(scene, Mapping):
         name = shortened(repr(scene.get("name", "without a name")))
         return scene, f"scene {name}"

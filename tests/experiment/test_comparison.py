@@ -182,6 +182,30 @@ def test_an_eye_sees_what_the_env_shows(scene, flow, noise):
     pool.close()
 
 
+@pytest.mark.parametrize("flow", ["exact", "estimated"])
+def test_an_eye_sees_each_street_as_if_it_were_alone(scene, flow):
+    if flow == "estimated":
+        pytest.importorskip("cv2")
+    names = ["raw", "obj", "seg2", "depth2"]
+    together, *alone = (Eye(scene, names, 12.0, flow=flow, noise=NOISE) for _ in range(3))
+    pool = EnvPool(scene, together.sensors, num_envs=2)
+    begins = {0: [0], 2: [1], 4: [0], 5: [1]}  # by step: the streets whose episode begins
+    drives: set[int] = set()
+    for step in range(7):
+        begun = begins.get(step, [])
+        going_on = sorted(drives.difference(begun))
+        drives.update(begun)
+        orders = {street: {"episode_seed": step} for street in begun} | dict.fromkeys(going_on, 0)
+        seen, _ = pool.advance([orders.get(street) for street in range(2)])
+        maps = together.look(seen, begun, going_on)
+        for row, street in enumerate([*begun, *going_on]):
+            own = [street]
+            expected = alone[street].look(seen, *(([], own) if street in going_on else (own, [])))
+            for name in names:
+                assert torch.equal(maps[name][row], expected[name][0]), (name, step, street)
+    pool.close()
+
+
 def test_rows_have_the_columns_of_evaluation_csv(rows):
     config = {
         "scene": {"name": "straight_road"},
