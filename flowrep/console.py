@@ -91,6 +91,15 @@ def _end(number: int, _: FrameType | None) -> NoReturn:
     sys.exit(128 + number)
 
 
+def end_when_unread() -> None:
+    """Makes the process end silently at the first print to a pipe that is no longer read.
+
+    Nothing is closed, so this is for commands that only print.
+    """
+    if hasattr(signal, "SIGPIPE"):  # not on Windows
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+
+
 def exit_unread() -> NoReturn:
     """Ends the process silently when its output is no longer read, as after `| head -1`."""
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -52,6 +52,7 @@ THIRD_PARTY_ONLY_IN = {
         "report/command.py",
         "config/command_line.py",
         "config/composition.py",
+        "config/flags.py",
         "config/quoting.py",
         "sweeps/job.py",
         "sweeps/plan.py",

@@ -1,6 +1,7 @@
 """A typo ends in one readable line that lists what exists, with exit code 2 and no traceback."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -18,41 +19,46 @@ from flowrep.envs import WorkerError
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.train import carry_out
 
+MISTAKES = [
+    ("representations=[eggo]", ["unknown representations 'eggo'", "'ego'", "depth2", "seg"]),
+    ("sed=3", ["unknown key 'sed'", "did you mean 'seed'", "total_frames", "preset"]),
+    ("scene=straight", ["unknown scene 'straight'", "straight_road"]),
+    ("representations.ego.scal=2", ["unknown key 'scal' of 'representations.ego'", "'scale'"]),
+    ("seed.value=3", ["unknown key 'value' of 'seed'", "it has no keys"]),
+    ("representations=[ego", ["can't read 'representations=[ego'"]),
+    ("scene=null", ["scene should be one of: h_shaped_pathways", "not null"]),
+    ("hydra/launcher=joblb", ["unknown hydra/launcher 'joblb'", "'joblib'", "basic"]),
+    ("hydra.run.dirr=x", ["Could not override 'hydra.run.dirr'"]),
+    ("~algorithm", ["'algorithm' needs a value: algorithm=...", "dqn, dsac, dsac_v, ppo"]),
+    ("-m scene=s_turn,straight", ["unknown scene 'straight'"]),
+    ("-m seed=0,1,-2", ["seed should be a whole number from 0 to 2147483647, not -2"]),
+    ("seed=0,1", ["'seed=0,1' is several values: add -m", "seed=[0,1]"]),
+    ("hydra.run.dir=/home/josé/x", ["'hydra.run.dir='\"'\"'/home/josé/x'\"'\"''"]),
+    ("--config-dir nowhere", ["--config-dir: there is no folder", "nowhere"]),
+    ("--config-name nope", ["Cannot find primary config 'nope'"]),
+    ("--config-path pkg://nowhere", ["Primary config module 'nowhere' not found"]),
+]
+# The same code finds these.
+MORE_MISTAKES = [
+    ("-m representations=[ego],[raw,eggo]", ["unknown representations 'eggo'"]),
+    ("preset=desktop", ["unknown preset 'desktop'", "laptop, laptop_long, overnight, paper"]),
+    ("algorithm=dqm", ["unknown algorithm 'dqm'", "dsac"]),
+    ("scene.camera.heigth_px=84", ["unknown key 'heigth_px' of 'scene.camera'", "height_px"]),
+    ("representations=null", ["representations should be one of: depth, depth2", "not null"]),
+    ("hydra/job_logging=loud", ["unknown hydra/job_logging 'loud'", "default"]),
+    ("~sed", ["unknown key 'sed'", "did you mean 'seed'"]),
+    ("-m algorithm.gamma=interval(0.9,1.5)", ["algorithm.gamma should be", "not 1.5"]),
+    ("--cfg job sed=1", ["unknown key 'sed'"]),
+    ("--help scene=straight", ["unknown scene 'straight'"]),
+    ("--info config sed=1", ["unknown key 'sed'"]),
+    ("-m --hydra-help seed=0,1", ["'seed=0,1' is several values: give one of them"]),
+    ("hydra.mode=MULTIRUN seed=0,1 --cfg job", ["'seed=0,1' is several values: give one"]),
+]
+
 
 @pytest.mark.parametrize(
     ("override", "names"),
-    [
-        ("representations=[eggo]", ["unknown representations 'eggo'", "'ego'", "depth2", "seg"]),
-        ("-m representations=[ego],[raw,eggo]", ["unknown representations 'eggo'"]),
-        ("sed=3", ["unknown key 'sed'", "did you mean 'seed'", "total_frames", "preset"]),
-        ("scene=straight", ["unknown scene 'straight'", "straight_road"]),
-        ("preset=desktop", ["unknown preset 'desktop'", "laptop, laptop_long, overnight, paper"]),
-        ("algorithm=dqm", ["unknown algorithm 'dqm'", "dsac"]),
-        ("representations.ego.scal=2", ["unknown key 'scal' of 'representations.ego'", "'scale'"]),
-        ("scene.camera.heigth_px=84", ["unknown key 'heigth_px' of 'scene.camera'", "height_px"]),
-        ("seed.value=3", ["unknown key 'value' of 'seed'", "it has no keys"]),
-        ("representations=[ego", ["can't read 'representations=[ego'"]),
-        ("representations=null", ["representations should be one of: depth, depth2", "not null"]),
-        ("scene=null", ["scene should be one of: h_shaped_pathways", "not null"]),
-        ("hydra/launcher=joblb", ["unknown hydra/launcher 'joblb'", "'joblib'", "basic"]),
-        ("hydra/job_logging=loud", ["unknown hydra/job_logging 'loud'", "default"]),
-        ("hydra.run.dirr=x", ["Could not override 'hydra.run.dirr'"]),
-        ("~sed", ["unknown key 'sed'", "did you mean 'seed'"]),
-        ("~algorithm", ["'algorithm' needs a value: algorithm=...", "dqn, dsac, dsac_v, ppo"]),
-        ("-m scene=s_turn,straight", ["unknown scene 'straight'"]),
-        ("-m seed=0,1,-2", ["seed should be a whole number from 0 to 2147483647, not -2"]),
-        ("-m algorithm.gamma=interval(0.9,1.5)", ["algorithm.gamma should be", "not 1.5"]),
-        ("seed=0,1", ["'seed=0,1' is several values: add -m", "seed=[0,1]"]),
-        ("hydra.run.dir=/home/josé/x", ["'hydra.run.dir='\"'\"'/home/josé/x'\"'\"''"]),
-        ("--config-dir nowhere", ["--config-dir: there is no folder", "nowhere"]),
-        ("--cfg job sed=1", ["unknown key 'sed'"]),
-        ("--help scene=straight", ["unknown scene 'straight'"]),
-        ("--info config sed=1", ["unknown key 'sed'"]),
-        ("-m --hydra-help seed=0,1", ["'seed=0,1' is several values: give one of them"]),
-        ("hydra.mode=MULTIRUN seed=0,1 --cfg job", ["'seed=0,1' is several values: give one"]),
-        ("--config-name nope", ["Cannot find primary config 'nope'"]),
-        ("--config-path pkg://nowhere", ["Primary config module 'nowhere' not found"]),
-    ],
+    [*MISTAKES, *(pytest.param(*mistake, marks=pytest.mark.slow) for mistake in MORE_MISTAKES)],
 )
 def test_a_mistake_is_named_and_what_exists_is_listed(override, names):
     with pytest.raises(UsageError) as caught:
@@ -78,6 +84,9 @@ def test_a_mistake_is_named_and_what_exists_is_listed(override, names):
         ("--package scene", "--package says which part --cfg shows: add --cfg job"),
         ("--experimental-rerun x.pickle", "reads a pickle.* resume="),
         ("--config-path conf", "absolute path .* not 'conf'; --config-dir adds"),
+        ("--shell-completion", "followed by install=SHELL, .* bash, fish, zsh for SHELL, not ''"),
+        ("--shell-completion install=tcsh", "bash, fish, zsh for SHELL, not 'install=tcsh'"),
+        ("-sc query=zsh", "sets COMP_LINE .*--shell-completion install=zsh prints"),
         ("--config-path /nowhere", "absolute path .* not '/nowhere'"),
     ],
 )
@@ -108,13 +117,28 @@ def test_flags_that_contradict_each_other_or_do_nothing_are_refused(flags, says)
         "--info searchpath",
         "-m --help --resolve",
         "-m --hydra-help",
-        "--shell-completion query=bash",
+        "--shell-completion install=bash",
         "--config-path pkg://flowrep.conf",
         "-m",
     ],
 )
 def test_what_hydra_accepts_passes(line):
     check_command("train", line.split(), TrainConfig)
+
+
+def test_the_shell_can_ask_for_completions(monkeypatch):
+    monkeypatch.setenv("COMP_LINE", "flowrep-train scene=")
+    check_command("train", ["--shell-completion", "query=bash"], TrainConfig)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shows", ["--help", "--info"])  # prints, logs
+def test_output_that_is_no_longer_read_ends_a_command_silently(shows):
+    command = [sys.executable, "-m", "flowrep.train", shows]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.communicate()[1] == b""
+    assert process.returncode == -signal.SIGPIPE
 
 
 @pytest.mark.parametrize("form", ["hydra.searchpath=[pkg://mypkg.conf]", "--config-dir"])

@@ -12,9 +12,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from flowrep.config import Section, UsageError
 from flowrep.config.composition import check_command, keys_added, parse, plain_config
+from flowrep.config.flags import only_shows
 from flowrep.config.quoting import override, shell_line, taken_as_typed
 from flowrep.config.run_names import run_of_sweep
-from flowrep.console import ended_by_signals, exit_unread
+from flowrep.console import end_when_unread, ended_by_signals, exit_unread
 
 __all__ = [
     "exit_with",
@@ -122,7 +123,9 @@ def run_command(config_name: str, command: Callable[[], Any], schema: type[Secti
     sys.argv[1:] = taken_as_typed(sys.argv[1:], FOLDERS)
     with ended_by_signals():
         try:
-            check_command(config_name, sys.argv[1:], schema)
+            args = check_command(config_name, sys.argv[1:], schema)
         except UsageError as error:
             exit_with(error)
+        if only_shows(args):
+            end_when_unread()
         command()

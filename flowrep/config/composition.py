@@ -38,7 +38,7 @@ REFUSALS = (HydraException, OmegaConfBaseException, ValueError)  # the last for 
 
 def check_command(
     config_name: str, arguments: Sequence[str], schema: type[Section] | None = None
-) -> None:
+) -> argparse.Namespace:
     """Refuses a command line that Hydra would refuse, or whose config violates the schema.
 
     Every value of a sweep is checked before any of its jobs starts.
@@ -48,13 +48,16 @@ def check_command(
         arguments: as typed, e.g. `["-m", "representations=[ego],[raw]", "seed=1"]`.
         schema: the schema of a job's config.
 
+    Returns:
+        The command line as Hydra's parser reads it.
+
     Raises:
         UsageError: a line for each mistake.
     """
     args = get_args_parser().parse_args(list(arguments))
     check_flags(args)
     if args.shell_completion or (args.hydra_help and not args.overrides):
-        return  # no config is composed
+        return args  # no config is composed
     preview = Preview(args, config_name)
     try:
         parsed = preview.with_sweepers(preview.parse(args.overrides))
@@ -63,6 +66,7 @@ def check_command(
                 validated(schema, config, keys_added(parsed))
     finally:
         GlobalHydra.instance().clear()
+    return args
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:

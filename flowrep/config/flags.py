@@ -1,7 +1,12 @@
 """The meaning of Hydra's flags, and which of them go together."""
 
 import argparse
+import os
+from collections.abc import Sequence
 from pathlib import Path
+
+from hydra.core.plugins import Plugins
+from hydra.plugins.completion_plugin import CompletionPlugin
 
 from flowrep.config import UsageError
 
@@ -51,3 +56,23 @@ def check_flags(args: argparse.Namespace) -> None:
     asked = [f"{flag} {does}" for flag, (given, does) in tasks.items() if given]
     if asked[1:]:
         raise UsageError(f"{', '.join(asked)}: keep one of these flags")
+    if args.shell_completion:
+        _check_completion(args.overrides)
+
+
+def _check_completion(words: Sequence[str]) -> None:
+    """Refuses what Hydra's completion can't read: its argument, or no line to complete."""
+    plugins = Plugins.instance().discover(CompletionPlugin)
+    shells = sorted(plugin.provides() for plugin in plugins)  # type: ignore[attr-defined]
+    typed = " ".join(words)
+    task, _, shell = typed.partition("=")
+    if task not in ("install", "uninstall", "query") or shell not in shells:
+        raise UsageError(
+            "--shell-completion should be followed by install=SHELL, uninstall=SHELL or "
+            f"query=SHELL, with {', '.join(shells)} for SHELL, not '{typed}'"
+        )
+    if task == "query" and not os.environ.get("COMP_LINE", "").strip():
+        raise UsageError(
+            f"--shell-completion {typed} is for the shell, which sets COMP_LINE to the line to "
+            f"complete; --shell-completion install={shell} prints the code that sets it up"
+        )
