@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Categorical
+from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose
 
@@ -114,6 +114,12 @@ def test_a_simulator_that_knows_poses_alone_gets_the_flow_of_one_that_knows_moti
     still = (got["sensor", "instance"] != 1).expand_as(got["obj"])
     assert (got["obj"][still] == 0).all()  # exactly, though poses lie kilometres out
     assert (got["obj"][:, 1:3][~still[:, 1:3]] != 0).any()
+
+
+def test_adapted_flow_has_the_precision_of_the_env_s():
+    measured = Unbounded((2, 5, 7), dtype=torch.float64)
+    adapt = AdaptFlow(direction="backward", grid="current")
+    assert adapt.transform_observation_spec(Composite(flow=measured))["raw"] == measured
 
 
 def test_a_missing_camera_key_is_named():

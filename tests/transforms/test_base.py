@@ -160,6 +160,12 @@ def test_missing_key_is_named_on_a_batch():
         RawFlow(INTRINSICS)(td)
 
 
+def test_a_missing_key_of_several_representations_is_named_with_all_of_them():
+    td = moments(2).exclude(("sensor", "depth"))
+    with pytest.raises(KeyError, match=r"'ego' and 'obj' needs key \('sensor', 'depth'\)"):
+        FlowFactorize(INTRINSICS, outputs=["ego", "obj"])(td)
+
+
 def test_missing_key_is_tolerated_when_torchrl_asks_for_it():
     transform = Depth()
     transform.set_missing_tolerance(True)

@@ -224,6 +224,10 @@ def test_options_that_cannot_be_are_refused(options, message):
         EstimatedFlow(**options)
 
 
+def test_pictures_may_be_left_as_small_as_they_are():
+    assert EstimatedFlow(min_side_px=1).estimator == DIS(min_side_px=1)
+
+
 @pytest.mark.parametrize(
     ("flow", "message"),
     [
