@@ -40,6 +40,7 @@ def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
     assert action.shape == env.batch_size
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", group_choices("representations"))
 def test_a_representation_is_one_key_named_as_its_file(name):
     assert list(composed(f"representations=[{name}]")["representations"]) == [name]

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
@@ -43,6 +42,7 @@ from flowrep.sequences import (
 from flowrep.sequences.job import Job
 from flowrep.sequences.scores import COLUMNS
 from flowrep.transforms import DIS
+from tests.config.composing import plain
 from tests.sequences import synthetic
 
 SEVEN_SCENES = Path(__file__).resolve().parents[2] / "shared" / "data" / "7scenes"
@@ -52,9 +52,7 @@ needs_7scenes = pytest.mark.skipif(
 
 
 def settings(*overrides) -> dict:
-    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        config = compose("factorize", list(overrides))
-    made = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    made = plain("factorize", *overrides)
     validated(FactorizeConfig, made)
     return made
 
@@ -149,7 +147,8 @@ def interrupted_after(frames, monkeypatch, tmp_path, *options):
             factorize(tmp_path, *options)
 
 
-@pytest.mark.parametrize("video", [True, False])
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("video", [False, True])
 def test_an_interrupted_job_is_continued(video, tmp_path, monkeypatch):
     monkeypatch.setattr(synthetic, "FRAMES", 6)
     synthetic.write_frames(tmp_path / "in")
@@ -283,15 +282,12 @@ def test_exact_flow_where_there_is_none(tmp_path):
         ("format.pose_axes=blender", "format.pose_axes should be opencv, opengl, ned or x_forward"),
         ("format.depth_kind=z_buffer", "format.near_m should be a number with depth_kind=z_buffer"),
         ("format.depth_unit_m=0", "format.depth_unit_m should be a number above 0, not 0"),
-        ("format.scale=2", "unknown key 'scale' of 'format'"),
         ("flow.preset=best", "flow.preset should be ultrafast, fast or medium, not 'best'"),
     ],
 )
 def test_what_cannot_be_is_named(override, says):
     with pytest.raises(UsageError) as caught:
-        check_command(
-            "factorize", ["input=a", "output=b", "format=frames", override], FactorizeConfig
-        )
+        settings("input=a", "output=b", "format=frames", override)
     assert says in str(caught.value)
 
 
@@ -304,7 +300,7 @@ def test_what_cannot_be_is_named(override, says):
 )
 def test_what_cannot_be_of_a_format_is_named(override, says):
     with pytest.raises(UsageError) as caught:
-        check_command("factorize", ["input=a", "output=b", "format=tum", override], FactorizeConfig)
+        settings("input=a", "output=b", "format=tum", override)
     assert says in str(caught.value)
 
 
@@ -312,6 +308,18 @@ def test_flow_on_the_other_grid_is_refused(moments, tmp_path):
     with pytest.raises(ValueError, match="previous frame's grid cannot be turned"):
         factorize(tmp_path, "format.flow_grid=previous")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("stride=0", "stride should be a positive whole number, not 0"),
+        ("format.scale=2", "unknown key 'scale' of 'format'"),
+    ],
+)
+def test_a_command_line_is_refused_by_name(override, says):
+    with pytest.raises(UsageError, match=says):
+        check_command("factorize", ["input=a", "output=b", "format=tum", override], FactorizeConfig)
 
 
 def test_unknown_formats_are_refused_and_the_known_ones_listed():
@@ -376,6 +384,7 @@ def test_a_still_camera_needs_neither_poses_nor_depth(tmp_path):
     assert abs(np.median(inside[1])) < 0.3
 
 
+@pytest.mark.slow_after_first
 @needs_7scenes
 @pytest.mark.parametrize(("stride", "pair"), [(1, "frame-000101"), (2, "frame-000102")])
 def test_a_real_static_room_has_little_object_flow(stride, pair, tmp_path):

@@ -17,6 +17,7 @@ def small_control():
     return module
 
 
+@pytest.mark.slow
 def test_the_best_policy_reaches_the_return_that_is_called_the_best(small_control):
     torch.manual_seed(0)
     games = small_control.Follow(4000)

@@ -1,5 +1,6 @@
 """A run folder may come from somebody else: none of its code runs, and it stays where it is."""
 
+import functools
 import sys
 from pathlib import Path
 
@@ -79,12 +80,17 @@ def test_an_algorithm_inside_flowrep_that_is_none_of_its_own_needs_trust():
         algorithm_class({"_target_": "flowrep.agent.checkpoint.load_checkpoint"}, None)
 
 
+@functools.cache
+def composed(command):
+    register_resolvers()
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        return compose(command, return_hydra_config=True)
+
+
 @pytest.mark.parametrize("name", ["../../etc", "/etc", "..", "a/b", "..\\b", "x" * 500, ""])
 @pytest.mark.parametrize("command", ["train", "view"])
 def test_a_scene_s_name_stays_in_the_output_folder(name, command):
-    register_resolvers()
-    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        config = compose(command, return_hydra_config=True)
+    config = composed(command).copy()
     OmegaConf.update(config, "scene.name", name)
     folder = Path(config.hydra.run.dir)
     above = Path("outputs/view") if command == "view" else Path("outputs") / folder.parts[1]

@@ -230,6 +230,7 @@ def test_a_checkpoint_replaced_while_it_is_read_is_read_again(tmp_path, monkeypa
     assert len(opened) == 2
 
 
+@pytest.mark.slow
 def test_a_writer_killed_at_any_instant_leaves_a_whole_checkpoint(tmp_path):
     path = tmp_path / "c.safetensors"
     save_checkpoint(path, {"version": 0, "a": torch.zeros(200_000)})

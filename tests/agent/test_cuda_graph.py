@@ -68,6 +68,7 @@ def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
     assert [name for name in expected if not torch.equal(expected[name], actual[name])] == []
 
 
+@pytest.mark.slow_after_first
 def test_a_loss_that_is_no_number_stops_the_weights_on_tape_too(make_any, random_steps):
     agent = make_any()
     batches = batches_of([agent], random_steps)

@@ -99,6 +99,7 @@ def test_one_hot_actions_learn_what_categorical_ones_do(make_agent, random_steps
     torch.testing.assert_close(agent.losses(as_batch(agent, steps))["q_loss"], expected)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("encoder", ["shared", "separate"])
 def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(
     make_agent, random_steps, tmp_path, encoder

@@ -101,6 +101,7 @@ def test_an_operation_in_a_team_takes_one_thread_and_several_outside(threads):
     assert threads_in_use() == 2
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("encoder", ["shared", "separate"])
 def test_the_number_of_threads_changes_no_bit(
     threads, monkeypatch, make_agent, random_steps, as_batch, encoder

@@ -15,6 +15,7 @@ def test_the_planner_arrives(make_street, speed):
     assert [drive.outcome for drive in ended] == ["success"] * 5
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
 def test_habit_and_chance_seldom_arrive(make_street, speed):
     env = make_street(speed=speed, sensors=())

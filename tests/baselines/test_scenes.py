@@ -139,6 +139,7 @@ def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, c
     assert front < 0.5 * 2**0.5 + 1e-6
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(
     ("path", "y_m"),
     [
@@ -159,6 +160,7 @@ def test_straight_on_in_the_h_stands_a_house(make_street, path, y_m):
     assert env.episode.now.vehicle[:2] == pytest.approx((0.0, y_m), abs=1e-6)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(
     ("name", "paths", "x_m"),
     [
@@ -197,7 +199,7 @@ def test_every_category_is_seen_on_a_drive(make_street, name):
     assert seen == set(env.scene.categories)
 
 
-@pytest.mark.slow_after_first
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TURNING)
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
 def test_the_planner_arrives_and_habit_and_chance_do_not(make_street, name, speed):

@@ -51,6 +51,7 @@ def test_a_command_has_the_keys_of_its_schema(name, schema, given):
     validated(schema, config)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
 def test_every_choice_of_every_group_is_right(group, name):
     choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"

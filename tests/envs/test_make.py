@@ -39,6 +39,14 @@ def make():
         env.close(raise_if_closed=False)
 
 
+@pytest.fixture(scope="module")
+def in_workers():
+    """Two environments in a process each: starting those takes a second."""
+    env = make_env(num_envs=2, num_workers=2)
+    yield env
+    env.close()
+
+
 def actions_of(count, num_envs, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return torch.randint(3, (count, num_envs), generator=generator)
@@ -76,6 +84,7 @@ def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers)
         make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("num_envs", [1, 3])
 @pytest.mark.parametrize(
     ("representations", "keep_sensor"),
@@ -194,6 +203,7 @@ def test_an_episode_has_the_same_noise_wherever_it_is_driven(make):
     assert not torch.equal(holes[1, :, 0], holes[1, :, 1])  # other steps of one
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_workers_give_what_one_process_gives(make, num_workers):
     actions = actions_of(40, 3)
@@ -207,9 +217,10 @@ def test_workers_give_what_one_process_gives(make, num_workers):
     assert_same(alone, shared)
 
 
-def test_a_step_begun_early_is_the_step(make):
-    late, early = (make(num_envs=2, num_workers=w, seed=3) for w in (0, 2))
+def test_a_step_begun_early_is_the_step(make, in_workers):
+    late, early = make(num_envs=2), in_workers
     for env in (late, early):
+        env.set_seed(3)
         begin_step(env, env.reset().set("action", torch.tensor([1, 2])))
     begun = early.step(early.reset().set("action", torch.tensor([1, 2])))
     assert_same(late.step(late.reset().set("action", torch.tensor([1, 2]))), begun)
@@ -229,14 +240,14 @@ def test_a_street_on_cuda_is_the_street_on_the_cpu(make, num_workers):
         torch.testing.assert_close(there[key].cpu(), here[key], rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("num_workers", "threads", "fits"), [(2, 2, True), (2, 3, False), (0, 4, True)]
-)
-def test_whether_cores_are_left_for_the_caller(make, monkeypatch, num_workers, threads, fits):
+def test_whether_cores_are_left_for_the_caller(make, in_workers, monkeypatch):
     monkeypatch.setattr("flowrep.envs.make.available_cores", lambda: 4)
-    assert has_spare_cores(make(num_envs=2, num_workers=num_workers), threads) == fits
+    assert has_spare_cores(in_workers, 2)
+    assert not has_spare_cores(in_workers, 3)
+    assert has_spare_cores(make(num_envs=2), 4)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noisy"])
 def test_states_pass_between_workers_and_one_process(make, noise):
     actions = actions_of(30, 3, seed=3)
@@ -260,14 +271,14 @@ def test_states_of_another_number_of_streets_are_refused(make):
         set_states(env, get_states(env)[:1])
 
 
-def test_streets_in_workers_are_out_of_reach(make):
+def test_streets_in_workers_are_out_of_reach(in_workers):
     with pytest.raises(ValueError, match="num_workers=0"):
-        street_envs(make(num_envs=2, num_workers=2))
+        street_envs(in_workers)
 
 
 def test_which_episodes_come_does_not_depend_on_the_policy(make):
     def seeds(actions):
-        env = make(num_envs=2, seed=5)
+        env = make(representations=(), num_envs=2, seed=5)
         steps, _ = play(env, actions)
         return [steps["episode_seed"][:, i, 0].unique_consecutive()[:3].tolist() for i in (0, 1)]
 

@@ -121,6 +121,7 @@ def test_each_pixel_is_found_where_its_flow_says_it_was(name):
         assert agree / asked >= 0.99
 
 
+@pytest.mark.slow
 def test_without_the_peoples_own_motion_people_are_not_found():
     def without_own_motion(frame):
         rows = frame["prev_from_curr"].expand_as(frame["instance_motion"])

@@ -43,6 +43,7 @@ def test_views_of_a_scene(Pair, scene):
     assert seen == {CATEGORY_ID[name] for name in load_scene(scene).categories}
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", ["straight_road", "three_way_junction"])
 def test_views_between_near_and_far_planes_that_cut_through_everything(Pair, name):
     scene = load_scene(name)

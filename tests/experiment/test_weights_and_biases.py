@@ -18,6 +18,7 @@ def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
         RunFolder(tmp_path).log_to_wandb("offline", {})
 
 
+@pytest.mark.slow
 def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_path):
     wandb = pytest.importorskip("wandb", reason="needs the extra: pip install 'flowrep[wandb]'")
     names = []

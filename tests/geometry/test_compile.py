@@ -93,6 +93,7 @@ def test_compiled_code_gives_the_bits_of_eager():
     assert obj[~static & valid.expand_as(obj)].abs().min() > 0
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_compiled_code_reads_transposed_memory_right():
     depth, _, camera, motions = inputs(3)

@@ -110,6 +110,7 @@ def entries(K):
     return tuple(float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_recorded_street_has_the_simulators_object_flow(name, street, tmp_path):
     write, open_it, has_flow, against_time, unit_m, least_share = FORMATS[name]

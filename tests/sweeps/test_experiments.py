@@ -35,6 +35,7 @@ def runs_of(*arguments):
     return [dict(override.split("=", 1) for override in job) for job in jobs]
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(
     ("name", "scenes", "stacks"),
     [
@@ -77,6 +78,7 @@ def test_each_stack_has_noise_in_half_of_the_runs_that_compare_it():
     assert "sensor_noise_laptop_straight_road_ego+obj_s0_noise-depth_camera" in names
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", group_choices("experiment"))
 def test_an_experiment_is_named_in_the_config_of_its_runs(name):
     assert plain("train", f"experiment={name}")["experiment"] == name
@@ -94,6 +96,7 @@ def test_an_agent_is_evaluated_at_lower_frame_rates_than_it_was_trained_at():
     assert final_episodes(config) == 6 * 1 * 4 * evaluation["final_episodes"]
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("height_px", [48, 84])
 def test_pictures_stay_square_where_resolution_is_compared(height_px):
     sides = [f"scene.camera.height_px={height_px}", "preset=laptop", "scene=straight_road"]

@@ -21,13 +21,20 @@ from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv
 
 
 def of_copies(contract: type[TransformContract]) -> type[TransformContract]:
-    """Returns a transform's contract, fulfilled by a copy of what was pickled."""
+    """Returns a transform's contract, fulfilled by a copy of what was pickled; its tests are slow.
+
+    The fast part has the originals' contracts.
+    """
 
     def make(self):
         return copy.deepcopy(pickle.loads(pickle.dumps(contract.make(self))))
 
     left_out = dict.fromkeys(["test_parallel_trans_env_check", "test_trans_parallel_env_check"])
-    return type(f"{contract.__name__}Copy", (contract,), {"make": make, **left_out})
+    return type(
+        f"{contract.__name__}Copy",
+        (contract,),
+        {"make": make, "pytestmark": pytest.mark.slow, **left_out},
+    )
 
 
 for _name, _contract in list(vars(test_contract).items()):
