@@ -1,6 +1,6 @@
 """Flow planes of several moving bodies in one image.
 
-Nearly all pixels show the static world. Where shapes may depend on the data, its flow is computed
+Nearly all pixels show the static world. In large batches on a CPU its flow is computed
 for the whole image, and bodies are a list of pixels; otherwise each pixel looks up its motion. Both
 use the operations of `camera_planes` in the same order, so their results are bitwise equal, and a
 static body has exactly the camera's flow.
@@ -23,6 +23,9 @@ from flowrep.geometry.closed_form import (
     motion_coefficients,
 )
 
+# Pixels up to which a lookup for each costs less than the steps that make a list.
+SMALL = 1 << 16
+
 
 def body_planes(
     depth: Tensor,
@@ -39,8 +42,8 @@ def body_planes(
     """
     dtype, compute = dtypes
     motions = prev_from_curr_by_instance.to(compute)
-    if torch.compiler.is_compiling() or not depth.is_cpu:
-        # no shapes that depend on the data
+    # When compiled, and on a GPU, no shape may depend on the data.
+    if torch.compiler.is_compiling() or not depth.is_cpu or depth.numel() <= SMALL:
         return _dense_body_planes(depth, instance, K.to(compute), motions, dt, dtype)
     static = camera_planes(depth, K, motions[..., 0, :, :], dt, dtypes)
     ids = instance.flatten()

@@ -10,6 +10,12 @@ from flowrep.geometry import rigid_flow
 from flowrep.geometry.bodies import body_planes
 from tests.geometry.scenes import HEIGHT, MOTION, OTHER_MOTION, WIDTH, K, depth_map, rigid
 
+
+@pytest.fixture(autouse=True)
+def _no_map_is_small(monkeypatch):
+    monkeypatch.setattr("flowrep.geometry.bodies.SMALL", 0)
+
+
 UNKNOWN = torch.full((4, 4), math.nan, dtype=torch.float64)
 FROM_BEHIND = rigid((0.0, 0.0, 0.0), (0.0, 0.0, -9.0))
 
