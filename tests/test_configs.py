@@ -81,6 +81,7 @@ def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():
     assert composed("preset=laptop", "algorithm.n_steps=2")["algorithm"]["n_steps"] == 2
 
 
+@pytest.mark.slow
 def test_the_longer_presets_change_laptop_in_the_documented_keys():
     laptop = flat(composed("preset=laptop"))
     changes = {

@@ -42,7 +42,7 @@ def test_a_run_continues(folder, monkeypatch):
     assert config["resume"] == str(folder.path)
 
 
-@pytest.mark.slow_after_first
+@pytest.mark.slow
 def test_a_run_is_evaluated(folder, monkeypatch):
     opened = []
     monkeypatch.setattr(evaluate, "evaluate", lambda config, runs: opened.extend(runs))
@@ -50,7 +50,7 @@ def test_a_run_is_evaluated(folder, monkeypatch):
     assert [run.path for run in opened] == [folder.path]
 
 
-@pytest.mark.slow_after_first
+@pytest.mark.slow
 def test_a_name_typed_without_hydras_quotes_is_understood(folder, monkeypatch):
     opened = []
     monkeypatch.setattr(evaluate, "evaluate", lambda config, runs: opened.extend(runs))

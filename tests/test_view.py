@@ -67,6 +67,7 @@ def test_what_cannot_be_is_named(override, expected):
     assert str(caught.value) == expected
 
 
+@pytest.mark.slow
 def test_the_episodes_that_are_shown_are_those_of_the_seed():
     def shown(seed):
         overrides = ["policy=never_turn", f"seed={seed}"]

@@ -90,6 +90,7 @@ def test_every_section_has_its_file():
     assert group_choices("representations") == sorted(Representations.keys())
 
 
+@pytest.mark.slow
 def test_the_other_sections_have_the_keys_of_their_files():
     assert keys_of("flow", "exact") == sorted(ExactFlow.keys())
     assert keys_of("flow", "estimated") == sorted(EstimatedFlow.keys())

@@ -203,7 +203,7 @@ def test_an_episode_has_the_same_noise_wherever_it_is_driven(make):
     assert not torch.equal(holes[1, :, 0], holes[1, :, 1])  # other steps of one
 
 
-@pytest.mark.slow_after_first
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_workers_give_what_one_process_gives(make, num_workers):
     actions = actions_of(40, 3)

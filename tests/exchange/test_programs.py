@@ -57,7 +57,7 @@ def exported(tmp_path_factory):
     return policy, folder
 
 
-@pytest.mark.slow_after_first
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", [DoubleDQN, PPO])
 def test_every_algorithms_program_gives_the_scores_of_its_network(algorithm):
     policy = build(algorithm)

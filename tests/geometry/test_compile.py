@@ -64,6 +64,7 @@ def test_flow_is_one_graph(dt):
     assert_same(compiled(*inputs(2), dt), everything(*inputs(2), dt))
 
 
+@pytest.mark.slow
 def test_sizes_may_change_between_calls():
     compiled = torch.compile(ego_flow, fullgraph=True, backend="eager", dynamic=True)
     for height, width in [(5, 7), (4, 9)]:

@@ -56,6 +56,7 @@ def test_streets_of_one_scene_share_a_client_until_the_last_one_is_closed(own_sc
     assert clients() == before
 
 
+@pytest.mark.slow
 def test_streets_that_share_a_client_keep_their_exits_and_people_apart():
     # Both stand in one world: each is asked in turn, and must not see the other's.
     paths = "south_to_north", "north_to_south"

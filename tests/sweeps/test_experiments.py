@@ -105,6 +105,7 @@ def test_pictures_stay_square_where_resolution_is_compared(height_px):
     assert camera["fov_deg"] == 60
 
 
+@pytest.mark.slow
 def test_a_mistake_in_an_experiment_of_one_s_own_is_named_before_any_run(tmp_path):
     (tmp_path / "experiment").mkdir()
     text = "# @package _global_\nhydra: {sweeper: {params: {scene: 's_turn,straight'}}}\n"

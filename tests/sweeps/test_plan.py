@@ -32,6 +32,7 @@ def test_a_plan_names_the_runs_that_hydra_will_make(tmp_path):
     assert config.hydra.sweep.subdir == plan.names[-1]
 
 
+@pytest.mark.slow
 def test_a_sweepers_own_runs_are_counted_and_found_by_their_logs(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     line = [
