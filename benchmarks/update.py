@@ -29,7 +29,7 @@ from flowrep.agent.cuda_graph import WARM_UP
 
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3
-SIZES = {"laptop": (48, 256), "paper": (84, 1024)}  # pixels a side, batch
+SIZES = {"laptop": (48, 128), "paper": (84, 1024)}  # pixels a side, batch
 
 
 def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
