@@ -7,8 +7,6 @@ import pytest
 
 PROGRAM = """
 import sys
-
-import pytest
 import torch, tensordict.nn, torchrl.data, torchrl.envs.transforms
 before = {name.partition(".")[0] for name in sys.modules}
 import flowrep.transforms
