@@ -40,7 +40,10 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
 
 @lru_cache(maxsize=8)
 def _checked(pickled: bytes) -> Scene:
-    """Returns a checked scene; each of many environments is given the same one."""
+    """Returns a checked scene; each of many environments is given the same one.
+
+    The key is the scene's bytes, as it holds mappings and so has no hash.
+    """
     scene = pickle.loads(pickled)
     return _loaded(dataclasses.asdict(scene), f"scene {shortened(repr(scene.name))}")
 
