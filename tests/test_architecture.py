@@ -42,7 +42,7 @@ FLOWREP_IMPORTS_ALLOWED = {
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py"},
-    "numba": {"simulator/rasteriser.py"},
+    "numba": {"simulator/rasteriser.py", "geometry/kernel.py"},
     "hydra": {
         "train.py",
         "evaluate.py",
@@ -63,6 +63,7 @@ THIRD_PARTY_ONLY_IN = {
 }
 # Extras of the transforms: imported when one is made that needs them, never before.
 LAZILY = {
+    "geometry/kernel.py": {"numba", "numpy"},
     "transforms/dis.py": {"cv2"},
     "transforms/raft.py": {"torchvision", "safetensors"},
 }
@@ -125,7 +126,7 @@ def test_the_transforms_bring_torch_tensordict_and_torchrl_alone():
         "import flowrep.transforms\n"
         "added = {name.split('.')[0] for name in set(sys.modules) - before}\n"
         "unwanted = {'pybullet', 'hydra', 'omegaconf', 'matplotlib', 'cv2', 'shapely', 'imageio',"
-        " 'gymnasium', 'yaml', 'safetensors', 'torchvision'}\n"
+        " 'gymnasium', 'yaml', 'safetensors', 'torchvision', 'numba'}\n"
         "print(sorted((added & unwanted) | ({'pybullet', 'hydra', 'matplotlib', 'cv2', 'shapely'}"
         " & set(sys.modules))))"
     )

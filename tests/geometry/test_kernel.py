@@ -1,0 +1,197 @@
+"""The compiled kernel equals PyTorch's passes over the pixels, bit for bit."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import forward_ad
+
+from flowrep.geometry import closed_form, ego_flow, factorize, rigid_flow
+from tests.geometry.scenes import HEIGHT, MOTION, OTHER_MOTION, WIDTH, K, depth_map, rigid
+
+pytest.importorskip("numba")
+
+UNKNOWN = torch.full((4, 4), math.nan, dtype=torch.float64)
+FROM_BEHIND = rigid((0.0, 0.0, 0.0), (0.0, 0.0, -9.0))
+LEAST = float(np.float32(closed_form.SMALLEST))
+
+
+@pytest.fixture(autouse=True)
+def _no_map_is_small(monkeypatch):
+    monkeypatch.setattr(closed_form, "SMALL", 0)
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Counts the kernel's calls."""
+    from flowrep.geometry import kernel
+
+    seen, compute = [], kernel.planes_of_motions
+    monkeypatch.setattr(kernel, "planes_of_motions", lambda *a: seen.append(a) or compute(*a))
+    return seen
+
+
+def scene(dtype=torch.float32):
+    """Three maps with every kind of invalid pixel; of five bodies, one is seen in each map."""
+    depth = depth_map(3)
+    depth[:, 0, 0, :4] = torch.tensor([math.inf, math.nan, 0.0, -2.0])  # on bodies
+    depth[:, 0, 4, :4] = torch.tensor([math.inf, math.nan, -math.inf, 1e-9])  # beside them
+    depth[:, 0, 4, 4:6] = torch.tensor([LEAST, np.nextafter(np.float32(LEAST), np.float32(0))])
+    motions = torch.stack([MOTION, OTHER_MOTION, UNKNOWN, FROM_BEHIND, MOTION, OTHER_MOTION])
+    motions = motions.repeat(3, 1, 1, 1)
+    motions[2, 0] = math.nan  # the last map's camera is unknown, its body is not
+    instance = torch.zeros(3, 1, HEIGHT, WIDTH, dtype=torch.uint8)
+    instance[0, 0, :3, 1:] = 3
+    instance[1, 0, :2] = 2
+    instance[2, 0, :2, :5] = 1
+    instance[2, 0, 3, 6] = 4
+    Ks = K.repeat(3, 1, 1)
+    Ks[1, 0, 0], Ks[1, 1, 2] = 9.0, 1.7
+    return depth.to(dtype), instance, Ks.to(dtype), motions.to(dtype)
+
+
+def by_torch(compute, *args, **options):
+    """Returns what PyTorch computes without the kernel."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(closed_form, "SMALL", 1 << 30)
+        return compute(*args, **options)
+
+
+def assert_same_bits(ours, theirs):
+    assert torch.equal(ours.flow.view(torch.int32), theirs.flow.view(torch.int32))
+    assert torch.equal(ours.valid, theirs.valid)
+
+
+@pytest.mark.parametrize("dt", [1.0, 0.3, torch.tensor([0.5, math.nan, 0.1])])
+@pytest.mark.parametrize("ids", ["mixed", "none", "all"])
+@pytest.mark.parametrize("kind", [torch.uint8, torch.int32])
+def test_bodies(calls, kind, ids, dt):
+    depth, instance, Ks, motions = scene()
+    if ids != "mixed":
+        instance = torch.full_like(instance, 0 if ids == "none" else 1)
+    inputs = depth, instance.to(kind), Ks, motions
+    flow = rigid_flow(*inputs, dt=dt)
+    assert len(calls) == 1
+    assert_same_bits(flow, by_torch(rigid_flow, *inputs, dt=dt))
+    assert len(calls) == 1
+    assert 0 < flow.valid.sum() < flow.valid.numel()
+
+
+@pytest.mark.parametrize("dt", [1.0, torch.tensor([0.5, 0.25, 0.1])])
+def test_a_camera(calls, dt):
+    depth, _, Ks, motions = scene()
+    inputs = depth, Ks, motions[:, 0]
+    flow = ego_flow(*inputs, dt=dt)
+    assert len(calls) == 1
+    assert_same_bits(flow, by_torch(ego_flow, *inputs, dt=dt))
+    assert flow.valid[0, 0, 4].tolist() == [True, False, False, False, True, False, True]
+
+
+def test_factors_and_what_they_share(calls):
+    depth, instance, Ks, motions = scene()
+    raw = rigid_flow(depth, instance, Ks, motions).flow
+    factors = factorize(raw, depth, Ks, motions[:, 0])
+    for ours, theirs in zip(factors, by_torch(factorize, raw, depth, Ks, motions[:, 0])):
+        assert torch.equal(ours, theirs)
+    assert len(calls) == 2
+    assert not factors.obj[0, :, 3:].any()  # exactly 0 on what stands still
+
+
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_one_camera_for_any_batch(calls, batch):
+    depth = depth_map(*batch).float()
+    instance = (torch.arange(HEIGHT * WIDTH) % 2).reshape(1, HEIGHT, WIDTH).expand_as(depth)
+    inputs = depth, instance, K.float(), torch.stack([MOTION, OTHER_MOTION]).float()
+    assert_same_bits(rigid_flow(*inputs), by_torch(rigid_flow, *inputs))
+    one_map = depth[(0,) * len(batch)].expand_as(depth)  # strides of 0
+    inputs = one_map, *inputs[1:]
+    assert_same_bits(rigid_flow(*inputs), by_torch(rigid_flow, *inputs))
+    assert len(calls) == 2
+
+
+def test_each_map_s_pixels_follow_its_own_camera_and_body():
+    depth, instance, Ks, motions = scene()
+    valid = rigid_flow(depth, instance, Ks, motions).valid[:, 0]
+    # By hand: body 3 was 9 m further back, so z - 9 > 0.01 z; body 2's motion is unknown, and so
+    # is all of the last map except its bodies 1 and 4.
+    assert torch.equal(valid[0, :3, 1:], depth[0, 0, :3, 1:] > 9 / 0.99)
+    assert not valid[1, :2].any()
+    assert valid[1, 2:4].all()
+    assert valid[2].sum() == 2 + 5 + 1  # columns 0 and 4 of row 0, row 1, and body 4's pixel
+
+
+@pytest.mark.parametrize("id_", [-1, 6])
+def test_an_id_without_a_motion_is_named(id_):
+    depth, instance, Ks, motions = scene()
+    instance = instance.to(torch.int16)
+    instance[1, 0, 2, 3] = id_
+    with pytest.raises(RuntimeError, match=rf"ids {min(id_, 0)} to {max(id_, 4)}.* 6 rows"):
+        rigid_flow(depth, instance, Ks, motions)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_other_floats_are_left_to_pytorch(calls, dtype):
+    depth, instance, Ks, motions = scene(dtype)
+    assert rigid_flow(depth, instance, Ks, motions).flow.dtype == dtype
+    rigid_flow(depth, instance, Ks.float(), motions.float())
+    assert len(calls) == (dtype is torch.float32)
+
+
+def test_small_maps_are_left_to_pytorch(calls, monkeypatch):
+    depth, _, Ks, motions = scene()
+    monkeypatch.setattr(closed_form, "SMALL", depth.numel())
+    ego_flow(depth, Ks, motions[:, 0])
+    assert not calls
+    ego_flow(torch.cat([depth, depth[:1]]), K.float(), motions[0, 0])
+    assert len(calls) == 1
+
+
+def test_without_numba_pytorch_computes(calls, monkeypatch):
+    monkeypatch.setattr(closed_form, "_numba_is_installed", lambda: False)
+    depth, _, Ks, motions = scene()
+    ego_flow(depth, Ks, motions[:, 0])
+    assert not calls
+
+
+def test_gradients_are_pytorch_s(calls):
+    depth, camera, motion = depth_map(2).float(), K.float(), MOTION.float()
+    for leaf in (depth, camera, motion):
+        leaf.requires_grad_()
+        ego_flow(depth, camera, motion).flow.sum().backward()
+        assert leaf.grad.abs().sum() > 0
+        with torch.no_grad():
+            assert not ego_flow(depth, camera, motion).flow.requires_grad
+        leaf.requires_grad_(False)
+    assert len(calls) == 3
+
+
+def test_forward_derivatives_and_vmap_are_pytorch_s(calls):
+    depth, camera = depth_map(2).float(), K.float()
+
+    def flow(motion):
+        return ego_flow(depth, camera, motion).flow
+
+    motions = torch.stack([MOTION, OTHER_MOTION]).float()
+    mapped = torch.func.vmap(flow)(motions)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(motions[0], torch.ones(4, 4))
+        assert forward_ad.unpack_dual(flow(dual)).tangent.abs().sum() > 0
+    assert not calls
+    for motion, result in zip(motions, mapped):
+        torch.testing.assert_close(result, flow(motion))
+    assert len(calls) == 2
+
+
+@pytest.mark.slow
+def test_a_folder_that_cannot_be_written_is_no_hindrance():
+    program = (
+        "import numba.core.caching as c; c.CacheImpl._locator_classes = []\n"
+        "import torch; from flowrep.geometry import closed_form, ego_flow\n"
+        "closed_form.SMALL = 0\n"
+        "print(ego_flow(torch.ones(1, 2, 2), torch.eye(3), torch.eye(4)).flow.abs().sum().item())"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert result.stdout.strip() == "0.0", result.stderr
