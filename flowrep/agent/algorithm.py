@@ -11,13 +11,14 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import LossModule
 
 from flowrep.agent.action import DiscreteActions
 from flowrep.agent.cuda_graph import as_cuda_graph
 from flowrep.agent.divergence import DivergenceWatch
 from flowrep.agent.options import options_of
 from flowrep.agent.policy import acting_network, stochastic_policy
+from flowrep.agent.targets import FastSoftUpdate
 
 
 class Memory(Protocol):
@@ -85,7 +86,7 @@ class Algorithm(ABC):
         rate_factors: Mapping[str, float] | None = None,
     ) -> None:
         self.loss = loss
-        self.target_updater = None if tau is None else SoftUpdate(loss, tau=tau)
+        self.target_updater = None if tau is None else FastSoftUpdate(loss, tau=tau)
         self.weights = weights_of(loss) | dict(self.other_weights())
         self.trained = {n: w for n, w in self.weights.items() if w.requires_grad}
         self.learning_rate, self.total_updates = learning_rate, max(1, total_updates)

@@ -20,38 +20,17 @@ from flowrep.agent.policy import MapNetwork, stochastic_policy
 ENCODERS = ("shared", "separate")
 
 
-class DiscreteSACHeadsLoss(DiscreteSACLoss):
-    """`DiscreteSACLoss` with one `Head` as policy and several as Q-functions.
-
-    TorchRL evaluates Q1 and Q2 one after the other (or by vmap), and twice at `s`: for L_Q with
-    gradients, for L_π without. Here both share one hidden layer of twice the width, and L_π reuses
-    the values computed for L_Q, so `qvalue_loss` must be called before `actor_loss` on the same
-    batch.
-    """
-
-    def _make_vmap(self) -> None:
-        self._vmap_qnetworkN0 = self._action_values
-        self._of_this_batch: Tensor | None = None
-
-    def _action_values(self, maps: TensorDictBase, params: Any) -> TensorDictBase:
-        """Returns a TensorDict with the action values `[nets, N, n]` of all Q-functions."""
-        (key,) = self.qvalue_network.in_keys
-        if params is self._cached_detached_qvalue_params and self._of_this_batch is not None:
-            values, self._of_this_batch = self._of_this_batch, None
-        else:
-            values = heads_together(maps[key], params["module"])
-            if params is self.qvalue_network_params:
-                self._of_this_batch = values.detach()
-        return TensorDict({self.tensor_keys.action_value: values}, values.shape[:2])
-
-
-class DiscreteSACMapLoss(DiscreteSACHeadsLoss):
+class DiscreteSACMapLoss(DiscreteSACLoss):
     """Discrete SAC loss on packed maps, as `ReplayMemory` samples them; see `DiscreteSAC`.
+
+    TorchRL's loss evaluates Q1 and Q2 one after the other (or by vmap), and twice at `s`: for L_Q
+    with gradients, for L_π without. Here both share one hidden layer of twice the width and are
+    evaluated once. TorchRL keeps the networks, the targets and α.
 
     Reads the maps, `action`, `steps_to_next_obs` and, under `next`, the maps, `reward`, `done` and
     `terminated`. Returns `loss_qvalue`, `loss_actor` and `loss_alpha`, to be minimised as a sum,
     with `alpha`, `entropy`, `q_mean` and `td_error`. Its target parameters are those of the
-    Q-functions and their encoder, and TorchRL's `SoftUpdate` moves all of them.
+    Q-functions and their encoder.
 
     Args:
         actor: the policy's network.
@@ -115,53 +94,61 @@ class DiscreteSACMapLoss(DiscreteSACHeadsLoss):
     def _set_in_keys(self) -> None:
         self._in_keys = transition_keys(self.codecs)
 
+    def make_value_estimator(self, *args: Any, **options: Any) -> None:
+        """Sets γ; y is the TD(0) target whatever the type."""
+        super().make_value_estimator(*args, **options)
+        self.gamma = float(self.value_estimator.gamma)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
-        embedded = self._embed(tensordict)
-        loss_qvalue, critic_info = self.qvalue_loss(embedded)
-        # the policy loss must not reach the critic's encoder through Q(s, a)
-        embedded["critic_embedding"] = embedded["critic_embedding"].detach()
-        loss_actor, actor_info = self.actor_loss(embedded)
-        negative_entropy = actor_info["log_prob"]
+        images = decode_maps(self.codecs, tensordict)
+        embedding = self.critic_encoder(images)
+        # neither L_π nor Q in it may train the critic's encoder
+        seen = embedding.detach() if self.encoder_is_shared else self.actor_encoder(images)
+        log_policy = self._log_policy(seen)
+        policy = log_policy.exp()
+        negative_entropy = (policy * log_policy).sum(-1)
         alpha = self.log_alpha.detach().exp()
-        entropy = -negative_entropy.mean()
+
+        q = heads_together(embedding, self.qvalue_network_params["module"])  # [2, N, n]
+        action = tensordict["action"]
+        if self.action_space != "categorical":
+            action = action.to(torch.uint8).argmax(-1)
+        chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
+        td_error = chosen - self._target(tensordict, alpha)
+        expected_q = (policy * q.detach().amin(0)).sum(-1)
+        surplus = (negative_entropy.detach() + self.target_entropy).mean()
         return TensorDict(
             {
-                "loss_qvalue": loss_qvalue,
-                "loss_actor": loss_actor,
-                "loss_alpha": self.alpha_loss(negative_entropy).mean(),
+                "loss_qvalue": td_error.square().mean(-1).sum(),
+                "loss_actor": (alpha * negative_entropy - expected_q).mean(),
+                "loss_alpha": -self.log_alpha * surplus,
                 "alpha": alpha,
-                "entropy": entropy,
-                # L_π = -α · entropy - mean Σ_a π min_i Q_i
-                "q_mean": -(loss_actor.detach() + alpha * entropy),
-                "td_error": critic_info["td_error"].mean(),
+                "entropy": -negative_entropy.detach().mean(),
+                "q_mean": expected_q.detach().mean(),
+                "td_error": td_error.detach().abs().amax(0).mean(),
             }
         )
 
-    def _embed(self, batch: TensorDictBase) -> TensorDict:
-        """Returns the batch with its maps replaced by embeddings."""
-        images = decode_maps(self.codecs, batch)
-        critic = self.critic_encoder(images)
-        actor = critic.detach() if self.encoder_is_shared else self.actor_encoder(images)
-        with torch.no_grad():
-            images = decode_maps(self.codecs, batch["next"])
-            following = batch["next"].select("reward", "done", "terminated")
-            with self.target_critic_encoder_params.to_module(self.critic_encoder):
-                target = self.critic_encoder(images)
-            following["critic_embedding"] = target
-            following["actor_embedding"] = (
-                target if self.encoder_is_shared else self.actor_encoder(images)
-            )
-        return TensorDict(
-            {
-                "actor_embedding": actor,
-                "critic_embedding": critic,
-                "action": batch["action"],
-                "steps_to_next_obs": batch["steps_to_next_obs"],
-                "next": following,
-            },
-            batch.batch_size,
-        )
+    @torch.no_grad()
+    def _target(self, batch: TensorDictBase, alpha: Tensor) -> Tensor:
+        """Returns y `[N]`."""
+        outcome = batch["next"]
+        images = decode_maps(self.codecs, outcome)
+        with self.target_critic_encoder_params.to_module(self.critic_encoder):
+            embedding = self.critic_encoder(images)
+        seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
+        log_policy = self._log_policy(seen)
+        q = heads_together(embedding, self.target_qvalue_network_params["module"]).amin(0)
+        value = (log_policy.exp() * (q - alpha * log_policy)).sum(-1, keepdim=True)
+        # masked instead of multiplied: the value after an end may even be nan
+        value = value.masked_fill(outcome["terminated"], 0.0)
+        discount = self.gamma ** batch["steps_to_next_obs"]
+        return (outcome["reward"] + discount * value).squeeze(-1)
+
+    def _log_policy(self, embedding: Tensor) -> Tensor:
+        """Returns log π `[N, n]`."""
+        return self.actor_network[0].module(embedding).log_softmax(-1)
 
 
 def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:

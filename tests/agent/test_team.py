@@ -109,6 +109,7 @@ def test_the_number_of_threads_changes_no_bit(
     # parts of a few images, as a large batch has them
     monkeypatch.setattr("flowrep.agent.layers.CACHE_BYTES", 1 << 16)
     monkeypatch.setattr("flowrep.agent.layers.ROWS", 8)
+    torch.set_num_threads(1)  # as in training; PyTorch's own threads do change bits
     steps, weights = random_steps(32), []
     for count in (1, 2, 3):
         threads(count)
