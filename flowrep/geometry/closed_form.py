@@ -210,3 +210,8 @@ def mask_channel(valid: Tensor) -> Tensor:
         ones = torch.where(valid, 1.0, 0.0).to(torch.uint8)
         valid = ones.as_strided(ones.shape, ones.stride()).view(torch.bool)
     return valid.unsqueeze(-3)
+
+
+def largest_raw(compute: torch.dtype) -> float:
+    """Returns the bound on |u| + |v| of raw flow, from which ego flow can be subtracted."""
+    return torch.finfo(compute).max / 4

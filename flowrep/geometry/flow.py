@@ -167,11 +167,17 @@ def factorize(
     dtype = torch.promote_types(own, raw.dtype)
     depth = depth.expand(*batch, -1, -1, -1)
     u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, (own, compute))
-    raw_u, raw_v = raw.to(dtype).expand(*batch, -1, -1, -1).unbind(-3)
+    raw = raw.to(dtype).expand(*batch, -1, -1, -1)
+    if closed_form.suits_kernel(dtype, depth, u, v, raw):
+        from flowrep.geometry import kernel  # needs numba
+
+        obj, known = kernel.object_flow(raw, u, v, valid)
+        return Factors(closed_form.stack_planes(u, v), obj, closed_form.mask_channel(known))
+    raw_u, raw_v = raw.unbind(-3)
     u, v = u.to(dtype), v.to(dtype)
     obj_u, obj_v = raw_u - u, raw_v - v
     # Finite, and small enough for a finite difference.
-    largest = torch.finfo(compute).max / 4
+    largest = closed_form.largest_raw(compute)
     measured = raw_u.to(compute).abs() + raw_v.to(compute).abs() < largest
     if torch.finfo(dtype).max < torch.finfo(compute).max:
         measured = measured & obj_u.isfinite() & obj_v.isfinite()

@@ -17,9 +17,10 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, Planes
+from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, Planes, largest_raw
 
 _LEAST_DEPTH, _LEAST_RATIO = np.float32(SMALLEST), np.float32(MIN_DEPTH_RATIO)
+_LARGEST_RAW = np.float32(largest_raw(torch.float32))
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
@@ -76,6 +77,28 @@ def planes_of_motions(
     return u.view(depth.shape), v.view(depth.shape), valid.view(depth.shape)
 
 
+def object_flow(raw: Tensor, u: Tensor, v: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns raw − ego, 0 where it isn't known, `[*B, 2, H, W]`, and where it is, `[*B, H, W]`.
+
+    Args:
+        raw: `[*B, 2, H, W]`, float32.
+        u: ego flow to the right, `[*B, H, W]`, float32.
+        v: ego flow downwards, likewise.
+        valid: where ego flow is known, bool `[*B, H, W]`.
+    """
+    *batch, height, width = valid.shape
+    maps = math.prod(batch)
+    obj = torch.empty(maps, 2, height, width)
+    known = torch.empty(maps, height, width, dtype=torch.bool)
+    _subtract(
+        raw.detach().reshape(maps, 2, height, width).contiguous().numpy(),
+        *(plane.reshape(known.shape).numpy() for plane in (u, v, valid)),
+        obj.numpy(),
+        known.numpy(),
+    )
+    return obj.view(*batch, 2, height, width), known.view(valid.shape)
+
+
 def _compiled(function: Callable[..., Any]) -> Any:
     # "numpy": a division by 0 is inf, as in PyTorch, and leaves no branch in the loop
     try:
@@ -123,6 +146,18 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
                     depth[n, i, j], x, y, far, (c[9], c[10], c[11]), dts[n]
                 )
     return lowest, highest
+
+
+@_compiled
+def _subtract(raw, u, v, valid, obj, known):
+    for n in range(len(raw)):
+        for i in range(raw.shape[2]):
+            for j in range(raw.shape[3]):
+                raw_u, raw_v = raw[n, 0, i, j], raw[n, 1, i, j]
+                is_known = valid[n, i, j] & (abs(raw_u) + abs(raw_v) < _LARGEST_RAW)
+                known[n, i, j] = is_known
+                obj[n, 0, i, j] = raw_u - u[n, i, j] if is_known else _ZERO
+                obj[n, 1, i, j] = raw_v - v[n, i, j] if is_known else _ZERO
 
 
 @_compiled

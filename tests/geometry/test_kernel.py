@@ -94,10 +94,21 @@ def test_factors_and_what_they_share(calls):
     depth, instance, Ks, motions = scene()
     raw = rigid_flow(depth, instance, Ks, motions).flow
     factors = factorize(raw, depth, Ks, motions[:, 0])
+    assert not factors.obj[0, :, 3:].any()  # exactly 0 on what stands still
+    raw[0, 0, 1, :4] = torch.tensor([math.nan, math.inf, -2e38, 4.0])
+    factors = factorize(raw, depth, Ks, motions[:, 0])
+    assert len(calls) == 3
     for ours, theirs in zip(factors, by_torch(factorize, raw, depth, Ks, motions[:, 0])):
         assert torch.equal(ours, theirs)
-    assert len(calls) == 2
-    assert not factors.obj[0, :, 3:].any()  # exactly 0 on what stands still
+    assert factors.valid[0, 0, 1, :4].tolist() == [False, False, False, True]
+
+
+def test_a_gradient_of_raw_flow_alone(calls):
+    depth, _, Ks, motions = scene()
+    raw = torch.ones(3, 2, HEIGHT, WIDTH, requires_grad=True)
+    factorize(raw, depth, Ks, motions[:, 0]).obj.sum().backward()
+    valid = ego_flow(depth, Ks, motions[:, 0]).valid
+    assert torch.equal(raw.grad, valid.expand_as(raw).float())
 
 
 @pytest.mark.parametrize("batch", [(), (2, 3)])
