@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -16,6 +17,7 @@ from flowrep.agent.encoder import Encoder
 from flowrep.agent.heads import Head, heads_together
 from flowrep.agent.observation import MapCodec, decode_maps
 from flowrep.agent.policy import MapNetwork, stochastic_policy
+from flowrep.agent.team import begin_task
 
 ENCODERS = ("shared", "separate")
 
@@ -87,6 +89,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.codecs, self.encoder_is_shared = actor.codecs, shared
+        self._target_encoder = (actor.another_encoder().to("meta"),)  # in a tuple: no submodule
         self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
         if not shared:
             self.convert_to_functional(actor.encoder, "actor_encoder")
@@ -101,6 +104,11 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
+        alpha = self.log_alpha.detach().exp()
+        targets: list[Tensor] = []
+        find_targets = partial(self._find_targets, tensordict, alpha, targets)
+        is_on_cpu = tensordict.device is None or tensordict.device.type == "cpu"
+        wait_for_targets = begin_task(find_targets) if is_on_cpu else find_targets
         images = decode_maps(self.codecs, tensordict)
         embedding = self.critic_encoder(images)
         # neither L_π nor Q in it may train the critic's encoder
@@ -108,14 +116,13 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         log_policy = self._log_policy(seen)
         policy = log_policy.exp()
         negative_entropy = (policy * log_policy).sum(-1)
-        alpha = self.log_alpha.detach().exp()
-
         q = heads_together(embedding, self.qvalue_network_params["module"])  # [2, N, n]
         action = tensordict["action"]
         if self.action_space != "categorical":
             action = action.to(torch.uint8).argmax(-1)
         chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
-        td_error = chosen - self._target(tensordict, alpha)
+        wait_for_targets()
+        td_error = chosen - targets[0]
         expected_q = (policy * q.detach().amin(0)).sum(-1)
         surplus = (negative_entropy.detach() + self.target_entropy).mean()
         return TensorDict(
@@ -131,12 +138,14 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         )
 
     @torch.no_grad()
-    def _target(self, batch: TensorDictBase, alpha: Tensor) -> Tensor:
-        """Returns y `[N]`."""
+    def _find_targets(self, batch: TensorDictBase, alpha: Tensor, found: list[Tensor]) -> None:
+        """Appends y `[N]`."""
         outcome = batch["next"]
         images = decode_maps(self.codecs, outcome)
-        with self.target_critic_encoder_params.to_module(self.critic_encoder):
-            embedding = self.critic_encoder(images)
+        # not `critic_encoder`, whose weights another thread reads
+        (encoder,) = self._target_encoder
+        with self.target_critic_encoder_params.to_module(encoder):
+            embedding = encoder(images)
         seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
         log_policy = self._log_policy(seen)
         q = heads_together(embedding, self.target_qvalue_network_params["module"]).amin(0)
@@ -144,7 +153,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         # masked instead of multiplied: the value after an end may even be nan
         value = value.masked_fill(outcome["terminated"], 0.0)
         discount = self.gamma ** batch["steps_to_next_obs"]
-        return (outcome["reward"] + discount * value).squeeze(-1)
+        found.append((outcome["reward"] + discount * value).squeeze(-1))
 
     def _log_policy(self, embedding: Tensor) -> Tensor:
         """Returns log π `[N, n]`."""

@@ -51,6 +51,24 @@ class Team:
             work.take()
         work.wait()
 
+    def begin(self, task: Task) -> Callable[[], None]:
+        """Has another thread run a task meanwhile, if the team has one.
+
+        Returns:
+            A function that returns when the task has ended, and runs it if nobody has begun to; it
+            raises what the task raised.
+        """
+        work = Work([task])
+        for calls in self._calls[:1]:
+            calls.put(work)
+
+        def finish() -> None:
+            with torch.no_grad():
+                work.take()
+            work.wait()
+
+        return finish
+
     def dismiss(self) -> None:
         """Ends the helper threads; from then on the caller works alone."""
         for calls in self._calls:
@@ -135,6 +153,11 @@ def run_tasks(tasks: Iterable[Task]) -> None:
         Exception: the first one that a task raised.
     """
     _team.run(tasks)
+
+
+def begin_task(task: Task) -> Callable[[], None]:
+    """Begins a task on another thread, if `use_threads` has set several; see `Team.begin`."""
+    return _team.begin(task)
 
 
 def parts(length: int, largest: int) -> list[slice]:

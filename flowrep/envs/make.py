@@ -91,8 +91,8 @@ def make_env(
             `flowrep.transforms.representation_stack`.
         noise: errors of the depth camera and of odometry, see `representation_stack`. They are
             drawn by frame, so that a repeated episode looks the same.
-        compiled: whether flow is computed through `torch.compile`: about eight times as fast on a
-            CPU and equal up to rounding, after up to a minute of compilation.
+        compiled: whether flow is computed through `torch.compile`: up to two and a half times as
+            fast on a CPU and equal up to rounding, after up to a minute of compilation.
         renderer: what renders depth, classes and ids, see `StreetEnv`.
 
     Raises:

@@ -60,6 +60,30 @@ def test_tasks_build_no_graph_whoever_runs_them():
     crew.dismiss()
 
 
+def test_a_task_runs_beside_the_caller_where_there_is_a_second_thread():
+    crew, meeting = Team(2), threading.Barrier(2, timeout=10)
+    wait = crew.begin(meeting.wait)
+    meeting.wait()  # nobody else would come
+    wait()
+    crew.dismiss()
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_a_task_that_was_begun_has_ended_after_the_wait(size):
+    crew, weight, seen = Team(size), torch.ones(1, requires_grad=True), []
+    wait = crew.begin(lambda: seen.append((weight * 2).requires_grad))
+    wait()
+    assert seen == [False]
+
+    def fail():
+        raise KeyError("seven")
+
+    wait = crew.begin(fail)
+    with pytest.raises(KeyError, match="seven"):
+        wait()
+    crew.dismiss()
+
+
 def test_helpers_end_when_they_are_dismissed():
     before = set(threading.enumerate())  # helpers of other teams may be ending
     crew = Team(3)
