@@ -31,7 +31,7 @@ def draw_learning_curve(run: RunFolder) -> None:
             capsize=3,
             label=None if number else "evaluation, greedy actions",
         )
-    axes.legend(loc="upper left")
+    axes.legend(loc="lower right")  # where a curve that rises leaves room
     axes.grid(alpha=0.3)
     figure.savefig(run.path / "learning_curve.png", dpi=120)
 
