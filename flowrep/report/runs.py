@@ -222,4 +222,11 @@ def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
         for key, inner in value.items():
             yield from _flat(inner, f"{place}.{key}" if place else str(key))
     else:
-        yield place, value
+        yield place, _plain(value)
+
+
+def _plain(value: Any) -> Any:
+    """Returns a value that is spelt in one way: 4.0 in a file is 4 on a command line."""
+    if isinstance(value, list):
+        return [_plain(part) for part in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -124,7 +124,7 @@ def test_runs_of_one_config_are_one_family_over_scenes_stacks_and_seeds(tmp_path
         ("flow__source", "estimated", "flow.source"),
         ("scene__camera__width_px", 84, "scene.camera.width_px"),
         ("scene__time_limit_steps", 90, "scene.straight_road.time_limit_steps"),
-        ("representations__obj__scale", 3.0, "representations.obj.scale"),
+        ("representations__obj__scale", 2.5, "representations.obj.scale"),
     ],
 )
 def test_runs_whose_configs_differ_are_apart_and_the_key_is_named(tmp_path, key, value, label):
@@ -137,13 +137,21 @@ def test_runs_whose_configs_differ_are_apart_and_the_key_is_named(tmp_path, key,
     assert f"{label}={value}" in found
 
 
+def test_a_whole_number_is_the_same_with_and_without_a_point(tmp_path):
+    ranges = {"scene__pedestrian_speed_mps": {"normal": [1, 2.5]}}
+    run_in(tmp_path, "a", algorithm__tau=1, **ranges)
+    ranges = {"scene__pedestrian_speed_mps": {"normal": [1.0, 2.5]}}
+    run_in(tmp_path, "b", seed=1, algorithm__tau=1.0, **ranges)
+    assert labels(tmp_path) == {"": ["a", "b"]}
+
+
 def test_a_run_without_a_key_that_differs_stands_beside_both(tmp_path):
     run_in(tmp_path, "one", representations__obj={"scale": 1.0})
     run_in(tmp_path, "two", representations__obj={"scale": 2.0})
     run_in(tmp_path, "seg2", stack="seg2")
     assert labels(tmp_path) == {
-        "representations.obj.scale=1.0": ["one", "seg2"],
-        "representations.obj.scale=2.0": ["seg2", "two"],
+        "representations.obj.scale=1": ["one", "seg2"],
+        "representations.obj.scale=2": ["seg2", "two"],
     }
 
 
