@@ -197,7 +197,7 @@ def test_noise_is_told_stack_by_stack_and_against_the_other_stacks(tmp_path):
     found, report = sections_of(tmp_path)
     section = found["sensor_noise"]
     assert section.notes == (
-        "exact: noise.depth_sigma_per_m=0.0, noise.drift_m=0.0.",
+        "exact: noise.depth_sigma_per_m=0, noise.drift_m=0.",
         "noisy: noise.depth_sigma_per_m=0.002, noise.drift_m=0.02.",
         "Missing in S-Turn: raw, noisy.",
     )
