@@ -12,12 +12,12 @@ import flowrep
 PACKAGE = Path(flowrep.__file__).parent
 
 FLOWREP_IMPORTS_ALLOWED = {
-    "geometry": {"geometry"},
+    "geometry": {"geometry", "jit"},
     "transforms": {"transforms", "geometry", "extras"},
     "agent": {"agent", "extras"},
     "palette": set(),
     "scenes": {"scenes", "config_tree", "extras", "palette"},
-    "simulator": {"simulator", "scenes", "palette"},
+    "simulator": {"simulator", "scenes", "palette", "jit"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
@@ -42,7 +42,7 @@ FLOWREP_IMPORTS_ALLOWED = {
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py"},
-    "numba": {"simulator/rasteriser.py", "geometry/kernel.py"},
+    "numba": {"jit.py"},
     "hydra": {
         "train.py",
         "evaluate.py",
@@ -63,7 +63,7 @@ THIRD_PARTY_ONLY_IN = {
 }
 # Extras of the transforms: imported when one is made that needs them, never before.
 LAZILY = {
-    "geometry/kernel.py": {"numba", "numpy"},
+    "geometry/kernel.py": {"numpy"},
     "transforms/dis.py": {"cv2"},
     "transforms/raft.py": {"torchvision", "safetensors"},
 }
@@ -72,7 +72,7 @@ PACKAGES_LIMITED_TO = {
     "transforms": {"torch", "tensordict", "torchrl"},
     "agent": {"torch", "tensordict", "torchrl", "safetensors", "numpy"},
     "scenes": {"numpy", "shapely", "yaml", "pydantic", "pydantic_core"},
-    "simulator": {"numpy", "numba", "pybullet", "shapely"},
+    "simulator": {"numpy", "pybullet", "shapely"},
 }
 
 # Nothing of flowrep imports this one: whoever has Hydra does.

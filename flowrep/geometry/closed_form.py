@@ -169,7 +169,7 @@ def flow_planes(
 ) -> Planes:
     """Returns u, v and valid of depth's shape; q is `q_far` at infinity.
 
-    Planes `[*B, H, W]` or a list of pixels, with which all other arguments broadcast.
+    Depth is `[*B, H, W]`; all other arguments broadcast with it.
     """
     depth = depth.to(x.dtype)
     has_depth = depth >= SMALLEST  # nan compares False

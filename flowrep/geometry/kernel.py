@@ -9,19 +9,21 @@ when `closed_form.suits_kernel` says so.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, Planes, largest_raw
+from flowrep.jit import compiled
 
 _LEAST_DEPTH, _LEAST_RATIO = np.float32(SMALLEST), np.float32(MIN_DEPTH_RATIO)
 _LARGEST_RAW = np.float32(largest_raw(torch.float32))
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+
+# "numpy": a division by 0 is inf, as in PyTorch, and leaves no branch in the loop
+_compiled = compiled(error_model="numpy")
 
 
 def planes_of_motions(
@@ -97,14 +99,6 @@ def object_flow(raw: Tensor, u: Tensor, v: Tensor, valid: Tensor) -> tuple[Tenso
         known.numpy(),
     )
     return obj.view(*batch, 2, height, width), known.view(valid.shape)
-
-
-def _compiled(function: Callable[..., Any]) -> Any:
-    # "numpy": a division by 0 is inf, as in PyTorch, and leaves no branch in the loop
-    try:
-        return njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:  # no writable cache folder: each process compiles again
-        return njit(nogil=True, error_model="numpy")(function)
 
 
 @_compiled

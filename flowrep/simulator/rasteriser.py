@@ -10,23 +10,17 @@ in u and v. This also holds for corners behind the camera, so nothing needs to b
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flowrep.jit import compiled
 from flowrep.simulator.triangles import Triangles
 
 _LEAST_AREA_PX = 0.01  # twice the area below which PyBullet's renderer omits triangles
 
-
-def _compiled(function: Callable[..., None]) -> Any:
-    try:
-        return njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # no writable cache folder: each process compiles again
-        return njit(nogil=True)(function)
+_compiled = compiled()
 
 
 class Maps(NamedTuple):
