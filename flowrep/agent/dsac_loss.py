@@ -105,10 +105,9 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
         alpha = self.log_alpha.detach().exp()
-        targets: list[Tensor] = []
-        find_targets = partial(self._find_targets, tensordict, alpha, targets)
+        target = partial(self._target, tensordict, alpha)
         is_on_cpu = tensordict.device is None or tensordict.device.type == "cpu"
-        wait_for_targets = begin_task(find_targets) if is_on_cpu else find_targets
+        wait_for_target = begin_task(target) if is_on_cpu else target
         images = decode_maps(self.codecs, tensordict)
         embedding = self.critic_encoder(images)
         # neither L_π nor Q in it may train the critic's encoder
@@ -121,8 +120,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         if self.action_space != "categorical":
             action = action.to(torch.uint8).argmax(-1)
         chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
-        wait_for_targets()
-        td_error = chosen - targets[0]
+        td_error = chosen - wait_for_target()
         expected_q = (policy * q.detach().amin(0)).sum(-1)
         surplus = (negative_entropy.detach() + self.target_entropy).mean()
         return TensorDict(
@@ -138,8 +136,8 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         )
 
     @torch.no_grad()
-    def _find_targets(self, batch: TensorDictBase, alpha: Tensor, found: list[Tensor]) -> None:
-        """Appends y `[N]`."""
+    def _target(self, batch: TensorDictBase, alpha: Tensor) -> Tensor:
+        """Returns y `[N]`."""
         outcome = batch["next"]
         images = decode_maps(self.codecs, outcome)
         # not `critic_encoder`, whose weights another thread reads
@@ -153,7 +151,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         # masked instead of multiplied: the value after an end may even be nan
         value = value.masked_fill(outcome["terminated"], 0.0)
         discount = self.gamma ** batch["steps_to_next_obs"]
-        found.append((outcome["reward"] + discount * value).squeeze(-1))
+        return (outcome["reward"] + discount * value).squeeze(-1)
 
     def _log_policy(self, embedding: Tensor) -> Tensor:
         """Returns log π `[N, n]`."""

@@ -15,10 +15,12 @@ from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from queue import SimpleQueue
 from threading import Thread
+from typing import TypeVar
 
 import torch
 
 Task = Callable[[], object]
+T = TypeVar("T")
 
 
 class Team:
@@ -51,21 +53,23 @@ class Team:
             work.take()
         work.wait()
 
-    def begin(self, task: Task) -> Callable[[], None]:
+    def begin(self, task: Callable[[], T]) -> Callable[[], T]:
         """Has another thread run a task meanwhile, if the team has one.
 
         Returns:
-            A function that returns when the task has ended, and runs it if nobody has begun to; it
-            raises what the task raised.
+            A function that waits for the task's result, and runs the task if nobody has begun to;
+            it raises what the task raised.
         """
-        work = Work([task])
+        results: list[T] = []
+        work = Work([lambda: results.append(task())])
         for calls in self._calls[:1]:
             calls.put(work)
 
-        def finish() -> None:
+        def finish() -> T:
             with torch.no_grad():
                 work.take()
             work.wait()
+            return results[0]
 
         return finish
 
@@ -155,7 +159,7 @@ def run_tasks(tasks: Iterable[Task]) -> None:
     _team.run(tasks)
 
 
-def begin_task(task: Task) -> Callable[[], None]:
+def begin_task(task: Callable[[], T]) -> Callable[[], T]:
     """Begins a task on another thread, if `use_threads` has set several; see `Team.begin`."""
     return _team.begin(task)
 
