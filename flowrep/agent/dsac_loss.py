@@ -106,8 +106,8 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         """Returns the losses of a batch, with gradients, and further metrics, without."""
         alpha = self.log_alpha.detach().exp()
         target = partial(self._target, tensordict, alpha)
-        is_on_cpu = tensordict.device is None or tensordict.device.type == "cpu"
-        wait_for_target = begin_task(target) if is_on_cpu else target
+        # a CUDA graph captures the work of one thread
+        wait_for_target = begin_task(target) if self.log_alpha.is_cpu else target
         images = decode_maps(self.codecs, tensordict)
         embedding = self.critic_encoder(images)
         # neither L_π nor Q in it may train the critic's encoder
