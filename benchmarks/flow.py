@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from flowrep.agent.allocator import keep_freed_memory
-from flowrep.geometry import closed_form, factorize, rigid_flow
+from flowrep.geometry import factorize, rigid_flow, single_pass
 
 SIZES = [(32, 48), (96, 48), (32, 84), (128, 84)]
 BODIES, SEEN = 16, 6
@@ -30,7 +30,7 @@ def step(depth: Tensor, instance: Tensor, K: Tensor, motions: Tensor) -> tuple[T
 
 def by_pytorch(*inputs: Tensor) -> tuple[Tensor, ...]:
     """Returns the same without the kernel."""
-    with patch.object(closed_form, "SMALL", 1 << 40):
+    with patch.object(single_pass, "SMALL", 1 << 40):
         return step(*inputs)
 
 

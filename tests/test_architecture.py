@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -79,16 +80,21 @@ PACKAGES_LIMITED_TO = {
 WITH_HYDRA = {"transforms/configs.py": {"hydra", "omegaconf"}}
 
 
-def imported_modules(path: Path) -> set[str]:
-    """Full dotted names of every module that a file imports, wherever in the file."""
-    names = set()
+def imports(path: Path) -> set[tuple[str, str]]:
+    """Every module that a file imports, wherever in the file, with each name taken from it."""
+    found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            found |= {(alias.name, "") for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import; write the full name"
-            names.add(node.module)
-    return names
+            found |= {(node.module, alias.name) for alias in node.names}
+    return found
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Full dotted names of every module that a file imports."""
+    return {module for module, _ in imports(path)}
 
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -110,6 +116,18 @@ def test_imports_point_one_way(path):
     assert "flowrep.torchrl_configs" not in imported
     for package, places in THIRD_PARTY_ONLY_IN.items():
         assert package not in outside or str(place) in places
+
+
+def test_no_modules_import_each_other():
+    places = [path.relative_to(PACKAGE.parent).with_suffix("") for path in MODULES]
+    modules = dict(zip((".".join(place.parts) for place in places), MODULES))
+    graph = {
+        module: {name for pair in imports(path) for name in (pair[0], ".".join(pair))}
+        & modules.keys()
+        for module, path in modules.items()
+    }
+    assert sum(map(len, graph.values())) > len(graph)
+    TopologicalSorter(graph).prepare()  # its CycleError names them
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))

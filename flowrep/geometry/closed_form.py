@@ -19,14 +19,9 @@ intermediate result could overflow in float32 (the worst case reaches 3e34).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
-from importlib.util import find_spec
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
-
-from flowrep.geometry.camera import centred_pixels
 
 # Lower bound on the depth in the previous camera over the depth in the current one.
 MIN_DEPTH_RATIO = 0.01
@@ -34,72 +29,7 @@ MIN_DEPTH_RATIO = 0.01
 LARGEST = 1e8  # bound on the entries of K, A and e, in pixels, metres and their products
 SMALLEST = 1e-8  # bound on depth in metres, and on dt
 
-SMALL = 1 << 14  # pixels for which loading the kernel isn't worth while
-
 Planes = tuple[Tensor, Tensor, Tensor]  # u, v, valid: [*B, H, W] each
-
-
-def camera_planes(
-    depth: Tensor,
-    K: Tensor,
-    prev_from_curr: Tensor,
-    dt: float | Tensor,
-    dtypes: tuple[torch.dtype, torch.dtype],
-) -> Planes:
-    """Returns the flow planes of one motion for the whole image.
-
-    `dtypes` are those of the result and of the computation.
-    """
-    dtype, compute = dtypes
-    K, dt, known = known_camera(K.to(compute), dt)
-    coefficients = motion_coefficients(K, prev_from_curr.to(compute), known)
-    x, y = centred_pixels(depth.shape[-2], depth.shape[-1], K)
-    if suits_kernel(dtype, depth, coefficients, x, dt):
-        from flowrep.geometry import kernel  # needs numba
-
-        motions = coefficients.unsqueeze(-2)
-        return kernel.planes_of_motions(depth.squeeze(-3), None, motions, x, y, dt)
-    by_motion = coefficients[..., None, None, :]  # [*B, 1, 1, 12]
-    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = by_motion.unbind(-1)
-    # A x~ is the sum of a term per column and one per row, tabulated to save work per pixel.
-    x, *columns = _table(x, axx * x, ayx * x, azx * x)
-    y, *rows = _table(y, axy * y + ax, ayy * y + ay, azy * y + az)
-    q_far = [column + row for column, row in zip(columns, rows)]
-    if isinstance(dt, Tensor):
-        dt = dt[..., None, None]
-    return flow_planes(depth.squeeze(-3), x, y, q_far, e, dt, dtype)
-
-
-def suits_kernel(dtype: torch.dtype, depth: Tensor, *others: float | Tensor) -> bool:
-    """Returns whether `flowrep.geometry.kernel` computes flow of `dtype` from these arguments.
-
-    It takes large float32 batches on a CPU, without gradients.
-    """
-    if torch.compiler.is_compiling():  # first, as a question about sizes would limit the program
-        return False
-    tensors = [depth, *(other for other in others if isinstance(other, Tensor))]
-    return (
-        dtype is torch.float32
-        and depth.is_cpu
-        and depth.numel() > SMALL
-        and all(tensor.dtype is torch.float32 and _is_plain(tensor) for tensor in tensors)
-        and _numba_is_installed()
-    )
-
-
-def _is_plain(tensor: Tensor) -> bool:
-    """Returns whether a tensor is numbers in memory: not a subclass, and not being transformed."""
-    return (
-        type(tensor) in (Tensor, torch.nn.Parameter)
-        and not (tensor.requires_grad and torch.is_grad_enabled())
-        and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
-        and forward_ad.unpack_dual(tensor).tangent is None
-    )
-
-
-@cache
-def _numba_is_installed() -> bool:
-    return find_spec("numba") is not None
 
 
 def known_camera(K: Tensor, dt: float | Tensor) -> tuple[Tensor, float | Tensor, Tensor]:
@@ -151,11 +81,6 @@ def motion_coefficients(K: Tensor, prev_from_curr: Tensor, known: Tensor) -> Ten
     # Concatenated, so that inductor stores the result instead of repeating `where` at every pixel.
     parts = zip(coefficients.split([8, 1, 3], -1), behind)
     return torch.cat([torch.where(known, part, otherwise) for part, otherwise in parts], -1)
-
-
-def _table(*entries: Tensor) -> tuple[Tensor, ...]:
-    """Returns the entries as slices of one tensor, which inductor stores and doesn't recompute."""
-    return torch.stack(torch.broadcast_tensors(*entries)).unbind()
 
 
 def flow_planes(

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from flowrep.geometry import closed_form
-from flowrep.geometry.bodies import body_planes
+from flowrep.geometry import closed_form, single_pass
 from flowrep.geometry.checks import broadcast_batch, check_is_tensor, check_shape, check_trailing
+from flowrep.geometry.planes import body_planes, camera_planes
 
 
 class Flow(NamedTuple):
@@ -72,7 +72,7 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
     batch = _check(depth, K, prev_from_curr, dt)
     dtypes = _dtypes(depth, K, prev_from_curr)
     depth = depth.expand(*batch, -1, -1, -1)
-    u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, dtypes)
+    u, v, valid = camera_planes(depth, K, prev_from_curr, dt, dtypes)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
@@ -166,12 +166,10 @@ def factorize(
     own, compute = _dtypes(depth, K, prev_from_curr)
     dtype = torch.promote_types(own, raw.dtype)
     depth = depth.expand(*batch, -1, -1, -1)
-    u, v, valid = closed_form.camera_planes(depth, K, prev_from_curr, dt, (own, compute))
+    u, v, valid = camera_planes(depth, K, prev_from_curr, dt, (own, compute))
     raw = raw.to(dtype).expand(*batch, -1, -1, -1)
-    if closed_form.suits_kernel(dtype, depth, u, v, raw):
-        from flowrep.geometry import kernel  # needs numba
-
-        obj, known = kernel.object_flow(raw, u, v, valid)
+    if single_pass.suits(dtype, depth, u, v, raw):
+        obj, known = single_pass.object_flow(raw, u, v, valid)
         return Factors(closed_form.stack_planes(u, v), obj, closed_form.mask_channel(known))
     raw_u, raw_v = raw.unbind(-3)
     u, v = u.to(dtype), v.to(dtype)

@@ -1,21 +1,12 @@
-"""Flow planes on a CPU in a single pass over the pixels, compiled by numba.
+"""The loops of `flowrep.geometry.single_pass`, compiled by numba at their first call.
 
-PyTorch needs some twenty passes for `closed_form.flow_planes`, each through memory. Here the same
-operations are done in the same order, each rounded to float32, so that the results are bitwise
-equal. Numba compiles at the first call and caches the machine code. The module is imported only
-when `closed_form.suits_kernel` says so.
+Arrays are float32, but for integer ids and bool masks; maps are the first axis.
 """
-
-from __future__ import annotations
-
-import math
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, Planes, largest_raw
+from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, largest_raw
 from flowrep.jit import compiled
 
 _LEAST_DEPTH, _LEAST_RATIO = np.float32(SMALLEST), np.float32(MIN_DEPTH_RATIO)
@@ -26,83 +17,8 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _compiled = compiled(error_model="numpy")
 
 
-def planes_of_motions(
-    depth: Tensor,
-    instance: Tensor | None,
-    coefficients: Tensor,
-    x: Tensor,
-    y: Tensor,
-    dt: float | Tensor,
-) -> Planes:
-    """Returns the flow planes of N motions per map.
-
-    Args:
-        depth: `[*B, H, W]`, float32, like all other floats.
-        instance: `[*B, H, W]`, integers, the motion of each pixel; None if all have motion 0.
-        coefficients: A and e of each motion, `[*B, N, 12]`.
-        x: pixel centres relative to the principal point, `[*B, 1, W]`.
-        y: the same, `[*B, H, 1]`.
-        dt: time between the frames, a number or `[*B]`.
-
-    Raises:
-        RuntimeError: an id without a motion.
-    """
-    *batch, height, width = depth.shape
-    maps, motions = math.prod(batch), coefficients.shape[-2]
-
-    def array(tensor: Tensor, *sizes: int) -> Any:
-        rows = tensor.detach().expand((*batch, *sizes)).reshape((maps, *sizes))
-        return rows.contiguous().numpy()
-
-    if instance is None:
-        ids = np.empty((0, height, width), np.uint8)
-    else:
-        ids = array(instance if instance.dtype is torch.uint8 else instance.long(), height, width)
-    u, v = torch.empty(2, maps, height, width).unbind()
-    valid = torch.empty(maps, height, width, dtype=torch.bool)
-    lowest, highest = _fill(
-        array(depth, height, width),
-        ids,
-        array(coefficients, motions, 12),
-        array(x.squeeze(-2), width),
-        array(y.squeeze(-1), height),
-        array(torch.as_tensor(dt, dtype=torch.float32)),
-        u.numpy(),
-        v.numpy(),
-        valid.numpy(),
-    )
-    if lowest < 0 or highest >= motions:
-        raise RuntimeError(
-            f"instance holds ids {lowest} to {highest}, an index out of "
-            f"prev_from_curr_by_instance's {motions} rows"
-        )
-    return u.view(depth.shape), v.view(depth.shape), valid.view(depth.shape)
-
-
-def object_flow(raw: Tensor, u: Tensor, v: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns raw − ego, 0 where it isn't known, `[*B, 2, H, W]`, and where it is, `[*B, H, W]`.
-
-    Args:
-        raw: `[*B, 2, H, W]`, float32.
-        u: ego flow to the right, `[*B, H, W]`, float32.
-        v: ego flow downwards, likewise.
-        valid: where ego flow is known, bool `[*B, H, W]`.
-    """
-    *batch, height, width = valid.shape
-    maps = math.prod(batch)
-    obj = torch.empty(maps, 2, height, width)
-    known = torch.empty(maps, height, width, dtype=torch.bool)
-    _subtract(
-        raw.detach().reshape(maps, 2, height, width).contiguous().numpy(),
-        *(plane.reshape(known.shape).numpy() for plane in (u, v, valid)),
-        obj.numpy(),
-        known.numpy(),
-    )
-    return obj.view(*batch, 2, height, width), known.view(valid.shape)
-
-
 @_compiled
-def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
+def fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
     """Fills u, v and valid; returns the lowest and the highest id."""
     lowest, highest = np.int64(0), np.int64(0)
     maps, height, width = depth.shape
@@ -143,7 +59,8 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
 
 
 @_compiled
-def _subtract(raw, u, v, valid, obj, known):
+def subtract(raw, u, v, valid, obj, known):
+    """Fills obj and known."""
     for n in range(len(raw)):
         for i in range(raw.shape[2]):
             for j in range(raw.shape[3]):

@@ -1,4 +1,4 @@
-"""The compiled kernel equals PyTorch's passes over the pixels, bit for bit."""
+"""The single pass equals PyTorch's passes over the pixels, bit for bit."""
 
 import math
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from flowrep.geometry import closed_form, ego_flow, factorize, rigid_flow
+from flowrep.geometry import closed_form, ego_flow, factorize, rigid_flow, single_pass
 from tests.geometry.scenes import HEIGHT, MOTION, OTHER_MOTION, WIDTH, K, depth_map, rigid
 
 pytest.importorskip("numba")
@@ -21,16 +21,14 @@ LEAST = float(np.float32(closed_form.SMALLEST))
 
 @pytest.fixture(autouse=True)
 def _no_map_is_small(monkeypatch):
-    monkeypatch.setattr(closed_form, "SMALL", 0)
+    monkeypatch.setattr(single_pass, "SMALL", 0)
 
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Counts the kernel's calls."""
-    from flowrep.geometry import kernel
-
-    seen, compute = [], kernel.planes_of_motions
-    monkeypatch.setattr(kernel, "planes_of_motions", lambda *a: seen.append(a) or compute(*a))
+    """Counts the calls of the kernel."""
+    seen, compute = [], single_pass.planes_of_motions
+    monkeypatch.setattr(single_pass, "planes_of_motions", lambda *a: seen.append(a) or compute(*a))
     return seen
 
 
@@ -56,7 +54,7 @@ def scene(dtype=torch.float32):
 def by_torch(compute, *args, **options):
     """Returns what PyTorch computes without the kernel."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(closed_form, "SMALL", 1 << 30)
+        patch.setattr(single_pass, "SMALL", 1 << 30)
         return compute(*args, **options)
 
 
@@ -153,7 +151,7 @@ def test_other_floats_are_left_to_pytorch(calls, dtype):
 
 def test_small_maps_are_left_to_pytorch(calls, monkeypatch):
     depth, _, Ks, motions = scene()
-    monkeypatch.setattr(closed_form, "SMALL", depth.numel())
+    monkeypatch.setattr(single_pass, "SMALL", depth.numel())
     ego_flow(depth, Ks, motions[:, 0])
     assert not calls
     ego_flow(torch.cat([depth, depth[:1]]), K.float(), motions[0, 0])
@@ -161,7 +159,7 @@ def test_small_maps_are_left_to_pytorch(calls, monkeypatch):
 
 
 def test_without_numba_pytorch_computes(calls, monkeypatch):
-    monkeypatch.setattr(closed_form, "_numba_is_installed", lambda: False)
+    monkeypatch.setattr(single_pass, "_numba_is_installed", lambda: False)
     depth, _, Ks, motions = scene()
     ego_flow(depth, Ks, motions[:, 0])
     assert not calls
@@ -200,8 +198,8 @@ def test_forward_derivatives_and_vmap_are_pytorch_s(calls):
 def test_a_folder_that_cannot_be_written_is_no_hindrance():
     program = (
         "import numba.core.caching as c; c.CacheImpl._locator_classes = []\n"
-        "import torch; from flowrep.geometry import closed_form, ego_flow\n"
-        "closed_form.SMALL = 0\n"
+        "import torch; from flowrep.geometry import ego_flow, single_pass\n"
+        "single_pass.SMALL = 0\n"
         "print(ego_flow(torch.ones(1, 2, 2), torch.eye(3), torch.eye(4)).flow.abs().sum().item())"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
