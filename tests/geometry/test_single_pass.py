@@ -26,7 +26,7 @@ def _no_map_is_small(monkeypatch):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Counts the calls of the kernel."""
+    """Lists the arguments of each call of the single pass."""
     seen, compute = [], single_pass.planes_of_motions
     monkeypatch.setattr(single_pass, "planes_of_motions", lambda *a: seen.append(a) or compute(*a))
     return seen
