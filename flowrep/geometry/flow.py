@@ -168,7 +168,7 @@ def factorize(
     depth = depth.expand(*batch, -1, -1, -1)
     u, v, valid = camera_planes(depth, K, prev_from_curr, dt, (own, compute))
     raw = raw.to(dtype).expand(*batch, -1, -1, -1)
-    if single_pass.suits(dtype, depth, u, v, raw):
+    if single_pass.suits(depth, u, v, raw):
         obj, known = single_pass.object_flow(raw, u, v, valid)
         return Factors(closed_form.stack_planes(u, v), obj, closed_form.mask_channel(known))
     raw_u, raw_v = raw.unbind(-3)

@@ -29,7 +29,7 @@ def camera_planes(
     K, dt, known = known_camera(K.to(compute), dt)
     coefficients = motion_coefficients(K, prev_from_curr.to(compute), known)
     x, y = centred_pixels(depth.shape[-2], depth.shape[-1], K)
-    if single_pass.suits(dtype, depth, coefficients, x, dt):
+    if single_pass.suits(depth, coefficients, x, dt):
         motions = coefficients.unsqueeze(-2)
         return single_pass.planes_of_motions(depth.squeeze(-3), None, motions, x, y, dt)
     by_motion = coefficients[..., None, None, :]  # [*B, 1, 1, 12]
@@ -62,7 +62,7 @@ def body_planes(
     motions = prev_from_curr_by_instance.to(compute)
     by_instance = motion_coefficients(K.unsqueeze(-3), motions, known.unsqueeze(-1))  # [*B, N, 12]
     x, y = centred_pixels(height, width, K)
-    if single_pass.suits(dtype, depth, by_instance, x, dt):
+    if single_pass.suits(depth, by_instance, x, dt):
         maps = depth.squeeze(-3), instance.squeeze(-3)
         return single_pass.planes_of_motions(*maps, by_instance, x, y, dt)
     row_of_pixel = instance.long().flatten(-3)  # [*B, H * W]

@@ -21,8 +21,8 @@ from flowrep.geometry.closed_form import Planes
 SMALL = 1 << 14  # pixels for which loading numba isn't worth while
 
 
-def suits(dtype: torch.dtype, depth: Tensor, *others: float | Tensor) -> bool:
-    """Returns whether this module computes flow of `dtype` from these arguments.
+def suits(depth: Tensor, *others: float | Tensor) -> bool:
+    """Returns whether this module computes flow from these arguments.
 
     It takes large float32 batches on a CPU, without gradients.
     """
@@ -30,8 +30,7 @@ def suits(dtype: torch.dtype, depth: Tensor, *others: float | Tensor) -> bool:
         return False
     tensors = [depth, *(other for other in others if isinstance(other, Tensor))]
     return (
-        dtype is torch.float32
-        and depth.is_cpu
+        depth.is_cpu
         and depth.numel() > SMALL
         and all(tensor.dtype is torch.float32 and _is_plain(tensor) for tensor in tensors)
         and _numba_is_installed()
