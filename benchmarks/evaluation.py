@@ -69,7 +69,7 @@ def measured(scene: Scene, agent: Agent, num_envs: int, episodes: int) -> dict[s
         return wrapped
 
     started = time.process_time()
-    arena = Arena(scene, [agent], [12.0], lambda *world: EnvPool(*world, num_envs=num_envs))
+    arena = Arena(scene, [agent], lambda *world: EnvPool(*world, num_envs=num_envs))
     made = time.process_time()
     jobs = [Job(0, True, "normal", 12.0, FIRST_SEED + k) for k in range(episodes)]
     with ExitStack() as stack:
@@ -79,7 +79,7 @@ def measured(scene: Scene, agent: Agent, num_envs: int, episodes: int) -> dict[s
             stack.enter_context(patch.object(owner, method, call))
         steps = sum(episode.length for _, episode in arena.run(jobs))
     ended = time.process_time()
-    arena.pool.close()
+    arena.close()
     return {**spent, "pool": made - started, "run": ended - made, "steps": steps}
 
 

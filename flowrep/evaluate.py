@@ -36,7 +36,7 @@ from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import WorkerError, street_envs
 from flowrep.exchange.policies import ForeignPolicy, PolicyError, Task, is_reference, load_policy
-from flowrep.experiment.arena import Agent, Arena
+from flowrep.experiment.arena import Agent
 from flowrep.experiment.comparison import Comparison, Row, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
@@ -44,12 +44,11 @@ from flowrep.experiment.origin import check_origin, origin_of
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.from_config import (
     Config,
+    arena_from_config,
     choose_device,
     env_from_config,
     policy_from_config,
-    pool_from_config,
 )
-from flowrep.scenes import load_scene
 from flowrep.viz.film import record_episode
 
 MISTAKES = (
@@ -186,15 +185,13 @@ def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> No
     )
     config = subjects[0].config
     num_envs = min(comparison.rides, config["num_envs"])
-    make_pool = partial(pool_from_config, config, num_envs)
-    agents = [subject.agent for subject in subjects]
-    arena = Arena(load_scene(config["scene"]), agents, rates, make_pool)
+    arena = arena_from_config(config, [subject.agent for subject in subjects], num_envs)
     try:
         comparison.run(arena, lambda: bool(stop))
     finally:
         for number, subject in enumerate(subjects):
             keep(subject, comparison.rows(number))
-        arena.pool.close()
+        arena.close()
 
 
 def keep(subject: Subject, rows: list[Row]) -> None:

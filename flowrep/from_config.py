@@ -3,6 +3,7 @@
 import inspect
 import multiprocessing
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pkgutil import resolve_name
 from typing import Any
 
@@ -15,10 +16,14 @@ from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.violations import closest
 from flowrep.envs import make_env
 from flowrep.envs.workers import available_cores
+from flowrep.experiment.arena import Agent, Arena
+from flowrep.experiment.arena_team import AnyArena, ArenaTeam, can_travel
 from flowrep.experiment.env_pool import EnvPool
-from flowrep.scenes import Scene
+from flowrep.scenes import load_scene
 
 Config = Mapping[str, Any]
+
+ENVS_PER_ARENA = 24  # at least, in a process of its own: a step of few costs as much as one of many
 
 
 def choose_device(name: str) -> torch.device:
@@ -80,18 +85,20 @@ def env_from_config(config: Config, **changes: Any) -> EnvBase:
     return env.append_transform(InitTracker())
 
 
-def pool_from_config(
-    config: Config, num_envs: int, scene: Scene, sensors: Sequence[str]
-) -> EnvPool:
-    """Returns environments for evaluation."""
-    workers = choose_workers(config["num_workers"], config["num_envs"])
-    return EnvPool(
-        scene,
-        sensors,
-        num_envs=num_envs,
-        num_workers=min(workers, num_envs),
-        renderer=config["renderer"],
-    )
+def arena_from_config(config: Config, agents: Sequence[Agent], num_envs: int) -> AnyArena:
+    """Returns what evaluates agents in the config's scene.
+
+    On a CPU, worker processes take whole episodes if each has enough environments; otherwise they
+    step the environments of one arena.
+    """
+    scene = load_scene(config["scene"])
+    workers = min(choose_workers(config["num_workers"], config["num_envs"]), num_envs)
+    renderer = config["renderer"]
+    processes = min(workers, num_envs // ENVS_PER_ARENA)
+    if processes > 1 and can_travel(agents):
+        return ArenaTeam(scene, agents, num_envs=num_envs, num_workers=processes, renderer=renderer)
+    pool = partial(EnvPool, num_envs=num_envs, num_workers=workers, renderer=renderer)
+    return Arena(scene, agents, pool)
 
 
 def agent_from_config(config: Config, env: EnvBase, trust: str | None = None) -> Algorithm:

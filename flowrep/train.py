@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -39,7 +40,8 @@ from flowrep.config.training import TrainConfig, validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import WorkerError
 from flowrep.envs.workers import available_cores
-from flowrep.experiment.arena import Agent, Arena
+from flowrep.experiment.arena import Agent
+from flowrep.experiment.arena_team import AnyArena
 from flowrep.experiment.comparison import Comparison, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
@@ -50,9 +52,9 @@ from flowrep.experiment.training import Training, train
 from flowrep.from_config import (
     Config,
     agent_from_config,
+    arena_from_config,
     choose_device,
     env_from_config,
-    pool_from_config,
 )
 from flowrep.scenes import SceneError, load_scene
 from flowrep.sweeps.plan import is_sweep
@@ -112,11 +114,13 @@ def carry_out(config: Config, folder: RunFolder) -> float:
         return final_success(folder, training.frames)
     with StopRequest() as stop:
         try:
-            clock = train(training, config, stop, partial(log_evaluation, training, config, stop))
-            print(f"wall time: {clock.summary()}")
-            print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
-            if not stop:
-                final_evaluation(training, config, stop)
+            with closing(make_arena(training, config)) as arena:
+                evaluate = partial(log_evaluation, training, config, arena, stop)
+                clock = train(training, config, stop, evaluate)
+                print(f"wall time: {clock.summary()}")
+                print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
+                if not stop:
+                    final_evaluation(training, config, arena, stop)
         except (CheckpointError, DivergenceError) as error:
             exit_with(f"after {training.frames} frames: {error}")
         except WorkerError as error:
@@ -203,7 +207,9 @@ def share_cores(config: Config) -> None:
         torch.set_num_threads(1)
 
 
-def log_evaluation(training: Training, config: Config, stop: StopRequest, frames: int) -> bool:
+def log_evaluation(
+    training: Training, config: Config, arena: AnyArena, stop: StopRequest, frames: int
+) -> bool:
     """Adds greedy episodes at the training speed to evaluation.csv; returns whether it stopped."""
     comparison = Comparison(
         speeds=[config["speed"]],
@@ -213,24 +219,18 @@ def log_evaluation(training: Training, config: Config, stop: StopRequest, frames
         policies=["greedy"],
     )
     with torch.random.fork_rng(devices=[]):
-        run_comparison(comparison, training, config, stop)
+        comparison.run(arena, lambda: bool(stop))
     if comparison.is_complete:
         training.run.log_episodes(with_origin(comparison.rows(), config, frames, "training"))
     return not comparison.is_complete
 
 
-def run_comparison(
-    comparison: Comparison, training: Training, config: Config, stop: StopRequest
-) -> None:
-    """Runs the episodes of the agent in training, in environments made for them."""
+def make_arena(training: Training, config: Config) -> AnyArena:
+    """Returns what evaluates the agent in training, all its evaluations one after the other."""
     agent = Agent.from_config(training.agent.policy, config, training.agent.device)
-    num_envs = min(comparison.rides, max(EVALUATION_ENVS, config["num_envs"]))
-    make_pool = partial(pool_from_config, config, num_envs)
-    arena = Arena(load_scene(config["scene"]), [agent], comparison.fps, make_pool)
-    try:
-        comparison.run(arena, lambda: bool(stop))
-    finally:
-        arena.pool.close()
+    asked = config["evaluation"]["episodes"], final_episodes(config)
+    num_envs = min(max(asked), max(EVALUATION_ENVS, config["num_envs"]))
+    return arena_from_config(config, [agent], num_envs)
 
 
 def final_episodes(config: Config) -> int:
@@ -241,7 +241,9 @@ def final_episodes(config: Config) -> int:
     return conditions * policies * evaluation["final_episodes"]
 
 
-def final_evaluation(training: Training, config: Config, stop: StopRequest) -> None:
+def final_evaluation(
+    training: Training, config: Config, arena: AnyArena, stop: StopRequest
+) -> None:
     """Compares the agent with baselines at each speed, films an episode and draws the figures."""
     evaluation, run = config["evaluation"], training.run
     comparison = Comparison(
@@ -252,7 +254,7 @@ def final_evaluation(training: Training, config: Config, stop: StopRequest) -> N
         policies=FINAL_POLICIES,
         baselines=evaluation["baselines"],
     )
-    run_comparison(comparison, training, config, stop)
+    comparison.run(arena, lambda: bool(stop))
     if not comparison.is_complete:
         return
     rows = comparison.rows()

@@ -13,7 +13,8 @@ from flowrep.envs.outcome import Outcome
 from flowrep.envs.registration import register_environments
 from flowrep.envs.represented import NumericInfo, RepresentationObservation
 from flowrep.envs.street_env import StreetEnv
-from flowrep.envs.workers import WorkerError, WorkerVectorEnv
+from flowrep.envs.worker_process import WorkerError
+from flowrep.envs.workers import WorkerVectorEnv
 
 register_environments()
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.sensing import observe_together
 from flowrep.envs.sensor_observation import episode_status
-from flowrep.envs.worker_process import Order
+from flowrep.envs.worker_environments import Order
 
 
 class StreetVectorEnv(SyncVectorEnv):

@@ -1,15 +1,9 @@
 """Environments stepped in parallel in several processes, several in each."""
 
-import atexit
 import os
-import pickle
-import sys
-import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
 from functools import partial
-from multiprocessing import connection
-from types import ModuleType
+from itertools import pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -18,18 +12,17 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory
 from numpy.typing import NDArray
 
-from flowrep.envs import worker_process
-from flowrep.envs.worker_process import (
+from flowrep.envs.worker_environments import (
     Arrays,
     EnvFactory,
     Order,
     VectorFactory,
-    Worker,
-    WorkerError,
+    WorkerEnvironments,
     copied,
     views,
 )
-from flowrep.envs.worker_server import server_context, signals_held
+from flowrep.envs.worker_group import WorkerGroup
+from flowrep.envs.worker_server import server_context
 
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
@@ -45,11 +38,7 @@ class WorkerVectorEnv(VectorEnv):
     Observations come back through shared memory, everything else through pipes. `step_async` begins
     a step, so that the caller can do other work until it calls `step` for the outcome.
 
-    Workers are forked from a server process that has imported the modules they need and holds none
-    of the caller's threads or CUDA state. They ignore SIGINT and SIGTERM, which terminals and
-    schedulers send to whole process groups, and end when the caller closes them or dies. A script
-    that defines its own environments, instead of importing them from a module, is run again by each
-    worker and needs an `if __name__ == "__main__":` guard.
+    See `WorkerGroup` for how the workers live and end.
 
     Args:
         env_factories: one picklable factory for each environment; all environments have the same
@@ -69,7 +58,6 @@ class WorkerVectorEnv(VectorEnv):
         in_each: VectorFactory = _SIDE_BY_SIDE,
     ) -> None:
         """Starts the workers and waits until they have built their environments."""
-        self._workers: list[Worker] = []
         if not 1 <= num_workers <= len(env_factories):
             raise ValueError(
                 f"num_workers is {num_workers} for {len(env_factories)} environments; "
@@ -84,28 +72,29 @@ class WorkerVectorEnv(VectorEnv):
         example.close()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        context = server_context(__name__)
-        memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
+        # made in the context of the processes that will open it
+        memory = create_shared_memory(
+            self.single_observation_space, self.num_envs, server_context(__name__)
+        )
         self._shared = views(self.single_observation_space, memory, self.num_envs)
         self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
-        # The interpreter would wait at exit for processes that ignore signals.
-        self._at_exit = partial(_call, weakref.WeakMethod(self._shut_down))
-        atexit.register(self._at_exit)
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
-        needs_main = _need_main_module(env_factories)
-        try:
-            with signals_held(), nullcontext() if needs_main else _without_main_module():
-                for rows in map(slice, bounds, bounds[1:]):
-                    self._workers.append(Worker(context, env_factories, rows, memory, in_each))
-            self._check_code(self._receive())
-        except BaseException:
-            self._shut_down()  # before the memory that they may be about to open is released
-            raise
+        self._rows = [slice(*ends) for ends in pairwise(bounds)]
+        self._group = WorkerGroup(
+            {
+                _name(rows): partial(
+                    WorkerEnvironments, env_factories[rows], rows, memory, self.num_envs, in_each
+                )
+                for rows in self._rows
+            },
+            given=env_factories,
+        )
+        self._group.wait_until_ready()
 
     @property
     def num_workers(self) -> int:
         """The number of processes."""
-        return len(self._workers)
+        return len(self._group)
 
     def reset(
         self,
@@ -133,7 +122,7 @@ class WorkerVectorEnv(VectorEnv):
                 f"environments, got {len(seeds)} seeds and a mask {mask.shape}"
             )
         self._send("reset", lambda rows: (seeds[rows], mask[rows], options))
-        self._receive()
+        self._group.receive()
         return copied(self._shared), {}
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -153,26 +142,26 @@ class WorkerVectorEnv(VectorEnv):
         elif not np.array_equal(self._begun, actions):
             raise ValueError(f"step_async began a step with {self._begun}, step got {actions}")
         self._begun = None
-        rewards, terminated, truncated = map(np.concatenate, zip(*self._receive()))
+        rewards, terminated, truncated = map(np.concatenate, zip(*self._group.receive()))
         return copied(self._shared), rewards, terminated, truncated, {}
 
     def drop_step(self) -> None:
         """Waits for a step under way and discards its outcome."""
         if self._begun is not None:
             self._begun = None
-            self._receive()
+            self._group.receive()
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Returns the result of a method, or the value of an attribute, for each environment."""
         self.drop_step()
         self._send("call", lambda rows: (name, args, kwargs))
-        return tuple(result for results in self._receive() for result in results)
+        return tuple(result for results in self._group.receive() for result in results)
 
     def call_each(self, name: str, arguments: Sequence[Any]) -> tuple[Any, ...]:
         """Returns the result of a method called with one argument for each environment."""
         self.drop_step()
         self._send("call_each", lambda rows: (name, list(arguments[rows])))
-        return tuple(result for results in self._receive() for result in results)
+        return tuple(result for results in self._group.receive() for result in results)
 
     def advance(self, orders: Sequence[Order]) -> tuple[Arrays, list[Any]]:
         """Executes one order per environment; requires workers with `StreetVectorEnv`s.
@@ -183,7 +172,7 @@ class WorkerVectorEnv(VectorEnv):
         """
         self.drop_step()
         self._send("advance", lambda rows: (orders[rows],))
-        standings = [standing for part in self._receive() for standing in part]
+        standings = [standing for part in self._group.receive() for standing in part]
         return self._shared.get("sensor", {}), standings
 
     def apply(
@@ -196,64 +185,14 @@ class WorkerVectorEnv(VectorEnv):
             arguments: one for each call.
         """
         self.drop_step()
-        waiting = enumerate(arguments)
-        busy: dict[Any, tuple[Worker, int]] = {}
-        free = list(self._workers)
-        with self._ending_with_a_failure():
-            while True:
-                for worker, (number, argument) in zip(free, waiting):
-                    worker.send("apply", (function, argument))
-                    busy[worker.pipe] = worker, number
-                if not busy:
-                    return
-                free = []
-                for pipe in connection.wait(list(busy)):
-                    worker, number = busy.pop(pipe)
-                    free.append(worker)
-                    yield number, worker.receive()
+        yield from self._group.apply("apply", ((function, argument) for argument in arguments))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the workers."""
-        self._shut_down()
+        self._group.close()
 
-    def _shut_down(self) -> None:
-        workers, self._workers = self._workers, []
-        for worker in workers:
-            worker.pipe.close()
-        for worker in workers:
-            worker.end()
-        if workers:
-            atexit.unregister(self._at_exit)
-
-    def _check_code(self, files: Sequence[str]) -> None:
-        # The fork server looks for modules in the current folder first.
-        ours = os.path.realpath(worker_process.__file__)
-        if others := set(files) - {ours}:
-            self.close()
-            raise WorkerError(
-                f"workers found another copy of this package ({others.pop()}) than this process "
-                f"({ours}): start from another folder than {os.getcwd()}"
-            )
-
-    def _send(self, command: str, arguments: Callable[[slice], tuple[Any, ...]]) -> None:
-        if not self._workers:
-            raise WorkerError("the workers have ended, by close() or by a failure before")
-        with self._ending_with_a_failure():
-            for worker in self._workers:
-                worker.send(command, arguments(worker.rows))
-
-    def _receive(self) -> list[Any]:
-        with self._ending_with_a_failure():
-            return [worker.receive() for worker in self._workers]
-
-    @contextmanager
-    def _ending_with_a_failure(self) -> Iterator[None]:
-        # The other workers' answers are useless without the failed one's.
-        try:
-            yield
-        except WorkerError:
-            self.close()
-            raise
+    def _send(self, method: str, arguments: Callable[[slice], tuple[Any, ...]]) -> None:
+        self._group.send(method, [arguments(rows) for rows in self._rows])
 
 
 def available_cores() -> int:
@@ -261,26 +200,6 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-@contextmanager
-def _without_main_module() -> Iterator[None]:
-    """Stops multiprocessing from running the main module again in new processes."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
-
-
-def _need_main_module(env_factories: Sequence[EnvFactory]) -> bool:
-    try:
-        with _without_main_module():
-            pickle.dumps(env_factories)
-    except (pickle.PicklingError, AttributeError):
-        return True
-    return False
-
-
-def _call(method: weakref.WeakMethod[Any]) -> None:
-    if (alive := method()) is not None:
-        alive()
+def _name(rows: slice) -> str:
+    first, last = rows.start, rows.stop - 1
+    return f"environment {first}" if first == last else f"environments {first} to {last}"

@@ -1,5 +1,6 @@
 """External policies in flowrep's environments: their task, observations and actions."""
 
+import pickle
 import sys
 import traceback
 from collections.abc import Callable, Mapping
@@ -72,6 +73,10 @@ class ForeignPolicy:
         if isinstance(given, TensorDictBase):
             given = given.get("action")
         return maps.set("action", self._checked(given, len(maps)))
+
+    def __reduce__(self) -> Any:
+        """Refuses to be pickled: its function may hold anything, and stays in this process."""
+        raise pickle.PicklingError(f"policy '{self.name}' stays in its process")
 
     def alone(self) -> Callable[[TensorDictBase], TensorDictBase]:
         """Returns the policy for one episode of a single environment, from its reset on."""

@@ -10,9 +10,10 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from flowrep.baselines.registry import Drive
 from flowrep.envs.outcome import Outcome, reward
-from flowrep.envs.worker_process import Order
-from flowrep.experiment.env_pool import EnvPool
+from flowrep.envs.worker_environments import Order
+from flowrep.experiment.env_pool import EnvPool, Options
 from flowrep.experiment.evaluation import Episode
 from flowrep.experiment.eye import Eye
 from flowrep.scenes.scene import Scene
@@ -76,7 +77,6 @@ class Arena:
     Args:
         scene: a loaded scene.
         agents: the agents that will drive.
-        fps: the frame rates of their episodes, Hz.
         make_pool: called with the scene and the sensors that the agents need.
     """
 
@@ -84,18 +84,15 @@ class Arena:
         self,
         scene: Scene,
         agents: Sequence[Agent],
-        fps: Sequence[float],
         make_pool: Callable[[Scene, Sequence[str]], EnvPool],
     ) -> None:
         """Makes the pool."""
         self.agents = list(agents)
-        self._eyes = {
-            (number, rate): agent.eye(scene, rate)
-            for number, agent in enumerate(agents)
-            for rate in fps
-        }
-        sensors = {name for eye in self._eyes.values() for name in eye.sensors}
-        self.pool = make_pool(scene, sorted(sensors))
+        self._scene = scene
+        self._eyes: dict[tuple[int, float], Eye] = {}  # by agent and frame rate
+        any_rate = scene.frame_rate_hz
+        sensors = {name for agent in agents for name in agent.eye(scene, any_rate).sensors}
+        self._pool = make_pool(scene, sorted(sensors))
 
     def run(self, jobs: Sequence[Job]) -> Iterator[tuple[int, Episode]]:
         """Yields the jobs' episodes with their numbers, as they end.
@@ -105,7 +102,7 @@ class Arena:
         share an agent and a frame rate are computed together.
         """
         waiting = deque(enumerate(jobs))
-        rides: list[_Ride | None] = [None] * self.pool.num_envs
+        rides: list[_Ride | None] = [None] * self._pool.num_envs
         actions: dict[int, int] = {}
         while True:
             orders: list[Order] = [None] * len(rides)
@@ -123,7 +120,7 @@ class Arena:
                     }
             if all(order is None for order in orders):
                 return
-            seen, standings = self.pool.advance(orders)
+            seen, standings = self._pool.advance(orders)
             begun = {street for street, order in enumerate(orders) if isinstance(order, dict)}
             for street, (ride, standing) in enumerate(zip(rides, standings)):
                 if ride is None or standing is None or street in begun:
@@ -136,6 +133,14 @@ class Arena:
                     yield ride.number, Episode(seed, outcome, hit, ride.total_reward, ride.length)
                     rides[street] = None
             actions = self._act(seen, rides, begun)
+
+    def drive(self, jobs: Sequence[tuple[str, Options]]) -> Iterator[tuple[int, Drive]]:
+        """Yields the episodes of baselines, see `EnvPool.drive`."""
+        return self._pool.drive(jobs)
+
+    def close(self) -> None:
+        """Closes the environments."""
+        self._pool.close()
 
     @torch.no_grad()
     def _act(
@@ -150,7 +155,7 @@ class Arena:
         for (agent, rate), streets in groups.items():
             first = [street for street in streets if street in begun]
             later = [street for street in streets if street not in begun]
-            maps = self._eyes[agent, rate].look(seen, first, later)
+            maps = self._eye(agent, rate).look(seen, first, later)
             order = [*first, *later]
             # for policies that remember what they saw in an environment
             maps["street"] = torch.tensor(order, device=maps.device)
@@ -163,6 +168,12 @@ class Arena:
                     chosen = choose(policy, part, [rides[order[row]] for row in rows])
                     actions |= zip((order[row] for row in rows), chosen)
         return actions
+
+    def _eye(self, agent: int, frame_rate_hz: float) -> Eye:
+        key = agent, frame_rate_hz
+        if key not in self._eyes:
+            self._eyes[key] = self.agents[agent].eye(self._scene, frame_rate_hz)
+        return self._eyes[key]
 
 
 def _job(rides: Sequence[_Ride | None], street: int) -> Job:

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 from tqdm.auto import tqdm
 
-from flowrep.experiment.arena import Arena, Job
+from flowrep.experiment.arena import Job
+from flowrep.experiment.arena_team import AnyArena
 from flowrep.experiment.env_pool import Options
 from flowrep.experiment.evaluation import OUTCOMES, Episode, outcome_shares
 
@@ -78,7 +79,7 @@ class Comparison:
         cells = [*self._rides, *self._drives]
         return all(len(self._done[cell]) == len(self._seeds) for cell in cells)
 
-    def run(self, arena: Arena, should_stop: Callable[[], bool] = lambda: False) -> None:
+    def run(self, arena: AnyArena, should_stop: Callable[[], bool] = lambda: False) -> None:
         """Runs the episodes; finished ones are kept even if it is interrupted.
 
         Args:
@@ -100,7 +101,7 @@ class Comparison:
                 bar.update()
                 if should_stop():
                     return
-            for number, drive in arena.pool.drive(driven):
+            for number, drive in arena.drive(driven):
                 ended = drive.outcome, drive.hit, drive.total_reward, drive.steps
                 self._keep(drives[number], Episode(drive.episode_seed, *ended))
                 bar.update()

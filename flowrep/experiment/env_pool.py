@@ -11,7 +11,7 @@ from flowrep.baselines.registry import BASELINES, Baseline, Drive, drive_episode
 from flowrep.envs.sensor_observation import SensorObservation
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.street_vector import StreetVectorEnv
-from flowrep.envs.worker_process import Arrays, Order
+from flowrep.envs.worker_environments import Arrays, Order
 from flowrep.envs.workers import WorkerVectorEnv
 from flowrep.scenes.scene import Scene
 

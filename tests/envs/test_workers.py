@@ -187,7 +187,10 @@ def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make)
     def interrupted():
         raise KeyboardInterrupt
 
-    with patch.object(env._workers[1], "receive", interrupted), pytest.raises(KeyboardInterrupt):
+    with (
+        patch.object(env._group.workers[1], "receive", interrupted),
+        pytest.raises(KeyboardInterrupt),
+    ):
         env.step(np.array([1, 2, 3]))
     assert_same(env.reset(seed=1), other.reset(seed=1))
     assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
@@ -203,7 +206,7 @@ def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
     env, other = make(3, 2), in_process(3)
     for each in (env, other):
         each.reset(seed=0)
-    for worker in env._workers:
+    for worker in env._group.workers:
         os.kill(worker.process.pid, signal.SIGINT)
         os.kill(worker.process.pid, signal.SIGTERM)
     assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
@@ -211,7 +214,7 @@ def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks into /proc")
 def test_such_signals_reach_no_worker_from_its_first_moment_on(make):
-    with open(f"/proc/{make(1, 1)._workers[0].process.pid}/status") as file:
+    with open(f"/proc/{make(1, 1)._group.workers[0].process.pid}/status") as file:
         blocked = int(dict(line.split(":") for line in file)["SigBlk"], 16)
     assert all(blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM))
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & {signal.SIGINT, signal.SIGTERM}
@@ -226,7 +229,7 @@ from flowrep.envs import WorkerVectorEnv
 if __name__ == "__main__":
     env = WorkerVectorEnv([Counter, Counter, Counter], 2)
     env.reset(seed=0)
-    print(*(worker.process.pid for worker in env._workers), flush=True)
+    print(*(worker.process.pid for worker in env._group.workers), flush=True)
     if "wait" in sys.argv:
         input()
 """

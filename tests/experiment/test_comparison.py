@@ -13,6 +13,7 @@ from flowrep.agent.action import DiscreteActions
 from flowrep.agent.policy import stochastic_policy
 from flowrep.envs import make_env
 from flowrep.experiment.arena import Agent, Arena
+from flowrep.experiment.arena_team import ArenaTeam
 from flowrep.experiment.comparison import Comparison, print_table, with_origin
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.eye import Eye
@@ -58,7 +59,11 @@ def straight_on():
     return Agent(act, {"depth": {}})
 
 
-def rows_of(scene, agents, num_envs=3, num_workers=0, **asked):
+def one_arena(scene, agents, **where):
+    return Arena(scene, agents, partial(EnvPool, **where))
+
+
+def rows_of(scene, agents, num_envs=3, num_workers=0, make_arena=one_arena, **asked):
     asked = {
         "speeds": ["low"],
         "fps": [12],
@@ -67,10 +72,9 @@ def rows_of(scene, agents, num_envs=3, num_workers=0, **asked):
         "episodes": 4,
     } | asked
     comparison = Comparison(**asked, agents=len(agents))
-    make_pool = partial(EnvPool, num_envs=num_envs, num_workers=num_workers)
-    arena = Arena(scene, agents, asked["fps"], make_pool)
+    arena = make_arena(scene, agents, num_envs=num_envs, num_workers=num_workers)
     comparison.run(arena)
-    arena.pool.close()
+    arena.close()
     assert comparison.is_complete
     return [comparison.rows(number) for number in range(len(agents))]
 
@@ -121,9 +125,15 @@ def test_rows_come_in_the_order_of_what_was_asked(alone):
     assert len({(row["outcome"], row["length"]) for row in alone}) > 6
 
 
-@pytest.mark.parametrize(("num_envs", "num_workers"), [(3, 0), (5, 2)])
-def test_where_episodes_are_run_is_not_seen_in_what_comes_out(scene, alone, num_envs, num_workers):
-    assert rows_of(scene, [agent("obj", "seg2")], num_envs, num_workers, **ASKED)[0] == alone
+@pytest.mark.parametrize(
+    ("make_arena", "num_envs", "num_workers"),
+    [(one_arena, 3, 0), (one_arena, 5, 2), (ArenaTeam, 5, 2), (ArenaTeam, 3, 3)],
+)
+def test_where_episodes_are_run_is_not_seen_in_what_comes_out(
+    scene, alone, make_arena, num_envs, num_workers
+):
+    where = num_envs, num_workers, make_arena
+    assert rows_of(scene, [agent("obj", "seg2")], *where, **ASKED)[0] == alone
 
 
 def test_agents_that_share_streets_do_not_touch_each_other(scene, alone):
@@ -149,10 +159,10 @@ def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
     comparison = Comparison(
         speeds=["low"], fps=[12], episodes=6, seed=5, policies=["greedy"], baselines=["random"]
     )
-    arena = Arena(scene, [agent("obj")], [12], partial(EnvPool, num_envs=6))
+    arena = one_arena(scene, [agent("obj")], num_envs=6)
     done = []
     comparison.run(arena, lambda: done.append(1) or len(done) == 3)
-    arena.pool.close()
+    arena.close()
     assert not comparison.is_complete
     ended = {k for episodes in comparison._done.values() for k in episodes}
     assert len(ended) == 3

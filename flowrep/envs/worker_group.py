@@ -1,0 +1,169 @@
+"""Several worker processes that end together."""
+
+import atexit
+import os
+import pickle
+import sys
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from multiprocessing import connection
+from types import ModuleType
+from typing import Any
+
+from flowrep.envs import worker_process
+from flowrep.envs.worker_process import Worker, WorkerError
+from flowrep.envs.worker_server import server_context, signals_held
+
+
+class WorkerGroup:
+    """Processes that hold an object each; when one fails, all are ended.
+
+    They are forked from a server process that has imported the modules of environments and holds
+    none of the caller's threads or CUDA state. They ignore SIGINT and SIGTERM, which terminals and
+    schedulers send to whole process groups, and end when the caller closes them or dies. A script
+    that defines classes of its own, instead of importing them from a module, is run again by each
+    worker and needs an `if __name__ == "__main__":` guard.
+
+    Args:
+        makers: what each process holds, in words, and the picklable function that makes it there.
+        given: the part of it that comes from the caller, perhaps from the caller's script.
+
+    Raises:
+        WorkerError: if a worker could not be started; all methods raise it once one has stopped.
+    """
+
+    def __init__(self, makers: Mapping[str, Callable[[], Any]], given: Any) -> None:
+        """Starts the processes, without waiting until they are ready."""
+        self.workers: list[Worker] = []
+        self._is_ready = False
+        context = server_context("flowrep.envs.workers")
+        # The interpreter would wait at exit for processes that ignore signals.
+        self._at_exit = partial(_call, weakref.WeakMethod(self.close))
+        atexit.register(self._at_exit)
+        needs_main = _needs_main_module(given)
+        try:
+            with signals_held(), nullcontext() if needs_main else _without_main_module():
+                for name, make in makers.items():
+                    self.workers.append(Worker(context, make, name))
+        except BaseException:
+            self.close()
+            raise
+
+    def __len__(self) -> int:
+        return len(self.workers)
+
+    def wait_until_ready(self) -> None:
+        """Waits until every process has made its object, and checks that it runs this code."""
+        if self._is_ready:
+            return
+        try:
+            files = self.receive()
+        except BaseException:
+            self.close()
+            raise
+        # The fork server looks for modules in the current folder first.
+        ours = os.path.realpath(worker_process.__file__)
+        if others := set(files) - {ours}:
+            self.close()
+            raise WorkerError(
+                f"workers found another copy of this package ({others.pop()}) than this process "
+                f"({ours}): start from another folder than {os.getcwd()}"
+            )
+        self._is_ready = True
+
+    def send(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> None:
+        """Calls a method in each process, with the arguments of each."""
+        if not self.workers:
+            raise WorkerError("the workers have ended, by close() or by a failure before")
+        with self._ending_with_a_failure():
+            for worker, given in zip(self.workers, arguments, strict=True):
+                worker.send(method, given)
+
+    def receive(self) -> list[Any]:
+        """Waits for all answers and returns them in the workers' order."""
+        with self._ending_with_a_failure():
+            return [worker.receive() for worker in self.workers]
+
+    def stream(
+        self, method: str, arguments: Sequence[tuple[Any, ...]]
+    ) -> Iterator[tuple[int, Any]]:
+        """Yields what a generator method yields in all processes, as it comes.
+
+        Args:
+            method: its name.
+            arguments: for each worker; an item is yielded with the worker's index.
+        """
+        self.send(method, arguments)
+        numbers = {worker.pipe: number for number, worker in enumerate(self.workers)}
+        busy = {worker.pipe: worker for worker in self.workers}
+        with self._ending_with_a_failure():
+            while busy:
+                for pipe in connection.wait(list(busy)):
+                    item = busy[pipe].receive()
+                    if busy[pipe].owes_answer:
+                        yield numbers[pipe], item
+                    else:
+                        del busy[pipe]
+
+    def apply(self, method: str, arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
+        """Yields the index and result of each call, made in any free process, as they end."""
+        waiting = enumerate(arguments)
+        busy: dict[Any, tuple[Worker, int]] = {}
+        free = list(self.workers)
+        with self._ending_with_a_failure():
+            while True:
+                for worker, (number, given) in zip(free, waiting):
+                    worker.send(method, given)
+                    busy[worker.pipe] = worker, number
+                if not busy:
+                    return
+                free = []
+                for pipe in connection.wait(list(busy)):
+                    worker, number = busy.pop(pipe)
+                    free.append(worker)
+                    yield number, worker.receive()
+
+    def close(self) -> None:
+        """Ends the processes."""
+        workers, self.workers = self.workers, []
+        for worker in workers:
+            worker.pipe.close()
+        for worker in workers:
+            worker.end()
+        atexit.unregister(self._at_exit)
+
+    @contextmanager
+    def _ending_with_a_failure(self) -> Iterator[None]:
+        # The other workers' answers are useless without the failed one's.
+        try:
+            yield
+        except WorkerError:
+            self.close()
+            raise
+
+
+@contextmanager
+def _without_main_module() -> Iterator[None]:
+    """Stops multiprocessing from running the main module again in new processes."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+def _needs_main_module(given: Any) -> bool:
+    try:
+        with _without_main_module():
+            pickle.dumps(given)
+    except (pickle.PicklingError, AttributeError):
+        return True
+    return False
+
+
+def _call(method: weakref.WeakMethod[Any]) -> None:
+    if (alive := method()) is not None:
+        alive()

@@ -1,0 +1,109 @@
+"""Arenas in several processes, which share episodes and cores."""
+
+import pickle
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+
+from flowrep.agent import keep_freed_memory
+from flowrep.baselines.registry import Drive
+from flowrep.envs.worker_group import WorkerGroup
+from flowrep.experiment.arena import Agent, Arena, Job
+from flowrep.experiment.env_pool import EnvPool, Options
+from flowrep.experiment.evaluation import Episode
+from flowrep.scenes.scene import Scene
+
+
+class ArenaTeam:
+    """An `Arena` in each of several processes; the episodes are those of a single one.
+
+    The processes start at once and are waited for by the first call.
+
+    Args:
+        scene: a loaded scene.
+        agents: the agents that will drive, on the CPU and picklable. Their weights are read anew by
+            each `run`.
+        num_envs: the number of environments of all processes together.
+        num_workers: the number of processes.
+        renderer: see `StreetEnv`.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        agents: Sequence[Agent],
+        *,
+        num_envs: int,
+        num_workers: int,
+        renderer: str = "auto",
+    ) -> None:
+        """Starts the processes."""
+        self._agents = list(agents)
+        shares = [len(range(i, num_envs, num_workers)) for i in range(num_workers)]
+        self._group = WorkerGroup(
+            {
+                f"arena {number}": partial(_Member, scene, _packed(agents), share, renderer)
+                for number, share in enumerate(shares)
+            },
+            given=self._agents,
+        )
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[int, Episode]]:
+        """Yields the jobs' episodes with their numbers, as they end; see `Arena.run`."""
+        return self._shared("run", jobs, _packed(self._agents))
+
+    def drive(self, jobs: Sequence[tuple[str, Options]]) -> Iterator[tuple[int, Drive]]:
+        """Yields the episodes of baselines, see `EnvPool.drive`."""
+        return self._shared("drive", jobs)
+
+    def close(self) -> None:
+        """Ends the processes."""
+        self._group.close()
+
+    def _shared(self, method: str, jobs: Sequence[Any], *given: Any) -> Iterator[tuple[int, Any]]:
+        self._group.wait_until_ready()
+        count = len(self._group)
+        shares = [(jobs[first::count], *given) for first in range(count)]
+        for first, (number, result) in self._group.stream(method, shares):
+            yield first + number * count, result
+
+
+class _Member:
+    """One arena, in its process."""
+
+    def __init__(self, scene: Scene, agents: bytes, num_envs: int, renderer: str) -> None:
+        keep_freed_memory()
+        torch.set_num_threads(1)
+        make_pool = partial(EnvPool, num_envs=num_envs, renderer=renderer)
+        self._arena = Arena(scene, pickle.loads(agents), make_pool)
+
+    def run(self, jobs: Sequence[Job], agents: bytes) -> Iterator[tuple[int, Episode]]:
+        self._arena.agents = pickle.loads(agents)
+        return self._arena.run(jobs)
+
+    def drive(self, jobs: Sequence[tuple[str, Options]]) -> Iterator[tuple[int, Drive]]:
+        return self._arena.drive(jobs)
+
+    def close(self) -> None:
+        self._arena.close()
+
+
+AnyArena = Arena | ArenaTeam
+
+
+def can_travel(agents: Sequence[Agent]) -> bool:
+    """Returns whether agents can be sent to another process and drive there."""
+    if any(torch.device(agent.device).type != "cpu" for agent in agents):
+        return False
+    try:
+        _packed(agents)
+    except (pickle.PicklingError, AttributeError, TypeError, RuntimeError):
+        return False
+    return True
+
+
+def _packed(agents: Sequence[Agent]) -> bytes:
+    # Sent as they are, tensors would be moved to shared memory, the caller's weights included.
+    return pickle.dumps(list(agents))
