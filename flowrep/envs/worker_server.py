@@ -27,7 +27,7 @@ def server_context(module: str) -> Any:
         OSError: the path of the folder for temporary files is too long.
     """
     context: Any = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([module])
+    context.set_forkserver_preload([module, "flowrep.envs.worker_freeze"])
     resource_tracker.ensure_running()  # which unblocks signals when it starts
     with signals_held(), _folder_told():
         forkserver.ensure_running()
