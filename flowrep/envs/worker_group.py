@@ -75,8 +75,7 @@ class WorkerGroup:
 
     def send(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> None:
         """Calls a method in each process, with the arguments of each."""
-        if not self.workers:
-            raise WorkerError("the workers have ended, by close() or by a failure before")
+        self._check_that_they_live()
         with self._ending_with_a_failure():
             for worker, given in zip(self.workers, arguments, strict=True):
                 worker.send(method, given)
@@ -109,6 +108,7 @@ class WorkerGroup:
 
     def apply(self, method: str, arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
         """Yields the index and result of each call, made in any free process, as they end."""
+        self._check_that_they_live()
         waiting = enumerate(arguments)
         busy: dict[Any, tuple[Worker, int]] = {}
         free = list(self.workers)
@@ -133,6 +133,10 @@ class WorkerGroup:
         for worker in workers:
             worker.end()
         atexit.unregister(self._at_exit)
+
+    def _check_that_they_live(self) -> None:
+        if not self.workers:
+            raise WorkerError("the workers have ended, by close() or by a failure before")
 
     @contextmanager
     def _ending_with_a_failure(self) -> Iterator[None]:
