@@ -1,3 +1,4 @@
+import gc
 import os
 import signal
 import subprocess
@@ -55,6 +56,9 @@ class Counter(gym.Env):
     def set_state(self, count):
         self.count = count
         return count + 1
+
+    def frozen(self):
+        return gc.get_freeze_count()
 
 
 @pytest.fixture
@@ -147,6 +151,10 @@ def test_every_environment_can_be_asked_and_told(make):
     assert env.call_each("set_state", [10, 20, 30, 40, 50]) == (11, 21, 31, 41, 51)
     after, *_ = env.step(np.array([1, 2, 3, 4, 5]))
     assert after["count"].tolist() == [[0, 11], [1, 22], [2, 33], [3, 44], [4, 55]]
+
+
+def test_what_workers_share_is_not_copied_by_their_garbage_collections(make):
+    assert min(make(2, 2).call("frozen")) > 100_000
 
 
 @pytest.mark.parametrize("num_workers", [0, 4])
