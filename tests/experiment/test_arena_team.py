@@ -112,9 +112,11 @@ def test_only_what_can_be_sent_to_a_process_is(config):
     assert not can_travel([agent._replace(policy=lambda maps: maps)])
     assert not can_travel([agent, Agent(ForeignPolicy("mine", print, None), {"depth": {}})])
     in_one = config | {"num_workers": 0}
+    stays = agent._replace(policy=lambda maps: maps)
     for arena in (
         arena_from_config(config, [agent], few),
         arena_from_config(in_one, [agent], many),
+        arena_from_config(config, [stays], many),
     ):
         assert not isinstance(arena, ArenaTeam)
         arena.close()
