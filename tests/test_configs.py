@@ -70,7 +70,7 @@ def test_the_default_is_the_papers_table_ii():
     assert algorithm["frames_per_update"] == 10
     assert algorithm["target_entropy_weight"] == 0.2
     camera = config["scene"]["camera"]
-    assert (camera["height_px"], camera["width_px"], camera["fov_deg"]) == (84, 84, 90)
+    assert (camera["height_px"], camera["width_px"], camera["fov_deg"]) == (84, 84, 60)
 
 
 def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():

@@ -25,7 +25,7 @@ def test_the_same_run_on_another_machine_is_the_same(config):
 @pytest.mark.parametrize(
     ("place", "value", "says"),
     [
-        ("scene.camera.fov_deg", 60.0, r"scene.camera.fov_deg=90.0, the config.yaml .*=60.0"),
+        ("scene.camera.fov_deg", 90.0, r"scene.camera.fov_deg=60.0, the config.yaml .*=90.0"),
         ("scene.name", "s_turn", "scene.name=straight_road, "),
         ("representations.ego.scale", 0.3, "representations.ego.scale=.* says .*=0.3"),
         ("representations.seg", {}, "representations.seg=absent"),
