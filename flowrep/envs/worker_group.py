@@ -95,14 +95,14 @@ class WorkerGroup:
             arguments: for each worker; an item is yielded with the worker's index.
         """
         self.send(method, arguments)
-        numbers = {worker.pipe: number for number, worker in enumerate(self.workers)}
-        busy = {worker.pipe: worker for worker in self.workers}
+        busy = {worker.pipe: (number, worker) for number, worker in enumerate(self.workers)}
         with self._ending_with_a_failure():
             while busy:
                 for pipe in connection.wait(list(busy)):
-                    item = busy[pipe].receive()
-                    if busy[pipe].owes_answer:
-                        yield numbers[pipe], item
+                    number, worker = busy[pipe]
+                    item = worker.receive()
+                    if worker.owes_answer:
+                        yield number, item
                     else:
                         del busy[pipe]
 

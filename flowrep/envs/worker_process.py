@@ -55,7 +55,7 @@ class Worker:
         That is what the method returned, or what it yielded, with None as the last part.
         """
         try:
-            message = _Message(*self.pipe.recv())
+            message: _Message = self.pipe.recv()
             self.owes_answer = not message.is_last
         except (EOFError, OSError) as error:
             raise self._gone() from error
@@ -98,7 +98,7 @@ def _work(pipe: Connection, make: Callable[[], Any]) -> None:
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the caller has closed, or is gone
     except Exception:
-        pipe.send(tuple(_Message(failure=traceback.format_exc())))
+        pipe.send(_Message(failure=traceback.format_exc()))
     finally:
         if made is not None:
             made.close()
@@ -107,6 +107,6 @@ def _work(pipe: Connection, make: Callable[[], Any]) -> None:
 def _answer(pipe: Connection, result: Any) -> None:
     if isinstance(result, Iterator):
         for item in result:
-            pipe.send(tuple(_Message(content=item, is_last=False)))
+            pipe.send(_Message(content=item, is_last=False))
         result = None
-    pipe.send(tuple(_Message(content=result)))
+    pipe.send(_Message(content=result))
