@@ -146,6 +146,13 @@ def test_agents_that_share_streets_do_not_touch_each_other(scene, alone):
     assert other != alone
 
 
+def test_flow_per_second_is_that_of_each_frame_rate(scene):
+    policy = stochastic_policy(Weigher(1.0), ["ego"], ACTIONS)
+    per_second = Agent(policy, {"ego": {"unit": "px_per_s"}})
+    both = rows_of(scene, [per_second], fps=[12, 6])[0]
+    assert [row for row in both if row["fps"] == 6] == rows_of(scene, [per_second], fps=[6])[0]
+
+
 def test_an_agent_drives_otherwise_with_noise(scene, alone):
     assert rows_of(scene, [agent("obj", "seg2", noise=None)], **ASKED)[0] != alone
 
