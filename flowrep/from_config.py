@@ -20,6 +20,7 @@ from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.arena_team import AnyArena, ArenaTeam, can_travel
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.scenes import load_scene
+from flowrep.simulator.renderer import choose_renderer
 
 Config = Mapping[str, Any]
 
@@ -70,6 +71,8 @@ def env_from_config(config: Config, **changes: Any) -> EnvBase:
     """
     num_envs: int = changes.get("num_envs") or config["num_envs"]
     num_workers = changes.get("num_workers", config["num_workers"])
+    if num_workers == "auto" and not _workers_help(config):
+        num_workers = 0
     arguments = {
         "scene": config["scene"],
         "representations": config["representations"],
@@ -85,18 +88,29 @@ def env_from_config(config: Config, **changes: Any) -> EnvBase:
     return env.append_transform(InitTracker())
 
 
+def _workers_help(config: Config) -> bool:
+    """Returns whether training is faster if other processes step the environments.
+
+    A learner on a CPU of two cores needs both, and the rasteriser makes steps cheap.
+    """
+    if available_cores() > 2 or choose_device(config["device"]).type != "cpu":
+        return True
+    return config["flow"]["source"] != "exact" or choose_renderer(config["renderer"]) == "pybullet"
+
+
 def arena_from_config(config: Config, agents: Sequence[Agent], num_envs: int) -> AnyArena:
     """Returns what evaluates agents in the config's scene.
 
-    On a CPU, worker processes take whole episodes if each has enough environments; otherwise they
-    step the environments of one arena.
+    On a CPU, each of several processes takes whole episodes if it has enough environments;
+    otherwise workers step the environments of one arena.
     """
     scene = load_scene(config["scene"])
     workers = min(choose_workers(config["num_workers"], config["num_envs"]), num_envs)
     renderer = config["renderer"]
     processes = min(workers, num_envs // ENVS_PER_ARENA)
     if processes > 1 and can_travel(agents):
-        return ArenaTeam(scene, agents, num_envs=num_envs, num_workers=processes, renderer=renderer)
+        counts = {"num_envs": num_envs, "num_processes": processes}
+        return ArenaTeam(scene, agents, **counts, renderer=renderer)
     pool = partial(EnvPool, num_envs=num_envs, num_workers=workers, renderer=renderer)
     return Arena(scene, agents, pool)
 

@@ -1,8 +1,10 @@
 """Every file of conf/ composes, and everything in it is used."""
 
 import inspect
+from unittest.mock import Mock
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
@@ -105,6 +107,32 @@ def test_the_longer_presets_change_laptop_in_the_documented_keys():
     for preset, expected in changes.items():
         config = flat(composed(f"preset={preset}"))
         assert {k: v for k, v in config.items() if v != laptop.get(k)} == expected
+
+
+@pytest.mark.parametrize(
+    ("cores", "device", "change", "workers"),
+    [
+        (1, "cpu", "renderer=auto", 0),
+        (2, "cpu", "renderer=auto", 0),
+        (2, "cpu", "num_workers=1", 1),
+        (2, "cpu", "renderer=pybullet", 2),
+        (2, "cpu", "flow=estimated", 2),
+        (2, "cuda", "renderer=auto", 2),
+        (3, "cpu", "renderer=auto", 3),
+    ],
+)
+def test_workers_step_environments_where_cores_are_free(
+    monkeypatch, cores, device, change, workers
+):
+    from flowrep import from_config
+
+    pytest.importorskip("numba", reason="without it PyBullet always renders")
+    made = Mock()
+    monkeypatch.setattr(from_config, "make_env", made)
+    monkeypatch.setattr(from_config, "available_cores", lambda: cores)
+    monkeypatch.setattr(from_config, "choose_device", torch.device)
+    from_config.env_from_config(composed(change, "num_envs=4", f"device={device}"))
+    assert made.call_args.kwargs["num_workers"] == workers
 
 
 def flat(config, prefix=""):

@@ -13,7 +13,7 @@ from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.dsac_v import DiscreteSACWithValue
 from flowrep.agent.ppo import PPO
 from flowrep.agent.replay import ReplayMemory
-from flowrep.agent.team import threads_in_use, use_threads
+from flowrep.agent.team import one_thread_an_operation, threads_in_use, use_threads
 
 __all__ = [
     "PPO",
@@ -26,6 +26,7 @@ __all__ = [
     "ReplayMemory",
     "keep_freed_memory",
     "load_checkpoint",
+    "one_thread_an_operation",
     "save_checkpoint",
     "threads_in_use",
     "use_threads",

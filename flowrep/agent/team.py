@@ -49,7 +49,7 @@ class Team:
         work = Work(tasks)
         for calls in self._calls[: len(work.tasks) - 1]:
             calls.put(work)
-        with torch.no_grad(), nullcontext() if self.size == 1 else _one_thread_an_operation():
+        with torch.no_grad(), nullcontext() if self.size == 1 else one_thread_an_operation():
             work.take()
         work.wait()
 
@@ -111,7 +111,8 @@ class Work:
 
 
 @contextmanager
-def _one_thread_an_operation() -> Iterator[None]:
+def one_thread_an_operation() -> Iterator[None]:
+    """Makes PyTorch compute each operation on one thread during the block."""
     before = torch.get_num_threads()
     if before == 1:
         yield

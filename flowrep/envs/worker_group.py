@@ -86,25 +86,23 @@ class WorkerGroup:
             return [worker.receive() for worker in self.workers]
 
     def stream(
-        self, method: str, arguments: Sequence[tuple[Any, ...]]
+        self, method: str, arguments: Sequence[tuple[Any, ...]], own: Iterator[Any]
     ) -> Iterator[tuple[int, Any]]:
         """Yields what a generator method yields in all processes, as it comes.
 
         Args:
             method: its name.
             arguments: for each worker; an item is yielded with the worker's index.
+            own: this process's part of the work, yielded with the index after the last worker's.
         """
         self.send(method, arguments)
         busy = {worker.pipe: (number, worker) for number, worker in enumerate(self.workers)}
         with self._ending_with_a_failure():
+            for item in own:
+                yield len(self.workers), item
+                yield from _arrived(busy, timeout_s=0.0)
             while busy:
-                for pipe in connection.wait(list(busy)):
-                    number, worker = busy[pipe]
-                    item = worker.receive()
-                    if worker.owes_answer:
-                        yield number, item
-                    else:
-                        del busy[pipe]
+                yield from _arrived(busy, timeout_s=None)
 
     def apply(self, method: str, arguments: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, Any]]:
         """Yields the index and result of each call, made in any free process, as they end."""
@@ -146,6 +144,19 @@ class WorkerGroup:
         except WorkerError:
             self.close()
             raise
+
+
+def _arrived(
+    busy: dict[Any, tuple[int, Worker]], timeout_s: float | None
+) -> Iterator[tuple[int, Any]]:
+    """Yields what has come from busy workers, one item of each; removes those that are done."""
+    for pipe in connection.wait(list(busy), timeout_s):
+        number, worker = busy[pipe]
+        item = worker.receive()
+        if worker.owes_answer:
+            yield number, item
+        else:
+            del busy[pipe]
 
 
 @contextmanager

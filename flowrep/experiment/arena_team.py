@@ -1,4 +1,4 @@
-"""Arenas in several processes, which share episodes and cores."""
+"""Arenas in this and other processes, which share episodes and cores."""
 
 import pickle
 from collections.abc import Iterator, Sequence
@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from flowrep.agent import keep_freed_memory
+from flowrep.agent import keep_freed_memory, one_thread_an_operation
 from flowrep.baselines.registry import Drive
 from flowrep.envs.worker_group import WorkerGroup
 from flowrep.experiment.arena import Agent, Arena, Job
@@ -17,16 +17,16 @@ from flowrep.scenes.scene import Scene
 
 
 class ArenaTeam:
-    """An `Arena` in each of several processes; the episodes are those of a single one.
+    """An `Arena` in this process and each of some others; the episodes are those of a single one.
 
-    The processes start at once and are waited for by the first call.
+    The other processes start at once and are waited for by the first call.
 
     Args:
         scene: a loaded scene.
         agents: the agents that will drive, on the CPU and picklable. Their weights are read anew by
             each `run`.
         num_envs: the number of environments of all processes together.
-        num_workers: the number of processes.
+        num_processes: the number of processes, including this one.
         renderer: see `StreetEnv`.
     """
 
@@ -36,12 +36,13 @@ class ArenaTeam:
         agents: Sequence[Agent],
         *,
         num_envs: int,
-        num_workers: int,
+        num_processes: int,
         renderer: str = "auto",
     ) -> None:
-        """Starts the processes."""
+        """Makes the environments of this process and starts the others."""
         self._agents = list(agents)
-        shares = [len(range(i, num_envs, num_workers)) for i in range(num_workers)]
+        *shares, own = (len(range(i, num_envs, num_processes)) for i in range(num_processes))
+        self._own = _arena(scene, agents, own, renderer)
         self._group = WorkerGroup(
             {
                 f"arena {number}": partial(_Member, scene, _packed(agents), share, renderer)
@@ -52,32 +53,35 @@ class ArenaTeam:
 
     def run(self, jobs: Sequence[Job]) -> Iterator[tuple[int, Episode]]:
         """Yields the jobs' episodes with their numbers, as they end; see `Arena.run`."""
-        return self._shared("run", jobs, _packed(self._agents))
+        with one_thread_an_operation():
+            yield from self._shared("run", jobs, _packed(self._agents))
 
     def drive(self, jobs: Sequence[tuple[str, Options]]) -> Iterator[tuple[int, Drive]]:
         """Yields the episodes of baselines, see `EnvPool.drive`."""
         return self._shared("drive", jobs)
 
     def close(self) -> None:
-        """Ends the processes."""
+        """Closes the environments and ends the other processes."""
+        self._own.close()
         self._group.close()
 
     def _shared(self, method: str, jobs: Sequence[Any], *given: Any) -> Iterator[tuple[int, Any]]:
         self._group.wait_until_ready()
-        count = len(self._group)
-        shares = [(jobs[first::count], *given) for first in range(count)]
-        for first, (number, result) in self._group.stream(method, shares):
+        count = len(self._group) + 1
+        *shares, rest = (jobs[first::count] for first in range(count))
+        own = getattr(self._own, method)(rest)
+        arguments = [(share, *given) for share in shares]
+        for first, (number, result) in self._group.stream(method, arguments, own):
             yield first + number * count, result
 
 
 class _Member:
-    """One arena, in its process."""
+    """The arena of another process."""
 
     def __init__(self, scene: Scene, agents: bytes, num_envs: int, renderer: str) -> None:
         keep_freed_memory()
         torch.set_num_threads(1)
-        make_pool = partial(EnvPool, num_envs=num_envs, renderer=renderer)
-        self._arena = Arena(scene, pickle.loads(agents), make_pool)
+        self._arena = _arena(scene, pickle.loads(agents), num_envs, renderer)
 
     def run(self, jobs: Sequence[Job], agents: bytes) -> Iterator[tuple[int, Episode]]:
         self._arena.agents = pickle.loads(agents)
@@ -88,6 +92,10 @@ class _Member:
 
     def close(self) -> None:
         self._arena.close()
+
+
+def _arena(scene: Scene, agents: Sequence[Agent], num_envs: int, renderer: str) -> Arena:
+    return Arena(scene, agents, partial(EnvPool, num_envs=num_envs, renderer=renderer))
 
 
 AnyArena = Arena | ArenaTeam

@@ -1,7 +1,8 @@
-"""Arenas in worker processes: what they share, how they fail and end."""
+"""Arenas in several processes: what they share, how they fail and end."""
 
 import os
 import signal
+from typing import ClassVar
 
 import pytest
 import torch
@@ -29,11 +30,14 @@ STRAIGHT_ON, LEFT = 0, 1
 class Leaning(nn.Module):
     """Always prefers one action, which is its weight."""
 
+    threads: ClassVar[set[int]] = set()  # with which this process called it
+
     def __init__(self, action):
         super().__init__()
         self.action = nn.Parameter(torch.tensor(float(action)))
 
     def forward(self, maps):
+        self.threads.add(torch.get_num_threads())
         return -(torch.arange(3.0) - self.action).abs().expand(len(maps), 3)
 
 
@@ -56,7 +60,7 @@ def team(scene):
     made = []
 
     def make(*agents):
-        made.append(ArenaTeam(scene, agents, num_envs=3, num_workers=2))
+        made.append(ArenaTeam(scene, agents, num_envs=3, num_processes=3))
         return made[-1]
 
     yield make
@@ -76,6 +80,17 @@ def test_each_run_reads_the_weights_of_that_moment(team):
     assert [after[k].episode_seed for k in range(6)] == [before[k].episode_seed for k in range(6)]
     straight_on = dict(team(leaning(STRAIGHT_ON)).run(JOBS))
     assert after == straight_on != before
+
+
+def test_this_process_drives_too_on_one_thread(team):
+    before = torch.get_num_threads()
+    Leaning.threads.clear()
+    try:
+        torch.set_num_threads(3)
+        list(team(leaning(LEFT)).run(JOBS))
+        assert (Leaning.threads, torch.get_num_threads()) == ({1}, 3)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_baselines_get_their_jobs_numbers(team):
