@@ -7,8 +7,15 @@ object and so give each worker a copy of the memory that they share.
 import gc
 from contextlib import suppress
 
+import numpy as np
+
+from flowrep.simulator.triangles import gather
+
 with suppress(ImportError):  # without numba, PyBullet renders
-    import flowrep.simulator.rasteriser  # noqa: F401
+    from flowrep.simulator.rasteriser import Rasteriser
+
+    # An empty world has its machine code loaded, which each worker would load for itself.
+    Rasteriser(gather([]), np.eye(3), (1, 1), (0.1, 1.0))
 
 gc.collect()
 gc.freeze()

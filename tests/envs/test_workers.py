@@ -13,7 +13,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from flowrep.envs import WorkerError, WorkerVectorEnv
+from flowrep.envs import StreetEnv, WorkerError, WorkerVectorEnv
 from flowrep.envs.worker_server import server_context
 
 pytestmark = pytest.mark.slow
@@ -59,6 +59,13 @@ class Counter(gym.Env):
 
     def frozen(self):
         return gc.get_freeze_count()
+
+    def rasterisers(self):
+        """The compiled variants of the rasteriser before and after a street is made."""
+        rasteriser = sys.modules["flowrep.simulator.rasteriser"]
+        before = list(rasteriser._draw.signatures)
+        StreetEnv("straight_road", sensors=["depth"]).close()
+        return before, rasteriser._draw.signatures
 
 
 @pytest.fixture
@@ -155,6 +162,13 @@ def test_every_environment_can_be_asked_and_told(make):
 
 def test_what_workers_share_is_not_copied_by_their_garbage_collections(make):
     assert min(make(2, 2).call("frozen")) > 100_000
+
+
+def test_workers_share_the_rasterisers_machine_code(make):
+    pytest.importorskip("numba", reason="PyBullet renders without it")
+    [(loaded, used)] = make(1, 1).call("rasterisers")
+    assert len(loaded) == 1
+    assert used == loaded
 
 
 @pytest.mark.parametrize("num_workers", [0, 4])
