@@ -63,6 +63,10 @@ def one_arena(scene, agents, **where):
     return Arena(scene, agents, partial(EnvPool, **where))
 
 
+def arenas(scene, agents, num_envs, num_workers):
+    return ArenaTeam(scene, agents, num_envs=num_envs, num_processes=num_workers)
+
+
 def rows_of(scene, agents, num_envs=3, num_workers=0, make_arena=one_arena, **asked):
     asked = {
         "speeds": ["low"],
@@ -127,7 +131,7 @@ def test_rows_come_in_the_order_of_what_was_asked(alone):
 
 @pytest.mark.parametrize(
     ("make_arena", "num_envs", "num_workers"),
-    [(one_arena, 3, 0), (one_arena, 5, 2), (ArenaTeam, 5, 2), (ArenaTeam, 3, 3)],
+    [(one_arena, 3, 0), (one_arena, 5, 2), (arenas, 5, 2), (arenas, 3, 3)],
 )
 def test_where_episodes_are_run_is_not_seen_in_what_comes_out(
     scene, alone, make_arena, num_envs, num_workers
