@@ -109,8 +109,9 @@ def arena_from_config(config: Config, agents: Sequence[Agent], num_envs: int) ->
     renderer = config["renderer"]
     processes = min(workers, num_envs // ENVS_PER_ARENA)
     if processes > 1 and can_travel(agents):
-        counts = {"num_envs": num_envs, "num_processes": processes}
-        return ArenaTeam(scene, agents, **counts, renderer=renderer)
+        return ArenaTeam(
+            scene, agents, num_envs=num_envs, num_processes=processes, renderer=renderer
+        )
     pool = partial(EnvPool, num_envs=num_envs, num_workers=workers, renderer=renderer)
     return Arena(scene, agents, pool)
 

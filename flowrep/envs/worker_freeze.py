@@ -1,5 +1,7 @@
 """Imported by the workers' server after all other modules, before it forks.
 
+It loads the rasteriser's machine code, which each worker would otherwise load for itself.
+
 Whatever the server holds by then is exempt from garbage collection, which would write to every
 object and so give each worker a copy of the memory that they share.
 """
@@ -14,7 +16,6 @@ from flowrep.simulator.triangles import gather
 with suppress(ImportError):  # without numba, PyBullet renders
     from flowrep.simulator.rasteriser import Rasteriser
 
-    # An empty world has its machine code loaded, which each worker would load for itself.
     Rasteriser(gather([]), np.eye(3), (1, 1), (0.1, 1.0))
 
 gc.collect()
