@@ -119,8 +119,9 @@ def carry_out(config: Config, folder: RunFolder) -> float:
                 clock = train(training, config, stop, evaluate)
                 print(f"wall time: {clock.summary()}")
                 print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
-                if not stop:
-                    final_evaluation(training, config, arena, stop)
+                is_evaluated = not stop and final_evaluation(training, config, arena, stop)
+            if is_evaluated:
+                show(training, config)
         except (CheckpointError, DivergenceError) as error:
             exit_with(f"after {training.frames} frames: {error}")
         except WorkerError as error:
@@ -243,8 +244,8 @@ def final_episodes(config: Config) -> int:
 
 def final_evaluation(
     training: Training, config: Config, arena: AnyArena, stop: StopRequest
-) -> None:
-    """Compares the agent with baselines at each speed, films an episode and draws the figures."""
+) -> bool:
+    """Compares the agent with baselines at each speed; returns False if it was stopped."""
     evaluation, run = config["evaluation"], training.run
     comparison = Comparison(
         speeds=evaluation["speeds"],
@@ -256,14 +257,23 @@ def final_evaluation(
     )
     comparison.run(arena, lambda: bool(stop))
     if not comparison.is_complete:
-        return
+        return False
     rows = comparison.rows()
     run.log_episodes(with_origin(rows, config, training.frames, "final"))
     write_failures(run.failures_path, run.read_episodes())
     print_table(rows)
     print_failures(rows)
+    return True
+
+
+def show(training: Training, config: Config) -> None:
+    """Draws the learning curve and films an episode of an evaluated agent.
+
+    To be called when the processes of the evaluation have ended, as it takes memory as well.
+    """
+    run = training.run
     draw_learning_curve(run)
-    if evaluation["video"]:
+    if config["evaluation"]["video"]:
         path = run.video_path(f"episode_{config['speed']}")
         make_env = partial(env_from_config, config)
         record_episode(

@@ -14,17 +14,18 @@ from typing import Any
 
 from flowrep.envs import worker_process
 from flowrep.envs.worker_process import Worker, WorkerError
-from flowrep.envs.worker_server import server_context, signals_held
+from flowrep.envs.worker_server import signals_held, worker_context
 
 
 class WorkerGroup:
     """Processes that hold an object each; when one fails, all are ended.
 
-    They are forked from a server process that has imported the modules of environments and holds
-    none of the caller's threads or CUDA state. They ignore SIGINT and SIGTERM, which terminals and
-    schedulers send to whole process groups, and end when the caller closes them or dies. A script
-    that defines classes of its own, instead of importing them from a module, is run again by each
-    worker and needs an `if __name__ == "__main__":` guard.
+    Several are forked from a server process that has imported the modules of environments; like a
+    single one, which is started anew, they hold none of the caller's threads or CUDA state. They
+    ignore SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, and end
+    when the caller closes them or dies. A script that defines classes of its own, instead of
+    importing them from a module, is run again by each worker and needs an
+    `if __name__ == "__main__":` guard.
 
     Args:
         makers: what each process holds, in words, and the picklable function that makes it there.
@@ -38,7 +39,7 @@ class WorkerGroup:
         """Starts the processes, without waiting until they are ready."""
         self.workers: list[Worker] = []
         self._is_ready = False
-        context = server_context("flowrep.envs.workers")
+        context = worker_context("flowrep.envs.workers", len(makers))
         # The interpreter would wait at exit for processes that ignore signals.
         self._at_exit = partial(_call, weakref.WeakMethod(self.close))
         atexit.register(self._at_exit)
@@ -63,7 +64,7 @@ class WorkerGroup:
         except BaseException:
             self.close()
             raise
-        # The fork server looks for modules in the current folder first.
+        # A new interpreter looks for modules in the current folder first.
         ours = os.path.realpath(worker_process.__file__)
         if others := set(files) - {ours}:
             self.close()

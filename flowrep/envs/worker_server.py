@@ -1,4 +1,4 @@
-"""The fork server of the workers: its imports, signals and temporary files."""
+"""How worker processes start: the fork server of several, its imports, signals and files."""
 
 import atexit
 import multiprocessing
@@ -14,21 +14,27 @@ _FOLDER = "FLOWREP_WORKER_SERVER_FOLDER"
 _LONGEST_FOLDER = 107 - len("/listener-12345678")  # bytes: a socket's path has 107 at most
 
 
-def server_context(module: str) -> Any:
-    """Returns a multiprocessing context with a running fork server.
+def worker_context(module: str, num_workers: int) -> Any:
+    """Returns a multiprocessing context that starts workers.
+
+    Several are forked from a server, which is running by then and imports what they need once. A
+    single one is a new interpreter, since a server beside it would only hold a second copy of that.
 
     SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, never reach the
     server or the processes that it forks. They end when the caller closes them or dies.
 
     Args:
-        module: imported by the server once for all workers, with its own imports.
+        module: imported by the server, with its own imports.
+        num_workers: the number of workers that will be started together.
 
     Raises:
-        OSError: the path of the folder for temporary files is too long.
+        OSError: the path of the folder for temporary files is too long for the server's socket.
     """
+    resource_tracker.ensure_running()  # which unblocks signals when it starts
+    if num_workers == 1:
+        return multiprocessing.get_context("spawn")
     context: Any = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([module, "flowrep.envs.worker_freeze"])
-    resource_tracker.ensure_running()  # which unblocks signals when it starts
     with signals_held(), _folder_told():
         forkserver.ensure_running()
     return context

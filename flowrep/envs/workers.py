@@ -22,7 +22,7 @@ from flowrep.envs.worker_environments import (
     views,
 )
 from flowrep.envs.worker_group import WorkerGroup
-from flowrep.envs.worker_server import server_context
+from flowrep.envs.worker_server import worker_context
 
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
@@ -73,9 +73,8 @@ class WorkerVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         # made in the context of the processes that will open it
-        memory = create_shared_memory(
-            self.single_observation_space, self.num_envs, server_context(__name__)
-        )
+        context = worker_context(__name__, num_workers)
+        memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
         self._shared = views(self.single_observation_space, memory, self.num_envs)
         self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()

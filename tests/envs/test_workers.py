@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from flowrep.envs import StreetEnv, WorkerError, WorkerVectorEnv
-from flowrep.envs.worker_server import server_context
+from flowrep.envs.worker_server import worker_context
 
 pytestmark = pytest.mark.slow
 
@@ -166,9 +166,9 @@ def test_what_workers_share_is_not_copied_by_their_garbage_collections(make):
 
 def test_workers_share_the_rasterisers_machine_code(make):
     pytest.importorskip("numba", reason="PyBullet renders without it")
-    [(loaded, used)] = make(1, 1).call("rasterisers")
-    assert len(loaded) == 1
-    assert used == loaded
+    for loaded, used in make(2, 2).call("rasterisers"):
+        assert len(loaded) == 1
+        assert used == loaded
 
 
 @pytest.mark.parametrize("num_workers", [0, 4])
@@ -235,8 +235,10 @@ def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks into /proc")
-def test_such_signals_reach_no_worker_from_its_first_moment_on(make):
-    with open(f"/proc/{make(1, 1)._group.workers[0].process.pid}/status") as file:
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_such_signals_reach_no_worker_from_its_first_moment_on(make, num_workers):
+    worker = make(2, num_workers)._group.workers[0]
+    with open(f"/proc/{worker.process.pid}/status") as file:
         blocked = int(dict(line.split(":") for line in file)["SigBlk"], 16)
     assert all(blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM))
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & {signal.SIGINT, signal.SIGTERM}
@@ -249,7 +251,7 @@ from tests.envs.test_workers import Counter
 from flowrep.envs import WorkerVectorEnv
 
 if __name__ == "__main__":
-    env = WorkerVectorEnv([Counter, Counter, Counter], 2)
+    env = WorkerVectorEnv([Counter, Counter, Counter], int(sys.argv[1]))
     env.reset(seed=0)
     print(*(worker.process.pid for worker in env._group.workers), flush=True)
     if "wait" in sys.argv:
@@ -267,10 +269,12 @@ def is_running(pid):
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks into /proc")
 @pytest.mark.parametrize("how", ["left open at the end", "killed"])
-def test_no_worker_outlives_its_caller(tmp_path, how):
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_no_worker_outlives_its_caller(tmp_path, num_workers, how):
     script = tmp_path / "holder.py"
     script.write_text(HOLDER)
-    command = [sys.executable, str(script), "wait" if how == "killed" else "end"]
+    how_it_ends = "wait" if how == "killed" else "end"
+    command = [sys.executable, str(script), str(num_workers), how_it_ends]
     paths = {"PYTHONPATH": os.pathsep.join([".", *sys.path]), "TMPDIR": str(tmp_path)}
     environment = os.environ | paths
     with subprocess.Popen(
@@ -278,7 +282,7 @@ def test_no_worker_outlives_its_caller(tmp_path, how):
     ) as holder:
         try:
             workers = [int(pid) for pid in holder.stdout.readline().split()]
-            assert len(workers) == 2
+            assert len(workers) == num_workers
             if how == "killed":
                 assert all(is_running(pid) for pid in workers)
                 holder.kill()
@@ -297,25 +301,30 @@ def test_no_worker_outlives_its_caller(tmp_path, how):
 GUARD = 'if __name__ == "__main__":'
 
 
-def run_script(tmp_path, text):
+def run_script(tmp_path, text, num_workers):
     script = tmp_path / "script.py"
     script.write_text(text)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([".", *sys.path])}
     return subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment
+        [sys.executable, str(script), str(num_workers)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
     )
 
 
-def test_a_script_needs_a_guard_only_for_environments_of_its_own(tmp_path):
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_a_script_needs_a_guard_only_for_environments_of_its_own(tmp_path, num_workers):
     unguarded = HOLDER.replace(GUARD, "if True:")
-    result = run_script(tmp_path, unguarded)
+    result = run_script(tmp_path, unguarded, num_workers)
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     own = "class Own(Counter):\n    pass\n\n"
     ours = HOLDER.replace("[Counter, ", "[Own, ").replace(GUARD, own + GUARD)
-    result = run_script(tmp_path, ours)
+    result = run_script(tmp_path, ours, num_workers)
     assert result.returncode == 0, result.stderr
-    result = run_script(tmp_path, ours.replace(GUARD, "if True:"))
+    result = run_script(tmp_path, ours.replace(GUARD, "if True:"), num_workers)
     assert result.returncode != 0
     assert GUARD in result.stderr
 
@@ -324,4 +333,4 @@ def test_a_folder_too_long_for_sockets_is_named(monkeypatch):
     folder = "/tmp/" + 85 * "x"  # 90 bytes, and "/listener-12345678" makes 108
     monkeypatch.setattr("flowrep.envs.worker_server.util.get_temp_dir", lambda: folder)
     with pytest.raises(OSError, match=f"'{folder}' is too long for sockets: shorten TMPDIR"):
-        server_context("flowrep.envs.workers")
+        worker_context("flowrep.envs.workers", 2)
