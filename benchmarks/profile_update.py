@@ -20,7 +20,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
-from update import SIZES, flowrep_agent, matrix_product, random_steps
+from update import SIZES, dtypes_of, flowrep_agent, matrix_product, random_steps
 
 from flowrep.agent import keep_freed_memory
 
@@ -111,7 +111,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", choices=SIZES, default="paper")
     parser.add_argument("--encoder", choices=("shared", "separate"), default="shared")
-    parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16")
+    parser.add_argument("--precision", choices=("auto", "bf16", "fp32"), default="auto")
     parser.add_argument("--rounds", type=int, default=9)
     args = parser.parse_args()
     keep_freed_memory()
@@ -119,7 +119,7 @@ def main() -> None:
     device, (side, batch) = torch.device("cpu"), SIZES[args.size]
     rates = {
         dtype: 2 * 2048**3 / median_seconds(matrix_product(dtype, device, 2048), args.rounds)
-        for dtype in (torch.bfloat16, torch.float32)
+        for dtype in dtypes_of(device).values()
     }
     block = torch.empty(1 << 28, dtype=torch.uint8)
     target = torch.empty_like(block)
@@ -132,8 +132,9 @@ def main() -> None:
     whole = median_seconds(draw_and_update, args.rounds)
     print(
         f"{args.size}: {side}x{side}, batch {batch}, {args.encoder}, {args.precision}, "
-        f"{torch.get_num_threads()} threads; products bf16 {rates[torch.bfloat16] / 1e9:.0f}, "
-        f"fp32 {rates[torch.float32] / 1e9:.0f} GFLOP/s, copies {bandwidth / 1e9:.1f} GB/s"
+        f"{torch.get_num_threads()} threads; products "
+        + ", ".join(f"{dtype} {rate / 1e9:.0f} GFLOP/s" for dtype, rate in rates.items())
+        + f"; copies {bandwidth / 1e9:.1f} GB/s"
     )
     timed = []
     for _ in range(args.rounds):

@@ -32,6 +32,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory
+from flowrep.agent.precision import has_fast_bf16
 
 CELLS, PIXELS, ENVS = 9, 4, 16
 SIDE = CELLS * PIXELS
@@ -168,14 +169,18 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=12_000)
     arguments = parser.parse_args()
     keep_freed_memory()
-    learners = {
+    learners: dict[str, Callable[..., Learner]] = {
         "TorchRL's stock recipe, fp32": stock_learner,
         "flowrep, fp32": flowrep_learner,
-        "flowrep, bf16": partial(flowrep_learner, precision="bf16"),
-        "flowrep, shared encoder, bf16": partial(
-            flowrep_learner, precision="bf16", encoder="shared"
-        ),
+        "flowrep, shared encoder, fp32": partial(flowrep_learner, encoder="shared"),
     }
+    if has_fast_bf16(torch.device("cpu")):
+        learners |= {
+            "flowrep, bf16": partial(flowrep_learner, precision="bf16"),
+            "flowrep, shared encoder, bf16": partial(
+                flowrep_learner, precision="bf16", encoder="shared"
+            ),
+        }
     print(f"greedy return after {arguments.frames} frames; the best is {BEST:.2f}")
     for name, make_learner in learners.items():
         start = time.perf_counter()

@@ -18,7 +18,16 @@ import time
 from pathlib import Path
 
 import torch
-from update import CHANNELS, MAPS, SIZES, flowrep_update, interleaved, random_steps, stock_update
+from update import (
+    CHANNELS,
+    MAPS,
+    SIZES,
+    dtypes_of,
+    flowrep_update,
+    interleaved,
+    random_steps,
+    stock_update,
+)
 
 from flowrep.agent import keep_freed_memory
 
@@ -70,11 +79,12 @@ def main() -> None:
             "ML-Agents, out of the box": Rival(args.python, side, batch, {}),
             "ML-Agents, freed memory kept": Rival(args.python, side, batch, KEEPING),
         }
+        fastest = next(iter(dtypes_of(device)))
         updates = {
-            "flowrep shared bf16": flowrep_update(steps, "shared", "bf16"),
-            "flowrep separate bf16": flowrep_update(steps, "separate", "bf16"),
-            "TorchRL stock, separate fp32": stock_update(steps),
+            f"flowrep {encoder} {fastest}": flowrep_update(steps, encoder, fastest)
+            for encoder in ("shared", "separate")
         }
+        updates["TorchRL stock, separate fp32"] = stock_update(steps)
         seconds = interleaved(rivals | updates, args.rounds, device, time.perf_counter)
         for rival in rivals.values():
             rival.close()
