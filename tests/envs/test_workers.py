@@ -244,6 +244,20 @@ def test_such_signals_reach_no_worker_from_its_first_moment_on(make, num_workers
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & {signal.SIGINT, signal.SIGTERM}
 
 
+def parent_of(pid):
+    with open(f"/proc/{pid}/stat") as file:
+        return int(file.read().rsplit(")", 1)[1].split()[1])
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks into /proc")
+def test_several_workers_share_a_server_and_a_single_one_needs_none(make):
+    (alone,) = make(2, 1)._group.workers
+    assert parent_of(alone.process.pid) == os.getpid()
+    parents = {parent_of(worker.process.pid) for worker in make(2, 2)._group.workers}
+    assert len(parents) == 1
+    assert os.getpid() not in parents
+
+
 HOLDER = """
 import sys
 from functools import partial
