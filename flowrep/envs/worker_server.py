@@ -21,7 +21,7 @@ def worker_context(module: str, num_workers: int) -> Any:
     single one is a new interpreter, since a server beside it would only hold a second copy of that.
 
     SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, never reach the
-    server or the processes that it forks. They end when the caller closes them or dies.
+    server or workers started under `signals_held`. They end when the caller closes them or dies.
 
     Args:
         module: imported by the server, with its own imports.
