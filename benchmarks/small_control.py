@@ -172,7 +172,6 @@ def main() -> None:
     learners: dict[str, Callable[..., Learner]] = {
         "TorchRL's stock recipe, fp32": stock_learner,
         "flowrep, fp32": flowrep_learner,
-        "flowrep, shared encoder, fp32": partial(flowrep_learner, encoder="shared"),
     }
     if has_fast_bf16(torch.device("cpu")):
         learners |= {
