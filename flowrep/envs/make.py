@@ -1,6 +1,6 @@
 """TorchRL environments of streets, with the transforms that write representations."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from torchrl.data import Composite
 from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
 from flowrep.envs.sensing import SENSORS
-from flowrep.envs.sensor_observation import SensorObservation
+from flowrep.envs.sensor_observation import sensed
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.street_vector import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
@@ -138,7 +138,7 @@ def make_env(
         sensors = [name for name in SENSORS if name in sensors or name not in _SELDOM]
     elif sensors:
         transforms.append(DropSensor())
-    factories = [partial(_sensed, street, sensors)] * num_envs
+    factories = [partial(sensed, street, sensors)] * num_envs
     vector: VectorEnv
     if num_workers:
         vector = WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)
@@ -214,10 +214,6 @@ def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None
 
 def _vector(env: TransformedEnv) -> Any:
     return env.base_env._env
-
-
-def _sensed(street: Callable[..., StreetEnv], sensors: Sequence[str]) -> SensorObservation:
-    return SensorObservation(street(sensors=sensors))
 
 
 def sensors_read(transforms: Iterable[Any]) -> list[str]:

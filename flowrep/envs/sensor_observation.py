@@ -1,6 +1,6 @@
 """Observations as `make_env` returns them: sensors, and the status of the episode."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -53,6 +53,11 @@ class SensorObservation(gym.Wrapper):
         code = _OUTCOME_CODE[info["outcome"]]
         status = episode_status([code], [info["hit"]], [info["episode_seed"]])
         return dict.fromkeys(self._names, observation) | {k: v[0] for k, v in status.items()}
+
+
+def sensed(street: Callable[..., gym.Env], sensors: Sequence[str]) -> SensorObservation:
+    """Returns a street with sensors; picklable in a partial, and imported without PyTorch."""
+    return SensorObservation(street(sensors=sensors))
 
 
 def episode_status(

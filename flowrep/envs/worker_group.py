@@ -20,8 +20,8 @@ from flowrep.envs.worker_server import signals_held, worker_context
 class WorkerGroup:
     """Processes that hold an object each; when one fails, all are ended.
 
-    Several are forked from a server process that has imported the modules of environments; like a
-    single one, which is started anew, they hold none of the caller's threads or CUDA state. They
+    Several are forked from a server process that has imported what they need; like a single one,
+    which is started anew, they hold none of the caller's threads or CUDA state. They
     ignore SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, and end
     when the caller closes them or dies. A script that defines classes of its own, instead of
     importing them from a module, is run again by each worker and needs an
@@ -30,16 +30,17 @@ class WorkerGroup:
     Args:
         makers: what each process holds, in words, and the picklable function that makes it there.
         given: the part of it that comes from the caller, perhaps from the caller's script.
+        module: imported by the server, unless an earlier group has started it.
 
     Raises:
         WorkerError: if a worker could not be started; all methods raise it once one has stopped.
     """
 
-    def __init__(self, makers: Mapping[str, Callable[[], Any]], given: Any) -> None:
+    def __init__(self, makers: Mapping[str, Callable[[], Any]], given: Any, module: str) -> None:
         """Starts the processes, without waiting until they are ready."""
         self.workers: list[Worker] = []
         self._is_ready = False
-        context = worker_context("flowrep.envs.workers", len(makers))
+        context = worker_context(module, len(makers))
         # The interpreter would wait at exit for processes that ignore signals.
         self._at_exit = partial(_call, weakref.WeakMethod(self.close))
         atexit.register(self._at_exit)

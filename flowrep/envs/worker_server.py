@@ -24,7 +24,7 @@ def worker_context(module: str, num_workers: int) -> Any:
     server or workers started under `signals_held`. They end when the caller closes them or dies.
 
     Args:
-        module: imported by the server, with its own imports.
+        module: imported by the server, with its own imports, if no server is running yet.
         num_workers: the number of workers that will be started together.
 
     Raises:

@@ -87,6 +87,7 @@ class WorkerVectorEnv(VectorEnv):
                 for rows in self._rows
             },
             given=env_factories,
+            module=__name__,
         )
         self._group.wait_until_ready()
 

@@ -49,6 +49,7 @@ class ArenaTeam:
                 for number, share in enumerate(shares)
             },
             given=self._agents,
+            module=__name__,
         )
 
     def run(self, jobs: Sequence[Job]) -> Iterator[tuple[int, Episode]]:

@@ -8,7 +8,7 @@ import gymnasium as gym
 from gymnasium.vector.utils import create_empty_array
 
 from flowrep.baselines.registry import BASELINES, Baseline, Drive, drive_episode
-from flowrep.envs.sensor_observation import SensorObservation
+from flowrep.envs.sensor_observation import sensed
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.street_vector import StreetVectorEnv
 from flowrep.envs.worker_environments import Arrays, Order
@@ -40,7 +40,8 @@ class EnvPool:
         renderer: str = "auto",
     ) -> None:
         """Makes the environments."""
-        street = partial(_street, scene, tuple(sensors), renderer)
+        bare = partial(StreetEnv, scene, renderer=renderer)
+        street = partial(sensed, bare, tuple(sensors))
         self.num_envs = num_envs
         self._workers: WorkerVectorEnv | None = None
         if num_workers:
@@ -79,10 +80,6 @@ class EnvPool:
     def close(self) -> None:
         """Stops the workers and closes the simulators."""
         (self._workers or self._streets).close()
-
-
-def _street(scene: Scene, sensors: tuple[str, ...], renderer: str) -> SensorObservation:
-    return SensorObservation(StreetEnv(scene, sensors=sensors, renderer=renderer))
 
 
 @cache

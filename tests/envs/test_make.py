@@ -2,6 +2,7 @@
 
 import shutil
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -215,6 +216,18 @@ def test_workers_give_what_one_process_gives(make, num_workers):
     shared, _ = play(env, actions)
     assert alone["next", "done"].any()
     assert_same(alone, shared)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="looks into /proc")
+def test_a_worker_steps_streets_without_pytorch(make):
+    """It takes some 200 MiB and most of the time that a worker needs to start."""
+    env = make(representations=["ego", "obj"], num_envs=2, num_workers=1)
+    env.rollout(2)
+    (worker,) = env.base_env._env._group.workers
+    loaded = Path(f"/proc/{worker.process.pid}/maps").read_text()
+    assert "pybullet" in loaded
+    assert "libtorch" not in loaded
 
 
 def test_a_step_begun_early_is_the_step(make, in_workers):

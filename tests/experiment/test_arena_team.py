@@ -55,7 +55,7 @@ def leaning(action):
     return Agent(stochastic_policy(Leaning(action), ["depth"], ACTIONS), {"depth": {}})
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def team(scene):
     made = []
 
@@ -66,6 +66,14 @@ def team(scene):
     yield make
     for arena in made:
         arena.close()
+
+
+@pytest.fixture(scope="module")
+def to_the_left(team):
+    """Has driven, so that its processes have begun."""
+    arena = team(leaning(LEFT))
+    list(arena.run(JOBS))
+    return arena
 
 
 def test_each_run_reads_the_weights_of_that_moment(team):
@@ -82,20 +90,20 @@ def test_each_run_reads_the_weights_of_that_moment(team):
     assert after == straight_on != before
 
 
-def test_this_process_drives_too_on_one_thread(team):
+def test_this_process_drives_too_on_one_thread(to_the_left):
     before = torch.get_num_threads()
     Leaning.threads.clear()
     try:
         torch.set_num_threads(3)
-        list(team(leaning(LEFT)).run(JOBS))
+        list(to_the_left.run(JOBS))
         assert (Leaning.threads, torch.get_num_threads()) == ({1}, 3)
     finally:
         torch.set_num_threads(before)
 
 
-def test_baselines_get_their_jobs_numbers(team):
+def test_baselines_get_their_jobs_numbers(to_the_left):
     jobs = [("never_turn", {"episode_seed": seed, "speed": "low"}) for seed in range(5)]
-    drives = dict(team(leaning(LEFT)).drive(jobs))
+    drives = dict(to_the_left.drive(jobs))
     assert {k: drive.episode_seed for k, drive in drives.items()} == {k: k for k in range(5)}
 
 
@@ -110,10 +118,9 @@ def test_a_process_that_was_killed_is_named_and_the_rest_ends(team):
         list(arena.run(JOBS))
 
 
-def test_what_was_left_unfinished_is_not_in_the_next_run(team):
-    arena = team(leaning(LEFT))
-    next(arena.run(JOBS))
-    assert dict(arena.run(JOBS[:4])).keys() == {0, 1, 2, 3}
+def test_what_was_left_unfinished_is_not_in_the_next_run(to_the_left):
+    next(to_the_left.run(JOBS))
+    assert dict(to_the_left.run(JOBS[:4])).keys() == {0, 1, 2, 3}
 
 
 def test_only_what_can_be_sent_to_a_process_is(config):
