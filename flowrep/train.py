@@ -11,7 +11,7 @@ from flowrep.extras import require
 
 if __name__ == "__main__":
     prepare()
-require("training", "train", "hydra", "pydantic", module=__name__)
+require("training", "train", "hydra", "pydantic", "matplotlib", "imageio", module=__name__)
 
 import hydra
 import torch

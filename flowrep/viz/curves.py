@@ -2,8 +2,6 @@
 
 from collections import defaultdict
 
-from matplotlib.figure import Figure
-
 from flowrep.experiment.evaluation import outcome_shares
 from flowrep.experiment.run_folder import RunFolder
 
@@ -14,6 +12,8 @@ def draw_learning_curve(run: RunFolder) -> None:
     The line is the success rate over the last training episodes (sampled actions); the points are
     greedy evaluations at the training speed and frame rate, with 95 % Wilson intervals.
     """
+    from matplotlib.figure import Figure  # a tenth of the time that a command takes to start
+
     metrics = run.read_metrics()
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.add_subplot(
