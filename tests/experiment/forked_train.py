@@ -21,9 +21,12 @@ import time
 import traceback
 from pathlib import Path
 
-import matplotlib.pyplot  # noqa: F401  what a run would import late
+# what a run would import late
+import matplotlib.pyplot  # noqa: F401
+import torch.utils.tensorboard  # noqa: F401
 
 import flowrep.agent.checkpoint as checkpoint
+import flowrep.envs.worker_freeze  # with the rasteriser's machine code
 import flowrep.train
 from flowrep.experiment.run_folder import RunFolder
 
