@@ -44,6 +44,13 @@ def test_a_command_ends_in_one_line(monkeypatch):
     assert caught.value.code == "error: training needs hydra; run: pip install 'flowrep[train]'"
 
 
+@pytest.mark.parametrize("package", ["matplotlib", "imageio"])
+def test_training_names_what_it_would_miss_at_its_end(package, monkeypatch):
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == package else name)
+    with pytest.raises(ImportError, match=f"training needs {package}"):
+        load("a_copy", "train.py")
+
+
 def test_every_console_script_is_there():
     tomllib = pytest.importorskip("tomllib", reason="Python 3.10 can't read pyproject.toml")
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]

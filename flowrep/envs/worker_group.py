@@ -20,17 +20,16 @@ from flowrep.envs.worker_server import signals_held, worker_context
 class WorkerGroup:
     """Processes that hold an object each; when one fails, all are ended.
 
-    Several are forked from a server process that has imported what they need; like a single one,
-    which is started anew, they hold none of the caller's threads or CUDA state. They
-    ignore SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, and end
-    when the caller closes them or dies. A script that defines classes of its own, instead of
-    importing them from a module, is run again by each worker and needs an
-    `if __name__ == "__main__":` guard.
+    Several are forked from a server process; like a single one, which is started anew, they hold
+    none of the caller's threads or CUDA state. They ignore SIGINT and SIGTERM, which terminals and
+    schedulers send to whole process groups, and end when the caller closes them or dies. A script
+    that defines classes of its own, instead of importing them from a module, is run again by each
+    worker and needs an `if __name__ == "__main__":` guard.
 
     Args:
         makers: what each process holds, in words, and the picklable function that makes it there.
         given: the part of it that comes from the caller, perhaps from the caller's script.
-        module: imported by the server, unless an earlier group has started it.
+        module: what the processes need; imported by the server, unless an earlier group started it.
 
     Raises:
         WorkerError: if a worker could not be started; all methods raise it once one has stopped.

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 
+from flowrep import envs
 from flowrep.envs import (
     Outcome,
     begin_step,
@@ -228,6 +229,14 @@ def test_a_worker_steps_streets_without_pytorch(make):
     loaded = Path(f"/proc/{worker.process.pid}/maps").read_text()
     assert "pybullet" in loaded
     assert "libtorch" not in loaded
+
+
+def test_what_is_imported_late_is_public_too():
+    for name in envs.__all__:
+        assert getattr(envs, name).__name__ == name
+    assert set(envs.__all__) <= set(dir(envs))
+    with pytest.raises(AttributeError, match="no attribute 'make_envs'"):
+        _ = envs.make_envs
 
 
 def test_a_step_begun_early_is_the_step(make, in_workers):
