@@ -1,9 +1,11 @@
 """What a launcher's worker does about one run: a stand-in for the run ends in each possible way."""
 
 import json
+import math
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -129,6 +131,25 @@ def test_a_request_that_is_not_read_is_no_mystery(request_for, monkeypatch):
     monkeypatch.setattr(job, "RUN", (sys.executable, "-c", "raise ImportError('no torch')"))
     request["overrides"] = ["x" * 1_000_000]  # more than a pipe holds
     assert job.supervised(request, never).message == "ImportError: no torch"
+
+
+def test_a_failed_run_stops_a_sweeper_that_needs_its_result_and_no_grid(monkeypatch, tmp_path):
+    def hydra_with(sweeper):
+        return SimpleNamespace(
+            runtime=SimpleNamespace(output_dir=str(tmp_path)),
+            overrides=SimpleNamespace(task=[]),
+            sweep=SimpleNamespace(dir=str(tmp_path)),
+            sweeper={"_target_": sweeper},
+        )
+
+    monkeypatch.setattr(job, "plain_config", lambda config: {"device": "cpu", "num_workers": 0})
+    monkeypatch.setattr(job, "supervised", lambda *_: Ending("failed", message="why"))
+    grid = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+    monkeypatch.setattr(job.HydraConfig, "get", lambda: hydra_with(grid))
+    assert math.isnan(job.job({}))
+    monkeypatch.setattr(job.HydraConfig, "get", lambda: hydra_with("elsewhere.OptunaSweeper"))
+    with pytest.raises(job.RunFailedError, match="failed: why"):
+        job.job({})
 
 
 def test_a_process_is_asked_to_stop_when_who_started_it_is_gone(tmp_path):
