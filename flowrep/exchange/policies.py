@@ -2,6 +2,7 @@
 
 import pickle
 import sys
+import sysconfig
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
 PROGRAM = ".pt2"
+STANDARD_LIBRARY = (sysconfig.get_path("stdlib"), "<frozen ")
 MEMORY_KEYS = ("street", "is_init")
 """Keys for policies with state: each row's environment, and whether its episode just began."""
 
@@ -212,11 +214,23 @@ class _named:
         """Raises PolicyError if the block raised another exception."""
         if error is None or isinstance(error, PolicyError) or not isinstance(error, Exception):
             return
-        frames = traceback.extract_tb(trace)
-        # the last line of the author's own code, rather than one deep in a library
-        own = [frame for frame in frames if "site-packages" not in frame.filename]
         text = str(error).strip().splitlines()
         raise PolicyError(
-            f"policy '{self.name}' failed: {type(error).__name__}: {text[0] if text else ''} "
-            f"({own[-1].filename}, line {own[-1].lineno})"
+            f"policy '{self.name}' failed: {type(error).__name__}: {text[0] if text else ''}"
+            f"{_place(trace)}"
         ) from error
+
+
+def _place(trace: Any) -> str:
+    """Returns the last line of the author's own code, rather than one deep in a library."""
+    frames = [frame for frame in traceback.extract_tb(trace) if frame.filename != __file__]
+    installed = [frame for frame in frames if "site-packages" in frame.filename]
+    own = [
+        frame
+        for frame in frames
+        if frame not in installed and not frame.filename.startswith(STANDARD_LIBRARY)
+    ]
+    # a policy may be installed as well; then it is the line that flowrep called
+    for frame in own[-1:] or installed[:1]:
+        return f" ({frame.filename}, line {frame.lineno})"
+    return ""

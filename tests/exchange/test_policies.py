@@ -1,11 +1,17 @@
 """Policies of somebody else's: what they see, and what is said of those that can't be used."""
 
+import shutil
+import sys
+from importlib import import_module
+from zipfile import ZipFile
+
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Categorical, Composite, Unbounded
 
+from flowrep.exchange import policies
 from flowrep.exchange.policies import ForeignPolicy, PolicyError, Task, load_policy
 
 TASK = Task(
@@ -145,6 +151,46 @@ def test_an_error_on_the_way_is_said_with_its_own_line(tmp_path):
     path = written(tmp_path, "def make(task):\n    return lambda maps: maps['rgb']\n")
     with pytest.raises(PolicyError, match=r"failed: KeyError: .*rgb.*mine\.py, line 2\)"):
         load_policy(f"{path}:make", TASK)(maps())
+    path = written(tmp_path, "import json\ndef make(task):\n    return json.loads('depth')\n")
+    with pytest.raises(PolicyError, match=r"failed: JSONDecodeError: .*mine\.py, line 3\)"):
+        load_policy(f"{path}:make", TASK)
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """The module under test as a wheel has it, in the folder of libraries, with a policy beside."""
+    folder = tmp_path / "site-packages"
+    folder.mkdir()
+    shutil.copy(policies.__file__, folder / "installed_policies.py")
+    (folder / "installed_policy.py").write_text(
+        "import torch\n"
+        "def make(task):\n"
+        "    return lambda maps: torch.zeros(2) + torch.zeros(3)\n"
+        "def refuse(task):\n"
+        "    raise ValueError('no depth here')\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+    yield import_module("installed_policies")
+    for name in ("installed_policies", "installed_policy"):
+        sys.modules.pop(name, None)
+
+
+def test_an_installed_policys_error_is_said_with_the_line_that_was_called(installed):
+    with pytest.raises(installed.PolicyError, match=r"no depth here \(.*policy\.py, line 5\)"):
+        installed.load_policy("installed_policy:refuse", TASK)
+    act = installed.load_policy("installed_policy:make", TASK)
+    with pytest.raises(installed.PolicyError, match=r"must match .*policy\.py, line 3\)"):
+        act(maps())
+
+
+def test_a_damaged_program_is_named(installed, tmp_path):
+    path = tmp_path / "agent.pt2"
+    with ZipFile(path, "w") as archive:
+        archive.writestr("version", "of something else")
+    with pytest.raises(installed.PolicyError) as caught:
+        installed.load_policy(str(path), TASK)
+    assert str(caught.value).startswith(f"policy '{path}' failed: ")
+    assert "installed_policies" not in str(caught.value)  # a line of flowrep's helps nobody
 
 
 @pytest.mark.parametrize(
