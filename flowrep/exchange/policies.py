@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.export.passes import move_to_device_pass
 from torchrl.data import Composite, TensorSpec
 
 PROGRAM = ".pt2"
@@ -188,7 +189,8 @@ def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
     if not Path(path).is_file():
         raise PolicyError(f"policy '{path}': there is no such file")
     with _named(path):
-        program = torch.export.load(path).module().to(task.device)
+        # moving the module alone would leave the devices that its graph names
+        program = move_to_device_pass(torch.export.load(path), task.device).module()
 
     @torch.no_grad()
     def act(maps: TensorDictBase) -> Tensor:

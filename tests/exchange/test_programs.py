@@ -12,6 +12,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from flowrep.agent import PPO, DiscreteSAC, DoubleDQN
 from flowrep.agent.policy import PolicyNetwork
+from flowrep.exchange.policies import Task, load_policy
 from flowrep.exchange.programs import ExportError, acting_program, write_agent
 
 HEIGHT, WIDTH, CLASSES = 40, 52, 5
@@ -87,6 +88,34 @@ def test_the_loader_acts_as_the_agent_and_needs_torch_alone(exported, tmp_path):
         with torch.no_grad():
             want = network_of(policy)(*seen.values()).argmax(-1)
         assert got.tolist() == want.tolist()
+
+
+def loaded(reference, device):
+    """The function by which an exported agent acts for flowrep, on maps on the device."""
+    maps_of = dict.fromkeys(KEYS)
+    task = Task("s_turn", maps_of, SPEC[0], Categorical(3), torch.eye(3), torch.device(device))
+    return load_policy(str(reference), task)._act
+
+
+@pytest.mark.parametrize("name", ["agent.pt2", "load_agent.py:make"])
+def test_an_exported_agent_acts_on_the_device_of_its_task(exported, name):
+    act = loaded(exported[1] / name, "meta")  # which stands for any device but the CPU
+    action = act({name: x.to("meta") for name, x in maps(3).items()})
+    assert (action.device.type, action.shape) == ("meta", (3,))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("name", ["agent.pt2", "load_agent.py:make"])
+def test_an_exported_agent_acts_on_a_gpu_as_on_the_cpu(exported, name):
+    policy, folder = exported
+    seen = maps(64)
+    with torch.no_grad():
+        scores = network_of(policy)(*seen.values())
+    best, second = scores.topk(2).values.T
+    clear = best - second > 0.01  # the GPU rounds differently
+    assert clear.any()
+    action = loaded(folder / name, "cuda")({name: x.cuda() for name, x in seen.items()})
+    assert torch.equal(action.cpu()[clear], scores.argmax(-1)[clear])
 
 
 def test_the_weights_are_those_of_ordinary_layers(exported):
