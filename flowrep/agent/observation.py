@@ -6,6 +6,8 @@
 | `Bounded(0, 255, uint8)` | intensity | `x / 255`, C channels |
 | any float | a quantity | itself, C channels |
 
+An id from n to 255 is a pixel without a class, all zeros.
+
 Maps are stored *packed*. The first convolution of the Nature encoder has kernel 8 and stride 4,
 which is the same sum as kernel 2 and stride 1 over blocks of 4 × 4 pixels taken as channels. Two
 input channels thus become 32, which suits vector units, and the pixels are reordered once, when a
@@ -99,8 +101,9 @@ class MapCodec:
     def decode(self, packed: Tensor) -> Tensor:
         """Returns `[N, network_channels * 16, h, w]`, channels last in memory, for the encoder."""
         if self.num_classes:
-            # looking up rows of the identity is several times faster than comparing ids
-            one_hot = torch.eye(self.num_classes, device=packed.device, dtype=self.dtype)
+            # looking up rows of the identity is several times faster than comparing ids; below it
+            # are rows of zeros, up to the largest id of a byte
+            one_hot = torch.eye(256, self.num_classes, device=packed.device, dtype=self.dtype)
             decoded = F.embedding(packed.int(), one_hot).flatten(-2)  # [N, h, w, C * 16 * n]
         elif self.is_byte:
             decoded = packed.to(self.dtype).div_(255)

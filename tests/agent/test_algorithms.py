@@ -36,6 +36,20 @@ def test_an_update_returns_what_it_says_it_does(make_any, random_steps):
 
 
 @pytest.mark.slow_after_first
+def test_pixels_without_a_class_are_acted_on_and_learnt_from(make_any, random_steps):
+    agent = make_any()
+
+    def partly_seen(size):
+        steps = random_steps(size)
+        for maps in (steps, steps["next"]):
+            maps["seg"][..., 3:9] = 255
+        return agent.policy(steps)
+
+    (*_, last) = learn(agent, partly_seen, 12)
+    assert last["grad_norm"].isfinite()
+
+
+@pytest.mark.slow_after_first
 def test_every_trained_weight_moves(make_any, random_steps):
     agent = make_any()
     before = weights(agent)
