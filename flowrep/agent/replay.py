@@ -274,7 +274,8 @@ class SuccessorSampler(Sampler):
         self._usable = (self._next_row >= 0).nonzero().squeeze(-1)
 
     def dumps(self, path: str | Path) -> None:
-        """Writes the links to a file in the folder `path`."""
+        """Writes the links to a file in the folder `path`, which is created if it is absent."""
+        Path(path).mkdir(exist_ok=True)
         torch.save(self.state_dict(), Path(path) / "links.pt")
 
     def loads(self, path: str | Path) -> None:

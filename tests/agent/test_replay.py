@@ -257,6 +257,24 @@ def test_a_restored_memory_goes_on_as_the_saved_one():
         memory(capacity=12).load_state_dict(state)
 
 
+@pytest.mark.parametrize("used", [0, 9])
+def test_a_memory_loaded_from_a_folder_goes_on_as_the_one_that_was_dumped(tmp_path, used):
+    first, second = memory(capacity=11), memory(capacity=11)
+    for i in range(8):  # more rows than it holds
+        first.extend(step([i, 100 + i], [i + 1, 101 + i]))
+    for i in range(used):
+        second.extend(step([50 + i], [51 + i]))
+    for _ in range(2):  # the second time over the first
+        first.dumps(tmp_path / "replay")
+    second.loads(tmp_path / "replay")
+    assert transitions(second) == transitions(first)
+    for replay in (first, second):
+        replay.extend(step([8, 108], [9, 109]))
+        torch.manual_seed(3)
+        replay.drawn = replay.sample()
+    assert (first.drawn == second.drawn).all()
+
+
 def test_a_memory_restored_before_any_frame_works():
     replay = memory()
     replay.load_state_dict(memory().state_dict())
