@@ -256,7 +256,7 @@ class Algorithm(ABC):
 
     @torch.no_grad()
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`.
+        """Continues from a `state_dict`, also if this agent has since learnt more or diverged.
 
         Raises:
             ValueError: if it was saved by another algorithm, or for other maps or sizes.
@@ -277,12 +277,14 @@ class Algorithm(ABC):
             )
         for name, weight in self.weights.items():
             weight.copy_(saved[name])
+        self.optimizer.state.clear()
         for name, moments in state["moments"].items():
             weight = self.trained[name]
             self.optimizer.state[weight] = {
                 key: value.to(weight.device, copy=True) for key, value in moments.items()
             }
         self.updates = state["updates"]
+        self.divergence.reset(self.updates)
         self._capture()  # Adam's moments are at new addresses
 
 

@@ -41,6 +41,16 @@ class DivergenceWatch:
         self.is_bad = torch.zeros((), device=device)
         """0.0 before the first bad update and 1.0 from then on, on the device."""
 
+    def reset(self, good_updates: int = 0) -> None:
+        """Forgets what it has seen, changing its own tensors in place.
+
+        Args:
+            good_updates: updates before the next one, for its number in messages.
+        """
+        self._values.zero_()
+        self._good_updates.fill_(good_updates)
+        self.is_bad.zero_()
+
     def look(self, metrics: Mapping[str, Tensor]) -> None:
         """Records an update's metrics, changing its own tensors in place."""
         values = torch.stack([metrics[name].float() for name in self.names])

@@ -1,5 +1,6 @@
 """What holds for every algorithm of conf/algorithm/."""
 
+import copy
 import math
 
 import pytest
@@ -120,6 +121,37 @@ def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(
         assert all(torch.equal(a[name].nan_to_num(7), b[name].nan_to_num(7)) for name in a)
     a, b = weights(whole), weights(resumed)
     assert [name for name in a if not torch.equal(a[name], b[name])] == []
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("before", [0, 2], ids=["before any update", "after two"])
+def test_a_used_agent_that_is_loaded_equals_a_new_one_bit_for_bit(make_any, random_steps, before):
+    used, new = make_any(learning_rate=0.01), make_any(learning_rate=0.01, seed=9)
+    for _ in range(12):
+        used.remember(random_steps(ENVS))
+    batches = [used.sample() for _ in range(before + 4)]
+    for batch in batches[:before]:
+        used.update(batch.clone())
+    state = copy.deepcopy(used.state_dict())
+    for batch in batches:
+        used.update(batch.clone())
+    spoilt = batches[0].clone()
+    for key in (("next", "reward"), "advantage", "value_target"):
+        if key in spoilt.keys(True):
+            spoilt[key] = torch.full_like(spoilt[key], torch.nan)
+    used.update(spoilt.clone())
+    with pytest.raises(DivergenceError, match=rf"in update {2 * before + 5} "):
+        used.divergence.check()
+    for agent in (used, new):
+        agent.load_state_dict(state)
+        for batch in batches[before:]:
+            agent.update(batch.clone())
+        agent.divergence.check()
+    a, b = weights(used), weights(new)
+    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+    used.update(spoilt)
+    with pytest.raises(DivergenceError, match=rf"in update {before + 5} "):
+        used.divergence.check()
 
 
 @pytest.mark.slow_after_first

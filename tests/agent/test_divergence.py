@@ -24,6 +24,20 @@ def test_the_first_bad_update_is_told_with_its_statistics():
         watch.check()
 
 
+def test_after_a_reset_updates_are_counted_from_the_given_number():
+    watch = DivergenceWatch(["q_loss"])
+    is_bad = watch.is_bad  # which the optimizer holds
+    watch.look(metrics(q_loss=math.nan))
+    watch.reset(40)
+    assert is_bad == 0
+    watch.check()
+    watch.look(metrics(q_loss=1.0))
+    watch.look(metrics(q_loss=math.inf))
+    assert is_bad == 1
+    with pytest.raises(DivergenceError, match=r"^q_loss became inf in update 42 \(q_loss=inf\)$"):
+        watch.check()
+
+
 def test_what_is_logged_beside_the_losses_may_be_undefined():
     watch = DivergenceWatch(["q_loss"], ["explained_variance"])
     watch.look(metrics(q_loss=1.0, explained_variance=math.nan))
