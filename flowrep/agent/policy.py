@@ -96,7 +96,7 @@ class PolicyNetwork(nn.Module):
         outputs = self.network(images)
         if not is_exporting():
             outputs = outputs[: math.prod(batch)]
-        return outputs.reshape(*batch, -1)
+        return outputs.reshape(*batch, outputs.shape[-1])
 
 
 def _padded(packed: Tensor) -> Tensor:

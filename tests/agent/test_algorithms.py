@@ -174,6 +174,14 @@ def test_a_loss_that_is_no_number_stops_the_weights_and_is_named(make_any, rando
         agent.divergence.check()
 
 
+def test_where_nothing_is_observed_nothing_is_done(make_any, random_maps):
+    agent = make_any()
+    for maps in (random_maps(4)[:0], random_maps(2, 3)[:, :0]):
+        with torch.no_grad():
+            assert agent.policy.get_dist(maps.clone()).probs.shape == (*maps.shape, 3)
+            assert agent.policy(maps)["action"].shape == maps.shape
+
+
 def test_acts_greedily_only_when_told_to(make_any, random_maps):
     agent, maps = make_any(), random_maps(1).expand(300).contiguous()
     with torch.no_grad():

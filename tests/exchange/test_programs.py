@@ -90,6 +90,16 @@ def test_the_loader_acts_as_the_agent_and_needs_torch_alone(exported, tmp_path):
         assert got.tolist() == want.tolist()
 
 
+def test_a_program_takes_any_number_of_maps(exported):
+    program = torch.export.load(exported[1] / "agent.pt2").module()
+    seen = maps(5)
+    whole = program(*seen.values())
+    assert whole.shape == (5, 3)
+    for count in (0, 1, 4):
+        some = program(*(x[:count] for x in seen.values()))
+        torch.testing.assert_close(some, whole[:count], atol=1e-5, rtol=1e-5)
+
+
 def loaded(reference, device):
     """The function by which an exported agent acts for flowrep, on maps on the device."""
     maps_of = dict.fromkeys(KEYS)
