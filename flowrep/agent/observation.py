@@ -95,7 +95,12 @@ class MapCodec:
         return x.to(self.stored_dtype)
 
     def store(self, x: Tensor) -> Tensor:
-        """Returns a raw map `[*B, C, H, W]` in its stored form, compact and packed."""
+        """Returns a raw map `[*B, C, H, W]` in its stored form, compact and packed.
+
+        Raises:
+            ValueError: as `batch_shape`.
+        """
+        self.batch_shape(x)
         return self.pack(self.compact(x))
 
     def decode(self, packed: Tensor) -> Tensor:

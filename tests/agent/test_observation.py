@@ -77,6 +77,14 @@ def test_any_leading_batch_packs_like_a_loop():
     assert torch.equal(c.pack(x), looped)
 
 
+@pytest.mark.parametrize("shape", [(3, 2, 42, 45), (3, 2, 38, 47), (3, 1, 38, 45), (38, 45)])
+def test_a_map_of_another_size_is_not_stored(shape):
+    c = codec(Unbounded((2, 38, 45)))
+    # rows 38 and 42 both make 9 blocks, so that packing alone would cut the larger map
+    with pytest.raises(ValueError, match=r"'map': .* built for maps \(2, 38, 45\), got \("):
+        c.store(torch.zeros(shape))
+
+
 def test_stored_types_are_compact():
     assert codec(Categorical(4, (1, 40, 40), dtype=torch.int64)).stored_dtype is torch.uint8
     assert codec(Bounded(0, 255, (3, 40, 40), dtype=torch.uint8)).stored_dtype is torch.uint8
