@@ -1,5 +1,6 @@
 """Exports a trained policy as a torch program, which runs without flowrep."""
 
+import copy
 import json
 import shutil
 from collections.abc import Mapping
@@ -28,7 +29,7 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
     greedy action has the largest score. For stochastic policies, the scores are logits.
 
     Args:
-        policy: of one of flowrep's algorithms.
+        policy: of one of flowrep's algorithms; it is left as it is.
         observation_spec: of the env that the policy was built for.
 
     Raises:
@@ -48,7 +49,9 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
     any_number = {0: Dim("batch")}
     with torch.no_grad():
         return torch.export.export(
-            network.cpu().eval(), tuple(maps), dynamic_shapes=((any_number,) * len(maps),)
+            copy.deepcopy(network).cpu().eval(),
+            tuple(maps),
+            dynamic_shapes=((any_number,) * len(maps),),
         )
 
 

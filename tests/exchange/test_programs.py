@@ -23,11 +23,12 @@ SPEC = Composite(
     shape=(1,),
 )
 KEYS = ["ego", "seg", "rgb"]
+SMALL = {"device": "cpu", "precision": "fp32", "hidden_size": 24}
 
 
 def build(algorithm):
     torch.manual_seed(3)
-    options = {"device": "cpu", "precision": "fp32", "hidden_size": 24}
+    options = dict(SMALL)
     if algorithm is DoubleDQN:
         options |= {"total_frames": 9, "final_epsilon": 0.0, "initial_epsilon": 0.0}
         options |= {"exploration_share": 0.5, "layer_norm": True}
@@ -154,6 +155,15 @@ def test_the_weights_are_those_of_ordinary_layers(exported):
     with torch.no_grad():
         want = network_of(policy)(*seen.values())
     torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-4)
+
+
+def test_a_policy_in_training_is_exported_and_left_as_it_is():
+    agent = DiscreteSAC(SPEC, Categorical(3, (1,)), KEYS, total_frames=9, **SMALL)
+    network, seen = network_of(agent.policy), maps(3)
+    got = acting_program(agent.policy, SPEC).module()(*seen.values())
+    assert all(module.training for module in network.modules())
+    with torch.no_grad():
+        torch.testing.assert_close(got, network(*seen.values()), atol=1e-5, rtol=1e-5)
 
 
 def test_a_policy_of_another_making_is_refused_by_name():
