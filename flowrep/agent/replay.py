@@ -61,6 +61,10 @@ class ReplayMemory(TensorDictReplayBuffer):
             batch_size=batch_size,
         )
 
+    def add(self, data: TensorDictBase) -> int:
+        """Stores one step of a single environment, as `extend` does, and returns its row."""
+        return int(self.extend(data.reshape(1)))
+
 
 class PackSteps(Transform):
     """Turns steps into packed rows on `extend`.

@@ -152,6 +152,16 @@ def test_a_single_trajectory_names_its_time():
     assert transitions(replay) == [(i, i, i + 1, i + 1, 0) for i in range(3)]
 
 
+def test_a_single_step_is_added_as_it_is_extended_by():
+    added, extended = memory(), memory()
+    for i in (3, 4, 5):
+        assert added.add(step([i], [i + 1])[0]) == i - 3
+        extended.extend(step([i], [i + 1]))
+    assert transitions(added) == transitions(extended) == [(3, 3, 4, 4, 0), (4, 4, 5, 5, 0)]
+    with pytest.raises(RuntimeError):
+        added.add(step([3, 4], [4, 5]))
+
+
 def test_the_oldest_are_overwritten():
     replay = memory(capacity=7)  # not a multiple of the two environments
     for i in range(9):
