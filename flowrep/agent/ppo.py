@@ -187,7 +187,7 @@ class PPO(Algorithm):
         """Returns the number of updates of one round if a rollout is complete, else 0."""
         if len(self.memory) < self.rollout_length:
             return 0
-        return self._updates_of(self.memory.steps().numel())
+        return self._updates_of(self.memory.numel())
 
     def sample(self) -> TensorDictBase:
         """Returns the round's next batch; the first call begins the round and clears the memory."""

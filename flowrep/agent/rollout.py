@@ -35,6 +35,10 @@ class Rollout:
         """Returns the number of steps of each environment."""
         return len(self._steps)
 
+    def numel(self) -> int:
+        """Returns the number of steps of all environments."""
+        return sum(step.numel() for step in self._steps)
+
     def extend(self, frames: TensorDictBase) -> None:
         """Stores steps of N environments: `[N]`, `[N, T]`, or as a TorchRL collector returns them.
 

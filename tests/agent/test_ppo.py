@@ -71,6 +71,14 @@ def test_a_round_is_due_when_the_rollout_is_complete_and_no_frame_is_learnt_from
     assert agent.total_updates == 600 // 8 * 6
 
 
+def test_counting_the_updates_that_are_due_copies_no_step(monkeypatch):
+    agent = make_ppo(rollout_length=3, batch_size=2)
+    for each in STEPS:  # one more than a rollout
+        agent.remember(each)
+    monkeypatch.setattr(agent.memory, "steps", None)
+    assert agent.updates_due(8) == 12  # 4 batches in each of 3 epochs
+
+
 def test_advantages_by_hand():
     """Environment 0 terminates in its second step, environment 1 is cut off in its third."""
     agent = make_ppo()
