@@ -153,7 +153,7 @@ class DoubleDQN(OffPolicy):
             device=device,
             precision=options["precision"],
             hidden_size=options["hidden_size"],
-            layer_norm=options["layer_norm"],
+            layer_norm=options.get("layer_norm", False),
         )
         exploration = EGreedyModule(
             action_spec,
