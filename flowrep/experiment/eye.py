@@ -6,13 +6,13 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs.transforms import Transform
 
 from flowrep.envs.make import sensors_read
 from flowrep.palette import num_classes
 from flowrep.scenes.scene import Scene
 from flowrep.simulator.camera import sampled_intrinsics
 from flowrep.transforms import representation_stack
+from flowrep.transforms.recurrent import RecurrentTransform
 
 
 class Eye:
@@ -49,12 +49,12 @@ class Eye:
         )
         self.sensors = sensors_read(self._transforms)
         self._device = torch.device(device)
-        # what transforms with a step of their own have written, which the next step needs
+        # what the next step needs of this one
         self._kept = [
             key
             for transform in self._transforms.transforms
-            if type(transform)._step is not Transform._step
-            for key in transform.out_keys
+            if isinstance(transform, RecurrentTransform)
+            for key in transform.carried_keys
         ]
         self._latest: TensorDictBase | None = None  # [num_envs]
 
@@ -73,11 +73,11 @@ class Eye:
         now: TensorDictBase = TensorDict({"sensor": sensor}, [len(rows)]).to(self._device)
         if going_on:
             before = now.empty() if self._latest is None else self._latest[rows]
-            before["_reset"] = torch.arange(len(rows), device=self._device) < len(begun)
+            begins = torch.arange(len(rows), device=self._device) < len(begun)
             for transform in self._transforms.transforms:
                 now = transform._step(before, now)
-                # begins anew what it has taken from an earlier episode
-                now = transform._reset_on_native_autoreset(before, now)
+                if isinstance(transform, RecurrentTransform):
+                    now = transform.begin_anew(begins, now)
         else:
             now = self._transforms._reset(now.empty(), now)
         if self._kept:

@@ -108,16 +108,20 @@ class MapTransform(Transform):
             f"the env offers {keys}. Name another one with in_keys=, or let the env emit it."
         )
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        maps = []
-        for key in self.in_keys:
-            value = next_tensordict.get(key, None)
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Returns the inputs; raises if one is missing or has another layout."""
+        maps = [tensordict.get(key, None) for key in self.in_keys]
+        for key, value in zip(self.in_keys, maps):
             if value is None:
-                if self.missing_tolerance:
-                    return next_tensordict
-                raise self._missing(key, next_tensordict)
-            maps.append(value)
+                raise self._missing(key, tensordict)
         self._check_layout(maps)
+        return maps
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        lacks = (next_tensordict.get(key, None) is None for key in self.in_keys)
+        if self.missing_tolerance and any(lacks):
+            return next_tensordict
+        maps = self._read(next_tensordict)
         compute = type(self).compute
         if self.compiled:
             compute = _compiled(compute)
@@ -177,6 +181,12 @@ def check_own_keys(transform: MapTransform) -> None:
             "replay buffer for instance, would start from what the first one made; give out_keys= "
             "names of their own"
         )
+
+
+def for_each_element(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
+    """Returns flags such as `done`, `[*B]` or `[*B, 1]`, as `[*B]`, the TensorDict's batch."""
+    batch_dims = tensordict.ndim
+    return flags.flatten(batch_dims).any(-1) if flags.ndim > batch_dims else flags
 
 
 def refuse_n_step(tensordict: TensorDictBase, key: NestedKey) -> None:

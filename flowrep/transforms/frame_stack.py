@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
-from flowrep.transforms.base import Keys, MapTransform, MissingKey, Reads, refuse_n_step
+from flowrep.transforms.base import Keys, Reads, refuse_n_step
+from flowrep.transforms.recurrent import RecurrentTransform
 
 
-class FrameStack(MapTransform):
+class FrameStack(RecurrentTransform):
     """The last `k` frames on the channel dimension, oldest first.
 
     | reads | writes | shape | range | unit |
@@ -73,31 +76,14 @@ class FrameStack(MapTransform):
         """Returns the stacks at an episode's first frame, which is repeated k times."""
         return tuple(torch.cat([frame] * self.k, -3) for frame in frames)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        for frame_key, stack_key in zip(self.in_keys, self.out_keys):
-            frame, stack = next_tensordict.get(frame_key, None), tensordict.get(stack_key, None)
-            if frame is None:
-                raise self._missing(frame_key, next_tensordict)
-            if stack is None:
-                raise MissingKey(
-                    f"representation {stack_key!r} needs the stack of the previous step: pass step "
-                    f"the TensorDict of reset or step_mdp, which holds {stack_key!r}"
-                )
-            next_tensordict.set(stack_key, push_frame(stack, frame))
-        return next_tensordict
+    @property
+    def carried_keys(self) -> list[NestedKey]:
+        """The stacks of the step before."""
+        return self.out_keys
 
-    def _reset_on_native_autoreset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        """Restarts the stacks of the envs that have just reset themselves."""
-        reset = tensordict.get("_reset")
-        for stack_key in self.out_keys:
-            stack = tensordict_reset.get(stack_key)
-            newest = stack.chunk(self.k, -3)[-1]
-            first = torch.cat([newest] * self.k, -3)
-            mask = expand_as_right(reset.reshape(tensordict.batch_size), stack)
-            tensordict_reset.set(stack_key, torch.where(mask, first, stack))
-        return tensordict_reset
+    def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Returns the stacks of the step before with the current frames appended."""
+        return tuple(push_frame(stack, frame) for stack, frame in zip(before, now))
 
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -119,32 +105,15 @@ class FrameStack(MapTransform):
     def _stack_from_trajectory(
         self, tensordict: TensorDictBase, frame_key: NestedKey, stack_key: NestedKey
     ) -> Tensor:
-        frames, done = tensordict.get(frame_key, None), tensordict.get(("next", "done"), None)
+        frames = tensordict.get(frame_key, None)
         if frames is None:
             raise self._missing(frame_key, tensordict)
-        if done is None or "time" not in tensordict.names:
-            raise MissingKey(
-                f"representation {stack_key!r} is not in the batch, and its frames can't be told "
-                f"apart: store {stack_key!r}, or give a trajectory with ('next', 'done') and a "
-                f"dimension named 'time' (td.refine_names(..., 'time')); names are "
-                f"{tensordict.names}"
-            )
-        done = done.flatten(tensordict.ndim).any(-1) if done.ndim > tensordict.ndim else done
-        return stack_trajectory(frames, done, self.k, tensordict.names.index("time"))
+        done, time_dim = self._trajectory(tensordict, stack_key)
+        return stack_trajectory(frames, done, self.k, time_dim)
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns each map's spec with k times the channels."""
         return tuple(_stacked(spec, self.k) for spec in specs)
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Returns the input specs of `step`, including the previous step's stacks."""
-        input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
-            return input_spec
-        observation_spec = self.transform_observation_spec(self.parent.observation_spec)
-        for stack_key in self.out_keys:
-            input_spec["full_state_spec"][stack_key] = observation_spec[stack_key]
-        return input_spec
 
 
 def push_frame(stack: Tensor, frame: Tensor) -> Tensor:

@@ -10,29 +10,20 @@ from tensordict import TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.transforms.base import (
-    MOTION,
-    MOTIONS,
-    Keys,
-    MapTransform,
-    MissingKey,
-    Reads,
-    refuse_n_step,
-)
+from flowrep.transforms.base import MOTION, MOTIONS, Keys, Reads, refuse_n_step
+from flowrep.transforms.recurrent import RecurrentTransform
 
 _CAMERA: NestedKey = ("sensor", "world_from_cam")
 _BODIES: NestedKey = ("sensor", "world_from_body")
 
 
-class PoseTransform(MapTransform):
+class PoseTransform(RecurrentTransform):
     """Base of transforms that write the motion between the poses of two steps.
 
-    The previous step's poses are read from the TensorDict passed to `step`, where the env declares
-    them as part of its state. No state is kept between calls, so episodes and envs can't mix. A
-    subclass defines the motion between two sets of poses.
+    A subclass defines the motion between two sets of poses.
 
     Args:
         reads: see `MapTransform`.
@@ -53,40 +44,20 @@ class PoseTransform(MapTransform):
         """Returns the motion at an episode's first frame, where nothing moves."""
         return (self.between(poses, poses),)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        now = self._poses(next_tensordict)
-        before = [tensordict.get(key, None) for key in self.in_keys]
-        for key, pose in zip(self.in_keys, before):
-            if pose is None:
-                raise MissingKey(
-                    f"{self.label} needs {key!r} of the previous step: pass step the TensorDict of "
-                    f"reset or step_mdp, which holds {key!r}"
-                )
-        return next_tensordict.set(self.out_keys[0], self.between(before, now))
+    @property
+    def carried_keys(self) -> list[NestedKey]:
+        """The poses of the step before."""
+        return self.in_keys
 
-    def _poses(self, tensordict: TensorDictBase) -> list[Tensor]:
-        poses = [tensordict.get(key, None) for key in self.in_keys]
-        for key, pose in zip(self.in_keys, poses):
-            if pose is None:
-                raise self._missing(key, tensordict)
-        self._check_layout(poses)
-        return poses
-
-    def _reset_on_native_autoreset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        """Resets the motion of the envs that have just reset themselves."""
-        key = self.out_keys[0]
-        (first,) = self.compute(*self._poses(tensordict_reset))
-        mask = tensordict.get("_reset").reshape(tensordict.batch_size)
-        motion = tensordict_reset.get(key)
-        return tensordict_reset.set(key, torch.where(expand_as_right(mask, motion), first, motion))
+    def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
+        """Returns the motion between two steps."""
+        return (self.between(before, now),)
 
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the motions of a replay batch, at its root and under `"next"`."""
         key = self.out_keys[0]
-        now = self._poses(tensordict)
+        now = self._read(tensordict)
         if tensordict.get(key, None) is None:
             tensordict.set(key, self._along_trajectory(tensordict, now))
         following = tensordict.get("next", None)
@@ -94,21 +65,13 @@ class PoseTransform(MapTransform):
             return tensordict  # stored: correct even if the next frame is several steps ahead
         if any(k in following.keys(True) for k in self.in_keys):
             refuse_n_step(tensordict, key)
-            following.set(key, self.between(now, self._poses(following)))
+            following.set(key, self.between(now, self._read(following)))
             tensordict.set("next", following)
         return tensordict
 
     def _along_trajectory(self, tensordict: TensorDictBase, now: Sequence[Tensor]) -> Tensor:
         """Returns the motion to each step of a trajectory, without motion at an episode's start."""
-        done = tensordict.get(("next", "done"), None)
-        if done is None or "time" not in tensordict.names:
-            raise MissingKey(
-                f"{self.label} is not in the batch, and the step before can't be told: store "
-                f"{self.out_keys[0]!r}, or give a trajectory with ('next', 'done') and a dimension "
-                f"named 'time' (td.refine_names(..., 'time')); names are {tensordict.names}"
-            )
-        done = done.flatten(tensordict.ndim).any(-1) if done.ndim > tensordict.ndim else done
-        time = tensordict.names.index("time")
+        done, time = self._trajectory(tensordict, self.out_keys[0])
         begins = torch.cat([torch.ones_like(done.narrow(time, 0, 1)), _but_last(done, time)], time)
         before = [
             torch.where(
@@ -119,15 +82,6 @@ class PoseTransform(MapTransform):
             for pose in now
         ]
         return self.between(before, now)
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Returns the input specs of `step`, including the previous step's poses."""
-        input_spec = super().transform_input_spec(input_spec)
-        if self.parent is None:
-            return input_spec
-        for key in self.in_keys:
-            input_spec["full_state_spec"][key] = self.parent.observation_spec[key].clone()
-        return input_spec
 
 
 class CameraMotion(PoseTransform):

@@ -147,3 +147,16 @@ class FakeSensorEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Everything is deterministic."""
+
+
+class SelfResettingEnv(FakeSensorEnv):
+    """Begins the next episode in the step that ends one, as Isaac Lab does (native auto-reset)."""
+
+    def __init__(self, batch_size: tuple[int, ...] = ()) -> None:
+        super().__init__(batch_size)
+        self._torchrl_native_autoreset = True
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        ended = super()._step(tensordict)
+        first = self._reset(TensorDict({"_reset": ended["done"]}, self.batch_size))
+        return ended.set("sensor", first["sensor"])
