@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import dispatch
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
@@ -20,6 +21,7 @@ from flowrep.transforms.base import (
     MapTransform,
     Reads,
     check_own_keys,
+    for_each_element,
 )
 from flowrep.transforms.flow import CameraTransform, Intrinsics
 
@@ -96,7 +98,8 @@ class AdaptPose(MapTransform):
         layout: `"matrix"`, `"xyz_xyzw"` or `"xyz_wxyz"`.
         direction: `"camera_to_world"` or `"world_to_camera"`.
         axes: `"opencv"`, `"opengl"` (Blender's), `"ned"` or `"x_forward_z_up"`.
-        check: whether ill-formed poses raise ValueError at resets and on batches; steps aren't
+        check: whether ill-formed poses raise ValueError at resets, in the envs that are reset, and
+            on batches, except after an episode's end where TorchRL writes nan; steps aren't
             checked. A check waits for a GPU: switch it off if resets or replay samples have to be
             fast there.
         in_keys: key of the env's pose.
@@ -143,24 +146,46 @@ class AdaptPose(MapTransform):
             pose, layout=self.layout, direction=self.direction, axes=self.axes, check=check
         )
 
-    def _refuse_ill_formed(self, *parts: TensorDictBase | None) -> None:
-        for part in parts if self.check else ():
-            pose = None if part is None else part.get(self.in_keys[0], None)
-            if pose is not None:
-                self._check_layout([pose])
-                self._adapted(pose, check=True)
+    def _refuse_ill_formed(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> None:
+        """Raises ValueError for an ill-formed pose, in the given rows `[*B]` or in all."""
+        pose = tensordict.get(self.in_keys[0], None)
+        if not self.check or pose is None:
+            return
+        self._check_layout([pose])
+        if rows is not None:
+            # A stand-in for the others; the quaternion has length 1 in either layout.
+            still = torch.eye(pose.shape[-1], dtype=pose.dtype, device=pose.device)
+            still = still if self.layout == "matrix" else still[-1]
+            pose = torch.where(expand_as_right(rows, pose), pose, still)
+        self._adapted(pose, check=True)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        self._refuse_ill_formed(tensordict_reset)
+        reset = tensordict.get("_reset", None)
+        rows = None if reset is None else for_each_element(reset, tensordict)
+        self._refuse_ill_formed(tensordict_reset, rows)
         return super()._reset(tensordict, tensordict_reset)
 
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the poses of a batch of any shape, at its root and under `"next"`."""
-        self._refuse_ill_formed(tensordict, tensordict.get("next", None))
+        self._refuse_ill_formed(tensordict)
+        following = tensordict.get("next", None)
+        if following is not None:
+            self._refuse_ill_formed(following, self._observed(following))
         return super().forward(tensordict)
+
+    def _observed(self, following: TensorDictBase) -> Tensor | None:
+        """Returns where the next step was observed: TorchRL hides that of an env that reset itself.
+
+        There the pose is nan throughout, and the step is done.
+        """
+        pose, done = (following.get(key, None) for key in (self.in_keys[0], "done"))
+        if pose is None or done is None:
+            return None
+        hidden = ~pose.isfinite().flatten(following.ndim).any(-1)
+        return ~(hidden & for_each_element(done, following))
 
     def output_specs(self, pose: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded float64 spec."""

@@ -21,7 +21,7 @@ from flowrep.transforms import (
     InstanceMotion,
     RawFlow,
 )
-from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
+from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv, SelfResettingEnv
 
 POSE = ("sensor", "world_from_cam")
 
@@ -75,6 +75,34 @@ def test_an_ill_formed_pose_is_refused_at_a_reset_and_on_a_batch_but_not_in_a_st
     good = td[:1].set("next", td[1:].clone())
     with pytest.raises(ValueError, match="left-handed"):
         adapt(good)
+
+
+@pytest.mark.parametrize("layout", ["matrix", "xyz_xyzw", "xyz_wxyz"])
+def test_rows_that_are_not_reset_are_not_checked(layout):
+    adapt = AdaptPose(layout=layout)
+    good = torch.eye(4) if layout == "matrix" else torch.tensor([5.0, 6, 7, 0.5, 0.5, 0.5, 0.5])
+    td = TensorDict({"pose": torch.stack([good, torch.zeros_like(good), good])}, [3])
+    resets = TensorDict({"_reset": torch.tensor([[True], [False], [True]])}, [3])
+    assert adapt._reset(resets, td.clone())[POSE].shape == (3, 4, 4)
+    with pytest.raises(ValueError, match="pose"):
+        adapt._reset(~resets, td.clone())
+
+
+def test_what_torchrl_hides_after_an_episode_is_not_checked():
+    adapt = AdaptPose(in_keys=POSE, out_keys="pose")
+    td = SelfResettingEnv((2,)).rollout(5, break_when_any_done=False).reshape(-1)
+    after = ("next", *POSE)
+    hidden = td[after].isnan().flatten(1).all(1)
+    assert torch.equal(hidden, td["next", "done"].squeeze(-1))
+    assert hidden.nonzero().flatten().tolist() == [2, 5 + 3]  # episodes of 3 and of 4 steps
+    assert torch.equal(adapt(td.clone())["next", "pose"].isnan().flatten(1).any(1), hidden)
+    for flaw in (
+        {("next", "done"): torch.zeros_like(hidden)},  # lost within an episode
+        {after: td[after].nan_to_num()},  # zeros
+        {POSE: td[after]},  # at the root
+    ):
+        with pytest.raises(ValueError, match=r"pose\[2\] (holds nan|has a last row)"):
+            adapt(td.clone().update(flaw))
 
 
 def test_poses_of_several_bodies_at_once():
