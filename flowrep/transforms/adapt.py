@@ -151,7 +151,7 @@ class AdaptPose(MapTransform):
         pose = tensordict.get(self.in_keys[0], None)
         if not self.check or pose is None:
             return
-        self._check_layout([pose])
+        self._check_layout([pose], tensordict.batch_size)
         if rows is not None:
             # A stand-in for the others; the quaternion has length 1 in either layout.
             still = torch.eye(pose.shape[-1], dtype=pose.dtype, device=pose.device)
@@ -167,7 +167,7 @@ class AdaptPose(MapTransform):
         self._refuse_ill_formed(tensordict_reset, rows)
         return super()._reset(tensordict, tensordict_reset)
 
-    @dispatch(source="in_keys", dest="out_keys")
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the poses of a batch of any shape, at its root and under `"next"`."""
         self._refuse_ill_formed(tensordict)

@@ -83,23 +83,30 @@ class MapTransform(Transform):
         self.compiled = False
         self.label = " and ".join(repr(key) for key in self.out_keys)
 
-    def _check_layout(self, maps: Sequence[Tensor | TensorSpec]) -> None:
-        """Raises ValueError for the first input whose layout is wrong or contradicts the others."""
+    def _check_layout(self, maps: Sequence[Tensor | TensorSpec], batch: torch.Size) -> None:
+        """Raises ValueError for the first input whose layout is wrong or contradicts the others.
+
+        `batch` is the TensorDict's or the spec's; that of the inputs may have further dims.
+        """
         agreed: dict[str, int] = {}
-        batch = maps[0].shape[: -len(self.reads[0].shape)]
+        leading = maps[0].shape[: -len(self.reads[0].shape)]
+        if leading[: len(batch)] == batch:
+            batch = leading
         for key, reads, value in zip(self.in_keys, self.reads, maps):
             rank = len(reads.shape)
             sizes = [
-                size if isinstance(size, int) else agreed.setdefault(size, got)
+                size if isinstance(size, int) else agreed.get(size, got)
                 for size, got in zip(reads.shape, value.shape[-rank:])
             ]
-            if tuple(value.shape) != (*batch, *sizes) or not _is_kind(value.dtype, reads.kind):
+            fits = len(sizes) == rank and tuple(value.shape) == (*batch, *sizes)
+            if not fits or not _is_kind(value.dtype, reads.kind):
                 known = {"*B": list(batch), **agreed}
                 raise ValueError(
                     f"representation {self.label}: key {key!r} should be {reads} with "
                     f"{', '.join(f'{name} = {size}' for name, size in known.items())}; "
                     f"got {value.dtype} {list(value.shape)}"
                 )
+            agreed |= {name: n for name, n in zip(reads.shape, sizes) if isinstance(name, str)}
 
     def _missing(self, key: NestedKey, offered: TensorDictBase | Composite) -> MissingKey:
         keys = sorted(offered.keys(True, True), key=str)
@@ -114,7 +121,7 @@ class MapTransform(Transform):
         for key, value in zip(self.in_keys, maps):
             if value is None:
                 raise self._missing(key, tensordict)
-        self._check_layout(maps)
+        self._check_layout(maps, tensordict.batch_size)
         return maps
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -134,7 +141,7 @@ class MapTransform(Transform):
     ) -> TensorDictBase:
         return self._call(tensordict_reset)
 
-    @dispatch(source="in_keys", dest="out_keys")
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the outputs for a batch of any shape, at its root and under `"next"`.
 
@@ -154,7 +161,7 @@ class MapTransform(Transform):
             if key not in offered:
                 raise self._missing(key, observation_spec)
         specs = [observation_spec[key] for key in self.in_keys]
-        self._check_layout(specs)
+        self._check_layout(specs, observation_spec.shape)
         observation_spec = observation_spec.clone()
         for key, spec in zip(self.out_keys, self.output_specs(*specs)):
             observation_spec[key] = spec

@@ -85,7 +85,7 @@ class FrameStack(RecurrentTransform):
         """Returns the stacks of the step before with the current frames appended."""
         return tuple(push_frame(stack, frame) for stack, frame in zip(before, now))
 
-    @dispatch(source="in_keys", dest="out_keys")
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the stacks of a replay batch, at its root and under `"next"`."""
         following = tensordict.get("next", None)

@@ -53,7 +53,7 @@ class PoseTransform(RecurrentTransform):
         """Returns the motion between two steps."""
         return (self.between(before, now),)
 
-    @dispatch(source="in_keys", dest="out_keys")
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the motions of a replay batch, at its root and under `"next"`."""
         key = self.out_keys[0]

@@ -67,7 +67,7 @@ class Segmentation(MapTransform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         ids = next_tensordict.get(self.in_keys[0], None)
         if self.encoding == "ids" and ids is not None:
-            self._check_layout([ids])
+            self._check_layout([ids], next_tensordict.batch_size)
             _check_fits_uint8(self.in_keys[0], ids)
         return super()._call(next_tensordict)
 

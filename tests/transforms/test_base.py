@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import pickle
+import re
 import shutil
 import sys
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import TransformedEnv
 
 from flowrep.transforms import Depth, FlowFactorize, FrameStack, RawFlow, Rgb, Segmentation, base
@@ -211,6 +213,26 @@ def test_wrong_layout_is_refused_before_the_first_step():
     env = TransformedEnv(FakeSensorEnv((3,)), Depth(in_keys=[("sensor", "rgb")]))
     with pytest.raises(ValueError, match=r"'depth'.*float \[\*B, 1, H, W\].*\[3, 3, 5, 7\]"):
         env.observation_spec  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("batch", "got"),
+    [([], "[5, 7]"), ([4], "[4, 5, 7]"), ([2, 3], "[2, 3, 5, 7]"), ([1], "[1, 5, 7]")],
+)
+def test_a_map_without_channels_is_refused(batch, got):
+    stack = FrameStack(k=2, in_keys=["grey"], out_keys=["grey2"])
+    expected = re.escape(f"key 'grey' should be [*B, C0, H0, W0] with *B = {batch}; ") + ".*"
+    td = TensorDict({"grey": torch.zeros(*batch, 5, 7)}, batch)
+    with pytest.raises(ValueError, match=expected + re.escape(got)):
+        stack._reset(td, td)
+    spec = Composite(grey=Unbounded((*batch, 5, 7)), shape=batch)
+    with pytest.raises(ValueError, match=expected + re.escape(got)):
+        stack.transform_observation_spec(spec)
+
+
+def test_a_map_may_have_a_batch_of_its_own():
+    cameras = TensorDict({"depth": torch.ones(2, 3, 1, 5, 7)}, [2])
+    assert Depth(in_keys="depth", out_keys="near")(cameras)["near"].shape == (2, 3, 1, 5, 7)
 
 
 def test_wrong_number_of_keys_is_refused():
