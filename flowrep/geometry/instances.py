@@ -41,3 +41,13 @@ def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
     ids = ids.long()
     nearest = torch.searchsorted(ascending, ids.contiguous()).clamp(max=count - 1)
     return torch.where(ascending[nearest] == ids, order[nearest] + 1, 0).to(dtype)
+
+
+def check_rows(lowest: int, highest: int, rows: int) -> None:
+    """Raises RuntimeError if ids from `lowest` to `highest` are no rows of `rows` motions."""
+    if lowest < 0 or highest >= rows:
+        raise RuntimeError(
+            f"instance holds ids {lowest} to {highest}, but prev_from_curr_by_instance has {rows} "
+            f"rows, for ids 0 to {rows - 1}; convert a simulator's ids, such as -1 for the "
+            "background, with the transform InstanceIds or with flowrep.geometry.instance_rows"
+        )

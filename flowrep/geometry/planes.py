@@ -12,6 +12,7 @@ from torch import Tensor
 from flowrep.geometry import single_pass
 from flowrep.geometry.camera import centred_pixels
 from flowrep.geometry.closed_form import Planes, flow_planes, known_camera, motion_coefficients
+from flowrep.geometry.instances import check_rows
 
 
 def camera_planes(
@@ -66,10 +67,14 @@ def body_planes(
         maps = depth.squeeze(-3), instance.squeeze(-3)
         return single_pass.planes_of_motions(*maps, by_instance, x, y, dt)
     row_of_pixel = instance.long().flatten(-3)  # [*B, H * W]
-    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = (
-        rows.expand(*batch, -1).gather(-1, row_of_pixel).unflatten(-1, (height, width))
-        for rows in by_instance.unbind(-1)
-    )
+    try:
+        axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = (
+            rows.expand(*batch, -1).gather(-1, row_of_pixel).unflatten(-1, (height, width))
+            for rows in by_instance.unbind(-1)
+        )
+    except RuntimeError:
+        check_rows(int(instance.min()), int(instance.max()), by_instance.shape[-2])
+        raise
     q_far = [
         axx * x + (axy * y + ax),
         ayx * x + (ayy * y + ay),

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from flowrep.geometry.closed_form import Planes
+from flowrep.geometry.instances import check_rows
 
 SMALL = 1 << 14  # pixels for which loading numba isn't worth while
 
@@ -99,11 +100,7 @@ def planes_of_motions(
         v.numpy(),
         valid.numpy(),
     )
-    if lowest < 0 or highest >= motions:
-        raise RuntimeError(
-            f"instance holds ids {lowest} to {highest}, an index out of "
-            f"prev_from_curr_by_instance's {motions} rows"
-        )
+    check_rows(lowest, highest, motions)
     return u.view(depth.shape), v.view(depth.shape), valid.view(depth.shape)
 
 

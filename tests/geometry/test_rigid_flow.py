@@ -86,9 +86,12 @@ def test_any_batch_equals_a_loop(batch):
     assert torch.equal(unbatched_K, rigid_flow(depth, instance, K.expand_as(Ks), motions).flow)
 
 
-def test_an_id_without_a_row_is_refused():
-    with pytest.raises(RuntimeError, match="index"):
-        rigid_flow(depth_map(), torch.full_like(instance_map(), 3), K, MOTIONS)
+@pytest.mark.parametrize(("id_", "held"), [(-1, "-1 to 2"), (3, "0 to 3")])
+def test_an_id_without_a_row_is_refused(id_, held):
+    instance = instance_map(2, dtype=torch.int32)
+    instance[1, 0, 2, 3] = id_
+    with pytest.raises(RuntimeError, match=f"instance holds ids {held}.* 0 to 2; .*InstanceIds"):
+        rigid_flow(depth_map(2), instance, K, MOTIONS)
 
 
 @pytest.mark.parametrize(
