@@ -41,9 +41,10 @@ class EstimatedFlow(FlowTransform):
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
             from two batches of pictures, uint8 `[N, 3, H, W]`, to the flow from the first to the
-            second, float `[N, 2, H, W]`, e.g. a configured `flowrep.transforms.DIS`.
+            second, float `[N, 2, H, W]`, e.g. a configured `flowrep.transforms.DIS`. A function has
+            none of the following three options.
         weights: file with RAFT's weights, see `flowrep.transforms.RAFT`.
-        preset: of DIS, see `flowrep.transforms.DIS`.
+        preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
         min_side_px: smaller pictures are enlarged to this; for RAFT to at least 128.
         outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw.
@@ -53,7 +54,8 @@ class EstimatedFlow(FlowTransform):
         out_keys: one key per output; their names by default.
 
     Raises:
-        ValueError: for an unknown estimator, output or unit, or options of another estimator.
+        ValueError: for an unknown estimator, output or unit, `weights` for another estimator than
+            RAFT, options for a function, and in each call for flow of another shape.
         ImportError: if a library that the estimator needs is not installed.
 
     Example:
@@ -75,8 +77,8 @@ class EstimatedFlow(FlowTransform):
         estimator: str | Estimator = "dis",
         *,
         weights: str | Path | None = None,
-        preset: str = "medium",
-        min_side_px: int = 160,
+        preset: str = DIS.preset,
+        min_side_px: int = DIS.min_side_px,
         outputs: Sequence[str] = ("raw",),
         scale: float = 1.0,
         unit: str = "px_per_step",
@@ -104,7 +106,14 @@ class EstimatedFlow(FlowTransform):
         """Returns the chosen outputs."""
         batch, size = pair.shape[:-3], pair.shape[-2:]
         previous, current = pair.to(torch.uint8).reshape(-1, 6, *size).chunk(2, -3)
-        flow = -self.estimator(current, previous).to(torch.float32)
+        flow = self.estimator(current, previous)
+        if flow.shape != (len(current), 2, *size):
+            raise ValueError(
+                f"representation {self.label}: the estimator should return [N, 2, H, W], "
+                f"{[len(current), 2, *size]}, got {list(flow.shape)}; channels that come last, as "
+                "OpenCV's, are moved by flow.movedim(-1, 1)"
+            )
+        flow = -flow.to(torch.float32)
         # After a reset both pictures are the same, and nothing has moved.
         differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
         flow = torch.where(differs, flow, 0.0).reshape(*batch, 2, *size)
@@ -129,6 +138,11 @@ def _estimator(
     if estimator == "dis":
         return DIS(preset, min_side_px)
     if callable(estimator):
+        if (preset, min_side_px) != (DIS.preset, DIS.min_side_px):
+            raise ValueError(
+                f"preset={preset!r} and min_side_px={min_side_px} are not read if the estimator is "
+                "a function: set them in it, e.g. estimator=DIS(preset, min_side_px)"
+            )
         return estimator
     raise ValueError(
         f"estimator must be one of {['dis', *NETWORKS]} or a function, got {estimator!r}"

@@ -216,12 +216,28 @@ def test_without_opencv_one_line_says_what_to_install(monkeypatch):
         ({"weights": "w.pth"}, "weights= are RAFT's; estimator 'dis' has none"),
         ({"preset": "slow"}, r"preset must be one of .*'medium'\], got 'slow'"),
         ({"min_side_px": 0}, "min_side_px must be at least 1, got 0"),
+        ({"estimator": pixel_steps, "weights": "w.pth"}, "weights= are RAFT's"),
+        ({"estimator": pixel_steps, "preset": "slow"}, "preset='slow' .* not read .* function"),
+        ({"estimator": DIS(), "min_side_px": 96}, r"min_side_px=96 are not read .*DIS\(preset"),
         ({"outputs": ["valid"]}, r"some of \['raw', 'unscaled'\]"),
     ],
 )
 def test_options_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         EstimatedFlow(**options)
+
+
+@pytest.mark.parametrize(
+    ("shape", "got"),
+    [
+        ((3, 5, 7, 2), r"got \[3, 5, 7, 2\]; .*movedim"),  # OpenCV's: a reshape would mix u and v
+        ((1, 2, 5, 7), r"got \[1, 2, 5, 7\]"),  # would be repeated for all three
+    ],
+)
+def test_an_estimator_s_flow_of_another_shape_is_refused(shape, got):
+    pairs = TensorDict({"rgb2": torch.zeros(3, 6, 5, 7, dtype=torch.uint8)}, [3])
+    with pytest.raises(ValueError, match=r"'raw'.* \[N, 2, H, W\], \[3, 2, 5, 7\], " + got):
+        EstimatedFlow(lambda first, second: torch.ones(shape))(pairs)
 
 
 def test_pictures_may_be_left_as_small_as_they_are():
