@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import multiprocessing
 import zlib
@@ -173,6 +174,12 @@ class SensorNoise(MapTransform):
             else:
                 self._generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
         return self._generator
+
+    def clone(self) -> SensorNoise:
+        """Returns a copy that continues the sequence with a generator of its own."""
+        copied = super().clone()
+        copied._generator = copy.deepcopy(self._generator)
+        return copied
 
     def get_extra_state(self) -> Tensor:
         """Returns the generator's state for `state_dict`, empty before the first use."""

@@ -130,7 +130,7 @@ def test_a_resumed_run_goes_on_in_the_same_sequence(calls):
     for _ in range(calls):
         noise.compute(*maps())
     saved = noise.state_dict()
-    copies = [copy.deepcopy(noise), pickle.loads(pickle.dumps(noise))]
+    copies = [copy.deepcopy(noise), pickle.loads(pickle.dumps(noise)), noise.clone()]
     want = [noise.compute(*maps())[2] for _ in range(2)]
     resumed = SensorNoise(**ALL, seed=1)
     resumed.compute(*maps())  # whatever it did before
@@ -140,6 +140,14 @@ def test_a_resumed_run_goes_on_in_the_same_sequence(calls):
     unused = SensorNoise(**ALL, seed=1)
     unused.load_state_dict(saved)
     torch.testing.assert_close(unused.state_dict(), saved)  # loaded and saved again before use
+
+
+def test_a_clone_s_noise_changes_nothing_in_the_original_s():
+    noise, alone = SensorNoise(**ALL, seed=1), SensorNoise(**ALL, seed=1)
+    for transform in (noise, alone):
+        transform.compute(*maps())
+    Compose(noise).clone()[0].compute(*maps())  # as an evaluation's env does
+    assert torch.equal(noise.compute(*maps())[2], alone.compute(*maps())[2])
 
 
 def frames(count: int) -> torch.Tensor:
