@@ -47,7 +47,8 @@ class AdaptDepth(CameraTransform):
         out_keys: key of depth in metres; must differ, so that nothing is adapted twice.
 
     Raises:
-        ValueError: for an unknown kind, or an argument that it lacks or doesn't use.
+        ValueError: for an unknown kind, an argument that it lacks or doesn't use, or a K that can't
+            be one.
 
     Example:
         >>> import torch

@@ -33,6 +33,9 @@ class CameraTransform(MapTransform):
         reads: see `MapTransform`.
         in_keys: see `MapTransform`.
         out_keys: see `MapTransform`.
+
+    Raises:
+        ValueError: for a K that is not finite, not positive in fx and fy, or transposed.
     """
 
     K: Tensor | None
@@ -180,13 +183,21 @@ def intrinsics_key(intrinsics: Intrinsics) -> NestedKey | None:
 
 
 def as_intrinsics(intrinsics: Intrinsics) -> Tensor:
-    """Returns K as a float tensor `[3, 3]`."""
+    """Returns K as a float tensor `[3, 3]`; raises ValueError if it is none."""
     K = torch.as_tensor(intrinsics)
     K = K.clone() if K.is_floating_point() else K.to(torch.get_default_dtype())
     if K.shape != (3, 3):
         raise ValueError(
             f"intrinsics is K, [3, 3], or the key of [*B, 3, 3] in the TensorDict; got "
             f"{list(K.shape)}"
+        )
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    rows = K.new_tensor([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    has_focal_lengths = fx > 0.0 and fy > 0.0  # nan compares False
+    if not (has_focal_lengths and K.isfinite().all() and torch.allclose(K, rows, atol=1e-6)):
+        raise ValueError(
+            "intrinsics should be K, with rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, "
+            f"finite, fx and fy positive; got {K.tolist()}. Pass K.T if it is transposed"
         )
     return K
 

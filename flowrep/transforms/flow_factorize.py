@@ -49,7 +49,8 @@ class FlowFactorize(FlowTransform):
         out_keys: one key per output; their names by default.
 
     Raises:
-        ValueError: for an unknown output or unit, or `"px_per_s"` without `dt_s`.
+        ValueError: for a K that can't be one, an unknown output or unit, or `"px_per_s"` without
+            `dt_s`.
 
     Example:
         The camera moved 0.1 m to the right, so a wall a metre away moves by fx · 0.1 = 5 px to the

@@ -51,7 +51,8 @@ class RawFlow(FlowTransform):
         out_keys: one key per output; their names by default.
 
     Raises:
-        ValueError: for an unknown output or unit, or `"px_per_s"` without `dt_s`.
+        ValueError: for a K that can't be one, an unknown output or unit, or `"px_per_s"` without
+            `dt_s`.
 
     Example:
         A body a metre away was 0.1 m further left: fx · 0.1 m / 1 m = 5 px to the right.

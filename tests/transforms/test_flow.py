@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -175,6 +176,33 @@ def test_intrinsics_are_copied_and_no_part_of_the_state():
 def test_options_are_checked(options, expected):
     with pytest.raises(ValueError, match=expected):
         FlowFactorize(**{"intrinsics": K, **options})
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"),
+    [
+        (0, 0, math.nan),
+        (0, 2, math.inf),
+        (0, 0, 0.0),
+        (1, 1, -5.0),  # v up
+        (1, 0, 0.3),
+        (2, 0, 3.2),
+        (2, 1, 2.1),
+        (2, 2, 2.0),
+    ],
+)
+def test_a_k_that_cannot_be_one_is_refused(row, column, value):
+    K = torch.tensor(INTRINSICS)
+    RawFlow(K)
+    K[row, column] = value
+    for make in (RawFlow, FlowFactorize, partial(AdaptDepth, "ray_length")):
+        with pytest.raises(ValueError, match=r"K, with rows \(fx, skew, cx\).* positive; got \[\["):
+            make(intrinsics=K)
+
+
+def test_a_transposed_k_is_refused():  # it would count as cx = cy = 0
+    with pytest.raises(ValueError, match=r"K\.T if it is transposed"):
+        RawFlow(torch.tensor(INTRINSICS).T)
 
 
 def test_raw_flow_offers_no_factors():
