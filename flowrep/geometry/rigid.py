@@ -163,7 +163,7 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
 
 
 def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
-    """Returns points `[*B, ..., 3]` expressed in frame a.
+    """Returns points `[*B, ..., 3]` expressed in frame a, in the wider float type.
 
     Args:
         a_from_b: `[*B, 4, 4]`; its batch dims are the leading dims of `points_b`.
@@ -187,6 +187,7 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
             f"{list(points_b.shape)} lacks; its batch dims are the leading dims of points_b"
         )
     broadcast_batch(a_from_b=a_from_b.shape[:-2], points_b=points_b.shape[: a_from_b.ndim - 2])
-    a_from_b = a_from_b.reshape(*a_from_b.shape[:-2], *[1] * point_dims, 4, 4)
-    rotated = (a_from_b[..., :3, :3] @ points_b.unsqueeze(-1)).squeeze(-1)
+    dtype = torch.promote_types(a_from_b.dtype, points_b.dtype)
+    a_from_b = a_from_b.to(dtype).reshape(*a_from_b.shape[:-2], *[1] * point_dims, 4, 4)
+    rotated = (a_from_b[..., :3, :3] @ points_b.to(dtype).unsqueeze(-1)).squeeze(-1)
     return rotated + a_from_b[..., :3, 3]

@@ -19,6 +19,17 @@ def test_transform_points_by_hand():
     torch.testing.assert_close(points_a[0].tolist(), [10.0, 21.0, 30.0])
 
 
+@pytest.mark.parametrize("points", [torch.float16, torch.float32, torch.float64])
+@pytest.mark.parametrize("transform", [torch.float32, torch.float64])
+def test_float_types_may_differ(transform, points):
+    # Seen along z at 3 m by a camera 10.25 m along x that looks along world x.
+    world_from_cam = torch.tensor([[0, 0, 1, 10.25], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    points_cam = torch.tensor([[0.5, 2.0, 3.0]], dtype=points)
+    points_world = transform_points(world_from_cam.to(transform), points_cam)
+    assert points_world.dtype == torch.promote_types(transform, points)
+    assert points_world.tolist() == [[13.25, -0.5, -2.0]]
+
+
 def test_invert_rigid_by_hand():
     a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
     # b's x axis is a's y axis: a's origin lies at -(20, -10, 30) in b. -t alone: (-10, -20, -30).
