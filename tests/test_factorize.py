@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import inspect
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -40,6 +41,7 @@ from flowrep.sequences import (
     read_kitti_flow,
 )
 from flowrep.sequences.job import Job
+from flowrep.sequences.output_folder import OutputFolder
 from flowrep.sequences.scores import COLUMNS
 from flowrep.transforms import DIS
 from tests.config.composing import plain
@@ -212,6 +214,12 @@ def test_what_is_there_is_not_overwritten(moments, tmp_path):
     (tmp_path / "out").mkdir()
     with pytest.raises(SequenceError, match="out: exists already"):
         factorize(tmp_path)
+
+
+@pytest.mark.parametrize("folder", [".", "..", "/"])
+def test_a_folder_without_a_name_is_not_overwritten(folder):
+    with pytest.raises(SequenceError, match=f"^{re.escape(folder)}: exists already"):
+        OutputFolder(folder, {}, resume=False)
 
 
 def test_without_an_unfinished_job_there_is_nothing_to_continue(moments, tmp_path):

@@ -32,9 +32,9 @@ class OutputFolder:
 
     def __init__(self, path: str | Path, settings: Mapping[str, Any], *, resume: bool) -> None:
         self.path = Path(path)
-        self.partial = self.path.with_name(f"{self.path.name}.partial")
-        if self.path.exists():
+        if self.path.exists():  # also . and /, which have no name
             raise SequenceError(self.path, "exists already; remove it, or give another output")
+        self.partial = self.path.with_name(f"{self.path.name}.partial")
         if self.partial.exists() and not resume:
             raise SequenceError(
                 self.partial, "is an unfinished job: resume=true continues it, or remove it"
