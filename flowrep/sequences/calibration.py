@@ -87,6 +87,9 @@ def _camera(path: Path, content: Mapping[str, Any], prefix: str = "") -> Camera:
             path, f"{prefix}first_pixel_centre is 0 (as OpenCV calibrates) or 0.5, "
             f"not {value['first_pixel_centre']}",
         )  # fmt: skip
+    for key in ("width", "height"):
+        if not value[key].is_integer():
+            raise SequenceError(path, f"{prefix}{key} should be a whole number, not {value[key]}")
     width, height = int(value["width"]), int(value["height"])
     check_pixels(path, width, height)
     if not (value["fx"] > 0 and value["fy"] > 0):

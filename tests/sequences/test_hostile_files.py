@@ -254,6 +254,8 @@ def test_binary_where_text_should_be(tmp_path):
     [
         ({"fx": None}, "fx should be a number"),
         ({"fx": -31.0}, "fx and fy should be positive"),
+        ({"width": 40.9}, "width should be a whole number, not 40.9"),
+        ({"height": 24.5}, "height should be a whole number, not 24.5"),
         ({"fx": float("nan")}, "fx should be a number"),
         ({"width": 2**31, "height": 2**31}, "claims 2147483648 x 2147483648"),
         ({"first_pixel_centre": 1}, "first_pixel_centre is 0"),
