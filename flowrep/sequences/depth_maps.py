@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.sequences.arrays import read_npy
+from flowrep.sequences.frame import SequenceError
 from flowrep.sequences.pictures import read_png16
 
 DEPTH_FILES = (".png", ".npy")
@@ -41,13 +42,24 @@ def depth_from_integers(
     return depth
 
 
-def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
+def read_depth(path: Path, unit_m: float, size: tuple[int, int]) -> NDArray[np.float32]:
     """Returns a depth map in metres: 16 bits (0 and 65535 missing) times a unit, or floats.
 
     Args:
         path: a .png, or a .npy of float metres, in which nan is missing and inf no surface.
         unit_m: the unit of the .png, metres.
+        size: height and width of its camera's pictures, from intrinsics.json.
+
+    Raises:
+        SequenceError: it can't be read, or has another size.
     """
     if path.suffix.lower() == ".npy":
-        return read_npy(path)
-    return depth_from_integers(read_png16(path), unit_m, missing=(0, 65535))
+        depth = read_npy(path)
+    else:
+        depth = depth_from_integers(read_png16(path), unit_m, missing=(0, 65535))
+    if depth.shape != size:
+        (height, width), (own_height, own_width) = size, depth.shape
+        raise SequenceError(
+            path, f"is {own_width} x {own_height}, intrinsics.json says {width} x {height}"
+        )
+    return depth

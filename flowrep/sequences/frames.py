@@ -153,14 +153,7 @@ class Frames(Recording):
         )
 
     def _depth(self, path: Path) -> NDArray[np.float32]:
-        stored = read_depth(path, self.depth_unit_m)
-        if stored.shape != self._camera.size:
-            height, width = self._camera.size
-            raise SequenceError(
-                path,
-                f"is {stored.shape[1]} x {stored.shape[0]}, "
-                f"intrinsics.json says {width} x {height}",
-            )
+        stored = read_depth(path, self.depth_unit_m, self._camera.size)
         K = torch.from_numpy(self._camera.K).float() if self.depth_kind == "ray_length" else None
         depth = adapt_depth(
             torch.from_numpy(stored)[None],

@@ -49,7 +49,7 @@ class Zed(Recording):
                 self.folder / "intrinsics.json",
                 "names a colour camera; a ZED's depth belongs to the left picture already",
             )
-        self.K = camera.K
+        self._camera, self.K = camera, camera.K
 
     def __len__(self) -> int:
         """Returns the number of left pictures."""
@@ -67,7 +67,7 @@ class Zed(Recording):
                 self._poses[index], self._poses_path, layout="xyz_xyzw", axes=self.pose_axes
             ),
             K=self.K,
-            depth=measured(read_depth(self._depths[number], DEPTH_UNIT_M)),
+            depth=measured(read_depth(self._depths[number], DEPTH_UNIT_M, self._camera.size)),
             rgb=read_rgb(picture),
         )
 

@@ -125,6 +125,17 @@ def test_wrong_depths_of_bits_and_sizes(kind, shape, dtype, says, tmp_path):
     assert says in refusal(lambda: all_of(Frames(tmp_path)), "0001.png")
 
 
+@pytest.mark.parametrize(
+    ("write", "open_it"), [(synthetic.write_frames, Frames), (synthetic.write_zed, Zed)]
+)
+def test_pictures_of_another_size_than_their_camera_has(write, open_it, tmp_path):
+    write(tmp_path)
+    larger = synthetic.camera_json(size=(36, 60))
+    text(tmp_path / "intrinsics.json", [json.dumps(larger)])
+    said = refusal(lambda: all_of(open_it(tmp_path)), "0.png")
+    assert "is 40 x 24, intrinsics.json says 60 x 36" in said
+
+
 def test_frames_of_differing_sizes(tmp_path):
     synthetic.write_tum(tmp_path)
     for kind, dtype, shape in (("rgb", np.uint8, (12, 20, 3)), ("depth", np.uint16, (12, 20))):
