@@ -97,7 +97,7 @@ def list_files(folder: Path, suffixes: Iterable[str], prefix: str = "") -> list[
     """Returns a folder's files with one of the suffixes, sorted by number, then by name.
 
     Raises:
-        SequenceError: no such folder, or no such file in it.
+        SequenceError: no such folder, no such file in it, or two that differ in the suffix alone.
     """
     suffixes = tuple(suffixes)
     try:
@@ -110,7 +110,12 @@ def list_files(folder: Path, suffixes: Iterable[str], prefix: str = "") -> list[
         raise SequenceError(folder, _reason(error, "folder")) from None
     if not found:
         raise SequenceError(folder, f"holds no {prefix}*{' or '.join(suffixes)} file")
-    return sorted(found, key=_natural)
+    found.sort(key=_natural)
+    by_stem: dict[str, Path] = {}
+    for path in found:
+        if (first := by_stem.setdefault(path.stem, path)) is not path:
+            raise SequenceError(path, f"belongs to the same frame as {first.name}; remove one")
+    return found
 
 
 def path_inside(folder: Path, relative: str, index: Path) -> Path:

@@ -73,6 +73,7 @@ class Recording(ABC):
     notes: tuple[str, ...] = ()
     one_size: bool = True
     _size: tuple[int, int] | None = None
+    _named: dict[str, tuple[int, Path]] | None = None
 
     @abstractmethod
     def __len__(self) -> int:
@@ -87,12 +88,13 @@ class Recording(ABC):
 
         Raises:
             IndexError: there is no such frame.
-            SequenceError: it can't be read, or does not fit the others.
+            SequenceError: it can't be read, does not fit the others, or has the name of another.
         """
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         frame = self._read(index)
         check_frame(frame)
+        self._check_name(index, frame)
         if self._size is None:
             self._size = frame.size
         if self.one_size and frame.size != self._size:
@@ -105,6 +107,18 @@ class Recording(ABC):
     def __iter__(self) -> Iterator[Frame]:
         """Yields the frames in order."""
         return (self[index] for index in range(len(self)))
+
+    def _check_name(self, index: int, frame: Frame) -> None:
+        """Raises SequenceError if another frame has the name."""
+        if self._named is None:
+            self._named = {}
+        first, source = self._named.setdefault(frame.name, (index, frame.source))
+        if first != index:
+            raise SequenceError(
+                frame.source,
+                f"frame {index} is named {frame.name}, like frame {first} ({source}): "
+                "both would write the same files",
+            )
 
 
 def check_frame(frame: Frame) -> None:

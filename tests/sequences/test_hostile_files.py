@@ -145,6 +145,34 @@ def test_frames_of_differing_sizes(tmp_path):
     assert "is 20 x 12, other frames are 40 x 24" in said
 
 
+@pytest.mark.parametrize(
+    ("name", "there", "second"),
+    [
+        ("sevenscenes", "frame-000001.color.png", "frame-000001.color.jpg"),
+        ("frames", "depth/0001.png", "depth/0001.npy"),
+        ("frames", "rgb/0001.png", "rgb/0001.jpeg"),
+        ("zed", "depth000001.npy", "depth000001.PNG"),
+    ],
+)
+def test_two_files_of_one_frame(name, there, second, tmp_path):
+    write, open_it, *_ = FORMATS[name]
+    write(tmp_path)
+    (tmp_path / second).write_bytes((tmp_path / there).read_bytes())
+    first, later = sorted([there, second])
+    said = refusal(lambda: open_it(tmp_path), later)
+    assert f"belongs to the same frame as {first.split('/')[-1]}; remove one" in said
+
+
+def test_two_frames_of_one_name(tmp_path):
+    synthetic.write_tum(tmp_path)
+    path = tmp_path / "rgb.txt"
+    path.write_text(path.read_text().replace("rgb/100.200000.png", "rgb/100.000000.png"))
+    recording = Tum(tmp_path)
+    said = refusal(lambda: all_of(recording), "rgb/100.000000.png")
+    assert "frame 2 is named 100.000000, like frame 0 (" in said
+    assert [recording[0].name for _ in range(2)] == ["100.000000"] * 2  # read again, it is itself
+
+
 FLO = struct.pack("<fii", 202021.25, 3, 2)
 
 
