@@ -1,5 +1,8 @@
 """The examples that need no simulator run as they stand and print what a hand gets."""
 
+import math
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -52,3 +55,31 @@ def test_the_tensors_example_prints_what_a_hand_gets(capsys):
     assert columns["ego"][3] == -0.07
     assert columns["obj"] == [0, 0, 0, 0.86, 0.86, 0, 0, 0]
     assert columns["raw"][3] == pytest.approx(0.79)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_policy_of_ones_own_keeps_clear_of_a_person_and_comes_back(side):
+    from examples.own_policy import make
+    from flowrep.scenes import load_scene
+    from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, roll, turn
+
+    vehicle, device = load_scene("straight_road").vehicle, torch.device("cpu")
+    K = torch.tensor([[40.0, 0.0, 21.0], [0.0, 40.0, 15.0], [0.0, 0.0, 1.0]])
+    spec = {"obj": torch.zeros(2, 30, 42)}
+    act = make(SimpleNamespace(intrinsics=K, observation_spec=spec, device=device))
+    state, way = VehicleState(0.0, 0.0, 0.0, 0.0), []
+    for step in range(70):
+        obj, depth = torch.zeros(1, 2, 30, 42), torch.ones(1, 1, 30, 42)
+        if step < 20:  # 10 m ahead, 4.5 px = 1.1 m aside, and 12 steps of 0.1 px nearer when met
+            column = 25 if side > 0 else 16
+            obj[..., 15, column] = torch.tensor([-0.1 * side, 0.0])
+            depth[..., 15, column] = 0.1
+        maps = {"obj": obj, "depth": depth}
+        maps |= {"street": torch.tensor([3]), "is_init": torch.tensor([[step == 0]])}
+        (action,) = act(maps).tolist()
+        state = roll(turn(state, YAW_SIGN[action], 1 / 12, vehicle), 1 / 12, vehicle.speed_mps)
+        way.append(side * state.y_m)
+    assert way[19] > 1.5  # with a person on the right, to the left
+    assert max(way) < 2.5  # and on the road, whose edge is at 3.5 m
+    assert abs(way[-1]) < 0.3
+    assert abs(math.degrees(state.yaw_rad)) < 1
