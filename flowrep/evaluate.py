@@ -195,7 +195,9 @@ def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> No
 
 
 def keep(subject: Subject, rows: list[Row]) -> None:
-    """Prints the results of one run's episodes and adds them to its table."""
+    """Prints the results of one run's episodes, if there are any, and adds them to its table."""
+    if not rows:
+        return
     run = subject.run
     rows = with_origin(rows, subject.config, subject.frames, "evaluate")
     run.log_episodes(rows)

@@ -103,9 +103,10 @@ def camera_of(run):
     return {key: camera[key] for key in ("height_px", "width_px", "fov_deg")}
 
 
-def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path):
+def test_a_policy_without_actions_leaves_a_line_and_no_row(tmp_path, capsys):
     path = tmp_path / "mine.py"
     path.write_text("def make(task):\n    return lambda maps: None\n")
     with pytest.raises(PolicyError, match="returned a NoneType; expected 1 whole numbers"):
         own(f"{path}:make", tmp_path / "out", "representations=[seg]", "num_envs=1", "episodes=1")
     assert not (tmp_path / "out" / "videos").exists()
+    assert capsys.readouterr().out == ""  # no table of no episodes, in a file that isn't there
