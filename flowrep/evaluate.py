@@ -35,6 +35,7 @@ from flowrep.config.evaluating import EvaluateConfig
 from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import WorkerError, street_envs
+from flowrep.exchange.cards import check_card
 from flowrep.exchange.policies import ForeignPolicy, PolicyError, Task, is_reference, load_policy
 from flowrep.experiment.arena import Agent
 from flowrep.experiment.comparison import Comparison, Row, print_table, with_origin
@@ -146,7 +147,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
     """Returns the user's own policy with its observations.
 
     Raises:
-        PolicyError, TableError: as `load_policy` and `RunFolder.read_episodes`.
+        PolicyError, TableError: as `check_card`, `load_policy` and `RunFolder.read_episodes`.
     """
     folder.read_episodes()
     config = {key: asked[key] for key in (*OF_THE_MACHINE, "scene", "representations")}
@@ -166,6 +167,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
         device=device,
     )
     env.close()
+    check_card(name, task)
     agent = Agent.from_config(load_policy(name, task), config, device)
     return Subject(folder, config, agent, frames=0)
 

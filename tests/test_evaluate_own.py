@@ -93,6 +93,8 @@ def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
         # the scene with the camera that the agent was trained with
         camera = [f"scene.camera.{key}={value}" for key, value in camera_of(run).items()]
         options = [*given[1:], *camera, "episodes=3", "baselines=[]"]
+        with pytest.raises(PolicyError, match=r"; give scene\.camera\.height_px=40 scene"):
+            own(name, tmp_path / "refused", *given[1:])
         rows = own(name, tmp_path / str(number), *options)
         drives = [(row["episode_seed"], row["outcome"], row["return"]) for row in rows]
         assert drives == [(row["episode_seed"], row["outcome"], row["return"]) for row in mine]
