@@ -24,7 +24,7 @@ from flowrep.simulator.person import person_meshes
 from flowrep.simulator.triangles import Body, gather
 
 Array = NDArray[Any]
-_BEHIND_M = 2.0  # people further behind are out of view, wherever on the vehicle the camera is
+_BEHIND_M = 2.0  # people further behind the camera are out of view: none reach that far
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
@@ -132,12 +132,9 @@ class Street:
 
     def place_pedestrians(self, poses: Array, viewer: VehicleState) -> None:
         """Places people at poses [P, 4] who have moved and are, or were last placed, in view."""
-        ahead = np.array([math.cos(viewer.yaw_rad), math.sin(viewer.yaw_rad)])
-        eye = np.array([viewer.x_m, viewer.y_m])
-        behind = ((poses[:, :2] - eye) @ ahead < -_BEHIND_M) & (
-            (self._placed[:, :2] - eye) @ ahead < -_BEHIND_M
-        )
-        due = np.flatnonzero((poses != self._placed).any(axis=-1) & ~behind)
+        depths = self._depths(np.stack([poses, self._placed]), viewer)
+        is_behind = (depths < -_BEHIND_M).all(axis=0)
+        due = np.flatnonzero((poses != self._placed).any(axis=-1) & ~is_behind)
         if due.size:
             places = people.place_parts(poses[due])
             self.simulator.place_all(
@@ -183,6 +180,16 @@ class Street:
                     return "pedestrian"
             touched = (name for body, name in near.items() if self.simulator.vehicle_touches(body))
             return next(touched, "")
+
+    def _depths(self, poses: Array, viewer: VehicleState) -> Array:
+        """Returns the depths [...] of the middles of people at poses [..., 4], for the camera."""
+        camera = self.layout.scene.camera
+        pitch = math.radians(camera.pitch_deg)
+        x, y = math.cos(viewer.yaw_rad), math.sin(viewer.yaw_rad)
+        at = viewer.x_m * x + viewer.y_m * y + camera.mount_forward_m
+        above_m = people.HEIGHT_M / 2 - camera.mount_height_m
+        forward_m = poses[..., 0] * x + poses[..., 1] * y - at
+        return math.cos(pitch) * forward_m + math.sin(pitch) * above_m
 
     def _add_ground(self, layout: Layout) -> None:
         striped = shapely.union_all([area.polygon for area in layout.crosswalks])

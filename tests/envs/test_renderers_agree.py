@@ -85,6 +85,33 @@ def test_a_person_fills_the_picture_and_is_cut_by_the_near_plane(make_street, st
     np.testing.assert_allclose(np.median(ratio), 1.0, rtol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "mount",
+    [
+        {"mount_forward_m": -8.0, "mount_height_m": 3.0},
+        {"mount_height_m": 12.0, "pitch_deg": -90.0},
+    ],
+    ids=["behind the vehicle", "above it"],
+)
+def test_people_behind_the_vehicle_are_seen_where_they_are(make_street, straight_road, mount):
+    # 3 m behind the vehicle, which stands still: 5 m before the one camera, 11 m below the other.
+    walk = Walk("points", points_m=((-3.0, -2.0), (-3.0, 2.0)))
+    walker = PedestrianGroup("one", 1, 0.0, walk, speed_mps=(1.5, 1.5))
+    camera = replace(straight_road.camera, **mount)
+    scene = replace(straight_road, pedestrian_groups=(walker,), camera=camera)
+    streets = [make_street(scene, renderer=name) for name in ("pybullet", "rasteriser")]
+    seen = []
+    for street in streets:
+        first, _ = street.reset(options={"episode_seed": 0, "vehicle_speed_mps": 0.0})
+        last = [street.step(0)[0] for _ in range(12)][-1]
+        seen.append([shown["instance"][0] > 0 for shown in (first, last)])
+    (first, last), (first_drawn, last_drawn) = seen
+    assert not (first_drawn & last_drawn).any()  # 1.5 m further, they cover other pixels
+    for pictured, drawn in ((first, first_drawn), (last, last_drawn)):
+        assert drawn.sum() > 5
+        assert (pictured != drawn).sum() <= 0.1 * drawn.sum()
+
+
 def test_maps_do_not_depend_on_whether_colours_are_asked_for(make_street):
     alone, with_colours = (
         make_street("three_way_junction", sensors=sensors)
