@@ -7,9 +7,10 @@ import numpy as np
 import shapely
 from shapely.geometry import Point, Polygon
 
+from flowrep.scenes.centrelines import centrelines
 from flowrep.scenes.fields import MOST_METRES
 from flowrep.scenes.goal_distance import free_ground
-from flowrep.scenes.layout import Box, Layout, centrelines
+from flowrep.scenes.layout import Box, Layout
 from flowrep.scenes.scene import Path, Scene
 from flowrep.scenes.schema import SceneError
 from flowrep.scenes.vehicle import footprint_corners

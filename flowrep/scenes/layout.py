@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-import shapely.ops
 from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from flowrep.scenes.centrelines import centrelines, pose_along, stretch
 from flowrep.scenes.scene import (
     CATEGORY_OF_KIND,
     BuildingRow,
@@ -23,7 +23,6 @@ from flowrep.scenes.scene import (
     Crosswalk,
     Kind,
     ObstacleRow,
-    Road,
     Scene,
     Walk,
     Zone,
@@ -32,7 +31,6 @@ from flowrep.scenes.vehicle import VehicleState
 from flowrep.scenes.walks import parallel, without_repeats
 
 Array = NDArray[np.float64]
-_ARC_STEP_DEG = 5.0
 _TOUCH_M = 0.05  # houses of a row stand wall to wall
 _PLOT_STEP_M = 0.5
 
@@ -75,32 +73,6 @@ class CrosswalkArea(NamedTuple):
 
     polygon: Polygon
     heading_rad: float
-
-
-def centreline(road: Road) -> LineString:
-    """Returns a road's centreline, with arcs sampled every few degrees."""
-    (x, y), heading = road.start_m, math.radians(road.heading_deg)
-    points = [(x, y)]
-    for piece in road.pieces:
-        if piece.straight_m is not None:
-            lengths, turn = [piece.straight_m], 0.0
-        else:
-            assert piece.arc_radius_m is not None
-            assert piece.arc_deg is not None
-            count = max(1, math.ceil(abs(piece.arc_deg) / _ARC_STEP_DEG))
-            turn = math.radians(piece.arc_deg) / count
-            lengths = [2 * piece.arc_radius_m * math.sin(abs(turn) / 2)] * count
-        for length in lengths:
-            x += length * math.cos(heading + turn / 2)
-            y += length * math.sin(heading + turn / 2)
-            heading += turn
-            points.append((x, y))
-    return LineString(points)
-
-
-def centrelines(scene: Scene) -> dict[str, LineString]:
-    """Returns the centreline of every road, by name."""
-    return {road.name: centreline(road) for road in scene.roads}
 
 
 def _with_round_corners(ground: BaseGeometry, radius_m: float) -> BaseGeometry:
@@ -149,17 +121,8 @@ class Layout:
 
     def pose_at(self, road: str, at_m: float, offset_m: float = 0.0) -> tuple[float, float, float]:
         """Returns x, y and heading at a distance along a road, `offset_m` to its left."""
-        line = self.lines[road]
-        step = min(0.05, line.length / 4)
-        middle = min(max(at_m, step), line.length - step)
-        behind, ahead = (line.interpolate(middle + sign * step) for sign in (-1, 1))
-        heading = math.atan2(ahead.y - behind.y, ahead.x - behind.x)
-        point = line.interpolate(at_m)
-        return (
-            point.x - offset_m * math.sin(heading),
-            point.y + offset_m * math.cos(heading),
-            heading,
-        )
+        x, y, heading = pose_along(self.lines[road], at_m)
+        return x - offset_m * math.sin(heading), y + offset_m * math.cos(heading), heading
 
     def width_m(self, road: str) -> float:
         """Returns the width of a road without its sidewalks."""
@@ -184,7 +147,7 @@ class Layout:
         if walk.kind == "along":
             assert walk.from_m is not None
             assert walk.to_m is not None
-            part = shapely.ops.substring(self.lines[walk.road], walk.from_m, walk.to_m)
+            part = stretch(self.lines[walk.road], walk.from_m, walk.to_m)
             return parallel(without_repeats(np.array(part.coords)), walk.offset_m)
         assert walk.at_m is not None
         road = self._roads[walk.road]
@@ -195,7 +158,7 @@ class Layout:
         return np.array([end[:2] for end in ends])
 
     def _zone_polygon(self, zone: Zone) -> Polygon:
-        part = shapely.ops.substring(self.lines[zone.road], zone.from_m, zone.to_m)
+        part = stretch(self.lines[zone.road], zone.from_m, zone.to_m)
         return ribbon(part, self._roads[zone.road].width_m / 2)
 
     def _closure_box(self, closure: Closure) -> Box:
@@ -212,7 +175,7 @@ class Layout:
 
     def _crosswalk_area(self, crosswalk: Crosswalk) -> CrosswalkArea:
         first, last = (crosswalk.at_m + side * crosswalk.depth_m / 2 for side in (-1, 1))
-        part = shapely.ops.substring(self.lines[crosswalk.road], first, last)
+        part = stretch(self.lines[crosswalk.road], first, last)
         _, _, heading = self.pose_at(crosswalk.road, crosswalk.at_m)
         return CrosswalkArea(ribbon(part, self._roads[crosswalk.road].width_m / 2), heading)
 
@@ -246,6 +209,8 @@ class Layout:
     ) -> None:
         side = 1.0 if row.side == "left" else -1.0
         edge = self._roads[row.road].width_m / 2 + row.setback_m
+        # The last house may stand beyond to_m, but then not beyond the road too.
+        last_middle = max(row.to_m, self.lines[row.road].length)
         at = row.from_m
         while at < row.to_m:
             front, depth = rng.uniform(*row.front_m), rng.uniform(*row.depth_m)
@@ -256,7 +221,7 @@ class Layout:
                 x, y, heading = self.pose_at(row.road, at + front / 2, offset)
                 facing = heading + (0.0 if row.side == "left" else math.pi)
                 house = Box("house", x, y, facing, size, variant)
-                if self._is_free(house, houses):
+                if at + front / 2 <= last_middle and self._is_free(house, houses):
                     houses.append(house)
                     at += front
                     break

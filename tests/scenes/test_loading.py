@@ -2,6 +2,7 @@
 
 import copy
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import yaml
 from flowrep.baselines import Planner, drives
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
+from flowrep.scenes.scene import BuildingRow, Crosswalk, ObstacleRow
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 CATEGORIES = ["sky", "road", "sidewalk", "building", "pedestrian", "car"]
@@ -150,6 +152,47 @@ def test_a_crosswalk_covers_its_stretch_of_road(data):
     (area,) = Layout(load_scene(data | {"crosswalks": [crosswalk]})).crosswalks
     assert area.polygon.area == pytest.approx(3.0 * 7.0)
     assert area.heading_rad == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize(("at_m", "x0", "x1"), [(1.0, -25, -22), (214.0, 187, 190)])
+def test_a_crosswalk_ends_where_its_road_does(straight_road, at_m, x0, x1):
+    # 4 m deep, a metre from an end of the road from (-25, 0) to (190, 0).
+    categories = (*straight_road.categories, "crosswalk")
+    crosswalks = (Crosswalk("main", at_m, 4.0),)
+    scene = replace(straight_road, categories=categories, crosswalks=crosswalks)
+    assert Layout(load_scene(scene)).crosswalks[0].polygon.bounds == (x0, -3.5, x1, 3.5)
+
+
+def test_rows_beyond_a_road_are_on_its_straight_continuation(straight_road):
+    # The road goes from (-25, 0) to (190, 0); its side is 5 m from its middle.
+    categories = (*straight_road.categories, "tree")
+    trees = [
+        ObstacleRow("tree", "main", 6.0, first, last, 10.0, (0.4, 0.4, 5.0))
+        for first, last in ((-20.0, 0.0), (205.0, 230.0))
+    ]
+    rows = [
+        BuildingRow("main", "right", first, last, 1.5, (10.0, 10.0), (6.0, 6.0), (5.0, 5.0))
+        for first, last in ((-30.0, 0.0), (212.0, 230.0))
+    ]
+    scene = replace(
+        straight_road,
+        categories=categories,
+        obstacle_rows=tuple(trees),
+        building_rows=tuple(rows),
+    )
+    layout = Layout(load_scene(scene))
+    np.testing.assert_allclose(
+        [(box.x_m, box.y_m) for box in layout.obstacles],
+        [(-45, 6), (-35, 6), (180, 6), (190, 6), (200, 6)],
+    )
+    # Wall to wall, each 10 m wide: from -55 to -25, and from 187 to 207.
+    middles = [-50, -40, -30, 192, 202]
+    np.testing.assert_allclose([house.x_m for house in layout.buildings], middles)
+
+
+def test_a_row_that_ends_with_its_road_has_no_house_beyond_it(straight_road):
+    *rows, across = Layout(straight_road).buildings
+    assert max(house.x_m for house in rows) < 190 < across.x_m
 
 
 def refuse(data, **changes):
