@@ -26,6 +26,7 @@ from flowrep.simulator.triangles import Body, gather
 Array = NDArray[Any]
 _BEHIND_M = 2.0  # people further behind the camera are out of view: none reach that far
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
+_TRIANGLES_A_BODY = 43_690  # PyBullet's limit for one mesh is 131,072 vertices
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
@@ -213,8 +214,8 @@ class Street:
             (paving, "sidewalk"),
             (grass, "terrain"),
         ):
-            if mesh.indices:
-                self._add_body(mesh, category)
+            for part in mesh.parts(_TRIANGLES_A_BODY):
+                self._add_body(part, category)
 
     def _lane_marks(self, layout: Layout, name: str, striped: BaseGeometry) -> meshes.Mesh:
         if layout.width_m(name) < _TWO_LANES_M:

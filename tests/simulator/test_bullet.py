@@ -13,6 +13,10 @@ import pybullet
 import pytest
 
 from flowrep.envs import StreetEnv
+from flowrep.simulator import street
+from flowrep.simulator.bullet import Simulator
+from flowrep.simulator.meshes import Mesh
+from flowrep.simulator.paint import picture
 
 
 @pytest.fixture
@@ -76,6 +80,34 @@ def test_streets_that_share_a_client_keep_their_exits_and_people_apart():
         for i in range(6):
             for name, value in alone[k][i].items():
                 np.testing.assert_array_equal(value, shared[i][k][name])
+
+
+def test_ground_of_any_extent_is_a_few_bodies(make_street, monkeypatch, own_scene):
+    scene = replace(own_scene, pedestrian_groups=(), building_rows=())
+    sensors, views = ("depth", "semantic", "rgb"), []
+    for most in (street._TRIANGLES_A_BODY, 40):
+        monkeypatch.setattr(street, "_TRIANGLES_A_BODY", most)
+        env = make_street(replace(scene, name=f"of_{most}"), sensors=sensors)
+        views.append(env.reset(seed=0)[0])
+        bodies = env._street.bodies
+        assert all(len(body.triangles) <= most for body in bodies)
+    assert len(bodies) > 2  # which road and sidewalk would be
+    for name, value in views[0].items():
+        np.testing.assert_array_equal(views[1][name], value)
+
+
+def test_pybullet_takes_as_large_a_body_as_ground_is_cut_into():
+    mesh, count = Mesh(), 2 * street._TRIANGLES_A_BODY + 1
+    mesh.vertices = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]] * count
+    mesh.normals, mesh.uvs = [[0.0, 0.0, 1.0]] * 3 * count, [[0.5, 0.5]] * 3 * count
+    mesh.indices = list(range(3 * count))
+    simulator = Simulator(picture())
+    with pytest.raises(SystemError):
+        simulator.add_body(mesh, "road")
+    parts = list(mesh.parts(street._TRIANGLES_A_BODY))
+    assert [len(part.indices) for part in parts] == [131_070, 131_070, 3]
+    assert [simulator.add_body(part, "road") for part in parts] == [0, 1, 2]
+    simulator.close()
 
 
 def test_a_forgotten_street_gives_its_client_back(own_scene):
