@@ -59,9 +59,9 @@ class Episode:
         rules: Rules,
         episode_seed: int,
         speed_mps: Range,
+        vehicle_speed_mps: float,
         *,
         path: str | None = None,
-        vehicle_speed_mps: float | None = None,
     ) -> None:
         """Draws the path and the pedestrians from the seed; the vehicle is at its start."""
         scene = rules.layout.scene
@@ -69,11 +69,9 @@ class Episode:
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
         self.rules = rules
         self.seed, self.speed_mps = episode_seed, speed_mps
+        self.vehicle_speed_mps = vehicle_speed_mps
         self.path = drawn if path is None else _path_named(scene.paths, path)
         self.crowd: Crowd = draw_crowd(rules.layout, scene.pedestrian_groups, speed_mps, rng)
-        self.vehicle_speed_mps = (
-            scene.vehicle.speed_mps if vehicle_speed_mps is None else vehicle_speed_mps
-        )
         self.goal = rules.layout.zones[self.path.end]
         self.now = Moment(rules.layout.start_state(self.path.start), 0)
         self.before = self.now

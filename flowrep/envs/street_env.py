@@ -13,6 +13,7 @@ from flowrep.envs.episode import Episode, Moment, Rules
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
+from flowrep.scenes.fields import MOST_DRIVING_MPS, MOST_WALKING_MPS
 from flowrep.scenes.loading import load_scene
 from flowrep.scenes.scene import Range, Scene, SpeedMode
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
@@ -98,6 +99,9 @@ class StreetEnv(gym.Env):
             options: `episode_seed` (int) selects the episode and `path` (str) its path;
                 `vehicle_speed_mps` (float) replaces the scene's speed, with 0 for a still camera;
                 `speed` and `frame_rate_hz` replace the env's for this episode.
+
+        Raises:
+            ValueError: an option is unknown or out of range.
         """
         self.begin(seed=seed, options=options)
         return self.sensing.observe(self.episode), self._info()
@@ -174,10 +178,10 @@ class StreetEnv(gym.Env):
             self._rules[rate] = Rules(self._street.layout, rate)
         self._episode = Episode(
             self._rules[rate],
-            int(options["episode_seed"]),
+            _episode_seed(options["episode_seed"]),
             _speed_range(self.scene, options.get("speed", self.speed_mps)),
+            _vehicle_speed(self.scene, options.get("vehicle_speed_mps")),
             path=options.get("path"),
-            vehicle_speed_mps=options.get("vehicle_speed_mps"),
         )
 
     def _info(self) -> dict[str, Any]:
@@ -202,16 +206,40 @@ def _action(action: Any) -> int:
     return number
 
 
+def _episode_seed(episode_seed: Any) -> int:
+    try:
+        number = operator.index(episode_seed)
+    except TypeError:
+        number = -1
+    if not 0 <= number < 1 << 31:
+        raise ValueError(
+            f"episode_seed is {episode_seed!r}; give a whole number from 0 to {(1 << 31) - 1}"
+        )
+    return number
+
+
 def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
     if isinstance(speed, str):
         if speed not in scene.pedestrian_speed_mps:
             modes = ", ".join(scene.pedestrian_speed_mps)
             raise ValueError(f"unknown speed {speed!r}; choose one of {modes}, or give (low, high)")
         return scene.pedestrian_speed_mps[speed]
-    low, high = (float(bound) for bound in speed)
-    if not 0 <= low <= high < math.inf:
-        raise ValueError(f"speed is ({low}, {high}) m/s; give (lowest, highest), from 0")
+    try:
+        low, high = (float(bound) for bound in speed)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not 0 <= low <= high <= MOST_WALKING_MPS:
+        remedy = f"give (lowest, highest) in m/s, from 0 to {MOST_WALKING_MPS:g}, or a mode's name"
+        raise ValueError(f"speed is {speed!r}; {remedy}")
     return low, high
+
+
+def _vehicle_speed(scene: Scene, vehicle_speed_mps: float | None) -> float:
+    speed = scene.vehicle.speed_mps if vehicle_speed_mps is None else float(vehicle_speed_mps)
+    if not 0 <= speed <= MOST_DRIVING_MPS:
+        remedy = f"give a speed from 0, for a still camera, to {MOST_DRIVING_MPS:g}"
+        raise ValueError(f"vehicle_speed_mps is {speed}; {remedy}")
+    return speed
 
 
 def _frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:

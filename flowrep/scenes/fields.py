@@ -14,6 +14,10 @@ MOST_PARTS = 100
 """Most roads, rows, closures and so on in a scene; paths are limited to half as many, single
 obstacles to five times as many."""
 
+MOST_WALKING_MPS = 20.0
+MOST_DRIVING_MPS = 100.0
+"""Greatest speeds of people and of the vehicle."""
+
 
 class Part:
     """Base of the dataclasses read from a mapping whose keys are exactly their fields."""
@@ -38,7 +42,7 @@ Size = Annotated[float, Strict(), Field(ge=0.01, le=200.0)]
 HouseSide = Annotated[float, Strict(), Field(ge=1.0, le=200.0)]
 Stride = Annotated[float, Strict(), Field(ge=0.1, le=MOST_METRES)]
 Angle = Annotated[float, Strict(), Field(ge=-360.0, le=360.0)]
-WalkingSpeed = Annotated[float, Strict(), Field(ge=0.0, le=20.0)]
+WalkingSpeed = Annotated[float, Strict(), Field(ge=0.0, le=MOST_WALKING_MPS)]
 
 FrameRate = Annotated[float, Strict(), Field(ge=0.5, le=1_000.0)]
 Steps = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
@@ -47,7 +51,7 @@ Pixels = Annotated[int, Strict(), Field(ge=1, le=4096)]
 FieldOfView = Annotated[float, Strict(), Field(ge=1.0, le=179.0)]
 Pitch = Annotated[float, Strict(), Field(ge=-90.0, le=90.0)]
 VehicleSize = Annotated[float, Strict(), Field(ge=0.1, le=20.0)]
-VehicleSpeed = Annotated[float, Strict(), Field(ge=0.1, le=100.0)]
+VehicleSpeed = Annotated[float, Strict(), Field(ge=0.1, le=MOST_DRIVING_MPS)]
 TurnRate = Annotated[float, Strict(), Field(ge=0.1, le=10_000.0)]
 
 People = Annotated[int, Strict(), Field(ge=1, le=85)]

@@ -307,7 +307,13 @@ def test_colour_pictures_come_in_both_layouts(make_street):
     ("arguments", "message"),
     [
         ({"speed": "fast"}, r"unknown speed 'fast'; choose one of low, normal, high"),
-        ({"speed": (2.0, 1.0)}, r"lowest, highest"),
+        (
+            {"speed": (2.0, 1.0)},
+            r"speed is \(2.0, 1.0\); give \(lowest, highest\) in m/s, from 0 to",
+        ),
+        ({"speed": (1.0, 21.0)}, r"lowest, highest"),
+        ({"speed": 1.5}, r"speed is 1.5; give \(lowest, highest\)"),
+        ({"speed": (1.0, 2.0, 3.0)}, r"speed is \(1.0, 2.0, 3.0\); give \(lowest, highest\)"),
         ({"frame_rate_hz": 0}, r"frame_rate_hz is 0.0; give a rate from 0.5"),
         ({"sensors": ("depth", "lidar")}, r"unknown sensors \['lidar'\]; they are: depth, "),
         ({"render_mode": "human"}, r"unknown render_mode 'human'"),
@@ -331,6 +337,27 @@ def test_calls_out_of_turn_say_what_to_call(make_street, one_stands):
         env.reset(options={"start": 3})
     with pytest.raises(ValueError, match=r"unknown path 'left'; the scene has \['main'\]"):
         env.reset(options={"path": "left"})
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("episode_seed", 1.7, r"episode_seed is 1.7; give a whole number from 0 to 2147483647"),
+        ("episode_seed", -1, r"episode_seed is -1; give a whole number"),
+        ("episode_seed", 1 << 31, r"episode_seed is 2147483648; give a whole number"),
+        ("vehicle_speed_mps", math.nan, r"vehicle_speed_mps is nan; give a speed from 0, for a"),
+        ("vehicle_speed_mps", -10.0, r"vehicle_speed_mps is -10.0; give a speed from 0"),
+        ("vehicle_speed_mps", 101.0, r"vehicle_speed_mps is 101.0; give .* to 100"),
+        ("speed", math.nan, r"speed is nan; give \(lowest, highest\)"),
+        ("speed", (1.0, math.nan), r"speed is \(1.0, nan\); give \(lowest, highest\)"),
+    ],
+)
+def test_reset_options_that_cannot_be_are_refused(make_street, empty_road, option, value, message):
+    env = make_street(empty_road, sensors=())
+    with pytest.raises(ValueError, match=message):
+        env.reset(options={option: value})
+    last = (1 << 31) - 1
+    assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
 
 
 def test_motion_between_two_steps_is_the_one_driven(make_street, empty_road):
