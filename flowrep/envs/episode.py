@@ -15,13 +15,15 @@ from shapely.geometry import Polygon
 from flowrep.envs.outcome import Outcome
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.pedestrians import Crowd, draw_crowd
-from flowrep.scenes.scene import Path, Range
+from flowrep.scenes.scene import Path, Range, Scene
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
 from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
-# Between two checks of the footprint the vehicle moves 0.42 m at 10 m/s: it can't skip anyone.
+# Between two checks of the footprint neither the vehicle nor anyone moves more than 0.42 m, as the
+# vehicle does at 10 m/s, nor a shorter vehicle its length: it can't skip anyone or anything.
 _CHECKS_HZ = 24.0
+_CHECKS_A_M = 2.4
 _STEPS_FORESEEN = 16  # people ignore the vehicle, so their positions are computed in batches
 
 
@@ -33,14 +35,25 @@ class Moment:
     ticks: int
 
 
+def ticks_a_step(
+    scene: Scene, frame_rate_hz: float, speed_mps: Range, vehicle_speed_mps: float
+) -> int:
+    """Returns how often the footprint is checked in a step, for the speeds of an episode."""
+    groups = [group for group in scene.pedestrian_groups if group.standing < group.count]
+    fastest_mps = max(((group.speed_mps or speed_mps)[1] for group in groups), default=0.0)
+    driven_hz = vehicle_speed_mps * max(_CHECKS_A_M, 1.0 / scene.vehicle.length_m)
+    checks_hz = max(_CHECKS_HZ, driven_hz, fastest_mps * _CHECKS_A_M)
+    return math.ceil(checks_hz / frame_rate_hz - 1e-9)
+
+
 class Rules:
     """The constants of a scene's episodes: ground plan, clock and limits."""
 
-    def __init__(self, layout: Layout, frame_rate_hz: float) -> None:
-        """Prepares the checks for a layout and a frame rate."""
+    def __init__(self, layout: Layout, frame_rate_hz: float, ticks_a_step: int) -> None:
+        """Prepares the checks for a layout, a frame rate and the number of checks in a step."""
         self.layout, self.frame_rate_hz = layout, frame_rate_hz
         self.dt_s = 1.0 / frame_rate_hz
-        self.ticks_a_step = math.ceil(_CHECKS_HZ / frame_rate_hz - 1e-9)
+        self.ticks_a_step = ticks_a_step
         self.tick_s = self.dt_s / self.ticks_a_step
         self.tick_times_s = [(1 + i) * self.tick_s for i in range(self.ticks_a_step)]
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)

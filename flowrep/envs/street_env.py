@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from flowrep.envs.episode import Episode, Moment, Rules
+from flowrep.envs.episode import Episode, Moment, Rules, ticks_a_step
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
@@ -75,7 +75,7 @@ class StreetEnv(gym.Env):
         self.num_classes = num_classes(self.scene.categories)
         self._street = Street.shared(self.scene)
         self._is_open = True
-        self._rules: dict[float, Rules] = {}  # by frame rate
+        self._rules: dict[tuple[float, int], Rules] = {}  # by frame rate and ticks a step
         self.sensing = Sensing(self.scene, self._street, sensors, renderer)
         self.K = self.sensing.K
         self._episode: Episode | None = None
@@ -174,13 +174,16 @@ class StreetEnv(gym.Env):
         if unknown := sorted(options.keys() - set(_OPTIONS)):
             raise ValueError(f"unknown reset options {unknown}; they are: {', '.join(_OPTIONS)}")
         rate = _frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz))
-        if rate not in self._rules:
-            self._rules[rate] = Rules(self._street.layout, rate)
+        speed_mps = _speed_range(self.scene, options.get("speed", self.speed_mps))
+        vehicle_speed_mps = _vehicle_speed(self.scene, options.get("vehicle_speed_mps"))
+        clock = rate, ticks_a_step(self.scene, rate, speed_mps, vehicle_speed_mps)
+        if clock not in self._rules:
+            self._rules[clock] = Rules(self._street.layout, *clock)
         self._episode = Episode(
-            self._rules[rate],
+            self._rules[clock],
             _episode_seed(options["episode_seed"]),
-            _speed_range(self.scene, options.get("speed", self.speed_mps)),
-            _vehicle_speed(self.scene, options.get("vehicle_speed_mps")),
+            speed_mps,
+            vehicle_speed_mps,
             path=options.get("path"),
         )
 

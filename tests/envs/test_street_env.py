@@ -12,6 +12,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from flowrep.envs import StreetEnv
+from flowrep.envs.episode import ticks_a_step
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes.scene import Obstacle, PedestrianGroup, Walk
 
@@ -150,6 +151,42 @@ def test_one_who_stands_between_two_frames_is_not_passed_by(make_street, straigh
     rewards, info = drive(make_street(scene, frame_rate_hz=3.0, sensors=()))
     assert (info["outcome"], info["hit"]) == ("collision", "pedestrian")
     assert len(rewards) == 10  # on the way to the tenth frame
+
+
+def test_no_speed_lets_the_vehicle_pass_through_a_fence_or_a_person(
+    make_street, empty_road, one_stands
+):
+    # Looked at 24 times a second, 40 m/s lead from 68.33 to 70 m: past a fence 0.1 m thick that the
+    # vehicle, 1 m long, touches within 0.55 m; 100 m/s lead from 29.17 to 33.33 m, past one who
+    # stands at 30 m and whom it touches within 0.8 m.
+    fence = Obstacle("fence", (69.17, 1.0), 90.0, (5.0, 0.1, 1.1))
+    fenced = replace(empty_road, obstacles=(fence,), categories=(*empty_road.categories, "fence"))
+    for scene, speed_mps, expected in ((fenced, 40.0, "fence"), (one_stands, 100.0, "pedestrian")):
+        _, info = drive(make_street(scene, sensors=()), vehicle_speed_mps=speed_mps)
+        assert (info["outcome"], info["hit"]) == ("collision", expected)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "walking_mps", "driving_mps", "length_m", "ticks"),
+    [
+        # Up to 10 m/s 24 looks a second, or one a frame.
+        (12.0, 2.4, 10.0, 1.0, 2),
+        (12.0, 2.4, 0.0, 1.0, 2),
+        (7.0, 2.4, 10.0, 1.0, 4),
+        (30.0, 2.4, 10.0, 1.0, 1),
+        # A look every 10/24 m: 96, 240 and 48 a second.
+        (12.0, 2.4, 40.0, 1.0, 8),
+        (12.0, 2.4, 100.0, 1.0, 20),
+        (12.0, 20.0, 10.0, 1.0, 4),
+        # A vehicle of 0.1 m moves no further than that: 100 a second.
+        (12.0, 2.4, 10.0, 0.1, 9),
+    ],
+)
+def test_looks_are_as_many_as_the_fastest_asks_for(
+    straight_road, rate_hz, walking_mps, driving_mps, length_m, ticks
+):
+    scene = replace(straight_road, vehicle=replace(straight_road.vehicle, length_m=length_m))
+    assert ticks_a_step(scene, rate_hz, (0.6, walking_mps), driving_mps) == ticks
 
 
 @pytest.mark.parametrize("action", [-1, 3, 7, 1.7, 1.0, "1", None, np.array([0, 1])])

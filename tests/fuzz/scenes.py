@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs.episode import Rules
+from flowrep.envs.episode import Rules, ticks_a_step
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.pedestrians import draw_crowd
@@ -142,7 +142,9 @@ def run(content: bytes) -> str:
             assert "; " in message, message
             return "refused"
     layout = Layout(scene)
-    Rules(layout, scene.frame_rate_hz)
+    walking_mps = scene.pedestrian_speed_mps["high"]
+    ticks = ticks_a_step(scene, scene.frame_rate_hz, walking_mps, scene.vehicle.speed_mps)
+    Rules(layout, scene.frame_rate_hz, ticks)
     times = np.linspace(0.0, scene.time_limit_s, 50)[:, None]
     for speed_mps in scene.pedestrian_speed_mps.values():
         rng = np.random.default_rng(0)
