@@ -13,7 +13,6 @@ from flowrep.scenes.goal_distance import free_ground
 from flowrep.scenes.layout import Box, Layout
 from flowrep.scenes.scene import Path, Scene
 from flowrep.scenes.schema import SceneError
-from flowrep.scenes.vehicle import footprint_corners
 
 _MOST_PIECES = 300
 _MOST_GROUND_M2 = 1e6
@@ -107,16 +106,23 @@ def _check_path(layout: Layout, path: Path, source: str) -> None:
     key = f"paths.{path.name}"
     blocks = [*layout.buildings, *layout.obstacles]
     blocks += [layout.closures[name] for name in path.closures]
-    footprint = Polygon(footprint_corners(layout.start_state(path.start), layout.scene.vehicle))
+    footprint = layout.start_footprint(path.start)
     if not layout.drivable.covers(footprint):
         raise SceneError(source, key, "starts off the road", "move or widen its start zone")
     if _is_built_over(footprint, blocks):
         raise SceneError(source, key, "its start collides", "move the start or what is in it")
     if _is_built_over(layout.zones[path.end], blocks):
         raise SceneError(source, key, "its ending zone is built over", "move what is in it")
+    if layout.zones[path.end].intersects(_start(layout, path)):
+        problem = f"starts inside its ending zone {path.end!r}"
+        raise SceneError(source, key, problem, "let it start or end elsewhere")
     if not _is_open(layout, path):
         problem = f"no free road leads from {path.start!r} to {path.end!r}"
         raise SceneError(source, key, problem, "join the roads or open a closure")
+
+
+def _start(layout: Layout, path: Path) -> Point:
+    return Point(layout.start_state(path.start)[:2])
 
 
 def _is_built_over(ground: Polygon, boxes: list[Box]) -> bool:
@@ -128,6 +134,6 @@ def _is_open(layout: Layout, path: Path) -> bool:
     # the start and the end.
     vehicle = layout.scene.vehicle
     room = free_ground(layout, path).buffer(-min(vehicle.width_m, vehicle.length_m) / 2)
-    start = Point(layout.start_state(path.start)[:2])
+    start = _start(layout, path)
     parts = shapely.get_parts(room)
     return any(part.covers(start) and part.intersects(layout.zones[path.end]) for part in parts)

@@ -27,7 +27,7 @@ from flowrep.scenes.scene import (
     Walk,
     Zone,
 )
-from flowrep.scenes.vehicle import VehicleState
+from flowrep.scenes.vehicle import VehicleState, footprint_corners
 from flowrep.scenes.walks import parallel, without_repeats
 
 Array = NDArray[np.float64]
@@ -133,6 +133,10 @@ class Layout:
         zone = next(zone for zone in self.scene.zones if zone.name == zone_name)
         x, y, heading = self.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
         return VehicleState(x, y, heading + (math.pi if zone.reverse else 0.0), 0.0)
+
+    def start_footprint(self, zone_name: str) -> Polygon:
+        """Returns the ground that the vehicle covers in the middle of a start zone."""
+        return Polygon(footprint_corners(self.start_state(zone_name), self.scene.vehicle))
 
     def walk_line(self, walk: Walk, lateral_m: float = 0.0) -> Array:
         """Returns the points [M, 2] of a walk, moved `lateral_m` to the left of its direction."""

@@ -22,6 +22,8 @@ from flowrep.scenes.walks import (
 def check_walks(layout: Layout, source: str) -> None:
     """Checks that no draw of an episode lets anyone walk into a box or another person.
 
+    Nor may it put anyone where the vehicle starts.
+
     Raises:
         SceneError: names the group and the remedy.
     """
@@ -36,12 +38,23 @@ def check_walks(layout: Layout, source: str) -> None:
             problem = f"goes through a {box.category} at ({box.x_m:.1f}, {box.y_m:.1f})"
             remedy = "move the walk or that box, or narrow spread_m"
             raise SceneError(source, f"{_key(group)}.walk", problem, remedy)
+        _check_starts(layout, group, ground, source)
     for (one, ground), (other, other_ground) in combinations(zip(groups, grounds), 2):
         gap = gap_m(ground, other_ground)
         if gap < APART_M:
             problem = f"people of {other.name!r} come within {gap:.2f} m of those of this group"
             remedy = f"keep the walks {APART_M} m apart: move one of them, or narrow its spread_m"
             raise SceneError(source, _key(one), problem, remedy)
+
+
+def _check_starts(
+    layout: Layout, group: PedestrianGroup, ground: list[BaseGeometry], source: str
+) -> None:
+    for path in layout.scene.paths:
+        if shapely.dwithin(ground, layout.start_footprint(path.start), RADIUS_M).any():
+            problem = f"people can be where the vehicle starts path {path.name!r}"
+            remedy = f"move the walk or zone {path.start!r}, or narrow spread_m"
+            raise SceneError(source, f"{_key(group)}.walk", problem, remedy)
 
 
 def _ground(layout: Layout, group: PedestrianGroup, source: str) -> list[BaseGeometry]:

@@ -302,6 +302,16 @@ def refuse(data, **changes):
             {"paths__0__closures": ["left_arm"]},
             "paths.left: no free road leads from 'south' to 'west'; join the roads or open",
         ),
+        ({"paths__0__end": "south"}, "paths.left: starts inside its ending zone 'south'; let it"),
+        (  # it starts at 3 m, in the middle of south, and would end from 2 m on
+            {"zones__1": {"name": "west", "road": "stem", "from_m": 2.0, "to_m": 9.0}},
+            "paths.left: starts inside its ending zone 'west'; let it start or end elsewhere",
+        ),
+        (  # lanes begin at 3.7 m, people reach 0.3 m to either side, and the vehicle to 3.5 m
+            {"pedestrian_groups__1__walk__at_m": 4.2},
+            "pedestrian_groups.across.walk: people can be where the vehicle starts path 'left'; "
+            "move the walk or zone 'south', or narrow spread_m",
+        ),
         (  # 0.2 m beside the walk: a person is 0.3 m to either side
             {"obstacles__0__center_m": [22.8, 2.0], "obstacles__0__yaw_deg": 0.0},
             "pedestrian_groups.across.walk: goes through a car at (22.8, 2.0)",
