@@ -212,6 +212,27 @@ def test_the_commands_end_with_one_line_and_code_2(arguments, says, tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
+def test_a_scene_file_that_kept_the_name_of_its_original_is_refused(tmp_path):
+    (tmp_path / "scene").mkdir()
+    original = (CONF_DIR / "scene" / "s_turn.yaml").read_text()
+    (tmp_path / "scene" / "back_alley.yaml").write_text(original)
+    line = ["--config-dir", str(tmp_path), "scene=back_alley"]
+    expected = (
+        "scene=back_alley has the name 's_turn', under which its results would be filed: write "
+        "name: back_alley in its file, or add scene.name=back_alley"
+    )
+    for command in ("train", "evaluate"):
+        with pytest.raises(UsageError) as caught:
+            check_command(command, [*line, "run=here"] if command == "evaluate" else line)
+        assert str(caught.value) == expected
+    with pytest.raises(UsageError, match="scene=back_alley has the name 's_turn'"):
+        check_command("train", [*line[:2], "-m", "scene=s_turn,back_alley"])
+    check_command("train", [*line, "scene.name=back_alley"], TrainConfig)
+    renamed = original.replace("name: s_turn", "name: back_alley", 1)
+    (tmp_path / "scene" / "back_alley.yaml").write_text(renamed)
+    check_command("train", line, TrainConfig)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "view"])
 def test_a_scene_of_ones_own_that_cannot_be_ends_in_one_line(command, tmp_path):

@@ -189,6 +189,7 @@ class Preview:
         except REFUSALS as error:
             raise UsageError(self._explained(error, parse(job))) from None
         _check_plugins(config.hydra)
+        _check_scene_name(config, job)
         return config
 
     def _compose(self, job: list[str]) -> DictConfig:
@@ -264,3 +265,16 @@ def _check_plugins(hydra: DictConfig) -> None:
                 f"hydra/{part}={hydra.runtime.choices[f'hydra/{part}']} needs a package that is "
                 f"not installed: pip install {name}"
             )
+
+
+def _check_scene_name(config: DictConfig, job: Iterable[str]) -> None:
+    """Refuses a scene file that has another scene's name, as a copy does, unless it is typed."""
+    choice, name = config.hydra.runtime.choices.get("scene"), OmegaConf.select(config, "scene.name")
+    if not choice or name is None or any(o.key_or_group == "scene.name" for o in parse(job)):
+        return
+    own = choice.rpartition("/")[2]
+    if name != own:
+        raise UsageError(
+            f"scene={choice} has the name '{name}', under which its results would be filed: write "
+            f"name: {own} in its file, or add scene.name={own}"
+        )
