@@ -1,11 +1,19 @@
 """Checks that the parts of a scene agree: references resolve and keys fit together."""
 
+import dataclasses
 from collections import Counter
 from collections.abc import Iterable
 
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes.people import PARTS
-from flowrep.scenes.scene import CATEGORY_OF_KIND, PedestrianGroup, Piece, Scene
+from flowrep.scenes.scene import (
+    CATEGORY_OF_KIND,
+    BuildingRow,
+    ObstacleRow,
+    PedestrianGroup,
+    Piece,
+    Scene,
+)
 from flowrep.scenes.schema import SceneError
 
 _KEYS_OF_WALK = {
@@ -13,6 +21,7 @@ _KEYS_OF_WALK = {
     "along": ("road", "from_m", "to_m"),
     "points": ("points_m",),
 }
+_MORE_KEYS_OF_WALK = {"along": ("offset_m",)}
 
 
 def check_consistency(scene: Scene, source: str) -> None:
@@ -28,6 +37,9 @@ def check_consistency(scene: Scene, source: str) -> None:
     for road in scene.roads:
         for i, piece in enumerate(road.pieces):
             _check_piece(piece, source, f"roads.{road.name}.pieces[{i}]")
+    for name in ("building_rows", "obstacle_rows"):
+        for i, row in enumerate(getattr(scene, name)):
+            _check_row(row, source, f"{name}[{i}]")
     for group in scene.pedestrian_groups:
         _check_walk(group, [road.name for road in scene.roads], source)
 
@@ -55,6 +67,16 @@ def _check_piece(piece: Piece, source: str, key: str) -> None:
         raise SceneError(source, key, "neither a straight piece nor an arc", remedy)
     if piece.arc_deg == 0:
         raise SceneError(source, f"{key}.arc_deg", "is 0", "give straight_m, or a turn")
+
+
+def _check_row(row: BuildingRow | ObstacleRow, source: str, key: str) -> None:
+    if isinstance(row, BuildingRow) and row.side in ("start", "end"):
+        if row.from_m or row.to_m:
+            problem = f"is one house across the road's {row.side}, wherever from_m and to_m are"
+            raise SceneError(source, key, problem, "give 0 for both, or side left or right")
+    elif row.from_m >= row.to_m:
+        problem = f"goes from {row.from_m:g} to {row.to_m:g} m"
+        raise SceneError(source, key, problem, "give from_m below to_m")
 
 
 def _check_categories(scene: Scene, source: str) -> None:
@@ -104,6 +126,12 @@ def _check_walk(group: PedestrianGroup, roads: list[str], source: str) -> None:
         if getattr(group.walk, name) in (None, ()):
             remedy = f"a walk of kind {group.walk.kind!r} needs {', '.join(needed)}"
             raise SceneError(source, f"{key}.{name}", "missing key", remedy)
+    keys = (*needed, *_MORE_KEYS_OF_WALK.get(group.walk.kind, ()))
+    for field in dataclasses.fields(group.walk):
+        is_given = getattr(group.walk, field.name) != field.default
+        if is_given and field.name not in ("kind", *keys):
+            remedy = f"remove it: a walk of kind {group.walk.kind!r} has {', '.join(keys)}"
+            raise SceneError(source, f"{key}.{field.name}", "would be ignored", remedy)
     if group.walk.road is not None:
         _known(source, f"{key}.road", [group.walk.road], roads)
 

@@ -276,6 +276,34 @@ def refuse(data, **changes):
             {"pedestrian_groups__1__walk__at_m": KeyError},
             "pedestrian_groups.across.walk.at_m: missing key; a walk of kind 'across' needs road",
         ),
+        (
+            {"pedestrian_groups__1__walk__offset_m": 30.0},
+            "pedestrian_groups.across.walk.offset_m: would be ignored; remove it: a walk of kind "
+            "'across' has road, at_m",
+        ),
+        (
+            {"pedestrian_groups__1__walk__from_m": 3.0},
+            "pedestrian_groups.across.walk.from_m: would",
+        ),
+        (
+            {"pedestrian_groups__1__walk__points_m": [[0.0, 0.0]]},
+            "pedestrian_groups.across.walk.points_m: would be ignored; remove it",
+        ),
+        (
+            {"pedestrian_groups__0__walk__at_m": 9.0},
+            "pedestrian_groups.along.walk.at_m: would be ignored; remove it: a walk of kind "
+            "'along' has road, from_m, to_m, offset_m",
+        ),
+        (
+            {
+                "pedestrian_groups__1__walk": {
+                    "kind": "points",
+                    "road": "stem",
+                    "points_m": [[25.0, -5.0], [25.0, 5.0]],
+                }
+            },
+            "pedestrian_groups.across.walk.road: would be ignored; remove it",
+        ),
         ({"pedestrian_groups__1__walk__road": "up"}, "pedestrian_groups.across.walk.road: unknown"),
         (
             {"zones__1__to_m": 99.0},

@@ -117,10 +117,13 @@ def test_values_out_of_range_are_refused(key, value, expected):
         ("building_rows", {"to_m": 1e6}, "building_rows[0].to_m: got 1000000.0; it should be at"),
         ("building_rows", {"to_m": 900}, "building_rows[0]: 0 to 900 m is not on road 'stem'; sta"),
         ("obstacle_rows", {"every_m": 1e-9}, "obstacle_rows[0].every_m: got 1e-09; it should be"),
+        ("building_rows", {"to_m": -9}, "building_rows[0]: goes from 0 to -9 m; give from_m below"),
+        ("obstacle_rows", {"to_m": 0.0}, "obstacle_rows[0]: goes from 0 to 0 m; give from_m below"),
+        ("building_rows", {"side": "end"}, "building_rows[0]: is one house across the road's end"),
         ("obstacle_rows", {"every_m": 0.1, "from_m": -99}, "obstacle_rows: could be 1390 "),
     ],
 )  # fmt: skip
-def test_rows_that_would_never_end_are_refused(key, changes, expected):
+def test_rows_without_an_end_or_a_length_are_refused(key, changes, expected):
     data = yaml.safe_load(CROSSROADS.read_text())
     row = {"road": "stem", "from_m": 0.0, "to_m": 40.0}
     if key == "building_rows":
