@@ -6,12 +6,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.sensing import observe_together
 from flowrep.envs.sensor_observation import episode_status
-from flowrep.envs.worker_environments import Order
+from flowrep.envs.worker_environments import Order, copied
 
 
 class StreetVectorEnv(SyncVectorEnv):
@@ -27,7 +28,9 @@ class StreetVectorEnv(SyncVectorEnv):
         """Makes the environments."""
         super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
         self._streets: list[Any] = [env.unwrapped for env in self.envs]
-        self._latest: dict[str, Any] = {}
+        self._latest: Any = create_empty_array(
+            self.single_observation_space, self.num_envs, np.zeros
+        )
 
     def reset(
         self,
@@ -85,7 +88,9 @@ class StreetVectorEnv(SyncVectorEnv):
         return [episode and (episode.outcome.label, episode.hit) for episode in asked]
 
     def _observe(self, rows: list[int]) -> dict[str, Any]:
-        """Renders some environments; the others keep their last observation."""
+        """Renders some environments; the others keep their last observation, at first zeros."""
+        if not rows:
+            return copied(self._latest)
         streets = [self._streets[row] for row in rows]
         episodes = [street.episode for street in streets]
         seen = observe_together([street.sensing for street in streets], episodes)

@@ -80,6 +80,15 @@ def test_a_tensordict_without_marks_resets_every_street(make):
         env.step(again.set("action", torch.tensor([0, 7])))
 
 
+def test_marks_that_name_no_street_reset_none(make):
+    env = make(representations=["ego"], num_envs=2, seed=0)
+    stepped = env.step(env.reset().set("action", torch.tensor([1, 2])))["next"]
+    none = torch.zeros(2, 1, dtype=torch.bool)
+    assert torch.equal(env.reset(stepped.clone().set("_reset", none))["ego"], stepped["ego"])
+    env.reset(TensorDict({"_reset": none}, env.batch_size))
+    assert [street.episode.steps for street in street_envs(env)] == [1, 1]
+
+
 @pytest.mark.parametrize(("num_envs", "num_workers"), [(0, 0), (-1, 0), (2, 3), (2, -1)])
 def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers):
     with pytest.raises(ValueError, match="at least one environment and no more workers than"):

@@ -91,6 +91,19 @@ def test_what_was_given_away_stays_as_it_is(both):
     assert ours.step(np.zeros(NUM_ENVS, dtype=int))[0]["sensor"]["depth"].any()
 
 
+def test_a_reset_of_no_street_returns_what_was_last_seen(both):
+    ours, _ = both(sensors=("depth",))
+    none = {"reset_mask": np.zeros(NUM_ENVS, dtype=bool)}
+    before, _ = ours.reset(options=dict(none))
+    assert not before["sensor"]["depth"].any()  # nothing has been seen: zeros, as workers have
+    ours.reset(seed=1)
+    last = ours.step(np.array([0, 1, 2]))[0]
+    again, _ = ours.reset(options=dict(none))
+    assert_same(again, last)
+    again["sensor"]["depth"][:] = 0.0
+    assert last["sensor"]["depth"].any()
+
+
 def test_a_street_whose_episode_has_ended_is_not_driven_on(both):
     ours, _ = both(sensors=())
     ours.reset(seed=1)
