@@ -8,7 +8,9 @@ from flowrep.palette import CATEGORY_ID
 from flowrep.scenes.people import PARTS
 from flowrep.scenes.scene import (
     CATEGORY_OF_KIND,
+    LEAST_HEIGHT_M,
     BuildingRow,
+    Obstacle,
     ObstacleRow,
     PedestrianGroup,
     Piece,
@@ -40,6 +42,9 @@ def check_consistency(scene: Scene, source: str) -> None:
     for name in ("building_rows", "obstacle_rows"):
         for i, row in enumerate(getattr(scene, name)):
             _check_row(row, source, f"{name}[{i}]")
+    for name in ("obstacles", "obstacle_rows"):
+        for i, obstacle in enumerate(getattr(scene, name)):
+            _check_height(obstacle, source, f"{name}[{i}].size_m[2]")
     for group in scene.pedestrian_groups:
         _check_walk(group, [road.name for road in scene.roads], source)
 
@@ -77,6 +82,13 @@ def _check_row(row: BuildingRow | ObstacleRow, source: str, key: str) -> None:
     elif row.from_m >= row.to_m:
         problem = f"goes from {row.from_m:g} to {row.to_m:g} m"
         raise SceneError(source, key, problem, "give from_m below to_m")
+
+
+def _check_height(obstacle: Obstacle | ObstacleRow, source: str, key: str) -> None:
+    height_m, least_m = obstacle.size_m[2], LEAST_HEIGHT_M.get(obstacle.kind, 0.0)
+    if height_m < least_m:
+        problem = f"is {height_m:g}, too low for a {obstacle.kind}"
+        raise SceneError(source, key, problem, f"give {least_m} or more")
 
 
 def _check_categories(scene: Scene, source: str) -> None:

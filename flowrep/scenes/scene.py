@@ -54,6 +54,9 @@ CATEGORY_OF_KIND: dict[Kind, str] = {
 }
 """Semantic class of each kind of box; lamp posts share the class of buildings."""
 
+LEAST_HEIGHT_M: dict[Kind, float] = {"car": 0.7, "traffic_light": 1.0, "lamp_post": 0.3}
+"""Least height of kinds with wheels or lamps of a fixed size; others may have any."""
+
 
 @dataclass(frozen=True)
 class Piece(Part):

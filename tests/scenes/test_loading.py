@@ -349,6 +349,10 @@ def refuse(data, **changes):
             {"obstacles__0__size_m": [4, 0, 1]},
             "obstacles[0].size_m[1]: got 0; it should be at",
         ),
+        (
+            {"obstacles__0__size_m": [4.0, 1.8, 0.6]},
+            "obstacles[0].size_m[2]: is 0.6, too low for a car; give 0.7 or more",
+        ),
         ({"terrain_m": 9.0}, "terrain_m: unknown name 'terrain'; choose from ['sky', "),
         ({"terrain_m": -1.0}, "terrain_m: got -1.0; it should be at least 0"),
         ({"corner_radius_m": -1.0}, "corner_radius_m: got -1.0; it should be at least 0"),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flowrep.scenes.layout import Box
+from flowrep.scenes.scene import LEAST_HEIGHT_M
 from flowrep.simulator.furniture import mesh_of
 
 SIZES = {
@@ -32,6 +33,17 @@ def test_a_shape_fills_its_box_and_hangs_over_it_only_above_heads(kind, variant)
     # A person of 1.75 m walks below whatever hangs over; a fir's lowest branches are at 1.5 m.
     low = points[:, 2] < (1.5 if kind == "tree" else 1.8)
     assert beyond[low].max() <= 0.03
+
+
+@pytest.mark.parametrize("variant", range(4))
+@pytest.mark.parametrize("kind", SIZES)
+def test_the_lowest_of_its_kind_stands_on_the_ground_and_has_no_face_without_area(kind, variant):
+    length, width, _ = SIZES[kind]
+    size = (length, width, LEAST_HEIGHT_M.get(kind, 0.01))
+    mesh = mesh_of(Box(kind, 0.0, 0.0, 0.0, size, variant))
+    assert np.isfinite(mesh.normals).all()
+    assert np.array(mesh.vertices)[:, 2].min() == 0.0
+    assert np.array(mesh.vertices)[:, 2].max() == pytest.approx(size[2])
 
 
 @pytest.mark.parametrize("kind", SIZES)
