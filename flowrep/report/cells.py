@@ -34,6 +34,12 @@ class Cell:
         low, high = of_each.min(), of_each.max()
         return f"{len(self.seeds)} × {low}" + (f"–{high}" if high > low else "")
 
+    @property
+    def shared(self) -> set[int]:
+        """The episodes that every run drove."""
+        by_episode = zip(self.episodes, self.outcomes.T)
+        return {episode for episode, of_runs in by_episode if not np.isnan(of_runs).any()}
+
 
 def success(row: Mapping[str, str]) -> float:
     """Judges an episode: 1 for a success, else 0."""
@@ -65,20 +71,13 @@ def cell_of(runs: Iterable[Run], condition: Condition, judge: Judge = success) -
 
 
 def side_by_side(first: Cell, second: Cell) -> tuple[Array, Array]:
-    """Returns the outcomes of two cells with the same episodes in their columns."""
-    episodes = sorted({*first.episodes, *second.episodes})
-    column = {episode: place for place, episode in enumerate(episodes)}
-    sides = []
-    for cell in (first, second):
-        wide = np.full((len(cell.seeds), len(episodes)), np.nan)
-        wide[:, [column[episode] for episode in cell.episodes]] = cell.outcomes
-        sides.append(wide)
-    return sides[0], sides[1]
-
-
-def shared_episodes(first: Cell, second: Cell) -> int:
-    """Returns the number of episodes that both drove."""
-    return len({*first.episodes} & {*second.episodes})
+    """Returns the outcomes of two cells in the episodes that every run of both drove."""
+    shared = first.shared & second.shared
+    ours, theirs = (
+        cell.outcomes[:, [episode in shared for episode in cell.episodes]]
+        for cell in (first, second)
+    )
+    return ours, theirs
 
 
 def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:

@@ -51,15 +51,44 @@ def test_an_episode_has_one_column_whichever_runs_drove_it(tmp_path):
     np.testing.assert_array_equal(cell.outcomes, [[0, 1, math.nan], [math.nan, 1, 0]])
 
 
-def test_two_cells_stand_side_by_side_by_episode(tmp_path):
-    first, second = config_of(), config_of(stack="seg2")
-    write_run(tmp_path / "a", first, rows_of(first, "cs"))
-    late = [row | {"episode_seed": 101} for row in rows_of(second, "s")]
-    write_run(tmp_path / "b", second, late)
-    runs = {run.stack: run for run in read_runs([tmp_path])[0]}
-    a, b = side_by_side(cell_of([runs["ego+obj"]], NORMAL), cell_of([runs["seg2"]], NORMAL))
-    np.testing.assert_array_equal(a, [[0, 1]])
-    np.testing.assert_array_equal(b, [[math.nan, 1]])
+def later(rows, episodes):
+    return [row | {"episode_seed": row["episode_seed"] + episodes} for row in rows]
+
+
+def test_two_cells_stand_side_by_side_in_the_episodes_that_all_their_runs_drove(tmp_path):
+    # Episodes 100 to 103, 102 to 105, and 101 to 103 of the other side: 102 and 103 are of all.
+    first, second, other = config_of(), config_of(seed=1), config_of(stack="seg2")
+    write_run(tmp_path / "a", first, rows_of(first, "cssc"))
+    write_run(tmp_path / "b", second, later(rows_of(second, "ccss"), 2))
+    write_run(tmp_path / "c", other, later(rows_of(other, "csc"), 1))
+    runs, _ = read_runs([tmp_path])
+    flows, seg = (cell_of([r for r in runs if r.stack == s], NORMAL) for s in ("ego+obj", "seg2"))
+    ours, theirs = side_by_side(flows, seg)
+    np.testing.assert_array_equal(ours, [[1, 0], [0, 0]])
+    np.testing.assert_array_equal(theirs, [[1, 0]])
+
+
+def test_a_difference_is_of_shared_episodes_alone(tmp_path):
+    # Both succeed in 2 of the same 4; over all its episodes raw flow has 6 of 8, +25 points.
+    run_in(tmp_path, "a", "sscc", stack="ego")
+    run_in(tmp_path, "b", "sscc" + "ssss", stack="raw")
+    found, _ = sections_of(tmp_path)
+    differences = found["flow_composition"].tables[1]
+    ((_, _, told, _, _, _, shared),) = rows_in(differences)
+    assert (told, shared) == ("0 [0, 0]", "4")
+
+
+def test_a_pair_without_shared_episodes_has_no_difference(tmp_path):
+    run_in(tmp_path, "a", {"low": "sc", "normal": "sc", "high": "sc"}, stack="ego")
+    config = config_of("s_turn", "raw")
+    rows = [row for s in ("low", "high") for row in rows_of(config, "ss", speed=s)]
+    write_run(tmp_path / "b", config, rows + later(rows_of(config, "ss"), 2))
+    found, _ = sections_of(tmp_path)
+    differences = found["flow_composition"].tables[1]
+    low, normal, high = rows_in(differences)
+    assert normal == ("raw − ego", "normal", "", "no shared episodes", "", "", "0")
+    assert low[-1] == high[-1] == "2"
+    assert "Of 2 comparisons" in differences.caption
 
 
 def test_table_iii_leaves_time_outs_out_and_tells_the_ratio(tmp_path):
