@@ -81,7 +81,10 @@ def rate_table(grids: Sequence[Grid], caption: str, ask: Settings) -> Table:
 
 
 def change(before: Cell | None, after: Cell | None) -> Array | None:
-    """Returns `[R, E]`, the change for each run and episode of both; None if they share none."""
+    """Returns `[R, E]`, the change for each run and episode of both; None if they share none.
+
+    A run that drove no episode under both conditions is no part of it.
+    """
     if before is None or after is None:
         return None
     seeds = [seed for seed in before.seeds if seed in after.seeds]
@@ -94,4 +97,6 @@ def change(before: Cell | None, after: Cell | None) -> Array | None:
         columns = np.searchsorted(cell.episodes, episodes)
         return cell.outcomes[rows][:, columns]
 
-    return both(after) - both(before)
+    changes = both(after) - both(before)
+    told = ~np.isnan(changes).all(axis=1)
+    return changes[told] if told.any() else None

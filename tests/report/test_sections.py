@@ -153,6 +153,19 @@ def test_a_change_needs_seeds_and_episodes_in_common(tmp_path):
     assert change(low, None) is None
 
 
+def test_a_run_that_drove_other_episodes_in_each_condition_is_no_part_of_a_change(tmp_path):
+    # Seed 0 loses both of its episodes; seed 1 drove others at low speed. As a change of 0 it
+    # would halve the loss.
+    run_in(tmp_path, "a", {"low": "ss", "normal": "cc"})
+    config = config_of("s_turn", seed=1)
+    rows = later(rows_of(config, "ss", speed="low"), 50) + rows_of(config, "ss")
+    write_run(tmp_path / "b", config, rows)
+    runs, _ = read_runs([tmp_path])
+    low, normal = cell_of(runs, Condition("greedy", "low", 12.0)), cell_of(runs, NORMAL)
+    np.testing.assert_array_equal(change(low, normal), [[-1, -1]])
+    assert change(cell_of(runs[1:], Condition("greedy", "low", 12.0)), normal) is None
+
+
 def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):
     run_in(tmp_path, "a", "ssss", algorithm__tau=0.02)
     run_in(tmp_path, "b", "sccc", algorithm__tau=0.005)
