@@ -1,11 +1,12 @@
 """Statistics of the scores of a few runs: interquartile means, bootstrap intervals, comparisons.
 
 As in rliable (Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical
-Precipice, NeurIPS 2021), scores are aggregated by their interquartile mean over runs and scenes,
-and runs are resampled within their scene. Two things differ. A run's score is itself a share of a
-few hundred episodes, so the episodes are resampled too, the same ones for all runs; otherwise two
-seeds that happen to agree would have an interval of no width. And scenes may have different numbers
-of runs, or lack some.
+Precipice, NeurIPS 2021), scores are aggregated by their interquartile mean over runs, and runs are
+resampled within their scene. Two things differ. A run's score is itself a share of a few hundred
+episodes, so the episodes are resampled too, the same ones for all runs; otherwise two seeds that
+happen to agree would have an interval of no width. And scenes may have different numbers of runs:
+each has its own interquartile mean, and all scenes count the same in the mean over them. With all
+runs in one, whoever has more seeds in the easier scene would seem better.
 """
 
 from collections.abc import Sequence
@@ -38,7 +39,7 @@ class Comparison(NamedTuple):
     """How much better one side does than another.
 
     Args:
-        difference: of the interquartile means, with its bootstrap interval.
+        difference: of the interquartile means, in the mean over scenes, with its interval.
         improvement: the probability that a run of the first side beats one of the second.
         p_value: of Welch's t-test over the runs' scores; nan where a side has one run alone.
         runs: the number of runs per side; that of one scene if a scene has one run of a side.
@@ -114,7 +115,7 @@ class Bootstrap:
         self.resamples, self.confidence, self.seed = resamples, confidence, seed
 
     def success(self, scenes: Sequence[Array]) -> Estimate:
-        """Returns the interquartile mean over the runs of all scenes.
+        """Returns the interquartile mean over a scene's runs, in the mean over scenes.
 
         Args:
             scenes: for each scene [R, E], see `rates`. One run alone gives Wilson's interval.
@@ -125,11 +126,13 @@ class Bootstrap:
 
     def mean(self, scenes: Sequence[Array]) -> Estimate:
         """Returns the same of outcomes of any kind, such as changes between two conditions."""
-        own = np.concatenate([rates(outcomes) for outcomes in scenes])
-        draws = [self._draw(k, outcomes, [len(outcomes)])[0] for k, outcomes in enumerate(scenes)]
-        return self._estimate(
-            float(interquartile_mean(own)), interquartile_mean(np.concatenate(draws, axis=1))
+        own = [rates(outcomes) for outcomes in scenes]
+        drawn = [self._draw(k, outcomes, [len(outcomes)])[0] for k, outcomes in enumerate(scenes)]
+        value, values = (
+            np.mean([interquartile_mean(scores) for scores in scores_of], axis=0)
+            for scores_of in (own, drawn)
         )
+        return self._estimate(float(value), values)
 
     def pooled_share(self, outcomes: Array) -> Estimate:
         """Returns the share over the pooled episodes of all runs; nan without episodes.
@@ -163,16 +166,14 @@ class Bootstrap:
             self._draw(k, np.concatenate(pair), [len(side) for side in pair])
             for k, pair in enumerate(scenes)
         ]
-        ours, theirs = (np.concatenate([pair[side] for pair in own]) for side in (0, 1))
-        ours_drawn, theirs_drawn = (
-            np.concatenate([pair[side] for pair in drawn], axis=1) for side in (0, 1)
+        difference, differences = (
+            np.mean([interquartile_mean(a) - interquartile_mean(b) for a, b in pairs], axis=0)
+            for pairs in (own, drawn)
         )
-        difference = float(interquartile_mean(ours) - interquartile_mean(theirs))
-        differences = interquartile_mean(ours_drawn) - interquartile_mean(theirs_drawn)
         improvement = float(np.mean([_improvement(*pair) for pair in own]))
         improvements = np.mean([_improvement(*pair) for pair in drawn], axis=0)
         return Comparison(
-            self._estimate(difference, differences),
+            self._estimate(float(difference), differences),
             self._estimate(improvement, improvements),
             _welch(own),
             _runs_a_side(own),

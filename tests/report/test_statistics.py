@@ -63,6 +63,25 @@ def test_scenes_are_strata():
     assert found == (0.5, 0.5, 0.5)
 
 
+def test_scenes_count_the_same_however_many_runs_they_have():
+    # 0.9 in one scene and 0.1 in the other: 0.5. Over all runs it would be (4 · 0.9 + 0.1) / 5,
+    # and the interquartile mean 0.9.
+    found = Bootstrap(500, confidence=0.5).success([runs(9, 9, 9, 9), runs(1)])
+    assert found.value == pytest.approx(0.5)
+    assert found.low < 0.5 < found.high
+
+
+def test_more_runs_in_the_easier_scene_are_no_advantage():
+    # 5 points better in both scenes, with two and four runs against four and two. Over all runs
+    # the middle ones are 0.15, 0.15, 0.15, 0.9 and 0.1, 0.85, 0.85, 0.85: 33 points worse.
+    easy = (runs(90, 90, episodes=100), runs(85, 85, 85, 85, episodes=100))
+    hard = (runs(15, 15, 15, 15, episodes=100), runs(10, 10, episodes=100))
+    found = Bootstrap(500).compare([easy, hard])
+    assert found.difference.value == pytest.approx(0.05)
+    assert found.verdict == "higher"
+    assert found.p_value == 0
+
+
 def test_scenes_are_resampled_independently():
     # Two scenes of one run at 0.5 in 100 episodes: the variance of their mean is half of one's.
     found = Bootstrap(8000).success([runs(50, episodes=100), runs(50, episodes=100)])
