@@ -121,7 +121,9 @@ def across(families: Sequence[Family], ask: Settings) -> list[Section]:
         if len(series) > 1:
             named = f"across_{stack}"
             sections.append(
-                success_section(named, f"{stack} under configs that differ", series, None, ask)
+                success_section(
+                    named, f"{stack} under configs that differ", series, None, ask, baselines=()
+                )
             )
     if not sections:
         return []
@@ -156,7 +158,7 @@ def variation_section(
     }
     pairs = [(f"{stack}, {v}", f"{stack}, {first}") for stack in stacks for v in others]
     pairs += [(f"{stacks[0]}, {v}", f"{stack}, {v}") for v in usable for stack in stacks[1:]]
-    section = success_section(variation.name, variation.title, series, pairs, ask)
+    section = success_section(variation.name, variation.title, series, pairs, ask, baselines=())
     notes = tuple(f"{variant}: {by_variant[variant].label}." for variant in usable)
     return replace(section, notes=(*notes, *section.notes))
 

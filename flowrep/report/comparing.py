@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from flowrep.report.cells import side_by_side
+from flowrep.report.cells import BASELINES, side_by_side
 from flowrep.report.experiments import SCENES, Experiment
 from flowrep.report.figures import draw_bars
 from flowrep.report.results import Grid, by_stack, grid_of, in_order, speeds_tested
@@ -68,6 +68,7 @@ def success_section(
     pairs: Sequence[tuple[str, str]] | None,
     ask: Settings,
     shown: Sequence[str] | None = None,
+    baselines: Sequence[str] = BASELINES,
 ) -> Section:
     """Returns bars, a table of success and one of differences for series of runs.
 
@@ -78,13 +79,16 @@ def success_section(
         pairs: series whose differences are listed; None for all, as long as they are few.
         ask: policy and intervals.
         shown: speed modes in the figure, None for all evaluated ones; the tables have all.
+        baselines: see `grid_of`.
     """
     runs = [run for members in series.values() for run in members]
     fps = runs[0].fps
     tested = speeds_tested(runs, ask.policy, fps)
     speeds = in_order([*tested, *(shown or ())], ("low", "normal", "high"))
     conditions = [Condition(ask.policy, speed, fps) for speed in speeds]
-    grids = [grid_of(scene, series, conditions, ask.bootstrap) for scene in scenes_of(runs)]
+    grids = [
+        grid_of(scene, series, conditions, ask.bootstrap, baselines) for scene in scenes_of(runs)
+    ]
     drawn = [_only(grid, shown) for grid in grids] if shown else grids
     if pairs is None:
         pairs = list(combinations(reversed(list(series)), 2))[:_MOST_PAIRS]

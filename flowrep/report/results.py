@@ -51,6 +51,7 @@ def grid_of(
     runs: Mapping[str, Sequence[Run]],
     conditions: Sequence[Condition],
     bootstrap: Bootstrap,
+    baselines: Sequence[str] = BASELINES,
 ) -> Grid:
     """Returns the success of several series of runs in a scene.
 
@@ -59,6 +60,8 @@ def grid_of(
         runs: the runs of each series, possibly none.
         conditions: the conditions in which they are compared.
         bootstrap: computes the intervals.
+        baselines: names of baselines; none where the runs' configs differ, since a baseline's
+            drives may differ too.
     """
     here = {name: [run for run in members if run.scene == scene] for name, members in runs.items()}
     cells = {(name, c): cell_of(here[name], c) for name, c in product(runs, conditions)}
@@ -66,7 +69,7 @@ def grid_of(
     everybody = [run for members in here.values() for run in members]
     shares = {
         (name, c): baseline_share(everybody, c._replace(policy=name))
-        for name, c in product(BASELINES, conditions)
+        for name, c in product(baselines, conditions)
     }
     found = {place: share for place, share in shares.items() if share is not None}
     return Grid(scene, tuple(runs), tuple(conditions), cells, scores, found)

@@ -181,6 +181,26 @@ def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):
     assert [row[0] for row in rows_in(differences)] == ["B − A"]
 
 
+@pytest.mark.parametrize(
+    ("changes", "together"),
+    [
+        ({"scene__time_limit_steps": 90}, "across_ego+obj"),
+        ({"noise__drift_m": 0.5}, "sensor_noise"),
+    ],
+    ids=["across", "variation"],
+)
+def test_a_baseline_is_told_beside_its_own_config_alone(tmp_path, changes, together):
+    # Never turning succeeds in 3 of 4 and, with less time, in 1 of 4; both as one would be 1 of 4.
+    for name, reached, other in (("a", "sssc", {}), ("b", "sccc", changes)):
+        config = config_of("s_turn", **other)
+        rows = rows_of(config, "ssss") + rows_of(config, reached, policy="never_turn")
+        write_run(tmp_path / name, config, rows)
+    found, _ = sections_of(tmp_path)
+    for name, share in (("1_success", "75"), ("2_success", "25")):
+        assert rows_in(found[name].tables[0])[1][:2] == ("never turn", share)
+    assert "never turn" not in [row[0] for row in rows_in(found[together].tables[0])]
+
+
 def test_runs_of_none_of_the_papers_experiments_are_shown_all_the_same(tmp_path):
     run_in(tmp_path, "a", "sscc", stack="rgb", scene="my_crossing")
     found, _ = sections_of(tmp_path)
