@@ -76,7 +76,7 @@ def success_section(
         name: the section's name.
         title: the section's heading.
         series: the runs of each series.
-        pairs: series whose differences are listed; None for all, as long as they are few.
+        pairs: series whose differences are listed; None for all, up to 15.
         ask: policy and intervals.
         shown: speed modes in the figure, None for all evaluated ones; the tables have all.
         baselines: see `grid_of`.
@@ -90,8 +90,6 @@ def success_section(
         grid_of(scene, series, conditions, ask.bootstrap, baselines) for scene in scenes_of(runs)
     ]
     drawn = [_only(grid, shown) for grid in grids] if shown else grids
-    if pairs is None:
-        pairs = list(combinations(reversed(list(series)), 2))[:_MOST_PAIRS]
     trained = listed(sorted({run.speed for run in runs}))
     caption = (
         f"Success of agents trained at {trained} speed, {ask.policy} actions, {fps:g} frames a "
@@ -153,10 +151,12 @@ def _over_scenes(grids: Sequence[Grid], bootstrap: Bootstrap) -> tuple[tuple[str
 def difference_table(
     name: str,
     grids: Sequence[Grid],
-    pairs: Sequence[tuple[str, str]],
+    pairs: Sequence[tuple[str, str]] | None,
     bootstrap: Bootstrap,
 ) -> Table | None:
     """Returns the difference of each pair with its verdict; None if there is no pair to compare."""
+    every = list(combinations(reversed(grids[0].series), 2)) if pairs is None else pairs
+    pairs = every[:_MOST_PAIRS] if pairs is None else pairs
     places = [(words(grid.scene), [grid]) for grid in grids]
     if len(grids) > 1:
         places.append((f"All {len(grids)} scenes", list(grids)))
@@ -178,8 +178,9 @@ def difference_table(
         "with 95 % bootstrap intervals over seeds and episodes; the probability that a run of the "
         "first beats one of the second (a tie counts half); p of Welch's t-test over seeds. A "
         "difference is told from noise where its interval leaves out 0 and p < 0.05; of fewer than "
-        f"{FEWEST_SEEDS} seeds a side it is one of these agents. {_by_chance(told)}"
+        f"{FEWEST_SEEDS} seeds a side it is one of these agents."
     )
+    caption = " ".join(filter(None, (caption, _by_chance(told), _left_out(pairs, every))))
     header = ("first − second", "speed", "points", "verdict", "P(first better) (%)", "p", "shared")
     return Table(f"{name}_differences", caption, header, tuple(blocks), words=(1, 3))
 
@@ -189,6 +190,12 @@ def _by_chance(comparisons: int) -> str:
         return ""
     about = f"{comparisons / 20:.1f}".rstrip("0").rstrip(".")
     return f"Of {comparisons} comparisons without any real difference, about {about} would pass."
+
+
+def _left_out(pairs: Sequence[tuple[str, str]], of: Sequence[tuple[str, str]]) -> str:
+    if len(pairs) == len(of):
+        return ""
+    return f"The first {len(pairs)} of {len(of)} pairs; a report of fewer runs has the others."
 
 
 def _difference_row(

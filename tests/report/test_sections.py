@@ -201,6 +201,17 @@ def test_a_baseline_is_told_beside_its_own_config_alone(tmp_path, changes, toget
     assert "never turn" not in [row[0] for row in rows_in(found[together].tables[0])]
 
 
+@pytest.mark.parametrize(("stacks", "pairs"), [(6, 15), (7, 21)])  # 6 · 5 / 2 and 7 · 6 / 2
+def test_pairs_that_are_too_many_for_a_table_are_counted(tmp_path, stacks, pairs):
+    for place in range(stacks):
+        run_in(tmp_path, f"{place}", "sc", stack=f"map{place}")
+    found, _ = sections_of(tmp_path)
+    differences = found["success"].tables[1]
+    assert len(rows_in(differences)) == 15
+    cut = f"The first 15 of {pairs} pairs; a report of fewer runs has the others."
+    assert differences.caption.endswith(cut) == (pairs > 15)
+
+
 def test_runs_of_none_of_the_papers_experiments_are_shown_all_the_same(tmp_path):
     run_in(tmp_path, "a", "sscc", stack="rgb", scene="my_crossing")
     found, _ = sections_of(tmp_path)
