@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, count, islice, product
+from string import ascii_uppercase
 
 from flowrep.report.comparing import Settings, experiment_section, scenes_of, success_section
 from flowrep.report.experiments import (
@@ -113,10 +115,10 @@ def across(families: Sequence[Family], ask: Settings) -> list[Section]:
     for stack in in_order([s for stacks in in_all for s in stacks], STACKS):
         series: dict[str, list[Run]] = {}
         taken: set[Run] = set()
-        for letter, family in zip("ABCDEFGHIJKLMNOPQRSTUVWXYZ", families):
+        for letters, family in zip(_letters(len(families)), families):
             ours = [r for r in family.runs if r.stack == stack and _unusable(r, ask) is None]
             if ours and not taken & set(ours):
-                series[letter] = ours
+                series[letters] = ours
                 taken |= set(ours)
         if len(series) > 1:
             named = f"across_{stack}"
@@ -166,8 +168,14 @@ def variation_section(
 def differing_keys(families: Sequence[Family]) -> Table:
     """Returns a table of the keys in which families differ, with a column per family."""
     keys = list(dict.fromkeys(key for family in families for key in family.differences))
-    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[: len(families)]
     rows = tuple((key, *(f.differences.get(key, "") for f in families)) for key in keys)
     caption = "Keys of the configs in which the runs differ. No number is of runs of two columns."
+    header = ("key", *_letters(len(families)))
     columns = tuple(range(1, len(families) + 1))
-    return Table("configs", caption, ("key", *letters), (("", rows),), words=columns)
+    return Table("configs", caption, header, (("", rows),), words=columns)
+
+
+def _letters(number: int) -> list[str]:
+    """Returns that many names: A to Z, AA, AB and so on."""
+    texts = (map("".join, product(ascii_uppercase, repeat=length)) for length in count(1))
+    return list(islice(chain.from_iterable(texts), number))

@@ -181,6 +181,19 @@ def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):
     assert [row[0] for row in rows_in(differences)] == ["B − A"]
 
 
+def test_after_26_configs_letters_are_doubled(tmp_path):
+    for number in range(28):
+        run_in(tmp_path, f"{number:02}", "s", algorithm__tau=number / 100)
+    found, _ = sections_of(tmp_path)
+    configs = found["configs"].tables[0]
+    ((_, *values),) = rows_in(configs)
+    assert (len(configs.header), len(values)) == (29, 28)
+    assert configs.header[25:] == ("Y", "Z", "AA", "AB")
+    assert values[26:] == ["0.26", "0.27"]
+    shown = [row[0] for row in rows_in(found["across_ego+obj"].tables[0])]
+    assert shown == list(configs.header[1:])
+
+
 @pytest.mark.parametrize(
     ("changes", "together"),
     [
