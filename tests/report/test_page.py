@@ -10,15 +10,18 @@ import pytest
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
+from flowrep.report.assembly import Chapter, Report
 from flowrep.report.command import report_on
 from flowrep.report.experiments import COMPLEMENTARY
 from flowrep.report.figures import draw_bars
-from flowrep.report.files import save
+from flowrep.report.files import save, write_files
 from flowrep.report.pictures import svg_uri
 from flowrep.report.results import grid_of
 from flowrep.report.runs import Condition, read_runs
+from flowrep.report.sections import Section
 from flowrep.report.statistics import Bootstrap
 from flowrep.report.style import LIGHT
+from flowrep.report.tables import Table
 from tests.report.folders import config_of, letters, rows_of, write_run
 
 pytestmark = pytest.mark.slow
@@ -32,6 +35,7 @@ ASKED = {
     "device": "cpu",
     "trust": None,
 }
+LIST = ".report_files"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 
 
@@ -91,7 +95,51 @@ def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
         )
         for kind in ("png", "pdf", "tex", "csv")
     }
-    assert found == drawn | tables | {"index.html"}
+    assert found == drawn | tables | {"index.html", LIST}
+
+
+def report_of(**sections):
+    """A report of sections with a table each, whose only cell is given."""
+    tables = {name: Table(name, "", ("x",), (("", ((cell,),)),)) for name, cell in sections.items()}
+    found = [Section(name, name, tables=(table,)) for name, table in tables.items()]
+    return Report((), (), (Chapter("", (), tuple(found)),))
+
+
+def files_in(folder):
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+
+
+def test_what_an_earlier_report_wrote_is_removed_and_nothing_else(tmp_path):
+    folder, aside = tmp_path / "report", tmp_path / "aside.txt"
+    write_files(report_of(one="1", two="2", three="3"), folder)
+    (folder / "two" / "mine.txt").write_text("")
+    (folder / "two" / "two.tex").write_text("% mine by now")
+    aside.write_text("")
+    nothing = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"  # of no bytes
+    with (folder / LIST).open("a") as lines:
+        lines.write(f"{nothing} ../aside.txt\n{nothing} two/gone.txt\nabc\n")
+    (one,) = write_files(report_of(one="4"), folder)
+    assert one == folder / "one"
+    assert (one / "one.csv").read_text() == "x\n4\n"
+    of_one = [f"one/one.{kind}" for kind in ("csv", "pdf", "png", "tex")]
+    assert files_in(folder) == [LIST, *of_one, "two/mine.txt", "two/two.tex"]
+    assert not (folder / "three").exists()
+    assert aside.exists()
+    write_files(report_of(), folder)
+    assert files_in(folder) == [LIST, "two/mine.txt", "two/two.tex"]
+
+
+def test_a_report_that_was_interrupted_is_removed_by_the_next(tmp_path, monkeypatch):
+    def refuse(table):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Table, "to_csv", refuse)
+        with pytest.raises(KeyboardInterrupt):
+            write_files(report_of(one="1"), tmp_path)
+    assert files_in(tmp_path) == [LIST, "one/one.pdf", "one/one.png", "one/one.tex"]
+    write_files(report_of(), tmp_path)
+    assert files_in(tmp_path) == [LIST]
 
 
 def test_the_page_says_what_is_missing_and_what_is_wrong(page):
