@@ -12,9 +12,11 @@ pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.report.assembly import Chapter, Report
 from flowrep.report.command import report_on
+from flowrep.report.drives import Drives, Plan
 from flowrep.report.experiments import COMPLEMENTARY
 from flowrep.report.figures import draw_bars
 from flowrep.report.files import save, write_files
+from flowrep.report.page import render_page
 from flowrep.report.pictures import svg_uri
 from flowrep.report.results import grid_of
 from flowrep.report.runs import Condition, read_runs
@@ -148,6 +150,14 @@ def test_the_page_says_what_is_missing_and_what_is_wrong(page):
     assert "No runs in H-Shaped Pathways and Three-Way Junction." in text
     assert "damaged/config.yaml can&#39;t be read" in text
     assert "34 runs, 34 of them finished, of 9 stacks" in text
+
+
+@pytest.mark.parametrize("plans", [{}, {"S-Turn": [Plan("ego", "of 1, 1 collided", "data:,")]}])
+def test_the_page_names_agents_that_could_not_drive(plans):
+    text = render_page(Report((), (), ()), Drives(plans, [], ["a has no checkpoint"]), [])
+    assert text.count("a has no checkpoint") == 1
+    assert text.count('id="drives"') == text.count('href="#drives"') == 1
+    assert ("The scene from above" in text) == bool(plans)
 
 
 def test_a_figure_saved_again_is_the_same_byte_for_byte(tmp_path):
