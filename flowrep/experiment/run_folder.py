@@ -153,7 +153,7 @@ class RunFolder:
         remedy = "restore the file that the run was started with"
         try:
             config = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
             reason = " ".join(str(error).split())
             raise RunFolderError(f"{path} can't be read: {reason}; {remedy}") from error
         if not isinstance(config, dict):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import chain, count, islice, product
 from string import ascii_uppercase
 
+from flowrep.config.command_line import folder_name
 from flowrep.report.comparing import Settings, experiment_section, scenes_of, success_section
 from flowrep.report.experiments import (
     COMPLEMENTARY,
@@ -121,7 +122,7 @@ def across(families: Sequence[Family], ask: Settings) -> list[Section]:
                 series[letters] = ours
                 taken |= set(ours)
         if len(series) > 1:
-            named = f"across_{stack}"
+            named = folder_name(f"across_{stack}")
             sections.append(
                 success_section(
                     named, f"{stack} under configs that differ", series, None, ask, baselines=()

@@ -81,7 +81,8 @@ def report_on(asked: dict[str, Any]) -> Path:
 
 def show(table: Table, title: str) -> None:
     """Prints a table."""
-    shown = rich.table.Table(title=title, box=rich.box.SIMPLE, pad_edge=False)
+    said = Text(title, style="table.title")  # in a str, brackets would be markup
+    shown = rich.table.Table(title=said, box=rich.box.SIMPLE, pad_edge=False)
     for place, heading in enumerate(table.header):
         justify: Any = "left" if table.is_text(place) else "right"
         shown.add_column(Text(heading), justify=justify, no_wrap=True)

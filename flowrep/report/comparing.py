@@ -10,7 +10,7 @@ from flowrep.report.cells import BASELINES, side_by_side
 from flowrep.report.experiments import SCENES, Experiment
 from flowrep.report.figures import draw_bars
 from flowrep.report.results import Grid, by_stack, grid_of, in_order, speeds_tested
-from flowrep.report.runs import Condition, Run
+from flowrep.report.runs import SPEEDS, Condition, Run
 from flowrep.report.sections import (
     MISSING,
     Drawing,
@@ -84,7 +84,7 @@ def success_section(
     runs = [run for members in series.values() for run in members]
     fps = runs[0].fps
     tested = speeds_tested(runs, ask.policy, fps)
-    speeds = in_order([*tested, *(shown or ())], ("low", "normal", "high"))
+    speeds = in_order([*tested, *(shown or ())], SPEEDS)
     conditions = [Condition(ask.policy, speed, fps) for speed in speeds]
     grids = [
         grid_of(scene, series, conditions, ask.bootstrap, baselines) for scene in scenes_of(runs)

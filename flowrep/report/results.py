@@ -6,10 +6,8 @@ from itertools import product
 from typing import NamedTuple
 
 from flowrep.report.cells import BASELINES, Cell, baseline_share, cell_of
-from flowrep.report.runs import Condition, Run
+from flowrep.report.runs import SPEEDS, Condition, Run
 from flowrep.report.statistics import Bootstrap, Estimate, rates
-
-SPEEDS = ("low", "normal", "high")
 
 
 class Score(NamedTuple):

@@ -1,17 +1,23 @@
 """Reads run folders: configs, episodes and metrics, and a list of what can't be read."""
 
-from collections.abc import Iterable, Iterator, Mapping
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.origin import origin_of
 from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.tables import TableError
 
 _ORDER = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 Rows = list[dict[str, str]]
+
+SPEEDS = ("low", "normal", "high")
+"""Pedestrians' speed modes, in the order of figures."""
 
 
 class Condition(NamedTuple):
@@ -163,39 +169,65 @@ def _read(path: Path) -> Run:
     run = Run(path, folder.read_config(), folder.read_episodes(), folder.read_metrics())
     remedy = "restore the file that the run was started with"
     try:
-        wrong = [
-            f"{key} is {value!r}" for key, value, kind in _parts(run) if type(value) not in kind
-        ]
+        wrong = [f"{key} is {value!r}" for key, value, is_right in _parts(run) if not is_right]
     except KeyError as error:
         raise RunFolderError(f"{path}/config.yaml has no {error.args[0]}; {remedy}") from None
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise RunFolderError(
             f"{path}/config.yaml is not what a run leaves ({error}); {remedy}"
         ) from None
     if wrong:
         raise RunFolderError(f"{path}/config.yaml: {wrong[0]}; {remedy}")
-    for number, row in enumerate(run.metrics, start=2):
-        try:
-            float(row.get("success") or 0)
-        except ValueError:
-            raise TableError(
-                f"{folder.metrics_path}, line {number}: success can't be {row['success']!r}; "
-                "correct or delete the line"
-            ) from None
+    _check_cells(folder.metrics_path, run.metrics, {"success": lambda text: float(text or 0)})
+    _check_cells(folder.evaluation_path, run.episodes, _CELLS)
     return run
 
 
-def _parts(run: Run) -> list[tuple[str, Any, tuple[type, ...]]]:
-    """The parts of a config that a report reads, with the types that they may have."""
+def _parts(run: Run) -> list[tuple[str, Any, bool]]:
+    """The parts of a config that a report reads, and whether a run can have left them."""
     assert run.identity
+    json.dumps(run.config, default=str, ensure_ascii=False).encode()  # its texts can be written
+    rate, names = run.config["scene"]["frame_rate_hz"], run.config["representations"]
     return [
-        ("scene.name", run.scene, (str,)),
-        ("scene.frame_rate_hz", run.config["scene"]["frame_rate_hz"], (float, int)),
-        ("representations", run.config["representations"], (dict,)),
-        ("seed", run.seed, (int,)),
-        ("speed", run.speed, (str,)),
-        ("total_frames", run.total_frames, (int,)),
+        ("scene.name", run.scene, _is_name(run.scene)),
+        ("scene.frame_rate_hz", rate, type(rate) in (float, int) and 0 < run.fps < math.inf),
+        ("representations", names, type(names) is dict),
+        *(("a name in representations", name, _is_name(name)) for name in names),
+        ("seed", run.seed, type(run.seed) is int),
+        ("speed", run.speed, run.speed in SPEEDS),
+        ("total_frames", run.total_frames, type(run.total_frames) is int),
     ]
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and value.isprintable()
+
+
+def _rate(text: str) -> float:
+    if not 0 < float(text) < math.inf:
+        raise ValueError(text)
+    return float(text)
+
+
+_CELLS: dict[str, Callable[[str], Any]] = {
+    "fps": _rate,
+    "speed": SPEEDS.index,
+    "outcome": OUTCOMES[1:].index,
+    "length": int,
+}
+"""The columns of evaluation.csv that a report reads beside those that every reader checks."""
+
+
+def _check_cells(path: Path, rows: Rows, columns: Mapping[str, Callable[[str], Any]]) -> None:
+    for number, row in enumerate(rows, start=2):
+        for column, read in columns.items():
+            try:
+                read(row.get(column, ""))
+            except ValueError:
+                raise TableError(
+                    f"{path}, line {number}: {column} can't be {row[column]!r}; correct or delete "
+                    "the line"
+                ) from None
 
 
 def _without_repeats(runs: list[Run], complaints: list[str]) -> list[Run]:

@@ -127,6 +127,7 @@ def styled(theme: Theme, font_pt: float) -> Iterator[None]:
         "grid.alpha": 0.35,
         "grid.linewidth": 0.5,
         "legend.frameon": False,
+        "text.parse_math": False,  # $ is literal
     }
     with mpl.rc_context(settings):
         yield

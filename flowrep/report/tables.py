@@ -142,10 +142,7 @@ class _Pen:
         self.y += _ROW_IN
 
     def _text(self, text: str, x: float, align: str, **style: Any) -> None:
-        # no mathtext: $ is literal
-        self.axes.text(
-            x, self.y + _ROW_IN / 2, text, ha=align, va="center", parse_math=False, **style
-        )
+        self.axes.text(x, self.y + _ROW_IN / 2, text, ha=align, va="center", **style)
 
 
 def latex_text(text: str) -> str:

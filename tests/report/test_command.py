@@ -11,7 +11,8 @@ from flowrep.config import UsageError
 from flowrep.config.composition import check_command
 from flowrep.config.reporting import ReportConfig
 from flowrep.report import command
-from flowrep.report.command import main, with_folders_named
+from flowrep.report.command import main, show, with_folders_named
+from flowrep.report.tables import Table
 from tests.config.composing import plain
 from tests.report.folders import config_of, rows_of, write_run
 
@@ -81,6 +82,11 @@ def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatc
     assert "1 run, 1 of them finished, of 1 stack (ego+obj) in Straight Road" in said
     assert "0.333 [0.048–2.326]" in said  # 1 out of bounds to 3 collisions; Wilson's of 1 of 4
     assert said.endswith(f"page: {tmp_path / 'out' / 'index.html'}\n")
+
+
+def test_a_tables_title_may_hold_brackets(capsys):
+    show(Table("t", "", ("a column as wide as the title",), ()), "tau=[/red], scale=[1]")
+    assert capsys.readouterr().out.split("\n")[0].strip() == "tau=[/red], scale=[1]"
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, capsys):

@@ -100,6 +100,20 @@ def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
     assert found == drawn | tables | {"index.html", LIST}
 
 
+def test_names_are_drawn_as_they_are_and_nothing_is_written_elsewhere(tmp_path):
+    for tau in (0.02, "[/red]"):
+        config = config_of(r"$\foo$", "/../../evil+$x^$", algorithm__tau=tau)
+        rows = rows_of(config, "sc") + rows_of(config, "sc", fps=6.0)
+        metrics = [{"frames": 1000, "success": 0.5}]
+        write_run(tmp_path / "runs" / f"run{len(str(tau))}", config, rows, metrics)
+    page = report_on(ASKED | {"run": str(tmp_path / "runs"), "output": str(tmp_path / "out" / "x")})
+    text = page.read_text(encoding="utf-8")
+    assert "Success over" in text
+    assert "[/red]" in text
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "runs"]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["x"]
+
+
 def report_of(**sections):
     """A report of sections with a table each, whose only cell is given."""
     tables = {name: Table(name, "", ("x",), (("", ((cell,),)),)) for name, cell in sections.items()}

@@ -43,6 +43,8 @@ def test_what_a_run_is_comes_from_its_config(tmp_path):
         ("config.yaml", "seed: [", "config.yaml can't be read"),
         ("config.yaml", "", "config.yaml is empty"),
         ("config.yaml", "seed: 1\n", "config.yaml has no scene"),
+        ("config.yaml", "seed: 2026-13-45\n", "config.yaml can't be read"),
+        ("config.yaml", "[" * 5000, "config.yaml can't be read"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv lacks the columns"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "line 2: frames can't be 'many'"),
         ("metrics.csv", "frames,success\n9,high\n", "line 2: success can't be 'high'"),
@@ -55,6 +57,54 @@ def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, te
     assert [run.path.name for run in runs] == ["good"]
     assert expected in complaint
     assert "\n" not in complaint
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("fps", "inf"),
+        ("fps", "nan"),
+        ("fps", "0"),
+        ("speed", "fast"),
+        ("outcome", "running"),
+        ("length", ""),
+    ],
+)
+def test_a_cell_that_no_episode_can_have_is_one_line(tmp_path, column, value):
+    run_in(tmp_path, "good")
+    config = config_of(seed=1)
+    first, *rows = rows_of(config, "ssss")
+    write_run(tmp_path / "bad", config, [*rows, first | {column: value}])
+    runs, (complaint,) = read_runs([tmp_path])
+    assert [run.path.name for run in runs] == ["good"]
+    said = f"bad/evaluation.csv, line 5: {column} can't be '{value}'; correct or delete the line"
+    assert complaint.endswith(said)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"representations": {5: {}, "ego": {}}}, "a name in representations is 5"),
+        ({"representations": {"ego\nobj": {}}}, r"a name in representations is 'ego\nobj'"),
+        ({"scene__name": "\x1b[2J"}, r"scene.name is '\x1b[2J'"),
+        ({"scene__frame_rate_hz": float("inf")}, "scene.frame_rate_hz is inf"),
+        ({"scene__frame_rate_hz": float("nan")}, "scene.frame_rate_hz is nan"),
+        ({"scene__frame_rate_hz": -12.0}, "scene.frame_rate_hz is -12.0"),
+        ({"scene__frame_rate_hz": 10**400}, "is not what a run leaves"),
+        ({"speed": "fast"}, "speed is 'fast'"),
+        ({"seed": True}, "seed is True"),
+        ({"experiment": "\ud800"}, "is not what a run leaves"),
+    ],
+)
+def test_a_config_that_no_run_can_have_is_one_line(tmp_path, changes, said):
+    run_in(tmp_path, "good", stack="raw")
+    config = config_of(seed=1, stack="raw")
+    path = write_run(tmp_path / "bad", config, rows_of(config, "s"))
+    (path / "config.yaml").write_text(yaml.safe_dump(config_of(**changes)))
+    runs, (complaint,) = read_runs([tmp_path])
+    assert [run.path.name for run in runs] == ["good"]
+    assert f"{path}/config.yaml" in complaint
+    assert said in complaint
 
 
 @pytest.mark.parametrize("key", ["speed", "scene__name", "scene__frame_rate_hz", "total_frames"])

@@ -194,6 +194,14 @@ def test_after_26_configs_letters_are_doubled(tmp_path):
     assert shown == list(configs.header[1:])
 
 
+def test_a_section_of_any_stack_has_the_name_of_a_folder(tmp_path):
+    run_in(tmp_path, "a", "ssss", stack="/../../evil", algorithm__tau=0.02)
+    run_in(tmp_path, "b", "sccc", stack="/../../evil", algorithm__tau=0.005)
+    section = sections_of(tmp_path)[0]["across__.._.._evil"]
+    assert section.title == "/../../evil under configs that differ"
+    assert all("/" not in part.name for part in (*section.drawings, *section.tables))
+
+
 @pytest.mark.parametrize(
     ("changes", "together"),
     [
