@@ -142,7 +142,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     runs: dict[Path, Run] = {}
     complaints: list[str] = []
     for folder in folders:
-        configs = sorted(path for path in folder.rglob("config.yaml") if _is_of_a_run(path))
+        configs = sorted(path for path in folder.rglob("config.yaml") if _is_of_a_run(path, folder))
         if not configs:
             what = (
                 "holds no run: no config.yaml is in it or below"
@@ -160,8 +160,9 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     return _without_repeats(list(runs.values()), complaints), complaints
 
 
-def _is_of_a_run(config: Path) -> bool:
-    return ".hydra" not in config.parts and "wandb" not in config.parts
+def _is_of_a_run(config: Path, folder: Path) -> bool:
+    below = config.relative_to(folder).parts  # the folder itself may be called anything
+    return ".hydra" not in below and "wandb" not in below
 
 
 def _read(path: Path) -> Run:

@@ -31,6 +31,17 @@ def test_runs_are_found_however_deep_and_once(tmp_path):
     assert complaints == []
 
 
+@pytest.mark.parametrize("name", ["wandb", ".hydra"])
+def test_a_folder_of_runs_may_lie_anywhere(tmp_path, name):
+    path = run_in(tmp_path / name / "sweep", "a")
+    (path / name).mkdir()
+    (path / name / "config.yaml").write_text("seed: 1\n")
+    for folder in (tmp_path / name, path):
+        runs, complaints = read_runs([folder])
+        assert [run.path for run in runs] == [path]
+        assert complaints == []
+
+
 def test_what_a_run_is_comes_from_its_config(tmp_path):
     run_in(tmp_path, "misnamed_ego_s7", stack="obj+seg2+ego", seed=3, scene="s_turn")
     (run,), _ = read_runs([tmp_path])
