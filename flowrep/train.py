@@ -177,22 +177,22 @@ def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
 
 
 def make_training(config: Config, folder: RunFolder) -> Training:
-    """Returns the run at its checkpoint, or at its start if it has none."""
+    """Returns the run at its checkpoint, or at its start if it was killed before the first one."""
+    is_new = config["resume"] is None
+    is_saved = folder.checkpoint_path.exists()
+    if not is_new and not is_saved:
+        folder.start_again(config)
     keep_freed_memory()
     share_cores(config)
     torch.manual_seed(config["seed"])
     env = env_from_config(config, compiled=config["compiled"])
     env.set_seed(config["seed"] * config["num_envs"])
-    is_new = config["resume"] is None
     # the class of a new run was named on the command line
     trusted = config["algorithm"]["_target_"] if is_new else config["trust"]
     agent = agent_from_config(config, env, trust=trusted)
     training = Training(env, agent, folder, origin_of(config))
-    if not is_new:
-        if folder.checkpoint_path.exists():
-            training.load()
-        else:
-            folder.forget_after(0)
+    if not is_new and is_saved:
+        training.load()
     return training
 
 

@@ -112,7 +112,7 @@ def _read(path: Path, parts: Collection[str] | None) -> dict[str, Any]:
             if metadata.get("format") != FORMAT:
                 raise CheckpointError(
                     f"{path} is a safetensors file but not a flowrep checkpoint of this version "
-                    f"({FORMAT!r}); start the run anew"
+                    f"({FORMAT!r}); start a new run"
                 )
             _check(zlib.crc32(metadata["state"].encode()), int(metadata["state_crc32"]), "document")
             document = json.loads(metadata["state"])
@@ -124,7 +124,7 @@ def _read(path: Path, parts: Collection[str] | None) -> dict[str, Any]:
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise CheckpointError(
             f"{path} is not a readable checkpoint ({error}): it is damaged or of another kind; "
-            "delete it and start the run anew"
+            "restore a copy of it, or start a new run"
         ) from error
 
 

@@ -194,6 +194,28 @@ class RunFolder:
             if len(kept) < len(rows) or not is_whole(path):
                 write_rows(path, kept, columns)
 
+    def start_again(self, config: Mapping[str, Any]) -> None:
+        """Drops all rows of a run that was killed before its first checkpoint, to start it again.
+
+        Args:
+            config: its config.
+
+        Raises:
+            RunFolderError: it had a checkpoint, as its results show; nothing is dropped then.
+        """
+        due = min(config["checkpoint_every_frames"], config["total_frames"])
+        first_save = due + config["num_envs"] - 1  # at the latest
+        episodes = self.read_episodes()
+        rows = [*self.read_metrics(), *episodes]
+        if any(row["evaluation"] != "training" for row in episodes) or any(
+            int(row["frames"]) > first_save for row in rows
+        ):
+            raise RunFolderError(
+                f"{self.checkpoint_path} is missing, and starting again would delete the run's "
+                "results: restore that file, or move the folder away and start a new run"
+            )
+        self.forget_after(0)
+
     def is_evaluated(self, frames: int, episodes: int) -> bool:
         """Returns whether the final evaluation is in evaluation.csv.
 

@@ -136,7 +136,7 @@ DAMAGES = {
 def test_a_file_that_is_no_checkpoint_is_named_with_a_way_out(tmp_path, damage):
     path = tmp_path / "c.safetensors"
     damage(path)
-    with pytest.raises(CheckpointError, match=r"c\.safetensors.* start the run anew"):
+    with pytest.raises(CheckpointError, match=r"c\.safetensors.* start a new run"):
         load_checkpoint(path)
 
 

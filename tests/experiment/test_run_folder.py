@@ -80,6 +80,25 @@ def test_a_resumed_run_drops_the_rows_it_will_write_again(tmp_path):
     assert [row["frames"] for row in rows_of(run.metrics_path)] == ["10"]
 
 
+@pytest.mark.parametrize(("frames", "kind"), [(17, "training"), (8, "final"), (8, "evaluate")])
+def test_only_what_was_written_before_the_first_checkpoint_is_dropped_without_one(
+    tmp_path, frames, kind
+):
+    run, config = RunFolder(tmp_path), {"checkpoint_every_frames": 15, "total_frames": 99}
+    config["num_envs"] = 2
+    for logged in (8, 16):
+        run.log_metrics(logged, {"alpha": 1 / logged})
+        run.log_episodes([episode(1, frames=str(logged), evaluation="training")])
+    run.start_again(config)
+    assert not run.metrics_path.exists()
+    assert not run.evaluation_path.exists()
+    run.log_metrics(8, {"alpha": 0.5})
+    run.log_episodes([episode(1, frames=str(frames), evaluation=kind)])
+    with pytest.raises(RunFolderError, match=r"latest\.safetensors is missing.*restore that file"):
+        run.start_again(config)
+    assert len(rows_of(run.metrics_path)) == len(run.read_episodes()) == 1
+
+
 def test_a_column_that_the_table_lacks_is_refused(tmp_path):
     append_rows(tmp_path / "t.csv", [{"a": 1}])
     with pytest.raises(ValueError, match="b"):

@@ -13,7 +13,7 @@ pytest.importorskip("pybullet", reason="training drives the simulated street")
 from flowrep.agent import DivergenceError
 from flowrep.config_tree import group_choices
 from flowrep.experiment.interruption import StopRequest
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.training import Training, train
 from flowrep.train import make_training
 from flowrep.transforms import FlowFactorize, RawFlow
@@ -148,6 +148,14 @@ def test_a_killed_run_continues_from_its_last_checkpoint_and_drops_later_rows(tm
         logged = [int(row["frames"]) for row in csv.DictReader(file)]
     assert logged == sorted(set(logged))
     assert logged[-1] == 120
+
+
+def test_a_run_whose_checkpoint_is_gone_keeps_its_results(tmp_path):
+    run = RunFolder(tmp_path)
+    run.log_metrics(62, {"alpha": 0.5})  # it saves at 60
+    with pytest.raises(RunFolderError, match=r"latest\.safetensors is missing.* restore that file"):
+        new_run(tmp_path, resume=True)
+    assert len(run.read_metrics()) == 1
 
 
 def test_an_evaluation_that_was_cut_short_is_made_up_for_on_the_same_frames(tmp_path):
