@@ -33,6 +33,7 @@ from flowrep.config.command_line import (
 )
 from flowrep.config.evaluating import EvaluateConfig
 from flowrep.config.training import validated_run
+from flowrep.config.violations import shown
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import WorkerError, street_envs
 from flowrep.exchange.cards import check_card
@@ -41,7 +42,7 @@ from flowrep.experiment.arena import Agent
 from flowrep.experiment.comparison import Comparison, Row, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.interruption import StopRequest
-from flowrep.experiment.origin import check_origin, origin_of
+from flowrep.experiment.origin import check_origin, differences, origin_of
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.from_config import (
     Config,
@@ -219,8 +220,8 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
     """Returns a run's agent in the requested scene, by default its own.
 
     Raises:
-        UsageError, TableError: its config or its table is damaged; both are checked before any
-            episode is run.
+        UsageError, TableError: its config or its table is damaged, or the scene has the name of its
+            own and is another; all are checked before any episode is run.
         CheckpointError: there is no checkpoint, it is damaged, or belongs to another run.
     """
     own = validated_run(run.read_config(), f"{run.path}/config.yaml")
@@ -233,6 +234,7 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
     if scene is not None:  # the agent keeps its camera in other scenes
         here["scene"] = scene | {"camera": own["scene"]["camera"]}
     config = own | here
+    check_scene(run, own["scene"], config["scene"])
     env = env_from_config(config, num_envs=1, num_workers=0)
     policy = policy_from_config(config, env, trust=config["trust"])
     env.close()
@@ -247,6 +249,22 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
     device = choose_device(config["device"])
     agent = Agent.from_config(policy, config, device)
     return Subject(run, config, agent, state["frames"])
+
+
+def check_scene(run: RunFolder, own: Config, asked: Config) -> None:
+    """Checks that episodes in a scene can't be taken for some in the run's own scene.
+
+    Raises:
+        UsageError: it has the name of the run's own scene and differs from it.
+    """
+    if asked["name"] != own["name"]:
+        return
+    for place, there, here in differences(own, asked, "scene"):
+        raise UsageError(
+            f"{run.path} was trained with {place}={shown(there)}, and rows with {shown(here)} "
+            f"would be taken for the same scene, '{own['name']}': give this one another name with "
+            "scene.name=, or leave scene= out"
+        )
 
 
 def film(asked: Config, subject: Subject) -> None:

@@ -13,8 +13,9 @@ pytest.importorskip("pybullet", reason="agents are evaluated in the simulated st
 
 from flowrep.agent import CheckpointError
 from flowrep.baselines import Drive
+from flowrep.config import UsageError
 from flowrep.envs import WorkerError
-from flowrep.evaluate import evaluate
+from flowrep.evaluate import evaluate, load_subject
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
@@ -111,6 +112,14 @@ def test_an_agent_drives_in_another_scene_when_that_is_asked_for(untouched):
     evaluate(asked(run, "scene=s_turn", "baselines=[never_turn]"), [run])
     assert {row["scene"] for row in rows_of(run)} == {"s_turn"}
     assert len(rows_of(run)) == 4
+
+
+def test_a_changed_scene_needs_a_name_of_its_own(run):
+    with pytest.raises(UsageError, match=r"with scene\.time_limit_steps=200, .* rows with 3 would"):
+        load_subject(asked(run, "scene=straight_road", "scene.time_limit_steps=3"), run)
+    changed = "scene=straight_road", "scene.time_limit_steps=3", "scene.name=short"
+    for scene in (changed, changed[:1]):  # the latter is its own
+        load_subject(asked(run, *scene), run)
 
 
 def test_an_agent_that_reads_classes_is_told_that_another_scene_has_others(tmp_path):
