@@ -92,13 +92,26 @@ def run(config: DictConfig) -> None:
         if own:
             evaluate_own(asked, own)
             return
-        runs = [run for path in as_list(asked["run"]) for run in RunFolder.all_in(path)]
+        runs = runs_in(as_list(asked["run"]))
         with ExitStack() as stack:
             for folder in runs:
                 stack.enter_context(folder.held("evaluating"))
             evaluate(asked, runs)
     except MISTAKES as error:
         exit_with(error)
+
+
+def runs_in(paths: Sequence[str]) -> list[RunFolder]:
+    """Returns the runs in folders of runs and of sweeps, each once.
+
+    Raises:
+        RunFolderError: there is no run in one of them.
+    """
+    runs: dict[Path, RunFolder] = {}
+    for path in paths:
+        for run in RunFolder.all_in(path):
+            runs.setdefault(run.path.resolve(), run)
+    return list(runs.values())
 
 
 def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:

@@ -15,7 +15,7 @@ from flowrep.agent import CheckpointError
 from flowrep.baselines import Drive
 from flowrep.config import UsageError
 from flowrep.envs import WorkerError
-from flowrep.evaluate import evaluate, load_subject
+from flowrep.evaluate import evaluate, load_subject, runs_in
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
@@ -105,6 +105,12 @@ def test_the_runs_of_a_sweep_are_evaluated_together_on_the_same_episodes(untouch
         assert len(rows_of(run)) == 4
     finally:
         shutil.rmtree(other.path)
+
+
+def test_a_run_that_is_named_twice_is_evaluated_once(run, tmp_path):
+    (tmp_path / "link").symlink_to(run.path)
+    named = [run.path, run.path.parent, tmp_path / "link", f"{run.path}/../{run.path.name}"]
+    assert [each.path for each in runs_in(named)] == [run.path]
 
 
 def test_an_agent_drives_in_another_scene_when_that_is_asked_for(untouched):

@@ -168,9 +168,10 @@ class ListOf(Expectation):
         return core_schema.union_schema([each, different]) if self.or_one else different
 
     def _words(self) -> str:
+        if self.or_one:
+            return f"{self.each._words()}, or a list of different such values"
         many = "one or more different values" if self.least else "different values"
-        words = f"a list of {many}, each {self.each._words()}"
-        return f"{self.each._words()}, or a list of such values" if self.or_one else words
+        return f"a list of {many}, each {self.each._words()}"
 
     def _names(self) -> tuple[str, ...]:
         return self.each._names()

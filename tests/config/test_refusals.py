@@ -267,31 +267,42 @@ def test_everything_that_is_wrong_is_said_at_once():
         ("run=null", "'run' needs a value: run=..."),
         (
             "run=3",
-            "run should be a run folder, or a sweep's, or a list of such values, or null, not 3",
+            "run should be a run folder, or a sweep's, or a list of different such values, or "
+            "null, not 3",
         ),
         (
             "run=here policy=mine.py:make scene=s_turn representations=[ego]",
             "run and policy=mine.py:make can't be combined: give one of them",
         ),
         ("run=here output=out", "output is for a policy of your own; run= has it in its config"),
-        ("speed=[]", "speed should be low, normal or high, or a list of such values, not []"),
+        (
+            "speed=[]",
+            "speed should be low, normal or high, or a list of different such values, not []",
+        ),
         (
             "speed=hihg",
-            "speed should be low, normal or high, or a list of such values, not 'hihg' "
+            "speed should be low, normal or high, or a list of different such values, not 'hihg' "
             "(did you mean 'high'?)",
         ),
-        ("fps=[]", "fps should be a number above 0, or a list of such values, not []"),
-        ("fps=nan", "fps should be a number above 0, or a list of such values, not nan"),
-        ("fps=[12,0]", "fps should be a number above 0, or a list of such values, not [12, 0]"),
+        ("fps=[]", "fps should be a number above 0, or a list of different such values, not []"),
+        ("fps=nan", "fps should be a number above 0, or a list of different such values, not nan"),
+        (
+            "fps=[12,12.0]",
+            "fps should be a number above 0, or a list of different such values, not [12, 12.0]",
+        ),
+        (
+            "fps=[12,0]",
+            "fps should be a number above 0, or a list of different such values, not [12, 0]",
+        ),
         (
             "policy=[]",
             "policy should be greedy, sampled, path.py:make, package.module:make or path.pt2, or a "
-            "list of such values, not []",
+            "list of different such values, not []",
         ),
         (
             "policy=gredy",
             "policy should be greedy, sampled, path.py:make, package.module:make or path.pt2, or a "
-            "list of such values, not 'gredy' (did you mean 'greedy'?)",
+            "list of different such values, not 'gredy' (did you mean 'greedy'?)",
         ),
         (
             "policy=[greedy,mine.py:make]",
