@@ -38,7 +38,7 @@ FLOWREP_IMPORTS_ALLOWED = {
         "simulator",
     }
     | {"sequences", "transforms", "geometry", "config_tree", "console"},
-    "report": {"report", "evaluate", "viz", "config", "experiment", "agent", "envs", "scenes"}
+    "report": {"report", "subjects", "viz", "config", "experiment", "agent", "envs", "scenes"}
     | {"config_tree", "console", "extras"},
 }
 THIRD_PARTY_ONLY_IN = {

@@ -15,13 +15,15 @@ from flowrep.agent import CheckpointError
 from flowrep.baselines import Drive
 from flowrep.config import UsageError
 from flowrep.envs import WorkerError
-from flowrep.evaluate import evaluate, load_subject, runs_in
+from flowrep.evaluate import evaluate, runs_in
 from flowrep.experiment.env_pool import EnvPool
+from flowrep.experiment.evaluation import Episode
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import train
 from flowrep.export import export
+from flowrep.subjects import Subject, load_subject
 from flowrep.train import make_training
 from flowrep.viz.curves import _evaluated
 from tests.test_configs import composed
@@ -181,6 +183,100 @@ def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypa
     monkeypatch.setattr("flowrep.evaluate.compare", lambda *_: pytest.fail("too late"))
     with pytest.raises(TableError, match="lacks the columns"):
         evaluate(asked(run), [run])
+
+
+class SomeArena:
+    """Runs nothing: an episode's return is its frame rate. `look` is called after each ride."""
+
+    def __init__(self, order=1, look=lambda: None):
+        self.order, self.look = order, look
+
+    def run(self, jobs):
+        for number, job in list(enumerate(jobs))[:: self.order]:
+            yield number, Episode(job.episode_seed, "success", "", job.fps, 5)
+            self.look()
+
+    def drive(self, jobs):
+        for number, (_, options) in enumerate(jobs):
+            yield number, Drive(options["episode_seed"], "timeout", "", -5.0, 7)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def some(tmp_path, monkeypatch):
+    """Makes runs whose agents drive in an arena, by default `SomeArena`."""
+
+    def make(*names, arena=None):
+        def load(asked, run):
+            if not run.path.name.startswith("good"):
+                raise CheckpointError(f"no checkpoint in {run.path}")
+            return Subject(run, config, None, 64, run.read_episodes())
+
+        same = {"representations": {"obj": {}}, "flow": {"source": "exact"}, "renderer": "auto"}
+        config = same | {"scene": {"name": "s_turn"}, "seed": 0, "num_envs": 2}
+        monkeypatch.setattr("flowrep.evaluate.load_subject", load)
+        monkeypatch.setattr("flowrep.evaluate.arena_from_config", lambda *_: arena or SomeArena())
+        return [RunFolder(tmp_path / name) for name in names]
+
+    return make
+
+
+def test_what_is_complete_is_saved_before_the_rest_is_run(some):
+    (run,) = some("good", arena=SomeArena(look=lambda: saved.append(len(run.read_episodes()))))
+    saved = []
+    evaluate(asked(run, "fps=[12,6]", "baselines=[random]"), [run])
+    assert saved == [0, 2, 2, 4]
+    assert len(rows_of(run)) == 8
+
+
+def test_the_order_in_which_episodes_end_is_not_seen_in_the_table(some):
+    many = "fps=[12,6]", "speed=[low,high]", "policy=[greedy,sampled]", "baselines=[random]"
+    (run,) = some("good")
+    evaluate(asked(run, *many), [run])
+    (backwards,) = some("good_backwards", arena=SomeArena(order=-1))
+    evaluate(asked(backwards, *many), [backwards])
+    assert backwards.evaluation_path.read_bytes() == run.evaluation_path.read_bytes()
+
+
+def test_a_run_that_can_not_be_saved_costs_no_other_its_episodes(some, capsys):
+    runs = some("good_1", "good_2")
+    (runs[0].path / "evaluation.tmp").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        evaluate(asked(runs[0]), runs)
+    assert ended.value.code == 1
+    assert len(rows_of(runs[1])) == 2
+    said = capsys.readouterr()
+    assert f"error: {runs[0].path}: " in said.err
+    assert f"2 episodes are in {runs[1].evaluation_path}" in said.out
+
+
+def test_all_is_saved_before_the_first_line_is_printed(some, monkeypatch):
+    def closed(*_):
+        raise BrokenPipeError
+
+    runs = some("good_1", "good_2")
+    monkeypatch.setattr("flowrep.evaluate.print_table", closed)
+    with pytest.raises(BrokenPipeError):
+        evaluate(asked(runs[0]), runs)
+    assert len(rows_of(runs[0])) == len(rows_of(runs[1])) == 2
+
+
+def test_a_run_that_can_not_be_evaluated_is_named_and_the_others_are(some, capsys):
+    runs = some("bad_1", "good", "bad_2")
+    with pytest.raises(SystemExit) as ended:
+        evaluate(asked(runs[0]), runs)
+    assert ended.value.code == 1
+    assert len(rows_of(runs[1])) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert [line for line in said if line.startswith("error")] == [
+        f"error: no checkpoint in {runs[0].path}",
+        f"error: no checkpoint in {runs[2].path}",
+        f"error: not evaluated or not saved, see above: {runs[0].path}, {runs[2].path}",
+    ]
+    with pytest.raises(CheckpointError, match="bad_2"):
+        evaluate(asked(runs[0]), [runs[0], runs[2]])
 
 
 def test_a_worker_that_dies_is_one_line_and_what_was_run_is_kept(untouched, monkeypatch):

@@ -22,6 +22,7 @@ __all__ = [
     "line_for",
     "own_keys",
     "plain_config",
+    "print_error",
     "register_resolvers",
     "run_command",
     "typed_value",
@@ -72,9 +73,14 @@ def exit_with(problem: str | Exception) -> NoReturn:
     """
     if isinstance(problem, BrokenPipeError):
         exit_unread()
+    print_error(problem)
+    sys.exit(EXIT_USAGE)
+
+
+def print_error(problem: str | Exception) -> None:
+    """Prints each line of a problem, without ending the process."""
     for line in str(problem).splitlines():
         print(f"error: {line}", file=sys.stderr)
-    sys.exit(EXIT_USAGE)
 
 
 def line_for(command: str, **values: str) -> str:

@@ -79,12 +79,19 @@ class Comparison:
         cells = [*self._rides, *self._drives]
         return all(len(self._done[cell]) == len(self._seeds) for cell in cells)
 
-    def run(self, arena: AnyArena, should_stop: Callable[[], bool] = lambda: False) -> None:
+    def run(
+        self,
+        arena: AnyArena,
+        should_stop: Callable[[], bool] = lambda: False,
+        save: Callable[[int], None] = lambda agent: None,
+    ) -> None:
         """Runs the episodes; finished ones are kept even if it is interrupted.
 
         Args:
             arena: an arena with as many agents.
             should_stop: called after each episode.
+            save: called with an agent's number when all its episodes with one policy, speed and
+                frame rate have been run.
         """
         count = len(self._seeds)
         rides = [(cell, k) for cell in self._rides for k in range(count)]
@@ -97,13 +104,17 @@ class Comparison:
         total = len(rides) + len(drives)
         with tqdm(total=total, unit="episode", desc="evaluating", leave=False) as bar:
             for number, episode in arena.run(jobs):
-                self._keep(rides[number], episode)
+                cell, k = rides[number]
+                self._done[cell][k] = episode
                 bar.update()
+                if len(self._done[cell]) == count:
+                    save(jobs[number].agent)
                 if should_stop():
                     return
             for number, drive in arena.drive(driven):
                 ended = drive.outcome, drive.hit, drive.total_reward, drive.steps
-                self._keep(drives[number], Episode(drive.episode_seed, *ended))
+                cell, k = drives[number]
+                self._done[cell][k] = Episode(drive.episode_seed, *ended)
                 bar.update()
                 if should_stop():
                     return
@@ -128,10 +139,6 @@ class Comparison:
 
     def _options(self, cell: _Cell, k: int) -> Options:
         return {"episode_seed": self._seeds[k], "speed": cell.speed, "frame_rate_hz": cell.fps}
-
-    def _keep(self, place: tuple[_Cell, int], episode: Episode) -> None:
-        cell, k = place
-        self._done[cell][k] = episode
 
 
 def with_origin(

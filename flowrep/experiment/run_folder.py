@@ -1,6 +1,6 @@
 """A run's folder: resolved config, metrics as CSV and TensorBoard, checkpoint, evaluation."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ from flowrep.experiment.folder_lock import folder_lock
 from flowrep.experiment.scalars import evaluation_scalars
 from flowrep.experiment.tables import TableError, append_rows, is_whole, read_rows, write_rows
 from flowrep.experiment.weights_and_biases import open_wandb
+
+Rows = Sequence[Mapping[str, str]]
 
 EVALUATION_COLUMNS = (
     "scene",
@@ -255,22 +257,34 @@ class RunFolder:
             _check_cell(path, number, row, "outcome", OUTCOMES.index)
         return rows
 
-    def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Adds evaluated episodes to evaluation.csv, and their means to TensorBoard and wandb.
+    def log_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
+        """Saves evaluated episodes, and logs their means to TensorBoard and wandb.
+
+        Args and errors are those of `save_episodes`.
+        """
+        rows = list(rows)
+        self.save_episodes(rows, table)
+        for frames, scalars in evaluation_scalars(rows).items():
+            self._plot(frames, scalars)
+
+    def save_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
+        """Adds evaluated episodes to evaluation.csv.
 
         An episode that the table already has, with the same policy, frames, speed and frame rate,
         is replaced in place, so that evaluating it again leaves the table unchanged.
 
+        Args:
+            rows: the episodes.
+            table: the rows to add them to, those of the file if None. With the rows from before an
+                evaluation, episodes can be saved as they end and still stand in order.
+
         Raises:
             TableError: as `read_episodes`; nothing is written then.
         """
-        rows = [{name: str(row[name]) for name in EVALUATION_COLUMNS} for row in rows]
-        table = {
-            tuple(row[name] for name in _EPISODE): row for row in (*self.read_episodes(), *rows)
-        }
-        write_rows(self.evaluation_path, table.values(), EVALUATION_COLUMNS)
-        for frames, scalars in evaluation_scalars(rows).items():
-            self._plot(frames, scalars)
+        before = self.read_episodes() if table is None else table
+        new = [{name: str(row[name]) for name in EVALUATION_COLUMNS} for row in rows]
+        by_episode = {tuple(row[name] for name in _EPISODE): row for row in (*before, *new)}
+        write_rows(self.evaluation_path, by_episode.values(), EVALUATION_COLUMNS)
 
 
 def _check_cell(

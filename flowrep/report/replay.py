@@ -14,7 +14,6 @@ from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
-from flowrep.evaluate import load_subject
 from flowrep.experiment.arena import Agent
 from flowrep.experiment.run_folder import RunFolder
 from flowrep.report.drives import Drives, Film, FilmPart, Plan
@@ -24,6 +23,7 @@ from flowrep.report.runs import Condition, Run
 from flowrep.report.style import words
 from flowrep.scenes import load_scene
 from flowrep.scenes.layout import Layout
+from flowrep.subjects import load_subject
 from flowrep.viz.film import Maps, maps_of
 from flowrep.viz.maps import representation_strip, write_video
 from flowrep.viz.plan import Track, draw_plan
