@@ -138,9 +138,18 @@ class Preview:
         """Returns overrides together with those of `hydra.sweeper.params` in an experiment.
 
         Typed overrides take precedence.
+
+        Raises:
+            UsageError: there are several experiments, each with sweeps of its own.
         """
         if not self.is_multirun:
             return [*parsed]
+        for override in (o for o in parsed if o.key_or_group == "experiment"):
+            if len(self._values(override)) > 1:
+                raise UsageError(
+                    f"'{override.input_line}' is several experiments, each with runs of its own: "
+                    "give each in a command of its own"
+                )
         params = OmegaConf.select(self.hydra_config(parsed), "sweeper.params") or {}
         typed = {override.get_key_element() for override in parsed}
         added = [f"{key}={value}" for key, value in params.items() if key not in typed]

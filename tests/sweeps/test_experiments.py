@@ -62,6 +62,12 @@ def test_what_is_typed_replaces_what_the_experiment_sweeps():
     assert {run["seed"] for run in runs} == {"7", "8"}
 
 
+@pytest.mark.parametrize("names", ["resolution,sensor_noise", "glob(f*)"])
+def test_experiments_are_swept_one_at_a_time(names):
+    with pytest.raises(UsageError, match=r"is several experiments, .* give each in a command of"):
+        check_command("train", ["-m", f"experiment={names}"])
+
+
 def test_flow_is_estimated_in_half_of_the_runs_that_compare_it():
     flows = Counter(run["flow"] for run in runs_of("experiment=estimated_flow"))
     assert flows == {"exact": 6, "estimated": 6}
