@@ -6,10 +6,11 @@ from pydantic import model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from flowrep.baselines.registry import BASELINES
-from flowrep.config.expectations import Count, CountOrZero, ListOf, Number, OneOf, Seed, Text
+from flowrep.config.expectations import Count, CountOrZero, ListOf, OneOf, Seed, Text
 from flowrep.config.representations import BY_SOURCE, Noise, Representations
 from flowrep.config.section import Section
 from flowrep.config.training import (
+    FRAME_RATE,
     SPEEDS,
     Device,
     Path,
@@ -50,7 +51,7 @@ class EvaluateConfig(Section):
     flow: Annotated[Any, BY_SOURCE] = None
     noise: Noise | None = None
     speed: Annotated[Any, ListOf(OneOf(SPEEDS), or_one=True)]
-    fps: Annotated[Any, ListOf(Number(above=0), or_one=True)]
+    fps: Annotated[Any, ListOf(FRAME_RATE, or_one=True)]
     episodes: Count
     policy: Annotated[Any, ListOf(Policy(POLICIES), or_one=True)]
     output: Path

@@ -22,10 +22,12 @@ from flowrep.config.representations import BY_SOURCE, Noise, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
 from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
+from flowrep.scenes.fields import FRAME_RATES_HZ
 from flowrep.scenes.scene import SpeedMode
 from flowrep.simulator.renderer import RENDERERS
 
 SPEEDS: tuple[str, ...] = get_args(SpeedMode)
+FRAME_RATE = Number(least=FRAME_RATES_HZ[0], most=FRAME_RATES_HZ[1])
 
 Speed = Annotated[str, OneOf(SPEEDS)]
 Device = Annotated[str, Text("auto, cpu, cuda or cuda:<number>", r"^(auto|cpu|cuda(:\d+)?)$")]
@@ -41,7 +43,7 @@ class Evaluation(Section):
     episodes: Count
     final_episodes: Count
     speeds: Annotated[list[str], ListOf(OneOf(SPEEDS))]
-    fps: Annotated[list[float], ListOf(Number(above=0))]
+    fps: Annotated[list[float], ListOf(FRAME_RATE)]
     baselines: Annotated[list[str], ListOf(OneOf(tuple(BASELINES)), least=0)]
     video: Switch
 

@@ -1,13 +1,14 @@
 """The config of `flowrep.view`, conf/view.yaml."""
 
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field
 
 from flowrep.baselines.registry import BASELINES
-from flowrep.config.expectations import Count, Number, OneOf, Seed, Switch, Text
+from flowrep.config.expectations import Count, OneOf, Seed, Switch, Text
 from flowrep.config.section import Section
-from flowrep.config.training import SceneSection, Speed
+from flowrep.config.training import FRAME_RATE, SceneSection, Speed
 
 
 class ViewConfig(Section):
@@ -16,7 +17,7 @@ class ViewConfig(Section):
     scene: SceneSection = Field(examples=["straight_road"])
     policy: Annotated[str, OneOf(tuple(BASELINES))]
     speed: Speed
-    frame_rate_hz: Annotated[float | None, Number(above=0, also=(None,))]
+    frame_rate_hz: Annotated[float | None, replace(FRAME_RATE, also=(None,))]
     path: Annotated[str | None, Text("the name of a path of the scene", also=(None,))]
     seed: Seed
     episodes: Count

@@ -13,7 +13,7 @@ from flowrep.envs.episode import Episode, Moment, Rules, ticks_a_step
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
-from flowrep.scenes.fields import MOST_DRIVING_MPS, MOST_WALKING_MPS
+from flowrep.scenes.fields import FRAME_RATES_HZ, MOST_DRIVING_MPS, MOST_WALKING_MPS
 from flowrep.scenes.loading import load_scene
 from flowrep.scenes.scene import Range, Scene, SpeedMode
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
@@ -247,8 +247,11 @@ def _vehicle_speed(scene: Scene, vehicle_speed_mps: float | None) -> float:
 
 def _frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
     rate = scene.frame_rate_hz if frame_rate_hz is None else float(frame_rate_hz)
-    if not 0.5 <= rate <= 1000.0:
-        raise ValueError(f"frame_rate_hz is {rate}; give a rate from 0.5 to 1000, say 12")
+    lowest, highest = FRAME_RATES_HZ
+    if not lowest <= rate <= highest:
+        raise ValueError(
+            f"frame_rate_hz is {rate}; give a rate from {lowest:g} to {highest:g}, say 12"
+        )
     return rate
 
 

@@ -18,6 +18,9 @@ MOST_WALKING_MPS = 20.0
 MOST_DRIVING_MPS = 100.0
 """Greatest speeds of people and of the vehicle."""
 
+FRAME_RATES_HZ = (0.5, 1_000.0)
+"""Lowest and highest frame rate of an environment."""
+
 
 class Part:
     """Base of the dataclasses read from a mapping whose keys are exactly their fields."""
@@ -44,7 +47,7 @@ Stride = Annotated[float, Strict(), Field(ge=0.1, le=MOST_METRES)]
 Angle = Annotated[float, Strict(), Field(ge=-360.0, le=360.0)]
 WalkingSpeed = Annotated[float, Strict(), Field(ge=0.0, le=MOST_WALKING_MPS)]
 
-FrameRate = Annotated[float, Strict(), Field(ge=0.5, le=1_000.0)]
+FrameRate = Annotated[float, Strict(), Field(ge=FRAME_RATES_HZ[0], le=FRAME_RATES_HZ[1])]
 Steps = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
 Seed = Annotated[int, Strict(), Field(ge=0, le=2**32 - 1)]
 Pixels = Annotated[int, Strict(), Field(ge=1, le=4096)]

@@ -125,6 +125,11 @@ def refusal(command, schema, line):
             "evaluation.speeds should be a list of one or more different values, each low, normal "
             "or high, not ['low', 'low']",
         ),
+        (
+            "evaluation.fps=[12,0.1]",
+            "evaluation.fps should be a list of one or more different values, each a number from "
+            "0.5 to 1000, not [12, 0.1]",
+        ),
         ("evaluation.video=maybe", "evaluation.video should be true or false, not 'maybe'"),
         (
             "speed=norml",
@@ -284,15 +289,23 @@ def test_everything_that_is_wrong_is_said_at_once():
             "speed should be low, normal or high, or a list of different such values, not 'hihg' "
             "(did you mean 'high'?)",
         ),
-        ("fps=[]", "fps should be a number above 0, or a list of different such values, not []"),
-        ("fps=nan", "fps should be a number above 0, or a list of different such values, not nan"),
+        (
+            "fps=[]",
+            "fps should be a number from 0.5 to 1000, or a list of different such values, not []",
+        ),
+        (
+            "fps=nan",
+            "fps should be a number from 0.5 to 1000, or a list of different such values, not nan",
+        ),
         (
             "fps=[12,12.0]",
-            "fps should be a number above 0, or a list of different such values, not [12, 12.0]",
+            "fps should be a number from 0.5 to 1000, or a list of different such values, "
+            "not [12, 12.0]",
         ),
         (
             "fps=[12,0]",
-            "fps should be a number above 0, or a list of different such values, not [12, 0]",
+            "fps should be a number from 0.5 to 1000, or a list of different such values, "
+            "not [12, 0]",
         ),
         (
             "policy=[]",
@@ -331,8 +344,11 @@ def test_an_evaluation_takes_one_value_or_a_list(line):
         ("episodes=0", "episodes should be a positive whole number, not 0"),
         ("sheet_rows=true", "sheet_rows should be a positive whole number, not true"),
         ("seed=-1", "seed should be a whole number from 0 to 2147483647, not -1"),
-        ("frame_rate_hz=0", "frame_rate_hz should be a number above 0, or null, not 0"),
-        ("frame_rate_hz=slow", "frame_rate_hz should be a number above 0, or null, not 'slow'"),
+        ("frame_rate_hz=0", "frame_rate_hz should be a number from 0.5 to 1000, or null, not 0"),
+        (
+            "frame_rate_hz=slow",
+            "frame_rate_hz should be a number from 0.5 to 1000, or null, not 'slow'",
+        ),
         ("interactive=maybe", "interactive should be true or false, not 'maybe'"),
     ],
 )
