@@ -119,10 +119,12 @@ def test_config_comes_back_as_written(tmp_path):
         ("- 1\n- 2\n", "holds a list"),
         ("seed: [1", "can't be read"),
         ("\x00", "can't be read"),
+        ("seed: 2001-99-99", "can't be read"),
+        ("[" * 500, "can't be read"),
         ("seed: 0\nscene: {name: s}\n", "has no representations"),
         ("seed:\n", "has no scene"),
     ],
-    ids=["empty", "list", "half", "binary", "a key is missing", "a value is missing"],
+    ids=["empty", "list", "half", "binary", "date", "deep", "a missing key", "a missing value"],
 )
 def test_a_damaged_config_is_named(tmp_path, text, says):
     (tmp_path / "config.yaml").write_text(text)
