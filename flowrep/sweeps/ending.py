@@ -1,6 +1,7 @@
 """The ending of a sweep's run, kept in its folder."""
 
 import json
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -31,9 +32,19 @@ class Ending:
         whole.write_text(json.dumps(asdict(self)) + "\n", encoding="utf-8")
         whole.replace(folder / "ending.json")
 
+    def keep(self, folder: Path) -> None:
+        """Writes it to a run's folder; if that fails, prints it, and this process remembers it."""
+        try:
+            self.write(folder)
+        except OSError as error:
+            _UNWRITTEN[folder.resolve()] = self
+            print(f"{folder}: {self.how}: {self.message} (not saved: {error})", file=sys.stderr)
+
     @classmethod
     def read(cls, folder: Path) -> "Ending | None":
         """Returns the ending in a run's folder, None while the run has not ended."""
+        if folder.resolve() in _UNWRITTEN:
+            return _UNWRITTEN[folder.resolve()]
         try:
             return cls(**json.loads((folder / "ending.json").read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
@@ -42,4 +53,8 @@ class Ending:
     @staticmethod
     def forget(folder: Path) -> None:
         """Removes the ending from a run's folder."""
+        _UNWRITTEN.pop(folder.resolve(), None)
         (folder / "ending.json").unlink(missing_ok=True)
+
+
+_UNWRITTEN: dict[Path, Ending] = {}  # by folder

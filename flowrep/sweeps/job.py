@@ -97,6 +97,15 @@ def supervised(request: Mapping[str, Any], should_stop: Callable[[], bool]) -> E
         should_stop: polled; once it returns true, the run saves and ends.
     """
     folder = Path(request["folder"])
+    try:
+        return _attempted(folder, request, should_stop)
+    except Exception as error:  # the other runs go on, and the summary has the reason
+        ending = Ending(FAILED, message=" ".join(f"error: {error}".split()))
+        ending.keep(folder)
+        return ending
+
+
+def _attempted(folder: Path, request: Mapping[str, Any], should_stop: Callable[[], bool]) -> Ending:
     ending = Ending.read(folder)
     if ending is not None and ending.how == FINISHED and _is_same(folder, request["config"]):
         return ending
@@ -112,8 +121,10 @@ def supervised(request: Mapping[str, Any], should_stop: Callable[[], bool]) -> E
             RUN, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
         ) as run:
             code = _wait(run, json.dumps(request), should_stop)
-    ending = Ending.read(folder) or _without_result(folder / LOG, begin, code)
-    ending.write(folder)
+    ending = Ending.read(folder)
+    if ending is None:
+        ending = _without_result(folder / LOG, begin, code)
+        ending.keep(folder)
     return ending
 
 
@@ -155,16 +166,16 @@ def _is_same(folder: Path, config: Mapping[str, Any]) -> bool:
     """Returns whether `config` defines a run; `flowrep.sweeps.__main__` reports a difference."""
     try:
         stored = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError):
+    except (OSError, yaml.YAMLError, ValueError, RecursionError):
         return False
-    return definition(stored) == definition(config)
+    return isinstance(stored, dict) and definition(stored) == definition(config)
 
 
 def definition(config: Any) -> Any:
     """Returns the part of a config that defines a run, as plain JSON data."""
     machine = ("device", "num_workers", "trust", "resume")
     kept = {k: v for k, v in config.items() if k not in machine} if config else config
-    return json.loads(json.dumps(kept))
+    return json.loads(json.dumps(kept, default=str))  # str: of a date
 
 
 def _leave_ctrl_c_to_the_launcher() -> None:

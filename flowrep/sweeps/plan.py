@@ -35,7 +35,7 @@ class Plan:
         """Returns the folders of its runs, only the existing ones if a sweeper names them."""
         if self.names:
             return [self.folder / name for name in self.names]
-        return sorted(path for path in self.folder.glob("*/") if (path / "job.log").is_file())
+        return sorted(path for path in self.folder.glob("*/") if (path / "job.log").exists())
 
 
 def is_sweep(arguments: Sequence[str]) -> bool:

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import yaml
-
 from flowrep.sweeps.ending import Ending
 
 WAITING, RUNNING = "waiting", "running"
@@ -42,8 +40,10 @@ def standing_of(run: Path) -> Standing:
     if not _is_held(run):
         return Standing(run.name, WAITING)
     row = _last_row(run / "metrics.csv")
-    frames = int(row.get("frames") or 0)
-    success = float(row.get("success") or "nan")
+    try:
+        frames, success = int(row.get("frames") or 0), float(row.get("success") or "nan")
+    except ValueError:  # another program changed the table; the run itself says so
+        frames, success = 0, float("nan")
     known = None if success != success else success
     return Standing(run.name, RUNNING, frames, _total_frames(run), known)
 
@@ -69,7 +69,7 @@ def _last_row(table: Path) -> dict[str, str]:
     """Returns the last complete row of a table by its columns, empty if there is none."""
     try:
         with table.open("rb") as file:
-            names = file.readline().decode().strip().split(",")
+            names = file.readline().decode(errors="replace").strip().split(",")
             file.seek(max(file.tell(), table.stat().st_size - 4096))
             lines = file.read().decode(errors="replace").split("\n")[:-1]
     except OSError:
@@ -80,8 +80,8 @@ def _last_row(table: Path) -> dict[str, str]:
 
 def _total_frames(run: Path) -> int:
     try:
-        text = (run / "config.yaml").read_text(encoding="utf-8")
-    except OSError:
+        text = (run / "config.yaml").read_text(encoding="utf-8", errors="replace")
+        lines = [line for line in text.splitlines() if line.startswith("total_frames:")]
+        return int(lines[0].partition(":")[2]) if lines else 0
+    except (OSError, ValueError):
         return 0
-    lines = [line for line in text.splitlines() if line.startswith("total_frames:")]
-    return int(yaml.safe_load(lines[0])["total_frames"]) if lines else 0

@@ -36,6 +36,13 @@ def test_a_run_stands_where_its_last_whole_row_says(tmp_path):
     assert standing_of(run) == Standing("run", "failed", message="error: x")
 
 
+def test_a_run_whose_files_were_damaged_is_running_as_far_as_is_known(tmp_path):
+    run = running(tmp_path / "run")
+    (run / "config.yaml").write_bytes(b"\xff\ntotal_frames: many\n")
+    (run / "metrics.csv").write_bytes(b"frames,success,\xff\nfew,0.5,0\n")
+    assert standing_of(run) == Standing("run", "running")
+
+
 def test_a_run_whose_process_is_gone_waits(tmp_path):
     run = running(tmp_path / "run", pid=2**22 + 1)  # above the largest there can be
     assert standing_of(run).state == "waiting"

@@ -81,6 +81,38 @@ def test_a_run_that_fails_says_why_and_is_tried_again(request_for, tmp_path, cod
     assert job.supervised(request_for(FINISHES), never).how == "finished"
 
 
+@pytest.mark.parametrize(
+    "damage", [b"\xff", b"- 1\n", b"seed: 2001-99-99\n", b"seed: 2001-01-01\n"]
+)
+def test_a_finished_run_whose_config_was_damaged_is_not_taken_for_finished(
+    request_for, tmp_path, damage
+):
+    job.supervised(request_for(FINISHES), never)
+    (tmp_path / "config.yaml").write_bytes(damage)
+    ending = job.supervised(request_for("print('error: config.yaml'); sys.exit(2)"), never)
+    assert ending == Ending.read(tmp_path) == Ending("failed", message="error: config.yaml")
+
+
+def test_a_run_that_can_not_be_started_has_failed(request_for, tmp_path):
+    (tmp_path / "job.log").mkdir()
+    ending = job.supervised(request_for(FINISHES), never)
+    assert ending == Ending.read(tmp_path)
+    assert ending.how == "failed"
+    assert ending.message.endswith(f"Is a directory: '{tmp_path}/job.log'")
+
+
+def test_a_reason_that_can_not_be_written_is_remembered(request_for, tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Ending, "write", full)
+    ending = job.supervised(request_for("print('error: why'); sys.exit(1)"), never)
+    assert ending == Ending.read(tmp_path) == Ending("failed", message="error: why")
+    assert f"{tmp_path}: failed: error: why (not saved: [Errno 28]" in capsys.readouterr().err
+    Ending.forget(tmp_path)
+    assert Ending.read(tmp_path) is None
+
+
 def test_what_an_earlier_attempt_said_is_not_the_reason_of_the_next(request_for):
     job.supervised(request_for("print('error: old'); sys.exit(2)"), never)
     assert job.supervised(request_for("sys.exit(1)"), never).message == "exit code 1"
