@@ -17,7 +17,7 @@ pytest.importorskip("pybullet", reason="the commands need the simulator")
 
 from flowrep.envs import WorkerError
 from flowrep.experiment.run_folder import RunFolder
-from flowrep.train import carry_out
+from flowrep.train import carry_out, main
 
 MISTAKES = [
     ("representations=[eggo]", ["unknown representations 'eggo'", "'ego'", "depth2", "seg"]),
@@ -173,6 +173,20 @@ def test_a_worker_that_dies_while_a_run_is_built_is_one_line(tmp_path, monkeypat
     assert ended.value.code == 2
     said = capsys.readouterr().err
     assert said == "error: the worker process of environment 0 is gone (SIGKILL)\n"
+
+
+@pytest.mark.parametrize("key", ["hydra.run.dir", "hydra.sweep.dir"])
+def test_an_output_folder_that_can_not_be_made_is_one_line(key, tmp_path, monkeypatch, capsys):
+    (tmp_path / "taken").touch()
+    flag = ["-m"] if "sweep" in key else []
+    monkeypatch.setattr(sys, "argv", ["flowrep-train", *flag, f"{key}={tmp_path}/taken/run"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: the ")
+    assert said.endswith(f"'{tmp_path}/taken/run'): give another with {key}=\n")
+    assert said.count("\n") == 1
 
 
 def run_command(*arguments, cwd):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import env_override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -134,4 +135,10 @@ def run_command(config_name: str, command: Callable[[], Any], schema: type[Secti
             exit_with(error)
         if only_shows(args):
             end_when_unread()
-        command()
+        try:
+            with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra raises errors, not prints them
+                command()
+        except OSError as error:  # commands print their own
+            exit_with(
+                f"the output folder can't be made ({error}): give another with hydra.run.dir="
+            )

@@ -1,6 +1,7 @@
 """Starts, watches and sums up a sweep from the command line."""
 
 import sys
+import traceback
 from collections.abc import Sequence
 
 import hydra
@@ -18,6 +19,8 @@ from flowrep.sweeps.plan import Plan, plan_of
 from flowrep.sweeps.standing import Standing, standings_of
 from flowrep.sweeps.stopping import SweepStop
 
+_NO_RESULT = "No trials are completed"  # says Optuna if all failed or were stopped; so do we
+
 
 def run_sweep(config_name: str) -> None:
     """Runs the sweep of `sys.argv`, which has been checked, and ends the process.
@@ -28,15 +31,18 @@ def run_sweep(config_name: str) -> None:
         plan = plan_of(config_name, sys.argv[1:])
     except UsageError as error:
         exit_with(error)
-    plan.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        plan.folder.mkdir(parents=True, exist_ok=True)
+        for folder in plan.folders():
+            ending = Ending.read(folder)
+            if ending is not None and ending.how != FINISHED:
+                Ending.forget(folder)  # it is tried again
+    except OSError as error:
+        exit_with(f"the sweep's folder can't be used ({error}): give another with hydra.sweep.dir=")
     given = override("hydra.sweep.dir", str(plan.folder))
     typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
     again = shell_line("python", "-m", f"flowrep.{config_name}", *typed, given)
     sys.argv[1:] = [*typed, given, *plan.options]
-    for folder in plan.folders():
-        ending = Ending.read(folder)
-        if ending is not None and ending.how != FINISHED:
-            Ending.forget(folder)  # it is tried again
     command = hydra.main(
         version_base=VERSION_BASE, config_path=str(CONF_DIR), config_name=config_name
     )(job)
@@ -47,8 +53,12 @@ def run_sweep(config_name: str) -> None:
                 command()
         except KeyboardInterrupt:
             failure = 130
-        except SystemExit as end:  # the launcher failed, and Hydra has reported it
+        except SystemExit as end:
             failure = end.code if isinstance(end.code, int) else 1
+        except Exception as error:  # of the launcher or the sweeper
+            failure = 1
+            if _NO_RESULT not in str(error):
+                traceback.print_exc()
     standings = standings_of(plan.folders())
     is_whole = all(s.state == FINISHED for s in standings) and not failure
     sum_up(plan, standings, "" if is_whole else again)

@@ -8,6 +8,7 @@ import platform
 import pytest
 from rich.console import Console
 
+from flowrep.sweeps import sweep
 from flowrep.sweeps.display import Display
 from flowrep.sweeps.ending import Ending
 from flowrep.sweeps.plan import Plan
@@ -89,3 +90,24 @@ def test_the_summary_says_what_failed_where_its_log_is_and_how_to_go_on(tmp_path
         "Continue the remaining runs with",
         "  python -m flowrep.train -m",
     ]
+
+
+@pytest.mark.parametrize(
+    ("problem", "is_printed"),
+    [("No trials are completed yet.", False), ("the launcher is broken", True)],
+)
+def test_a_sweep_without_any_result_ends_in_its_summary(
+    tmp_path, monkeypatch, capsys, problem, is_printed
+):
+    def fails():
+        raise ValueError(problem)
+
+    monkeypatch.setattr(sweep, "plan_of", lambda *_: Plan(tmp_path, 1, ("a",)))
+    monkeypatch.setattr(sweep.hydra, "main", lambda **_: lambda job: fails)
+    monkeypatch.setattr("sys.argv", ["flowrep-train", "-m"])
+    with pytest.raises(SystemExit) as ended:
+        sweep.run_sweep("train")
+    assert ended.value.code == 1
+    said = capsys.readouterr()
+    assert "0 of 1 runs finished" in said.out
+    assert ("Traceback" in said.err) is is_printed
