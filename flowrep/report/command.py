@@ -115,10 +115,19 @@ def with_folders_named(arguments: Sequence[str]) -> list[str]:
 
     >>> with_folders_named(["outputs/a", "outputs/b", "videos=1", "--cfg", "job"])
     ['run=[outputs/a,outputs/b]', 'videos=1', '--cfg', 'job']
+
+    Raises:
+        UsageError: `run=` is given too.
     """
-    bare = [o for o in get_args_parser().parse_args([*arguments]).overrides if _is_folder(o)]
+    overrides = get_args_parser().parse_args([*arguments]).overrides
+    bare = [text for text in overrides if _is_folder(text)]
     if not bare:
         return list(arguments)
+    for text in overrides:
+        if text.startswith("run=") and text not in bare:
+            raise UsageError(
+                f"'{bare[0]}' and '{text}' are folders in two ways: write the names alone"
+            )
     if len(bare) == 1:
         value = override("run", bare[0])
     else:
@@ -132,5 +141,8 @@ def _is_folder(text: str) -> bool:
 
 def main() -> None:
     """Entry point; a mistake on the command line ends in one line that lists the choices."""
-    sys.argv[1:] = with_folders_named(sys.argv[1:])
+    try:
+        sys.argv[1:] = with_folders_named(sys.argv[1:])
+    except UsageError as error:
+        exit_with(error)
     run_command("report", run, ReportConfig)

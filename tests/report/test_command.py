@@ -42,6 +42,7 @@ def test_what_is_no_folder_stays_what_it_is():
         (["x", "policy=best"], "policy should be greedy or sampled, not 'best'"),
         (["x", "trajectories=-1"], "trajectories should be a whole number"),
         (["x", "vidoes=1"], "unknown key 'vidoes' (did you mean 'videos'?)"),
+        (["x", "run=y"], "'x' and 'run=y' are folders in two ways: write the names alone"),
     ],
 )
 def test_a_wrong_command_is_refused_by_name(arguments, expected):
