@@ -7,6 +7,7 @@ from torchrl.data import Composite
 
 from flowrep.agent import CheckpointError, load_checkpoint
 from flowrep.config import UsageError
+from flowrep.config.run_names import OF_THE_MACHINE
 from flowrep.config.training import validated_run
 from flowrep.config.violations import shown
 from flowrep.envs import street_envs
@@ -18,7 +19,7 @@ from flowrep.experiment.origin import check_origin, differences, origin_of
 from flowrep.experiment.run_folder import Rows, RunFolder
 from flowrep.from_config import Config, choose_device, env_from_config, policy_from_config
 
-OF_THE_MACHINE = ("device", "num_envs", "num_workers", "trust")  # of the evaluation, not of the run
+OF_THE_EVALUATION = (*OF_THE_MACHINE, "num_envs")  # not of the run
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
     path = run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(own), path)
-    here = {key: asked[key] for key in OF_THE_MACHINE}
+    here = {key: asked[key] for key in OF_THE_EVALUATION}
     scene = asked.get("scene")
     if scene is not None:  # the agent keeps its camera in other scenes
         here["scene"] = scene | {"camera": own["scene"]["camera"]}
@@ -102,7 +103,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
         PolicyError, TableError: as `check_card`, `load_policy` and `RunFolder.read_episodes`.
     """
     table = folder.read_episodes()
-    config = {key: asked[key] for key in (*OF_THE_MACHINE, "scene", "representations")}
+    config = {key: asked[key] for key in (*OF_THE_EVALUATION, "scene", "representations")}
     config |= {"flow": asked.get("flow") or {"source": "exact"}, "noise": asked.get("noise")}
     config |= {"renderer": "auto"}
     config |= {"speed": "normal", "seed": ""}  # of its training, which is unknown

@@ -36,6 +36,7 @@ from flowrep.config.command_line import (
     typed_value,
 )
 from flowrep.config.quoting import override
+from flowrep.config.run_names import OF_THE_MACHINE
 from flowrep.config.training import TrainConfig, validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import WorkerError
@@ -62,7 +63,6 @@ from flowrep.sweeps.sweep import run_sweep
 from flowrep.viz.curves import draw_learning_curve
 from flowrep.viz.film import record_episode
 
-OF_THE_MACHINE = ("device", "num_workers", "trust")  # from the command line that resumes a run
 FINAL_POLICIES = ("greedy", "sampled")  # the agent's, evaluated beside the baselines
 EVALUATION_ENVS = 96  # side by side at least: more make a step of each cheaper
 EVALUATION_SEED = 1_000_000  # of the first episode evaluated during training

@@ -7,7 +7,7 @@ from hashlib import sha1
 _BY_VALUE = (
     "experiment", "preset", "debug", "scene", "representations", "flow", "algorithm", "speed",
 )  # fmt: skip
-_OF_THE_MACHINE = ("device", "num_workers", "trust")
+OF_THE_MACHINE = ("device", "num_workers", "trust")  # keys that don't define a run
 _LONGEST = 100
 
 
@@ -26,7 +26,7 @@ def run_of_sweep(overrides: Iterable[str]) -> str:
     'laptop_s1_algorithm.tau-0.01'
     """
     values = dict(sorted(override.partition("=")[::2] for override in overrides))
-    for key in _OF_THE_MACHINE:
+    for key in OF_THE_MACHINE:
         values.pop(key, None)
     seed = values.pop("seed", None)
     words = [_plain(values.pop(key)) for key in _BY_VALUE if key in values]

@@ -22,6 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from flowrep.config.command_line import plain_config, register_resolvers
+from flowrep.config.run_names import OF_THE_MACHINE
 from flowrep.sweeps.ending import FAILED, FINISHED, LOG, STOPPED, Ending
 from flowrep.sweeps.stopping import is_stopped
 
@@ -173,8 +174,8 @@ def _is_same(folder: Path, config: Mapping[str, Any]) -> bool:
 
 def definition(config: Any) -> Any:
     """Returns the part of a config that defines a run, as plain JSON data."""
-    machine = ("device", "num_workers", "trust", "resume")
-    kept = {k: v for k, v in config.items() if k not in machine} if config else config
+    other = (*OF_THE_MACHINE, "resume")
+    kept = {k: v for k, v in config.items() if k not in other} if config else config
     return json.loads(json.dumps(kept, default=str))  # str: of a date
 
 
