@@ -242,6 +242,10 @@ def test_a_scene_file_that_kept_the_name_of_its_original_is_refused(tmp_path):
     with pytest.raises(UsageError, match="scene=back_alley has the name 's_turn'"):
         check_command("train", [*line[:2], "-m", "scene=s_turn,back_alley"])
     check_command("train", [*line, "scene.name=back_alley"], TrainConfig)
+    experiment = "# @package _global_\nscene: {name: slow_street, time_limit_steps: 100}\n"
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "slow.yaml").write_text(experiment)
+    check_command("train", [*line[:2], "scene=straight_road", "experiment=slow"], TrainConfig)
     renamed = original.replace("name: s_turn", "name: back_alley", 1)
     (tmp_path / "scene" / "back_alley.yaml").write_text(renamed)
     check_command("train", line, TrainConfig)

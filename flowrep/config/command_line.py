@@ -138,6 +138,8 @@ def run_command(config_name: str, command: Callable[[], Any], schema: type[Secti
         try:
             with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra raises errors, not prints them
                 command()
+        except BrokenPipeError as error:
+            exit_with(error)
         except OSError as error:  # commands print their own
             exit_with(
                 f"the output folder can't be made ({error}): give another with hydra.run.dir="

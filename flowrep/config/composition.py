@@ -7,7 +7,7 @@ refuses is examined again, to say what is wrong and what exists instead.
 
 import argparse
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -140,20 +140,25 @@ class Preview:
         Typed overrides take precedence.
 
         Raises:
-            UsageError: there are several experiments, each with sweeps of its own.
+            UsageError: there are several experiments, and one of them has such overrides.
         """
         if not self.is_multirun:
             return [*parsed]
-        for override in (o for o in parsed if o.key_or_group == "experiment"):
-            if len(self._values(override)) > 1:
+        for experiment in (o for o in parsed if o.key_or_group == "experiment"):
+            names = self._values(experiment)
+            others = [self._values(override)[0] for override in parsed if override != experiment]
+            if len(names) > 1 and any(self._params([*others, name]) for name in names):
                 raise UsageError(
-                    f"'{override.input_line}' is several experiments, each with runs of its own: "
+                    f"'{experiment.input_line}' is several experiments, each with runs of its own: "
                     "give each in a command of its own"
                 )
-        params = OmegaConf.select(self.hydra_config(parsed), "sweeper.params") or {}
+        params = self._params([self._values(override)[0] for override in parsed])
         typed = {override.get_key_element() for override in parsed}
         added = [f"{key}={value}" for key, value in params.items() if key not in typed]
         return [*self.parse(added), *parsed]
+
+    def _params(self, job: list[str]) -> Mapping[str, Any]:
+        return OmegaConf.select(self._explained_config(job).hydra, "sweeper.params") or {}
 
     def hydra_config(self, parsed: Sequence[Override]) -> DictConfig:
         """Returns Hydra's own part of the config for the first of a sweep's jobs."""
@@ -198,7 +203,7 @@ class Preview:
         except REFUSALS as error:
             raise UsageError(self._explained(error, parse(job))) from None
         _check_plugins(config.hydra)
-        _check_scene_name(config, job)
+        _check_scene_name(config, job, self._options("scene"))
         return config
 
     def _compose(self, job: list[str]) -> DictConfig:
@@ -276,13 +281,13 @@ def _check_plugins(hydra: DictConfig) -> None:
             )
 
 
-def _check_scene_name(config: DictConfig, job: Iterable[str]) -> None:
-    """Refuses a scene file that has another scene's name, as a copy does, unless it is typed."""
+def _check_scene_name(config: DictConfig, job: Iterable[str], scenes: Iterable[str]) -> None:
+    """Refuses a scene file with the name of another, as a copy has, unless the name is typed."""
     choice, name = config.hydra.runtime.choices.get("scene"), OmegaConf.select(config, "scene.name")
     if not choice or name is None or any(o.key_or_group == "scene.name" for o in parse(job)):
         return
     own = choice.rpartition("/")[2]
-    if name != own:
+    if name != own and name in scenes:
         raise UsageError(
             f"scene={choice} has the name '{name}', under which its results would be filed: write "
             f"name: {own} in its file, or add scene.name={own}"

@@ -68,6 +68,17 @@ def test_experiments_are_swept_one_at_a_time(names):
         check_command("train", ["-m", f"experiment={names}"])
 
 
+def test_experiments_without_runs_of_their_own_are_swept_together(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    for speed in ("low", "high"):
+        text = f"# @package _global_\nexperiment: people_{speed}\nspeed: {speed}\n"
+        (tmp_path / "experiment" / f"people_{speed}.yaml").write_text(text)
+    line = ["--config-dir", str(tmp_path), "-m", "experiment=people_low,people_high"]
+    check_command("train", [*line, "scene=straight_road"])
+    with pytest.raises(UsageError, match="is several experiments"):
+        check_command("train", [*line[:-1], "experiment=people_low,resolution"])
+
+
 def test_flow_is_estimated_in_half_of_the_runs_that_compare_it():
     flows = Counter(run["flow"] for run in runs_of("experiment=estimated_flow"))
     assert flows == {"exact": 6, "estimated": 6}
