@@ -35,7 +35,7 @@ class Moment:
     ticks: int
 
 
-def ticks_a_step(
+def ticks_for(
     scene: Scene, frame_rate_hz: float, speed_mps: Range, vehicle_speed_mps: float
 ) -> int:
     """Returns how often the footprint is checked in a step, for the speeds of an episode."""

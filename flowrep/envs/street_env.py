@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from flowrep.envs.episode import Episode, Moment, Rules, ticks_a_step
+from flowrep.envs.episode import Episode, Moment, Rules, ticks_for
 from flowrep.envs.outcome import Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
@@ -176,7 +176,7 @@ class StreetEnv(gym.Env):
         rate = _frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz))
         speed_mps = _speed_range(self.scene, options.get("speed", self.speed_mps))
         vehicle_speed_mps = _vehicle_speed(self.scene, options.get("vehicle_speed_mps"))
-        clock = rate, ticks_a_step(self.scene, rate, speed_mps, vehicle_speed_mps)
+        clock = rate, ticks_for(self.scene, rate, speed_mps, vehicle_speed_mps)
         if clock not in self._rules:
             self._rules[clock] = Rules(self._street.layout, *clock)
         self._episode = Episode(
@@ -238,10 +238,14 @@ def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
 
 
 def _vehicle_speed(scene: Scene, vehicle_speed_mps: float | None) -> float:
-    speed = scene.vehicle.speed_mps if vehicle_speed_mps is None else float(vehicle_speed_mps)
+    given = scene.vehicle.speed_mps if vehicle_speed_mps is None else vehicle_speed_mps
+    try:
+        speed = float(given)
+    except (TypeError, ValueError):
+        speed = math.nan
     if not 0 <= speed <= MOST_DRIVING_MPS:
         remedy = f"give a speed from 0, for a still camera, to {MOST_DRIVING_MPS:g}"
-        raise ValueError(f"vehicle_speed_mps is {speed}; {remedy}")
+        raise ValueError(f"vehicle_speed_mps is {given!r}; {remedy}")
     return speed
 
 

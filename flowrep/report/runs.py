@@ -6,17 +6,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.origin import origin_of
 from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.tables import TableError
+from flowrep.scenes.scene import SpeedMode
 
 _ORDER = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 Rows = list[dict[str, str]]
 
-SPEEDS = ("low", "normal", "high")
+SPEEDS: tuple[str, ...] = get_args(SpeedMode)
 """Pedestrians' speed modes, in the order of figures."""
 
 

@@ -21,7 +21,7 @@ from flowrep.transforms.base import (
     MapTransform,
     Reads,
     check_own_keys,
-    for_each_element,
+    flags_of_batch,
 )
 from flowrep.transforms.flow import CameraTransform, Intrinsics
 
@@ -164,7 +164,7 @@ class AdaptPose(MapTransform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         reset = tensordict.get("_reset", None)
-        rows = None if reset is None else for_each_element(reset, tensordict)
+        rows = None if reset is None else flags_of_batch(reset, tensordict)
         self._refuse_ill_formed(tensordict_reset, rows)
         return super()._reset(tensordict, tensordict_reset)
 
@@ -186,7 +186,7 @@ class AdaptPose(MapTransform):
         if pose is None or done is None:
             return None
         hidden = ~pose.isfinite().flatten(following.ndim).any(-1)
-        return ~(hidden & for_each_element(done, following))
+        return ~(hidden & flags_of_batch(done, following))
 
     def output_specs(self, pose: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded float64 spec."""

@@ -190,7 +190,7 @@ def check_own_keys(transform: MapTransform) -> None:
         )
 
 
-def for_each_element(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
+def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
     """Returns flags such as `done`, `[*B]` or `[*B, 1]`, as `[*B]`, the TensorDict's batch."""
     batch_dims = tensordict.ndim
     return flags.flatten(batch_dims).any(-1) if flags.ndim > batch_dims else flags

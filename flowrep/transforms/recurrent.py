@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import Composite
 
-from flowrep.transforms.base import MapTransform, MissingKey, for_each_element
+from flowrep.transforms.base import MapTransform, MissingKey, flags_of_batch
 
 
 class RecurrentTransform(MapTransform):
@@ -55,7 +55,7 @@ class RecurrentTransform(MapTransform):
             begins: bool `[*B]` or `[*B, 1]`.
             tensordict: `[*B]`, with the inputs and the outputs.
         """
-        begins = for_each_element(begins, tensordict)
+        begins = flags_of_batch(begins, tensordict)
         for key, first in zip(self.out_keys, self.compute(*self._read(tensordict))):
             mask = expand_as_right(begins, first)
             tensordict.set(key, torch.where(mask, first, tensordict.get(key)))
@@ -70,7 +70,7 @@ class RecurrentTransform(MapTransform):
                 f"or give a trajectory with ('next', 'done') and a dimension named 'time' "
                 f"(td.refine_names(..., 'time')); names are {tensordict.names}"
             )
-        return for_each_element(done, tensordict), tensordict.names.index("time")
+        return flags_of_batch(done, tensordict), tensordict.names.index("time")
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Returns the input specs of `step`, including the carried entries."""

@@ -12,7 +12,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from flowrep.envs import StreetEnv
-from flowrep.envs.episode import ticks_a_step
+from flowrep.envs.episode import ticks_for
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes.scene import Obstacle, PedestrianGroup, Walk
 
@@ -186,7 +186,7 @@ def test_looks_are_as_many_as_the_fastest_asks_for(
     straight_road, rate_hz, walking_mps, driving_mps, length_m, ticks
 ):
     scene = replace(straight_road, vehicle=replace(straight_road.vehicle, length_m=length_m))
-    assert ticks_a_step(scene, rate_hz, (0.6, walking_mps), driving_mps) == ticks
+    assert ticks_for(scene, rate_hz, (0.6, walking_mps), driving_mps) == ticks
 
 
 @pytest.mark.parametrize("action", [-1, 3, 7, 1.7, 1.0, "1", None, np.array([0, 1])])
@@ -385,6 +385,7 @@ def test_calls_out_of_turn_say_what_to_call(make_street, one_stands):
         ("vehicle_speed_mps", math.nan, r"vehicle_speed_mps is nan; give a speed from 0, for a"),
         ("vehicle_speed_mps", -10.0, r"vehicle_speed_mps is -10.0; give a speed from 0"),
         ("vehicle_speed_mps", 101.0, r"vehicle_speed_mps is 101.0; give .* to 100"),
+        ("vehicle_speed_mps", "fast", r"vehicle_speed_mps is 'fast'; give a speed from 0"),
         ("speed", math.nan, r"speed is nan; give \(lowest, highest\)"),
         ("speed", (1.0, math.nan), r"speed is \(1.0, nan\); give \(lowest, highest\)"),
     ],

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from flowrep.config_tree import CONF_DIR
-from flowrep.envs.episode import Rules, ticks_a_step
+from flowrep.envs.episode import Rules, ticks_for
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.pedestrians import draw_crowd
@@ -143,7 +143,7 @@ def run(content: bytes) -> str:
             return "refused"
     layout = Layout(scene)
     walking_mps = scene.pedestrian_speed_mps["high"]
-    ticks = ticks_a_step(scene, scene.frame_rate_hz, walking_mps, scene.vehicle.speed_mps)
+    ticks = ticks_for(scene, scene.frame_rate_hz, walking_mps, scene.vehicle.speed_mps)
     Rules(layout, scene.frame_rate_hz, ticks)
     times = np.linspace(0.0, scene.time_limit_s, 50)[:, None]
     for speed_mps in scene.pedestrian_speed_mps.values():
