@@ -8,7 +8,7 @@ import sys
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from flowrep.config import UsageError
+from flowrep.config import UsageError, command_line
 from flowrep.config.composition import check_command
 from flowrep.config.training import TrainConfig
 from flowrep.config_tree import CONF_DIR
@@ -187,6 +187,18 @@ def test_an_output_folder_that_can_not_be_made_is_one_line(key, tmp_path, monkey
     assert said.startswith("error: the ")
     assert said.endswith(f"'{tmp_path}/taken/run'): give another with {key}=\n")
     assert said.count("\n") == 1
+
+
+def test_output_that_is_closed_is_no_folder_that_can_not_be_made(monkeypatch, capsys):
+    def closed():
+        raise BrokenPipeError
+
+    monkeypatch.setattr(command_line, "exit_unread", lambda: sys.exit(141))
+    monkeypatch.setattr(sys, "argv", ["flowrep-train"])
+    with pytest.raises(SystemExit) as ended:
+        command_line.run_command("train", closed, TrainConfig)
+    assert ended.value.code == 141
+    assert capsys.readouterr().err == ""
 
 
 def run_command(*arguments, cwd):
