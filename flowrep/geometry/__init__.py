@@ -5,7 +5,12 @@ from flowrep.geometry.depth import DepthKind, adapt_depth, z_from_ray_length, z_
 from flowrep.geometry.flow import Factors, Flow, ego_flow, factorize, rigid_flow
 from flowrep.geometry.flow_layout import Channels, Direction, Grid, adapt_flow
 from flowrep.geometry.instances import instance_rows
-from flowrep.geometry.intrinsics import FovAxis, intrinsics_from_fov, intrinsics_from_opencv
+from flowrep.geometry.intrinsics import (
+    FovAxis,
+    check_intrinsics,
+    intrinsics_from_fov,
+    intrinsics_from_opencv,
+)
 from flowrep.geometry.poses import (
     CameraAxes,
     PoseDirection,
@@ -35,6 +40,7 @@ __all__ = [
     "adapt_depth",
     "adapt_flow",
     "adapt_pose",
+    "check_intrinsics",
     "check_rigid",
     "ego_flow",
     "factorize",

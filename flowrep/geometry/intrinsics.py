@@ -1,4 +1,4 @@
-"""The intrinsics K from a simulator's field of view or from a calibration."""
+"""The intrinsics K from a simulator's field of view or from a calibration, and their check."""
 
 from __future__ import annotations
 
@@ -72,3 +72,39 @@ def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
     half_pixel = torch.zeros(3, 3, dtype=K_opencv.dtype, device=K_opencv.device)
     half_pixel[:2, 2] = 0.5
     return K_opencv + half_pixel
+
+
+def check_intrinsics(name: str, K: Tensor) -> None:
+    """Checks that every K has the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1).
+
+    The check waits for a GPU.
+
+    Args:
+        name: the argument's name, for the message.
+        K: `[*B, 3, 3]`, pixels.
+
+    Raises:
+        ValueError: for nan or inf, other rows, or a focal length that is not positive; names the
+            index of the first such K in the batch.
+        TypeError: if it is not a float tensor.
+
+    >>> check_intrinsics("K", torch.tensor([[4.0, 0.0, 0.0], [0.0, 8.0, 0.0], [1.5, 2.5, 1.0]]))
+    Traceback (most recent call last):
+    ValueError: K should have the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, ...
+    """
+    check_shape(name, K, (3, 3))
+    fixed = K.new_tensor([0.0, 0.0, 0.0, 1.0])
+    zeros_and_one = torch.cat([K[..., 1, :1], K[..., 2, :]], -1)
+    right = (
+        K.isfinite().flatten(-2).all(-1)
+        & (K.diagonal(dim1=-2, dim2=-1)[..., :2] > 0.0).all(-1)
+        & ((zeros_and_one - fixed).abs() <= 1e-6).all(-1)
+    )
+    if not bool(right.all()):
+        index = (~right).nonzero()[0].tolist()
+        where = f"{name}[{', '.join(map(str, index))}]" if index else name
+        raise ValueError(
+            f"{where} should have the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, "
+            f"finite, fx and fy positive; got {K[tuple(index)].tolist()}. Pass K.T if it is "
+            "transposed"
+        )

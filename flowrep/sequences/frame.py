@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from flowrep.geometry import check_rigid
+from flowrep.geometry import check_intrinsics, check_rigid
 
 
 class SequenceError(Exception):
@@ -137,11 +137,9 @@ def check_frame(frame: Frame) -> None:
         raise SequenceError(frame.source, f"pictures of one frame differ in size: {listing}")
     try:
         check_rigid("pose", torch.from_numpy(frame.world_from_cam))
+        check_intrinsics("intrinsics", torch.from_numpy(frame.K))
     except ValueError as error:
         raise SequenceError(frame.source, str(error)) from None
-    focal = np.diag(frame.K)[:2]
-    if not (np.isfinite(frame.K).all() and (focal > 0).all()):
-        raise SequenceError(frame.source, f"no intrinsics: {frame.K.tolist()}")
 
 
 def _size_text(size: tuple[int, int]) -> str:

@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Categorical, TensorSpec, Unbounded
 
+from flowrep.geometry import check_intrinsics
 from flowrep.transforms.base import DEPTH, Keys, MapTransform, Reads, as_keys
 
 UNITS = ("px_per_step", "px_per_s")
@@ -191,14 +192,7 @@ def as_intrinsics(intrinsics: Intrinsics) -> Tensor:
             f"intrinsics is K, [3, 3], or the key of [*B, 3, 3] in the TensorDict; got "
             f"{list(K.shape)}"
         )
-    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
-    rows = K.new_tensor([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    has_focal_lengths = fx > 0.0 and fy > 0.0  # nan compares False
-    if not (has_focal_lengths and K.isfinite().all() and torch.allclose(K, rows, atol=1e-6)):
-        raise ValueError(
-            "intrinsics should be K, with rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, "
-            f"finite, fx and fy positive; got {K.tolist()}. Pass K.T if it is transposed"
-        )
+    check_intrinsics("intrinsics", K)
     return K
 
 

@@ -10,6 +10,7 @@ from flowrep.geometry import (
     adapt_depth,
     adapt_flow,
     adapt_pose,
+    check_intrinsics,
     instance_rows,
     intrinsics_from_fov,
     intrinsics_from_opencv,
@@ -227,6 +228,14 @@ def test_an_ill_formed_pose_is_refused_by_name_and_place(what, expected):
     with pytest.raises(ValueError, match=rf"^pose\[1, 2\] {expected}"):
         adapt_pose(poses)
     assert adapt_pose(poses, check=False).shape == (2, 3, 4, 4)
+
+
+def test_intrinsics_that_are_none_are_refused_by_name_and_place():
+    cameras = CAMERA.repeat(2, 3, 1, 1)
+    check_intrinsics("K", cameras)
+    cameras[1, 2, 2, 0] = 3.5  # and so (3.5, 0, 1) as the last row
+    with pytest.raises(ValueError, match=r"^K\[1, 2\] should .*got \[\[4.0, 0.0, 3.5\], .*, \[3.5"):
+        check_intrinsics("K", cameras)
 
 
 def test_a_quaternion_that_is_not_of_unit_length_is_refused():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 import zlib
 
@@ -340,6 +341,18 @@ def test_every_format_names_a_file_that_is_missing_or_empty(name, tmp_path):
             assert str(tmp_path) in str(caught.value)
         path.write_bytes(content)
     assert len(all_of(open_it(tmp_path))) == frames
+
+
+@pytest.mark.parametrize("change", [{(2, 0): 31.5}, {(0, 0): -1.0}, {(1, 2): math.inf}])
+def test_a_sintel_camera_that_is_none(change, tmp_path):
+    synthetic.write_sintel(tmp_path)
+    path = next(tmp_path.rglob("*.cam"))
+    K = np.frombuffer(path.read_bytes(), "<f8", 9, offset=4).reshape(3, 3).copy()
+    for place, value in change.items():
+        K[place] = value
+    path.write_bytes(path.read_bytes()[:4] + K.tobytes() + path.read_bytes()[4 + 72 :])
+    said = refusal(lambda: all_of(Sintel(tmp_path, scene="cave")), "")
+    assert "intrinsics should have the rows (fx, skew, cx)" in said
 
 
 def test_a_scene_that_leads_out_of_the_folder(tmp_path):
