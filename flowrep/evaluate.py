@@ -148,7 +148,7 @@ def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> li
     def save(number: int) -> None:
         subject = subjects[number]
         with suppress(OSError):  # `keep` tries again and reports it
-            subject.run.save_episodes(subject.rows(comparison, number), subject.table)
+            subject.save(subject.rows(comparison, number))
 
     config = subjects[0].config
     num_envs = min(comparison.rides, config["num_envs"])
@@ -184,7 +184,8 @@ def keep(subject: Subject, rows: Sequence[Row]) -> bool:
     if not rows:
         return True
     try:
-        run.log_episodes(rows, subject.table)
+        subject.save(rows)
+        run.plot_episodes(rows)
         write_failures(run.failures_path, run.read_episodes())
     except OSError as error:
         print_error(

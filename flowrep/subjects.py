@@ -1,5 +1,6 @@
 """Agents to evaluate, with what they see: those of runs, and policies of the user's own."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,7 @@ from flowrep.exchange.policies import Task, load_policy
 from flowrep.experiment.arena import Agent
 from flowrep.experiment.comparison import Comparison, Row, with_origin
 from flowrep.experiment.origin import check_origin, differences, origin_of
+from flowrep.experiment.other_scenes import keep_scene, known_scene
 from flowrep.experiment.run_folder import Rows, RunFolder
 from flowrep.from_config import Config, choose_device, env_from_config, policy_from_config
 
@@ -32,6 +34,7 @@ class Subject:
         agent: its policy and observations.
         frames: the frames that it was trained for.
         table: the rows of the run's table before this evaluation.
+        trained_in: the name of the scene in the run's config, None for the user's own policy.
     """
 
     run: RunFolder
@@ -39,18 +42,29 @@ class Subject:
     agent: Agent
     frames: int
     table: Rows
+    trained_in: str | None = None
 
     def rows(self, comparison: Comparison, number: int) -> list[Row]:
         """Returns the rows of its episodes so far; `number` is its number in the comparison."""
         return with_origin(comparison.rows(number), self.config, self.frames, "evaluate")
+
+    def save(self, rows: Sequence[Row]) -> None:
+        """Saves rows, and the scene that they name unless it is in the run's config.
+
+        Raises:
+            OSError: they can't be written.
+        """
+        if rows and self.config["scene"]["name"] != self.trained_in:
+            keep_scene(self.run, self.config["scene"])
+        self.run.save_episodes(rows, self.table)
 
 
 def load_subject(asked: Config, run: RunFolder) -> Subject:
     """Returns a run's agent in the requested scene, by default its own.
 
     Raises:
-        UsageError, TableError: its config or its table is damaged, or the scene has the name of its
-            own and is another; all are checked before any episode is run.
+        UsageError, TableError: its config or its table is damaged, or the scene has the name of
+            another one of the run's; all are checked before any episode is run.
         CheckpointError: there is no checkpoint, it is damaged, or belongs to another run.
     """
     own = validated_run(run.read_config(), f"{run.path}/config.yaml")
@@ -63,7 +77,7 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
     if scene is not None:  # the agent keeps its camera in other scenes
         here["scene"] = scene | {"camera": own["scene"]["camera"]}
     config = own | here
-    check_scene(run, own["scene"], config["scene"])
+    check_scene(run, config["scene"], table, own=own["scene"])
     env = env_from_config(config, num_envs=1, num_workers=0)
     policy = policy_from_config(config, env, trust=config["trust"])
     env.close()
@@ -77,22 +91,31 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
         ) from error
     device = choose_device(config["device"])
     agent = Agent.from_config(policy, config, device)
-    return Subject(run, config, agent, state["frames"], table)
+    return Subject(run, config, agent, state["frames"], table, own["scene"]["name"])
 
 
-def check_scene(run: RunFolder, own: Config, asked: Config) -> None:
-    """Checks that episodes in a scene can't be taken for some in the run's own scene.
+def check_scene(run: RunFolder, asked: Config, table: Rows, own: Config | None = None) -> None:
+    """Checks that episodes in a scene can't be taken for some in another scene of its name.
+
+    Args:
+        run: the run's folder, or the folder for the table of the user's own policy.
+        asked: the scene.
+        table: the rows of the run's table.
+        own: the scene in which the run was trained.
 
     Raises:
-        UsageError: it has the name of the run's own scene and differs from it.
+        UsageError: it differs from the scene that the run's config, or rows of its table, mean.
+        RunFolderError: the file that holds that scene is damaged.
     """
-    if asked["name"] != own["name"]:
-        return
-    for place, there, here in differences(own, asked, "scene"):
+    name = asked["name"]
+    known = own if own is not None and own["name"] == name else None
+    if known is None and any(row["scene"] == name for row in table):
+        known = known_scene(run, name)
+    for place, there, here in differences(known or asked, asked, "scene"):
         raise UsageError(
-            f"{run.path} was trained with {place}={shown(there)}, and rows with {shown(here)} "
-            f"would be taken for the same scene, '{own['name']}': give this one another name with "
-            "scene.name=, or leave scene= out"
+            f"in {run.path} scene '{name}' has {place}={shown(there)}, and rows with {shown(here)} "
+            "would be taken for the same scene: give this one another name with scene.name="
+            f"{', or leave scene= out' if known is own else ''}"
         )
 
 
@@ -101,12 +124,14 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
 
     Raises:
         PolicyError, TableError: as `check_card`, `load_policy` and `RunFolder.read_episodes`.
+        UsageError, RunFolderError: as `check_scene`.
     """
     table = folder.read_episodes()
     config = {key: asked[key] for key in (*OF_THE_EVALUATION, "scene", "representations")}
     config |= {"flow": asked.get("flow") or {"source": "exact"}, "noise": asked.get("noise")}
     config |= {"renderer": "auto"}
     config |= {"speed": "normal", "seed": ""}  # of its training, which is unknown
+    check_scene(folder, config["scene"], table)
     env = env_from_config(config, num_envs=1, num_workers=0)
     device = choose_device(config["device"])
     task = Task(

@@ -8,6 +8,7 @@ import shutil
 import signal
 
 import pytest
+import yaml
 
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
@@ -19,7 +20,7 @@ from flowrep.evaluate import evaluate, runs_in
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.evaluation import Episode
 from flowrep.experiment.interruption import StopRequest
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.tables import TableError
 from flowrep.experiment.training import train
 from flowrep.export import export
@@ -68,6 +69,7 @@ def untouched(run):
     yield run
     (run.path / "config.yaml").write_bytes(config)
     run.evaluation_path.unlink(missing_ok=True)
+    shutil.rmtree(run.path / "scenes", ignore_errors=True)
 
 
 def test_a_run_of_ppo_is_evaluated_whatever_its_batch(tmp_path):
@@ -123,11 +125,29 @@ def test_an_agent_drives_in_another_scene_when_that_is_asked_for(untouched):
 
 
 def test_a_changed_scene_needs_a_name_of_its_own(run):
-    with pytest.raises(UsageError, match=r"with scene\.time_limit_steps=200, .* rows with 3 would"):
+    with pytest.raises(UsageError, match=r"has scene\.time_limit_steps=200, .* rows with 3 would"):
         load_subject(asked(run, "scene=straight_road", "scene.time_limit_steps=3"), run)
     changed = "scene=straight_road", "scene.time_limit_steps=3", "scene.name=short"
     for scene in (changed, changed[:1]):  # the latter is its own
         load_subject(asked(run, *scene), run)
+
+
+def test_two_changed_scenes_of_one_name_are_told_apart(untouched):
+    run, short = untouched, ["scene=straight_road", "scene.name=short"]
+    evaluate(asked(run, *short, "scene.time_limit_steps=3"), [run])
+    table = run.evaluation_path.read_bytes()
+    evaluate(asked(run, *short, "scene.time_limit_steps=3"), [run])
+    assert run.evaluation_path.read_bytes() == table
+    with pytest.raises(UsageError, match=r"'short' has scene\.time_limit_steps=3, and .* 4 would"):
+        load_subject(asked(run, *short, "scene.time_limit_steps=4"), run)
+
+    kept = run.path / "scenes/short.yaml"
+    kept.write_text("[]")
+    with pytest.raises(RunFolderError, match=r"short\.yaml is not the scene .* rows of 'short'"):
+        load_subject(asked(run, *short, "scene.time_limit_steps=3"), run)
+    run.evaluation_path.unlink()  # without rows nothing can be mistaken
+    evaluate(asked(run, *short, "scene.time_limit_steps=4"), [run])
+    assert yaml.safe_load(kept.read_text())["time_limit_steps"] == 4
 
 
 def test_an_agent_that_reads_classes_is_told_that_another_scene_has_others(tmp_path):

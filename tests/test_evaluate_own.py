@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
+from flowrep.config import UsageError
 from flowrep.evaluate import evaluate, evaluate_own
 from flowrep.exchange.policies import PolicyError
 from flowrep.export import export
@@ -44,6 +45,8 @@ def test_a_policy_that_goes_on_drives_as_the_baseline_does(tmp_path):
     assert len(episodes(rows, name)) == 3
     assert episodes(rows, name) == episodes(rows, "never_turn")
     assert {(row["representations"], row["frames"]) for row in rows} == {("seg", "0")}
+    with pytest.raises(UsageError, match=r"'straight_road' has scene\.time_limit_steps=200, and "):
+        own(name, tmp_path / "out", *given, "scene.time_limit_steps=3")
 
 
 def test_the_documented_example_beats_never_turning_and_is_filmed(tmp_path):

@@ -17,21 +17,9 @@ from flowrep.experiment.weights_and_biases import open_wandb
 Rows = Sequence[Mapping[str, str]]
 
 EVALUATION_COLUMNS = (
-    "scene",
-    "representations",
-    "flow",
-    "seed",
-    "frames",
-    "evaluation",
-    "policy",
-    "speed",
-    "fps",
-    "episode_seed",
-    "outcome",
-    "hit",
-    "return",
-    "length",
-)
+    "scene", "representations", "flow", "seed", "frames", "evaluation",
+    "policy", "speed", "fps", "episode_seed", "outcome", "hit", "return", "length",
+)  # fmt: skip
 _EPISODE = ("scene", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
 """The columns that identify a row's policy and episode."""
 
@@ -55,6 +43,7 @@ class RunFolder:
     evaluation.csv           a row for each evaluated episode; `evaluation` says whether it was run
                              while training, at the end of it ("final"), or by flowrep.evaluate
     failures.csv             why episodes failed, by policy and speed
+    scenes/                  the scenes of flowrep.evaluate's rows, except the run's own
     videos/                  what the agent saw and did
     ```
     """
@@ -257,13 +246,14 @@ class RunFolder:
             _check_cell(path, number, row, "outcome", OUTCOMES.index)
         return rows
 
-    def log_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
-        """Saves evaluated episodes, and logs their means to TensorBoard and wandb.
-
-        Args and errors are those of `save_episodes`.
-        """
+    def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Saves evaluated episodes and plots them, see `save_episodes` and `plot_episodes`."""
         rows = list(rows)
-        self.save_episodes(rows, table)
+        self.save_episodes(rows)
+        self.plot_episodes(rows)
+
+    def plot_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Logs the means of evaluated episodes to TensorBoard and wandb."""
         for frames, scalars in evaluation_scalars(rows).items():
             self._plot(frames, scalars)
 
