@@ -63,11 +63,7 @@ def run(config: DictConfig) -> None:
         if own:
             evaluate_own(asked, own)
             return
-        runs = runs_in(as_list(asked["run"]))
-        with ExitStack() as stack:
-            for folder in runs:
-                stack.enter_context(folder.held("evaluating"))
-            evaluate(asked, runs)
+        evaluate(asked, runs_in(as_list(asked["run"])))
     except MISTAKES as error:
         exit_with(error)
 
@@ -86,25 +82,26 @@ def runs_in(paths: Sequence[str]) -> list[RunFolder]:
 
 
 def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
-    """Evaluates the agents of runs whose folders are locked.
+    """Evaluates the agents of runs, and locks their folders meanwhile.
 
-    Runs with the same scene, camera and renderer share environments and episodes. A run that can't
-    be evaluated or saved is reported and does not stop the others; the exit code is then 1.
+    Runs with the same scene, camera and renderer share environments and episodes. A run that is in
+    use, or can't be evaluated or saved, is reported and does not stop the others; the exit code is
+    then 1.
     """
-    subjects = load_subjects(asked, runs)
-    by_street: dict[str, list[Subject]] = {}
-    for subject in subjects:
-        street = json.dumps([subject.config[key] for key in ("scene", "renderer")])
-        by_street.setdefault(street, []).append(subject)
     saved: list[Subject] = []
-    with StopRequest() as stop:
-        for group in by_street.values():
-            saved += compare(asked, group, stop)
-            if stop:
-                break
-        else:
-            for subject in saved:
-                film(asked, subject)
+    with ExitStack() as locks:
+        by_street: dict[str, list[Subject]] = {}
+        for subject in load_subjects(asked, runs, locks):
+            street = json.dumps([subject.config[key] for key in ("scene", "renderer")])
+            by_street.setdefault(street, []).append(subject)
+        with StopRequest() as stop:
+            for group in by_street.values():
+                saved += compare(asked, group, stop)
+                if stop:
+                    break
+            else:
+                for subject in saved:
+                    film(asked, subject)
     if stop:
         sys.exit(stop.exit_code)
     done = [subject.run for subject in saved]
@@ -210,8 +207,8 @@ def as_list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
-def load_subjects(asked: Config, runs: Sequence[RunFolder]) -> list[Subject]:
-    """Returns the agents of runs; prints why some can't be loaded.
+def load_subjects(asked: Config, runs: Sequence[RunFolder], locks: ExitStack) -> list[Subject]:
+    """Returns the agents of runs, whose folders `locks` holds; prints why some can't be loaded.
 
     Raises:
         one of `MISTAKES`, if none can be.
@@ -219,6 +216,7 @@ def load_subjects(asked: Config, runs: Sequence[RunFolder]) -> list[Subject]:
     subjects = []
     for run in runs:
         try:
+            locks.enter_context(run.held("evaluating"))
             subjects.append(load_subject(asked, run))
         except MISTAKES as error:
             if not subjects and run is runs[-1]:

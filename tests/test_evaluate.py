@@ -299,6 +299,18 @@ def test_a_run_that_can_not_be_evaluated_is_named_and_the_others_are(some, capsy
         evaluate(asked(runs[0]), [runs[0], runs[2]])
 
 
+def test_a_run_that_is_in_use_is_named_and_the_others_are_evaluated(some, capsys):
+    runs = some("good_1", "good_2")
+    with runs[0].held("training"), pytest.raises(SystemExit) as ended:
+        evaluate(asked(runs[0]), runs)
+    assert ended.value.code == 1
+    assert len(rows_of(runs[1])) == 2
+    said = capsys.readouterr().err
+    assert f"error: '{runs[0].path}' is in use: process {os.getpid()} on" in said
+    with runs[1].held("evaluating"):  # its lock is free again
+        pass
+
+
 def test_a_worker_that_dies_is_one_line_and_what_was_run_is_kept(untouched, monkeypatch):
     run = untouched
 
