@@ -15,7 +15,7 @@ PACKAGE = Path(flowrep.__file__).parent
 FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry", "jit"},
     "transforms": {"transforms", "geometry", "extras"},
-    "agent": {"agent", "extras"},
+    "agent": {"agent", "extras", "jit"},
     "palette": set(),
     "scenes": {"scenes", "config_tree", "extras", "palette"},
     "simulator": {"simulator", "scenes", "palette", "jit"},

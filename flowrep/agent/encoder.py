@@ -19,9 +19,8 @@ STRIDES = (1, 2, 1)  # of the convolutions, in packed pixels
 class NatureEncoder(nn.Module):
     """Returns 512 features of a map: 32 × 8/4, 64 × 4/2, 64 × 3/1, linear; LeakyReLU after each.
 
-    Weights are those of ordinary convolutions in float32; they are cast to the dtype of the input,
-    so that a bfloat16 map is encoded in bfloat16. The last map is flattened rows first, channels
-    last.
+    Weights are those of ordinary convolutions in float32; they are cast to the codec's dtype. The
+    last map is flattened rows first, channels last.
     """
 
     def __init__(self, codec: MapCodec) -> None:
@@ -46,8 +45,8 @@ class NatureEncoder(nn.Module):
         return F.leaky_relu_(linear(features, self.linear.weight, self.linear.bias), SLOPE)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Returns the embeddings `[N, 512]` of a decoded map `[N, 16 * channels, h, w]`."""
-        (features,) = convolve([image], self.convolutions(), STRIDES)
+        """Returns the embeddings `[N, 512]` of a decoded map `[N, 16 * C, h, w]`."""
+        (features,) = convolve([image], self.convolutions(), STRIDES, self.codec.dtype)
         return self.embed(features)
 
 
@@ -74,7 +73,7 @@ class Encoder(nn.Module):
         """Returns the embeddings `[N, 512 * maps]` of decoded maps, in the maps' order."""
         encoders: list[NatureEncoder] = list(self.encoders)  # type: ignore[arg-type]
         weights = [w for encoder in encoders for w in encoder.convolutions()]
-        features = convolve(images, weights, STRIDES)
+        features = convolve(images, weights, STRIDES, encoders[0].codec.dtype)
         embeddings = [encoder.embed(x) for encoder, x in zip(encoders, features)]
         if self.layer_norm:
             embeddings = [F.layer_norm(x, x.shape[-1:]) for x in embeddings]

@@ -1,9 +1,9 @@
 """The layers of a network on a CPU, with each batch split among a team of threads.
 
-They compute the same as PyTorch's `conv2d`, `leaky_relu` and `linear`, in the dtype of their
-input, with float32 gradients for weights. They also do less work: nothing is cast twice, and the
-weight gradients of strided convolutions are products over unfolded maps, small enough to stay in a
-core's cache.
+They compute the same as PyTorch's `conv2d`, `leaky_relu` and `linear`, with float32 gradients for
+weights. They also do less work: nothing is cast twice, the weight gradients of strided convolutions
+are products over unfolded maps, small enough to stay in a core's cache, and class ids are not
+spread out to one-hot maps.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
+from flowrep.agent.class_convolution import ClassConvolution, one_hot
+from flowrep.agent.convolution import Convolution, channel_rows
 from flowrep.agent.team import parts, run_tasks
 
 SLOPE = 0.01  # of LeakyReLU below 0
@@ -28,26 +30,34 @@ aten = torch.ops.aten
 
 
 def convolve(
-    images: Sequence[Tensor], weights: Sequence[Tensor], strides: Sequence[int]
+    images: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    strides: Sequence[int],
+    dtype: torch.dtype,
 ) -> Sequence[Tensor]:
     """Returns the features of several maps: convolutions, LeakyReLU after each, flattened.
 
     Args:
-        images: one per map, `[N, C, h, w]`, channels last in memory.
-        weights: the first map's `[O, C, k, k]` and `[O]` for each stride, then the next map's.
-        strides: of the convolutions.
+        images: one per map, `[N, C, h, w]`, channels last in memory: of `dtype`, or of uint8, which
+            are class ids and mean their one-hot maps `[N, C * n, h, w]`.
+        weights: the first map's `[O, C, k, k]` and `[O]` for each stride, then the next map's; the
+            first one for class ids has C * n input channels.
+        strides: of the convolutions; 1 for the first.
+        dtype: to compute in.
 
     Returns:
-        `[N, rows * columns * O]` per map, rows first, channels last, in the dtype of the images.
+        `[N, rows * columns * O]` per map, rows first, channels last, of `dtype`.
     """
     if all(_is_shared_out(image) and not image.requires_grad for image in images):
         keeps = torch.is_grad_enabled()
-        return Convolutions.apply(strides, keeps, len(images), *images, *weights)
+        return Convolutions.apply(strides, dtype, keeps, len(images), *images, *weights)
     features = []
     for i, x in enumerate(images):
         layers = iter(weights[2 * len(strides) * i :])
         for stride, weight, bias in zip(strides, layers, layers):
-            x = F.leaky_relu_(F.conv2d(x, *_cast(weight, bias, x.dtype), stride), SLOPE)
+            if _holds_ids(x):
+                x = one_hot(x, weight.shape[1] // x.shape[1], dtype)
+            x = F.leaky_relu_(Convolution(weight, bias, stride, dtype)(x), SLOPE)
         features.append(x.permute(0, 2, 3, 1).flatten(1))
     return features
 
@@ -59,6 +69,10 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return F.linear(x, weight.to(x.dtype), bias.to(x.dtype))
 
 
+def _holds_ids(x: Tensor) -> bool:
+    return x.dtype is torch.uint8
+
+
 def _is_shared_out(x: Tensor) -> bool:
     # an exported program takes batches of any size and has no team of threads
     return x.is_cpu and not torch.compiler.is_exporting()
@@ -67,21 +81,26 @@ def _is_shared_out(x: Tensor) -> bool:
 class Convolutions(torch.autograd.Function):
     """Chains of convolutions, each followed by LeakyReLU, one chain per map.
 
-    `apply(strides, keeps, maps, *tensors)` takes each map's image `[N, C, h, w]` (channels last,
-    without a gradient), then each map's weights `[O, C, k, k]` and biases `[O]` in turn, and
+    `apply(strides, dtype, keeps, maps, *tensors)` takes each map's image `[N, C, h, w]` (channels
+    last, without a gradient), then each map's weights `[O, C, k, k]` and biases `[O]` in turn, and
     returns each map's features `[N, rows * columns * O]`, rows first, channels last. With `keeps`,
     the activations that `backward` needs are kept.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, strides: Sequence[int], keeps: bool, maps: int, *tensors: Tensor
+        ctx: Any,
+        strides: Sequence[int],
+        dtype: torch.dtype,
+        keeps: bool,
+        maps: int,
+        *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
         """Returns the features of each map."""
         images, weights = tensors[:maps], tensors[maps:]
         size = 2 * len(strides)
         chains = [
-            _Chain(image, weights[i * size : (i + 1) * size], strides)
+            _Chain(image, weights[i * size : (i + 1) * size], strides, dtype)
             for i, image in enumerate(images)
         ]
         run_tasks(task for chain in chains for task in chain.forward_tasks(keeps))
@@ -95,26 +114,39 @@ class Convolutions(torch.autograd.Function):
         chains: list[_Chain] = ctx.chains
         run_tasks(task for chain, g in zip(chains, gradients) for task in chain.backward_tasks(g))
         ctx.chains = None
-        nothing = [None] * (3 + len(chains))
+        nothing = [None] * (4 + len(chains))
         return (*nothing, *(g for chain in chains for g in chain.weight_gradients()))
 
 
 class _Chain:
     """The convolutions of one map."""
 
-    def __init__(self, image: Tensor, weights: Sequence[Tensor], strides: Sequence[int]) -> None:
+    def __init__(
+        self,
+        image: Tensor,
+        weights: Sequence[Tensor],
+        strides: Sequence[int],
+        dtype: torch.dtype,
+    ) -> None:
         self.image = image
-        self.layers = [
-            (*_cast(weight, bias, image.dtype), stride)
+        self.layers: list[Convolution | ClassConvolution] = [
+            Convolution(weight, bias, stride, dtype)
             for weight, bias, stride in zip(weights[::2], weights[1::2], strides)
         ]
-        shapes = [tuple(image.shape[2:])]  # rows, columns, and from the first layer on channels
-        for weight, _, stride in self.layers:
-            sizes = [(n - k) // stride + 1 for n, k in zip(shapes[-1], weight.shape[2:])]
-            shapes.append((*sizes, weight.shape[0]))
+        self.spread: int | None = None  # classes of a one-hot map, if that is made
+        if _holds_ids(image):
+            if dtype is torch.float32:
+                self.layers[0] = ClassConvolution(weights[0], weights[1], image.shape[1])
+            else:  # its products are fast, and look-ups have not been measured against them
+                self.spread = weights[0].shape[1] // image.shape[1]
+        shapes = []  # rows, columns, channels
+        size = tuple(image.shape[2:])
+        for layer, bias in zip(self.layers, weights[1::2]):
+            size = layer.size_after(*size)
+            shapes.append((*size, len(bias)))
         self.last = shapes[-1]
-        self.features = image.new_empty(len(image), math.prod(self.last))
-        largest = max(math.prod(shape) for shape in shapes[1:]) * image.element_size()
+        self.features = image.new_empty(len(image), math.prod(self.last), dtype=dtype)
+        largest = max(math.prod(shape) for shape in shapes) * self.features.element_size()
         self.parts = parts(len(image), max(1, CACHE_BYTES // largest))
         self.kept: list[list[Tensor]] = [[]] * len(self.parts)
         self.gradients: list[list[Tensor]] = [[]] * len(self.parts)
@@ -124,9 +156,11 @@ class _Chain:
 
     def _forward(self, i: int, part: slice, keeps: bool) -> None:
         x = self.image[part]
+        if self.spread is not None:
+            x = one_hot(x, self.spread, self.features.dtype)
         kept = [x]
-        for weight, bias, stride in self.layers:
-            x = F.leaky_relu_(F.conv2d(x, weight, bias, stride), SLOPE)
+        for layer in self.layers:
+            x = F.leaky_relu_(layer(x), SLOPE)
             kept.append(x)
         self.features[part].view(-1, *self.last).copy_(x.permute(0, 2, 3, 1))
         if keeps:
@@ -138,13 +172,12 @@ class _Chain:
     def _backward(self, i: int, part: slice, gradient: Tensor) -> None:
         g = gradient[part].reshape(-1, *self.last).permute(0, 3, 1, 2)
         found: list[Tensor] = []
-        for index in reversed(range(len(self.layers))):
-            weight, _, stride = self.layers[index]
+        for index, layer in reversed(list(enumerate(self.layers))):
             x, y = self.kept[i][index : index + 2]
             g = aten.leaky_relu_backward(g, y, SLOPE, True)
-            found = [_weight_gradient(g, x, weight, stride), _channel_rows(g).sum(0), *found]
-            if index:
-                g = _convolution_backward(g, x, weight, stride, [True, False])[0]
+            found = [layer.weight_gradient(g, x), channel_rows(g).sum(0), *found]
+            if index and isinstance(layer, Convolution):
+                g = layer.input_gradient(g, x)
         self.kept[i], self.gradients[i] = [], found
 
     def weight_gradients(self) -> list[Tensor]:
@@ -195,38 +228,3 @@ def _sum(tensors: Sequence[Tensor]) -> Tensor:
     for tensor in tensors[1:]:
         total = total + tensor
     return total
-
-
-def _cast(weight: Tensor, bias: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    # channels-last weights keep the whole chain in that layout
-    return weight.to(dtype, memory_format=torch.channels_last), bias.to(dtype)
-
-
-def _weight_gradient(g: Tensor, x: Tensor, weight: Tensor, stride: int) -> Tensor:
-    """Returns the gradient of a convolution's weight."""
-    outputs, channels, height, width = weight.shape
-    if height * width < 9:  # unfolding costs more than it saves
-        return _convolution_backward(g, x, weight, stride, [False, True])[1]
-    product = _channel_rows(g).t() @ _unfold(x, height, width, stride)
-    return product.view(outputs, height, width, channels).permute(0, 3, 1, 2)
-
-
-def _convolution_backward(
-    g: Tensor, x: Tensor, weight: Tensor, stride: int, wanted: list[bool]
-) -> tuple[Tensor, ...]:
-    """Returns the wanted gradients of input and weight."""
-    return aten.convolution_backward(
-        g, x, weight, None, [stride] * 2, [0, 0], [1, 1], False, [0, 0], 1, [*wanted, False]
-    )
-
-
-def _unfold(x: Tensor, height: int, width: int, stride: int) -> Tensor:
-    """Returns the window of each output pixel: `[N * rows * columns, height * width * C]`."""
-    x = x.permute(0, 2, 3, 1)
-    windows = x.unfold(1, height, stride).unfold(2, width, stride)  # [N, rows, columns, C, h, w]
-    return windows.permute(0, 1, 2, 4, 5, 3).reshape(-1, height * width * x.shape[-1])
-
-
-def _channel_rows(x: Tensor) -> Tensor:
-    """Returns `[N, C, h, w]` as `[N * h * w, C]`."""
-    return x.permute(0, 2, 3, 1).reshape(-1, x.shape[1])

@@ -6,7 +6,8 @@
 | `Bounded(0, 255, uint8)` | intensity | `x / 255`, C channels |
 | any float | a quantity | itself, C channels |
 
-An id from n to 255 is a pixel without a class, all zeros.
+An id from n to 255 is a pixel without a class, all zeros. One-hot maps are not stored, and in
+float32 on a CPU not even made, see `class_convolution`.
 
 Maps are stored *packed*. The first convolution of the Nature encoder has kernel 8 and stride 4,
 which is the same sum as kernel 2 and stride 1 over blocks of 4 × 4 pixels taken as channels. Two
@@ -20,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec
@@ -104,17 +104,16 @@ class MapCodec:
         return self.pack(self.compact(x))
 
     def decode(self, packed: Tensor) -> Tensor:
-        """Returns `[N, network_channels * 16, h, w]`, channels last in memory, for the encoder."""
-        if self.num_classes:
-            # looking up rows of the identity is several times faster than comparing ids; below it
-            # are rows of zeros, up to the largest id of a byte
-            one_hot = torch.eye(256, self.num_classes, device=packed.device, dtype=self.dtype)
-            decoded = F.embedding(packed.int(), one_hot).flatten(-2)  # [N, h, w, C * 16 * n]
-        elif self.is_byte:
-            decoded = packed.to(self.dtype).div_(255)
-        else:
-            decoded = packed.to(self.dtype)
-        return decoded.permute(0, 3, 1, 2)
+        """Returns `[N, C * 16, h, w]`, channels last in memory, for the encoder.
+
+        Class ids stay uint8, and `convolve` takes them for their one-hot maps; other maps have the
+        network's dtype.
+        """
+        if not self.num_classes:
+            packed = packed.to(self.dtype)
+            if self.is_byte:
+                packed = packed.div_(255)
+        return packed.permute(0, 3, 1, 2)
 
     def pack_weight(self, weight: Tensor) -> Tensor:
         """Returns a `[out, C * n, 8, 8]` kernel as `[out, C * 16 * n, 2, 2]` over packed maps."""

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from flowrep.agent import layers
 from flowrep.agent.cuda_graph import WARM_UP, OfOneShape, as_cuda_graph
 from tests.agent.tape import Foreign, Tape
 
@@ -33,6 +34,12 @@ def state_of(agent):
     return agent.weights | moments | {"watched": watch._values, "good": watch._good_updates}
 
 
+@pytest.fixture
+def layers_of_cuda(monkeypatch):
+    """Layers that are PyTorch's operations alone, as on CUDA; a tape records no others."""
+    monkeypatch.setattr(layers, "_is_shared_out", lambda x: False)
+
+
 class Taped:
     """Stands in for a CUDA graph: some steps as they are, one on tape, the rest from the tape."""
 
@@ -55,6 +62,7 @@ class Taped:
 
 
 @pytest.mark.slow_after_first
+@pytest.mark.usefixtures("layers_of_cuda")
 def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
     eager, taped = make_any(learning_rate=0.01), make_any(learning_rate=0.01)
     batches = batches_of([eager, taped], random_steps)
@@ -69,6 +77,7 @@ def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
 
 
 @pytest.mark.slow_after_first
+@pytest.mark.usefixtures("layers_of_cuda")
 def test_a_loss_that_is_no_number_stops_the_weights_on_tape_too(make_any, random_steps):
     agent = make_any()
     batches = batches_of([agent], random_steps)

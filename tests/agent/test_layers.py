@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from flowrep.agent import layers
+from flowrep.agent.class_convolution import one_hot
 from flowrep.agent.layers import convolve, linear
 
 STRIDES = (1, 2, 1)
@@ -48,7 +49,7 @@ def test_two_maps_are_convolved_like_by_pytorch(monkeypatch, images_a_part):
     torch.manual_seed(0)
     images = [image(7, 3, 11, 9), image(7, 4, 10, 9)]
     weights = [chain(3), chain(4)]
-    features = convolve(images, [w for ws in weights for w in ws], STRIDES)
+    features = convolve(images, [w for ws in weights for w in ws], STRIDES, torch.float32)
     sum(weighed(f) for f in features).backward()
     for x, ws, actual in zip(images, weights, features):
         expected, gradients = plain(x, ws)
@@ -56,11 +57,30 @@ def test_two_maps_are_convolved_like_by_pytorch(monkeypatch, images_a_part):
             assert (a - b).abs().max() < 1e-6 * b.abs().max()
 
 
+@pytest.mark.parametrize("shared_out", [True, False], ids=["team", "export"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_ids_are_convolved_like_their_one_hot_maps(monkeypatch, dtype, shared_out):
+    monkeypatch.setattr(layers, "CACHE_BYTES", 3 * 6 * 10 * 8 * dtype.itemsize)  # three images
+    monkeypatch.setattr(layers, "_is_shared_out", lambda x: shared_out)
+    torch.manual_seed(4)
+    ids = torch.randint(0, 5, (7, 11, 9, 3), dtype=torch.uint8).permute(0, 3, 1, 2)
+    ids[2, 1, 4, 3] = 200  # of four classes: 4 and 200 are none
+    images, weights = [ids, image(7, 3, 11, 9).to(dtype)], [chain(3 * 4), chain(3)]
+    features = convolve(images, [w for ws in weights for w in ws], STRIDES, dtype)
+    sum(weighed(f) for f in features).backward()
+    expected, gradients = plain(one_hot(ids, 4, torch.float64), weights[0])
+    assert features[0].dtype is dtype
+    # eight bits of mantissa, six layers there and back
+    tolerance = 1e-6 if dtype is torch.float32 else 0.1
+    for a, b in zip([features[0], *(w.grad for w in weights[0])], [expected, *gradients]):
+        assert (a - b).norm() < tolerance * b.norm()
+
+
 def test_an_image_with_gradients_gets_them():
     torch.manual_seed(1)
     weights, x = chain(3), image(2, 3, 11, 9)
-    (without,) = convolve([x], weights, STRIDES)
-    (features,) = convolve([x.requires_grad_()], weights, STRIDES)
+    (without,) = convolve([x], weights, STRIDES, torch.float32)
+    (features,) = convolve([x.requires_grad_()], weights, STRIDES, torch.float32)
     torch.testing.assert_close(features, without, **TIGHT)
     weighed(features).backward()
     assert x.grad.abs().sum() > 0
@@ -68,7 +88,7 @@ def test_an_image_with_gradients_gets_them():
 
 def test_nothing_is_kept_without_gradients():
     with torch.no_grad():
-        (features,) = convolve([image(2, 3, 11, 9)], chain(3), STRIDES)
+        (features,) = convolve([image(2, 3, 11, 9)], chain(3), STRIDES, torch.float32)
     assert features.grad_fn is None
 
 
@@ -99,7 +119,7 @@ def test_only_the_gradients_that_are_asked_for_are_computed():
 def test_weights_get_float32_gradients_of_bfloat16_layers():
     torch.manual_seed(3)
     weights, x = chain(3), image(4, 3, 11, 9)
-    (features,) = convolve([x.bfloat16()], weights, STRIDES)
+    (features,) = convolve([x.bfloat16()], weights, STRIDES, torch.bfloat16)
     assert features.dtype is torch.bfloat16
     weighed(features).backward()
     _, gradients = plain(x, weights)
