@@ -48,7 +48,7 @@ class MapCodec:
 
     @property
     def network_channels(self) -> int:
-        """Channels of the decoded map, before packing."""
+        """Channels of the map that the network sees, before packing."""
         return self.channels * (self.num_classes or 1)
 
     @property
