@@ -146,6 +146,7 @@ def test_two_changed_scenes_of_one_name_are_told_apart(untouched):
     with pytest.raises(RunFolderError, match=r"short\.yaml is not the scene .* rows of 'short'"):
         load_subject(asked(run, *short, "scene.time_limit_steps=3"), run)
     run.evaluation_path.unlink()  # without rows nothing can be mistaken
+    kept.write_bytes(b"\xff")
     evaluate(asked(run, *short, "scene.time_limit_steps=4"), [run])
     assert yaml.safe_load(kept.read_text())["time_limit_steps"] == 4
 

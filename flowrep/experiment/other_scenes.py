@@ -37,12 +37,12 @@ def keep_scene(run: RunFolder, scene: Mapping[str, Any]) -> None:
         OSError: it can't be written.
     """
     path = _path(run, scene["name"])
-    text = yaml.safe_dump(dict(scene), sort_keys=False)
-    if path.is_file() and path.read_text(encoding="utf-8") == text:
+    data = yaml.safe_dump(dict(scene), sort_keys=False).encode()
+    if path.is_file() and path.read_bytes() == data:
         return
     path.parent.mkdir(exist_ok=True)
     whole = path.with_suffix(".tmp")
-    whole.write_text(text, encoding="utf-8")
+    whole.write_bytes(data)
     whole.replace(path)
 
 
