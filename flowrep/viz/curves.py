@@ -31,7 +31,7 @@ def draw_learning_curve(run: RunFolder) -> None:
             capsize=3,
             label=None if number else "evaluation, greedy actions",
         )
-    axes.legend(loc="lower right")  # where a curve that rises leaves room
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)  # covers no curve
     axes.grid(alpha=0.3)
     figure.savefig(run.path / "learning_curve.png", dpi=120)
 
