@@ -1,13 +1,24 @@
 """Functions that numba compiles at their first call, with the machine code cached."""
 
 from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
 from typing import Any
 
-from numba import njit
+
+@cache
+def numba_is_installed() -> bool:
+    """Returns whether numba can be imported, without importing it."""
+    return find_spec("numba") is not None
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Returns a decorator; `options` are those of `numba.njit`."""
+    """Returns a decorator; `options` are those of `numba.njit`.
+
+    Raises:
+        ImportError: numba is not installed.
+    """
+    from numba import njit  # here, as it takes half a second and is an extra
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:

@@ -7,12 +7,11 @@ the weights of an id for all places of the kernel, so that each id of the input 
 
 from __future__ import annotations
 
-from functools import cache
-from importlib.util import find_spec
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from flowrep.jit import numba_is_installed
 
 IDS_A_PRODUCT = 1 << 12  # their one-hot rows should fit into a core's cache
 
@@ -81,7 +80,7 @@ class ClassConvolution:
     def _table_gradient(self, rows: Tensor, g: Tensor) -> Tensor:
         """Returns the table's gradient: for each of its rows, the sum of `g` where it was read."""
         gradient = torch.zeros_like(self.table)
-        if _numba_is_installed():
+        if numba_is_installed():
             from flowrep.agent.class_kernel import add_rows
 
             add_rows(rows.numpy(), g.numpy(), gradient.numpy())
@@ -92,8 +91,3 @@ class ClassConvolution:
             read.scatter_(1, rows[start : start + step].long(), 1.0)
             gradient.addmm_(read.t(), g[start : start + step])
         return gradient
-
-
-@cache
-def _numba_is_installed() -> bool:
-    return find_spec("numba") is not None

@@ -47,18 +47,11 @@ class Convolution:
 
     def _backward(self, g: Tensor, x: Tensor, wanted: list[bool]) -> tuple[Tensor, ...]:
         return aten.convolution_backward(
-            g,
-            x,
-            self.weight,
-            None,
-            [self.stride] * 2,
-            [0, 0],
-            [1, 1],
-            False,
-            [0, 0],
-            1,
+            g, x, self.weight, None,
+            [self.stride] * 2, [0, 0], [1, 1],  # stride, padding, dilation
+            False, [0, 0], 1,  # transposed, output padding, groups
             [*wanted, False],
-        )
+        )  # fmt: skip
 
 
 def channel_rows(x: Tensor) -> Tensor:

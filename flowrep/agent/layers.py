@@ -129,16 +129,17 @@ class _Chain:
         dtype: torch.dtype,
     ) -> None:
         self.image = image
+        looks_up = _holds_ids(image) and dtype is torch.float32
+        # in bfloat16 the products take no longer than look-ups, see docs/performance.md
+        spreads = _holds_ids(image) and not looks_up
+        self.spread = weights[0].shape[1] // image.shape[1] if spreads else None  # to classes
         self.layers: list[Convolution | ClassConvolution] = [
-            Convolution(weight, bias, stride, dtype)
-            for weight, bias, stride in zip(weights[::2], weights[1::2], strides)
+            ClassConvolution(weights[0], weights[1], image.shape[1])
+            if looks_up
+            else Convolution(weights[0], weights[1], strides[0], dtype)
         ]
-        self.spread: int | None = None  # classes of a one-hot map, if that is made
-        if _holds_ids(image):
-            if dtype is torch.float32:
-                self.layers[0] = ClassConvolution(weights[0], weights[1], image.shape[1])
-            else:  # its products are fast, and look-ups have not been measured against them
-                self.spread = weights[0].shape[1] // image.shape[1]
+        for stride, weight, bias in zip(strides[1:], weights[2::2], weights[3::2]):
+            self.layers.append(Convolution(weight, bias, stride, dtype))
         shapes = []  # rows, columns, channels
         size = tuple(image.shape[2:])
         for layer, bias in zip(self.layers, weights[1::2]):

@@ -8,8 +8,6 @@ results are bitwise equal. Only maps that `suits` accepts may be passed.
 from __future__ import annotations
 
 import math
-from functools import cache
-from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -18,6 +16,7 @@ from torch.autograd import forward_ad
 
 from flowrep.geometry.closed_form import Planes
 from flowrep.geometry.instances import check_rows
+from flowrep.jit import numba_is_installed
 
 SMALL = 1 << 14  # pixels for which loading numba isn't worth while
 
@@ -34,7 +33,7 @@ def suits(depth: Tensor, *others: float | Tensor) -> bool:
         depth.is_cpu
         and depth.numel() > SMALL
         and all(tensor.dtype is torch.float32 and _is_plain(tensor) for tensor in tensors)
-        and _numba_is_installed()
+        and numba_is_installed()
     )
 
 
@@ -46,11 +45,6 @@ def _is_plain(tensor: Tensor) -> bool:
         and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
         and forward_ad.unpack_dual(tensor).tangent is None
     )
-
-
-@cache
-def _numba_is_installed() -> bool:
-    return find_spec("numba") is not None
 
 
 def planes_of_motions(

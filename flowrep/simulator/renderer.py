@@ -1,7 +1,8 @@
 """Choice of renderer for depth, classes and ids: the numba rasteriser or PyBullet."""
 
 import warnings
-from importlib.util import find_spec
+
+from flowrep.jit import numba_is_installed
 
 RENDERERS = ("auto", "rasteriser", "pybullet")
 _REMEDY = "run: pip install 'flowrep[sim]'"
@@ -16,7 +17,7 @@ def choose_renderer(name: str) -> str:
     """
     if name not in RENDERERS:
         raise ValueError(f"unknown renderer {name!r}; choose one of {', '.join(RENDERERS)}")
-    if name != "pybullet" and find_spec("numba") is None:
+    if name != "pybullet" and not numba_is_installed():
         if name == "rasteriser":
             raise ImportError(f"renderer 'rasteriser' needs numba; {_REMEDY}")
         warnings.warn(

@@ -32,7 +32,7 @@ def test_a_weight_is_looked_up_at_its_place_in_the_kernel():
 @pytest.mark.parametrize(("height", "width"), [(2, 3), (1, 1), (3, 2)])
 def test_it_is_the_convolution_of_one_hot_maps(monkeypatch, height, width, has_numba):
     if not has_numba:
-        monkeypatch.setattr(class_convolution, "_numba_is_installed", lambda: False)
+        monkeypatch.setattr(class_convolution, "numba_is_installed", lambda: False)
         monkeypatch.setattr(class_convolution, "IDS_A_PRODUCT", 20)  # and so several products
     torch.manual_seed(0)
     ids = torch.randint(0, CLASSES + 1, (4, 6, 5, 2), dtype=torch.uint8).permute(0, 3, 1, 2)

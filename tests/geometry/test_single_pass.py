@@ -159,7 +159,7 @@ def test_small_maps_are_left_to_pytorch(calls, monkeypatch):
 
 
 def test_without_numba_pytorch_computes(calls, monkeypatch):
-    monkeypatch.setattr(single_pass, "_numba_is_installed", lambda: False)
+    monkeypatch.setattr(single_pass, "numba_is_installed", lambda: False)
     depth, _, Ks, motions = scene()
     ego_flow(depth, Ks, motions[:, 0])
     assert not calls

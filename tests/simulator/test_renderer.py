@@ -10,7 +10,7 @@ from flowrep.simulator.renderer import choose_renderer
 
 
 def without_numba(monkeypatch):
-    monkeypatch.setattr(renderer, "find_spec", lambda name: None)
+    monkeypatch.setattr(renderer, "numba_is_installed", lambda: False)
 
 
 @pytest.mark.parametrize(
