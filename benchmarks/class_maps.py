@@ -1,14 +1,16 @@
-"""Times updates that read class ids, by look-up and over one-hot maps.
+"""Times what reads class ids by look-up and over one-hot maps: a convolution, and updates.
 
     python benchmarks/class_maps.py [--rounds 7] [--batch 128] [--side 48] [--classes 5]
 
-Discrete SAC on one thread in float32; CPU time, so that it can be measured beside other work. All
-variants take turns in each round. `depth2` is the same network over two plain channels.
+The first convolution of the network alone, then updates of discrete SAC in float32; `depth2` is the
+same network over two plain channels. One thread; CPU time, so that it can be measured beside other
+work. All variants take turns in each round.
 """
 
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from unittest.mock import patch
 
 import torch
@@ -18,32 +20,56 @@ from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 from update import interleaved
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory, use_threads
-from flowrep.agent.class_convolution import one_hot
+from flowrep.agent.class_convolution import ClassConvolution, one_hot
 from flowrep.agent.convolution import Convolution
+from flowrep.agent.precision import has_fast_bf16
 
-ACTIONS = 3
+ACTIONS, CHANNELS = 3, 2
+FEATURES, BLOCK = 32, 4  # of the network's first convolution: 8 x 8 by 4, as 2 x 2 over blocks
 STACKS = {"depth2": ["depth2"], "seg2": ["seg2"], "ego+obj+seg2": ["ego", "obj", "seg2"]}
 
 
 class OneHotConvolution(Convolution):
     """A convolution over one-hot maps that are made for it."""
 
-    def __init__(self, weight: Tensor, bias: Tensor, channels: int) -> None:
-        super().__init__(weight, bias, 1, torch.float32)
+    def __init__(
+        self, weight: Tensor, bias: Tensor, channels: int, dtype: torch.dtype = torch.float32
+    ) -> None:
+        super().__init__(weight, bias, 1, dtype)
         self.classes = weight.shape[1] // channels
 
     def __call__(self, ids: Tensor) -> Tensor:
-        return super().__call__(one_hot(ids, self.classes, torch.float32))
+        return super().__call__(one_hot(ids, self.classes, self.weight.dtype))
 
     def weight_gradient(self, g: Tensor, ids: Tensor) -> Tensor:
-        return super().weight_gradient(g, one_hot(ids, self.classes, torch.float32))
+        return super().weight_gradient(g, one_hot(ids, self.classes, self.weight.dtype))
+
+
+def layers_of(classes: int, side: int, maps: int) -> dict[str, Callable[[], object]]:
+    """Returns both passes of the first convolution of some maps, by look-up and one-hot."""
+    channels, pixels = CHANNELS * BLOCK**2, side // BLOCK
+    ids = torch.randint(classes, (maps, channels, pixels, pixels), dtype=torch.uint8)
+    ids = ids.contiguous(memory_format=torch.channels_last)
+    weight, bias = torch.randn(FEATURES, channels * classes, 2, 2), torch.randn(FEATURES)
+    layers = {
+        "look-up, fp32": ClassConvolution(weight, bias, channels),
+        "one-hot, fp32": OneHotConvolution(weight, bias, channels),
+    }
+    if has_fast_bf16(torch.device("cpu")):
+        layers["one-hot, bf16"] = OneHotConvolution(weight, bias, channels, torch.bfloat16)
+    passes: dict[str, Callable[[], object]] = {}
+    for name, layer in layers.items():
+        g = torch.randn_like(layer(ids))
+        passes[f"{name}, forward"] = partial(layer, ids)
+        passes[f"{name}, weight gradient"] = partial(layer.weight_gradient, g, ids)
+    return passes
 
 
 def update_of(
     names: list[str], classes: int, side: int, batch: int, *, looks_up: bool
 ) -> Callable[[], object]:
     """Returns an agent's update on random maps."""
-    shape = (2, side, side)
+    shape = (CHANNELS, side, side)
     specs: dict[str, TensorSpec] = {name: Unbounded(shape) for name in names}
     if "seg2" in names:
         specs["seg2"] = Categorical(classes, shape, dtype=torch.uint8)
@@ -84,16 +110,19 @@ def main() -> None:
     use_threads(1)
     keep_freed_memory()
     torch.manual_seed(0)
+    cpu = torch.device("cpu")
+    layers = layers_of(args.classes, args.side, 2 * args.batch)  # maps before and after a step
     updates = {}
     for stack, names in STACKS.items():
         updates[stack] = update_of(names, *sizes, looks_up=True)
         if "seg2" in names:
             updates[f"{stack}, one-hot"] = update_of(names, *sizes, looks_up=False)
-    seconds = interleaved(updates, args.rounds, torch.device("cpu"), time.process_time)
     print(f"{args.side} x {args.side}, batch {args.batch}, {args.classes} classes, one thread")
-    print("| update | ms |\n| --- | --- |")
-    for name, taken in seconds.items():
-        print(f"| {name} | {1000 * taken:.1f} |")
+    for title, variants in (("first convolution", layers), ("update", updates)):
+        seconds = interleaved(variants, args.rounds, cpu, time.process_time)
+        print(f"\n| {title} | ms |\n| --- | --- |")
+        for name, taken in seconds.items():
+            print(f"| {name} | {1000 * taken:.1f} |")
 
 
 if __name__ == "__main__":
