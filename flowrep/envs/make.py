@@ -1,6 +1,6 @@
 """TorchRL environments of streets, with the transforms that write representations."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
+from flowrep.envs.needs import check_rate, sensors_read
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.sensor_observation import sensed
 from flowrep.envs.street_env import StreetEnv
@@ -26,11 +27,29 @@ _SELDOM = ("rgb", "frame")  # sensors that are kept only if something reads them
 
 
 class VectorWrapper(GymWrapper):
-    """TorchRL's wrapper, with reset masks moved to the CPU and optional.
+    """TorchRL's wrapper, with reset masks moved to the CPU and optional, and options checked.
 
     TorchRL 0.14 passes them on from the TensorDict's device, which fails on CUDA, and requires them
     in every TensorDict; here, all environments are reset if they are missing.
+
+    Args:
+        env: the environments.
+        check_options: called with the options of each reset.
+        kwargs: passed to TorchRL's wrapper.
     """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        check_options: Callable[[Mapping[str, Any] | None], None],
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(env, **kwargs)
+        self._check_options = check_options
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        self._check_options(kwargs.get("options"))
+        return super()._reset(tensordict, **kwargs)
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
         if reset is None:
@@ -144,7 +163,12 @@ def make_env(
         vector = WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)
     else:
         vector = StreetVectorEnv(factories)
-    base = VectorWrapper(vector, device=torch.device(device), categorical_action_encoding=True)
+    base = VectorWrapper(
+        vector,
+        partial(check_rate, [*transforms], frame_rate_hz=probe.frame_rate_hz),
+        device=torch.device(device),
+        categorical_action_encoding=True,
+    )
     env = TransformedEnv(base, transforms)
     if seed is not None:
         env.set_seed(seed)
@@ -214,9 +238,3 @@ def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None
 
 def _vector(env: TransformedEnv) -> Any:
     return env.base_env._env
-
-
-def sensors_read(transforms: Iterable[Any]) -> list[str]:
-    """Returns the sensors that transforms read, in the order of `SENSORS`."""
-    keys = {key for transform in transforms for key in transform.in_keys}
-    return [name for name in SENSORS if ("sensor", name) in keys]

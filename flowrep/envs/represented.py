@@ -1,5 +1,6 @@
 """Representations as plain numpy maps, for gymnasium learners without TorchRL."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -13,8 +14,8 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose
 
+from flowrep.envs.needs import check_rate, sensors_read
 from flowrep.envs.outcome import Outcome, hit_code
-from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
 from flowrep.scenes.scene import Scene
 from flowrep.transforms import representation_stack
@@ -67,6 +68,7 @@ class RepresentationObservation(gym.Wrapper):
             intrinsics = torch.from_numpy(inner.K)
         if dt_s is None and hasattr(inner, "frame_rate_hz"):
             dt_s = 1.0 / inner.frame_rate_hz
+        self._frame_rate_hz = 1.0 / dt_s if dt_s else math.nan  # unknown; then no flow is in px/s
         self._stack = representation_stack(
             _onehot(representations) if joined else representations,
             intrinsics=intrinsics,
@@ -79,7 +81,12 @@ class RepresentationObservation(gym.Wrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Maps, dict[str, Any]]:
-        """Begins an episode."""
+        """Begins an episode.
+
+        Raises:
+            ValueError: the options ask for another frame rate than that of flow in px/s.
+        """
+        check_rate(self._stack, options, self._frame_rate_hz)
         observation, info = self.env.reset(seed=seed, options=options)
         sensed = _sensed(observation)
         self._now = self._stack._reset(sensed, sensed)
@@ -198,8 +205,7 @@ def _sensors_for(representations: Representations) -> list[str]:
     stack: Compose = representation_stack(
         representations, intrinsics=torch.eye(3), num_classes=1, dt_s=1.0
     )
-    read = {key for transform in stack for key in transform.in_keys}
-    return [name for name in SENSORS if ("sensor", name) in read]
+    return sensors_read(stack)
 
 
 def _onehot(representations: Representations) -> dict[str, dict[str, Any]]:

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from flowrep.envs.make import sensors_read
+from flowrep.envs.needs import sensors_read
 from flowrep.palette import num_classes
 from flowrep.scenes.scene import Scene
 from flowrep.simulator.camera import sampled_intrinsics
@@ -47,8 +47,9 @@ class Eye:
             flow=flow,
             noise=noise,
         )
-        self.sensors = sensors_read(self._transforms)
         self._device = torch.device(device)
+        self._transforms.to(self._device)
+        self.sensors = sensors_read(self._transforms)
         # what the next step needs of this one
         self._kept = [
             key

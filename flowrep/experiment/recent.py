@@ -77,7 +77,8 @@ class Means:
             self._sums = {name: value.detach().clone() for name, value in metrics.items()}
         else:
             for name, value in metrics.items():
-                self._sums[name] += value.detach()
+                # not in place, as restored sums are on the CPU
+                self._sums[name] = self._sums[name] + value.detach()
         self._count += 1
 
     def take(self) -> dict[str, float]:

@@ -108,6 +108,7 @@ class FlowTransform(CameraTransform):
         flows = [output for output in outputs if output != "valid"]
         scales = _per_output("scale", scale, flows)
         units = _per_output("unit", unit, flows)
+        self.is_per_second = "px_per_s" in units.values()
         self.factors = {name: _factor(scales[name], units[name], dt_s) for name in flows}
         if compiled:
             _check_compiler()

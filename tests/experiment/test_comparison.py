@@ -203,6 +203,18 @@ def test_an_eye_sees_what_the_env_shows(scene, flow, noise):
     pool.close()
 
 
+def test_an_eye_computes_where_it_is_told_to(scene):
+    # the meta device stands for a GPU: it, too, refuses a K that stayed on the CPU
+    eye = Eye(scene, ["raw", "ego", "obj", "seg2", "depth2"], 12.0, noise=NOISE, device="meta")
+    pool = EnvPool(scene, eye.sensors, num_envs=2)
+    seen, _ = pool.advance([{"episode_seed": 1}, {"episode_seed": 2}])
+    first = eye.look(seen, [0, 1], [])
+    seen, _ = pool.advance([0, 0])
+    for maps in (first, eye.look(seen, [0], [1])):
+        assert {maps[name].device.type for name in ("raw", "ego", "obj", "seg2")} == {"meta"}
+    pool.close()
+
+
 @pytest.mark.parametrize("flow", ["exact", "estimated"])
 def test_an_eye_sees_each_street_as_if_it_were_alone(scene, flow):
     if flow == "estimated":

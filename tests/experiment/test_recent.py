@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from flowrep.experiment.recent import Means, RecentEpisodes
 
@@ -80,3 +81,11 @@ def test_an_interval_across_a_checkpoint_has_the_mean_of_all_of_it():
     after.add({"q_loss": torch.tensor(4.0)})
     assert after.take() == {"q_loss": 2.5}
     assert before.take() == {"q_loss": 1.0}
+
+
+def test_updates_on_a_gpu_go_on_with_sums_from_a_file():
+    with FakeTensorMode():  # knows CUDA's rules without a GPU
+        means = Means()
+        means.restore({"sums": {"q_loss": torch.tensor(1.0)}, "count": 1})
+        means.add({"q_loss": torch.ones((), device="cuda")})
+        assert means.state()["sums"]["q_loss"].device.type == "cuda"
