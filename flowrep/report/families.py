@@ -6,6 +6,7 @@ from typing import Any
 
 from flowrep.report.runs import Run
 
+ABSENT = "absent"
 _SHOWN = 3  # keys in a label
 _LONG = 24  # characters of a value; a longer one is shown as a version number
 
@@ -15,8 +16,8 @@ class Family:
     """Runs that may be compared: they differ in scene, representations and seed alone.
 
     Args:
-        runs: the family's runs; one that lacks a key, as `ego` lacks `representations.obj.scale`,
-            may be in several families.
+        runs: the family's runs; one that can't have a key, as `ego` can't have
+            `representations.obj.scale`, may be in several families.
         differences: the keys in which families differ, with this one's values as text.
     """
 
@@ -33,13 +34,19 @@ class Family:
 
 def families_of(runs: Sequence[Run]) -> list[Family]:
     """Returns families, the one with the most runs first."""
+    keys = dict.fromkeys(key for run in runs for key in run.identity)
+    lacking = {key: _lacking(key, runs) for key in keys}
     values: dict[str, dict[Hashable, Any]] = {}
+    identities = []
     for run in runs:
-        for key, value in run.identity.items():
+        lacks = {key: ABSENT for key in keys if run in lacking[key]}
+        identities.append(run.identity | lacks)
+        for key, value in identities[-1].items():
             values.setdefault(key, {})[repr(value)] = value
-    differing = [key for key, found in values.items() if len(found) > 1]
+    differing = [key for key in keys if len(values[key]) > 1]
     signatures = [
-        {key: repr(run.identity[key]) for key in differing if key in run.identity} for run in runs
+        {key: repr(identity[key]) for key in differing if key in identity}
+        for identity in identities
     ]
     distinct = list({tuple(sorted(s.items())): s for s in signatures}.values())
     whole = _widest(distinct)
@@ -51,6 +58,12 @@ def families_of(runs: Sequence[Run]) -> list[Family]:
         }
         found.append(Family(tuple(members), shown))
     return sorted(found, key=lambda family: -len(family.runs))
+
+
+def _lacking(key: str, runs: Sequence[Run]) -> set[Run]:
+    """Returns the runs without a key that they could have, as others with the same part do."""
+    parts = {run.part_with(key) for run in runs if key in run.identity}
+    return {run for run in runs if key not in run.identity and run.part_with(key) in parts}
 
 
 Signature = dict[str, str]

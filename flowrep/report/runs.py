@@ -59,6 +59,17 @@ class Run:
         shared = {f"scene.{key}": scene[key] for key in _OF_EVERY_SCENE if key in scene}
         return dict([*_flat(parts | shared), *_flat(own, f"scene.{self.scene}")])
 
+    def part_with(self, key: str) -> Any:
+        """Returns what decides whether its identity may have a key, None if it can't."""
+        place, _, rest = key.partition(".")
+        if place == "representations":
+            return next((n for n in self.config[place] if f"{rest}.".startswith(f"{n}.")), None)
+        if place == "scene":
+            parts = (*_OF_EVERY_SCENE, self.scene)
+            return next((part for part in parts if f"{rest}.".startswith(f"{part}.")), None)
+        deciding = {"algorithm": "_target_", "flow": "source"}.get(place)
+        return (place, self.identity.get(f"{place}.{deciding}") if deciding else None)
+
     @property
     def scene(self) -> str:
         """The name of the scene that it was trained in."""

@@ -216,6 +216,33 @@ def test_a_run_without_a_key_that_differs_stands_beside_both(tmp_path):
     }
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "label"),
+    [
+        ("scene__obstacles", ["car"], "scene.straight_road.obstacles"),
+        ("algorithm__beta", 2, "algorithm.beta"),
+        ("scene__camera__roll_deg", 3, "scene.camera.roll_deg"),
+    ],
+)
+def test_an_option_that_only_some_runs_have_keeps_them_apart(tmp_path, key, value, label):
+    run_in(tmp_path, "a")
+    run_in(tmp_path, "b", **{key: value})
+    run_in(tmp_path, "c", seed=1)
+    assert labels(tmp_path) == {f"{label}=absent": ["a", "c"], f"{label}={value}": ["b"]}
+
+
+def test_the_options_of_another_flow_or_algorithm_are_no_difference_of_their_own(tmp_path):
+    ours = {"algorithm___target_": "flowrep.agent.SAC"}
+    run_in(tmp_path, "a", **ours)
+    run_in(tmp_path, "b", **ours, flow__source="estimated", flow__preset="fast")
+    run_in(tmp_path, "c", algorithm__beta=2, algorithm___target_="my.Algorithm")
+    assert labels(tmp_path) == {
+        "flow.source=exact, algorithm._target_=flowrep.agent.SAC": ["a"],
+        "flow.source=estimated, algorithm._target_=flowrep.agent.SAC": ["b"],
+        "flow.source=exact, algorithm._target_=my.Algorithm": ["c"],
+    }
+
+
 def test_many_keys_that_differ_make_a_short_label(tmp_path):
     run_in(tmp_path, "a")
     changes = {"total_frames": 5, "num_envs": 3, "speed": "low", "algorithm__tau": 1.0}
