@@ -39,8 +39,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     share = successes / trials
     centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
     half = (z2 * share * (1 - share) / trials + z2**2 / (4 * trials**2)) ** 0.5 / (1 + z2 / trials)
-    # Rounding may leave the exact ends 0 and 1 by an ulp.
-    return max(0.0, centre - half), min(1.0, centre + half)
+    # the share is within, but rounding may leave an end an ulp inside of it, or outside of [0, 1]
+    return max(0.0, min(share, centre - half)), min(1.0, max(share, centre + half))
 
 
 def outcome_shares(outcomes: Iterable[str]) -> dict[str, tuple[float, float, float]]:
