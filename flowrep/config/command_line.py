@@ -67,14 +67,20 @@ def folder_name(text: str) -> str:
     return "_" if name in ("", ".", "..") else name
 
 
-def exit_with(problem: str | Exception) -> NoReturn:
+def exit_with(problem: str | Exception, remedy: str = "") -> NoReturn:
     """Ends the process with the exit code of a usage error, printing each line of the problem.
 
     Prints nothing if the problem is that the process's output is no longer read.
+
+    Args:
+        problem: what is wrong.
+        remedy: a line to print after it; the last `error:` line of a sweep's job is its reason.
     """
     if isinstance(problem, BrokenPipeError):
         exit_unread()
     print_error(problem)
+    if remedy:
+        print(remedy, file=sys.stderr)
     sys.exit(EXIT_USAGE)
 
 

@@ -6,6 +6,7 @@ Workers import this module alone, so it imports no torch.
 import json
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -157,7 +158,8 @@ def _without_result(log: Path, begin: int, code: int) -> Ending:
         name = signal.Signals(-code).name
         hint = ": is there enough memory?" if -code == signal.SIGKILL else ""
         return Ending(FAILED, message=f"ended by {name}{hint}")
-    lines = [line.strip() for line in log.read_bytes()[begin:].decode(errors="replace").split("\n")]
+    text = log.read_bytes()[begin:].decode(errors="replace")
+    lines = [line.strip() for line in re.split(r"[\r\n]", text)]  # a bar's line ends in "\r"
     errors = [line for line in lines if line.startswith("error: ")]
     last = [line for line in lines if line][-1:]
     return Ending(FAILED, message=(errors or last or [f"exit code {code}"])[-1])

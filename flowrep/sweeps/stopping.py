@@ -19,8 +19,8 @@ def is_stopped(sweep: Path) -> bool:
 class SweepStop:
     """Turns SIGINT and SIGTERM in the launching process into a marker file in the sweep's folder.
 
-    Workers on any machine look for it. A second signal ends this process at once. Use it as a
-    context manager.
+    Workers on any machine look for it. A second signal ends this process at once; the file then
+    stays until the sweep is continued, for jobs that are still queued. Use it as a context manager.
 
     Args:
         sweep: the sweep's folder, which exists.
@@ -38,10 +38,11 @@ class SweepStop:
             self._previous[number] = signal.signal(number, self._receive)
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Restores the handlers and removes the marker."""
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        """Restores the handlers, and removes the marker unless jobs may still have to see it."""
         self._give_back()
-        self._mark.unlink(missing_ok=True)
+        if error is None or self.received is None:
+            self._mark.unlink(missing_ok=True)
 
     def _receive(self, number: int, _: FrameType | None) -> None:
         self.received = signal.Signals(number)

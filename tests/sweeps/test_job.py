@@ -67,6 +67,13 @@ def test_a_run_of_another_config_is_not_taken_for_the_one_asked_for(request_for,
     ("code", "expected"),
     [
         ("print('error: no such device', file=sys.stderr); sys.exit(2)", "error: no such device"),
+        # after a progress bar, which ends its lines in another way
+        ("print('\\revaluating: 0%|  \\r  \\rerror: no space'); sys.exit(2)", "error: no space"),
+        # of a traceback, the last line; what to do about it is no reason
+        (
+            "print('error: failed:\\nerror: OSError: it\\nContinue'); sys.exit(2)",
+            "error: OSError: it",
+        ),
         ("raise ValueError('what happened')", "ValueError: what happened"),
         ("sys.exit(3)", "exit code 3"),
         ("os.kill(os.getpid(), signal.SIGKILL)", "ended by SIGKILL: is there enough memory?"),
@@ -205,12 +212,23 @@ def test_the_definition_of_a_run_leaves_out_where_it_is_computed():
     assert json.loads(json.dumps(job.definition(CONFIG))) == job.definition(stored)
 
 
-def test_the_first_signal_marks_the_sweep_and_the_next_ends_the_process(tmp_path):
+def test_the_first_signal_marks_the_sweep_until_it_has_ended(tmp_path):
     with SweepStop(tmp_path) as stop:
         assert not is_stopped(tmp_path)
         signal.raise_signal(signal.SIGINT)
         assert is_stopped(tmp_path)
         assert stop.received == signal.SIGINT
-        with pytest.raises(KeyboardInterrupt):
+    assert not is_stopped(tmp_path)  # all jobs have ended
+
+
+def test_the_second_signal_ends_the_process_and_jobs_still_queued_find_the_mark(tmp_path):
+    def press_twice():
+        with SweepStop(tmp_path):
             signal.raise_signal(signal.SIGINT)
-    assert not is_stopped(tmp_path)
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        press_twice()
+    assert is_stopped(tmp_path)
+    with SweepStop(tmp_path):  # the sweep is continued
+        assert not is_stopped(tmp_path)
