@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from typing import Any
@@ -91,7 +92,7 @@ def run(config: DictConfig) -> float:
                 folder.check_is_new()
                 folder.write_config(plain, job.overrides.task)
             else:
-                plain = resumed_config(plain, folder)
+                plain = resumed_config(plain, folder, job.overrides.task)
             return carry_out(plain, folder)
     except (UsageError, SceneError, RunFolderError, TableError, OSError) as error:
         exit_with(error)
@@ -107,25 +108,26 @@ def carry_out(config: Config, folder: RunFolder) -> float:
         exit_with(error)
     print(f"run folder: {folder.path}")
     where, how_to_go_on = str(folder.path), how_to_resume(config, folder)
-    if training.frames >= config["total_frames"] and folder.is_evaluated(
+    is_evaluated = training.frames >= config["total_frames"] and folder.is_evaluated(
         training.frames, final_episodes(config)
-    ):
+    )
+    if is_evaluated:
         print(f"this run is complete; evaluate it with: {line_for('evaluate', run=where)}")
-        return final_success(folder, training.frames)
     with StopRequest() as stop:
         try:
-            with closing(make_arena(training, config)) as arena:
-                evaluate = partial(log_evaluation, training, config, arena, stop)
-                clock = train(training, config, stop, evaluate)
-                print(f"wall time: {clock.summary()}")
-                print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
-                is_evaluated = not stop and final_evaluation(training, config, arena, stop)
+            if not is_evaluated:
+                with closing(make_arena(training, config)) as arena:
+                    evaluate = partial(log_evaluation, training, config, arena, stop)
+                    clock = train(training, config, stop, evaluate)
+                    print(f"wall time: {clock.summary()}")
+                    print(f"outside gradient updates: {1 - clock.share('update'):.0%}")
+                    is_evaluated = not stop and final_evaluation(training, config, arena, stop)
             if is_evaluated:
                 show(training, config)
         except (CheckpointError, DivergenceError) as error:
             exit_with(f"after {training.frames} frames: {error}")
         except WorkerError as error:
-            exit_with(f"after {training.frames} frames: {error}\nContinue with: {how_to_go_on}")
+            exit_with(f"after {training.frames} frames: {error}", f"Continue with: {how_to_go_on}")
         except BrokenPipeError:
             raise  # from printing: the disk is not full
         except OSError as error:
@@ -160,12 +162,21 @@ def how_to_resume(config: Config, folder: RunFolder) -> str:
     return line_for("train", resume=str(folder.path), **trust)
 
 
-def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
-    """Returns the config of the run to resume, with the settings of this machine."""
+def resumed_config(
+    plain: dict[str, Any], folder: RunFolder, given: Sequence[str]
+) -> dict[str, Any]:
+    """Returns the config of the run to resume, with the settings of the machine that are given.
+
+    Args:
+        plain: the composed config.
+        folder: the run's folder.
+        given: the overrides that were typed.
+
+    Raises:
+        UsageError: others than those of the machine were, or the run's config is damaged.
+    """
     others = [
-        o
-        for o in HydraConfig.get().overrides.task
-        if not o.startswith(("resume=", *(f"{key}=" for key in OF_THE_MACHINE)))
+        o for o in given if not o.startswith(("resume=", *(f"{key}=" for key in OF_THE_MACHINE)))
     ]
     if others:
         raise UsageError(
@@ -173,7 +184,10 @@ def resumed_config(plain: dict[str, Any], folder: RunFolder) -> dict[str, Any]:
             "leave it out (device=, num_workers= and trust= may be given)"
         )
     stored = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
-    return stored | {key: plain[key] for key in (*OF_THE_MACHINE, "resume")}
+    # a class to trust is never taken from a file
+    here = ["trust", "resume"]
+    here += [key for key in OF_THE_MACHINE if any(o.startswith(f"{key}=") for o in given)]
+    return stored | {key: plain[key] for key in here}
 
 
 def make_training(config: Config, folder: RunFolder) -> Training:
@@ -260,21 +274,21 @@ def final_evaluation(
         return False
     rows = comparison.rows()
     run.log_episodes(with_origin(rows, config, training.frames, "final"))
-    write_failures(run.failures_path, run.read_episodes())
     print_table(rows)
     print_failures(rows)
     return True
 
 
 def show(training: Training, config: Config) -> None:
-    """Draws the learning curve and films an episode of an evaluated agent.
+    """Writes the causes of failure and the learning curve, and films an episode unless it is there.
 
     To be called when the processes of the evaluation have ended, as it takes memory as well.
     """
     run = training.run
+    write_failures(run.failures_path, run.read_episodes())
     draw_learning_curve(run)
-    if config["evaluation"]["video"]:
-        path = run.video_path(f"episode_{config['speed']}")
+    path = run.video_path(f"episode_{config['speed']}")
+    if config["evaluation"]["video"] and not path.exists():
         make_env = partial(env_from_config, config)
         record_episode(
             make_env, training.agent.policy, config["representations"], path, seed=FINAL_SEED

@@ -62,12 +62,16 @@ def test_a_run_says_where_its_time_went(smoke_run):
 
 def test_a_complete_run_is_not_evaluated_twice(smoke_run):
     run, _ = smoke_run
-    before = (run / "evaluation.csv").read_text()
+    tables = [run / "evaluation.csv", run / "failures.csv"]
+    before = [table.read_text() for table in tables]
+    tables[1].unlink()  # a full disk, say, left out what comes after the evaluation
+    (run / "learning_curve.png").unlink()
     command = [sys.executable, "-m", "flowrep.train", f"resume={run}"]
     result = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, cwd=run)
     assert result.returncode == 0, result.stderr
     assert "this run is complete" in result.stdout
-    assert (run / "evaluation.csv").read_text() == before
+    assert [table.read_text() for table in tables] == before
+    assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_evaluate_adds_rows_for_what_was_asked(smoke_run):

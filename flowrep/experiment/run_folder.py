@@ -44,6 +44,7 @@ class RunFolder:
                              while training, at the end of it ("final"), or by flowrep.evaluate
     failures.csv             why episodes failed, by policy and speed
     scenes/                  the scenes of flowrep.evaluate's rows, except the run's own
+    maps/                    what policies of one's own saw in flowrep.evaluate's rows
     videos/                  what the agent saw and did
     ```
     """
@@ -118,6 +119,11 @@ class RunFolder:
     def metrics_path(self) -> Path:
         """The table of logged training steps."""
         return self.path / "metrics.csv"
+
+    @property
+    def curve_path(self) -> Path:
+        """The picture of the learning curve."""
+        return self.path / "learning_curve.png"
 
     def video_path(self, name: str) -> Path:
         """The file for a video of that name."""

@@ -33,7 +33,9 @@ def draw_learning_curve(run: RunFolder) -> None:
         )
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)  # covers no curve
     axes.grid(alpha=0.3)
-    figure.savefig(run.path / "learning_curve.png", dpi=120)
+    whole = run.curve_path.with_suffix(".tmp")
+    figure.savefig(whole, dpi=120, format="png")
+    whole.replace(run.curve_path)
 
 
 def _evaluated(run: RunFolder) -> list[tuple[int, float, float, float]]:

@@ -81,5 +81,7 @@ def record_episode(
     frames, outcome = film_episode(env, policy)
     fps = street_envs(env)[0].frame_rate_hz
     env.close()
-    write_video(path, [representation_strip(maps) for maps in frames], fps=fps)
+    whole = path.with_suffix(f".tmp{path.suffix}")  # so that `path` is never half a film
+    write_video(whole, [representation_strip(maps) for maps in frames], fps=fps)
+    whole.replace(path)
     return outcome

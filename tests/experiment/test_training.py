@@ -11,11 +11,12 @@ from tensordict import TensorDict
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.agent import DivergenceError
+from flowrep.config import UsageError
 from flowrep.config_tree import group_choices
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.training import Training, train
-from flowrep.train import make_training
+from flowrep.train import make_training, resumed_config
 from flowrep.transforms import FlowFactorize, RawFlow
 from tests.test_configs import composed
 
@@ -46,6 +47,23 @@ def test_flow_is_compiled_where_the_config_says_so(tmp_path, monkeypatch, compil
     flows = [t.compiled for t in training.env.transform if isinstance(t, RawFlow | FlowFactorize)]
     training.env.close()
     assert flows == [compiled, compiled]
+
+
+def test_a_resumed_run_keeps_its_machine_settings_unless_others_are_given(tmp_path):
+    own = composed("debug=smoke", "device=cpu", "num_workers=2")
+    folder = RunFolder(tmp_path)
+    folder.write_config(own)
+
+    def resumed(*given):
+        config = resumed_config(composed(*given), folder, given)
+        return config["device"], config["num_workers"], config["trust"]
+
+    assert resumed() == ("cpu", 2, None)
+    assert resumed("num_workers=0", "trust=my.Class") == ("cpu", 0, "my.Class")
+    folder.write_config(own | {"trust": "from.a.File"})
+    assert resumed("device=auto") == ("auto", 2, None)
+    with pytest.raises(UsageError, match="so 'seed=1' would be ignored"):
+        resumed("device=cpu", "seed=1")
 
 
 class StopAfter(StopRequest):
