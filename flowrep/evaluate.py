@@ -101,7 +101,7 @@ def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
                     break
             else:
                 for subject in saved:
-                    film(asked, subject)
+                    film(asked, subject, stop)
     if stop:
         sys.exit(stop.exit_code)
     done = [subject.run for subject in saved]
@@ -129,7 +129,7 @@ def evaluate_own(asked: Config, names: Sequence[str]) -> None:
                     break
                 if not saved:
                     sys.exit(EXIT_USAGE)
-                film(asked, subject)
+                film(asked, subject, stop)
     if stop:
         sys.exit(stop.exit_code)
 
@@ -225,12 +225,16 @@ def load_subjects(asked: Config, runs: Sequence[RunFolder], locks: ExitStack) ->
     return subjects
 
 
-def film(asked: Config, subject: Subject) -> None:
-    """Writes `video` episodes for each speed and frame rate."""
+def film(asked: Config, subject: Subject, stop: StopRequest) -> None:
+    """Writes `video` episodes for each speed and frame rate, until a stop is asked for."""
     config, run = subject.config, subject.run
+    name = config["scene"]["name"]
+    where = "" if name == subject.trained_in else f"{name}_"
     for speed, rate in product(as_list(asked["speed"]), as_list(asked["fps"])):
         for number in range(asked["video"]):
-            path = run.video_path(f"{speed}_{rate:g}fps_{number}")
+            if stop:
+                return
+            path = run.video_path(f"{where}{speed}_{rate:g}fps_{asked['seed'] + number}")
             make = partial(env_from_config, config, speed=speed, frame_rate_hz=float(rate))
             seen, seed = config["representations"], asked["seed"] + number
             policy = subject.agent.policy

@@ -1,13 +1,16 @@
 """Agents to evaluate, with what they see: those of runs, and policies of the user's own."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torchrl.data import Composite
 
 from flowrep.agent import CheckpointError, load_checkpoint
 from flowrep.config import UsageError
+from flowrep.config.command_line import folder_name
 from flowrep.config.run_names import OF_THE_MACHINE
 from flowrep.config.training import validated_run
 from flowrep.config.violations import shown
@@ -17,7 +20,7 @@ from flowrep.exchange.policies import Task, load_policy
 from flowrep.experiment.arena import Agent
 from flowrep.experiment.comparison import Comparison, Row, with_origin
 from flowrep.experiment.origin import check_origin, differences, origin_of
-from flowrep.experiment.other_scenes import keep_scene, known_scene
+from flowrep.experiment.row_meanings import keep, known, maps_file, scene_file
 from flowrep.experiment.run_folder import Rows, RunFolder
 from flowrep.from_config import Config, choose_device, env_from_config, policy_from_config
 
@@ -35,6 +38,7 @@ class Subject:
         frames: the frames that it was trained for.
         table: the rows of the run's table before this evaluation.
         trained_in: the name of the scene in the run's config, None for the user's own policy.
+        policy: the name of the user's own policy, None for a run's agent.
     """
 
     run: RunFolder
@@ -43,19 +47,23 @@ class Subject:
     frames: int
     table: Rows
     trained_in: str | None = None
+    policy: str | None = None
 
     def rows(self, comparison: Comparison, number: int) -> list[Row]:
         """Returns the rows of its episodes so far; `number` is its number in the comparison."""
         return with_origin(comparison.rows(number), self.config, self.frames, "evaluate")
 
     def save(self, rows: Sequence[Row]) -> None:
-        """Saves rows, and the scene that they name unless it is in the run's config.
+        """Saves rows, with the scene and the maps that they name unless the run's config has them.
 
         Raises:
             OSError: they can't be written.
         """
-        if rows and self.config["scene"]["name"] != self.trained_in:
-            keep_scene(self.run, self.config["scene"])
+        scene = self.config["scene"]
+        if rows and scene["name"] != self.trained_in:
+            keep(scene_file(self.run, scene["name"]), scene)
+        if rows and self.policy is not None:
+            keep(maps_file(self.run, folder_name(self.policy)), maps_of(self.config))
         self.run.save_episodes(rows, self.table)
 
 
@@ -108,14 +116,38 @@ def check_scene(run: RunFolder, asked: Config, table: Rows, own: Config | None =
         RunFolderError: the file that holds that scene is damaged.
     """
     name = asked["name"]
-    known = own if own is not None and own["name"] == name else None
-    if known is None and any(row["scene"] == name for row in table):
-        known = known_scene(run, name)
-    for place, there, here in differences(known or asked, asked, "scene"):
+    before = own if own is not None and own["name"] == name else None
+    if before is None and any(row["scene"] == name for row in table):
+        before = known(scene_file(run, name))
+    for place, there, here in differences(before or asked, asked, "scene"):
         raise UsageError(
             f"in {run.path} scene '{name}' has {place}={shown(there)}, and rows with {shown(here)} "
             "would be taken for the same scene: give this one another name with scene.name="
-            f"{', or leave scene= out' if known is own else ''}"
+            f"{', or leave scene= out' if before is own else ''}"
+        )
+
+
+def maps_of(config: Config) -> dict[str, Any]:
+    """Returns the part of a config that decides what a policy sees, apart from the scene."""
+    errors = {name: size for name, size in (config["noise"] or {}).items() if size}
+    return {"representations": config["representations"], "flow": config["flow"], "noise": errors}
+
+
+def check_maps(folder: RunFolder, config: Config, policy: str, table: Rows) -> None:
+    """Checks that episodes of the user's own policy can't be taken for some with other maps.
+
+    Raises:
+        UsageError: what it sees differs from what it saw in the rows of the table.
+        RunFolderError: the file that holds that is damaged.
+    """
+    if not any(row["policy"] == policy for row in table):
+        return
+    path = maps_file(folder, folder_name(policy))
+    asked = json.loads(json.dumps(maps_of(config)))
+    for place, there, here in differences(known(path) or asked, asked):
+        raise UsageError(
+            f"the rows of {policy} in {folder.path} have {place}={shown(there)}, and rows with "
+            f"{shown(here)} would be taken for the same: give these another folder with output="
         )
 
 
@@ -124,7 +156,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
 
     Raises:
         PolicyError, TableError: as `check_card`, `load_policy` and `RunFolder.read_episodes`.
-        UsageError, RunFolderError: as `check_scene`.
+        UsageError, RunFolderError: as `check_scene` and `check_maps`.
     """
     table = folder.read_episodes()
     config = {key: asked[key] for key in (*OF_THE_EVALUATION, "scene", "representations")}
@@ -132,6 +164,7 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
     config |= {"renderer": "auto"}
     config |= {"speed": "normal", "seed": ""}  # of its training, which is unknown
     check_scene(folder, config["scene"], table)
+    check_maps(folder, config, name, table)
     env = env_from_config(config, num_envs=1, num_workers=0)
     device = choose_device(config["device"])
     task = Task(
@@ -147,4 +180,4 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
     env.close()
     check_card(name, task)
     agent = Agent.from_config(load_policy(name, task), config, device)
-    return Subject(folder, config, agent, frames=0, table=table)
+    return Subject(folder, config, agent, frames=0, table=table, policy=name)

@@ -143,7 +143,7 @@ def test_two_changed_scenes_of_one_name_are_told_apart(untouched):
 
     kept = run.path / "scenes/short.yaml"
     kept.write_text("[]")
-    with pytest.raises(RunFolderError, match=r"short\.yaml is not the scene .* rows of 'short'"):
+    with pytest.raises(RunFolderError, match=r"short\.yaml is not what was .* rows of 'short'"):
         load_subject(asked(run, *short, "scene.time_limit_steps=3"), run)
     run.evaluation_path.unlink()  # without rows nothing can be mistaken
     kept.write_bytes(b"\xff")
@@ -338,3 +338,17 @@ def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(untouched, monkeypat
     assert ended.value.code == 130
     assert [row["policy"] for row in rows_of(run)] == ["greedy", "greedy", "random"]
     assert not (run.path / "videos").exists()
+
+
+def test_a_stop_ends_between_two_films(untouched, monkeypatch):
+    filmed = []
+
+    def record(make, policy, seen, path, seed):
+        filmed.append(path.name)
+        signal.raise_signal(signal.SIGTERM)  # as schedulers send it
+
+    monkeypatch.setattr("flowrep.evaluate.record_episode", record)
+    with pytest.raises(SystemExit) as ended:
+        evaluate(asked(untouched, "video=2", "seed=7"), [untouched])
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert filmed == ["normal_12fps_7.mp4"]

@@ -49,6 +49,23 @@ def test_a_policy_that_goes_on_drives_as_the_baseline_does(tmp_path):
         own(name, tmp_path / "out", *given, "scene.time_limit_steps=3")
 
 
+def test_rows_of_other_maps_are_not_mixed_with_those_of_the_first(tmp_path):
+    path = tmp_path / "straight.py"
+    path.write_text("def make(task):\n    return lambda maps: [0] * len(maps)\n")
+    given = ["representations=[seg,depth]", "episodes=1", "baselines=[]", *SMALL]
+    own(f"{path}:make", tmp_path / "out", *given)
+    assert len(own(f"{path}:make", tmp_path / "out", *given, "episodes=2")) == 2
+    for change, said in (
+        ("noise=depth_camera", r"have noise\.\w+='absent', and rows with 0\.\d+ would be taken for"),
+        ("representations=[depth]", r"have representations\.seg=.*: give these another folder"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            own(f"{path}:make", tmp_path / "out", *given, change)
+    path.rename(tmp_path / "other.py")  # another policy's rows are known by its name
+    rows = own(f"{tmp_path}/other.py:make", tmp_path / "out", *given, "representations=[depth]")
+    assert [row["representations"] for row in rows] == ["seg+depth", "seg+depth", "depth"]
+
+
 def test_the_documented_example_beats_never_turning_and_is_filmed(tmp_path):
     given = [
         "representations=[obj,depth]",
@@ -62,7 +79,8 @@ def test_the_documented_example_beats_never_turning_and_is_filmed(tmp_path):
     mine = episodes(rows, "examples/own_policy.py:make")
     assert len(mine) == 12
     assert successes(mine) > 2 * successes(episodes(rows, "never_turn"))
-    assert [path.name for path in (tmp_path / "videos").iterdir()] == ["normal_12fps_0.mp4"]
+    films = [path.name for path in (tmp_path / "videos").iterdir()]
+    assert films == ["straight_road_normal_12fps_2000000.mp4"]
 
 
 def test_an_agent_of_stable_baselines3_drives(tmp_path, monkeypatch):

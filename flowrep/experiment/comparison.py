@@ -180,7 +180,7 @@ def print_table(rows: Sequence[Mapping[str, Any]], console: Console | None = Non
     """Prints the share of each outcome in %, with its 95 % Wilson interval."""
     table = Table(title="Share of episodes in % [95 % interval]", box=box.SIMPLE, pad_edge=False)
     for heading in ("speed", "fps", "policy", "episodes"):
-        table.add_column(heading, no_wrap=True)
+        table.add_column(heading, no_wrap=heading != "policy", overflow="fold")  # it may be a path
     for heading in OUTCOMES[1:]:
         table.add_column(heading.replace("_", " "), justify="right", no_wrap=True)
     by_policy: dict[tuple[str, float, str], list[str]] = defaultdict(list)

@@ -57,7 +57,7 @@ def print_failures(rows: Sequence[Mapping[str, Any]], console: Console | None = 
     """Prints the causes of failure by policy and speed."""
     table = Table(title="Causes of failure in % of the failures", box=box.SIMPLE, pad_edge=False)
     for heading in ("speed", "fps", "policy", "failures"):
-        table.add_column(heading, no_wrap=True)
+        table.add_column(heading, no_wrap=heading != "policy", overflow="fold")  # it may be a path
     lines = failure_causes(rows)
     for cause in CAUSES:
         # In two lines, so that all fit into 100 columns.

@@ -1,4 +1,7 @@
-"""The scenes of a run's evaluations elsewhere, kept whole: rows know theirs by its name alone."""
+"""What rows of evaluation.csv mean beyond their columns, kept in files beside the table.
+
+A row knows its scene by its name alone, and of what a policy of the user's own saw only the names.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,42 +12,51 @@ import yaml
 from flowrep.experiment.run_folder import RunFolder, RunFolderError
 
 
-def known_scene(run: RunFolder, name: str) -> dict[str, Any] | None:
-    """Returns the scene of that name in which episodes were run, None if it wasn't kept.
+def scene_file(run: RunFolder, name: str) -> Path:
+    """Returns the file for a scene, whole, in which rows were run; not for the run's own."""
+    return run.path / "scenes" / f"{name}.yaml"
+
+
+def maps_file(run: RunFolder, policy: str) -> Path:
+    """Returns the file for what a policy of the user's own saw.
+
+    Args:
+        run: the folder of its table.
+        policy: its name, without characters that a file can't have.
+    """
+    return run.path / "maps" / f"{policy}.yaml"
+
+
+def known(path: Path) -> dict[str, Any] | None:
+    """Returns what a file holds, None if there is none.
 
     Raises:
-        RunFolderError: its file is damaged.
+        RunFolderError: the file is damaged.
     """
-    path = _path(run, name)
     if not path.is_file():
         return None
     try:
-        scene = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, ValueError, RecursionError):
-        scene = None
-    if not isinstance(scene, dict):
+        data = None
+    if not isinstance(data, dict):
         raise RunFolderError(
-            f"{path} is not the scene that was evaluated: restore it, or delete it together with "
-            f"the rows of '{name}' in {run.evaluation_path}"
+            f"{path} is not what was evaluated: restore it, or delete it together with the rows "
+            f"of '{path.stem}' in {path.parent.parent / 'evaluation.csv'}"
         )
-    return scene
+    return data
 
 
-def keep_scene(run: RunFolder, scene: Mapping[str, Any]) -> None:
-    """Writes a scene to `scenes/<name>.yaml`, unless that is what the file holds.
+def keep(path: Path, data: Mapping[str, Any]) -> None:
+    """Writes data, unless that is what the file holds.
 
     Raises:
         OSError: it can't be written.
     """
-    path = _path(run, scene["name"])
-    data = yaml.safe_dump(dict(scene), sort_keys=False).encode()
-    if path.is_file() and path.read_bytes() == data:
+    text = yaml.safe_dump(dict(data), sort_keys=False).encode()
+    if path.is_file() and path.read_bytes() == text:
         return
     path.parent.mkdir(exist_ok=True)
     whole = path.with_suffix(".tmp")
-    whole.write_bytes(data)
+    whole.write_bytes(text)
     whole.replace(path)
-
-
-def _path(run: RunFolder, name: str) -> Path:
-    return run.path / "scenes" / f"{name}.yaml"
