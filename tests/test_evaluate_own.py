@@ -56,7 +56,7 @@ def test_rows_of_other_maps_are_not_mixed_with_those_of_the_first(tmp_path):
     own(f"{path}:make", tmp_path / "out", *given)
     assert len(own(f"{path}:make", tmp_path / "out", *given, "episodes=2")) == 2
     for change, said in (
-        ("noise=depth_camera", r"have noise\.\w+='absent', and rows with 0\.\d+ would be taken for"),
+        ("noise=depth_camera", r"have noise\.\w+='absent', and rows with 0\.\d+ would be"),
         ("representations=[depth]", r"have representations\.seg=.*: give these another folder"),
     ):
         with pytest.raises(UsageError, match=said):
