@@ -54,7 +54,6 @@ class Comparison:
         baselines: Sequence[str] = (),
         agents: int = 1,
     ) -> None:
-        self.fps = [*fps]
         self._seeds = [(seed + k) % (1 << 31) for k in range(episodes)]
         # ordered by agent and frame rate, so that environments share a batch for long
         self._rides = [
