@@ -76,7 +76,11 @@ def factorize_recording(settings: dict[str, Any]) -> int:
         return 130
     if not job.done:
         folder.discard_if_empty()
-        raise SequenceError(settings["input"], "has no two consecutive frames")
+        chosen = {key: settings[key] for key in ("start", "stop", "stride")}
+        given = " ".join(f"{key}={value}" for key, value in chosen.items() if value is not None)
+        raise SequenceError(
+            settings["input"], f"has no two consecutive frames of one clip with {given}"
+        )
     folder.finish(job.summary())
     warning = "warning: " if diagnosis.suspects else ""
     print(f"{warning}{diagnosis.words}")

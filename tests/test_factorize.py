@@ -6,6 +6,7 @@ import csv
 import inspect
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -33,6 +34,7 @@ from flowrep.sequences import (
     RECORDINGS,
     STREAMS,
     EstimatedFlowSource,
+    Frame,
     SequenceError,
     SevenScenes,
     diagnose,
@@ -40,7 +42,7 @@ from flowrep.sequences import (
     read_flo,
     read_kitti_flow,
 )
-from flowrep.sequences.job import Job
+from flowrep.sequences.job import Job, JobOptions
 from flowrep.sequences.output_folder import OutputFolder
 from flowrep.sequences.scores import COLUMNS
 from flowrep.transforms import DIS
@@ -248,7 +250,7 @@ def test_a_first_frame_that_is_broken_leaves_nothing_at_all(moments, tmp_path):
 
 
 def test_one_frame_alone_has_no_flow(moments, tmp_path):
-    with pytest.raises(SequenceError, match="has no two consecutive frames"):
+    with pytest.raises(SequenceError, match="no two consecutive frames of one clip with start=2"):
         factorize(tmp_path, "start=2", "video=false")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 
@@ -262,6 +264,48 @@ def test_a_stride_takes_every_other_frame(moments, tmp_path):
     _, out = factorize(tmp_path, "stride=2", "video=false", "check_consistency=false")
     (row,) = table(out)
     assert (row["index"], row["name"], row["epe_px"]) == ("2", "0002", "")
+
+
+def test_a_stride_does_not_pair_frames_of_two_clips(tmp_path):
+    synthetic.write_kitti(tmp_path / "in")
+    training, mapping = tmp_path / "in/training", tmp_path / "in/train_mapping.txt"
+    for path in [*training.glob("*/000000*")]:  # a second pair
+        shutil.copy(path, path.with_name(path.name.replace("000000", "000001")))
+    mapping.write_text(2 * mapping.read_text())
+    # frames in order: a later, a earlier, b later, b earlier; every third is the first and the last
+    options = ["stride=3", "video=false"]
+    options += [f"format.raw_data={tmp_path}/in/raw", f"format.mapping={mapping}"]
+    with pytest.raises(SequenceError, match=r"no two .* frames of one clip with start=0 stride=3"):
+        factorize(tmp_path, *options, source="in/training", format="kitti")
+
+
+class Camera:
+    """A stream whose third frame begins a clip."""
+
+    has_flow, notes = False, ()
+
+    def __iter__(self):
+        for number in range(7):
+            yield Frame(
+                name=f"{number}",
+                source=Path("camera"),
+                world_from_cam=np.eye(4),
+                K=np.array([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]]),
+                depth=np.ones((6, 8), np.float32),
+                starts_clip=number == 3,
+            )
+
+
+def test_a_camera_whose_skipped_frame_begins_a_clip_gives_no_pair_across_it(tmp_path):
+    pairs = []
+
+    def flow_source(previous, current):
+        pairs.append((previous.name, current.name))
+        return np.zeros((2, 6, 8), np.float32)
+
+    out = OutputFolder(tmp_path / "out", {}, resume=False)
+    Job(Camera(), flow_source, out, JobOptions(stop=7, stride=2)).run()  # 0, 2, 4 and 6
+    assert pairs == [("0", "2"), ("4", "6")]
 
 
 def test_exact_flow_where_there_is_none(tmp_path):

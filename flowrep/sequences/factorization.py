@@ -30,9 +30,11 @@ class FactorizedFrame:
         frame: the current frame, t.
         previous: the frame before, t'.
         raw: `[2, H, W]`, nan where unknown.
-        ego: `[2, H, W]`, 0 where depth is missing.
+        ego: `[2, H, W]`, 0 where `ego_valid` is false.
         obj: `[2, H, W]`, raw - ego where both are known and trusted, 0 elsewhere.
         valid: `[H, W]`, where raw and ego are known and trusted.
+        ego_valid: `[H, W]`, where ego is, whatever raw is: depth is known, and the point was in
+            front of the previous camera.
     """
 
     frame: Frame
@@ -41,6 +43,7 @@ class FactorizedFrame:
     ego: Flow
     obj: Flow
     valid: NDArray[np.bool_]
+    ego_valid: NDArray[np.bool_]
 
 
 # From the previous and the current frame to raw flow on the current grid, nan where unknown.
@@ -148,10 +151,15 @@ def factorize_pair(previous: Frame, current: Frame, raw: Flow) -> FactorizedFram
     motion = relative_motion(
         torch.from_numpy(previous.world_from_cam), torch.from_numpy(current.world_from_cam)
     )
-    ego, obj, valid = factorize(
-        torch.from_numpy(raw),
+    measured = np.isfinite(raw).all(axis=0)
+    ego, obj, ego_valid = factorize(
+        torch.from_numpy(np.where(measured, raw, np.float32(0))),
         torch.from_numpy(current.depth)[None],
         torch.from_numpy(current.K).float(),
         motion,
     )
-    return FactorizedFrame(current, previous, raw, ego.numpy(), obj.numpy(), valid[0].numpy())
+    valid = ego_valid[0].numpy() & measured
+    known_obj = np.where(valid, obj.numpy(), np.float32(0))
+    return FactorizedFrame(
+        current, previous, raw, ego.numpy(), known_obj, valid, ego_valid[0].numpy()
+    )

@@ -79,6 +79,10 @@ class Recording(ABC):
     def __len__(self) -> int:
         """Returns the number of frames."""
 
+    def starts_clip(self, index: int) -> bool:
+        """Returns whether the frames before this one belong to another shot, without reading it."""
+        return False
+
     @abstractmethod
     def _read(self, index: int) -> Frame:
         """Returns a frame, unchecked."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -150,12 +150,25 @@ class Job:
         return range(first, min(last, len(self.stream)), self.options.stride)
 
     def _frames(self, resumed_after: int | None) -> Iterator[tuple[int, Frame]]:
+        """Yields the frames that are used; one starts a clip if a frame skipped before it does."""
+        start, stop, stride = self.options.start, self.options.stop, self.options.stride
         if isinstance(self.stream, Recording):
-            yield from ((index, self.stream[index]) for index in self._indices(resumed_after))
-        else:
-            options = self.options
-            numbered: Iterable[tuple[int, Frame]] = enumerate(self.stream)
-            yield from islice(numbered, options.start, options.stop, options.stride)
+            for index in self._indices(resumed_after):
+                frame = self.stream[index]
+                yield index, replace(frame, starts_clip=self._starts_clip(index))
+            return
+        starts_clip = False
+        for index, frame in islice(enumerate(self.stream), stop):
+            starts_clip |= frame.starts_clip
+            if index >= start and (index - start) % stride == 0:
+                yield index, replace(frame, starts_clip=starts_clip)
+                starts_clip = False
+
+    def _starts_clip(self, index: int) -> bool:
+        """Returns whether the frame used before this one belongs to another shot."""
+        assert isinstance(self.stream, Recording)
+        since = range(max(0, index - self.options.stride + 1), index + 1)
+        return any(self.stream.starts_clip(i) for i in since)
 
     def _factorized(
         self, resumed_after: int | None

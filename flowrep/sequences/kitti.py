@@ -67,6 +67,10 @@ class Kitti(Recording):
         """Returns the number of frames: two per pair."""
         return 2 * len(self._pairs)
 
+    def starts_clip(self, index: int) -> bool:
+        """Returns whether it is the earlier frame of a pair."""
+        return index % 2 == 0
+
     def _read(self, index: int) -> Frame:
         pair, is_current = self._pairs[index // 2], bool(index % 2)
         name = f"{pair}_{'10' if is_current else '11'}"
@@ -87,7 +91,7 @@ class Kitti(Recording):
             rgb=rgb,
             raw=-read_kitti_flow(flow) if is_current else None,
             raw_since=f"{pair}_11" if is_current else None,
-            starts_clip=not is_current,
+            starts_clip=self.starts_clip(index),
         )
 
     def _recordings(self, mapping: Path) -> dict[int, tuple[Path, int]]:

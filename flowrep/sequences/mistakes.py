@@ -46,7 +46,8 @@ def _inverted(then: Callable[[Tensor], Tensor] = lambda pose: pose) -> Callable[
 
 
 def _ray_from_z(depth: Tensor, K: Tensor) -> Tensor:
-    return depth.square() / z_from_ray_length(depth, K)
+    ray = depth.square() / z_from_ray_length(depth, K)
+    return torch.where(depth.isinf(), depth, ray)  # the sky stays at infinity
 
 
 def _unit(factor: float) -> Callable[[Tensor, Tensor], Tensor]:

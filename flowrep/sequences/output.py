@@ -64,14 +64,10 @@ def write_frame(
 
 
 def known(kind: str, factorized: FactorizedFrame) -> NDArray[np.bool_]:
-    """Returns where a flow is known: ego needs a known depth, obj needs raw and ego."""
-    if kind == "obj":
-        return factorized.valid
-    measured: NDArray[np.bool_] = np.isfinite(factorized.raw[0]) & np.isfinite(factorized.raw[1])
+    """Returns where a flow is known: obj needs raw and ego."""
     if kind == "raw":
-        return measured
-    # Where raw is known, a pixel is invalid if it was behind the camera, where ego is unknown.
-    return (factorized.frame.depth > 0) & (factorized.valid | ~measured)  # nan compares False
+        return np.isfinite(factorized.raw[0]) & np.isfinite(factorized.raw[1])
+    return factorized.ego_valid if kind == "ego" else factorized.valid
 
 
 def arrays(factorized: FactorizedFrame) -> dict[str, NDArray[Any]]:

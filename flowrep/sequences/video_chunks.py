@@ -26,7 +26,7 @@ class VideoChunks:
     def __init__(self, folder: Path, *, fps: float, continue_after: int = 0) -> None:
         self.folder, self.fps = folder, fps
         self.frames = _keep_whole(folder, continue_after)
-        self._size: tuple[int, int] | None = None
+        self._size = _size_of(next(folder.glob("00000000-*.mp4"))) if self.frames else None
         self._writer: Any = None
         self._in_chunk = 0
 
@@ -106,3 +106,11 @@ def _keep_whole(folder: Path, at_most: int) -> int:
         else:
             chunk.unlink()
     return frames
+
+
+def _size_of(chunk: Path) -> tuple[int, int]:
+    """Returns the height and width of a video."""
+    import imageio.v3 as imageio
+
+    width, height = imageio.immeta(chunk, plugin="FFMPEG")["size"]
+    return height, width

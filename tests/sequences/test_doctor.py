@@ -18,6 +18,7 @@ from flowrep.geometry import (
     z_from_ray_length,
 )
 from flowrep.sequences import Doctor, diagnose
+from flowrep.sequences.mistakes import MISTAKES
 from tests.geometry.scenes import rigid
 
 HEIGHT, WIDTH = 45, 64
@@ -101,6 +102,18 @@ def test_a_wrong_convention_is_named(mistake, right):
     assert found.rivals_px[mistake] < 1e-3
     assert found.residual_px > 0.1
     assert found.words.startswith("a convention looks wrong:")
+
+
+def test_the_sky_is_at_infinity_as_either_kind_of_depth():
+    depth = torch.full((1, HEIGHT, WIDTH), torch.inf)
+    depth[0, 30, 50] = 2.0
+    for mistake, expected in (
+        ("ray_length", 4.0 / float(ray_length(depth)[0, 30, 50])),
+        ("not_ray_length", float(ray_length(depth)[0, 30, 50])),
+    ):
+        corrected = MISTAKES[mistake].depth(depth, K)
+        assert corrected.isinf().sum() == HEIGHT * WIDTH - 1
+        assert corrected[0, 30, 50].item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from flowrep.sequences import (
     recorded_flow,
 )
 from flowrep.sequences.factorization import consistent
+from flowrep.sequences.output import known
 from flowrep.sequences.scores import _median_px, end_point_error, score
 from flowrep.transforms import DIS
 
@@ -86,6 +87,22 @@ def test_a_new_clip_has_no_flow_since_the_last_one():
     source = EstimatedFlowSource(DIS(), check_consistency=False)
     frames = [frame("a"), frame("b"), frame("c", starts_clip=True), frame("d")]
     assert [made is None for made in factorize_frames(frames, source)] == [True, False, True, False]
+
+
+def test_ego_flow_is_known_wherever_geometry_gives_it():
+    # The previous camera was 2 m ahead, so a point 1 m away was behind it; raw is unknown there.
+    depth = np.full((40, 60), 4.0, np.float32)
+    depth[:20], depth[:, 40:] = 1.0, np.nan
+    raw = np.zeros((2, 40, 60), np.float32)
+    raw[:, :, :20] = np.nan
+    ahead = np.eye(4)
+    ahead[2, 3] = 2.0
+    made = factorize_pair(frame("a", world_from_cam=ahead), frame("b", depth=depth), raw)
+    assert known("ego", made).tolist() == (depth == 4.0).tolist()
+    assert known("obj", made).tolist() == ((depth == 4.0) & np.isfinite(raw[0])).tolist()
+    assert not made.obj[:, ~known("obj", made)].any()
+    # twice as near then: u - cx was twice what it is now, for column 5 -25, so that p - p' is 25
+    np.testing.assert_allclose(made.ego[0, 30, 5], 25.0)
 
 
 def test_flow_of_ones_own_has_to_be_of_this_pair():
