@@ -79,7 +79,8 @@ def factorize_recording(settings: dict[str, Any]) -> int:
         chosen = {key: settings[key] for key in ("start", "stop", "stride")}
         given = " ".join(f"{key}={value}" for key, value in chosen.items() if value is not None)
         raise SequenceError(
-            settings["input"], f"has no two consecutive frames of one clip with {given}"
+            settings["input"],
+            f"has no two consecutive frames of one clip with {given}: choose others",
         )
     folder.finish(job.summary())
     warning = "warning: " if diagnosis.suspects else ""

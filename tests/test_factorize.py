@@ -99,6 +99,7 @@ def test_all_that_is_written(moments, tmp_path):
         arrays = np.load(out / f"flow/{name}.npz")
         np.testing.assert_allclose(arrays["ego"] + arrays["obj"], moment.raw, atol=1e-5)
         assert arrays["valid"].all()
+        assert arrays["ego_valid"].all()
     # 0.3 m ahead on a curve: the pose before, seen from the pose now.
     expected = np.linalg.inv(synthetic.pose(0)) @ synthetic.pose(1)
     np.testing.assert_allclose(np.load(out / "flow/0001.npz")["prev_from_curr"], expected)
@@ -280,7 +281,7 @@ def test_a_stride_does_not_pair_frames_of_two_clips(tmp_path):
 
 
 class Camera:
-    """A stream whose third frame begins a clip."""
+    """A stream whose fourth frame begins a clip."""
 
     has_flow, notes = False, ()
 

@@ -155,7 +155,10 @@ class Job:
         if isinstance(self.stream, Recording):
             for index in self._indices(resumed_after):
                 frame = self.stream[index]
-                yield index, replace(frame, starts_clip=self._starts_clip(index))
+                yield (
+                    index,
+                    replace(frame, starts_clip=frame.starts_clip or self._starts_clip(index)),
+                )
             return
         starts_clip = False
         for index, frame in islice(enumerate(self.stream), stop):

@@ -44,7 +44,7 @@ def write_frame(
 
     ```
     flow/<raw, ego, obj>/<name>.flo      and / or .png, KITTI's
-    flow/<name>.npz                      raw, ego, obj, valid, K, prev_from_curr
+    flow/<name>.npz                      raw, ego, obj, valid, ego_valid, K, prev_from_curr
     pictures/<raw, ego, obj>/<name>.png  colours, with the scale and the wheel
     ```
     """
@@ -78,6 +78,7 @@ def arrays(factorized: FactorizedFrame) -> dict[str, NDArray[Any]]:
         "ego": factorized.ego,
         "obj": factorized.obj,
         "valid": factorized.valid,
+        "ego_valid": factorized.ego_valid,
         "K": current.K,
         "prev_from_curr": np.linalg.inv(previous.world_from_cam) @ current.world_from_cam,
     }

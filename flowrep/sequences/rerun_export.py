@@ -9,6 +9,7 @@ import numpy as np
 
 from flowrep.sequences.factorization import FactorizedFrame
 from flowrep.sequences.frame import SequenceError
+from flowrep.sequences.output import shown
 from flowrep.viz import flow_to_rgb
 
 _JPEG_QUALITY = 80
@@ -61,7 +62,7 @@ class RerunExport:
         depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
         self._log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
         for name, scale_px in self.scale_px.items():
-            colours = flow_to_rgb(getattr(factorized, name), scale_px)
+            colours = flow_to_rgb(shown(name, factorized), scale_px)
             self._log(f"flow/{name}", rr.Image(colours).compress(jpeg_quality=_JPEG_QUALITY))
 
     def close(self) -> None:
