@@ -17,8 +17,9 @@ _NEIGHBOURS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) 
 
 
 def free_ground(layout: Layout, path: Path) -> BaseGeometry:
-    """Returns the road minus the obstacles and closures of a path's episodes."""
-    boxes = [*layout.obstacles, *(layout.closures[name] for name in path.closures)]
+    """Returns the road minus the buildings, obstacles and closures of a path's episodes."""
+    boxes = [*layout.buildings, *layout.obstacles]
+    boxes += [layout.closures[name] for name in path.closures]
     free = layout.drivable.difference(shapely.union_all([box.footprint for box in boxes]))
     shapely.prepare(free)
     return free

@@ -105,7 +105,9 @@ class Layout:
         self.drivable = _with_round_corners(shapely.union_all([*self.ribbons.values()]), radius)
         paved = shapely.union_all([*wide, _with_round_corners(shapely.union_all(wide), radius)])
         self._paved = shapely.union(paved, self.drivable)
-        self.sidewalks = self._paved.difference(self.drivable)
+        has_sidewalks = any(road.sidewalk_m > 0 for road in scene.roads)
+        # without any, rounding of corners leaves slivers
+        self.sidewalks = self._paved.difference(self.drivable) if has_sidewalks else Polygon()
         self.terrain = self._terrain(scene.terrain_m)
         self.crosswalks = tuple(self._crosswalk_area(crosswalk) for crosswalk in scene.crosswalks)
         self.zones = {zone.name: self._zone_polygon(zone) for zone in scene.zones}

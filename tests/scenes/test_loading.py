@@ -195,6 +195,25 @@ def test_a_row_that_ends_with_its_road_has_no_house_beyond_it(straight_road):
     assert max(house.x_m for house in rows) < 190 < across.x_m
 
 
+def test_a_house_on_the_road_blocks_it(data):
+    # A lane from the south ends 8 m below the stem's axis; the house beyond its end is built from
+    # there over the stem, 6 m wide and 12 m deep.
+    lane = {"name": "lane", "start_m": [20.0, -30.0], "heading_deg": 90.0, "width_m": 6.0}
+    lane |= {"sidewalk_m": 0.0, "pieces": [{"straight_m": 22.0}]}
+    house = {"road": "lane", "side": "end", "from_m": 0.0, "to_m": 0.0, "setback_m": 0.0}
+    house |= {"front_m": [6.0, 6.0], "depth_m": [12.0, 12.0], "height_m": [8.0, 8.0]}
+    data |= {"pedestrian_groups": [], "obstacles": [], "roads": [*data["roads"], lane]}
+    load_scene(data)
+    message = refuse(data, building_rows=[house])
+    assert message.startswith("paths.left: no free road leads from 'south' to 'west'")
+
+
+def test_rounded_roads_without_sidewalks_have_none(data):
+    data |= {"roads": [road | {"sidewalk_m": 0.0} for road in data["roads"]]}
+    data |= {"pedestrian_groups": [], "corner_radius_m": 5.0}
+    assert Layout(load_scene(data)).sidewalks.is_empty
+
+
 def refuse(data, **changes):
     """Returns the message that refuses the data with a change at each dotted key."""
     data = copy.deepcopy(data)
@@ -374,6 +393,10 @@ def refuse(data, **changes):
                 ],
             },
             "crosswalks[0].at_m: 50 m is not on road 'stem'; stay within 0 and 40.0",
+        ),
+        (
+            {"zones__1__from_m": 69.5},
+            "zones.west: ends a path and is 0.5 m long; make it 1 m long, or vehicles can drive",
         ),
     ],
 )
