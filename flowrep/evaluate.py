@@ -234,13 +234,13 @@ def film(asked: Config, subject: Subject, stop: StopRequest) -> None:
         for number in range(asked["video"]):
             if stop:
                 return
-            path = run.video_path(f"{where}{speed}_{rate:g}fps_{asked['seed'] + number}")
+            episode_seed = (asked["seed"] + number) % (1 << 31)
+            path = run.video_path(f"{where}{speed}_{rate:g}fps_{episode_seed}")
             make = partial(env_from_config, config, speed=speed, frame_rate_hz=float(rate))
-            seen, seed = config["representations"], asked["seed"] + number
-            policy = subject.agent.policy
+            seen, policy = config["representations"], subject.agent.policy
             if isinstance(policy, ForeignPolicy):
                 policy = policy.alone()
-            record_episode(make, policy, seen, path, seed=seed)
+            record_episode(make, policy, seen, path, episode_seed=episode_seed)
             print(f"video: {path}")
 
 

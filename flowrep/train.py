@@ -290,9 +290,8 @@ def show(training: Training, config: Config) -> None:
     path = run.video_path(f"episode_{config['speed']}")
     if config["evaluation"]["video"] and not path.exists():
         make_env = partial(env_from_config, config)
-        record_episode(
-            make_env, training.agent.policy, config["representations"], path, seed=FINAL_SEED
-        )
+        seen, policy = config["representations"], training.agent.policy
+        record_episode(make_env, policy, seen, path, episode_seed=FINAL_SEED)
         print(f"video: {path}")
 
 

@@ -8,6 +8,7 @@ import shutil
 import signal
 
 import pytest
+import torch
 import yaml
 
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
@@ -15,7 +16,7 @@ pytest.importorskip("pybullet", reason="agents are evaluated in the simulated st
 from flowrep.agent import CheckpointError
 from flowrep.baselines import Drive
 from flowrep.config import UsageError
-from flowrep.envs import WorkerError
+from flowrep.envs import WorkerError, make_env, street_envs
 from flowrep.evaluate import evaluate, runs_in
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.evaluation import Episode
@@ -27,6 +28,7 @@ from flowrep.export import export
 from flowrep.subjects import Subject, load_subject
 from flowrep.train import make_training
 from flowrep.viz.curves import _evaluated
+from flowrep.viz.film import film_episode
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow
@@ -343,7 +345,7 @@ def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(untouched, monkeypat
 def test_a_stop_ends_between_two_films(untouched, monkeypatch):
     filmed = []
 
-    def record(make, policy, seen, path, seed):
+    def record(make, policy, seen, path, episode_seed):
         filmed.append(path.name)
         signal.raise_signal(signal.SIGTERM)  # as schedulers send it
 
@@ -352,3 +354,14 @@ def test_a_stop_ends_between_two_films(untouched, monkeypatch):
         evaluate(asked(untouched, "video=2", "seed=7"), [untouched])
     assert ended.value.code == 128 + signal.SIGTERM
     assert filmed == ["normal_12fps_7.mp4"]
+
+
+def test_a_film_is_of_the_episode_that_names_it():
+    env = make_env("straight_road", {"rgb": {}}, keep_sensor=True)
+
+    def leave_the_road(tensordict):
+        return tensordict.set("action", torch.ones(1, dtype=torch.int64))
+
+    film_episode(env, leave_the_road, episode_seed=2_000_017)
+    assert street_envs(env)[0].episode.seed == 2_000_017
+    env.close()

@@ -273,12 +273,19 @@ def _check_plugins(hydra: DictConfig) -> None:
     """Refuses a launcher or sweeper of `conf/hydra/` whose package is not installed."""
     for part in ("launcher", "sweeper"):
         package = ".".join(str(hydra[part]["_target_"]).split(".")[:2])
-        if package.startswith("hydra_plugins.") and find_spec(package) is None:
+        if package.startswith("hydra_plugins.") and not _is_installed(package):
             name = package.split(".")[1].replace("_", "-")
             raise UsageError(
                 f"hydra/{part}={hydra.runtime.choices[f'hydra/{part}']} needs a package that is "
                 f"not installed: pip install {name}"
             )
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ModuleNotFoundError:  # not even the package that it is in
+        return False
 
 
 def _check_scene_name(config: DictConfig, job: Iterable[str], scenes: Iterable[str]) -> None:

@@ -39,7 +39,7 @@ class Comparison:
         seed: the seed of the first episode.
         policies: "greedy", "sampled" or both, applied to every agent, or the name of a policy with
             only one way to act.
-        baselines: names in `flowrep.envs.BASELINES`, run on the same episodes.
+        baselines: names in `flowrep.baselines.BASELINES`, run on the same episodes.
         agents: the number of agents.
     """
 

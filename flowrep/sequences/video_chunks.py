@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from flowrep.viz import Image
+from flowrep.viz.maps import sampled_for_codec
 
 CHUNK_FRAMES = 100
 
@@ -32,6 +33,7 @@ class VideoChunks:
 
     def append(self, image: Image) -> None:
         """Adds a frame; if its size differs from the first one's, it is cut or padded in white."""
+        image = sampled_for_codec(image)
         if self._writer is None:
             self._open(image)
         assert self._size is not None

@@ -18,15 +18,20 @@ Maps = dict[str, Tensor]
 
 
 @torch.no_grad()
-def film_episode(env: EnvBase, policy: Policy) -> tuple[list[Maps], str]:
+def film_episode(
+    env: EnvBase, policy: Policy, episode_seed: int | None = None
+) -> tuple[list[Maps], str]:
     """Returns the maps of every frame of one greedy episode, and its outcome.
 
     Args:
         env: a batch of one environment that keeps all sensors and rgb.
         policy: writes `action`.
+        episode_seed: identifies the episode, as in evaluation.csv; the env's next one if None.
     """
     intrinsics = torch.as_tensor(street_envs(env)[0].K)
-    tensordict = env.reset()
+    tensordict = env.reset(
+        **({} if episode_seed is None else {"options": {"episode_seed": episode_seed}})
+    )
     frames = [maps_of(tensordict["sensor"][0].cpu(), intrinsics)]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while not tensordict["done"].any():
@@ -64,7 +69,7 @@ def record_episode(
     representations: Mapping[str, Any],
     path: Path,
     *,
-    seed: int,
+    episode_seed: int,
 ) -> str:
     """Writes the video of one greedy episode to `path`; returns its outcome.
 
@@ -73,12 +78,11 @@ def record_episode(
         policy: writes `action`.
         representations: the policy's inputs, a mapping from name to options.
         path: the mp4 file.
-        seed: seeds the environment, which draws the episode.
+        episode_seed: identifies the episode, as in evaluation.csv.
     """
     seen = dict(representations) | {"rgb": {}}
     env = make_env(representations=seen, keep_sensor=True, num_envs=1, num_workers=0)
-    env.set_seed(seed)
-    frames, outcome = film_episode(env, policy)
+    frames, outcome = film_episode(env, policy, episode_seed)
     fps = street_envs(env)[0].frame_rate_hz
     env.close()
     whole = path.with_suffix(f".tmp{path.suffix}")  # so that `path` is never half a film

@@ -6,6 +6,7 @@ Images are numpy uint8 `[H, W, 3]`. Maps go in as numpy or torch, `[C, H, W]`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
@@ -38,6 +39,7 @@ _OFF_WHITE = 255 * (
     1 - np.clip(np.abs((6 * np.arange(_HUES)[:, None] / _HUES + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
 ).astype(np.float32)
 _BAR_PX = 28
+_MOST_CODEC_PX = 16_384  # a side
 _NOTE_PX = 20
 _GAP_PX = 4
 _GAP_GREY = 200  # so that the white of no motion has an edge
@@ -225,7 +227,8 @@ def write_png(path: str | Path, image: Image) -> None:
 def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
     """Writes frames `[H, W, 3]` of the same size as an mp4 (H.264) that browsers play.
 
-    Odd sizes, which the codec does not support, are padded with a white row or column.
+    Odd sizes, which the codec does not support, are padded with a white row or column, and frames
+    that are too large for it are sampled.
     """
     import imageio.v2 as imageio
 
@@ -234,17 +237,23 @@ def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> Non
     with imageio.get_writer(
         path, fps=fps, codec="libx264", quality=8, pixelformat="yuv420p", macro_block_size=1
     ) as video:
-        for frame in frames:
+        for frame in map(sampled_for_codec, frames):
             odd_rows, odd_columns = frame.shape[0] % 2, frame.shape[1] % 2
             fill = ((0, odd_rows), (0, odd_columns), (0, 0))
             video.append_data(np.pad(frame, fill, constant_values=255))
+
+
+def sampled_for_codec(image: Image) -> Image:
+    """Returns every n-th row and column, with the least n for which H.264 takes the image."""
+    step = math.ceil(max(image.shape[:2]) / _MOST_CODEC_PX)
+    return image[::step, ::step]
 
 
 @lru_cache(maxsize=64)
 def _label_bar(label: str, width: int, with_wheel: bool) -> Image:
     bar = np.full((_BAR_PX, width, 3), 255, np.uint8)
     bar = _written(bar, {(2, _BAR_PX // 2): (label, "lm", (0, 0, 0))}, size=18)
-    if with_wheel:
+    if with_wheel and width >= _BAR_PX:
         bar[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
     return bar
 

@@ -1,5 +1,6 @@
 """Which runs a sweep has, before it begins, and where they go."""
 
+import sys
 from importlib.util import find_spec
 
 import pytest
@@ -66,7 +67,10 @@ def test_what_is_no_sweep_is_refused(line, says):
 
 
 @pytest.mark.skipif(bool(find_spec("ray")), reason="Ray is installed")
-def test_a_launcher_that_lacks_its_package_says_which():
+@pytest.mark.parametrize("has_others", [True, False])
+def test_a_launcher_that_lacks_its_package_says_which(monkeypatch, has_others):
+    if not has_others:  # as without the extra `sweep`
+        monkeypatch.setitem(sys.modules, "hydra_plugins", None)
     with pytest.raises(UsageError, match="pip install hydra-ray-launcher"):
         check_command("train", ["-m", "hydra/launcher=ray_jobs", "seed=0,1"])
 

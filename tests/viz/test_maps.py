@@ -21,6 +21,7 @@ from flowrep.viz import (
     write_png,
     write_video,
 )
+from flowrep.viz.maps import sampled_for_codec
 
 
 def flow_of(u: float, v: float) -> np.ndarray:
@@ -192,6 +193,19 @@ def test_video_of_odd_size_can_be_played(tmp_path):
     played = imageio.imread(tmp_path / "new" / "episode.mp4")
     assert played.shape == (3, 34, 52, 3)
     assert np.abs(played[:, 16, 25, 0].astype(int) - [20, 120, 220]).max() <= 6
+
+
+def test_frames_that_the_codec_cannot_take_are_sampled():
+    wide = np.arange(20_000, dtype=np.uint8)[None, :, None].repeat(6, 0).repeat(3, 2)
+    small = sampled_for_codec(wide)
+    assert small.shape == (3, 10_000, 3)
+    assert (small == wide[::2, ::2]).all()
+    assert sampled_for_codec(wide[:, :16_384]).shape == (6, 16_384, 3)
+
+
+def test_a_strip_of_narrow_pictures_has_no_wheels():
+    narrow = np.zeros((2, 480, 16), np.float32)
+    assert representation_strip({"raw": narrow, "obj": narrow}).shape[0] > 480
 
 
 def test_importing_viz_needs_numpy_alone():
