@@ -2,6 +2,7 @@
 #   docker build -t flowrep .
 #   docker run --rm -v "$PWD/outputs:/flowrep/outputs" flowrep train ARGS="seed=1"
 #   docker run --rm flowrep test
+# It runs as user 1000, who must be able to write to outputs/: chmod o+w outputs
 FROM python:3.11-slim-bookworm
 
 # A compiler for torch.compile, make for the two commands; nothing of a screen. Debian's mirrors keep

@@ -1,7 +1,15 @@
-"""The error for missing packages of an extra."""
+"""Which packages are installed, and the error for missing ones of an extra."""
 
 import sys
 from importlib.util import find_spec
+
+
+def is_installed(package: str) -> bool:
+    """Returns whether a package or submodule can be imported, without importing it."""
+    try:
+        return find_spec(package) is not None
+    except ModuleNotFoundError:  # not even the package that it is in
+        return False
 
 
 def require(what: str, extra: str, *packages: str, module: str = "") -> None:
@@ -17,7 +25,7 @@ def require(what: str, extra: str, *packages: str, module: str = "") -> None:
         ImportError: a package is missing; names the first one and the extra.
     """
     for package in packages:
-        if find_spec(package) is None:
+        if not is_installed(package):
             message = f"{what} needs {package}; run: pip install 'flowrep[{extra}]'"
             if module == "__main__":
                 sys.exit(f"error: {message}")

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable
 from functools import cache
-from importlib.util import find_spec
 from typing import Any
+
+from flowrep.extras import is_installed
 
 
 @cache
 def numba_is_installed() -> bool:
     """Returns whether numba can be imported, without importing it."""
-    return find_spec("numba") is not None
+    return is_installed("numba")
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:

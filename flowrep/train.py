@@ -2,10 +2,8 @@
 
 import logging
 import sys
-from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
-from typing import Any
 
 from flowrep.console import prepare
 from flowrep.extras import require
@@ -27,7 +25,6 @@ from flowrep.agent import (
     use_threads,
 )
 from flowrep.config import UsageError, validated
-from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.command_line import (
     exit_with,
     line_for,
@@ -37,8 +34,7 @@ from flowrep.config.command_line import (
     typed_value,
 )
 from flowrep.config.quoting import override
-from flowrep.config.run_names import OF_THE_MACHINE
-from flowrep.config.training import TrainConfig, validated_run
+from flowrep.config.training import TrainConfig
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import WorkerError
 from flowrep.envs.workers import available_cores
@@ -58,6 +54,7 @@ from flowrep.from_config import (
     choose_device,
     env_from_config,
 )
+from flowrep.resuming import how_to_resume, resumed_config
 from flowrep.scenes import SceneError, load_scene
 from flowrep.sweeps.plan import is_sweep
 from flowrep.sweeps.sweep import run_sweep
@@ -153,41 +150,6 @@ def final_success(folder: RunFolder, frames: int) -> float:
         if (row["evaluation"], row["policy"], int(row["frames"])) == ("final", "greedy", frames)
     ]
     return outcomes.count("success") / len(outcomes)
-
-
-def how_to_resume(config: Config, folder: RunFolder) -> str:
-    """Returns the command line that continues a run."""
-    target = config["algorithm"]["_target_"]
-    trust = {} if target in ALGORITHMS else {"trust": target}
-    return line_for("train", resume=str(folder.path), **trust)
-
-
-def resumed_config(
-    plain: dict[str, Any], folder: RunFolder, given: Sequence[str]
-) -> dict[str, Any]:
-    """Returns the config of the run to resume, with the settings of the machine that are given.
-
-    Args:
-        plain: the composed config.
-        folder: the run's folder.
-        given: the overrides that were typed.
-
-    Raises:
-        UsageError: others than those of the machine were, or the run's config is damaged.
-    """
-    others = [
-        o for o in given if not o.startswith(("resume=", *(f"{key}=" for key in OF_THE_MACHINE)))
-    ]
-    if others:
-        raise UsageError(
-            f"resume= continues a run with its own config, so '{others[0]}' would be ignored; "
-            "leave it out (device=, num_workers= and trust= may be given)"
-        )
-    stored = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
-    # a class to trust is never taken from a file
-    here = ["trust", "resume"]
-    here += [key for key in OF_THE_MACHINE if any(o.startswith(f"{key}=") for o in given)]
-    return stored | {key: plain[key] for key in here}
 
 
 def make_training(config: Config, folder: RunFolder) -> Training:

@@ -37,7 +37,7 @@ FLOWREP_IMPORTS_ALLOWED = {
         "scenes",
         "simulator",
     }
-    | {"sequences", "transforms", "geometry", "config_tree", "console"},
+    | {"sequences", "transforms", "geometry", "config_tree", "console", "extras"},
     "report": {"report", "subjects", "viz", "config", "experiment", "agent", "envs", "scenes"}
     | {"config_tree", "console", "extras"},
 }

@@ -8,7 +8,6 @@ refuses is examined again, to say what is wrong and what exists instead.
 import argparse
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from flowrep.config.hydra_mistakes import needs_a_choice, one_line, unknown_choi
 from flowrep.config.quoting import override as quoted_override
 from flowrep.config.quoting import shell_line
 from flowrep.config_tree import CONF_DIR
+from flowrep.extras import is_installed
 
 VERSION_BASE = "1.3"  # of Hydra's behaviour, as in the commands' entry points
 REFUSALS = (HydraException, OmegaConfBaseException, ValueError)  # the last for `scene=null`
@@ -273,19 +273,12 @@ def _check_plugins(hydra: DictConfig) -> None:
     """Refuses a launcher or sweeper of `conf/hydra/` whose package is not installed."""
     for part in ("launcher", "sweeper"):
         package = ".".join(str(hydra[part]["_target_"]).split(".")[:2])
-        if package.startswith("hydra_plugins.") and not _is_installed(package):
+        if package.startswith("hydra_plugins.") and not is_installed(package):
             name = package.split(".")[1].replace("_", "-")
             raise UsageError(
                 f"hydra/{part}={hydra.runtime.choices[f'hydra/{part}']} needs a package that is "
                 f"not installed: pip install {name}"
             )
-
-
-def _is_installed(package: str) -> bool:
-    try:
-        return find_spec(package) is not None
-    except ModuleNotFoundError:  # not even the package that it is in
-        return False
 
 
 def _check_scene_name(config: DictConfig, job: Iterable[str], scenes: Iterable[str]) -> None:

@@ -16,7 +16,8 @@ from flowrep.config_tree import group_choices
 from flowrep.experiment.interruption import StopRequest
 from flowrep.experiment.run_folder import RunFolder, RunFolderError
 from flowrep.experiment.training import Training, train
-from flowrep.train import make_training, resumed_config
+from flowrep.resuming import resumed_config
+from flowrep.train import make_training
 from flowrep.transforms import FlowFactorize, RawFlow
 from tests.test_configs import composed
 
