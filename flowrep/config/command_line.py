@@ -32,6 +32,8 @@ __all__ = [
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output")
 """Keys whose values are folders, which may have any name."""
+CAMERAS = ("input",)
+"""Those of them that may also be a camera's number."""
 
 
 def register_resolvers() -> None:
@@ -114,7 +116,7 @@ def own_keys() -> set[str]:
 
 def typed_value(key: str) -> Any:
     """Returns a key's value on the command line, None if it was not given."""
-    typed = [a for a in taken_as_typed(sys.argv[1:], FOLDERS) if a.startswith(f"{key}=")]
+    typed = [a for a in taken_as_typed(sys.argv[1:], FOLDERS, CAMERAS) if a.startswith(f"{key}=")]
     if not typed:
         return None
     try:
@@ -133,7 +135,7 @@ def run_command(config_name: str, command: Callable[[], Any], schema: type[Secti
         schema: the schema of the composed config.
     """
     register_resolvers()
-    sys.argv[1:] = taken_as_typed(sys.argv[1:], FOLDERS)
+    sys.argv[1:] = taken_as_typed(sys.argv[1:], FOLDERS, CAMERAS)
     with ended_by_signals():
         try:
             args = check_command(config_name, sys.argv[1:], schema)

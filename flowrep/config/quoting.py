@@ -29,19 +29,36 @@ def shell_line(*words: str) -> str:
     return shlex.join(words)
 
 
-def taken_as_typed(arguments: Iterable[str], keys: Collection[str]) -> list[str]:
+def taken_as_typed(
+    arguments: Iterable[str], keys: Collection[str], numbers: Collection[str] = ()
+) -> list[str]:
     """Returns arguments with Hydra's quotes added to folders that were typed without them.
+
+    A folder is quoted if it exists, or if Hydra would take its name for a number or the like.
 
     Args:
         arguments: the arguments of the command line.
         keys: the keys whose values are folders.
+        numbers: those of them that may also be a number, as a camera's.
     """
-    return [_as_typed(argument, keys) for argument in arguments]
+    return [_as_typed(argument, keys, numbers) for argument in arguments]
 
 
-def _as_typed(argument: str, keys: Collection[str]) -> str:
+def _as_typed(argument: str, keys: Collection[str], numbers: Collection[str]) -> str:
     key, _, text = argument.partition("=")
-    return override(key, text) if key in keys and text and Path(text).exists() else argument
+    if key not in keys or not text:
+        return argument
+    is_misread = key not in numbers and _reads_as_number(argument)
+    return override(key, text) if is_misread or Path(text).exists() else argument
+
+
+def _reads_as_number(line: str) -> bool:
+    try:
+        (parsed,) = OverridesParser.create().parse_overrides([line])
+    except HydraException:
+        return False
+    is_single = parsed.value_type is ValueType.ELEMENT
+    return is_single and isinstance(parsed.value(), int | float)  # a bool is an int
 
 
 def _reads_as(line: str, text: str) -> bool:

@@ -51,3 +51,12 @@ def test_a_folder_that_is_there_is_taken_as_it_was_typed(tmp_path, monkeypatch):
     assert read(shell_line("flowrep-train", typed)) == {"resume": "a,b=[c]"}
     others = ["resume=nowhere,b", "seed=a,b=[c]", "--multirun", "resume="]
     assert taken_as_typed(others, ["resume"]) == others
+
+
+@pytest.mark.parametrize("name", ["20240501", "1e3", "0x10", "true", "inf"])
+def test_a_folder_named_like_a_number_is_a_folder(name):
+    typed = taken_as_typed(
+        [f"output={name}", f"input={name}", "seed=7"], ["output", "input"], ["input"]
+    )
+    assert read(shell_line("flowrep-factorize", typed[0])) == {"output": name}
+    assert typed[1:] == [f"input={name}", "seed=7"]
