@@ -91,13 +91,13 @@ def _whisker(axes: Axes, at: float, width: float, score: Score, theme: Theme) ->
     value, low, high = (100 * number for number in score.estimate)
     axes.errorbar(
         at, value, [[max(value - low, 0)], [max(high - value, 0)]], color=theme.text,
-        linewidth=0.9, capsize=1.8, capthick=0.9,
+        linewidth=0.9, capsize=1.8, capthick=0.9, clip_on=False,
     )  # fmt: skip
     if len(score.of_seeds) > 1:
         dots = [100 * share for share in score.of_seeds]
         offset = [at + 0.24 * width] * len(dots)
         ring: Any = {"facecolor": theme.ground, "edgecolor": theme.text, "linewidth": 0.5}
-        axes.scatter(offset, dots, s=5, zorder=4, **ring)
+        axes.scatter(offset, dots, s=5, zorder=4, clip_on=False, **ring)
 
 
 def _bar_handles(series: Sequence[str], baselines: set[str], theme: Theme) -> list[Any]:
@@ -143,6 +143,7 @@ def _rate_lines(axes: Axes, grid: Grid, theme: Theme) -> None:
         axes.errorbar(
             xs, values, [below, above], color=look.colour, linestyle=look.dashes,
             marker=look.marker, markersize=3.5, linewidth=1.3, elinewidth=0.9, capsize=1.8,
+            clip_on=False,
         )  # fmt: skip
     axes.set_xticks(at, [f"{rate:g}" for rate in at])
     axes.set_xlabel("frames a second (Hz)")

@@ -29,6 +29,7 @@ def draw_learning_curve(run: RunFolder) -> None:
             fmt="o",
             color="C1",
             capsize=3,
+            clip_on=False,  # an agent may succeed always
             label=None if number else "evaluation, greedy actions",
         )
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)  # covers no curve
