@@ -40,9 +40,9 @@ class NatureEncoder(nn.Module):
         both = chain.from_iterable(zip(weights, biases))
         return [tensor for tensor in both if tensor is not None]
 
-    def embed(self, features: Tensor) -> Tensor:
-        """Returns the embeddings `[N, 512]` of the convolutions' features."""
-        return F.leaky_relu_(linear(features, self.linear.weight, self.linear.bias), SLOPE)
+    def embed(self, features: Tensor, rows: int | None = None) -> Tensor:
+        """Returns the embeddings `[N, 512]` of convolved features; `rows` as in `linear`."""
+        return F.leaky_relu_(linear(features, self.linear.weight, self.linear.bias, rows), SLOPE)
 
     def forward(self, image: Tensor) -> Tensor:
         """Returns the embeddings `[N, 512]` of a decoded map `[N, 16 * C, h, w]`."""
@@ -69,12 +69,17 @@ class Encoder(nn.Module):
         """Width of the concatenation."""
         return EMBEDDING_SIZE * len(self.encoders)
 
-    def forward(self, images: Sequence[Tensor]) -> Tensor:
-        """Returns the embeddings `[N, 512 * maps]` of decoded maps, in the maps' order."""
+    def forward(self, images: Sequence[Tensor], rows: int | None = None) -> Tensor:
+        """Returns the embeddings `[N, 512 * maps]` of decoded maps, in the maps' order.
+
+        Args:
+            images: the decoded maps.
+            rows: as in `linear`.
+        """
         encoders: list[NatureEncoder] = list(self.encoders)  # type: ignore[arg-type]
         weights = [w for encoder in encoders for w in encoder.convolutions()]
         features = convolve(images, weights, STRIDES, encoders[0].codec.dtype)
-        embeddings = [encoder.embed(x) for encoder, x in zip(encoders, features)]
+        embeddings = [encoder.embed(x, rows) for encoder, x in zip(encoders, features)]
         if self.layer_norm:
             embeddings = [F.layer_norm(x, x.shape[-1:]) for x in embeddings]
         return torch.cat(embeddings, dim=-1)

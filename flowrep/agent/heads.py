@@ -23,10 +23,12 @@ class Head(nn.Module):
         self.hidden = nn.Linear(embedding_size, hidden_size)
         self.output = nn.Linear(hidden_size, n_actions)
 
-    def forward(self, embedding: Tensor) -> Tensor:
-        """Returns one float32 number per action."""
-        hidden = F.silu(linear(embedding, self.hidden.weight, self.hidden.bias))
-        return self.output(hidden.float())
+    def forward(self, embedding: Tensor, rows: int | None = None) -> Tensor:
+        """Returns one float32 number per action; `rows` as in `linear`."""
+        hidden = F.silu(linear(embedding, self.hidden.weight, self.hidden.bias, rows))
+        if rows is None:
+            return self.output(hidden.float())
+        return linear(hidden.float(), self.output.weight, self.output.bias, rows)
 
 
 def heads_together(embedding: Tensor, weights: Mapping[str, Any]) -> Tensor:

@@ -23,8 +23,10 @@ from flowrep.agent.heads import Head
 from flowrep.agent.observation import MapCodec, map_codecs
 from flowrep.agent.precision import compute_dtype
 
-# Products of fewer rows are rounded differently, and actions would depend on the size of the batch.
+# Convolutions of fewer maps are rounded differently, and so are products of another number of rows;
+# actions would depend on the size of the batch.
 SMALLEST_BATCH = 8
+ROWS = 32
 
 
 class MapNetwork(nn.Module):
@@ -50,9 +52,14 @@ class MapNetwork(nn.Module):
         self.encoder = Encoder(codecs, layer_norm=layer_norm)
         self.head = Head(self.encoder.embedding_size, hidden_size, outputs)
 
-    def forward(self, images: Sequence[Tensor]) -> Tensor:
-        """Returns `[N, outputs]`."""
-        return self.head(self.encoder(images))
+    def forward(self, images: Sequence[Tensor], rows: int | None = None) -> Tensor:
+        """Returns `[N, outputs]`.
+
+        Args:
+            images: the decoded maps.
+            rows: of each product on a CPU, see `flowrep.agent.layers.linear`.
+        """
+        return self.head(self.encoder(images, rows), rows)
 
     def another_encoder(self) -> Encoder:
         """Returns an encoder for the same maps with its own weights."""
@@ -93,7 +100,7 @@ class PolicyNetwork(nn.Module):
             batch = codec.batch_shape(x)
             packed = codec.store(x.reshape(-1, *x.shape[-3:]))
             images.append(codec.decode(packed if is_exporting() else _padded(packed)))
-        outputs = self.network(images)
+        outputs = self.network(images, ROWS)
         if not is_exporting():
             outputs = outputs[: math.prod(batch)]
         return outputs.reshape(*batch, outputs.shape[-1])
