@@ -154,11 +154,9 @@ class Job:
         start, stop, stride = self.options.start, self.options.stop, self.options.stride
         if isinstance(self.stream, Recording):
             for index in self._indices(resumed_after):
-                frame = self.stream[index]
-                yield (
-                    index,
-                    replace(frame, starts_clip=frame.starts_clip or self._starts_clip(index)),
-                )
+                frame, skipped = self.stream[index], range(max(0, index - stride + 1), index)
+                starts_clip = frame.starts_clip or any(map(self.stream.starts_clip, skipped))
+                yield index, replace(frame, starts_clip=starts_clip)
             return
         starts_clip = False
         for index, frame in islice(enumerate(self.stream), stop):
@@ -166,12 +164,6 @@ class Job:
             if index >= start and (index - start) % stride == 0:
                 yield index, replace(frame, starts_clip=starts_clip)
                 starts_clip = False
-
-    def _starts_clip(self, index: int) -> bool:
-        """Returns whether the frame used before this one belongs to another shot."""
-        assert isinstance(self.stream, Recording)
-        since = range(max(0, index - self.options.stride + 1), index + 1)
-        return any(self.stream.starts_clip(i) for i in since)
 
     def _factorized(
         self, resumed_after: int | None

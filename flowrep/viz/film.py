@@ -29,9 +29,8 @@ def film_episode(
         episode_seed: identifies the episode, as in evaluation.csv; the env's next one if None.
     """
     intrinsics = torch.as_tensor(street_envs(env)[0].K)
-    tensordict = env.reset(
-        **({} if episode_seed is None else {"options": {"episode_seed": episode_seed}})
-    )
+    chosen = {} if episode_seed is None else {"options": {"episode_seed": episode_seed}}
+    tensordict = env.reset(**chosen)
     frames = [maps_of(tensordict["sensor"][0].cpu(), intrinsics)]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while not tensordict["done"].any():
