@@ -17,7 +17,7 @@ from flowrep.scenes.schema import SceneError
 _MOST_PIECES = 300
 _MOST_GROUND_M2 = 1e6
 _MOST_BOXES = 1_000
-LEAST_END_M = 1.0  # of an ending zone; the vehicle's place is checked every 0.42 m at least
+_LEAST_END_M = 1.0  # of an ending zone; the vehicle's place is checked at least every 0.42 m
 _BEYOND_M = 100.0  # how far rows may extend beyond either end of a road
 
 
@@ -100,9 +100,10 @@ def check_paths(layout: Layout, source: str) -> None:
         if zone.from_m > zone.to_m:
             problem = f"[{zone.from_m}, {zone.to_m}] m runs backwards"
             raise SceneError(source, f"zones.{zone.name}", problem, "give from_m below to_m")
-        if zone.to_m - zone.from_m < LEAST_END_M and zone.name in ends:
-            problem = f"ends a path and is {zone.to_m - zone.from_m:g} m long"
-            remedy = f"make it {LEAST_END_M:g} m long, or vehicles can drive through between checks"
+        length = zone.to_m - zone.from_m
+        if zone.name in ends and length < _LEAST_END_M - 1e-6:
+            problem = f"ends a path and is {length:g} m long"
+            remedy = f"give it {_LEAST_END_M:g} m, or vehicles can drive through between checks"
             raise SceneError(source, f"zones.{zone.name}", problem, remedy)
     for path in layout.scene.paths:
         _check_path(layout, path, source)

@@ -396,12 +396,17 @@ def refuse(data, **changes):
         ),
         (
             {"zones__1__from_m": 69.5},
-            "zones.west: ends a path and is 0.5 m long; make it 1 m long, or vehicles can drive",
+            "zones.west: ends a path and is 0.5 m long; give it 1 m, or vehicles can drive",
         ),
     ],
 )
 def test_what_cannot_be_is_refused(data, changes, expected):
     assert refuse(data, **changes).startswith(expected)
+
+
+def test_an_ending_zone_may_be_a_metre_long(data):
+    data["zones"][1] |= {"from_m": 63.1, "to_m": 64.1}  # 0.99999... in floating point
+    load_scene(data)
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path):
