@@ -17,7 +17,7 @@ class Experiment:
         name: the name in conf/experiment/ and of files.
         title: the heading.
         stacks: the compared stacks, in the figure's order.
-        pairs: the differences that the paper discusses; it says that the first does better.
+        pairs: the differences to list, as (first, second) of first minus second.
         speeds: pedestrians' speed modes of the figure; None for all that were evaluated.
     """
 
@@ -53,6 +53,8 @@ COMPLEMENTARY = Experiment(
         ("ego+obj+seg2", "ego+obj"),
         ("ego+obj+depth2", "ego+obj"),
         (_BOTH, "ego+obj"),
+        ("ego+obj", "seg2"),
+        ("ego+obj", "depth2"),
     ),
 )
 FAILURE_STACKS = ("ego+obj", "depth2", "seg2", "ego+obj+depth2", "ego+obj+seg2", _BOTH)
