@@ -22,8 +22,7 @@ import torch
 
 from flowrep.sequences import EstimatedFlowSource, Frames, SevenScenes
 from flowrep.sequences.job import Job, JobOptions
-from flowrep.sequences.output import OutputOptions
-from flowrep.sequences.output_folder import OutputFolder
+from flowrep.sequences.output import OutputFolder, OutputOptions
 from flowrep.transforms import DIS
 
 FRAMES = 60

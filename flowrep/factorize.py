@@ -25,8 +25,7 @@ from flowrep.config_tree import CONF_DIR
 from flowrep.sequences import EstimatedFlowSource, Recording, SequenceError, Stream, recorded_flow
 from flowrep.sequences.factorization import FlowSource
 from flowrep.sequences.job import Job, JobOptions, as_settings
-from flowrep.sequences.output import OutputOptions
-from flowrep.sequences.output_folder import OutputFolder
+from flowrep.sequences.output import OutputFolder, OutputOptions
 from flowrep.transforms import EstimatedFlow
 
 MISTAKES = (SequenceError, ValueError, ImportError, OSError)

@@ -43,8 +43,7 @@ from flowrep.sequences import (
     read_kitti_flow,
 )
 from flowrep.sequences.job import Job, JobOptions
-from flowrep.sequences.output_folder import OutputFolder
-from flowrep.sequences.scores import COLUMNS
+from flowrep.sequences.output import COLUMNS, OutputFolder
 from flowrep.transforms import DIS
 from tests.config.composing import plain
 from tests.sequences import synthetic

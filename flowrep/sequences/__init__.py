@@ -1,5 +1,6 @@
 """Recorded RGB-D sequences with camera poses: readers, registration, factorisation, a doctor."""
 
+from flowrep.sequences.calibration import Registration
 from flowrep.sequences.doctor import Diagnosis, Doctor, diagnose
 from flowrep.sequences.factorization import (
     EstimatedFlowSource,
@@ -8,17 +9,15 @@ from flowrep.sequences.factorization import (
     factorize_pair,
     recorded_flow,
 )
-from flowrep.sequences.flow_files import (
+from flowrep.sequences.files import (
     read_flo,
     read_kitti_flow,
     write_flo,
     write_kitti_flow,
 )
-from flowrep.sequences.formats import RECORDINGS, STREAMS, Stream
-from flowrep.sequences.frame import Frame, Recording, SequenceError
 from flowrep.sequences.frames import Frames
 from flowrep.sequences.kitti import Kitti
-from flowrep.sequences.registration import Registration
+from flowrep.sequences.recording import Frame, Recording, SequenceError, Stream
 from flowrep.sequences.sevenscenes import SevenScenes
 from flowrep.sequences.sintel import Sintel
 from flowrep.sequences.tartanair import TartanAir
@@ -59,3 +58,15 @@ __all__ = [
     "write_flo",
     "write_kitti_flow",
 ]
+
+RECORDINGS: dict[str, type[Recording]] = {
+    "frames": Frames,
+    "kitti": Kitti,
+    "sevenscenes": SevenScenes,
+    "sintel": Sintel,
+    "tartanair": TartanAir,
+    "tum": Tum,
+    "vkitti2": VKitti2,
+    "zed": Zed,
+}
+STREAMS = {"video": StillVideo, "zed_live": ZedLive}

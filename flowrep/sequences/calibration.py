@@ -1,18 +1,21 @@
-"""A camera's intrinsics from a list of four numbers or a JSON file."""
+"""Cameras of recordings: intrinsics, poses and their times, registration of depth to colour."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from flowrep.sequences.files import finite_number, read_json
-from flowrep.sequences.frame import SequenceError
-from flowrep.sequences.pictures import check_pixels
+from flowrep.geometry import CameraAxes, PoseDirection, PoseLayout, adapt_pose
+from flowrep.sequences.files import check_pixels, finite_number, read_json, read_table
+from flowrep.sequences.recording import SequenceError
 
 
 @dataclass(frozen=True)
@@ -97,3 +100,177 @@ def _camera(path: Path, content: Mapping[str, Any], prefix: str = "") -> Camera:
     shift = 0.5 - value["first_pixel_centre"]
     K = intrinsics(value["fx"], value["fy"], value["cx"] + shift, value["cy"] + shift)
     return Camera(K, height, width)
+
+
+Pose = NDArray[np.float64]  # world_from_cam [4, 4]
+
+
+def as_pose(
+    numbers: NDArray[np.float64],
+    source: Path,
+    *,
+    layout: PoseLayout = "matrix",
+    direction: PoseDirection = "camera_to_world",
+    axes: CameraAxes = "opencv",
+) -> Pose:
+    """Returns `world_from_cam` from the 7, 12 or 16 numbers of one pose.
+
+    Raises:
+        SequenceError: the pose has nan, an invalid quaternion, or a matrix that is not rigid.
+    """
+    values = torch.from_numpy(np.array(numbers, dtype=np.float64).reshape(-1))
+    if layout == "matrix":
+        last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+        values = (torch.cat([values, last_row]) if len(values) == 12 else values).reshape(4, 4)
+    try:
+        pose = adapt_pose(values, layout=layout, direction=direction, axes=axes)
+    except ValueError as error:
+        raise SequenceError(source, str(error)) from None
+    return pose.numpy()
+
+
+def read_pose_lines(path: Path, layout: PoseLayout, frames: int) -> NDArray[np.float64]:
+    """Returns the numbers of one pose per line, for a known number of frames.
+
+    Raises:
+        SequenceError: there are too few or too many lines, or numbers in a line.
+    """
+    table = read_table(path, [12, 16] if layout == "matrix" else [7])
+    if len(table) != frames:
+        raise SequenceError(path, f"has {len(table)} poses for {frames} frames")
+    return table
+
+
+def check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
+    """Raises SequenceError if a time is not a number, or earlier than the one before it."""
+    if not np.isfinite(times_s).all():
+        raise SequenceError(path, "holds a timestamp that is not a number")
+    backwards = np.flatnonzero(np.diff(times_s) < 0)
+    if len(backwards):
+        before, after = times_s[backwards[0]], times_s[backwards[0] + 1]
+        raise SequenceError(path, f"timestamps go backwards: {after:.6f} follows {before:.6f}")
+
+
+def nearest(
+    times_s: NDArray[np.float64], wanted_s: NDArray[np.float64], tolerance_s: float
+) -> NDArray[np.int64]:
+    """Returns the index of the time nearest to each wanted one, -1 if none is near enough.
+
+    >>> nearest(np.array([0.0, 1.0, 2.0]), np.array([0.98, 1.5, 2.03]), 0.05).tolist()
+    [1, -1, 2]
+    """
+    after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
+    before = (after - 1).clip(0)
+    gap_after, gap_before = (np.abs(times_s[index] - wanted_s) for index in (after, before))
+    found = np.where(gap_before <= gap_after, before, after)
+    return np.where(np.minimum(gap_before, gap_after) <= tolerance_s, found, -1)
+
+
+def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
+    """Returns the pose at a share of the way, with constant velocity and angular velocity.
+
+    >>> before, after = np.eye(4), np.eye(4)
+    >>> after[0, 3] = 2.0
+    >>> interpolated_pose(before, after, 0.25)[0, 3].item()
+    0.5
+    """
+    relative = before[:3, :3].T @ after[:3, :3]
+    axis_angle, _ = cv2.Rodrigues(relative)
+    pose = np.eye(4)
+    pose[:3, :3] = before[:3, :3] @ cv2.Rodrigues(share * axis_angle)[0]
+    pose[:3, 3] = (1 - share) * before[:3, 3] + share * after[:3, 3]
+    return pose
+
+
+_LARGEST_FOOTPRINT_PX = 8
+
+
+class Registration:
+    """Registers depth to the colour camera's pixels.
+
+    Each depth pixel becomes a square that faces the camera, as large as the pixel is at its
+    distance and at least one colour pixel; if several fall on one colour pixel, the nearest is
+    visible. Colour pixels that no square reaches (hidden from the depth camera, or outside its
+    picture) are missing, nan.
+
+    Args:
+        K_depth: `[3, 3]` of the depth camera, pixels.
+        K_colour: `[3, 3]` of the colour camera, pixels.
+        colour_from_depth: `[4, 4]`, takes points of the depth camera into the colour camera's
+            frame, metres.
+        size: height and width of the colour pictures.
+
+    >>> K = np.array([[4.0, 0.0, 1.0], [0.0, 4.0, 0.5], [0.0, 0.0, 1.0]])
+    >>> colour_from_depth = np.eye(4)
+    >>> colour_from_depth[0, 3] = 0.5  # at 2 m that is 4 * 0.5 / 2 = 1 px to the right
+    >>> Registration(K, K, colour_from_depth, (1, 2))(np.array([[2.0, 8.0]], np.float32))
+    array([[nan,  2.]], dtype=float32)
+    """
+
+    def __init__(
+        self,
+        K_depth: NDArray[np.float64],
+        K_colour: NDArray[np.float64],
+        colour_from_depth: NDArray[np.float64],
+        size: tuple[int, int],
+    ) -> None:
+        self.K_colour, self.size = K_colour, size
+        self.depth_from_colour = np.linalg.inv(colour_from_depth)
+        self._depth_focal = float(min(K_depth[0, 0], K_depth[1, 1]))
+        # p_colour ~ z (to_colour @ pixel) + shift, so only one product per pixel is left to do.
+        self._to_colour = K_colour @ colour_from_depth[:3, :3] @ np.linalg.inv(K_depth)
+        self._shift = K_colour @ colour_from_depth[:3, 3]
+        self._rays: NDArray[np.float32] | None = None  # [3, H, W] of the last size seen
+
+    def __call__(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns the colour camera's depth, `[height, width]`, metres, nan where missing.
+
+        Args:
+            depth: `[H, W]` of the depth camera, metres; nan and inf are no surface.
+        """
+        rays = self._rays_of(depth.shape)
+        surface = np.isfinite(depth) & (depth > 0)
+        x, y, z = (ray * depth + shift for ray, shift in zip(rays, self._shift.astype(np.float32)))
+        surface &= z > 0
+        u, v, z_colour, z_depth = x[surface], y[surface], z[surface], depth[surface]
+        u, v = u / z_colour, v / z_colour
+        footprint = (z_depth / z_colour) * np.float32(self._colour_focal / self._depth_focal)
+        return self._nearest(u, v, z_colour, np.maximum(footprint, 1.0))
+
+    def _nearest(
+        self,
+        u: NDArray[np.float32],
+        v: NDArray[np.float32],
+        z: NDArray[np.float32],
+        footprint: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Returns the depth of the nearest square around (u, v) in each pixel."""
+        height, width = self.size
+        seen = np.full(height * width + 1, np.inf, dtype=np.float32)  # the last: outside
+        # The pixels whose centres lie in [u - side / 2, u + side / 2).
+        first_u = np.ceil(u - (footprint + 1) / 2).astype(np.int64)
+        first_v = np.ceil(v - (footprint + 1) / 2).astype(np.int64)
+        widest = float(footprint.max()) if len(footprint) else 0.0
+        reach = min(math.ceil(widest), _LARGEST_FOOTPRINT_PX)
+        for right in range(reach):
+            for down in range(reach):
+                column, row = first_u + right, first_v + down
+                inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+                if right or down:
+                    inside &= column + 0.5 < u + footprint / 2
+                    inside &= row + 0.5 < v + footprint / 2
+                place = np.where(inside, row * width + column, height * width)
+                np.minimum.at(seen, place, z)
+        seen[np.isinf(seen)] = np.nan
+        return seen[:-1].reshape(height, width)
+
+    def _rays_of(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        if self._rays is None or self._rays.shape[1:] != shape:
+            row, column = np.indices(shape) + 0.5
+            pixels = np.stack([column, row, np.ones(shape)]).reshape(3, -1)
+            self._rays = (self._to_colour @ pixels).reshape(3, *shape).astype(np.float32)
+        return self._rays
+
+    @property
+    def _colour_focal(self) -> float:
+        return float(max(self.K_colour[0, 0], self.K_colour[1, 1]))

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from flowrep.geometry import factorize, relative_motion
-from flowrep.sequences.flow_files import Flow
-from flowrep.sequences.frame import Frame, SequenceError
+from flowrep.sequences.files import Flow
+from flowrep.sequences.recording import Frame, SequenceError
 from flowrep.transforms.estimated_flow import Estimator
 
 # The squared error of going there and back is below a hundredth of the squared lengths plus half a

@@ -22,14 +22,24 @@ from flowrep.geometry import (
 from flowrep.geometry.checks import check_name
 from flowrep.geometry.depth import check_depth_options
 from flowrep.geometry.flow_layout import check_flow_options
-from flowrep.sequences.calibration import read_cameras
-from flowrep.sequences.depth_maps import DEPTH_FILES, read_depth
-from flowrep.sequences.files import list_files, read_table
-from flowrep.sequences.flow_files import read_flo, read_kitti_flow
-from flowrep.sequences.frame import Frame, Recording, SequenceError
-from flowrep.sequences.pictures import PICTURES, read_rgb
-from flowrep.sequences.poses import as_pose, check_ascending, read_pose_lines
-from flowrep.sequences.registration import Registration
+from flowrep.sequences.calibration import (
+    Registration,
+    as_pose,
+    check_ascending,
+    read_cameras,
+    read_pose_lines,
+)
+from flowrep.sequences.files import (
+    DEPTH_FILES,
+    PICTURES,
+    list_files,
+    read_depth,
+    read_flo,
+    read_kitti_flow,
+    read_rgb,
+    read_table,
+)
+from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 FLOW_FILES = (".flo", ".png")
 

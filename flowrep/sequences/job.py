@@ -21,13 +21,16 @@ from flowrep.sequences.factorization import (
     FlowSource,
     factorize_pair,
 )
-from flowrep.sequences.formats import Stream
-from flowrep.sequences.frame import Frame, Recording
-from flowrep.sequences.output import OutputOptions, video_frame, write_frame
-from flowrep.sequences.output_folder import OutputFolder
-from flowrep.sequences.rerun_export import RerunExport
-from flowrep.sequences.scores import score
-from flowrep.sequences.video_chunks import VideoChunks
+from flowrep.sequences.output import (
+    OutputFolder,
+    OutputOptions,
+    RerunExport,
+    VideoChunks,
+    score,
+    video_frame,
+    write_frame,
+)
+from flowrep.sequences.recording import Frame, Recording, Stream
 
 DOCTOR_PAIRS = 10
 VIDEO_CHUNKS = "video_chunks"

@@ -10,12 +10,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.calibration import intrinsics, opencv_intrinsics
-from flowrep.sequences.files import list_files, path_inside, read_lines, read_table
-from flowrep.sequences.flow_files import read_kitti_flow
-from flowrep.sequences.frame import Frame, Recording, SequenceError
-from flowrep.sequences.pictures import read_png16, read_rgb
-from flowrep.sequences.poses import Pose, as_pose
+from flowrep.sequences.calibration import Pose, as_pose, intrinsics, opencv_intrinsics
+from flowrep.sequences.files import (
+    list_files,
+    path_inside,
+    read_kitti_flow,
+    read_lines,
+    read_png16,
+    read_rgb,
+    read_table,
+)
+from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 EARTH_RADIUS_M = 6378137.0
 _OXTS_NUMBERS = 30

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrep.sequences.calibration import four_intrinsics, intrinsics
-from flowrep.sequences.depth_maps import depth_from_integers
-from flowrep.sequences.files import list_files, read_matrix
-from flowrep.sequences.frame import Frame, Recording, SequenceError
-from flowrep.sequences.pictures import read_png16, read_rgb
-from flowrep.sequences.poses import as_pose
-from flowrep.sequences.registration import Registration
+from flowrep.sequences.calibration import Registration, as_pose, four_intrinsics, intrinsics
+from flowrep.sequences.files import (
+    depth_from_integers,
+    list_files,
+    read_matrix,
+    read_png16,
+    read_rgb,
+)
+from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 DEPTH_UNIT_M = 0.001
 _COLOUR = (".color.png", ".color.jpg")

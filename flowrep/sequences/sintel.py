@@ -8,11 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.files import list_files, read_bytes
-from flowrep.sequences.flow_files import FLO_TAG, read_flo, read_tagged_floats
-from flowrep.sequences.frame import Frame, Recording, SequenceError
-from flowrep.sequences.pictures import read_mask, read_rgb
-from flowrep.sequences.poses import as_pose
+from flowrep.sequences.calibration import as_pose
+from flowrep.sequences.files import (
+    FLO_TAG,
+    list_files,
+    read_bytes,
+    read_flo,
+    read_mask,
+    read_rgb,
+    read_tagged_floats,
+)
+from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 
 class Sintel(Recording):

@@ -7,12 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.arrays import read_npy, read_npy_mask
-from flowrep.sequences.calibration import intrinsics
-from flowrep.sequences.files import list_files
-from flowrep.sequences.frame import Frame, Recording, SequenceError
-from flowrep.sequences.pictures import read_rgb
-from flowrep.sequences.poses import as_pose, read_pose_lines
+from flowrep.sequences.calibration import as_pose, intrinsics, read_pose_lines
+from flowrep.sequences.files import list_files, read_npy, read_npy_mask, read_rgb
+from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 
 class TartanAir(Recording):

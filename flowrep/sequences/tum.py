@@ -8,18 +8,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.calibration import four_intrinsics, opencv_intrinsics
-from flowrep.sequences.depth_maps import depth_from_integers
-from flowrep.sequences.files import path_inside, read_lines, read_table
-from flowrep.sequences.frame import Frame, Recording, SequenceError
-from flowrep.sequences.pictures import read_png16, read_rgb
-from flowrep.sequences.poses import (
+from flowrep.sequences.calibration import (
     Pose,
     as_pose,
     check_ascending,
+    four_intrinsics,
     interpolated_pose,
     nearest,
+    opencv_intrinsics,
 )
+from flowrep.sequences.files import (
+    depth_from_integers,
+    path_inside,
+    read_lines,
+    read_png16,
+    read_rgb,
+    read_table,
+)
+from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 DEPTH_UNIT_M = 1 / 5000
 

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flowrep.sequences.frame import Frame, SequenceError, check_frame
-from flowrep.sequences.pictures import check_pixels
+from flowrep.sequences.files import check_pixels
+from flowrep.sequences.recording import Frame, SequenceError, check_frame
 
 
 class StillVideo:

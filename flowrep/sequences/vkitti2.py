@@ -8,13 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.calibration import opencv_intrinsics
-from flowrep.sequences.depth_maps import depth_from_integers
-from flowrep.sequences.files import list_files, read_table
-from flowrep.sequences.flow_files import Flow
-from flowrep.sequences.frame import Frame, Recording, SequenceError
-from flowrep.sequences.pictures import read_png16, read_png16_rgb, read_rgb
-from flowrep.sequences.poses import as_pose
+from flowrep.sequences.calibration import as_pose, opencv_intrinsics
+from flowrep.sequences.files import (
+    Flow,
+    depth_from_integers,
+    list_files,
+    read_png16,
+    read_png16_rgb,
+    read_rgb,
+    read_table,
+)
+from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 DEPTH_UNIT_M = 0.01
 

@@ -9,12 +9,9 @@ from numpy.typing import NDArray
 
 from flowrep.geometry import CameraAxes
 from flowrep.geometry.checks import check_name
-from flowrep.sequences.calibration import read_cameras
-from flowrep.sequences.depth_maps import DEPTH_FILES, read_depth
-from flowrep.sequences.files import list_files
-from flowrep.sequences.frame import Frame, Recording, SequenceError
-from flowrep.sequences.pictures import PICTURES, read_rgb
-from flowrep.sequences.poses import as_pose, read_pose_lines
+from flowrep.sequences.calibration import as_pose, read_cameras, read_pose_lines
+from flowrep.sequences.files import DEPTH_FILES, PICTURES, list_files, read_depth, read_rgb
+from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 DEPTH_UNIT_M = 0.001
 

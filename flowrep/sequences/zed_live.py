@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from flowrep.sequences.calibration import opencv_intrinsics
-from flowrep.sequences.frame import Frame, SequenceError, check_frame
+from flowrep.sequences.recording import Frame, SequenceError, check_frame
 from flowrep.sequences.zed import measured
 
 

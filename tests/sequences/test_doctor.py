@@ -18,7 +18,7 @@ from flowrep.geometry import (
     z_from_ray_length,
 )
 from flowrep.sequences import Doctor, diagnose
-from flowrep.sequences.mistakes import MISTAKES
+from flowrep.sequences.doctor import MISTAKES
 from tests.geometry.scenes import rigid
 
 HEIGHT, WIDTH = 45, 64

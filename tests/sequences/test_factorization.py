@@ -20,8 +20,7 @@ from flowrep.sequences import (
     recorded_flow,
 )
 from flowrep.sequences.factorization import consistent
-from flowrep.sequences.output import known
-from flowrep.sequences.scores import _median_px, end_point_error, score
+from flowrep.sequences.output import _median_px, end_point_error, known, score
 from flowrep.transforms import DIS
 
 K = np.array([[30.0, 0, 30.5], [0, 28.0, 21.0], [0, 0, 1]])

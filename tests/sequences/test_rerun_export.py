@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 from flowrep.sequences import Frames, SequenceError, factorize_frames, recorded_flow
-from flowrep.sequences.rerun_export import RerunExport
+from flowrep.sequences.output import RerunExport
 from tests.sequences import synthetic
 
 

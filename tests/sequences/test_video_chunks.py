@@ -7,7 +7,7 @@ pytest.importorskip("imageio_ffmpeg", reason="videos need ffmpeg")
 
 import imageio.v3 as imageio
 
-from flowrep.sequences.video_chunks import VideoChunks
+from flowrep.sequences.output import VideoChunks
 
 
 def test_a_continued_video_keeps_the_size_of_its_first_frame(tmp_path):

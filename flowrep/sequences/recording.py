@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -58,6 +59,21 @@ class Frame:
         """Height and width."""
         height, width = self.depth.shape
         return height, width
+
+
+class Stream(Protocol):
+    """Frames as they come, from a camera or from a `Recording`, which can also be indexed."""
+
+    @property
+    def has_flow(self) -> bool:
+        """Whether frames may bring flow of their own."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes for the user, a sentence each."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yields the frames in order."""
 
 
 class Recording(ABC):
