@@ -1,30 +1,41 @@
 # `make help` lists the targets. Everything happens in .venv at the root of the checkout.
 
-# The newest Python that pybullet has wheels for; override with `make train PYTHON=...`.
-PYTHON ?= $(shell command -v python3.11 || command -v python3.10 || command -v python3)
+# Override with `make train PYTHON=...`.
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
 # Installed before all that depends on torch, so that pip doesn't pick a build of its own choice.
 TORCH ?= torch==2.13.0
 ARGS ?=
 
 BIN := .venv/bin
+PIP := $(PIP)
 INSTALLED := .venv/.installed
+DEVELOPED := .venv/.developed
 
 .DEFAULT_GOAL := help
-.PHONY: help install train evaluate view gallery test test-fast fuzz mutate schema lint types format bench bench-gpu smoke docs wheel clean check-python
+.PHONY: help install develop train evaluate view gallery test test-fast test-python schema lint types format bench bench-gpu smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
 
 check-python:
-	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v in ((3, 10), (3, 11)) else "flowrep needs CPython 3.10 or 3.11, because pybullet has wheels for no other (found %d.%d): try `make PYTHON=python3.11`" % v)'
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v <= (3, 13) else "flowrep needs Python 3.11, 3.12 or 3.13 (found %d.%d): try `make PYTHON=python3.13`" % v)'
 
 $(INSTALLED): pyproject.toml | check-python
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(TORCH)"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
+	@echo "Installing PyTorch into $(ENV) (a minute or two) ..."
+	@$(PYTHON) -m venv $(ENV)
+	@$(PIP) "$(TORCH)"
+	@echo "Installing flowrep and what training, reports and recordings need ..."
+	@$(PIP) --editable ".[train,report,factorize]"
+	@touch $@
+
+$(DEVELOPED): $(INSTALLED)
+	@echo "Installing what the tests need ..."
+	@$(PIP) --editable ".[dev]"
 	@touch $@
 
 install: $(INSTALLED)  ## Create .venv and install flowrep into it
+
+develop: $(DEVELOPED)  ## The same with what tests, lint and types need
 
 train: $(INSTALLED)  ## Train and evaluate an agent on Straight Road: make train ARGS="seed=1"
 	$(BIN)/python -m flowrep.train preset=laptop $(ARGS)
@@ -53,30 +64,26 @@ gallery: $(INSTALLED)  ## Make the README's gallery anew
 # since its tests share what they prepare.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses=auto --dist=loadfile
 
-test: $(INSTALLED)  ## Run the tests
+test: $(DEVELOPED)  ## Run the tests
 	$(PYTEST) $(ARGS)
 
-test-fast: $(INSTALLED)  ## Run those that take no more than a second or two
+test-fast: $(DEVELOPED)  ## Run those that take no more than a second or two
 	$(PYTEST) -m "not slow" $(ARGS)
 
-fuzz: $(INSTALLED)  ## Throw odd inputs at every part: make fuzz ARGS="--parts scenes --mutations 10000"
-	$(BIN)/python -m tests.fuzz $(ARGS)
-
-mutate: $(INSTALLED)  ## Break the code here and there and see tests fail: make mutate ARGS="geometry --sample 60"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[mutate]"
-	$(BIN)/python -m tests.mutate $(ARGS)
+test-python:  ## Run the fast tests on another Python, in an environment of its own: make test-python PYTHON=python3.13
+	$(MAKE) test-fast ENV=.venv-$(notdir $(PYTHON))
 
 schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
 	$(BIN)/python -c 'from flowrep.scenes.schema import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
 
-lint: $(INSTALLED)  ## Check style and formatting
+lint: $(DEVELOPED)  ## Check style and formatting
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(INSTALLED)  ## Check types
+types: $(DEVELOPED)  ## Check types
 	$(BIN)/mypy
 
-format: $(INSTALLED)  ## Mend style and formatting
+format: $(DEVELOPED)  ## Mend style and formatting
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
@@ -84,19 +91,19 @@ format: $(INSTALLED)  ## Mend style and formatting
 BENCHMARKS = $(filter-out %mlagents.py %mlagents_worker.py benchmarks/gpu%,$(wildcard benchmarks/*.py))
 
 bench: $(INSTALLED)  ## Run the benchmarks, one after the other
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[bench]"
+	$(PIP) --editable ".[bench]"
 	for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
 bench-gpu: $(INSTALLED)  ## Measure everything on a GPU into outputs/gpu/
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[bench]"
+	$(PIP) --editable ".[bench]"
 	$(BIN)/python benchmarks/gpu.py $(ARGS)
 
 docs: $(INSTALLED)  ## Build the documentation into site/
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
+	$(PIP) --editable ".[docs]"
 	$(BIN)/zensical build --strict --clean
 
-wheel: $(INSTALLED)  ## Build the wheel into dist/
+wheel: $(DEVELOPED)  ## Build the wheel into dist/
 	$(BIN)/python -m build --wheel
 
 clean:  ## Remove .venv, builds and caches; never outputs/
-	rm -rf .venv dist build site .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-* dist build site .pytest_cache .mypy_cache .ruff_cache

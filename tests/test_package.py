@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("build", reason="pip install 'flowrep[dev]'")
-pytest.importorskip("twine", reason="pip install 'flowrep[dev]'")
+pytest.importorskip("build", reason="pip install '.[dev]'")
+pytest.importorskip("twine", reason="pip install '.[dev]'")
 
 import flowrep
 
@@ -36,10 +36,10 @@ def python(*arguments, executable=None, **options):
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     """The sdist and the wheel that is built from it."""
-    pytest.importorskip("hatchling", reason="pip install 'flowrep[dev]'")
+    pytest.importorskip("hatchling", reason="pip install '.[dev]'")
     folder = tmp_path_factory.mktemp("dist")
     python("-m", "build", "--no-isolation", "--outdir", folder, ROOT)
-    return folder / f"flowrep-{VERSION}.tar.gz", folder / f"flowrep-{VERSION}-py3-none-any.whl"
+    return folder / f"flowrep_rl-{VERSION}.tar.gz", folder / f"flowrep_rl-{VERSION}-py3-none-any.whl"
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_the_wheel_has_the_configs_and_nothing_beside_the_package(built):
         names = set(wheel.namelist())
     configs = {f"flowrep/{path.relative_to(ROOT)}" for path in ROOT.glob("conf/**/*.yaml")}
     assert configs <= names
-    assert {name.split("/")[0] for name in names} == {"flowrep", f"flowrep-{VERSION}.dist-info"}
+    assert {name.split("/")[0] for name in names} == {"flowrep", f"flowrep_rl-{VERSION}.dist-info"}
     assert not [name for name in names if name.endswith((".pyc", ".png"))]
 
 

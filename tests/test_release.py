@@ -36,7 +36,7 @@ def test_the_dockerfile_runs_targets_that_make_has():
     dockerfile = (ROOT / "Dockerfile").read_text("utf-8")
     targets = re.findall(r"docker run .*? flowrep (\S+)", dockerfile)
     assert targets == ["train", "test"]
-    for target in (*targets, "install"):
+    for target in (*targets, "develop"):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE)
 
 
@@ -48,7 +48,7 @@ def test_pip_install_lines_name_extras_that_exist_and_read_alike():
     code = [*ROOT.glob("tests/**/*.py"), *ROOT.glob("flowrep/**/*.py")]
     for path in (path for path in (*pages, *code) if path.suffix in (".md", ".py", ".ipynb")):
         text = path.read_text("utf-8")
-        for quoted in re.findall(r"pip install '(?:\.|flowrep)\[([\w,]+)\]'", text):
+        for quoted in re.findall(r"pip install '(?:\.|flowrep(?:-rl)?)\[([\w,]+)\]'", text):
             assert set(quoted.split(",")) <= extras, path
         # a clone is what there is: pages and examples install `.`, with quotes for every shell
         if path in pages:

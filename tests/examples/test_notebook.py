@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-nbformat = pytest.importorskip("nbformat", reason="pip install 'flowrep[dev]'")
-nbclient = pytest.importorskip("nbclient", reason="pip install 'flowrep[dev]'")
-pytest.importorskip("ipykernel", reason="pip install 'flowrep[dev]'")
+nbformat = pytest.importorskip("nbformat", reason="pip install '.[dev]'")
+nbclient = pytest.importorskip("nbclient", reason="pip install '.[dev]'")
+pytest.importorskip("ipykernel", reason="pip install '.[dev]'")
 pytest.importorskip("pybullet", reason="the notebook's street is simulated in PyBullet")
 
 NOTEBOOK = Path(__file__).parents[2] / "examples" / "raw_ego_obj.ipynb"
