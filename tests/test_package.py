@@ -39,7 +39,10 @@ def built(tmp_path_factory):
     pytest.importorskip("hatchling", reason="pip install '.[dev]'")
     folder = tmp_path_factory.mktemp("dist")
     python("-m", "build", "--no-isolation", "--outdir", folder, ROOT)
-    return folder / f"flowrep_rl-{VERSION}.tar.gz", folder / f"flowrep_rl-{VERSION}-py3-none-any.whl"
+    return (
+        folder / f"flowrep_rl-{VERSION}.tar.gz",
+        folder / f"flowrep_rl-{VERSION}-py3-none-any.whl",
+    )
 
 
 @pytest.fixture(scope="module")
