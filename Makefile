@@ -6,10 +6,11 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 TORCH ?= torch==2.13.0
 ARGS ?=
 
-BIN := .venv/bin
-PIP := $(PIP)
-INSTALLED := .venv/.installed
-DEVELOPED := .venv/.developed
+ENV := .venv
+BIN := $(ENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+INSTALLED := $(ENV)/.installed
+DEVELOPED := $(ENV)/.developed
 
 .DEFAULT_GOAL := help
 .PHONY: help install develop train evaluate view gallery test test-fast test-python schema lint types format bench bench-gpu smoke docs wheel clean check-python
