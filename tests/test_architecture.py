@@ -131,9 +131,8 @@ def test_no_modules_import_each_other():
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_modules_have_a_noun_for_a_name_and_one_reason_to_exist(path):
+def test_modules_have_a_noun_for_a_name(path):
     assert path.stem not in {"utils", "common", "helpers", "misc"}
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 300
 
 
 @pytest.mark.slow
