@@ -4,16 +4,19 @@ It is not an agent but an upper bound for a scene: a beam search that simulates 
 the present to the ending zone and keeps only drives without a collision.
 """
 
+import heapq
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from flowrep.envs.episode import Episode, Rules
 from flowrep.envs.street_env import StreetEnv
-from flowrep.scenes.goal_distance import GoalDistance, free_ground
+from flowrep.scenes.layout import free_ground
 from flowrep.scenes.people import RADIUS_M as PERSON_RADIUS_M
 from flowrep.scenes.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
 
@@ -24,6 +27,8 @@ _MARGIN_M = 0.1  # distance kept from people and from the road's edge
 _LOOK_AHEAD_M = 6.0
 # States in the same cell are interchangeable: x, y in metres, yaw and yaw rate in degrees.
 _CELL = np.array([0.5, 0.5, 4.0, 6.0])
+_GRID_M = 0.5  # of the distances to the ending zone
+_NEIGHBOURS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 
 class Planner:
@@ -71,12 +76,52 @@ class Planner:
                 return found
         return actions
 
-    def _way(self, episode: Episode) -> GoalDistance:
+    def _way(self, episode: Episode) -> "GoalDistance":
         key = (episode.rules, episode.path.name)
         if key not in self._ways:
             free = free_ground(episode.rules.layout, episode.path)
             self._ways[key] = GoalDistance(free, episode.goal)
         return self._ways[key]
+
+
+class GoalDistance:
+    """A grid of shortest distances from the free ground to the ending zone."""
+
+    def __init__(self, free: BaseGeometry, goal: BaseGeometry) -> None:
+        """Fills the grid outwards from the ending zone (Dijkstra, eight neighbours)."""
+        x0, y0, x1, y1 = free.bounds
+        self._origin = np.array([x0, y0])
+        columns, rows = (math.ceil(size / _GRID_M) for size in (x1 - x0, y1 - y0))
+        x = x0 + (np.arange(columns) + 0.5) * _GRID_M
+        y = y0 + (np.arange(rows) + 0.5) * _GRID_M
+        grid_x, grid_y = np.meshgrid(x, y, indexing="ij")
+        is_free = shapely.contains_xy(free, grid_x, grid_y)
+        is_goal = is_free & shapely.contains_xy(goal, grid_x, grid_y)
+        # A margin of cells at infinity represents everything outside the grid.
+        self._way = np.full((columns + 2, rows + 2), np.inf)
+        is_open = np.pad(is_free, 1)
+        queue = [(0.0, int(i) + 1, int(j) + 1) for i, j in np.argwhere(is_goal)]
+        for _, i, j in queue:
+            self._way[i, j] = 0.0
+        while queue:
+            way, i, j = heapq.heappop(queue)
+            if way > self._way[i, j]:
+                continue
+            for di, dj, step in _NEIGHBOURS:
+                longer = way + step * _GRID_M
+                if is_open[i + di, j + dj] and longer < self._way[i + di, j + dj]:
+                    self._way[i + di, j + dj] = longer
+                    heapq.heappush(queue, (longer, i + di, j + dj))
+
+    def __call__(self, x_m: Array, y_m: Array) -> Array:
+        """Returns the distance to the ending zone in metres, inf off the free ground.
+
+        `x_m` and `y_m` have the same shape, as has the result.
+        """
+        cell = np.floor((np.stack([x_m, y_m], -1) - self._origin) / _GRID_M).astype(np.int64) + 1
+        limit = np.array(self._way.shape) - 1
+        cell = np.clip(cell, 0, limit)
+        return self._way[cell[..., 0], cell[..., 1]]
 
 
 class _Search:

@@ -9,8 +9,7 @@ from shapely.geometry import Point, Polygon
 
 from flowrep.scenes.centrelines import centrelines
 from flowrep.scenes.fields import MOST_METRES
-from flowrep.scenes.goal_distance import free_ground
-from flowrep.scenes.layout import Box, Layout
+from flowrep.scenes.layout import Box, Layout, free_ground
 from flowrep.scenes.scene import Path, Scene
 from flowrep.scenes.schema import SceneError
 

@@ -23,6 +23,7 @@ from flowrep.scenes.scene import (
     Crosswalk,
     Kind,
     ObstacleRow,
+    Path,
     Scene,
     Walk,
     Zone,
@@ -244,3 +245,12 @@ class Layout:
             box = Box(row.kind, x, y, heading + facing, row.size_m, i)
             if not shapely.intersects(box.footprint, taken).any():
                 yield box
+
+
+def free_ground(layout: Layout, path: Path) -> BaseGeometry:
+    """Returns the road minus the buildings, obstacles and closures of a path's episodes."""
+    boxes = [*layout.buildings, *layout.obstacles]
+    boxes += [layout.closures[name] for name in path.closures]
+    free = layout.drivable.difference(shapely.union_all([box.footprint for box in boxes]))
+    shapely.prepare(free)
+    return free

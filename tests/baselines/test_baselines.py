@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from flowrep.baselines import Planner, RandomActions, drives, never_turn
-from flowrep.scenes.goal_distance import GoalDistance
+from flowrep.baselines.planner import GoalDistance
 
 
 @pytest.mark.slow_after_first

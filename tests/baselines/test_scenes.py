@@ -16,8 +16,7 @@ from flowrep.envs.episode import Moment
 from flowrep.envs.registration import SCENE_BY_ID
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
-from flowrep.scenes.goal_distance import free_ground
-from flowrep.scenes.layout import Layout
+from flowrep.scenes.layout import Layout, free_ground
 from flowrep.scenes.vehicle import VehicleState
 from flowrep.simulator.meshes import kerb
 
