@@ -15,6 +15,7 @@ PACKAGE = Path(flowrep.__file__).parent
 FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry", "jit"},
     "transforms": {"transforms", "geometry", "extras"},
+    "testing": {"geometry"},
     "agent": {"agent", "extras", "jit"},
     "palette": set(),
     "scenes": {"scenes", "config_tree", "extras", "palette"},
@@ -71,6 +72,7 @@ LAZILY = {
 PACKAGES_LIMITED_TO = {
     "geometry": {"torch"},
     "transforms": {"torch", "tensordict", "torchrl"},
+    "testing": {"torch", "tensordict"},
     "agent": {"torch", "tensordict", "torchrl", "safetensors", "numpy"},
     "scenes": {"numpy", "shapely", "yaml", "pydantic", "pydantic_core"},
     "simulator": {"numpy", "pybullet", "shapely"},
