@@ -22,7 +22,7 @@ from update import interleaved
 from flowrep.agent import DiscreteSAC, keep_freed_memory, use_threads
 from flowrep.agent.class_convolution import ClassConvolution, one_hot
 from flowrep.agent.convolution import Convolution
-from flowrep.agent.precision import has_fast_bf16
+from flowrep.agent.observation import has_fast_bf16
 
 ACTIONS, CHANNELS = 3, 2
 FEATURES, BLOCK = 32, 4  # of the network's first convolution: 8 x 8 by 4, as 2 x 2 over blocks

@@ -19,8 +19,7 @@ from unittest.mock import patch
 import torch
 from torch import nn
 
-from flowrep.agent.action import DiscreteActions
-from flowrep.agent.policy import acting_network, stochastic_policy
+from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
 from flowrep.envs import make_env
 from flowrep.experiment.arena import Agent, Arena, Job
 from flowrep.experiment.env_pool import EnvPool

@@ -15,7 +15,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from flowrep.agent.allocator import keep_freed_memory
+from flowrep.agent.algorithm import keep_freed_memory
 from flowrep.geometry import factorize, rigid_flow, single_pass
 
 SIZES = [(32, 48), (96, 48), (32, 84), (128, 84)]

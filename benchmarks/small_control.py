@@ -32,7 +32,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory
-from flowrep.agent.precision import has_fast_bf16
+from flowrep.agent.observation import has_fast_bf16
 
 CELLS, PIXELS, ENVS = 9, 4, 16
 SIDE = CELLS * PIXELS

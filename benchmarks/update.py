@@ -26,8 +26,8 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory, use_threads
-from flowrep.agent.cuda_graph import WARM_UP
-from flowrep.agent.precision import has_fast_bf16
+from flowrep.agent.algorithm import WARM_UP
+from flowrep.agent.observation import has_fast_bf16
 
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3

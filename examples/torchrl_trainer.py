@@ -20,8 +20,8 @@ from torchrl.objectives import SoftUpdate
 from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer
 
 from flowrep.agent import DiscreteSAC, ReplayMemory
-from flowrep.agent.action import DiscreteActions
-from flowrep.agent.dsac_loss import DiscreteSACMapLoss
+from flowrep.agent.dsac import DiscreteSACMapLoss
+from flowrep.agent.networks import DiscreteActions
 from flowrep.envs import get_states, make_env, set_states
 from flowrep.scenes import load_scene
 

@@ -19,8 +19,11 @@ from hydra.utils import get_object, instantiate  # noqa: E402
 from torchrl.data import TensorDictReplayBuffer  # noqa: E402
 from torchrl.envs import InitTracker  # noqa: E402
 
-from flowrep.agent.action import DiscreteActions  # noqa: E402
-from flowrep.agent.policy import MapNetwork, acting_network  # noqa: E402
+from flowrep.agent.networks import (  # noqa: E402
+    DiscreteActions,
+    MapNetwork,
+    acting_network,
+)
 
 LOSSES = [name for group, name in configs.CONFIGS if group == "loss"]
 EXAMPLE = configs.__doc__.partition("```yaml")[2].partition("```")[0]

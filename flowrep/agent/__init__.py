@@ -4,10 +4,8 @@ from flowrep.extras import require
 
 require("flowrep.agent", "train", "safetensors")
 
-from flowrep.agent.algorithm import Algorithm
-from flowrep.agent.allocator import keep_freed_memory
+from flowrep.agent.algorithm import Algorithm, DivergenceError, keep_freed_memory
 from flowrep.agent.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from flowrep.agent.divergence import DivergenceError
 from flowrep.agent.dqn import DoubleDQN
 from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.dsac_v import DiscreteSACWithValue

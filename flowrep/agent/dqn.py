@@ -14,9 +14,14 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss, ValueEstimators
 
-from flowrep.agent.action import DiscreteActions
+from flowrep.agent.networks import (
+    DiscreteActions,
+    MapNetwork,
+    PackedNetwork,
+    PolicyNetwork,
+    acting_network,
+)
 from flowrep.agent.off_policy import OffPolicy
-from flowrep.agent.policy import MapNetwork, PackedNetwork, PolicyNetwork, acting_network
 
 
 class EpsilonGreedyPolicy(TensorDictSequential):

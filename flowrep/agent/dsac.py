@@ -1,16 +1,177 @@
-"""Discrete soft actor-critic from maps."""
+"""Discrete soft actor-critic, which encodes each map once for the policy and both Q-functions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
-from tensordict import NestedKey
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictParams
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.objectives import LossModule
+from torchrl.objectives import DiscreteSACLoss, LossModule, ValueEstimators
 
-from flowrep.agent.dsac_loss import DiscreteSACMapLoss
+from flowrep.agent.networks import (
+    DiscreteActions,
+    Encoder,
+    Head,
+    MapNetwork,
+    heads_together,
+    stochastic_policy,
+)
+from flowrep.agent.observation import MapCodec, decode_maps
 from flowrep.agent.off_policy import OffPolicy
+from flowrep.agent.team import begin_task
+
+ENCODERS = ("shared", "separate")
+
+
+class DiscreteSACMapLoss(DiscreteSACLoss):
+    """Discrete SAC loss on packed maps, as `ReplayMemory` samples them; see `DiscreteSAC`.
+
+    TorchRL's loss evaluates Q1 and Q2 one after the other (or by vmap), and twice at `s`: for L_Q
+    with gradients, for L_π without. Here both share one hidden layer of twice the width and are
+    evaluated once. TorchRL keeps the networks, the targets and α.
+
+    Reads the maps, `action`, `steps_to_next_obs` and, under `next`, the maps, `reward`, `done` and
+    `terminated`. Returns `loss_qvalue`, `loss_actor` and `loss_alpha`, to be minimised as a sum,
+    with `alpha`, `entropy`, `q_mean` and `td_error`. Its target parameters are those of the
+    Q-functions and their encoder.
+
+    Args:
+        actor: the policy's network.
+        actions: the policy's action space.
+        encoder: with `"shared"`, policy and Q-functions read one set of encoders, trained by L_Q
+            alone, and in y both read its target, so that each observation is encoded once. With
+            `"separate"`, each has its own, and π(·|s') in y reads the policy's.
+        initial_alpha: α before the first update.
+        target_entropy_weight: target entropy as a share of the largest, log n.
+        gamma: discount per frame.
+    """
+
+    critic_encoder: Encoder
+    critic_encoder_params: TensorDictParams
+    target_critic_encoder_params: TensorDictParams
+    actor_encoder: Encoder
+    actor_encoder_params: TensorDictParams
+    target_actor_encoder_params: TensorDictParams
+    out_keys: ClassVar[list[str]] = [
+        "loss_qvalue",
+        "loss_actor",
+        "loss_alpha",
+        "alpha",
+        "entropy",
+        "q_mean",
+        "td_error",
+    ]
+
+    def __init__(
+        self,
+        actor: MapNetwork,
+        actions: DiscreteActions,
+        *,
+        encoder: str = "shared",
+        initial_alpha: float = 0.5,
+        target_entropy_weight: float = 0.2,
+        gamma: float = 0.99,
+    ) -> None:
+        if encoder not in ENCODERS:
+            raise ValueError(f"encoder={encoder!r}: expected one of {', '.join(ENCODERS)}")
+        shared = encoder == "shared"
+        with next(actor.parameters()).device:
+            critic_encoder = actor.encoder if shared else actor.another_encoder()
+            critic_head = Head(critic_encoder.embedding_size, actor.hidden_size, actions.count)
+        super().__init__(
+            stochastic_policy(actor.head, ["actor_embedding"], actions),
+            TensorDictModule(critic_head, ["critic_embedding"], ["action_value"]),
+            action_space=actions.space,
+            num_actions=actions.count,
+            loss_function="l2",
+            alpha_init=initial_alpha,
+            target_entropy="auto",
+            target_entropy_weight=target_entropy_weight,
+        )
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        self.codecs, self.encoder_is_shared = actor.codecs, shared
+        self._target_encoder = (actor.another_encoder().to("meta"),)  # in a tuple: no submodule
+        self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
+        if not shared:
+            self.convert_to_functional(actor.encoder, "actor_encoder")
+
+    def _set_in_keys(self) -> None:
+        self._in_keys = transition_keys(self.codecs)
+
+    def make_value_estimator(self, *args: Any, **options: Any) -> None:
+        """Sets γ; y is the TD(0) target whatever the type."""
+        super().make_value_estimator(*args, **options)
+        self.gamma = float(self.value_estimator.gamma)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns the losses of a batch, with gradients, and further metrics, without."""
+        alpha = self.log_alpha.detach().exp()
+        target = partial(self._target, tensordict, alpha)
+        # a CUDA graph captures the work of one thread
+        wait_for_target = begin_task(target) if self.log_alpha.is_cpu else target
+        images = decode_maps(self.codecs, tensordict)
+        embedding = self.critic_encoder(images)
+        # neither L_π nor Q in it may train the critic's encoder
+        seen = embedding.detach() if self.encoder_is_shared else self.actor_encoder(images)
+        log_policy = self._log_policy(seen)
+        policy = log_policy.exp()
+        negative_entropy = (policy * log_policy).sum(-1)
+        q = heads_together(embedding, self.qvalue_network_params["module"])  # [2, N, n]
+        action = tensordict["action"]
+        if self.action_space != "categorical":
+            action = action.to(torch.uint8).argmax(-1)
+        chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
+        td_error = chosen - wait_for_target()
+        expected_q = (policy * q.detach().amin(0)).sum(-1)
+        surplus = (negative_entropy.detach() + self.target_entropy).mean()
+        return TensorDict(
+            {
+                "loss_qvalue": td_error.square().mean(-1).sum(),
+                "loss_actor": (alpha * negative_entropy - expected_q).mean(),
+                "loss_alpha": -self.log_alpha * surplus,
+                "alpha": alpha,
+                "entropy": -negative_entropy.detach().mean(),
+                "q_mean": expected_q.detach().mean(),
+                "td_error": td_error.detach().abs().amax(0).mean(),
+            }
+        )
+
+    @torch.no_grad()
+    def _target(self, batch: TensorDictBase, alpha: Tensor) -> Tensor:
+        """Returns y `[N]`."""
+        outcome = batch["next"]
+        images = decode_maps(self.codecs, outcome)
+        # not `critic_encoder`, whose weights another thread reads
+        (encoder,) = self._target_encoder
+        with self.target_critic_encoder_params.to_module(encoder):
+            embedding = encoder(images)
+        seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
+        log_policy = self._log_policy(seen)
+        q = heads_together(embedding, self.target_qvalue_network_params["module"]).amin(0)
+        value = (log_policy.exp() * (q - alpha * log_policy)).sum(-1, keepdim=True)
+        # masked instead of multiplied: the value after an end may even be nan
+        value = value.masked_fill(outcome["terminated"], 0.0)
+        discount = self.gamma ** batch["steps_to_next_obs"]
+        return (outcome["reward"] + discount * value).squeeze(-1)
+
+    def _log_policy(self, embedding: Tensor) -> Tensor:
+        """Returns log π `[N, n]`."""
+        return self.actor_network[0].module(embedding).log_softmax(-1)
+
+
+def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
+    """Returns the keys of a sampled transition that a loss reads."""
+    maps = [codec.key for codec in codecs]
+    outcome = ["reward", "done", "terminated"]
+    following: list[NestedKey] = [
+        ("next", *(key if isinstance(key, tuple) else (key,))) for key in (*maps, *outcome)
+    ]
+    return [*maps, "action", "steps_to_next_obs", *following]
 
 
 class DiscreteSAC(OffPolicy):

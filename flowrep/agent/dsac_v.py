@@ -12,11 +12,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams
 from torchrl.objectives import LossModule
 
-from flowrep.agent.action import DiscreteActions
-from flowrep.agent.dsac import DiscreteSAC
-from flowrep.agent.dsac_loss import transition_keys
+from flowrep.agent.dsac import DiscreteSAC, transition_keys
+from flowrep.agent.networks import DiscreteActions, MapNetwork
 from flowrep.agent.observation import decode_maps
-from flowrep.agent.policy import MapNetwork
 
 
 class DiscreteSACValueLoss(LossModule):

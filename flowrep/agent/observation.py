@@ -1,19 +1,4 @@
-"""Packs observation maps for storage and decodes them for a network, given their specs.
-
-| spec | means | the network sees |
-| --- | --- | --- |
-| `Categorical(n)` | a class id per pixel, C stacked frames | one-hot, `C * n` channels |
-| `Bounded(0, 255, uint8)` | intensity | `x / 255`, C channels |
-| any float | a quantity | itself, C channels |
-
-An id from n to 255 is a pixel without a class, all zeros. One-hot maps are not stored, and in
-float32 on a CPU not even made, see `class_convolution`.
-
-Maps are stored *packed*. The first convolution of the Nature encoder has kernel 8 and stride 4,
-which is the same sum as kernel 2 and stride 1 over blocks of 4 × 4 pixels taken as channels. Two
-input channels thus become 32, which suits vector units, and the pixels are reordered once, when a
-frame is stored, instead of in every update.
-"""
+"""Packs observation maps for storage and decodes them for a network, given their specs."""
 
 from __future__ import annotations
 
@@ -24,6 +9,37 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec
+
+PRECISIONS = ("auto", "bf16", "fp32")
+
+
+def compute_dtype(precision: str, device: torch.device) -> torch.dtype:
+    """Returns the dtype of activations for `precision` on `device`.
+
+    Args:
+        precision: `"bf16"`, `"fp32"`, or `"auto"`: bfloat16 where the device multiplies it faster
+            than float32, float32 elsewhere.
+        device: where the networks run.
+
+    Raises:
+        ValueError: on any other `precision`.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision={precision!r}: expected one of {', '.join(PRECISIONS)}")
+    if precision == "auto":
+        return torch.bfloat16 if has_fast_bf16(device) else torch.float32
+    return torch.bfloat16 if precision == "bf16" else torch.float32
+
+
+def has_fast_bf16(device: torch.device) -> bool:
+    """Returns whether `device` has instructions for bfloat16 products (AVX-512 BF16, AMX, CUDA)."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if device.type == "cpu":
+        instructions = torch.cpu.get_capabilities()
+        return bool(instructions.get("avx512_bf16") or instructions.get("amx_bf16"))
+    return False
+
 
 BLOCK = 4  # the stride of the first convolution
 KERNEL = 2 * BLOCK

@@ -9,10 +9,9 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, TensorSpec
 
-from flowrep.agent.action import DiscreteActions
 from flowrep.agent.algorithm import Algorithm
-from flowrep.agent.observation import map_codecs
-from flowrep.agent.precision import compute_dtype
+from flowrep.agent.networks import DiscreteActions
+from flowrep.agent.observation import compute_dtype, map_codecs
 from flowrep.agent.replay import ReplayMemory
 
 

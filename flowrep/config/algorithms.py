@@ -4,8 +4,8 @@ from typing import Annotated, Protocol
 
 from pydantic import ConfigDict, Field
 
-from flowrep.agent.dsac_loss import ENCODERS
-from flowrep.agent.precision import PRECISIONS
+from flowrep.agent.dsac import ENCODERS
+from flowrep.agent.observation import PRECISIONS
 from flowrep.config.expectations import (
     Count,
     NotNegative,

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch.export import Dim, ExportedProgram
 from torchrl.data import Composite
 
-from flowrep.agent.policy import PolicyNetwork
+from flowrep.agent.networks import PolicyNetwork
 from flowrep.exchange import load_agent
 
 PROGRAM, WEIGHTS, CARD, LOADER = "agent.pt2", "agent.safetensors", "agent.json", "load_agent.py"
@@ -38,7 +38,7 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
     networks = [module for module in policy.modules() if isinstance(module, PolicyNetwork)]
     if len(networks) != 1:
         raise ExportError(
-            f"a policy is exported through its one flowrep.agent.policy.PolicyNetwork, of which "
+            f"a policy is exported through its one flowrep.agent.networks.PolicyNetwork, of which "
             f"{type(policy).__name__} has {len(networks)}; build it with acting_network()"
         )
     (network,) = networks

@@ -4,7 +4,27 @@ import torch.nn.functional as F
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from flowrep.agent.class_convolution import one_hot
-from flowrep.agent.observation import map_codecs
+from flowrep.agent.observation import compute_dtype, map_codecs
+
+
+def test_auto_takes_bfloat16_where_it_is_fast(monkeypatch):
+    cpu = torch.device("cpu")
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
+    assert compute_dtype("auto", cpu) is torch.bfloat16
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx2": True})
+    assert compute_dtype("auto", cpu) is torch.float32
+    assert compute_dtype("bf16", cpu) is torch.bfloat16
+    assert compute_dtype("auto", torch.device("meta")) is torch.float32
+
+
+def test_fp32_is_float32_everywhere(monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
+    assert compute_dtype("fp32", torch.device("cpu")) is torch.float32
+
+
+def test_another_name_is_refused():
+    with pytest.raises(ValueError, match="precision='half': expected one of auto, bf16, fp32"):
+        compute_dtype("half", torch.device("cpu"))
 
 
 def codec(spec, key="map", dtype=torch.float32):

@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from flowrep.agent import PPO, DiscreteSAC, DoubleDQN
-from flowrep.agent.policy import PolicyNetwork
+from flowrep.agent.networks import PolicyNetwork
 from flowrep.exchange.policies import Task, load_policy
 from flowrep.exchange.programs import ExportError, acting_program, write_agent
 

@@ -10,8 +10,7 @@ from torch import nn
 
 pytest.importorskip("pybullet", reason="policies drive the simulated street")
 
-from flowrep.agent.action import DiscreteActions
-from flowrep.agent.policy import stochastic_policy
+from flowrep.agent.networks import DiscreteActions, stochastic_policy
 from flowrep.envs import WorkerError
 from flowrep.exchange.policies import ForeignPolicy
 from flowrep.experiment.arena import Agent, Job

@@ -9,8 +9,7 @@ from torch import nn
 
 pytest.importorskip("pybullet", reason="policies drive the simulated street")
 
-from flowrep.agent.action import DiscreteActions
-from flowrep.agent.policy import stochastic_policy
+from flowrep.agent.networks import DiscreteActions, stochastic_policy
 from flowrep.envs import make_env
 from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.arena_team import ArenaTeam

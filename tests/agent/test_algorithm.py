@@ -1,0 +1,510 @@
+"""What holds for every algorithm of conf/algorithm/."""
+
+import copy
+import math
+import platform
+import subprocess
+import sys
+from unittest.mock import patch
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import Categorical, OneHot
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from flowrep.agent import algorithm, layers, load_checkpoint, save_checkpoint
+from flowrep.agent.algorithm import (
+    WARM_UP,
+    DivergenceError,
+    DivergenceWatch,
+    OfOneShape,
+    as_cuda_graph,
+)
+from tests.agent.tape import Foreign, Tape
+
+ENVS = 5
+
+
+def learn(agent, random_steps, steps, frames=0):
+    """Takes in so many steps of five environments, with the updates that they bring."""
+    metrics = []
+    for _ in range(steps):
+        agent.remember(random_steps(ENVS))
+        frames += ENVS
+        metrics += [agent.update(agent.sample()) for _ in range(agent.updates_due(frames))]
+    return metrics
+
+
+def weights(agent):
+    return {name: w.clone() for name, w in agent.state_dict()["weights"].items()}
+
+
+def test_an_update_returns_what_it_says_it_does(make_any, random_steps):
+    agent = make_any()
+    (*_, last) = learn(agent, random_steps, 12)
+    assert tuple(sorted(last)) == tuple(sorted(agent.metric_names()))
+    assert all(value.shape == () and not value.requires_grad for value in last.values())
+    assert all(value.isfinite() for name, value in last.items() if name != "explained_variance")
+    assert agent.updates > 0
+
+
+@pytest.mark.slow_after_first
+def test_pixels_without_a_class_are_acted_on_and_learnt_from(make_any, random_steps):
+    agent = make_any()
+
+    def partly_seen(size):
+        steps = random_steps(size)
+        for maps in (steps, steps["next"]):
+            maps["seg"][..., 3:9] = 255
+        return agent.policy(steps)
+
+    (*_, last) = learn(agent, partly_seen, 12)
+    assert last["grad_norm"].isfinite()
+
+
+@pytest.mark.slow_after_first
+def test_every_trained_weight_moves(make_any, random_steps):
+    agent = make_any()
+    before = weights(agent)
+    learn(agent, random_steps, 20)
+    still = [n for n, w in weights(agent).items() if torch.equal(w, before[n])]
+    assert still == []
+
+
+def test_a_transition_of_three_steps_is_discounted_three_times(make_any, random_steps, as_batch):
+    agent, cubed = make_any(gamma=0.5), make_any(gamma=0.5**3)
+    if not hasattr(agent, "frames_per_update"):
+        pytest.skip("learns from whole rollouts")
+    steps = random_steps(16)
+    batch, once = as_batch(agent, steps), as_batch(agent, steps)
+    batch["steps_to_next_obs"] = torch.full((16, 1), 3.0)
+    loss, expected = agent.losses(batch)["q_loss"], cubed.losses(once)["q_loss"]
+    torch.testing.assert_close(loss, expected)
+    assert not torch.isclose(loss, agent.losses(once)["q_loss"])
+
+
+@pytest.mark.slow_after_first
+def test_the_learning_rate_ends_at_zero_with_the_frames(make_any, random_steps):
+    agent = make_any(total_frames=200, learning_rate=2**-10)
+    metrics = learn(agent, random_steps, 40)
+    rates = [m["learning_rate"].item() for m in metrics]
+    assert len(rates) == agent.total_updates
+    assert rates[0] == 2**-10
+    assert rates[-1] == pytest.approx(2**-10 / len(rates))
+
+
+@pytest.mark.parametrize(
+    ("name", "frames_before", "frames_after", "due"),
+    [
+        ("off-policy, in its first batch", 0, 16, 0),
+        ("one for each 10 frames after it", 0, 25, 0),
+        ("one for each 10 frames after it", 0, 26, 1),
+        ("counted beyond those taken", 40, 66, 3),
+    ],
+)
+def test_off_policy_updates_due(make_agent, name, frames_before, frames_after, due):
+    agent = make_agent(batch_size=16, frames_per_update=10)
+    agent.updates = agent.updates_due(frames_before)
+    assert agent.updates_due(frames_after) == due, name
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("steps", [5, 13])  # an on-policy rollout of 8 is cut in its middle
+def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(
+    make_any, random_steps, tmp_path, steps
+):
+    def go_on(agent):
+        torch.manual_seed(2)
+        return learn(agent, random_steps, 12, frames=steps * ENVS)
+
+    whole = make_any()
+    learn(whole, random_steps, steps)
+    saved = {"agent": whole.state_dict(), "memory": whole.memory.state_dict()}
+    save_checkpoint(tmp_path / "c", saved)
+    expected = go_on(whole)
+
+    resumed = make_any(seed=9)
+    state = load_checkpoint(tmp_path / "c")
+    resumed.load_state_dict(state["agent"])
+    resumed.memory.load_state_dict(state["memory"])
+    actual = go_on(resumed)
+    assert len(expected) == len(actual) > 0
+    for a, b in zip(expected, actual):
+        assert all(torch.equal(a[name].nan_to_num(7), b[name].nan_to_num(7)) for name in a)
+    a, b = weights(whole), weights(resumed)
+    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("before", [0, 2], ids=["before any update", "after two"])
+def test_a_used_agent_that_is_loaded_equals_a_new_one_bit_for_bit(make_any, random_steps, before):
+    used, new = make_any(learning_rate=0.01), make_any(learning_rate=0.01, seed=9)
+    for _ in range(12):
+        used.remember(random_steps(ENVS))
+    batches = [used.sample() for _ in range(before + 4)]
+    for batch in batches[:before]:
+        used.update(batch.clone())
+    state = copy.deepcopy(used.state_dict())
+    for batch in batches:
+        used.update(batch.clone())
+    spoilt = batches[0].clone()
+    for key in (("next", "reward"), "advantage", "value_target"):
+        if key in spoilt.keys(True):
+            spoilt[key] = torch.full_like(spoilt[key], torch.nan)
+    used.update(spoilt.clone())
+    with pytest.raises(DivergenceError, match=rf"in update {2 * before + 5} "):
+        used.divergence.check()
+    for agent in (used, new):
+        agent.load_state_dict(state)
+        for batch in batches[before:]:
+            agent.update(batch.clone())
+        agent.divergence.check()
+    a, b = weights(used), weights(new)
+    assert [name for name in a if not torch.equal(a[name], b[name])] == []
+    used.update(spoilt)
+    with pytest.raises(DivergenceError, match=rf"in update {before + 5} "):
+        used.divergence.check()
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_loss_that_is_no_number_stops_the_weights_and_is_named(make_any, random_steps, bad):
+    agent = make_any()
+    learn(agent, random_steps, 12)
+    agent.divergence.check()
+    before, updates = weights(agent), agent.updates
+    rewards = random_steps(ENVS)
+    rewards["next", "reward"] = torch.full((ENVS, 1), bad)
+    rewards["next", "terminated"] = torch.ones(ENVS, 1, dtype=torch.bool)
+    for _ in range(16):
+        agent.remember(rewards)
+    for _ in range(3):
+        agent.update(agent.sample())
+    moved = {n for n, w in weights(agent).items() if not torch.equal(w, before[n])}
+    assert not moved & agent.trained.keys()
+    with pytest.raises(DivergenceError, match=rf"_loss became (nan|inf) in update {updates + 1} "):
+        agent.divergence.check()
+
+
+def test_where_nothing_is_observed_nothing_is_done(make_any, random_maps):
+    agent = make_any()
+    for maps in (random_maps(4)[:0], random_maps(2, 3)[:, :0]):
+        with torch.no_grad():
+            assert agent.policy.get_dist(maps.clone()).probs.shape == (*maps.shape, 3)
+            assert agent.policy(maps)["action"].shape == maps.shape
+
+
+def test_acts_greedily_only_when_told_to(make_any, random_maps):
+    agent, maps = make_any(), random_maps(1).expand(300).contiguous()
+    with torch.no_grad():
+        drawn = agent.policy(maps.clone())["action"]
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            greedy = agent.policy(maps.clone())["action"]
+    assert len(drawn.unique()) == 3
+    assert len(greedy.unique()) == 1
+
+
+def test_one_hot_actions_are_learnt_from_as_well(make_any, random_steps):
+    agent = make_any(action_spec=OneHot(3))
+
+    def one_hot(size):
+        steps = random_steps(size)
+        steps["action"] = torch.nn.functional.one_hot(steps["action"], 3)
+        return steps
+
+    assert learn(agent, one_hot, 12)
+
+
+def test_a_state_of_other_maps_is_refused_by_name(make_any):
+    saved = make_any(keys=["flow"]).state_dict()
+    with pytest.raises(ValueError, match=r"does not fit this one in \d+ weights, first .* here, "):
+        make_any(keys=["flow", "seg"]).load_state_dict(saved)
+
+
+@pytest.mark.parametrize("changes", [{}, {"layer_norm": True}], ids=["as is", "layer norm"])
+def test_a_policy_is_built_and_loaded_without_its_learner(
+    make_any, observation_spec, random_steps, random_maps, tmp_path, changes
+):
+    """Of one environment, too, where a rollout would be less than a batch of PPO's."""
+    agent = make_any(**changes)
+    learn(agent, random_steps, 12)
+    save_checkpoint(tmp_path / "c", {"policy": dict(agent.policy.state_dict())})
+    options = make_any.options | {"total_frames": 1000}
+    options |= {name: value for name, value in changes.items() if name in options}
+    policy = type(agent).make_policy(
+        observation_spec[:1], Categorical(3), ["flow", "seg"], device="cpu", **options
+    )
+    maps = random_maps(20)
+    with torch.no_grad():
+        expected = agent.policy.get_dist(maps.clone()).probs
+        assert not torch.equal(policy.get_dist(maps.clone()).probs, expected)
+        policy.load_state_dict(load_checkpoint(tmp_path / "c")["policy"])
+        assert torch.equal(policy.get_dist(maps.clone()).probs, expected)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            greedy = agent.policy(maps.clone())["action"]
+            assert torch.equal(policy(maps.clone())["action"], greedy)
+        assert torch.equal(expected.argmax(-1), greedy)
+
+
+@pytest.mark.slow_after_first
+def test_actions_are_drawn_as_the_distribution_says(make_any, random_steps, random_maps):
+    agent = make_any()
+    learn(agent, random_steps, 12)
+    maps = random_maps(1)
+    with torch.no_grad():
+        expected = agent.policy.get_dist(maps.clone()).probs[0]
+        drawn = agent.policy(maps.expand(3000).contiguous())["action"]
+    # three standard deviations of a share are 0.027
+    shares = torch.bincount(drawn, minlength=3) / 3000
+    torch.testing.assert_close(shares, expected, atol=0.03, rtol=0)
+
+
+def metrics(**values):
+    return {name: torch.tensor(value) for name, value in values.items()}
+
+
+def test_the_first_bad_update_is_told_with_its_statistics():
+    watch = DivergenceWatch(["q_loss", "actor_loss"], ["entropy"])
+    watch.look(metrics(q_loss=1.0, actor_loss=2.0, entropy=0.5))
+    assert watch.is_bad == 0
+    watch.check()
+    watch.look(metrics(q_loss=3.0, actor_loss=-math.inf, entropy=0.25))
+    assert watch.is_bad == 1
+    watch.look(metrics(q_loss=math.nan, actor_loss=math.nan, entropy=9.0))
+    assert watch.is_bad == 1
+    message = r"^actor_loss became -inf in update 2 \(q_loss=3, actor_loss=-inf, entropy=0.25\)$"
+    with pytest.raises(DivergenceError, match=message):
+        watch.check()
+
+
+def test_after_a_reset_updates_are_counted_from_the_given_number():
+    watch = DivergenceWatch(["q_loss"])
+    is_bad = watch.is_bad  # which the optimizer holds
+    watch.look(metrics(q_loss=math.nan))
+    watch.reset(40)
+    assert is_bad == 0
+    watch.check()
+    watch.look(metrics(q_loss=1.0))
+    watch.look(metrics(q_loss=math.inf))
+    assert is_bad == 1
+    with pytest.raises(DivergenceError, match=r"^q_loss became inf in update 42 \(q_loss=inf\)$"):
+        watch.check()
+
+
+def test_what_is_logged_beside_the_losses_may_be_undefined():
+    watch = DivergenceWatch(["q_loss"], ["explained_variance"])
+    watch.look(metrics(q_loss=1.0, explained_variance=math.nan))
+    assert watch.is_bad == 0
+    watch.check()
+
+
+def test_looking_reads_nothing_back_from_the_device(monkeypatch):
+    """`item`, `tolist` and `bool` are what makes a GPU's host wait."""
+    watch = DivergenceWatch(["q_loss"])
+    values = metrics(q_loss=1.0)
+
+    def forbidden(*_):
+        raise AssertionError("the host would have to wait here")
+
+    with monkeypatch.context() as patched:
+        for name in ("item", "tolist", "__bool__", "__float__", "__int__", "numpy"):
+            patched.setattr(torch.Tensor, name, forbidden)
+        watch.look(values)
+        with pytest.raises(AssertionError, match="have to wait"):
+            watch.check()
+
+
+ENVS, BATCHES = 5, 7
+
+
+def batches_of(agents, random_steps):
+    """Samples for several updates, drawn before the first one; all agents see the same steps."""
+    for _ in range(12):
+        step = random_steps(ENVS).to(agents[0].device)
+        for agent in agents:
+            agent.remember(step)
+    return [agents[0].sample() for _ in range(BATCHES)]
+
+
+def state_of(agent):
+    """All that an update changes, by name."""
+    moments = {
+        f"{name}/{key}": value
+        for name, weight in agent.trained.items()
+        for key, value in agent.optimizer.state[weight].items()
+    }
+    watch = agent.divergence
+    return agent.weights | moments | {"watched": watch._values, "good": watch._good_updates}
+
+
+@pytest.fixture
+def layers_of_cuda(monkeypatch):
+    """Layers that are PyTorch's operations alone, as on CUDA; a tape records no others."""
+    monkeypatch.setattr(layers, "_is_shared_out", lambda x: False)
+
+
+class Taped:
+    """Stands in for a CUDA graph: some steps as they are, one on tape, the rest from the tape."""
+
+    def __init__(self, step):
+        self.step, self.calls, self.tape = step, 0, Tape()
+
+    def __call__(self, batch):
+        self.calls += 1
+        if self.calls < WARM_UP:
+            return self.step(batch)
+        if self.calls == WARM_UP:
+            static = batch.clone()
+            self.inputs = static.copy()
+            with self.tape:
+                self.out = self.step(static)
+        else:
+            self.inputs.update_(batch)
+            self.tape.replay()
+        return self.out.clone()
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.usefixtures("layers_of_cuda")
+def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
+    eager, taped = make_any(learning_rate=0.01), make_any(learning_rate=0.01)
+    batches = batches_of([eager, taped], random_steps)
+    taped._step = Taped(taped._take_step)
+    for batch in batches:
+        expected, actual = eager.update(batch.clone()), taped.update(batch.clone())
+        assert expected.keys() == actual.keys()
+        differing = [n for n in expected if not torch.equal(expected[n], actual[n])]
+        assert [n for n in differing if not expected[n].isnan()] == []
+    expected, actual = state_of(eager), state_of(taped)
+    assert [name for name in expected if not torch.equal(expected[name], actual[name])] == []
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.usefixtures("layers_of_cuda")
+def test_a_loss_that_is_no_number_stops_the_weights_on_tape_too(make_any, random_steps):
+    agent = make_any()
+    batches = batches_of([agent], random_steps)
+    agent._step = Taped(agent._take_step)
+    for batch in batches[:5]:
+        agent.update(batch.clone())
+    before = {name: weight.clone() for name, weight in agent.trained.items()}
+    bad = batches[5].clone()
+    for key in (("next", "reward"), "advantage", "value_target"):
+        if key in bad.keys(True):
+            bad[key] = torch.full_like(bad[key], torch.nan)
+    agent.update(bad)
+    agent.update(batches[6].clone())
+    assert [n for n, w in agent.trained.items() if not torch.equal(w, before[n])] == []
+    with pytest.raises(ArithmeticError, match="in update 6"):
+        agent.divergence.check()
+
+
+def on_a_device_that_cannot_be_read(make_any):
+    """An agent on "meta", which has shapes and no numbers, as good as a GPU that must not wait."""
+    reads = {"item": lambda _: 0.5, "is_set_to": lambda *_: False, "__bool__": lambda _: True}
+    with patch.multiple(Tensor, **reads):  # TorchRL looks into the weights when it is set up
+        return make_any(device="meta")
+
+
+def take_losses(agent, batch):
+    losses = agent.losses(batch)
+    torch.stack([x for name, x in losses.items() if name.endswith("_loss")]).sum().backward()
+    agent._gradient_norm()
+    agent.after_update()
+
+
+def test_an_update_asks_the_device_for_no_number_and_brings_it_none(make_any, random_steps):
+    batch = batches_of([make_any()], random_steps)[0].to("meta")
+    agent = on_a_device_that_cannot_be_read(make_any)
+    assert agent.CAPTURABLE
+    take_losses(agent, batch.copy())  # TorchRL brings its discount when it is first used
+    with Foreign() as foreign:
+        take_losses(agent, batch.copy())
+    assert foreign.crossings == []
+
+
+def test_on_a_cpu_a_step_stays_what_it_is():
+    assert as_cuda_graph(len, torch.device("cpu")) is len
+
+
+def test_an_algorithm_can_be_told_to_leave_graphs_alone(make_any):
+    with patch("flowrep.agent.algorithm.as_cuda_graph", return_value=len):  # as on CUDA
+        agent = make_any()
+        assert agent._step is len
+        agent.step_eagerly()
+        assert agent._step == agent._take_step
+        agent.load_state_dict(agent.state_dict())
+        assert agent._step == agent._take_step
+
+
+def test_a_batch_unlike_the_first_is_refused_by_name():
+    step = OfOneShape(lambda batch: batch)
+    first = TensorDict({"seen": torch.zeros(4, 2), "next": {"reward": torch.zeros(4, 1)}}, [4])
+    assert step(first) is first
+    step(first.clone().update({"td_error": torch.zeros(4)}))
+    with pytest.raises(ValueError, match=r"'seen' \(\(4, 2\).* has it \(\(1, 2\)"):
+        step(first[:1])
+    with pytest.raises(ValueError, match=r"reward.*float32.*float64"):
+        step(first.clone().update({"next": {"reward": torch.zeros(4, 1, dtype=torch.float64)}}))
+    with pytest.raises(ValueError, match=r"reward.*absent"):
+        step(first.exclude(("next", "reward")))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_graph_on_cuda_equals_the_steps_it_replaces(make_any, random_steps):
+    eager, graph = make_any(device="cuda"), make_any(device="cuda")
+    batches = batches_of([eager, graph], random_steps)
+    eager.step_eagerly()
+    for batch in batches:
+        expected, actual = eager.update(batch.clone()), graph.update(batch.clone())
+        for name, value in expected.items():
+            torch.testing.assert_close(actual[name], value, rtol=1e-3, atol=1e-4, equal_nan=True)
+    for name, value in state_of(eager).items():
+        torch.testing.assert_close(state_of(graph)[name], value, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_an_agent_on_cuda_resumes_into_a_graph_of_its_own(make_any, random_steps):
+    whole, resumed = make_any(device="cuda"), make_any(device="cuda", seed=9)
+    batches = batches_of([whole, resumed], random_steps)
+    for batch in batches[:5]:
+        whole.update(batch.clone())
+        resumed.update(batch.clone())
+    resumed.load_state_dict(whole.state_dict())
+    for batch in [*batches[5:], *batches[:5]]:
+        whole.update(batch.clone())
+        resumed.update(batch.clone())
+    for name, weight in whole.weights.items():
+        torch.testing.assert_close(resumed.weights[name], weight, rtol=1e-3, atol=1e-4)
+
+
+COUNT_PAGE_FAULTS = """
+import resource, sys
+from flowrep.agent import keep_freed_memory
+if sys.argv[1] == "keep":
+    assert keep_freed_memory()
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(5):
+        bytearray(b"x") * 80_000_000  # some 20,000 pages
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+faults()
+print(faults())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator")
+def test_a_freed_block_is_reused_without_page_faults():
+    faults = {}
+    for mode in ("default", "keep"):
+        command = [sys.executable, "-c", COUNT_PAGE_FAULTS, mode]
+        result = subprocess.run(command, capture_output=True, text=True, check=True)
+        faults[mode] = int(result.stdout)
+    assert faults["keep"] < 0.1 * faults["default"]
+
+
+def test_another_c_library_is_left_alone(monkeypatch):
+    monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
+    assert algorithm.keep_freed_memory() is False
