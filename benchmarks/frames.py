@@ -21,7 +21,7 @@ from torchrl.envs import Compose, EnvBase, GymWrapper, TransformedEnv
 
 from flowrep.envs import make_env
 from flowrep.envs.episode import Episode
-from flowrep.envs.street_vector import StreetVectorEnv
+from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.scene import Scene
 
@@ -34,7 +34,7 @@ def together(scene: Scene, num_envs: int) -> EnvBase:
 
 
 def one_by_one(scene: Scene, num_envs: int) -> EnvBase:
-    with patch("flowrep.envs.make.StreetVectorEnv", ONE_BY_ONE):
+    with patch("flowrep.envs.torchrl_env.StreetVectorEnv", ONE_BY_ONE):
         return make_env(scene, MAPS, num_envs=num_envs, seed=0, renderer="pybullet")
 
 

@@ -22,7 +22,7 @@ from update import agent_for
 from flowrep.agent import ReplayMemory, keep_freed_memory
 from flowrep.envs import StreetEnv, make_env
 from flowrep.envs.episode import Episode
-from flowrep.envs.street_vector import StreetVectorEnv
+from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.scenes import load_scene
 
 WARM_UP = 20  # steps of every env

@@ -20,7 +20,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "palette": set(),
     "scenes": {"scenes", "config_tree", "extras", "palette"},
     "simulator": {"simulator", "scenes", "palette", "jit"},
-    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette"},
+    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
     | {"transforms", "palette"},

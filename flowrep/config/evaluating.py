@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from pydantic import model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from flowrep.baselines.registry import BASELINES
+from flowrep.baselines.baselines import BASELINES
 from flowrep.config.expectations import Count, CountOrZero, ListOf, OneOf, Seed, Text
 from flowrep.config.representations import BY_SOURCE, Noise, Representations
 from flowrep.config.section import Section

@@ -5,7 +5,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import ConfigDict, Field, model_validator
 
-from flowrep.baselines.registry import BASELINES
+from flowrep.baselines.baselines import BASELINES
 from flowrep.config.algorithms import BY_TARGET, AnyAlgorithm
 from flowrep.config.expectations import (
     Count,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from flowrep.baselines.registry import BASELINES
+from flowrep.baselines.baselines import BASELINES
 from flowrep.config.expectations import Count, OneOf, Seed, Switch, Text
 from flowrep.config.section import Section
 from flowrep.config.training import FRAME_RATE, SceneSection, Speed

@@ -1,21 +1,24 @@
 """Streets with pedestrians in PyBullet: gymnasium environments and `make_env` for TorchRL.
 
-What needs PyTorch is imported when it is first asked for. Workers that step environments do without
-it, and start in a third of the time.
+What needs PyTorch is imported when it is first asked for: workers step environments without it.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from flowrep.envs import availability as availability  # before imports that need PyBullet
-from flowrep.envs.outcome import Outcome
-from flowrep.envs.registration import register_environments
+from flowrep.extras import require
+
+require("flowrep.envs", "sim", "pybullet", "gymnasium", "shapely", "yaml")
+
+import gymnasium
+
+from flowrep.envs.episode import Outcome
 from flowrep.envs.street_env import StreetEnv
-from flowrep.envs.worker_process import WorkerError
-from flowrep.envs.workers import WorkerVectorEnv
+from flowrep.envs.workers import WorkerError, WorkerVectorEnv
 
 if TYPE_CHECKING:
-    from flowrep.envs.make import (
+    from flowrep.envs.gym_wrappers import NumericInfo, RepresentationObservation
+    from flowrep.envs.torchrl_env import (
         begin_step,
         get_states,
         has_spare_cores,
@@ -23,11 +26,22 @@ if TYPE_CHECKING:
         set_states,
         street_envs,
     )
-    from flowrep.envs.represented import NumericInfo, RepresentationObservation
 
-register_environments()
+SCENE_BY_ID = {
+    "flowrep/StraightRoad-v0": "straight_road",
+    "flowrep/STurn-v0": "s_turn",
+    "flowrep/HShapedPathways-v0": "h_shaped_pathways",
+    "flowrep/ThreeWayJunction-v0": "three_way_junction",
+}
+"""The scene of each environment that is registered with gymnasium."""
+
+for _id, _scene in SCENE_BY_ID.items():
+    gymnasium.register(
+        _id, entry_point="flowrep.envs.gym_wrappers:make_street", kwargs={"scene": _scene}
+    )
 
 __all__ = [
+    "SCENE_BY_ID",
     "NumericInfo",
     "Outcome",
     "RepresentationObservation",
@@ -47,9 +61,9 @@ def __getattr__(name: str) -> Any:
     """Returns what is public and was not imported above."""
     if name not in __all__:
         raise AttributeError(f"module 'flowrep.envs' has no attribute '{name}'")
-    is_represented = name in ("NumericInfo", "RepresentationObservation")
-    module = import_module(f"flowrep.envs.{'represented' if is_represented else 'make'}")
-    return getattr(module, name)
+    is_wrapper = name in ("NumericInfo", "RepresentationObservation")
+    home = import_module(f"flowrep.envs.{'gym_wrappers' if is_wrapper else 'torchrl_env'}")
+    return getattr(home, name)
 
 
 def __dir__() -> list[str]:

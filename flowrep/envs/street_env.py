@@ -9,8 +9,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from flowrep.envs.episode import Episode, Moment, Rules, ticks_for
-from flowrep.envs.outcome import Outcome, reward
+from flowrep.envs.episode import Episode, Moment, Outcome, Rules, reward, ticks_for
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
 from flowrep.scenes.fields import FRAME_RATES_HZ, MOST_DRIVING_MPS, MOST_WALKING_MPS

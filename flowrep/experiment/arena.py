@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from flowrep.baselines.registry import Drive
-from flowrep.envs.outcome import Outcome, reward
-from flowrep.envs.worker_environments import Order
+from flowrep.baselines.baselines import Drive
+from flowrep.envs.episode import Outcome, reward
+from flowrep.envs.workers import Order
 from flowrep.experiment.env_pool import EnvPool, Options
 from flowrep.experiment.evaluation import Episode
 from flowrep.experiment.eye import Eye

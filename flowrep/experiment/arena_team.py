@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from flowrep.agent import keep_freed_memory, one_thread_an_operation
-from flowrep.baselines.registry import Drive
-from flowrep.envs.worker_group import WorkerGroup
+from flowrep.baselines.baselines import Drive
+from flowrep.envs.workers import WorkerGroup
 from flowrep.experiment.arena import Agent, Arena, Job
 from flowrep.experiment.env_pool import EnvPool, Options
 from flowrep.experiment.evaluation import Episode

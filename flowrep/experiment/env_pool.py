@@ -7,12 +7,10 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector.utils import create_empty_array
 
-from flowrep.baselines.registry import BASELINES, Baseline, Drive, drive_episode
-from flowrep.envs.sensor_observation import sensed
+from flowrep.baselines.baselines import BASELINES, Baseline, Drive, drive_episode
 from flowrep.envs.street_env import StreetEnv
-from flowrep.envs.street_vector import StreetVectorEnv
-from flowrep.envs.worker_environments import Arrays, Order
-from flowrep.envs.workers import WorkerVectorEnv
+from flowrep.envs.vector_env import StreetVectorEnv, sensed
+from flowrep.envs.workers import Arrays, Order, WorkerVectorEnv
 from flowrep.scenes.scene import Scene
 
 Options = dict[str, Any]

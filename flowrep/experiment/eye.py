@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from flowrep.envs.needs import sensors_read
+from flowrep.envs.torchrl_env import sensors_read
 from flowrep.palette import num_classes
 from flowrep.scenes.scene import Scene
 from flowrep.simulator.camera import sampled_intrinsics

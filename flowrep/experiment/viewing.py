@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.baselines.registry import Baseline
+from flowrep.baselines.baselines import Baseline
 from flowrep.envs.street_env import StreetEnv
 from flowrep.palette import CATEGORY_ID
 

@@ -12,8 +12,8 @@ import shapely
 from gymnasium.utils.env_checker import check_env
 
 from flowrep.baselines import Planner, RandomActions, drives, never_turn
+from flowrep.envs import SCENE_BY_ID
 from flowrep.envs.episode import Moment
-from flowrep.envs.registration import SCENE_BY_ID
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.layout import Layout, free_ground

@@ -1,4 +1,3 @@
-import gc
 import os
 import signal
 import subprocess
@@ -13,8 +12,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from flowrep.envs import StreetEnv, WorkerError, WorkerVectorEnv
-from flowrep.envs.worker_server import worker_context
+from flowrep.envs import WorkerError, WorkerVectorEnv
+from flowrep.envs.workers import worker_context
 
 pytestmark = pytest.mark.slow
 
@@ -56,16 +55,6 @@ class Counter(gym.Env):
     def set_state(self, count):
         self.count = count
         return count + 1
-
-    def frozen(self):
-        return gc.get_freeze_count()
-
-    def rasterisers(self):
-        """The compiled variants of the rasteriser before and after a street is made."""
-        rasteriser = sys.modules["flowrep.simulator.rasteriser"]
-        before = list(rasteriser._draw.signatures)
-        StreetEnv("straight_road", sensors=["depth"]).close()
-        return before, rasteriser._draw.signatures
 
 
 @pytest.fixture
@@ -160,17 +149,6 @@ def test_every_environment_can_be_asked_and_told(make):
     assert after["count"].tolist() == [[0, 11], [1, 22], [2, 33], [3, 44], [4, 55]]
 
 
-def test_what_workers_share_is_not_copied_by_their_garbage_collections(make):
-    assert min(make(2, 2).call("frozen")) > 100_000
-
-
-def test_workers_share_the_rasterisers_machine_code(make):
-    pytest.importorskip("numba", reason="PyBullet renders without it")
-    for loaded, used in make(2, 2).call("rasterisers"):
-        assert len(loaded) == 1
-        assert used == loaded
-
-
 @pytest.mark.parametrize("num_workers", [0, 4])
 def test_more_workers_than_environments_are_refused(make, num_workers):
     with pytest.raises(ValueError, match=f"num_workers is {num_workers} for 3 environments"):
@@ -219,7 +197,7 @@ def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make)
 
 
 def test_workers_that_run_another_copy_of_the_code_are_refused(make, monkeypatch):
-    monkeypatch.setattr("flowrep.envs.worker_process.__file__", "/elsewhere/worker_process.py")
+    monkeypatch.setattr("flowrep.envs.workers.__file__", "/elsewhere/worker_process.py")
     with pytest.raises(WorkerError, match="another copy of this package"):
         make(2, 1)
 
@@ -345,6 +323,6 @@ def test_a_script_needs_a_guard_only_for_environments_of_its_own(tmp_path, num_w
 
 def test_a_folder_too_long_for_sockets_is_named(monkeypatch):
     folder = "/tmp/" + 85 * "x"  # 90 bytes, and "/listener-12345678" makes 108
-    monkeypatch.setattr("flowrep.envs.worker_server.util.get_temp_dir", lambda: folder)
+    monkeypatch.setattr("flowrep.envs.workers.util.get_temp_dir", lambda: folder)
     with pytest.raises(OSError, match=f"'{folder}' is too long for sockets: shorten TMPDIR"):
         worker_context("flowrep.envs.workers", 2)

@@ -26,7 +26,6 @@ import matplotlib.pyplot  # noqa: F401
 import torch.utils.tensorboard  # noqa: F401
 
 import flowrep.agent.checkpoint as checkpoint
-import flowrep.envs.worker_freeze  # with the rasteriser's machine code
 import flowrep.train
 from flowrep.experiment.run_folder import RunFolder
 

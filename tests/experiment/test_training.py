@@ -110,7 +110,7 @@ def differing(a, b, place="") -> list[str]:
 
 @pytest.mark.parametrize("cores", [1, 64])
 def test_how_many_processes_drive_is_not_seen_in_what_comes_out(tmp_path, monkeypatch, cores):
-    monkeypatch.setattr("flowrep.envs.make.available_cores", lambda: cores)
+    monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: cores)
     alone = finish(tmp_path / "alone")
     training, config = new_run(tmp_path / "two", num_workers=2)
     train(training, config, StopAfter(training, 50), lambda frames: False)

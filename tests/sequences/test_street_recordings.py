@@ -16,8 +16,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 pytest.importorskip("pybullet", reason="the streets are PyBullet's")
 
 from flowrep.envs import StreetEnv
-from flowrep.envs.motion import CameraPose
-from flowrep.envs.sensing import SENSORS
+from flowrep.envs.sensing import SENSORS, CameraPose
 from flowrep.geometry import factorize, rigid_flow
 from flowrep.scenes import load_scene
 from flowrep.sequences import (

@@ -14,9 +14,9 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose
 
-from flowrep.envs.needs import check_rate, sensors_read
-from flowrep.envs.outcome import Outcome, hit_code
+from flowrep.envs.episode import Outcome, hit_code
 from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.torchrl_env import check_rate, sensors_read
 from flowrep.scenes.scene import Scene
 from flowrep.transforms import representation_stack
 from flowrep.transforms.flow import Intrinsics

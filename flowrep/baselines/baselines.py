@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from flowrep.baselines.planner import Planner
-from flowrep.envs.outcome import Outcome, reward
+from flowrep.envs.episode import Outcome, reward
 from flowrep.envs.street_env import StreetEnv
 from flowrep.scenes.vehicle import NO_OP
 

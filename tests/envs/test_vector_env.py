@@ -8,8 +8,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from flowrep.envs import StreetEnv
 from flowrep.envs.sensing import SENSORS
-from flowrep.envs.sensor_observation import SensorObservation
-from flowrep.envs.street_vector import StreetVectorEnv
+from flowrep.envs.vector_env import SensorObservation, StreetVectorEnv
 
 NUM_ENVS = 3
 

@@ -279,7 +279,7 @@ def test_a_street_on_cuda_is_the_street_on_the_cpu(make, num_workers):
 
 
 def test_whether_cores_are_left_for_the_caller(make, in_workers, monkeypatch):
-    monkeypatch.setattr("flowrep.envs.make.available_cores", lambda: 4)
+    monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 4)
     assert has_spare_cores(in_workers, 2)
     assert not has_spare_cores(in_workers, 3)
     assert has_spare_cores(make(num_envs=2), 4)

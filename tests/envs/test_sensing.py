@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from flowrep.envs.motion import CameraPose, instance_motion, planar, relative_camera, rigid_inverse
+from flowrep.envs.sensing import CameraPose, instance_motion, planar, relative_camera, rigid_inverse
 from flowrep.scenes.camera import CameraConfig
 from flowrep.simulator.camera import vehicle_from_camera
 
