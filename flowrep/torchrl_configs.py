@@ -46,12 +46,12 @@ from torchrl.trainers.algorithms.configs.objectives import LossConfig
 from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from flowrep.agent import dqn, dsac, dsac_v, ppo, replay
-from flowrep.envs import make
+from flowrep.envs import torchrl_env
 from flowrep.transforms.configs import config_class
 
 # By group and name.
 CONFIGS: dict[tuple[str, str], type] = {
-    ("env", "street"): config_class(make.make_env, EnvConfig),
+    ("env", "street"): config_class(torchrl_env.make_env, EnvConfig),
     ("loss", "discrete_sac_maps"): config_class(dsac.DiscreteSACMapLoss, LossConfig, partial=True),
     ("loss", "discrete_sac_value_maps"): config_class(
         dsac_v.DiscreteSACValueLoss, LossConfig, partial=True
