@@ -96,7 +96,8 @@ def check_flow(
         >>> from tensordict import TensorDict
         >>> motion = torch.eye(4)
         >>> motion[0, 3] = 0.1  # the camera moves to the right past a wall, 5 px per step
-        >>> sensor = {"depth": torch.full((3, 1, 8, 60), 1.0), "prev_from_curr": motion.repeat(3, 1, 1)}
+        >>> depth = torch.ones(3, 1, 8, 60)
+        >>> sensor = {"depth": depth, "prev_from_curr": motion.repeat(3, 1, 1)}
         >>> raw = torch.tensor([-5.0, 0.0]).reshape(1, 2, 1, 1).expand(3, 2, 8, 60)
         >>> frames = TensorDict({"sensor": sensor, "raw": raw}, [3])
         >>> check_flow(frames, [[50.0, 0, 30], [0, 50.0, 4], [0, 0, 1]]).agreement
@@ -107,7 +108,7 @@ def check_flow(
     K = torch.as_tensor(intrinsics, dtype=torch.float32)
     sensor = frames["sensor"]
     depth = sensor["depth"].float()
-    if "instance_motion" in sensor.keys():
+    if "instance_motion" in sensor:
         motions, ids = sensor["instance_motion"].float(), sensor["instance"]
     else:
         motions = sensor["prev_from_curr"].float().unsqueeze(-3)

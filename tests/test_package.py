@@ -96,3 +96,23 @@ def test_installed_its_commands_and_configs_are_there(installed, tmp_path):
         "scene=s_turn", "--cfg", "job", executable=installed / "flowrep-train", **where
     )
     assert "name: s_turn" in composed
+
+
+def test_importing_notices_the_other_distribution_of_that_name(tmp_path):
+    other = tmp_path / "flowrep-0.6.7.dist-info"
+    other.mkdir()
+    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: flowrep\nVersion: 0.6.7\n")
+    env = os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}"}
+    alone = subprocess.run(
+        [sys.executable, "-W", "error", "-c", "import flowrep"],
+        env=env | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    beside = subprocess.run(
+        [sys.executable, "-c", "import flowrep"], env=env, capture_output=True, text=True
+    )
+    assert (alone.returncode, alone.stderr) == (0, "")
+    assert beside.returncode == 0
+    assert "0.6.7" in beside.stderr
+    assert "pip uninstall" in beside.stderr

@@ -1,4 +1,4 @@
-"""`check_flow` against drives in a street: right data are right, and each wrong convention is named."""
+"""`check_flow` on drives in a street: right data are right, each wrong convention is named."""
 
 import pytest
 import torch
