@@ -24,8 +24,8 @@ BODIES, SEEN = 16, 6
 
 def step(depth: Tensor, instance: Tensor, K: Tensor, motions: Tensor) -> tuple[Tensor, ...]:
     """Returns raw, ego and object flow, as RawFlow and FlowFactorize compute them."""
-    raw = rigid_flow(depth, instance, K, motions).flow
-    return (raw, *factorize(raw, depth, K, motions[:, 0])[:2])
+    raw = rigid_flow(depth, instance, K, motions)
+    return (raw.flow, *factorize(raw, depth, K, motions[:, 0])[:2])
 
 
 def by_pytorch(*inputs: Tensor) -> tuple[Tensor, ...]:

@@ -27,12 +27,12 @@ def main() -> None:
     motions = instance_motion(
         world_from_prev_cam, world_from_cam, world_from_prev_person, world_from_person
     )
-    raw, _ = rigid_flow(depth, instance, K, motions)
+    raw = rigid_flow(depth, instance, K, motions)  # with a mask of known flow
     ego, obj, valid = factorize(raw, depth, K, motions[0])  # row 0 is the camera's own motion
 
     assert valid.all()
     print("u of the middle row, px")
-    for name, flow in {"raw": raw, "ego": ego, "obj": obj}.items():
+    for name, flow in {"raw": raw.flow, "ego": ego, "obj": obj}.items():
         print(name, " ".join(f"{u:+.2f}" for u in flow[0, 2].tolist()))
 
 

@@ -127,7 +127,12 @@ def rigid_flow(
 
 
 def factorize(
-    raw: Tensor, depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Tensor = 1.0
+    raw: Tensor | Flow,
+    depth: Tensor,
+    K: Tensor,
+    prev_from_curr: Tensor,
+    *,
+    dt: float | Tensor = 1.0,
 ) -> Factors:
     """Returns raw flow split into ego flow and object flow.
 
@@ -139,7 +144,8 @@ def factorize(
     Equation 6 of the paper.
 
     Args:
-        raw: `[*B, 2, H, W]`, pixels per dt.
+        raw: `[*B, 2, H, W]`, pixels per dt, nan where it isn't known; or what `rigid_flow` returns,
+            which says so with a mask (its flow alone, 0 there, would count as measured).
         depth: `[*B, 1, H, W]`, metres along the optical axis.
         K: `[*B, 3, 3]`.
         prev_from_curr: `[*B, 4, 4]`.
@@ -158,6 +164,9 @@ def factorize(
     >>> ego.flatten(), obj.flatten()
     (tensor([-0.5000, -0.5000]), tensor([0.0000, 3.5000]))
     """
+    if isinstance(raw, Flow):
+        # Viewed as bytes, as inductor's CPU code fails to compile a `where` on a bool view.
+        raw = torch.where(raw.valid.view(torch.uint8) != 0, raw.flow, math.nan)
     check_shape("raw", raw, (2, "H", "W"))
     batch = _check(depth, K, prev_from_curr, dt)
     _check_same_size("raw", raw, depth)

@@ -12,7 +12,7 @@ from torchrl.data import TensorSpec, Unbounded
 
 from flowrep.transforms.base import Keys, Reads
 from flowrep.transforms.dis import DIS
-from flowrep.transforms.flow import FlowTransform, checked_outputs
+from flowrep.transforms.flow import FlowTransform, checked_outputs, mask_spec
 from flowrep.transforms.raft import NETWORKS, RAFT, SMALLEST_SIDE_PX
 
 PICTURE_PAIR = Reads((6, "H", "W"), "integer")
@@ -28,6 +28,7 @@ class EstimatedFlow(FlowTransform):
     | --- | --- | --- | --- | --- |
     | `"rgb2"`, uint8 `[*B, 6, H, W]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` × `scale` |
     | | `"unscaled"` if chosen | as above | any | px/step |
+    | | `"raw_valid"`, `"unscaled_valid"` | bool `[*B, 1, H, W]` | | |
 
     Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
     step, as in `RawFlow`. The estimator therefore runs from the current picture to the previous one
@@ -37,6 +38,8 @@ class EstimatedFlow(FlowTransform):
     `FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])` writes them, correctly across
     resets and in a replay buffer. After a reset the current picture comes twice and flow is
     exactly 0. This transform itself keeps no state.
+
+    Where the estimator's flow isn't finite, flow is 0 and the mask beside it False, as `RawFlow`'s.
 
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
@@ -99,6 +102,7 @@ class EstimatedFlow(FlowTransform):
             compiled=False,
             in_keys=in_keys,
             out_keys=out_keys,
+            masked=["raw", "unscaled"],
         )
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
 
@@ -117,13 +121,17 @@ class EstimatedFlow(FlowTransform):
         # After a reset both pictures are the same, and nothing has moved.
         differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
         flow = torch.where(differs, flow, 0.0).reshape(*batch, 2, *size)
-        return tuple(self._in_unit(name, flow) for name in self.outputs)
+        known = flow.isfinite().all(-3, keepdim=True)
+        flow = torch.where(known, flow, 0.0)
+        made = [self._in_unit(name, flow) for name in self.outputs]
+        return (*made, *[known] * len(self.masks))
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns one unbounded spec per output."""
+        """Returns an unbounded spec per flow and a boolean one per mask."""
         (pair,) = specs
-        shape = torch.Size([*pair.shape[:-3], 2, *pair.shape[-2:]])
-        return tuple(Unbounded(shape, device=pair.device) for _ in self.outputs)
+        batch, size = pair.shape[:-3], pair.shape[-2:]
+        flows = [Unbounded((*batch, 2, *size), device=pair.device) for _ in self.outputs]
+        return (*flows, *(mask_spec(batch, size, pair.device) for _ in self.masks))
 
 
 def _estimator(

@@ -77,6 +77,7 @@ class FlowTransform(CameraTransform):
         compiled: whether `compute` runs through `torch.compile`.
         in_keys: see `MapTransform`.
         out_keys: one key per output.
+        masked: outputs beside which the class writes where they are known, under `mask_key`.
 
     Raises:
         ValueError: for a number of keys, a unit or a `dt_s` that does not fit, and for
@@ -95,6 +96,7 @@ class FlowTransform(CameraTransform):
         compiled: bool,
         in_keys: Keys,
         out_keys: Keys | None,
+        masked: Sequence[str] = (),
     ) -> None:
         super().__init__(
             intrinsics, reads, in_keys, list(outputs) if out_keys is None else out_keys
@@ -105,6 +107,9 @@ class FlowTransform(CameraTransform):
                 f"got {self.out_keys}"
             )
         self.outputs = tuple(outputs)
+        keys = zip(outputs, tuple(self.out_keys))
+        self.masks = tuple(mask_key(key) for name, key in keys if name in masked)
+        self.out_keys = [*self.out_keys, *self.masks]
         flows = [output for output in outputs if output != "valid"]
         scales = _per_output("scale", scale, flows)
         units = _per_output("unit", unit, flows)
@@ -137,11 +142,22 @@ class FlowTransform(CameraTransform):
         batch, size, device = depth.shape[:-3], depth.shape[-2:], depth.device
         dtype = torch.promote_types(depth.dtype, torch.float32)
         return tuple(
-            Categorical(2, shape=(*batch, 1, *size), device=device, dtype=torch.bool)
+            mask_spec(batch, size, device)
             if name == "valid"
             else Unbounded((*batch, 2, *size), device=device, dtype=dtype)
-            for name in self.outputs
+            for name in (*self.outputs, *["valid"] * len(self.masks))
         )
+
+
+def mask_spec(batch: torch.Size, size: torch.Size, device: torch.device | None) -> TensorSpec:
+    """Returns the spec of a mask, bool `[*B, 1, H, W]`."""
+    return Categorical(2, shape=(*batch, 1, *size), device=device, dtype=torch.bool)
+
+
+def mask_key(flow: NestedKey) -> NestedKey:
+    """Returns the key of the mask that says where a raw flow is known: `"raw_valid"` for `"raw"`."""
+    *path, name = (flow,) if isinstance(flow, str) else flow
+    return (*path, f"{name}_valid") if path else f"{name}_valid"
 
 
 def checked_outputs(outputs: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from flowrep import geometry
 from flowrep.transforms.base import DEPTH, FLOW, MOTION, Keys
-from flowrep.transforms.flow import FlowTransform, Intrinsics, checked_outputs
+from flowrep.transforms.flow import FlowTransform, Intrinsics, checked_outputs, mask_key
 
 _EGO_KEYS: list[NestedKey] = [("sensor", "depth"), ("sensor", "prev_from_curr")]
 
@@ -23,13 +25,15 @@ class FlowFactorize(FlowTransform):
     | `"raw"`, px/step | `"ego"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
     | `("sensor", "depth")`, m | `"obj"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
     | `("sensor", "prev_from_curr")` | `"raw"` if chosen | as above | any | as above |
-    | | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
+    | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
 
     Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the
     paper), obj = raw − ego is the objects' own flow (Eq. 6), both p_t − p_t' on the current frame's
     grid, channels (u right, v down). `prev_from_curr` `[*B, 4, 4]` maps a point from the current
     camera's frame to the previous camera's. Flow is 0 where it isn't known: where depth is `nan`,
     the point was not in front of the previous camera, or the motion, K or raw flow isn't finite.
+    Raw flow isn't known either where the mask beside it, bool `"raw_valid"` (`RawFlow` and
+    `EstimatedFlow` write it; its key follows raw's), is False: a store of raw flow keeps both.
     With the simulator's raw flow, obj is exactly 0 on everything static.
 
     Args:
@@ -95,6 +99,21 @@ class FlowFactorize(FlowTransform):
             in_keys=keys if in_keys is None else in_keys,
             out_keys=out_keys,
         )
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Returns the inputs, with nan in raw flow where its mask says that it isn't known."""
+        maps = super()._read(tensordict)
+        known = tensordict.get(mask_key(self.in_keys[0]), None) if self.reads[0] == FLOW else None
+        if known is None:
+            return maps
+        raw = maps[0]
+        if known.dtype != torch.bool or known.shape != raw[..., :1, :, :].shape:
+            raise ValueError(
+                f"representation {self.label}: key {mask_key(self.in_keys[0])!r} should be bool "
+                f"{list(raw[..., :1, :, :].shape)}, where {self.in_keys[0]!r} is known; "
+                f"got {known.dtype} {list(known.shape)}"
+            )
+        return [torch.where(known, raw, math.nan), *maps[1:]]
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""

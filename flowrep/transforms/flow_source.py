@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,7 +16,7 @@ from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.noise_source import Sensed
 from flowrep.transforms.raw_flow import RawFlow
 
-_UNSCALED = "_raw"  # raw flow in px/step, nan where unknown: what FlowFactorize reads
+_UNSCALED = "_raw"  # raw flow in px/step: what FlowFactorize reads
 PICTURES_KEY = "_rgb2"  # the previous and the current picture, kept for the next step
 ESTIMATED_FLOW_KEY = ("sensor", "flow")  # takes the place of _UNSCALED for estimated flow
 
@@ -84,7 +83,7 @@ def exact_flow_makers(
 ) -> list[Transform]:
     """Returns one RawFlow if raw flow is needed, and one FlowFactorize if ego or obj is."""
     if "obj" in flows:
-        raw = RawFlow(intrinsics, invalid=math.nan, out_keys=_UNSCALED, **context)
+        raw = RawFlow(intrinsics, out_keys=_UNSCALED, **context)
         raw.label = "'obj'"
         factors = FlowFactorize(
             intrinsics,

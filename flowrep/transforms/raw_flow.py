@@ -26,12 +26,14 @@ class RawFlow(FlowTransform):
     | --- | --- | --- | --- | --- |
     | `("sensor", "depth")`, m | `"raw"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
     | `("sensor", "instance")` | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
-    | `("sensor", "instance_motion")` | | | | |
+    | `("sensor", "instance_motion")` | `"raw_valid"` | as `"valid"` | | |
 
     Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
     step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, N, 4, 4]` maps a point fixed to
     instance i from the current camera's frame to its place in the previous camera's frame; row 0 is
     the static world's. The observation thus holds everything that flow needs of the previous step.
+    Where flow isn't known, because depth is `nan` or a point was not in front of the previous
+    camera, raw is 0 and the mask beside it, `"raw_valid"`, is False: `FlowFactorize` reads both.
     No state is kept, and shuffled samples of a replay buffer give the same flow as the env.
 
     Args:
@@ -45,10 +47,10 @@ class RawFlow(FlowTransform):
             on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
             the result in torch's cache. Otherwise numba, where it is installed, computes large
             float32 batches on a CPU two to five times as fast as PyTorch, with the same bits.
-        invalid: value, before scaling, where flow isn't known (depth `nan`, or a point behind the
-            previous camera).
+        invalid: value, before scaling, where flow isn't known.
         in_keys: depth, instance ids and one motion per instance.
-        out_keys: one key per output; their names by default.
+        out_keys: one key per output; their names by default. The mask's key follows raw's:
+            `("sensor", "flow_valid")` for `("sensor", "flow")`.
 
     Raises:
         ValueError: for a K that can't be one, an unknown output or unit, or `"px_per_s"` without
@@ -95,6 +97,7 @@ class RawFlow(FlowTransform):
             compiled=compiled,
             in_keys=_KEYS if in_keys is None else in_keys,
             out_keys=out_keys,
+            masked=["raw"],
         )
         self.invalid = float(invalid)
 
@@ -106,6 +109,5 @@ class RawFlow(FlowTransform):
         if self.invalid != 0.0:
             # Viewed as bytes, as inductor's CPU code fails to compile a `where` on a bool view.
             flow = torch.where(valid.view(torch.uint8) != 0, flow, self.invalid)
-        return tuple(
-            valid if name == "valid" else self._in_unit(name, flow) for name in self.outputs
-        )
+        made = [valid if name == "valid" else self._in_unit(name, flow) for name in self.outputs]
+        return (*made, *[valid] * len(self.masks))

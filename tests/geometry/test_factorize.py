@@ -77,6 +77,22 @@ def test_unknown_pixels_have_no_object_flow_and_say_so():
     assert ego[:, [1, 2, 3], [1, 2, 3]].abs().min() > 0
 
 
+def test_unknown_flow_of_a_body_is_no_object_flow():
+    # The camera slid 0.5 m right before 4 m: ego -0.5 px. What was behind it has no raw flow; its 0
+    # taken as measured would make obj +0.5.
+    camera = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
+    motions = torch.eye(4).repeat(2, 1, 1)
+    motions[:, 0, 3] = 0.5
+    motions[1, 2, 3] = -5.0
+    depth, instance = torch.full((1, 1, 2), 4.0), torch.tensor([[[0, 1]]])
+    raw = rigid_flow(depth, instance, camera, motions)
+    ego, obj, valid = factorize(raw, depth, camera, motions[0])
+    assert raw.flow[0].tolist() == [[-0.5, 0.0]]
+    assert ego[0].tolist() == [[-0.5, -0.5]]
+    assert (obj == 0).all()
+    assert valid.tolist() == [[[True, False]]]
+
+
 @pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
 def test_any_batch_equals_a_loop(batch):
     generator = torch.Generator().manual_seed(7)

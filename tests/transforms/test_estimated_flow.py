@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import sys
 
 import pytest
@@ -14,7 +15,13 @@ from torchrl.envs import ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from flowrep.geometry import ego_flow
-from flowrep.transforms import DIS, EstimatedFlow, FrameStack, representation_stack
+from flowrep.transforms import (
+    DIS,
+    EstimatedFlow,
+    FlowFactorize,
+    FrameStack,
+    representation_stack,
+)
 from tests.transforms.contract import TransformContract
 from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
 
@@ -186,6 +193,23 @@ def test_offline_equals_online_to_the_last_bit():
 def test_estimated_raw_alone_reads_pictures_alone():
     stack = representation_stack(["raw"], flow="estimated")
     assert {key for transform in stack for key in transform.in_keys} == {("sensor", "rgb"), "_rgb2"}
+
+
+def test_pixels_that_an_estimator_does_not_know_have_flow_0_and_no_object_flow():
+    def knows_the_left_half(current, previous):
+        flow = pixel_steps(current, previous)
+        flow[..., 4:] = math.nan
+        return flow
+
+    pictures = FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])
+    factors = FlowFactorize(INTRINSICS, outputs=["obj", "valid"])
+    stack = Compose(pictures, EstimatedFlow(knows_the_left_half), factors)
+    td = TransformedEnv(FakeSensorEnv((2,)), stack).rollout(2)[:, 1]
+    assert (td["raw"][..., :4] == -1.0).all()
+    assert (td["raw"][..., 4:] == 0.0).all()
+    assert not td["raw_valid"][..., 4:].any()
+    assert (td["obj"][..., 4:] == 0.0).all()
+    assert not td["valid"][..., 4:].any()
 
 
 def test_object_flow_is_the_estimate_less_ego_flow():

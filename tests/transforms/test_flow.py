@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs.transforms import Compose
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import TransformedEnv, check_env_specs
+from torchrl.envs.transforms import Compose, RenameTransform
 
 from flowrep.transforms import AdaptDepth, FlowFactorize, RawFlow, representation_stack
 from tests.transforms.fake_env import INTRINSICS, STATUE, WALKER, FakeSensorEnv, frame
@@ -133,13 +136,94 @@ def test_a_body_that_came_from_behind_the_camera_has_no_flow():
     assert RawFlow(K, invalid=math.nan)(td)["raw"][:, 0, 1].isnan().all()
 
 
-def test_a_stack_gives_such_a_body_no_object_flow_either():
-    td = scene()
-    td["sensor", "instance_motion"][1, 2, 3] = -9.0
-    td = representation_stack(["raw", "ego", "obj"], intrinsics=K)(td)
-    assert td["ego"][0, 0, 1] == -2.0
-    assert (td["raw"][:, 0, 1] == 0).all()
-    assert (td["obj"][:, 0, 1] == 0).all()  # raw - ego would be +2
+def overtaken() -> TensorDict:
+    """Returns a wall at 5 m and three bodies before a camera that slid 0.5 m right, 0.25 m down.
+
+    Body 1 (column 1) was 6 m further back, behind the camera; body 2 (column 2) had no pose a step
+    ago; body 3 (column 3) was 0.75 m further left relative to the camera.
+    """
+    camera = torch.eye(4)
+    camera[:2, 3] = torch.tensor([0.5, 0.25])
+    motions = camera.repeat(4, 1, 1)
+    motions[1, 2, 3] = -6.0
+    motions[2] = math.nan
+    motions[3, 0, 3] = -0.25
+    sensor = {
+        "depth": torch.full((1, 2, 4), 5.0),
+        "instance": torch.arange(4, dtype=torch.uint8).expand(1, 2, 4).clone(),
+        "prev_from_curr": camera,
+        "instance_motion": motions,
+    }
+    return TensorDict({"sensor": sensor})
+
+
+WITH_MASK = {"outputs": ["ego", "obj", "valid"]}
+STACKS = {
+    "two lines": lambda K: Compose(RawFlow(K), FlowFactorize(K, **WITH_MASK)),
+    "other keys": lambda K: Compose(
+        RawFlow(K, out_keys=[("sensor", "flow")]),
+        FlowFactorize(
+            K,
+            in_keys=[("sensor", "flow"), ("sensor", "depth"), ("sensor", "prev_from_curr")],
+            **WITH_MASK,
+        ),
+        RenameTransform([("sensor", "flow")], ["raw"]),
+    ),
+    "nan": lambda K: Compose(RawFlow(K, invalid=math.nan), FlowFactorize(K, **WITH_MASK)),
+    "representation_stack": lambda K: representation_stack(["raw", "ego", "obj"], intrinsics=K),
+}
+
+
+@pytest.mark.parametrize("make", STACKS.values(), ids=list(STACKS))
+def test_a_moving_camera_gives_bodies_of_unknown_flow_no_object_flow(make):
+    td = make([[50.0, 0.0, 1.5], [0.0, 40.0, 0.5], [0.0, 0.0, 1.0]])(overtaken())
+    # ego: 50 * 0.5 m / 5 m = 5 px to the left, 40 * 0.25 m / 5 m = 2 px up, on every pixel.
+    ego = torch.tensor([-5.0, -2.0])[:, None, None].expand(2, 2, 4)
+    torch.testing.assert_close(td["ego"], ego)
+    # obj = raw - ego: 0 of the wall and where raw isn't known (raw taken as 0 would give +5, +2);
+    # body 3: raw = 50 * 0.25 / 5 = 2.5 px to the right, and with the camera's part gone 7.5.
+    obj = torch.zeros(2, 2, 4)
+    obj[0, :, 3] = 7.5
+    torch.testing.assert_close(td["obj"], obj)
+    if "valid" in td.keys():
+        assert td["valid"].tolist() == [[[True, False, False, True]] * 2]
+
+
+@pytest.mark.parametrize("make", STACKS.values(), ids=list(STACKS))
+def test_unknown_raw_flow_is_0_in_any_batch_and_order(make):
+    stack = make(K)
+    torch.manual_seed(0)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(6), batch_size=9, transform=stack)
+    frames = overtaken().expand(2, 3).clone()
+    frames["sensor", "depth"] += 0.1 * torch.arange(6.0).reshape(2, 3, 1, 1, 1)  # tell them apart
+    buffer.extend(frames.clone().reshape(-1))
+    for td in (stack(frames.clone()), buffer.sample()):
+        assert (td["obj"][..., 1:3] == 0).all()
+        assert (td["ego"] != 0).any(-3).all()
+        for at in np.ndindex(*td.batch_size):
+            alone = stack(td[at].select("sensor"))
+            assert torch.equal(td["obj"][at], alone["obj"])
+            if make is not STACKS["nan"]:
+                assert td["raw"].isfinite().all()
+                assert (td["raw"][..., 1:3] == 0).all()
+
+
+def test_the_mask_beside_raw_flow_is_in_the_specs_and_follows_its_key():
+    keys = {"outputs": ["raw", "valid"], "out_keys": [("a", "flow"), "known"]}
+    env = TransformedEnv(FakeSensorEnv((2,)), RawFlow(INTRINSICS, **keys))
+    check_env_specs(env)
+    td = env.rollout(2)
+    assert td["a", "flow_valid"].dtype == torch.bool
+    assert torch.equal(td["a", "flow_valid"], td["known"])
+    assert not td["known"].all()
+    assert "raw_valid" not in RawFlow(INTRINSICS, outputs=["valid"]).out_keys
+
+
+def test_a_mask_of_another_layout_is_refused():
+    td = RawFlow(K)(scene())
+    for wrong in (td["raw_valid"].float(), td["raw_valid"][0]):
+        with pytest.raises(ValueError, match="raw_valid"):
+            FlowFactorize(K)(td.clone().set("raw_valid", wrong))
 
 
 def test_ego_alone_reads_no_raw_flow():
