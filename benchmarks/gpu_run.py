@@ -156,9 +156,9 @@ def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, fl
 
     from flowrep.config.command_line import register_resolvers
     from flowrep.config_tree import CONF_DIR
-    from flowrep.experiment.interruption import StopRequest
-    from flowrep.experiment.run_folder import RunFolder
-    from flowrep.experiment.training import train
+    from flowrep.experiment.run import RunFolder
+    from flowrep.experiment.runner import train
+    from flowrep.progress import StopRequest
     from flowrep.train import make_training
 
     register_resolvers()

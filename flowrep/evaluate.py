@@ -36,9 +36,9 @@ from flowrep.envs import WorkerError
 from flowrep.exchange.policies import ForeignPolicy, PolicyError, is_reference
 from flowrep.experiment.comparison import Comparison, Row, print_table
 from flowrep.experiment.failures import print_failures, write_failures
-from flowrep.experiment.interruption import StopRequest
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run import RunFolder
 from flowrep.from_config import Config, arena_from_config, env_from_config
+from flowrep.progress import StopRequest
 from flowrep.subjects import Subject, load_own, load_subject
 from flowrep.viz.film import record_episode
 

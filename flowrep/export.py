@@ -23,8 +23,7 @@ from flowrep.config.training import validated_run
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import street_envs
 from flowrep.exchange.programs import acting_program, write_agent
-from flowrep.experiment.origin import check_origin, origin_of
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.from_config import Config, env_from_config, policy_from_config
 from flowrep.scenes import load_scene
 

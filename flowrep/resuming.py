@@ -8,7 +8,7 @@ from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.command_line import line_for
 from flowrep.config.run_names import OF_THE_MACHINE
 from flowrep.config.training import validated_run
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run import RunFolder
 from flowrep.from_config import Config
 
 

@@ -19,9 +19,8 @@ from flowrep.exchange.cards import check_card
 from flowrep.exchange.policies import Task, load_policy
 from flowrep.experiment.arena import Agent
 from flowrep.experiment.comparison import Comparison, Row, with_origin
-from flowrep.experiment.origin import check_origin, differences, origin_of
 from flowrep.experiment.row_meanings import keep, known, maps_file, scene_file
-from flowrep.experiment.run_folder import Rows, RunFolder
+from flowrep.experiment.run import Rows, RunFolder, check_origin, differences, origin_of
 from flowrep.from_config import Config, choose_device, env_from_config, policy_from_config
 
 OF_THE_EVALUATION = (*OF_THE_MACHINE, "num_envs")  # not of the run

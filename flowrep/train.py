@@ -42,11 +42,8 @@ from flowrep.experiment.arena import Agent
 from flowrep.experiment.arena_team import AnyArena
 from flowrep.experiment.comparison import Comparison, print_table, with_origin
 from flowrep.experiment.failures import print_failures, write_failures
-from flowrep.experiment.interruption import StopRequest
-from flowrep.experiment.origin import origin_of
-from flowrep.experiment.run_folder import RunFolder, RunFolderError
-from flowrep.experiment.tables import TableError
-from flowrep.experiment.training import Training, train
+from flowrep.experiment.run import RunFolder, RunFolderError, origin_of
+from flowrep.experiment.runner import Training, train
 from flowrep.from_config import (
     Config,
     agent_from_config,
@@ -54,10 +51,12 @@ from flowrep.from_config import (
     choose_device,
     env_from_config,
 )
+from flowrep.progress import StopRequest
 from flowrep.resuming import how_to_resume, resumed_config
 from flowrep.scenes import SceneError, load_scene
 from flowrep.sweeps.plan import is_sweep
 from flowrep.sweeps.sweep import run_sweep
+from flowrep.tables import TableError
 from flowrep.viz.curves import draw_learning_curve
 from flowrep.viz.film import record_episode
 

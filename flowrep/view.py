@@ -27,10 +27,10 @@ from flowrep.config.viewing import ViewConfig
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import StreetEnv
 from flowrep.envs.sensing import SENSORS
-from flowrep.experiment.tables import append_rows
 from flowrep.experiment.viewing import CategoryCount, Viewed, view_episode
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
+from flowrep.tables import append_rows
 from flowrep.viz import contact_sheet, representation_strip, write_png, write_video
 from flowrep.viz.film import Maps, maps_of
 from flowrep.viz.plan import Track, draw_plan

@@ -23,11 +23,13 @@ FLOWREP_IMPORTS_ALLOWED = {
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
-    | {"transforms", "palette"},
+    | {"transforms", "palette", "progress", "tables"},
+    "progress": set(),
+    "tables": set(),
     "viz": {"viz", "experiment", "envs", "scenes", "geometry", "palette"},
     "exchange": {"exchange", "agent"},
-    "sequences": {"sequences", "experiment", "transforms", "geometry", "viz"},
-    "sweeps": {"sweeps", "train", "config", "config_tree", "experiment", "scenes"},
+    "sequences": {"sequences", "progress", "tables", "transforms", "geometry", "viz"},
+    "sweeps": {"sweeps", "tables", "train", "config", "config_tree", "experiment", "scenes"},
     "config": {
         "config",
         "agent",
@@ -40,7 +42,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     }
     | {"sequences", "transforms", "geometry", "config_tree", "console", "extras"},
     "report": {"report", "subjects", "viz", "config", "experiment", "agent", "envs", "scenes"}
-    | {"config_tree", "console", "extras"},
+    | {"config_tree", "console", "extras", "tables"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py"},

@@ -16,7 +16,7 @@ from flowrep.config_tree import CONF_DIR
 pytest.importorskip("pybullet", reason="the commands need the simulator")
 
 from flowrep.envs import WorkerError
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run import RunFolder
 from flowrep.train import carry_out, main
 
 MISTAKES = [

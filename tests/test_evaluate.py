@@ -20,12 +20,12 @@ from flowrep.envs import WorkerError, make_env, street_envs
 from flowrep.evaluate import evaluate, runs_in
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.evaluation import Episode
-from flowrep.experiment.interruption import StopRequest
-from flowrep.experiment.run_folder import RunFolder, RunFolderError
-from flowrep.experiment.tables import TableError
-from flowrep.experiment.training import train
+from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.experiment.runner import train
 from flowrep.export import export
+from flowrep.progress import StopRequest
 from flowrep.subjects import Subject, load_subject
+from flowrep.tables import TableError
 from flowrep.train import make_training
 from flowrep.viz.curves import _evaluated
 from flowrep.viz.film import film_episode

@@ -9,7 +9,7 @@ pytest.importorskip("pybullet", reason="the commands need the simulator")
 
 from flowrep import evaluate, train
 from flowrep.config.command_line import line_for
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run import RunFolder
 from tests.config.composing import plain
 
 NAMES = ["plain", "a=b,[c] {d}", 'José\'s "runs"', "日本 ~1#", "${seed}", "2026", "back\\slash\\"]

@@ -21,7 +21,7 @@ from flowrep.config.expectations import (
 from flowrep.config.representations import BY_SOURCE, Noise, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
-from flowrep.experiment.weights_and_biases import MODES as WANDB_MODES
+from flowrep.experiment.run import MODES as WANDB_MODES
 from flowrep.scenes.fields import FRAME_RATES_HZ
 from flowrep.scenes.scene import SpeedMode
 from flowrep.simulator.renderer import RENDERERS

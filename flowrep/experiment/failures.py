@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from flowrep.experiment.tables import write_rows
+from flowrep.tables import write_rows
 
 CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
 _GROUP = ("scene", "representations", "flow", "frames", "evaluation", "policy", "speed", "fps")

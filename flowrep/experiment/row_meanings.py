@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from flowrep.experiment.run_folder import RunFolder, RunFolderError
+from flowrep.experiment.run import RunFolder, RunFolderError
 
 
 def scene_file(run: RunFolder, name: str) -> Path:

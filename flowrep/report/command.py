@@ -22,7 +22,7 @@ from flowrep.config.command_line import exit_with, own_keys, plain_config, run_c
 from flowrep.config.quoting import override
 from flowrep.config.reporting import ReportConfig
 from flowrep.config_tree import CONF_DIR
-from flowrep.experiment.run_folder import RunFolderError
+from flowrep.experiment.run import RunFolderError
 from flowrep.report.assembly import assemble
 from flowrep.report.comparing import Settings
 from flowrep.report.drives import Drives

@@ -15,7 +15,7 @@ from flowrep.config import UsageError
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
 from flowrep.experiment.arena import Agent
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run import RunFolder
 from flowrep.report.drives import Drives, Film, FilmPart, Plan
 from flowrep.report.families import families_of
 from flowrep.report.pictures import film_uri, png_uri

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 from flowrep.experiment.evaluation import OUTCOMES
-from flowrep.experiment.origin import origin_of
-from flowrep.experiment.run_folder import RunFolder, RunFolderError
-from flowrep.experiment.tables import TableError
+from flowrep.experiment.run import RunFolder, RunFolderError, origin_of
 from flowrep.scenes.scene import SpeedMode
+from flowrep.tables import TableError
 
 _ORDER = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 Rows = list[dict[str, str]]

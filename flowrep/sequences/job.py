@@ -13,8 +13,7 @@ from typing import Any
 import torch
 from tqdm.auto import tqdm
 
-from flowrep.experiment.interruption import StopRequest
-from flowrep.experiment.stopwatch import Stopwatch
+from flowrep.progress import StopRequest, Stopwatch
 from flowrep.sequences.doctor import Diagnosis, Doctor
 from flowrep.sequences.factorization import (
     FactorizedFrame,

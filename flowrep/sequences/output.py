@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.experiment.tables import append_rows, is_whole, read_rows, write_rows
 from flowrep.sequences.factorization import FactorizedFrame
 from flowrep.sequences.files import Flow, write_flo, write_kitti_flow
 from flowrep.sequences.recording import SequenceError
+from flowrep.tables import append_rows, is_whole, read_rows, write_rows
 from flowrep.viz import Image, flow_note, flow_to_rgb, representation_strip, strip
 from flowrep.viz import flow_to_rgb as colours_of
 from flowrep.viz.maps import sampled_for_codec

@@ -20,14 +20,12 @@ from flowrep.config import UsageError, validated
 from flowrep.config.algorithms import ALGORITHMS
 from flowrep.config.command_line import exit_with
 from flowrep.config.training import TrainConfig
-from flowrep.experiment.folder_lock import FolderInUseError
-from flowrep.experiment.origin import differences
-from flowrep.experiment.run_folder import RunFolder, RunFolderError
-from flowrep.experiment.tables import TableError
+from flowrep.experiment.run import FolderInUseError, RunFolder, RunFolderError, differences
 from flowrep.scenes import SceneError, load_scene
 from flowrep.sweeps.ending import FINISHED, Ending
 from flowrep.sweeps.job import definition
 from flowrep.sweeps.stopping import stop_when_closed
+from flowrep.tables import TableError
 from flowrep.train import carry_out
 
 PATIENCE_S = 60.0  # to wait for a run of the same sweep that is saving after a stop

@@ -3,7 +3,7 @@
 from collections import defaultdict
 
 from flowrep.experiment.evaluation import outcome_shares
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run import RunFolder
 
 
 def draw_learning_curve(run: RunFolder) -> None:

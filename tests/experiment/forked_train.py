@@ -27,7 +27,7 @@ import torch.utils.tensorboard  # noqa: F401
 
 import flowrep.agent.checkpoint as checkpoint
 import flowrep.train
-from flowrep.experiment.run_folder import RunFolder
+from flowrep.experiment.run import RunFolder
 
 
 def die(*_, **__):

@@ -16,7 +16,7 @@ from flowrep.experiment.arena_team import ArenaTeam
 from flowrep.experiment.comparison import Comparison, print_table, with_origin
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.eye import Eye
-from flowrep.experiment.run_folder import EVALUATION_COLUMNS
+from flowrep.experiment.run import EVALUATION_COLUMNS
 from flowrep.scenes import load_scene
 from tests.test_configs import composed
 

@@ -13,10 +13,11 @@ import pytest
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
+from tests.experiment.test_training import differing
+
 from flowrep.agent import load_checkpoint
 from flowrep.config_tree import group_choices
-from flowrep.experiment.run_folder import RunFolder
-from tests.experiment.test_training import differing
+from flowrep.experiment.run import RunFolder
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow

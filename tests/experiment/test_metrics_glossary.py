@@ -9,9 +9,9 @@ import pytest
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.config_tree import group_choices
-from flowrep.experiment.interruption import StopRequest
-from flowrep.experiment.run_folder import RunFolder
-from flowrep.experiment.training import train
+from flowrep.experiment.run import RunFolder
+from flowrep.experiment.runner import train
+from flowrep.progress import StopRequest
 from flowrep.train import make_training
 from tests.test_configs import composed
 

@@ -4,7 +4,7 @@ import csv
 
 import yaml
 
-from flowrep.experiment.run_folder import EVALUATION_COLUMNS
+from flowrep.experiment.run import EVALUATION_COLUMNS
 
 EPISODES = 8
 

@@ -5,7 +5,7 @@ import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.experiment.run_folder import RunFolderError
+from flowrep.experiment.run import RunFolderError
 from flowrep.report.families import families_of
 from flowrep.report.runs import read_runs
 from tests.report.folders import config_of, letters, rows_of, write_run

@@ -1,10 +1,152 @@
+"""A run's folder: one owner, tables that survive, a checkpoint that belongs to its config."""
+
+import copy
 import csv
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from flowrep.experiment.run_folder import EVALUATION_COLUMNS, RunFolder, RunFolderError
-from flowrep.experiment.tables import TableError, append_rows
+from flowrep.agent import CheckpointError
+from flowrep.experiment.run import (
+    EVALUATION_COLUMNS,
+    FolderInUseError,
+    RunFolder,
+    RunFolderError,
+    check_origin,
+    folder_lock,
+    origin_of,
+    run_id,
+)
+from flowrep.tables import TableError, append_rows
+from tests.test_configs import composed
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from flowrep.experiment.run import folder_lock
+with folder_lock(Path(sys.argv[1]), "training"):
+    print("held", flush=True)
+    time.sleep(100)
+"""
+
+
+def test_who_holds_a_folder_is_named_and_one_that_was_killed_holds_it_no_more(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE) as other:
+        try:
+            assert other.stdout.readline() == b"held\n"
+            message = rf"in use: process {other.pid} on {platform.node()} has been training in it "
+            with pytest.raises(FolderInUseError, match=message + r"since \d{4}-\d\d-\d\d .*Wait"):
+                folder_lock(tmp_path, "evaluating").__enter__()
+        finally:
+            other.kill()
+    assert other.returncode == -signal.SIGKILL
+    with folder_lock(tmp_path, "evaluating"):
+        assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
+
+
+def test_it_is_given_back_whatever_happens_in_it(tmp_path):
+    with pytest.raises(ZeroDivisionError), folder_lock(tmp_path, "training"):
+        raise ZeroDivisionError
+    assert (tmp_path / ".lock").read_text() == ""
+    with folder_lock(tmp_path, "training"), pytest.raises(FolderInUseError):
+        folder_lock(tmp_path, "training").__enter__()
+
+
+@pytest.mark.parametrize("text", ["", "half of {", "[1]", "{}"])
+def test_a_holder_that_has_not_yet_written_who_it_is(tmp_path, text):
+    with folder_lock(tmp_path, "training"):
+        (tmp_path / ".lock").write_text(text)
+        with pytest.raises(FolderInUseError, match="another process has just begun"):
+            folder_lock(tmp_path, "training").__enter__()
+
+
+def test_a_disk_without_locks_is_said_so_and_used(tmp_path, monkeypatch, capsys):
+    def no_locks(*_):
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr("flowrep.experiment.run.fcntl.flock", no_locks)
+    with folder_lock(tmp_path, "training"):
+        pass
+    assert "no locks on the disk" in capsys.readouterr().err
+
+
+PATH = Path("run/checkpoint/latest.safetensors")
+
+
+@pytest.fixture(scope="module")
+def config():
+    return composed("debug=smoke")
+
+
+def test_the_same_run_on_another_machine_is_the_same(config):
+    here = config | {"device": "cuda", "num_workers": 7, "resume": "somewhere", "wandb": "online"}
+    check_origin(origin_of(config), origin_of(here), PATH)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "says"),
+    [
+        ("scene.camera.fov_deg", 90.0, r"scene.camera.fov_deg=60.0, the config.yaml .*=90.0"),
+        ("scene.name", "s_turn", "scene.name=straight_road, "),
+        ("representations.ego.scale", 0.3, "representations.ego.scale=.* says .*=0.3"),
+        ("representations.seg", {}, "representations.seg=absent"),
+        ("algorithm.gamma", 0.5, "algorithm.gamma=0.99"),
+        ("noise.drift_m", 0.1, "noise.drift_m=0.0, .* says noise.drift_m=0.1"),
+        ("seed", 1, "seed=0"),
+    ],
+)
+def test_an_edited_config_is_refused_by_the_name_of_the_key(config, place, value, says):
+    edited = copy.deepcopy(config)
+    *path, key = place.split(".")
+    node = edited
+    for part in path:
+        node = node[part]
+    node[key] = value
+    with pytest.raises(CheckpointError, match=f"{PATH} belongs to a run with {says}"):
+        check_origin(origin_of(config), origin_of(edited), PATH)
+
+
+def test_another_version_is_refused(config):
+    saved = origin_of(config) | {"flowrep": "0.0.9"}
+    with pytest.raises(CheckpointError, match=r"by flowrep 0\.0\.9, this is .*: install that"):
+        check_origin(saved, origin_of(config), PATH)
+
+
+def test_a_resumed_run_keeps_its_name_and_another_has_its_own(tmp_path):
+    first, other = RunFolder(tmp_path / "a").path, RunFolder(tmp_path / "b").path
+    assert run_id(first) == run_id(first) != run_id(other)
+
+
+def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    RunFolder(tmp_path).log_to_wandb("off", {})
+    with pytest.raises(ImportError, match=r"wandb=offline needs .*flowrep\[train,wandb\]"):
+        RunFolder(tmp_path).log_to_wandb("offline", {})
+
+
+@pytest.mark.slow
+def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_path):
+    wandb = pytest.importorskip("wandb", reason="needs the extra: pip install 'flowrep[wandb]'")
+    names = []
+    for frames in (10, 20):
+        run = RunFolder(tmp_path)
+        run.log_to_wandb("offline", {"seed": 3})
+        run.log_metrics(frames, {"alpha": 1 / frames})
+        names.append(wandb.run.id)
+        assert wandb.run.config["seed"] == 3
+        assert dict(wandb.run.summary)["alpha"] == 1 / frames
+        wandb.finish()
+    assert names == [run_id(tmp_path)] * 2
+    assert list((tmp_path / "wandb").glob(f"offline-run-*/run-{names[0]}.wandb"))
+    assert (tmp_path / "metrics.csv").read_text().splitlines()[1:] == ["10,0.1", "20,0.05"]
+
 
 CONFIG = {
     "scene": {"camera": {"height_px": 48}},
@@ -224,7 +366,7 @@ def test_a_table_that_can_not_be_replaced_stays(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("flowrep.experiment.tables.os.fsync", full)
+    monkeypatch.setattr("flowrep.tables.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         run.log_episodes([episode(2)])
     assert run.read_episodes() == [episode(1)]

@@ -1,6 +1,6 @@
 import pytest
 
-from flowrep.experiment.tables import append_rows, is_whole, read_rows, write_rows
+from flowrep.tables import append_rows, is_whole, read_rows, write_rows
 
 
 def test_rows_come_back_as_text(tmp_path):

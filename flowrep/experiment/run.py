@@ -1,18 +1,206 @@
-"""A run's folder: resolved config, metrics as CSV and TensorBoard, checkpoint, evaluation."""
+"""A run's folder: its lock, config, tables of metrics and episodes, loggers and checkpoint."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+import errno
+import fcntl
+import json
+import os
+import platform
+import sys
+import uuid
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from datetime import datetime
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import yaml
 from torchrl.record.loggers import TensorboardLogger
 
+from flowrep import __version__
+from flowrep.agent import CheckpointError
 from flowrep.experiment.evaluation import OUTCOMES
-from flowrep.experiment.folder_lock import folder_lock
-from flowrep.experiment.scalars import evaluation_scalars
-from flowrep.experiment.tables import TableError, append_rows, is_whole, read_rows, write_rows
-from flowrep.experiment.weights_and_biases import open_wandb
+from flowrep.tables import TableError, append_rows, is_whole, read_rows, write_rows
+
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some network file systems
+
+
+class FolderInUseError(OSError):
+    """Another process works in the folder; the message says which."""
+
+
+@contextmanager
+def folder_lock(folder: Path, doing: str) -> Iterator[None]:
+    """Locks a folder against other processes.
+
+    The lock is released when the process ends, however it ends.
+
+    Args:
+        folder: an existing folder; `.lock` is created in it and kept.
+        doing: the activity, for the error that other processes get, e.g. "training".
+
+    Raises:
+        FolderInUseError: another process holds the folder; gives its id, host and start time.
+    """
+    with (folder / ".lock").open("a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FolderInUseError(
+                f"'{folder}' is in use: {_holder(file.name)}. Wait until it has ended, or stop it"
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            print(f"warning: no locks on the disk of '{folder}' ({error})", file=sys.stderr)
+        file.truncate(0)
+        now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+        holder = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
+        json.dump(holder, file)
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)
+
+
+def _holder(lock: str) -> str:
+    """Describes the process that wrote a lock file."""
+    try:
+        holder = json.loads(Path(lock).read_text(encoding="utf-8"))
+        return "process {pid} on {host} has been {doing} in it since {since}".format(**holder)
+    except (ValueError, KeyError, TypeError):  # it has not written its description yet
+        return "another process has just begun in it"
+
+
+_IDENTITY = (
+    "scene",
+    "representations",
+    "flow",
+    "noise",
+    "algorithm",
+    "speed",
+    "seed",
+    "num_envs",
+    "total_frames",
+)
+"""The parts of a config that determine the weights."""
+
+_ABSENT = "absent"
+
+
+def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the identity of a run: flowrep's version, and the config keys that define it."""
+    parts = {key: config[key] for key in _IDENTITY}
+    return {"flowrep": __version__} | json.loads(json.dumps(parts))
+
+
+def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
+    """Checks that a checkpoint belongs to a run.
+
+    Args:
+        saved: the origin stored in the checkpoint.
+        expected: the origin of the config in its folder.
+        path: the checkpoint, for the message.
+
+    Raises:
+        CheckpointError: if it belongs to another; names the first difference.
+    """
+    if saved.get("flowrep") != expected["flowrep"]:
+        raise CheckpointError(
+            f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
+            "install that version, or start a new run"
+        )
+    for place, there, here in differences(saved, expected):
+        raise CheckpointError(
+            f"{path} belongs to a run with {place}={there}, the config.yaml of its folder says "
+            f"{place}={here}: restore the file that was there, or start a new run"
+        )
+
+
+def differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yields the dotted key of each difference with the two values."""
+    if not (isinstance(saved, Mapping) and isinstance(expected, Mapping)):
+        if saved != expected:
+            yield place, saved, expected
+        return
+    for key in dict.fromkeys([*saved, *expected]):
+        there, here = saved.get(key, _ABSENT), expected.get(key, _ABSENT)
+        yield from differences(there, here, f"{place}.{key}" if place else key)
+
+
+_TITLES = {"training": "evaluation"}  # training itself has scalars too
+
+
+def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
+    """Returns shares of outcomes, mean return and mean length of each evaluation, by frames.
+
+    Args:
+        rows: rows of evaluation.csv.
+
+    >>> row = {"scene": "s_turn", "evaluation": "final", "policy": "greedy", "speed": "low"}
+    >>> row |= {"fps": 12.0, "frames": 100, "outcome": "success", "return": 7.5, "length": 90}
+    >>> evaluation_scalars([row])[100]["final/s_turn/low/12fps/greedy/success"]
+    1.0
+    """
+    groups: dict[tuple[int, str], list[Mapping[str, Any]]] = defaultdict(list)
+    for row in rows:
+        kind, rate = row["evaluation"], f"{float(row['fps']):g}fps"
+        words = _TITLES.get(kind, kind), row["scene"], row["speed"], rate, row["policy"]
+        groups[int(row["frames"]), "/".join(words)].append(row)
+    scalars: dict[int, dict[str, float]] = defaultdict(dict)
+    for (frames, title), episodes in groups.items():
+        outcomes = [episode["outcome"] for episode in episodes]
+        for name in OUTCOMES[1:]:
+            scalars[frames][f"{title}/{name}"] = outcomes.count(name) / len(outcomes)
+        for name in ("return", "length"):
+            scalars[frames][f"{title}/{name}"] = fmean(float(e[name]) for e in episodes)
+    return dict(scalars)
+
+
+MODES = ("off", "offline", "online")
+
+
+def open_wandb(folder: Path, mode: str, config: Mapping[str, Any]) -> Any:
+    """Returns a TorchRL logger to the folder's own wandb run, the same one whenever it is resumed.
+
+    Args:
+        folder: the run's folder; wandb writes its files to `wandb/` in it.
+        mode: "offline" keeps them there for `wandb sync`, "online" sends them.
+        config: shown beside the run.
+
+    Raises:
+        ImportError: wandb is not installed.
+    """
+    try:
+        import wandb  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            f"wandb={mode} needs packages of an extra: pip install 'flowrep[train,wandb]'"
+        ) from error
+    from torchrl.record.loggers.wandb import WandbLogger
+
+    return WandbLogger(
+        folder.name,
+        project="flowrep",
+        save_dir=str(folder),
+        id=run_id(folder),
+        mode=mode,
+        config=dict(config),
+        log_env_packages=False,
+    )
+
+
+def run_id(folder: Path) -> str:
+    """Returns wandb's id of the run, generated once and kept in its folder."""
+    kept = folder / "wandb_id"
+    if not kept.is_file():
+        fresh = folder / "wandb_id.tmp"
+        fresh.write_text(uuid.uuid4().hex[:12], encoding="utf-8")
+        fresh.replace(kept)
+    return kept.read_text(encoding="utf-8")
+
 
 Rows = Sequence[Mapping[str, str]]
 

@@ -1,0 +1,106 @@
+"""How a long loop is stopped, what happens in it at intervals, and where its time goes."""
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any
+
+
+class StopRequest:
+    """Turns SIGINT and SIGTERM into a flag that the loop checks between two steps.
+
+    The first signal sets `received`. Another Ctrl-C ends the process at once; another SIGTERM
+    doesn't, since schedulers send it to each process of a job and more than once. Use it as a
+    context manager; the previous handlers are restored on exit.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        """Starts without a signal; handlers are installed on entering."""
+        self.received: signal.Signals | None = None
+        self._previous: dict[signal.Signals, Any] = {}
+
+    @property
+    def exit_code(self) -> int:
+        """The exit code that shells expect of a process ended by the received signal."""
+        return 0 if self.received is None else 128 + self.received
+
+    def __bool__(self) -> bool:
+        """Returns whether a stop was requested."""
+        return self.received is not None
+
+    def __enter__(self) -> "StopRequest":
+        """Installs the handlers."""
+        self._previous = {number: signal.signal(number, self._receive) for number in self.SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Restores the previous handlers."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        self.received = self.received or signal.Signals(number)
+        signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
+
+
+@dataclass
+class Every:
+    """True once each time a step counter passes a multiple of `interval`.
+
+    The counter may advance by more than one (vectorised environments); a multiple that was jumped
+    over counts when it is passed. `interval=0` never fires.
+
+    >>> should_log = Every(10)
+    >>> [should_log(step) for step in (4, 8, 12, 16, 20, 24)]
+    [False, False, True, False, True, False]
+    """
+
+    interval: int
+    last: int = 0
+
+    def __call__(self, step: int) -> bool:
+        """Returns whether `step` passed a new multiple since the last call."""
+        if not self.interval or step // self.interval <= self.last // self.interval:
+            return False
+        self.last = step
+        return True
+
+
+class Stopwatch:
+    """Adds up wall time by section.
+
+    >>> clock = Stopwatch()
+    >>> with clock("update"):
+    ...     pass
+    >>> clock.share("update")
+    1.0
+    """
+
+    def __init__(self) -> None:
+        """Starts with no sections."""
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, section: str) -> Iterator[None]:
+        """Adds the time spent inside to `section`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            elapsed = time.perf_counter() - start
+            self.seconds[section] = self.seconds.get(section, 0.0) + elapsed
+
+    def share(self, *sections: str) -> float:
+        """Returns the share of all counted time that the sections took; 0 at first."""
+        total = sum(self.seconds.values())
+        return sum(self.seconds.get(name, 0.0) for name in sections) / total if total else 0.0
+
+    def summary(self) -> str:
+        """Returns the shares of all sections in one line, the largest first."""
+        ordered = sorted(self.seconds, key=self.seconds.__getitem__, reverse=True)
+        return ", ".join(f"{name} {self.share(name):.0%}" for name in ordered)
