@@ -7,6 +7,7 @@ from flowrep.transforms.estimated_flow import EstimatedFlow
 from flowrep.transforms.flow_factorize import FlowFactorize
 from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.instance_ids import InstanceIds
+from flowrep.transforms.mirror import Mirror
 from flowrep.transforms.motion import CameraMotion, InstanceMotion
 from flowrep.transforms.raft import RAFT
 from flowrep.transforms.raw_flow import RawFlow
@@ -33,6 +34,7 @@ __all__ = [
     "FrameStack",
     "InstanceIds",
     "InstanceMotion",
+    "Mirror",
     "RawFlow",
     "Rgb",
     "Segmentation",

@@ -89,6 +89,7 @@ FlowFactorizeConfig = config_class(transforms.FlowFactorize)
 FrameStackConfig = config_class(transforms.FrameStack)
 InstanceIdsConfig = config_class(transforms.InstanceIds)
 InstanceMotionConfig = config_class(transforms.InstanceMotion)
+MirrorConfig = config_class(transforms.Mirror)
 RawFlowConfig = config_class(transforms.RawFlow)
 RgbConfig = config_class(transforms.Rgb)
 SegmentationConfig = config_class(transforms.Segmentation)
@@ -106,6 +107,7 @@ CONFIGS: dict[str, type[TransformConfig]] = {
     "frame_stack": FrameStackConfig,
     "instance_ids": InstanceIdsConfig,
     "instance_motion": InstanceMotionConfig,
+    "mirror": MirrorConfig,
     "raw_flow": RawFlowConfig,
     "rgb": RgbConfig,
     "segmentation": SegmentationConfig,

@@ -30,6 +30,7 @@ REQUIRED = {
     "FlowFactorize": {"intrinsics": K},
     "FrameStack": {"in_keys": ["seg", ["sensor", "depth"]], "out_keys": ["seg2", ["a", "b"]]},
     "InstanceIds": {"body_ids": [17, 3]},
+    "Mirror": {"in_keys": ["raw", ["a", "seg"]], "swapped_actions": [0, 2, 1]},
     "RawFlow": {"intrinsics": K},
     "Segmentation": {"num_classes": 5},
 }

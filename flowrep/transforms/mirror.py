@@ -1,0 +1,187 @@
+"""Left-right images of transitions, for replay in worlds that look alike in a mirror."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, expand_as_right
+from torch import Tensor
+from torchrl.envs.transforms import Transform
+
+from flowrep.transforms.base import Keys, MissingKey, as_keys
+
+Images = Literal["half", "both", "all"]
+
+
+class Mirror(Transform):
+    """Left-right images of the transitions that a replay buffer samples.
+
+    In a street that may as well be its own mirror image, whatever is learnt from turning left holds
+    for turning right. A transition's image has the columns of its maps reversed, now and under
+    `"next"`, the horizontal component of its flows negated, and its action exchanged; reward and
+    ends are the same.
+
+    | reads and writes | shape | its image |
+    | --- | --- | --- |
+    | a map | `[*B, C, H, W]` | column i is column 2·cx - 1 - i |
+    | a flow (`flow_keys`) | `[*B, 2·k, H, W]`, u and v of k frames | the same, with u negated |
+    | the action | `[*B]` or one-hot `[*B, n]` | `swapped_actions[action]` |
+
+    Convention: pixel (0, 0)'s centre is (0.5, 0.5), so that column i sees x / z = (i + 0.5 - cx) /
+    fx, and the column that sees the opposite is 2·cx - 1 - i. With cx = W / 2 that is the last for
+    the first. flowrep's simulated camera samples a pixel at its left edge, cx = W / 2 + 0.5: column
+    i becomes W - i, and column 0 would be one beyond the picture. Such columns, |2·cx - W| at one
+    border, take the nearest that was seen; the others are exact.
+
+    This is for replay buffers. It keeps no state and writes over what it reads. An env refuses it,
+    since actions would have to be exchanged before they are taken.
+
+    Args:
+        in_keys: all maps to mirror.
+        flow_keys: those of them that are flows; None for none.
+        swapped_actions: for each action the one that does the same in a mirror, such as
+            `[0, 2, 1]` for (straight on, left, right).
+        intrinsics: the maps' camera [3, 3], without skew; None if it is centred, cx = W / 2. 2·cx
+            has to be whole, as nothing is interpolated: maps of classes couldn't be.
+        images: "half" replaces each transition with probability 1/2, a trajectory (with a dimension
+            named "time") as a whole; "both" appends the images along the first dimension, which
+            doubles it; "all" replaces all.
+        action_key: the key of the action.
+        generator: of the draws for "half", on the batch's device; None for PyTorch's own.
+
+    Raises:
+        ValueError: for a flow that is not among `in_keys`, actions that exchanging twice doesn't
+            bring back, or intrinsics without an exact image.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> flow = torch.tensor([[[1.0, 2.0, 3.0]], [[4.0, 5.0, 6.0]]])  # u and v of one row
+        >>> td = TensorDict({"raw": flow, "action": torch.tensor(1)})
+        >>> mirror = Mirror("raw", flow_keys="raw", swapped_actions=[0, 2, 1], images="all")
+        >>> mirror(td)["raw"].tolist(), td["action"].item()
+        ([[[-3.0, -2.0, -1.0]], [[6.0, 5.0, 4.0]]], 2)
+    """
+
+    invertible = False
+    swapped_actions: Tensor
+
+    def __init__(
+        self,
+        in_keys: Keys,
+        *,
+        swapped_actions: Sequence[int],
+        flow_keys: Keys | None = None,
+        intrinsics: Tensor | Sequence[Sequence[float]] | None = None,
+        images: Images = "half",
+        action_key: NestedKey = "action",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        keys = as_keys(in_keys)
+        super().__init__(in_keys=keys, out_keys=keys)
+        self.flow_keys = [] if flow_keys is None else as_keys(flow_keys)
+        unknown = [key for key in self.flow_keys if key not in keys]
+        if unknown:
+            raise ValueError(f"flow_keys has {unknown}, which in_keys lacks: {keys}")
+        swapped = torch.as_tensor(swapped_actions, dtype=torch.long)
+        actions = torch.arange(len(swapped))
+        if sorted(swapped.tolist()) != actions.tolist() or not swapped[swapped].equal(actions):
+            raise ValueError(
+                "swapped_actions gives each action's mirror image, and the image's is the action "
+                f"again; got {swapped.tolist()}"
+            )
+        if images not in get_args(Images):
+            raise ValueError(f"images={images!r}: expected one of {', '.join(get_args(Images))}")
+        self.register_buffer("swapped_actions", swapped, persistent=False)
+        self.twice_cx = None if intrinsics is None else _twice_cx(intrinsics)
+        self.images, self.generator = images, generator
+        self.action_key: NestedKey = as_keys([action_key])[0]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns a batch of transitions with the images in their place, or behind them."""
+        if self.images == "both":
+            seen = torch.ones(tensordict.batch_size, dtype=torch.bool, device=tensordict.device)
+            return torch.cat([tensordict, self._mirror(tensordict.copy(), seen)])
+        return self._mirror(tensordict, self._draw(tensordict))
+
+    def _draw(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns which transitions are to be mirrored, `[*B]`."""
+        shape, device = tensordict.batch_size, tensordict[self.in_keys[0]].device
+        if self.images == "all":
+            return torch.ones(shape, dtype=torch.bool, device=device)
+        drawn = [1 if name == "time" else n for name, n in zip(tensordict.names, shape)]
+        chance = torch.rand(drawn, generator=self.generator, device=device)
+        return (chance < 0.5).expand(shape)
+
+    def _mirror(self, tensordict: TensorDictBase, chosen: Tensor) -> TensorDictBase:
+        """Writes the images of the `chosen` [*B] transitions over them."""
+        tensordict[self.action_key] = self._exchange(tensordict[self.action_key], chosen)
+        following = tensordict.get("next", None)
+        for key in self.in_keys:
+            is_flow = key in self.flow_keys
+            if tensordict.get(key, None) is None:
+                known = sorted(tensordict.keys(True, True), key=str)
+                raise MissingKey(f"Mirror needs key {key!r}; the batch has {known}")
+            for place in (tensordict, following):
+                x = None if place is None else place.get(key, None)
+                if x is not None:
+                    place[key] = mirror_map(x, chosen, self.twice_cx, is_flow=is_flow)
+        return tensordict
+
+    def _exchange(self, action: Tensor, chosen: Tensor) -> Tensor:
+        swapped = self.swapped_actions.to(action.device)
+        is_one_hot = action.ndim > chosen.ndim and action.shape[-1] == len(swapped)
+        image = action[..., swapped] if is_one_hot else swapped[action.long()].to(action.dtype)
+        return torch.where(expand_as_right(chosen, action), image, action)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        raise RuntimeError("Mirror is for replay: append it to a replay buffer, not to an env")
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._call(next_tensordict)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def __repr__(self) -> str:
+        """Returns the class name with the keys and which images it makes."""
+        return f"{type(self).__name__}({self.in_keys}, images={self.images!r})"
+
+
+def mirror_map(x: Tensor, chosen: Tensor, twice_cx: int | None, *, is_flow: bool) -> Tensor:
+    """Returns maps `[*B, C, H, W]`, the `chosen` `[*B]` of them mirrored.
+
+    Args:
+        x: maps.
+        chosen: which to mirror.
+        twice_cx: 2·cx of the camera, see `Mirror`; None for W.
+        is_flow: whether channels are u, v, u, v, …, of which u changes its sign.
+    """
+    width = x.shape[-1]
+    column = torch.arange(width, device=x.device)
+    opposite = ((width if twice_cx is None else twice_cx) - 1 - column).clamp(0, width - 1)
+    chosen = chosen[..., None, None, None]
+    # one pass over the maps: a gather takes half the time of a flip and a choice between the two
+    x = x.gather(-1, torch.where(chosen, opposite, column).expand(x.shape))
+    if not is_flow:
+        return x
+    is_u = torch.arange(x.shape[-3], device=x.device)[:, None, None] % 2 == 0
+    return torch.where(chosen & is_u, -x, x)
+
+
+def _twice_cx(intrinsics: Any) -> int:
+    K = torch.as_tensor(intrinsics, dtype=torch.float64)
+    if K.shape != (3, 3) or K[0, 1] != 0:
+        raise ValueError(f"intrinsics should be one [3, 3] without skew, got {K.tolist()}")
+    twice_cx = round(2 * K[0, 2].item())
+    if abs(2 * K[0, 2].item() - twice_cx) > 1e-3:
+        raise ValueError(
+            f"the camera's cx is {K[0, 2].item():g}, so that columns would have to be "
+            "interpolated; Mirror needs 2·cx whole"
+        )
+    return twice_cx

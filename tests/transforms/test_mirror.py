@@ -1,0 +1,216 @@
+"""Mirror: left-right images of transitions, worked out by hand."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from flowrep import geometry
+from flowrep.transforms import Mirror
+from flowrep.transforms.base import MissingKey
+from tests.transforms.fake_env import FakeSensorEnv
+
+SWAPPED = [0, 2, 1]  # straight on, left, right
+
+
+def camera(cx: float) -> list[list[float]]:
+    return [[6.0, 0.0, cx], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]]
+
+
+def transitions(*batch: int) -> TensorDict:
+    """Random flows of two frames, ids and actions, now and next; 2 rows, 5 columns."""
+    steps = {
+        "raw": torch.randn(*batch, 4, 2, 5),
+        "seg": torch.randint(9, (*batch, 1, 2, 5), dtype=torch.uint8),
+    }
+    following = {key: x.roll(1, -2) + 1 for key, x in steps.items()}
+    following["reward"] = torch.randn(*batch, 1)
+    return TensorDict({**steps, "action": torch.randint(3, batch), "next": following}, batch)
+
+
+def mirror(images="all", **options) -> Mirror:
+    keys = {"flow_keys": "raw", "swapped_actions": SWAPPED} | options
+    return Mirror(["raw", "seg"], images=images, **keys)
+
+
+def image(td: TensorDict) -> TensorDict:
+    """The images of `transitions`, by a centred camera, in other words than the transform's."""
+    sign = torch.tensor([-1.0, 1.0, -1.0, 1.0])[:, None, None]
+    out = td.clone()
+    for place in (out, out["next"]):
+        place["raw"], place["seg"] = place["raw"].flip(-1) * sign, place["seg"].flip(-1)
+    out["action"] = torch.where(td["action"] == 0, 0, 3 - td["action"])
+    return out
+
+
+def same(a: TensorDict, b: TensorDict) -> bool:
+    return bool((a == b).all())
+
+
+# TorchRL's cases
+
+
+@pytest.mark.parametrize("wrap", [lambda make: make(), lambda make: SerialEnv(2, [make, make])])
+def test_an_env_refuses_it(wrap):
+    def make():
+        seen = Mirror([("sensor", "depth")], swapped_actions=SWAPPED)
+        return TransformedEnv(FakeSensorEnv(), seen)
+
+    with pytest.raises(RuntimeError, match="replay"):
+        wrap(make).rollout(2)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
+def test_transform_no_env_and_compose(batch):
+    td = transitions(*batch)
+    assert same(mirror()(td.clone()), image(td))
+    assert same(Compose(mirror())(td.clone()), image(td))
+
+
+def test_transform_model():
+    double = TensorDictModule(lambda x: 2 * x, in_keys=["raw"], out_keys=["double"])
+    td = transitions(3)
+    assert torch.equal(nn.Sequential(mirror(), double)(td.clone())["double"], 2 * image(td)["raw"])
+
+
+@pytest.mark.parametrize("method", ["transform=", "append_transform"])
+def test_transform_rb(method):
+    td = transitions(6)
+    td["number"] = torch.arange(6)
+    storage, seen = LazyTensorStorage(6), pickle.loads(pickle.dumps(mirror()))
+    if method == "transform=":
+        buffer = TensorDictReplayBuffer(storage=storage, transform=seen, batch_size=40)
+    else:
+        buffer = TensorDictReplayBuffer(storage=storage, batch_size=40)
+        buffer.append_transform(seen)
+    buffer.extend(td)  # stored as it is
+    assert torch.equal(storage[:]["raw"], td["raw"])
+    sample = buffer.sample()
+    want = image(td)[sample["number"]]
+    assert same(sample.select(*want.keys(True, True)), want)
+
+
+def test_transform_inverse():
+    td = TensorDict({"action": torch.tensor([2, 0, 1])}, [3])
+    assert same(mirror().inv(td.clone()), td)
+
+
+# What an image is
+
+
+@pytest.mark.parametrize(
+    ("cx", "seen"),
+    [
+        (2.5, [4, 3, 2, 1, 0]),  # the centre of five columns: reversed
+        # flowrep's renderer samples pixels at their left edges, cx = W / 2 + 0.5: column i shows
+        # what W - i showed, and column 5 was not seen. Reversing alone would be one column off.
+        (3.0, [4, 4, 3, 2, 1]),
+        (2.0, [3, 2, 1, 0, 0]),
+    ],
+)
+def test_the_columns_of_an_image(cx, seen):
+    td = TensorDict({"seg": torch.arange(5).reshape(1, 1, 5), "action": torch.tensor(0)})
+    assert (
+        Mirror("seg", swapped_actions=SWAPPED, intrinsics=camera(cx), images="all")(td)["seg"]
+        .flatten()
+        .tolist()
+        == seen
+    )
+
+
+def test_ego_flow_of_the_image_is_the_image_of_ego_flow():
+    # cx = 3 and seven columns: the last sees what none on the left did
+    K, width = torch.tensor(camera(3.0)), 7
+    depth = 2 + torch.rand(1, 5, width)
+    turn, reflect = torch.eye(4), torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0]))
+    turn[0, 0] = turn[2, 2] = torch.cos(torch.tensor(0.2))
+    turn[0, 2], turn[2, 0] = torch.sin(torch.tensor(0.2)), -torch.sin(torch.tensor(0.2))
+    turn[:3, 3] = torch.tensor([0.3, -0.1, 0.5])
+    td = TensorDict({"ego": geometry.ego_flow(depth, K, turn).flow, "depth": depth})
+    td["action"] = torch.tensor(1)
+    seen = Mirror(
+        ["ego", "depth"], flow_keys="ego", swapped_actions=SWAPPED, intrinsics=K, images="all"
+    )(td)
+    there = geometry.ego_flow(seen["depth"], K, reflect @ turn @ reflect).flow
+    torch.testing.assert_close(there[..., :-1], seen["ego"][..., :-1], atol=1e-5, rtol=1e-5)
+
+
+def test_one_hot_actions_and_actions_of_their_own_dim_are_exchanged():
+    td = transitions(3)
+    td["action"] = torch.tensor([0, 1, 2])
+    one_hot = td.clone().set("action", torch.eye(3, dtype=torch.bool))
+    column = td.clone().set("action", td["action"][:, None])
+    assert mirror()(one_hot)["action"].int().argmax(-1).tolist() == [0, 2, 1]
+    assert mirror()(column)["action"].tolist() == [[0], [2], [1]]
+
+
+# Which transitions
+
+
+def test_half_of_a_batch_is_replaced_whole_transitions_at_a_time():
+    td = transitions(400)
+    torch.manual_seed(3)
+    got = mirror("half")(td.clone())
+    chosen = (got["raw"] != td["raw"]).flatten(1).any(-1)
+    assert 150 < chosen.sum() < 250
+    assert same(got[chosen], image(td)[chosen])
+    assert same(got[~chosen], td[~chosen])
+    torch.manual_seed(3)
+    assert same(mirror("half")(td.clone()), got)
+
+
+def test_draws_come_from_the_generator_that_is_given():
+    td, rng = transitions(50), torch.Generator().manual_seed(5)
+    first = mirror("half", generator=rng)(td.clone())
+    before = torch.get_rng_state()
+    again = mirror("half", generator=torch.Generator().manual_seed(5))(td.clone())
+    assert same(first, again)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_trajectory_is_mirrored_as_a_whole():
+    td = transitions(64, 3)
+    td.names = [None, "time"]
+    got = mirror("half")(td.clone())
+    changed = (got["raw"] != td["raw"]).flatten(2).any(-1)
+    assert (changed.all(-1) == changed.any(-1)).all()
+    assert 0 < changed.sum() < changed.numel()
+
+
+def test_both_appends_the_images():
+    td = transitions(3, 2)
+    got = mirror("both")(td.clone())
+    assert same(got, torch.cat([td, image(td)]))
+
+
+def test_a_batch_may_lack_the_next_maps_but_not_its_own():
+    td = transitions(3)
+    rest = mirror()(td.clone().exclude(("next", "raw"), ("next", "seg")))
+    assert torch.equal(rest["raw"], image(td)["raw"])
+    assert same(rest["next"], td["next"].select("reward"))
+    with pytest.raises(MissingKey, match="seg"):
+        mirror()(td.exclude("seg"))
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"flow_keys": "ego"}, "ego"),
+        ({"swapped_actions": [1, 2, 0]}, "swapped_actions"),
+        ({"swapped_actions": [0, 0, 1]}, "swapped_actions"),
+        ({"images": "some"}, "images"),
+        ({"intrinsics": camera(2.6)}, "cx"),
+        ({"intrinsics": [[6.0, 0.1, 3.0], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]]}, "intrinsics"),
+    ],
+)
+def test_what_has_no_image_is_refused(options, named):
+    with pytest.raises(ValueError, match=named):
+        mirror(**options)
