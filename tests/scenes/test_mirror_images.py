@@ -55,7 +55,7 @@ def is_image(thing, other, m):
     matrix = [*m[:2, :2].ravel(), *m[:2, 2]]
     images = [affine_transform(shape, matrix) for shape in shapes]
     return what == other_what and all(
-        a.is_empty and b.is_empty or a.hausdorff_distance(b) < APART_M
+        (a.is_empty and b.is_empty) or a.hausdorff_distance(b) < APART_M
         for a, b in zip(images, other_shapes)
     )
 
