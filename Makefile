@@ -75,7 +75,7 @@ test-python:  ## Run the fast tests on another Python, in an environment of its 
 	$(MAKE) test-fast ENV=.venv-$(notdir $(PYTHON))
 
 schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
-	$(BIN)/python -c 'from flowrep.scenes.schema import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
+	$(BIN)/python -c 'from flowrep.scenes.load import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
 
 lint: $(DEVELOPED)  ## Check style and formatting
 	$(BIN)/ruff check .

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flowrep.baselines import Planner
 from flowrep.envs import StreetEnv
 from flowrep.scenes import Scene, load_scene, scene_names
-from flowrep.scenes.people import PARTS
+from flowrep.scenes.pedestrians import PARTS
 
 CAMERAS = ((48, 48, 90), (48, 48, 60), (64, 64, 60), (84, 84, 90), (84, 84, 60), (48, 84, 60))
 BINS_M = ((5, 10), (10, 15), (15, 20), (20, 25), (25, 30))

@@ -27,7 +27,7 @@ from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.from_config import Config, env_from_config, policy_from_config
 from flowrep.scenes import load_scene
 
-ACTIONS = ("no_op", "turn_left", "turn_right")  # by their indices in flowrep.scenes.vehicle
+ACTIONS = ("no_op", "turn_left", "turn_right")  # by their indices in flowrep.scenes.scene
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="export")

@@ -20,7 +20,7 @@ from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.arena_team import AnyArena, ArenaTeam, can_travel
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.scenes import load_scene
-from flowrep.simulator.renderer import choose_renderer
+from flowrep.simulator.camera import choose_renderer
 
 Config = Mapping[str, Any]
 

@@ -18,7 +18,7 @@ from flowrep.config.composition import check_command
 from flowrep.config_tree import CONF_DIR
 from flowrep.envs import StreetEnv
 from flowrep.scenes import load_scene
-from flowrep.scenes.camera import CameraConfig
+from flowrep.scenes.scene import CameraConfig
 from flowrep.view import check, drive_on, film, moments, moving_pixels
 
 TINY = CameraConfig(6, 8, 90.0, 1.5, 0.0, -5.0, 0.2, 300.0)

@@ -9,7 +9,7 @@ import numpy as np
 from flowrep.baselines.planner import Planner
 from flowrep.envs.episode import Outcome, reward
 from flowrep.envs.street_env import StreetEnv
-from flowrep.scenes.vehicle import NO_OP
+from flowrep.scenes.scene import NO_OP
 
 Baseline = Callable[[StreetEnv], int]
 """Returns the next action; may read the env's whole state."""

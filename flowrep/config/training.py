@@ -22,9 +22,8 @@ from flowrep.config.representations import BY_SOURCE, Noise, Representations
 from flowrep.config.section import Section, validated
 from flowrep.config.violations import UsageError, broken_rule
 from flowrep.experiment.run import MODES as WANDB_MODES
-from flowrep.scenes.fields import FRAME_RATES_HZ
-from flowrep.scenes.scene import SpeedMode
-from flowrep.simulator.renderer import RENDERERS
+from flowrep.scenes.scene import FRAME_RATES_HZ, SpeedMode
+from flowrep.simulator.camera import RENDERERS
 
 SPEEDS: tuple[str, ...] = get_args(SpeedMode)
 FRAME_RATE = Number(least=FRAME_RATES_HZ[0], most=FRAME_RATES_HZ[1])

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from flowrep.envs.episode import Episode, Moment
 from flowrep.palette import CLASS_COLOURS, num_classes
-from flowrep.scenes.people import PARTS, world_from_parts
+from flowrep.scenes.pedestrians import PARTS, world_from_parts
 from flowrep.scenes.scene import Scene
 from flowrep.simulator.bullet import Picture
 from flowrep.simulator.camera import (
+    choose_renderer,
     depth_from_zbuffer,
     gl_projection,
     gl_view,
     sampled_intrinsics,
     vehicle_from_camera,
 )
-from flowrep.simulator.renderer import choose_renderer
 from flowrep.simulator.street import Street
 
 Array = NDArray[Any]

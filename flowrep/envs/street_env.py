@@ -12,10 +12,17 @@ from gymnasium import spaces
 from flowrep.envs.episode import Episode, Moment, Outcome, Rules, reward, ticks_for
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
-from flowrep.scenes.fields import FRAME_RATES_HZ, MOST_DRIVING_MPS, MOST_WALKING_MPS
-from flowrep.scenes.loading import load_scene
-from flowrep.scenes.scene import Range, Scene, SpeedMode
-from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
+from flowrep.scenes.load import load_scene
+from flowrep.scenes.scene import (
+    FRAME_RATES_HZ,
+    MOST_DRIVING_MPS,
+    MOST_WALKING_MPS,
+    YAW_SIGN,
+    Range,
+    Scene,
+    SpeedMode,
+    VehicleState,
+)
 from flowrep.simulator.street import Street
 
 _OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz")

@@ -17,9 +17,9 @@ from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.vector_env import StreetVectorEnv, sensed
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
-from flowrep.scenes.loading import load_scene
+from flowrep.scenes.load import load_scene
 from flowrep.scenes.scene import Range, Scene, SpeedMode
-from flowrep.simulator.renderer import choose_renderer
+from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import representation_stack
 
 

@@ -4,8 +4,7 @@ from flowrep.extras import require
 
 require("flowrep.scenes", "sim", "shapely", "yaml", "pydantic")
 
-from flowrep.scenes.loading import load_scene, scene_names  # noqa: E402 - after the check above
-from flowrep.scenes.scene import Scene  # noqa: E402
-from flowrep.scenes.schema import SceneError  # noqa: E402
+from flowrep.scenes.load import load_scene, scene_names  # noqa: E402 - after the check above
+from flowrep.scenes.scene import Scene, SceneError  # noqa: E402
 
 __all__ = ["Scene", "SceneError", "load_scene", "scene_names"]

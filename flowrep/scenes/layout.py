@@ -1,6 +1,7 @@
 """A scene laid out on the ground: polygons, boxes and walking lines, computed once from its data.
 
-Convention: world metres, x forward at yaw 0, yaw counter-clockwise.
+Convention: world metres, x forward at yaw 0, yaw counter-clockwise. Distances along a road are
+metres from its start; places before it, or beyond the road's end, are on its straight continuation.
 """
 
 import math
@@ -11,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+import shapely.ops
 from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from flowrep.scenes.centrelines import centrelines, pose_along, stretch
 from flowrep.scenes.scene import (
     CATEGORY_OF_KIND,
     BuildingRow,
@@ -24,16 +25,90 @@ from flowrep.scenes.scene import (
     Kind,
     ObstacleRow,
     Path,
+    Road,
     Scene,
+    VehicleState,
     Walk,
     Zone,
+    footprint_corners,
 )
-from flowrep.scenes.vehicle import VehicleState, footprint_corners
-from flowrep.scenes.walks import parallel, without_repeats
 
 Array = NDArray[np.float64]
+_ARC_STEP_DEG = 5.0
 _TOUCH_M = 0.05  # houses of a row stand wall to wall
 _PLOT_STEP_M = 0.5
+SHORTEST_M = 1e-3  # stretch of a walk; shorter ones are left out
+
+
+def centreline(road: Road) -> LineString:
+    """Returns a road's centreline, with arcs sampled every few degrees."""
+    (x, y), heading = road.start_m, math.radians(road.heading_deg)
+    points = [(x, y)]
+    for piece in road.pieces:
+        if piece.straight_m is not None:
+            lengths, turn = [piece.straight_m], 0.0
+        else:
+            assert piece.arc_radius_m is not None
+            assert piece.arc_deg is not None
+            count = max(1, math.ceil(abs(piece.arc_deg) / _ARC_STEP_DEG))
+            turn = math.radians(piece.arc_deg) / count
+            lengths = [2 * piece.arc_radius_m * math.sin(abs(turn) / 2)] * count
+        for length in lengths:
+            x += length * math.cos(heading + turn / 2)
+            y += length * math.sin(heading + turn / 2)
+            heading += turn
+            points.append((x, y))
+    return LineString(points)
+
+
+def centrelines(scene: Scene) -> dict[str, LineString]:
+    """Returns the centreline of every road, by name."""
+    return {road.name: centreline(road) for road in scene.roads}
+
+
+def pose_along(line: LineString, at_m: float) -> tuple[float, float, float]:
+    """Returns x, y and heading at a distance along a centreline or its continuation.
+
+    >>> pose_along(LineString([(0, 0), (9, 0)]), -2.0)
+    (-2.0, 0.0, 0.0)
+    """
+    step = min(0.05, line.length / 4)
+    middle = min(max(at_m, step), line.length - step)
+    behind, ahead = (line.interpolate(middle + sign * step) for sign in (-1, 1))
+    heading = math.atan2(ahead.y - behind.y, ahead.x - behind.x)
+    # shapely would count negative distances from the far end, and stop at either
+    on_road = min(max(at_m, 0.0), line.length)
+    point, beyond = line.interpolate(on_road), at_m - on_road
+    return point.x + beyond * math.cos(heading), point.y + beyond * math.sin(heading), heading
+
+
+def stretch(line: LineString, from_m: float, to_m: float) -> LineString:
+    """Returns the part of a centreline between two distances along it.
+
+    >>> stretch(LineString([(0, 0), (9, 0)]), -1.0, 3.0).wkt
+    'LINESTRING (0 0, 3 0)'
+    """
+    first, last = (min(max(at_m, 0.0), line.length) for at_m in (from_m, to_m))
+    return shapely.ops.substring(line, first, last)
+
+
+def without_repeats(points: Array) -> Array:
+    """Returns points [M, 2] without those within about a millimetre of the previous one."""
+    kept = [points[0]]
+    for point in points[1:]:
+        if np.hypot(*(point - kept[-1])) > SHORTEST_M:
+            kept.append(point)
+    return np.array(kept)
+
+
+def parallel(points: Array, aside_m: float) -> Array:
+    """Returns a line [M, 2] moved to its left, corner by corner, every stretch by `aside_m`."""
+    steps = np.diff(points, axis=0)
+    normals = np.stack([-steps[:, 1], steps[:, 0]], axis=-1) / np.hypot(*steps.T)[:, None]
+    before, after = np.vstack([normals[:1], normals]), np.vstack([normals, normals[-1:]])
+    # The corner lies on the bisector, one metre from both adjacent stretches.
+    share = np.maximum(1.0 + (before * after).sum(axis=-1), 1e-9)
+    return points + aside_m * (before + after) / share[:, None]
 
 
 @dataclass(frozen=True)

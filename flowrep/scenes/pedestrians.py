@@ -1,16 +1,152 @@
-"""People walking back and forth along lines; their positions depend on time alone."""
+"""People: their parts, the parallel lanes that they walk in, and where they are at any time.
+
+Convention: a person's pose is (x, y, yaw, swing): position, heading, and the angle in radians by
+which the left leg is swung backwards and the right leg forwards about the axis of the hips.
+"""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
-from flowrep.scenes.layout import Layout
+from flowrep.scenes.layout import SHORTEST_M, Layout, parallel
 from flowrep.scenes.scene import PedestrianGroup, Range
-from flowrep.scenes.walks import draw_lanes
 
 Array = NDArray[Any]
+
+RADIUS_M, HEIGHT_M = 0.3, 1.75
+"""The collision cylinder."""
+
+PARTS = ("upper body", "left leg", "right leg")
+HIP_M, _HIP_ASIDE_M = 0.82, 0.1
+_SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
+
+
+class Parts(NamedTuple):
+    """Poses of the parts of P people: positions [P, 3, 3] in metres, quaternions [P, 3, 4]."""
+
+    positions: Array
+    quaternions_xyzw: Array
+
+
+def place_parts(poses: Array) -> Parts:
+    """Returns the poses of the parts of people at poses [P, 4]."""
+    x, y, yaw, swing = poses.T
+    positions = np.zeros((len(poses), len(PARTS), 3))
+    positions[:, :, 0] = x[:, None]
+    positions[:, :, 1] = y[:, None]
+    aside = _HIP_ASIDE_M * _SIDES
+    positions[:, 1:, 0] -= np.sin(yaw)[:, None] * aside
+    positions[:, 1:, 1] += np.cos(yaw)[:, None] * aside
+    positions[:, 1:, 2] = HIP_M
+    # Rotation about y by the leg's own angle, then about z by yaw.
+    sine_z, cosine_z = np.sin(yaw / 2)[:, None], np.cos(yaw / 2)[:, None]
+    half = np.zeros((len(poses), len(PARTS)))
+    half[:, 1:] = 0.5 * swing[:, None] * _SIDES
+    sine_y, cosine_y = np.sin(half), np.cos(half)
+    quaternions = np.stack(
+        [-sine_z * sine_y, cosine_z * sine_y, sine_z * cosine_y, cosine_z * cosine_y], axis=-1
+    )
+    return Parts(positions, quaternions)
+
+
+def world_from_parts(poses: Array) -> Array:
+    """Returns the parts of people at poses [P, 4] as transforms [3·P, 4, 4], person by person."""
+    x, y, yaw, swing = poses.T
+    transforms = np.zeros((len(poses), len(PARTS), 4, 4))
+    sine, cosine = np.sin(yaw)[:, None], np.cos(yaw)[:, None]
+    angle = np.zeros((len(poses), len(PARTS)))
+    angle[:, 1:] = swing[:, None] * _SIDES
+    sine_y, cosine_y = np.sin(angle), np.cos(angle)
+    # Rz(yaw) · Ry(angle)
+    transforms[..., 0, 0] = cosine * cosine_y
+    transforms[..., 0, 1] = -sine
+    transforms[..., 0, 2] = cosine * sine_y
+    transforms[..., 1, 0] = sine * cosine_y
+    transforms[..., 1, 1] = cosine
+    transforms[..., 1, 2] = sine * sine_y
+    transforms[..., 2, 0] = -sine_y
+    transforms[..., 2, 2] = cosine_y
+    aside = np.array([0.0, *(_HIP_ASIDE_M * _SIDES)])
+    transforms[..., 0, 3] = x[:, None] - sine * aside
+    transforms[..., 1, 3] = y[:, None] + cosine * aside
+    transforms[:, 1:, 2, 3] = HIP_M
+    transforms[..., 3, 3] = 1.0
+    return transforms.reshape(-1, 4, 4)
+
+
+APART_M = 2 * RADIUS_M
+"""Distance between the centres of two people who touch without overlapping."""
+
+LANE_M = APART_M + 0.01
+"""Distance between the middles of neighbouring lanes."""
+
+
+def keeps_its_stretches(points: Array, aside_m: float) -> bool:
+    """Returns whether a line moved aside keeps every stretch, with none reversed.
+
+    The length of a stretch is linear in `aside_m`, so if this holds at two distances, it holds
+    between them.
+    """
+    steps = np.diff(points, axis=0)
+    moved = np.diff(parallel(points, aside_m), axis=0)
+    return bool(((steps * moved).sum(axis=-1) > SHORTEST_M * np.hypot(*steps.T)).all())
+
+
+def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
+    """Returns whether lanes up to half of `spread_m` to either side stay as far apart as drawn.
+
+    They do if the strip of all lanes, widened by half a person's room, does not overlap itself: the
+    only way from one lane to another is then across all lanes between them, or out of the strip and
+    in again.
+    """
+    reach, room = spread_m / 2 + APART_M / 2, APART_M / 2
+    first, last = points[1] - points[0], points[-1] - points[-2]
+    longer = points.astype(np.float64)
+    longer[0] -= room * first / np.hypot(*first)
+    longer[-1] += room * last / np.hypot(*last)
+    if not all(keeps_its_stretches(longer, side * reach) for side in (-1, 1)):
+        return False
+    right, left = (parallel(longer, side * reach) for side in (-1, 1))
+    return bool(shapely.polygons(np.vstack([right, left[::-1]])).is_valid)
+
+
+def covered_ground(points: Array, spread_m: float) -> list[BaseGeometry]:
+    """Returns the ground that the lanes of a walk can cover, one convex piece for each stretch.
+
+    The pieces are lines if `spread_m` is 0.
+    """
+    right, left = (parallel(points, side * spread_m / 2) for side in (-1, 1))
+    corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
+    return list(shapely.convex_hull(shapely.multipoints(corners)))
+
+
+def gap_m(ground: list[BaseGeometry], other: list[BaseGeometry]) -> float:
+    """Returns the distance in metres between two lists of shapes."""
+    tree = shapely.STRtree(other)
+    _, distances = tree.query_nearest(ground, all_matches=False, return_distance=True)
+    return float(distances.min())
+
+
+def least_spread_m(count: int) -> float:
+    """Returns the least width in metres that the lanes of `count` people take."""
+    return round((count - 1) * LANE_M, 6)
+
+
+def draw_lanes(count: int, spread_m: float, rng: np.random.Generator) -> Array:
+    """Returns each person's lane [P] as its distance in metres to the left of the walk.
+
+    All placements of lanes within `spread_m` that are at least `LANE_M` apart are equally likely,
+    and so are all orders of the people.
+    """
+    free = max(spread_m - least_spread_m(count), 0.0)
+    lanes = np.sort(rng.uniform(0.0, 1.0, count)) * free + LANE_M * np.arange(count)
+    return rng.permutation(lanes - spread_m / 2)
+
+
 _TURN_S = 0.6  # about-turn at either end of a walk
 _STRIDE_M = 1.4  # one step with each leg
 _SWING_RAD = 0.38  # of a leg, either way: feet 0.6 m apart
@@ -58,7 +194,7 @@ class Crowd:
         return self._places(self._along(time_s))[0]
 
     def poses(self, time_s: float | Array) -> Array:
-        """Returns everyone's pose [P, 4], as defined in `flowrep.scenes.people`.
+        """Returns everyone's pose [P, 4], as defined in `flowrep.scenes.pedestrians`.
 
         Times [T, 1] give poses [T, P, 4]. Legs swing with the distance walked; people standing
         still have one foot in front of the other.

@@ -1,7 +1,9 @@
-"""Low-polygon meshes of flat-shaded, coloured triangles, and the markings on the ground."""
+"""Low-polygon meshes of coloured triangles, and rigid bodies as arrays for the rasteriser."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -9,9 +11,195 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from flowrep.simulator.paint import Patch, swatch
+from flowrep.scenes.layout import Box
+from flowrep.scenes.pedestrians import HIP_M, PARTS
+from flowrep.scenes.scene import Kind
 
 Array = NDArray[np.float64]
+SIZE_PX = 256
+_SWATCH_PX = 8
+_FRONT_PX = (60, 64)  # height, width of one house front in the texture
+_FLOORS = (2, 3, 4, 5)
+
+PAINTS: dict[str, tuple[int, int, int]] = {
+    "asphalt": (84, 84, 90),
+    "lane_mark": (226, 222, 206),
+    "paving": (178, 168, 156),
+    "skin": (224, 176, 144),
+    "trousers": (44, 52, 84),
+    "shirt_red": (196, 52, 52),
+    "shirt_green": (58, 140, 84),
+    "shirt_yellow": (222, 178, 60),
+    "shirt_blue": (60, 104, 190),
+    "roof": (92, 66, 58),
+    "grass": (110, 150, 74),
+    "leaf": (48, 112, 56),
+    "wood": (128, 92, 60),
+    "metal": (90, 94, 100),
+    "car_body": (52, 84, 168),
+    "glass": (60, 76, 92),
+    "hair": (66, 48, 36),
+    "shoe": (34, 30, 30),
+    "tyre": (30, 30, 34),
+    "car_red": (170, 44, 44),
+    "car_white": (222, 222, 218),
+    "car_grey": (120, 124, 130),
+    "leaf_light": (92, 146, 62),
+    "lamp_white": (250, 244, 214),
+    "lamp_red": (230, 48, 40),
+    "lamp_green": (60, 200, 96),
+    "lamp_off": (52, 46, 44),
+    "kerb": (214, 210, 202),
+}
+SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
+_WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))
+NUM_FRONTS = len(_WALLS) * len(_FLOORS)
+
+# (u0, v0, u1, v1): a rectangle of the texture, v downwards.
+Patch = tuple[float, float, float, float]
+
+
+def swatch(name: str) -> Patch:
+    """Returns the middle of a plain colour, as a patch of zero size."""
+    u = (list(PAINTS).index(name) + 0.5) * _SWATCH_PX / SIZE_PX
+    v = 0.5 * _SWATCH_PX / SIZE_PX
+    return (u, v, u, v)
+
+
+def front(variant: int) -> Patch:
+    """Returns the patch of house front `variant`, modulo the number of fronts."""
+    row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
+    top = _SWATCH_PX + row * _FRONT_PX[0]
+    left = column * _FRONT_PX[1]
+    pixels = np.array([left + 0.5, top + 0.5, left + _FRONT_PX[1] - 0.5, top + _FRONT_PX[0] - 0.5])
+    u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
+    return (u0, v0, u1, v1)
+
+
+def upper_storeys(variant: int) -> Patch:
+    """Returns a house front above its ground floor, for walls without a door."""
+    u0, v0, u1, v1 = front(variant)
+    floors = _FLOORS[variant % NUM_FRONTS // len(_WALLS)]
+    return (u0, v0, u1, v1 - (v1 - v0) / floors)
+
+
+def texture() -> NDArray[np.uint8]:
+    """Returns the texture [SIZE_PX, SIZE_PX, 3]."""
+    image = np.zeros((SIZE_PX, SIZE_PX, 3), dtype=np.uint8)
+    for i, rgb in enumerate(PAINTS.values()):
+        image[:_SWATCH_PX, i * _SWATCH_PX : (i + 1) * _SWATCH_PX] = rgb
+    height, width = _FRONT_PX
+    for row, floors in enumerate(_FLOORS):
+        for column, rgb in enumerate(_WALLS):
+            top, left = _SWATCH_PX + row * height, column * width
+            image[top : top + height, left : left + width] = _house_front(floors, rgb)
+    return image
+
+
+def _house_front(floors: int, rgb: tuple[int, int, int]) -> NDArray[np.uint8]:
+    height, width = _FRONT_PX
+    image = np.full((height, width, 3), rgb, dtype=np.uint8)
+    storey, bay = height // floors, width // 4
+    for floor in range(floors):
+        top = floor * storey + storey // 4
+        image[floor * storey] = np.array(rgb) * 0.8
+        for column in range(4):
+            left = column * bay + bay // 4
+            image[top : top + storey // 2, left : left + bay // 2] = PAINTS["glass"]
+    # A door in the second bay of the ground floor, down to the street.
+    image[height - storey * 2 // 3 :, bay + bay // 4 : 2 * bay - bay // 4] = PAINTS["wood"]
+    return image
+
+
+_CHUNK_TRIANGLES = 24
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body.
+
+    Args:
+        vertices: [V, 3], metres, in the body's own frame.
+        triangles: [T, 3], indices of vertices, counter-clockwise seen from outside.
+        semantic: its id in the semantic map.
+        instance: its id in the instance map.
+        moves: whether it has a pose of its own; if not, its frame is the world's.
+    """
+
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    semantic: int
+    instance: int
+    moves: bool = False
+
+
+class Triangles(NamedTuple):
+    """All bodies, in C chunks, as arrays for the rasteriser."""
+
+    points: NDArray[np.float64]  # [V, 3], in the frames of their bodies
+    corners: NDArray[np.int32]  # [T, 3], indices of a chunk's own points
+    point_bounds: NDArray[np.int32]  # [C + 1], chunk c has the points from entry c to c + 1
+    corner_bounds: NDArray[np.int32]  # [C + 1], the same for triangles
+    centres: NDArray[np.float64]  # [C, 3], of the chunks' bounding spheres
+    radii: NDArray[np.float64]  # [C]
+    bodies: NDArray[np.int32]  # [C], the body of each chunk
+    poses: NDArray[np.int32]  # [C], index among the moving bodies; -1 for the static world
+    semantic: NDArray[np.uint8]  # [B], by body
+    instance: NDArray[np.uint8]  # [B]
+
+
+def gather(bodies: Sequence[Body]) -> Triangles:
+    """Returns the triangles of all bodies, numbered in the given order."""
+    points: list[NDArray[np.float64]] = [np.empty((0, 3))]
+    corners: list[NDArray[np.int32]] = [np.empty((0, 3), dtype=np.int32)]
+    owners: list[int] = []
+    poses: list[int] = []
+    movers = iter(range(len(bodies)))
+    for number, body in enumerate(bodies):
+        pose = next(movers) if body.moves else -1
+        for chunk in _chunks(body.vertices[body.triangles]):
+            own, inverse = np.unique(chunk.reshape(-1, 3), axis=0, return_inverse=True)
+            points.append(own)
+            corners.append(inverse.reshape(-1, 3).astype(np.int32))
+            owners.append(number)
+            poses.append(pose)
+    spheres = [_sphere(own) for own in points[1:]]
+    return Triangles(
+        points=np.concatenate(points),
+        corners=np.concatenate(corners),
+        point_bounds=_bounds(points[1:]),
+        corner_bounds=_bounds(corners[1:]),
+        centres=np.array([centre for centre, _ in spheres]).reshape(-1, 3),
+        radii=np.array([radius for _, radius in spheres], dtype=np.float64),
+        bodies=np.array(owners, dtype=np.int32),
+        poses=np.array(poses, dtype=np.int32),
+        semantic=np.array([body.semantic for body in bodies], dtype=np.uint8),
+        instance=np.array([body.instance for body in bodies], dtype=np.uint8),
+    )
+
+
+def _chunks(triangles: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Returns triangles [T, 3, 3] in groups of neighbours."""
+    if len(triangles) == 0:
+        return []
+    if len(triangles) <= _CHUNK_TRIANGLES:
+        return [triangles]
+    middles = triangles.mean(axis=1)
+    longest = int(np.ptp(middles, axis=0).argmax())
+    order = np.argsort(middles[:, longest], kind="stable")
+    half = len(order) // 2
+    return [*_chunks(triangles[order[:half]]), *_chunks(triangles[order[half:]])]
+
+
+def _sphere(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
+def _bounds(arrays: Sequence[NDArray]) -> NDArray[np.int32]:
+    return np.cumsum([0, *(len(array) for array in arrays)]).astype(np.int32)
+
+
 Point3 = tuple[float, float, float]
 _CELL_M = 15.0  # cells that the ground is cut into: small triangles are interpolated better
 _DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M = 2.0, 6.0, 0.15
@@ -177,3 +365,149 @@ def crosswalk(area: Polygon, heading_rad: float) -> Mesh:
         stripe = LineString(ends).buffer(_STRIPE_M / 2, cap_style="flat").intersection(area)
         mesh.ground(stripe, _RISE_M, "lane_mark")
     return mesh
+
+
+_CAR_PAINTS = ("car_body", "car_red", "car_white", "car_grey")
+_CROWN_SIDES = 6
+
+
+def mesh_of(box: Box, *, both_sides: bool = False) -> Mesh:
+    """Returns the mesh for a box; with `both_sides` a house has two fronts."""
+    mesh = house(box, both_sides=both_sides) if box.kind == "house" else _SHAPES[box.kind](box)
+    return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
+
+
+def house(box: Box, *, both_sides: bool = False) -> Mesh:
+    """Returns the walls of a house visible from a street: a front on its right, and the sides.
+
+    With `both_sides` it has a front on its left too. Roofs are never visible and are left out.
+    """
+    length, width, height = box.size_m
+    windows, side = front(box.variant), upper_storeys(box.variant)
+    sides = (windows, side, windows if both_sides else None, side)
+    mesh = Mesh()
+    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
+    return mesh
+
+
+def car(box: Box) -> Mesh:
+    """Returns a car facing along x: body, windows all around, roof, wheels, lights."""
+    (length, width, height), paint = box.size_m, swatch(_CAR_PAINTS[box.variant % 4])
+    x, y = length / 2, width / 2
+    belt = 0.6 * height
+    mesh = Mesh()
+    mesh.box((-x, -y, 0.28), (x, y, belt), paint)
+    # The underside, in the shade.
+    mesh.walls((-0.9 * x, -0.8 * y, 0.0), (0.9 * x, 0.8 * y, 0.28), (swatch("tyre"),) * 4)
+    sill = _rectangle(-0.68 * x, 0.46 * x, 0.94 * y)
+    roof = _rectangle(-0.52 * x, 0.14 * x, 0.76 * y)
+    mesh.frustum(sill, belt, roof, height, swatch("glass"), paint)
+    for side in (-1, 1):
+        for axle in (-0.62 * x, 0.62 * x):
+            mesh.disc((axle, side * (y + 0.01), 0.33), (0.0, side, 0.0), 0.33, swatch("tyre"))
+            mesh.disc((axle, side * (y + 0.02), 0.33), (0.0, side, 0.0), 0.16, swatch("metal"))
+        lamps = (("lamp_white", x + 0.01, 1.0), ("lamp_red", -x - 0.01, -1.0))
+        for name, at, ahead in lamps:
+            mesh.disc((at, side * 0.72 * y, 0.5 * height), (ahead, 0.0, 0.0), 0.12, swatch(name))
+    return mesh
+
+
+def tree(box: Box) -> Mesh:
+    """Returns a trunk with a crown in proportion to its height, either broad or a fir's."""
+    length, width, height = box.size_m
+    mesh = Mesh()
+    is_fir = box.variant % 3 == 2
+    below = 0.28 * height if is_fir else 0.42 * height
+    sides = (swatch("wood"),) * 4
+    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, below), sides)
+    leaf = swatch("leaf" if is_fir or box.variant % 2 else "leaf_light")
+    reach = (0.2 if is_fir else 0.27) * height
+    if is_fir:
+        tiers = ((0.28, 0.6, 1.0, 0.4), (0.5, 0.82, 0.75, 0.25), (0.72, 1.0, 0.5, 0.0))
+    else:
+        tiers = ((0.38, 0.56, 0.55, 1.0), (0.56, 0.8, 1.0, 0.85), (0.8, 1.0, 0.85, 0.3))
+    for low, high, bottom, top in tiers:
+        ring, upper = (_ring(_CROWN_SIDES, reach * share) for share in (bottom, max(top, 0.02)))
+        mesh.frustum(ring, low * height, upper, high * height, leaf, leaf, floor=leaf)
+    return mesh
+
+
+def fence(box: Box) -> Mesh:
+    """Returns a stretch of fence along x: a post at either end and two rails."""
+    length, width, height = box.size_m
+    paint, x, y = swatch("wood"), length / 2, width / 2
+    mesh = Mesh()
+    for at in (-x + 0.06, x - 0.06):
+        mesh.box((at - 0.06, -y, 0.0), (at + 0.06, y, height), paint)
+    for low, high in ((0.3, 0.5), (0.72, 0.92)):
+        mesh.walls(
+            (-x, -y / 2, low * height), (x, y / 2, high * height), (paint, None, paint, None)
+        )
+    return mesh
+
+
+def traffic_light(box: Box) -> Mesh:
+    """Returns a post with a head of three lamps, the lowest lit, facing traffic along x."""
+    length, width, height = box.size_m
+    head_m, reach = 0.95, 0.17
+    mesh = Mesh()
+    post = (swatch("metal"),) * 4
+    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height - head_m), post)
+    mesh.box((-reach, -reach, height - head_m), (reach, reach, height), swatch("tyre"))
+    for name, share in (("lamp_off", 0.83), ("lamp_off", 0.5), ("lamp_green", 0.17)):
+        centre = (-reach - 0.01, 0.0, height - head_m * (1 - share))
+        mesh.disc(centre, (-1.0, 0.0, 0.0), 0.12, swatch(name))
+    return mesh
+
+
+def lamp_post(box: Box) -> Mesh:
+    """Returns a post with a lamp on an arm to its left, over the road."""
+    length, width, height = box.size_m
+    metal = swatch("metal")
+    mesh = Mesh()
+    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), (metal,) * 4)
+    mesh.box((-0.05, 0.0, height - 0.12), (0.05, 1.2, height), metal)
+    mesh.box((-0.14, 0.8, height - 0.24), (0.14, 1.5, height - 0.12), swatch("lamp_white"))
+    return mesh
+
+
+_SHAPES: dict[Kind, Callable[[Box], Mesh]] = {
+    "tree": tree,
+    "fence": fence,
+    "car": car,
+    "traffic_light": traffic_light,
+    "lamp_post": lamp_post,
+}
+
+
+def _rectangle(x0: float, x1: float, y: float) -> np.ndarray:
+    return np.array([(x0, -y), (x1, -y), (x1, y), (x0, y)])
+
+
+def _ring(sides: int, radius_m: float) -> np.ndarray:
+    angles = np.arange(sides) * (2 * math.pi / sides)
+    return radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+
+def person_meshes(variant: int) -> tuple[Mesh, ...]:
+    """Returns the meshes of a person's `PARTS`, facing along x; `variant` selects the shirt.
+
+    Seen from the side, as a vehicle sees people crossing, the arms alone span 0.6 m. The origin of
+    a leg is its hip.
+    """
+    shirt, skin = swatch(SHIRTS[variant % len(SHIRTS)]), swatch("skin")
+    body = Mesh()
+    for side, arm in ((-1, 0.19), (1, -0.19)):
+        y = 0.26 * side
+        body.box((arm - 0.11, y - 0.05, 0.95), (arm + 0.11, y + 0.05, 1.35), shirt)
+        body.box((arm - 0.05, y - 0.05, 0.85), (arm + 0.11, y + 0.05, 0.95), skin, lid=False)
+    body.box((-0.14, -0.21, 0.8), (0.14, 0.21, 1.47), shirt)
+    body.box((-0.11, -0.1, 1.47), (0.12, 0.1, 1.68), skin, lid=False)
+    body.box((-0.13, -0.11, 1.62), (0.12, 0.11, 1.75), swatch("hair"))
+    legs = []
+    for _ in PARTS[1:]:
+        leg = Mesh()
+        leg.box((-0.1, -0.08, -HIP_M + 0.1), (0.1, 0.08, 0.02), swatch("trousers"), lid=False)
+        leg.box((-0.1, -0.08, -HIP_M), (0.2, 0.08, -HIP_M + 0.1), swatch("shoe"))
+        legs.append(leg)
+    return (body, *legs)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.jit import compiled
-from flowrep.simulator.triangles import Triangles
+from flowrep.simulator.meshes import Triangles
 
 _LEAST_AREA_PX = 0.01  # twice the area below which PyBullet's renderer omits triangles
 

@@ -13,21 +13,48 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from flowrep.palette import CATEGORY_ID
-from flowrep.scenes import people
+from flowrep.scenes import pedestrians
 from flowrep.scenes.layout import Box, Layout
-from flowrep.scenes.safe_ground import SafeGround
-from flowrep.scenes.scene import Scene
-from flowrep.scenes.vehicle import VehicleState
-from flowrep.simulator import furniture, meshes, paint
+from flowrep.scenes.scene import Scene, VehicleState
+from flowrep.simulator import meshes
 from flowrep.simulator.bullet import Simulator
-from flowrep.simulator.person import person_meshes
-from flowrep.simulator.triangles import Body, gather
+from flowrep.simulator.meshes import Body, gather, person_meshes
 
 Array = NDArray[Any]
 _BEHIND_M = 2.0  # people further behind the camera are out of view: none reach that far
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
 _TRIANGLES_A_BODY = 43_690  # PyBullet's limit for one mesh is 131,072 vertices
+_SAFE_CELL_M = 0.25
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
+
+
+class SafeGround:
+    """A fast, conservative test that a vehicle is on the road, clear of boxes and ending zones.
+
+    Where it returns False, exact tests decide. It does not consider people.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        """Marks the cells that are safe for any vehicle position and heading in them."""
+        vehicle = layout.scene.vehicle
+        reach = math.hypot(vehicle.length_m, vehicle.width_m) / 2 + _SAFE_CELL_M
+        ends = [layout.zones[path.end] for path in layout.scene.paths]
+        boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
+        unsafe = shapely.union_all([*ends, *(box.footprint for box in boxes)]).buffer(reach)
+        safe = layout.drivable.buffer(-reach).difference(unsafe)
+        self._x0, self._y0, x1, y1 = layout.drivable.bounds
+        x = np.arange(self._x0, x1, _SAFE_CELL_M) + _SAFE_CELL_M / 2
+        y = np.arange(self._y0, y1, _SAFE_CELL_M) + _SAFE_CELL_M / 2
+        shapely.prepare(safe)
+        table = shapely.contains_xy(safe, *np.meshgrid(x, y, indexing="ij"))
+        self._columns = [column.astype(np.uint8).tobytes() for column in table]
+        self._rows = len(y)
+
+    def __call__(self, x_m: float, y_m: float) -> bool:
+        """Returns whether the vehicle's centre is on safe ground."""
+        i, j = int((x_m - self._x0) // _SAFE_CELL_M), int((y_m - self._y0) // _SAFE_CELL_M)
+        is_on_table = 0 <= i < len(self._columns) and 0 <= j < self._rows
+        return is_on_table and self._columns[i][j] == 1
 
 
 class Solid(NamedTuple):
@@ -61,13 +88,13 @@ class Street:
         self.is_safe = SafeGround(layout)
         self.lock = threading.RLock()  # held from placing bodies to rendering them
         self.users = 0
-        self.simulator = Simulator(paint.picture())
+        self.simulator = Simulator(meshes.texture())
         self.bodies: list[Body] = []
         vehicle = layout.scene.vehicle
         self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
         self._vehicle_reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
-        self._person_reach_m = self._vehicle_reach_m + people.RADIUS_M
-        self._person = self.simulator.add_cylinder(people.RADIUS_M, people.HEIGHT_M)
+        self._person_reach_m = self._vehicle_reach_m + pedestrians.RADIUS_M
+        self._person = self.simulator.add_cylinder(pedestrians.RADIUS_M, pedestrians.HEIGHT_M)
         self._solids: list[Solid] = []
         self._add_ground(layout)
         self._add_solids(layout)
@@ -78,7 +105,7 @@ class Street:
             self._add_body(mesh, "pedestrian", instance=number)
             for number, mesh in enumerate(meshes_of_all, start=1)
         ]
-        self._parts = np.array(parts, dtype=int).reshape(count, len(people.PARTS))
+        self._parts = np.array(parts, dtype=int).reshape(count, len(pedestrians.PARTS))
         self._placed = np.full((count, 4), np.nan)  # where everyone's parts were last placed
         self.triangles = gather(self.bodies)
         self._solids_while_closed: dict[tuple[str, ...], Solids] = {}
@@ -137,7 +164,7 @@ class Street:
         is_behind = (depths < -_BEHIND_M).all(axis=0)
         due = np.flatnonzero((poses != self._placed).any(axis=-1) & ~is_behind)
         if due.size:
-            places = people.place_parts(poses[due])
+            places = pedestrians.place_parts(poses[due])
             self.simulator.place_all(
                 self._parts[due].ravel().tolist(),
                 places.positions.reshape(-1, 3),
@@ -188,7 +215,7 @@ class Street:
         pitch = math.radians(camera.pitch_deg)
         x, y = math.cos(viewer.yaw_rad), math.sin(viewer.yaw_rad)
         at = viewer.x_m * x + viewer.y_m * y + camera.mount_forward_m
-        above_m = people.HEIGHT_M / 2 - camera.mount_height_m
+        above_m = pedestrians.HEIGHT_M / 2 - camera.mount_height_m
         forward_m = poses[..., 0] * x + poses[..., 1] * y - at
         return math.cos(pitch) * forward_m + math.sin(pitch) * above_m
 
@@ -231,11 +258,11 @@ class Street:
             for first in range(0, len(boxes), _BOXES_A_BODY):
                 mesh, chunk = meshes.Mesh(), boxes[first : first + _BOXES_A_BODY]
                 for box in chunk:
-                    mesh.add(furniture.mesh_of(box))
+                    mesh.add(meshes.mesh_of(box))
                 self._solids.append(self._add_solid(mesh, category, chunk))
 
     def _add_closure(self, box: Box) -> Solid:
-        return self._add_solid(furniture.mesh_of(box, both_sides=True), box.category, [box])
+        return self._add_solid(meshes.mesh_of(box, both_sides=True), box.category, [box])
 
     def _add_solid(self, mesh: meshes.Mesh, category: str, boxes: list[Box]) -> Solid:
         body = self._add_body(

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from flowrep.envs.street_env import StreetEnv
-from flowrep.scenes.vehicle import NO_OP, TURN_LEFT, TURN_RIGHT
+from flowrep.scenes.scene import NO_OP, TURN_LEFT, TURN_RIGHT
 from flowrep.viz.film import maps_of
 from flowrep.viz.maps import Image, representation_strip
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from flowrep.scenes.camera import CameraConfig
+from flowrep.scenes.scene import CameraConfig
 from flowrep.simulator.bullet import Simulator
 from flowrep.simulator.camera import (
     depth_from_zbuffer,
@@ -14,8 +14,7 @@ from flowrep.simulator.camera import (
     sampled_intrinsics,
     vehicle_from_camera,
 )
-from flowrep.simulator.meshes import Mesh
-from flowrep.simulator.paint import picture, swatch
+from flowrep.simulator.meshes import Mesh, texture, swatch
 
 NEAR_M, FAR_M = 0.2, 300.0
 # Columns: height, width, fx, fy. Nothing is square, so that no two numbers can be swapped.
@@ -25,7 +24,7 @@ CAMERAS = [(36, 60, 40.0, 31.0), (84, 84, 42.0, 42.0), (61, 48, 30.0, 55.0), (12
 @pytest.fixture(scope="module")
 def slanted_plane():
     """A plane whose z in the camera grows to the right and upwards: 0.6 x - 0.5 y - z = -6."""
-    simulator = Simulator(picture())
+    simulator = Simulator(texture())
     # The camera's frame is the world's here: z forward. Corners on z = 6 + 0.6 x - 0.5 y.
     corners = [(x, y, 6 + 0.6 * x - 0.5 * y) for x, y in ((-5, 5), (5, 5), (5, -5), (-5, -5))]
     mesh = Mesh()

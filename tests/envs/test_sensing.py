@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowrep.envs.sensing import CameraPose, instance_motion, planar, relative_camera, rigid_inverse
-from flowrep.scenes.camera import CameraConfig
+from flowrep.scenes.scene import CameraConfig
 from flowrep.simulator.camera import vehicle_from_camera
 
 MOUNT = vehicle_from_camera(CameraConfig(48, 60, 70.0, 1.5, 0.4, -10.0, 0.2, 100.0))

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from flowrep.scenes.people import PARTS, place_parts, world_from_parts
-from flowrep.simulator.person import person_meshes
+from flowrep.scenes.pedestrians import PARTS, place_parts, world_from_parts
+from flowrep.simulator.meshes import person_meshes
 
 # At (5, 2), looking along +y: its left is -x. The left leg swings back by 30°.
 POSE = np.array([[5.0, 2.0, math.pi / 2, math.radians(30.0)]])

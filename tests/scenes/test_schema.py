@@ -9,7 +9,7 @@ import yaml
 
 from flowrep.config_tree import CONF_DIR
 from flowrep.scenes import SceneError, load_scene
-from flowrep.scenes.schema import json_schema
+from flowrep.scenes.load import json_schema
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 SCHEMA = Path(__file__).parents[2] / "docs" / "scene.schema.json"

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from flowrep.scenes.vehicle import (
+from flowrep.scenes.scene import (
     NO_OP,
     TURN_LEFT,
     TURN_RIGHT,

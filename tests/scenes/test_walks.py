@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 
 from flowrep.scenes import SceneError, load_scene, scene_names
-from flowrep.scenes.layout import Layout
-from flowrep.scenes.pedestrians import draw_crowd
-from flowrep.scenes.scene import PedestrianGroup, Walk
-from flowrep.scenes.walks import (
+from flowrep.scenes.layout import Layout, parallel, without_repeats
+from flowrep.scenes.pedestrians import (
+    draw_crowd,
     draw_lanes,
     keeps_its_stretches,
     keeps_lanes_apart,
-    parallel,
-    without_repeats,
 )
+from flowrep.scenes.scene import PedestrianGroup, Walk
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 CORNER = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 3.0)])

@@ -15,8 +15,7 @@ import pytest
 from flowrep.envs import StreetEnv
 from flowrep.simulator import street
 from flowrep.simulator.bullet import Simulator
-from flowrep.simulator.meshes import Mesh
-from flowrep.simulator.paint import picture
+from flowrep.simulator.meshes import Mesh, texture
 
 
 @pytest.fixture
@@ -101,7 +100,7 @@ def test_pybullet_takes_as_large_a_body_as_ground_is_cut_into():
     mesh.vertices = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]] * count
     mesh.normals, mesh.uvs = [[0.0, 0.0, 1.0]] * 3 * count, [[0.5, 0.5]] * 3 * count
     mesh.indices = list(range(3 * count))
-    simulator = Simulator(picture())
+    simulator = Simulator(texture())
     with pytest.raises(SystemError):
         simulator.add_body(mesh, "road")
     parts = list(mesh.parts(street._TRIANGLES_A_BODY))

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from flowrep.simulator.meshes import Body, gather
 from flowrep.simulator.rasteriser import Rasteriser, _compiled
-from flowrep.simulator.triangles import Body, gather
 
 # Nothing is square and nothing centred, so that no two numbers can be swapped.
 HEIGHT, WIDTH = 6, 9

@@ -5,12 +5,12 @@ import warnings
 
 import pytest
 
-from flowrep.simulator import renderer
-from flowrep.simulator.renderer import choose_renderer
+from flowrep.simulator import camera
+from flowrep.simulator.camera import choose_renderer
 
 
 def without_numba(monkeypatch):
-    monkeypatch.setattr(renderer, "numba_is_installed", lambda: False)
+    monkeypatch.setattr(camera, "numba_is_installed", lambda: False)
 
 
 @pytest.mark.parametrize(
