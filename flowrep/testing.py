@@ -114,6 +114,8 @@ def check_flow(
         motions = sensor["prev_from_curr"].float().unsqueeze(-3)
         ids = torch.zeros_like(depth, dtype=torch.uint8)
     raw = frames[raw_key].float()
+    if (known := frames.get(f"{raw_key}_valid", None)) is not None:
+        raw = torch.where(known, raw, torch.nan)
 
     def agreement(flow: Tensor, z: Tensor, K: Tensor, motions: Tensor) -> tuple[float, float]:
         return _agreement(flow, z, ids, _depth_before(z, ids, K, motions), tolerance)
@@ -123,11 +125,12 @@ def check_flow(
     flows = {"no flow": torch.zeros_like(raw), "-raw": -raw, "ego flow alone": ego}
     if not (ids > 0).any():
         del flows["ego flow alone"]  # the same in a static world
-    known = raw[..., 1:, :, :, :].isfinite().all(-3) & depth[..., 1:, 0, :, :].isfinite()
+    moving = raw[..., 1:, :, :, :].norm(dim=-3)
+    moving = moving[moving.isfinite() & depth[..., 1:, 0, :, :].isfinite()]
     return FlowCheck(
         share,
         hidden,
-        raw[..., 1:, :, :, :].norm(dim=-3)[known].median().item(),
+        moving.median().item() if len(moving) else 0.0,
         {name: agreement(flow, depth, K, motions)[0] for name, flow in flows.items()},
         {
             name: agreement(geometry.rigid_flow(z, ids, k, m).flow, z, k, m)[0]
