@@ -1,6 +1,7 @@
 """TorchRL transforms that turn sensor maps into mid-level representations."""
 
 from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose
+from flowrep.transforms.body_rows import BodyRows
 from flowrep.transforms.depth import Depth
 from flowrep.transforms.dis import DIS
 from flowrep.transforms.estimated_flow import EstimatedFlow
@@ -27,6 +28,7 @@ __all__ = [
     "AdaptDepth",
     "AdaptFlow",
     "AdaptPose",
+    "BodyRows",
     "CameraMotion",
     "Depth",
     "EstimatedFlow",

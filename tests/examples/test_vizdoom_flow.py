@@ -1,0 +1,33 @@
+"""Flow in ViZDoom, verified by warping: what a pixel shows now was seen where flow says it was."""
+
+import pytest
+
+pytest.importorskip("vizdoom", reason="ViZDoom is not installed: pip install '.[examples]'")
+
+from examples.vizdoom_flow import K, make_env
+from flowrep.testing import check_flow
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("doom"))  # ViZDoom writes a file where it runs
+        env = make_env()
+        env.set_seed(2)
+        frames = env.rollout(30)["next"]
+        env.close()
+    return frames
+
+
+def test_each_frame_warps_into_the_one_before(frames):
+    found = check_flow(frames, K, tolerance=0.1)  # depth has steps of 22 cm
+    assert found.is_right
+    assert found.agreement > 0.98
+
+
+def test_monsters_alone_have_object_flow(frames):
+    obj, moving = frames["obj"], frames["sensor", "instance"] > 0
+    assert (obj.norm(dim=-3, keepdim=True)[moving] > 1).any()
+    assert (obj.abs().amax(-3, keepdim=True)[~moving] == 0).all()
+    rest = frames["raw"] - frames["ego"] - obj
+    assert rest[frames["raw_valid"].expand_as(obj)].abs().max() < 1e-3
