@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from flowrep.agent.algorithm import keep_freed_memory
-from flowrep.geometry import factorize, rigid_flow, single_pass
+from flowrep.geometry import factorize, rigid_flow
+from flowrep.geometry import flow as flow_module
 
 SIZES = [(32, 48), (96, 48), (32, 84), (128, 84)]
 BODIES, SEEN = 16, 6
@@ -30,7 +31,7 @@ def step(depth: Tensor, instance: Tensor, K: Tensor, motions: Tensor) -> tuple[T
 
 def by_pytorch(*inputs: Tensor) -> tuple[Tensor, ...]:
     """Returns the same without the kernel."""
-    with patch.object(single_pass, "SMALL", 1 << 40):
+    with patch.object(flow_module, "SMALL", 1 << 40):
         return step(*inputs)
 
 

@@ -1,6 +1,6 @@
 """Hydra configs of the env, the losses and the replay memory, in TorchRL's own config groups.
 
-Importing this module registers them, and the transforms of `flowrep.transforms.configs` with them:
+Importing this module registers them, with the transforms of `flowrep.transforms.hydra_configs`:
 
 | group | names |
 | --- | --- |
@@ -47,7 +47,7 @@ from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from flowrep.agent import dqn, dsac, dsac_v, ppo, replay
 from flowrep.envs import torchrl_env
-from flowrep.transforms.configs import config_class
+from flowrep.transforms.hydra_configs import config_class
 
 # By group and name.
 CONFIGS: dict[tuple[str, str], type] = {

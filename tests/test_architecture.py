@@ -62,14 +62,13 @@ THIRD_PARTY_ONLY_IN = {
         "sweeps/plan.py",
         "sweeps/sweep.py",
         "torchrl_configs.py",
-        "transforms/configs.py",
+        "transforms/hydra_configs.py",
     },
 }
 # Extras of the transforms: imported when one is made that needs them, never before.
 LAZILY = {
-    "geometry/kernel.py": {"numpy"},
-    "transforms/dis.py": {"cv2"},
-    "transforms/raft.py": {"torchvision", "safetensors"},
+    "geometry/numba_flow.py": {"numpy"},
+    "transforms/estimated_flow.py": {"cv2", "torchvision", "safetensors"},
 }
 PACKAGES_LIMITED_TO = {
     "geometry": {"torch"},
@@ -81,7 +80,7 @@ PACKAGES_LIMITED_TO = {
 }
 
 # Nothing of flowrep imports this one: whoever has Hydra does.
-WITH_HYDRA = {"transforms/configs.py": {"hydra", "omegaconf"}}
+WITH_HYDRA = {"transforms/hydra_configs.py": {"hydra", "omegaconf"}}
 
 
 def imports(path: Path) -> set[tuple[str, str]]:
@@ -116,7 +115,7 @@ def test_imports_point_one_way(path):
     if part in PACKAGES_LIMITED_TO:
         extras = LAZILY.get(place.as_posix(), set()) | WITH_HYDRA.get(place.as_posix(), set())
         assert outside <= PACKAGES_LIMITED_TO[part] | extras
-    assert place.name == "torchrl_configs.py" or "flowrep.transforms.configs" not in imported
+    assert place.name == "torchrl_configs.py" or "flowrep.transforms.hydra_configs" not in imported
     assert "flowrep.torchrl_configs" not in imported
     for package, places in THIRD_PARTY_ONLY_IN.items():
         assert package not in outside or str(place) in places

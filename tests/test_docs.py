@@ -11,7 +11,7 @@ from torchrl.data import Composite, Unbounded
 
 from flowrep import transforms
 from flowrep.transforms import RawFlow
-from flowrep.transforms.configs import CONFIGS
+from flowrep.transforms.hydra_configs import CONFIGS
 from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 
 DOCS = Path(__file__).parents[1] / "docs"

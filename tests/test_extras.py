@@ -20,7 +20,7 @@ MODULES = {
     "factorize.py": "factorising needs cv2; run: pip install 'flowrep[factorize]'",
     "agent/__init__.py": "flowrep.agent needs safetensors; run: pip install 'flowrep[train]'",
     "torchrl_configs.py": "flowrep.torchrl_configs needs hydra; run: pip install 'flowrep[train]'",
-    "transforms/configs.py": "flowrep.transforms.configs needs hydra; run: pip install 'flowrep[",
+    "transforms/hydra_configs.py": "needs hydra; run: pip install 'flowrep[train]'",
 }
 
 

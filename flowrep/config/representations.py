@@ -7,11 +7,10 @@ from pydantic import model_validator
 from flowrep.config.expectations import Count, Factor, NotNegative, OneOf, Positive, Share, Text
 from flowrep.config.section import ChosenBy, Section
 from flowrep.config.violations import broken_rule
-from flowrep.transforms.dis import PRESETS
+from flowrep.transforms.estimated_flow import NETWORKS, PRESETS
 from flowrep.transforms.flow import UNITS
-from flowrep.transforms.flow_source import FLOW_SOURCES
-from flowrep.transforms.raft import NETWORKS
-from flowrep.transforms.segmentation import ENCODINGS
+from flowrep.transforms.maps import ENCODINGS
+from flowrep.transforms.stack import FLOW_SOURCES
 
 NOT_CHOSEN: Any = None
 

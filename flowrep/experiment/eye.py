@@ -12,7 +12,7 @@ from flowrep.palette import num_classes
 from flowrep.scenes.scene import Scene
 from flowrep.simulator.camera import sampled_intrinsics
 from flowrep.transforms import representation_stack
-from flowrep.transforms.recurrent import RecurrentTransform
+from flowrep.transforms.base import RecurrentTransform
 
 
 class Eye:

@@ -1,27 +1,35 @@
 """Cameras, rigid motions and the flow they cause, as pure batched functions on torch tensors."""
 
-from flowrep.geometry.camera import project, unproject
-from flowrep.geometry.depth import DepthKind, adapt_depth, z_from_ray_length, z_from_z_buffer
-from flowrep.geometry.flow import Factors, Flow, ego_flow, factorize, rigid_flow
-from flowrep.geometry.flow_layout import Channels, Direction, Grid, adapt_flow
-from flowrep.geometry.instances import instance_rows
-from flowrep.geometry.intrinsics import (
+from flowrep.geometry.camera import (
     FovAxis,
     check_intrinsics,
     intrinsics_from_fov,
     intrinsics_from_opencv,
+    project,
+    unproject,
 )
-from flowrep.geometry.poses import (
+from flowrep.geometry.depth import DepthKind, adapt_depth, z_from_ray_length, z_from_z_buffer
+from flowrep.geometry.flow import (
+    Channels,
+    Direction,
+    Factors,
+    Flow,
+    Grid,
+    adapt_flow,
+    ego_flow,
+    factorize,
+    rigid_flow,
+)
+from flowrep.geometry.pose import (
     CameraAxes,
     PoseDirection,
     PoseLayout,
     adapt_pose,
-    pose_from_quaternion,
-)
-from flowrep.geometry.rigid import (
     check_rigid,
     instance_motion,
+    instance_rows,
     invert_rigid,
+    pose_from_quaternion,
     relative_motion,
     transform_points,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, get_args
 
 import torch
@@ -70,6 +69,14 @@ def check_name(option: str, name: object, names: Any) -> None:
     """Raises ValueError if `name` is not a value of the `Literal` `names`, and lists its values."""
     known = list(get_args(names))
     if name not in known:
-        close = difflib.get_close_matches(str(name), known, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"{option} must be one of {known}, got {name!r}{hint}")
+        raise ValueError(f"{option} must be one of {known}, got {name!r}")
+
+
+def check_rows(lowest: int, highest: int, rows: int) -> None:
+    """Raises RuntimeError if ids from `lowest` to `highest` are no rows of `rows` motions."""
+    if lowest < 0 or highest >= rows:
+        raise RuntimeError(
+            f"instance holds ids {lowest} to {highest}, but prev_from_curr_by_instance has {rows} "
+            f"rows, for ids 0 to {rows - 1}; convert a simulator's ids, such as -1 for the "
+            "background, with the transform InstanceIds or with flowrep.geometry.instance_rows"
+        )

@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 import torch
 from torch import Tensor
 
-from flowrep.geometry.camera import centred_pixels
+from flowrep.geometry.camera import pixel_rays
 from flowrep.geometry.checks import broadcast_batch, check_name, check_shape
 
 DepthKind: TypeAlias = Literal["z", "ray_length", "z_buffer"]
@@ -74,10 +74,7 @@ def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
     check_shape("K", K, (3, 3))
     broadcast_batch(ray_length=ray_length.shape[:-3], K=K.shape[:-2])
     K = K.to(torch.promote_types(ray_length.dtype, torch.float32))
-    x_px, y_px = centred_pixels(ray_length.shape[-2], ray_length.shape[-1], K)
-    K = K[..., None, None, :, :]
-    y = y_px / K[..., 1, 1]
-    x = (x_px - K[..., 0, 1] * y) / K[..., 0, 0]
+    x, y = pixel_rays(ray_length.shape[-2], ray_length.shape[-1], K)
     per_z = (1.0 + x.square() + y.square()).sqrt()  # length of the ray per metre of z
     return (ray_length / per_z.unsqueeze(-3)).to(ray_length.dtype)
 

@@ -7,14 +7,30 @@ the pixels and stores no point cloud.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
-from flowrep.geometry import closed_form, single_pass
-from flowrep.geometry.checks import broadcast_batch, check_is_tensor, check_shape, check_trailing
-from flowrep.geometry.planes import body_planes, camera_planes
+from flowrep.geometry import closed_form
+from flowrep.geometry.camera import centred_pixels
+from flowrep.geometry.checks import (
+    broadcast_batch,
+    check_is_tensor,
+    check_name,
+    check_rows,
+    check_shape,
+    check_trailing,
+)
+from flowrep.geometry.closed_form import Planes, flow_planes, known_camera, motion_coefficients
+from flowrep.jit import numba_is_installed
+
+Direction: TypeAlias = Literal["forward", "backward"]
+Grid: TypeAlias = Literal["current", "previous"]
+Channels: TypeAlias = Literal["uv", "row_column"]
+
+SMALL = 1 << 14  # pixels for which loading numba isn't worth while
 
 
 class Flow(NamedTuple):
@@ -72,7 +88,7 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
     batch = _check(depth, K, prev_from_curr, dt)
     dtypes = _dtypes(depth, K, prev_from_curr)
     depth = depth.expand(*batch, -1, -1, -1)
-    u, v, valid = camera_planes(depth, K, prev_from_curr, dt, dtypes)
+    u, v, valid = _camera_planes(depth, K, prev_from_curr, dt, dtypes)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
@@ -122,7 +138,7 @@ def rigid_flow(
     batch = broadcast_batch(others=batch, instance=instance.shape[:-3])
     dtypes = _dtypes(depth, K, motions)
     depth, instance = (image.expand(*batch, -1, -1, -1) for image in (depth, instance))
-    u, v, valid = body_planes(depth, instance, K, motions, dt, dtypes)
+    u, v, valid = _body_planes(depth, instance, K, motions, dt, dtypes)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
@@ -175,10 +191,12 @@ def factorize(
     own, compute = _dtypes(depth, K, prev_from_curr)
     dtype = torch.promote_types(own, raw.dtype)
     depth = depth.expand(*batch, -1, -1, -1)
-    u, v, valid = camera_planes(depth, K, prev_from_curr, dt, (own, compute))
+    u, v, valid = _camera_planes(depth, K, prev_from_curr, dt, (own, compute))
     raw = raw.to(dtype).expand(*batch, -1, -1, -1)
-    if single_pass.suits(depth, u, v, raw):
-        obj, known = single_pass.object_flow(raw, u, v, valid)
+    if _suits_numba(depth, u, v, raw):
+        from flowrep.geometry import numba_flow  # needs numba
+
+        obj, known = numba_flow.object_flow(raw, u, v, valid)
         return Factors(closed_form.stack_planes(u, v), obj, closed_form.mask_channel(known))
     raw_u, raw_v = raw.unbind(-3)
     u, v = u.to(dtype), v.to(dtype)
@@ -195,6 +213,55 @@ def factorize(
         obj_u, obj_v = torch.where(mask, obj_u, 0.0), torch.where(mask, obj_v, 0.0)
     ego, obj = closed_form.stack_planes(u, v), closed_form.stack_planes(obj_u, obj_v)
     return Factors(ego, obj, closed_form.mask_channel(known))
+
+
+def adapt_flow(
+    flow: Tensor, *, direction: Direction, grid: Grid, channels: Channels = "uv"
+) -> Tensor:
+    """Returns flow p_t - p_t' on the current frame's grid, (u right, v down), `[*B, 2, H, W]`.
+
+    Convention: `direction` is that of the vectors: `"forward"` is p_t - p_t', from a point's
+    previous to its current position; `"backward"` is p_t' - p_t. `grid` is the frame whose pixels
+    they belong to. An estimator called with (current, previous) gives backward flow on the current
+    grid.
+
+    Flow on the previous frame's grid raises ValueError: its pixels have moved, several of them to
+    the same pixel and none to others, so flow on the current grid would be a guess.
+
+    Args:
+        flow: `[*B, 2, H, W]`, pixels.
+        direction: `"forward"` or `"backward"`.
+        grid: `"current"` or `"previous"`.
+        channels: `"uv"` (column first) or `"row_column"`.
+
+    Raises:
+        ValueError: an unknown name, a shape that does not fit, or flow on the previous grid.
+        TypeError: no float tensor.
+
+    >>> flow = torch.tensor([3.0, -2.0]).reshape(2, 1, 1)  # 3 rows up, 2 columns right it was
+    >>> adapt_flow(flow, direction="backward", grid="current", channels="row_column").flatten()
+    tensor([ 2., -3.])
+    """
+    check_flow_options(direction, grid, channels)
+    check_shape("flow", flow, (2, "H", "W"))
+    if channels == "row_column":
+        flow = flow.flip(-3)
+    return -flow if direction == "backward" else flow
+
+
+def check_flow_options(direction: str, grid: str, channels: str) -> None:
+    """Raises ValueError for an unknown name, and for the previous frame's grid."""
+    check_name("direction", direction, Direction)
+    check_name("grid", grid, Grid)
+    check_name("channels", channels, Channels)
+    if grid == "previous":
+        raise ValueError(
+            f"{direction} flow on the previous frame's grid cannot be turned into flow on the "
+            "current frame's grid exactly: pixels that were covered have no vector, and where "
+            "several land on one only depth says which is seen. Have the flow computed from the "
+            "current frame to the previous one (most estimators: swap the two pictures) and adapt "
+            "it with direction='backward', grid='current'"
+        )
 
 
 def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torch.Size:
@@ -228,3 +295,108 @@ def _dtypes(*tensors: Tensor) -> tuple[torch.dtype, torch.dtype]:
     for tensor in tensors[1:]:
         dtype = torch.promote_types(dtype, tensor.dtype)
     return dtype, torch.promote_types(dtype, torch.float32)
+
+
+def _camera_planes(
+    depth: Tensor,
+    K: Tensor,
+    prev_from_curr: Tensor,
+    dt: float | Tensor,
+    dtypes: tuple[torch.dtype, torch.dtype],
+) -> Planes:
+    """Returns the flow planes of one motion for the whole image.
+
+    `dtypes` are those of the result and of the computation.
+    """
+    dtype, compute = dtypes
+    K, dt, known = known_camera(K.to(compute), dt)
+    coefficients = motion_coefficients(K, prev_from_curr.to(compute), known)
+    x, y = centred_pixels(depth.shape[-2], depth.shape[-1], K)
+    if _suits_numba(depth, coefficients, x, dt):
+        from flowrep.geometry import numba_flow  # needs numba
+
+        motions = coefficients.unsqueeze(-2)
+        return numba_flow.planes_of_motions(depth.squeeze(-3), None, motions, x, y, dt)
+    by_motion = coefficients[..., None, None, :]  # [*B, 1, 1, 12]
+    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = by_motion.unbind(-1)
+    # A x~ is the sum of a term per column and one per row, tabulated to save work per pixel.
+    x, *columns = _table(x, axx * x, ayx * x, azx * x)
+    y, *rows = _table(y, axy * y + ax, ayy * y + ay, azy * y + az)
+    q_far = [column + row for column, row in zip(columns, rows)]
+    if isinstance(dt, Tensor):
+        dt = dt[..., None, None]
+    return flow_planes(depth.squeeze(-3), x, y, q_far, e, dt, dtype)
+
+
+def _body_planes(
+    depth: Tensor,
+    instance: Tensor,
+    K: Tensor,
+    prev_from_curr_by_instance: Tensor,
+    dt: float | Tensor,
+    dtypes: tuple[torch.dtype, torch.dtype],
+) -> Planes:
+    """Returns the flow planes of one motion per instance; `depth` and `instance` share a batch.
+
+    Raises:
+        RuntimeError: an id without a motion.
+    """
+    dtype, compute = dtypes
+    *batch, _, height, width = depth.shape
+    K, dt, known = known_camera(K.to(compute), dt)
+    motions = prev_from_curr_by_instance.to(compute)
+    by_instance = motion_coefficients(K.unsqueeze(-3), motions, known.unsqueeze(-1))  # [*B, N, 12]
+    x, y = centred_pixels(height, width, K)
+    if _suits_numba(depth, by_instance, x, dt):
+        from flowrep.geometry import numba_flow  # needs numba
+
+        maps = depth.squeeze(-3), instance.squeeze(-3)
+        return numba_flow.planes_of_motions(*maps, by_instance, x, y, dt)
+    row_of_pixel = instance.long().flatten(-3)  # [*B, H * W]
+    try:
+        axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = (
+            rows.expand(*batch, -1).gather(-1, row_of_pixel).unflatten(-1, (height, width))
+            for rows in by_instance.unbind(-1)
+        )
+    except RuntimeError:
+        check_rows(int(instance.min()), int(instance.max()), by_instance.shape[-2])
+        raise
+    q_far = [
+        axx * x + (axy * y + ax),
+        ayx * x + (ayy * y + ay),
+        azx * x + (azy * y + az),
+    ]
+    if isinstance(dt, Tensor):
+        dt = dt[..., None, None]
+    return flow_planes(depth.squeeze(-3), x, y, q_far, e, dt, dtype)
+
+
+def _table(*entries: Tensor) -> tuple[Tensor, ...]:
+    """Returns the entries as slices of one tensor, which inductor stores and doesn't recompute."""
+    return torch.stack(torch.broadcast_tensors(*entries)).unbind()
+
+
+def _suits_numba(depth: Tensor, *others: float | Tensor) -> bool:
+    """Returns whether `numba_flow` takes these: large float32 batches on a CPU, no gradients."""
+    if torch.compiler.is_compiling():  # first, as a question about sizes would limit the program
+        return False
+    tensors = [depth, *(other for other in others if isinstance(other, Tensor))]
+    return (
+        depth.is_cpu
+        and depth.numel() > SMALL
+        and all(tensor.dtype is torch.float32 and _is_plain(tensor) for tensor in tensors)
+        and numba_is_installed()
+    )
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    """Returns whether a tensor is numbers in memory: not a subclass, and not being transformed."""
+    if type(tensor) not in (Tensor, torch.nn.Parameter):
+        return False
+    if tensor.requires_grad and torch.is_grad_enabled():
+        return False
+    try:
+        tensor.data_ptr()
+    except RuntimeError:  # in torch.func's vmap, grad or jvp a tensor has no memory of its own
+        return False
+    return forward_ad.unpack_dual(tensor).tangent is None

@@ -21,7 +21,7 @@ from flowrep.geometry import (
 )
 from flowrep.geometry.checks import check_name
 from flowrep.geometry.depth import check_depth_options
-from flowrep.geometry.flow_layout import check_flow_options
+from flowrep.geometry.flow import check_flow_options
 from flowrep.sequences.calibration import (
     Registration,
     as_pose,

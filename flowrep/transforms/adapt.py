@@ -12,7 +12,7 @@ from torchrl.data import TensorSpec, Unbounded
 from flowrep import geometry
 from flowrep.geometry import checks
 from flowrep.geometry.depth import check_depth_options
-from flowrep.geometry.flow_layout import check_flow_options
+from flowrep.geometry.flow import check_flow_options
 from flowrep.transforms.base import (
     DEPTH,
     FLOW,

@@ -2,23 +2,248 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional
 from torchrl.data import TensorSpec, Unbounded
 
 from flowrep.transforms.base import Keys, Reads
-from flowrep.transforms.dis import DIS
 from flowrep.transforms.flow import FlowTransform, checked_outputs, mask_spec
-from flowrep.transforms.raft import NETWORKS, RAFT, SMALLEST_SIDE_PX
 
 PICTURE_PAIR = Reads((6, "H", "W"), "integer")
 
 # Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
 Estimator = Callable[[Tensor, Tensor], Tensor]
+
+PRESETS = ("ultrafast", "fast", "medium")  # OpenCV's numbers 0, 1, 2
+SMALLEST_SIDE_PX = 128  # the network's coarsest correlation level has 1 / 64 of this
+_MULTIPLE_PX = 8  # the network works at an eighth of the size
+NETWORKS = ("raft_small", "raft_large")
+
+
+@dataclass(frozen=True)
+class DIS:
+    """Dense inverse search: flow in a few milliseconds per picture on a CPU, without weights.
+
+    Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels,
+    because the preset "medium" matches patches of 8 px at half size, too coarse for a picture of
+    48 px (`benchmarks/estimated_flow.py` measures the effect). The faster presets choose their
+    scale by the picture's width and gain less, or nothing.
+
+    The pictures of a batch are split among as many threads as torch uses
+    (`torch.set_num_threads`), since OpenCV releases Python's lock. Pictures on another device are
+    copied to the CPU and their flow back, which waits for the device.
+
+    Args:
+        preset: `"ultrafast"`, `"fast"` or `"medium"`, OpenCV's own.
+        min_side_px: pictures with a shorter side below this are enlarged to at least this; 1
+            enlarges none.
+
+    Raises:
+        ValueError: for an unknown preset or a size below 1.
+        ImportError: OpenCV is not installed.
+
+    Example:
+        >>> import torch
+        >>> ramp = torch.linspace(0, 255, 40).to(torch.uint8).expand(1, 3, 40, 40)
+        >>> DIS()(ramp, ramp).abs().max()  # nothing moved
+        tensor(0.)
+    """
+
+    preset: str = "medium"
+    min_side_px: int = 160
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for invalid options, and ImportError without OpenCV."""
+        if self.preset not in PRESETS:
+            raise ValueError(f"preset must be one of {list(PRESETS)}, got {self.preset!r}")
+        if self.min_side_px < 1:
+            raise ValueError(f"min_side_px must be at least 1, got {self.min_side_px}")
+        _opencv()
+
+    def __call__(self, first: Tensor, second: Tensor) -> Tensor:
+        """Returns the displacement of each pixel from the first picture to the second.
+
+        Convention: `[N, 2, H, W]` float32, (u right, v down), pixels, on the first picture's grid.
+
+        Args:
+            first: uint8 `[N, 3, H, W]`, RGB.
+            second: as `first`.
+        """
+        pairs = list(zip(_channels_last(first), _channels_last(second)))
+        with ThreadPoolExecutor(max(1, min(len(pairs), torch.get_num_threads()))) as pool:
+            flows = list(pool.map(lambda pair: self._flow(*pair), pairs))
+        if not flows:
+            return torch.zeros(0, 2, *first.shape[-2:], device=first.device)
+        return torch.stack(flows).to(first.device)
+
+    def _flow(self, first: Any, second: Any) -> Tensor:
+        cv2 = _opencv()
+        height, width = first.shape[:2]
+        factor = whole_factor(height, width, self.min_side_px)
+        grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second)]
+        if factor > 1:
+            size = (width * factor, height * factor)
+            grey = [cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC) for picture in grey]
+        # One estimator per call: its buffers aren't thread-safe, and creating it is cheap.
+        flow = cv2.DISOpticalFlow_create(PRESETS.index(self.preset)).calc(*grey, None)
+        if factor > 1:
+            flow = cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) / factor
+        return torch.from_numpy(flow).movedim(-1, 0)
+
+
+def whole_factor(height: int, width: int, min_side_px: int) -> int:
+    """Returns the smallest whole factor that makes both sides at least `min_side_px`.
+
+    >>> whole_factor(48, 84, 160), whole_factor(200, 300, 160)
+    (4, 1)
+    """
+    return max(1, math.ceil(min_side_px / min(height, width)))
+
+
+def _channels_last(pictures: Tensor) -> Any:
+    """Returns the pictures as a numpy array [N, H, W, 3], which OpenCV reads."""
+    return pictures.movedim(-3, -1).contiguous().cpu().numpy()
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            "flow estimated by DIS needs OpenCV: pip install 'flowrep[flow]'"
+        ) from error
+    return cv2
+
+
+class RAFT(nn.Module):
+    """Recurrent all-pairs field transforms: flow by a network, on any device.
+
+    Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels.
+    Sides that are not a multiple of 8 are padded by repeating the border, and the padding is
+    cropped again. On pairs with hardly any motion it is noisier than DIS.
+
+    Args:
+        weights: a file with the network's state dict, `.safetensors` or `.pth`, read without
+            unpickling objects. The weights published by torchvision fit.
+        network: `"raft_small"` or `"raft_large"`, matching the weights.
+        updates: number of refinements of the flow; more are slower and more accurate.
+        min_side_px: pictures with a shorter side below this are enlarged to at least this; not
+            below 128.
+
+    Raises:
+        ImportError: torchvision is missing or was built for another torch.
+        FileNotFoundError: there is no file at that path.
+        ValueError: for an unknown network, a size that is too small, or weights that do not fit.
+    """
+
+    def __init__(
+        self,
+        weights: str | Path,
+        network: str = "raft_small",
+        updates: int = 12,
+        min_side_px: int = SMALLEST_SIDE_PX,
+    ) -> None:
+        super().__init__()
+        if network not in NETWORKS:
+            raise ValueError(f"network must be one of {list(NETWORKS)}, got {network!r}")
+        if min_side_px < SMALLEST_SIDE_PX or updates < 1:
+            raise ValueError(
+                f"RAFT needs min_side_px of at least {SMALLEST_SIDE_PX} and at least one update, "
+                f"got {min_side_px} and {updates}"
+            )
+        self.updates, self.min_side_px = int(updates), int(min_side_px)
+        state = _read_weights(Path(weights))
+        self.network = getattr(_optical_flow(), network)(weights=None)
+        try:
+            self.network.load_state_dict(state)
+        except RuntimeError as error:
+            raise ValueError(
+                f"{weights} does not hold the weights of {network}: {str(error)[:200]}"
+            ) from error
+        self.network.eval().requires_grad_(False)
+
+    @torch.no_grad()
+    def forward(self, first: Tensor, second: Tensor) -> Tensor:
+        """Returns the displacement of each pixel from the first picture to the second.
+
+        Convention: `[N, 2, H, W]` float32, (u right, v down), pixels, on the first picture's grid.
+
+        Args:
+            first: uint8 `[N, 3, H, W]`, RGB.
+            second: as `first`.
+        """
+        height, width = first.shape[-2:]
+        factor = whole_factor(height, width, self.min_side_px)
+        first, second = (self._prepared(picture, factor) for picture in (first, second))
+        flow = self.network(first, second, num_flow_updates=self.updates)[-1]
+        flow = flow[..., : height * factor, : width * factor]
+        return functional.avg_pool2d(flow, factor) / factor if factor > 1 else flow
+
+    def train(self, mode: bool = True) -> RAFT:
+        """Keeps the network in evaluation mode, even if its env is put into training mode."""
+        return super().train(False)
+
+    @staticmethod
+    def _prepared(pictures: Tensor, factor: int) -> Tensor:
+        """Returns pictures in [-1, 1], enlarged, with sides that are multiples of 8."""
+        scaled = pictures.float() / 127.5 - 1.0
+        if factor > 1:
+            scaled = functional.interpolate(
+                scaled, scale_factor=factor, mode="bilinear", align_corners=False
+            )
+        bottom, right = (-side % _MULTIPLE_PX for side in scaled.shape[-2:])
+        return functional.pad(scaled, (0, right, 0, bottom), mode="replicate")
+
+
+def _read_weights(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no RAFT weights at '{path}': give weights= the state dict of a torchvision RAFT, "
+            "a .safetensors or .pth file; none come with flowrep"
+        )
+    if path.suffix == ".safetensors":
+        try:
+            from safetensors.torch import load_file
+        except ImportError as error:
+            raise ImportError(f"'{path}' needs safetensors: pip install safetensors") from error
+        return _state_of(path, lambda: load_file(path))
+    return _state_of(path, lambda: torch.load(path, map_location="cpu", weights_only=True))
+
+
+def _state_of(path: Path, read: Callable[[], Any]) -> dict[str, Tensor]:
+    """Returns a reader's state dict; hides its error message, which advises trusting the file."""
+    try:
+        state = read()
+    except Exception as error:  # readers fail on garbage in as many ways as there is garbage
+        if isinstance(error, OSError):
+            raise
+        raise ValueError(
+            f"'{path}' is not a readable weights file ({type(error).__name__}): it is damaged, or "
+            "holds more than a state dict. Save the network's state_dict() again, preferably as "
+            ".safetensors"
+        ) from None
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise ValueError(f"'{path}' holds no state dict, a mapping from names to tensors")
+    return state
+
+
+def _optical_flow() -> Any:
+    try:
+        from torchvision.models import optical_flow
+    except (ImportError, RuntimeError) as error:  # RuntimeError: built for another torch
+        raise ImportError(
+            "flow estimated by RAFT needs the torchvision that belongs to your torch: "
+            f"pip install 'flowrep[raft]' ({error})"
+        ) from error
+    return optical_flow
 
 
 class EstimatedFlow(FlowTransform):

@@ -10,16 +10,34 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Categorical, TensorSpec, Unbounded
 
+from flowrep import geometry
 from flowrep.geometry import check_intrinsics
-from flowrep.transforms.base import DEPTH, Keys, MapTransform, Reads, as_keys
+from flowrep.transforms.base import (
+    DEPTH,
+    FLOW,
+    IDS,
+    MOTION,
+    MOTIONS,
+    Keys,
+    MapTransform,
+    Reads,
+    as_keys,
+)
 
 UNITS = ("px_per_step", "px_per_s")
 
 CAMERA = Reads((3, 3), "float")
+_RAW_KEYS: list[NestedKey] = [
+    ("sensor", "depth"),
+    ("sensor", "instance"),
+    ("sensor", "instance_motion"),
+]
+_EGO_KEYS: list[NestedKey] = [("sensor", "depth"), ("sensor", "prev_from_curr")]
 
 # K itself, or the key under which the env gives it.
 Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
@@ -98,18 +116,16 @@ class FlowTransform(CameraTransform):
         out_keys: Keys | None,
         masked: Sequence[str] = (),
     ) -> None:
-        super().__init__(
-            intrinsics, reads, in_keys, list(outputs) if out_keys is None else out_keys
-        )
-        if len(self.out_keys) != len(outputs):
+        keys = as_keys(list(outputs) if out_keys is None else out_keys)
+        if len(keys) != len(outputs):
             raise ValueError(
                 f"{type(self).__name__} writes {list(outputs)}: out_keys needs as many keys, "
-                f"got {self.out_keys}"
+                f"got {keys}"
             )
-        self.outputs = tuple(outputs)
-        keys = zip(outputs, tuple(self.out_keys))
-        self.masks = tuple(mask_key(key) for name, key in keys if name in masked)
-        self.out_keys = [*self.out_keys, *self.masks]
+        masks = [mask_key(key) for name, key in zip(outputs, keys) if name in masked]
+        super().__init__(intrinsics, reads, in_keys, [*keys, *masks])
+        self.label = " and ".join(map(repr, keys))
+        self.outputs, self.masks = tuple(outputs), tuple(masks)
         flows = [output for output in outputs if output != "valid"]
         scales = _per_output("scale", scale, flows)
         units = _per_output("unit", unit, flows)
@@ -149,13 +165,223 @@ class FlowTransform(CameraTransform):
         )
 
 
+class RawFlow(FlowTransform):
+    """Exact optical flow of a world of rigid bodies, from a simulator's state.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "depth")`, m | `"raw"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
+    | `("sensor", "instance")` | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
+    | `("sensor", "instance_motion")` | `"raw_valid"` | as `"valid"` | | |
+
+    Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
+    step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, N, 4, 4]` maps a point fixed to
+    instance i from the current camera's frame to its place in the previous camera's frame; row 0 is
+    the static world's. The observation thus holds everything that flow needs of the previous step.
+    Where flow isn't known, because depth is `nan` or a point was not in front of the previous
+    camera, raw is 0 and the mask beside it, `"raw_valid"`, is False: `FlowFactorize` reads both.
+    No state is kept, and shuffled samples of a replay buffer give the same flow as the env.
+
+    Args:
+        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
+            it, `[*B, 3, 3]`.
+        outputs: which of `"raw"` and `"valid"` to write.
+        scale: factor on the flow.
+        unit: `"px_per_step"` or `"px_per_s"`.
+        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
+        compiled: whether `compute` runs through `torch.compile`, which is some five times as fast
+            on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
+            the result in torch's cache. Otherwise numba, where it is installed, computes large
+            float32 batches on a CPU two to five times as fast as PyTorch, with the same bits.
+        invalid: value, before scaling, where flow isn't known.
+        in_keys: depth, instance ids and one motion per instance.
+        out_keys: one key per output; their names by default. The mask's key follows raw's:
+            `("sensor", "flow_valid")` for `("sensor", "flow")`.
+
+    Raises:
+        ValueError: for a K that can't be one, an unknown output or unit, or `"px_per_s"` without
+            `dt_s`.
+
+    Example:
+        A body a metre away was 0.1 m further left: fx · 0.1 m / 1 m = 5 px to the right.
+
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> motions = torch.eye(4).repeat(2, 1, 1)
+        >>> motions[1, 0, 3] = -0.1
+        >>> sensor = {
+        ...     "depth": torch.ones(1, 1, 2),
+        ...     "instance": torch.tensor([[[0, 1]]]),
+        ...     "instance_motion": motions,
+        ... }
+        >>> raw = RawFlow([[50.0, 0, 1], [0, 50.0, 0.5], [0, 0, 1]])
+        >>> raw(TensorDict({"sensor": sensor}))["raw"][0, 0, 1]
+        tensor(5.)
+    """
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        *,
+        outputs: Sequence[str] = ("raw",),
+        scale: float = 1.0,
+        unit: str = "px_per_step",
+        dt_s: float | None = None,
+        compiled: bool = False,
+        invalid: float = 0.0,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
+    ) -> None:
+        outputs = checked_outputs(outputs, ("raw", "valid"))
+        super().__init__(
+            intrinsics,
+            [DEPTH, IDS, MOTIONS],
+            outputs=outputs,
+            scale=scale,
+            unit=unit,
+            dt_s=dt_s,
+            compiled=compiled,
+            in_keys=_RAW_KEYS if in_keys is None else in_keys,
+            out_keys=out_keys,
+            masked=["raw"],
+        )
+        self.invalid = float(invalid)
+
+    def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
+        """Returns the chosen outputs, from depth, instance ids and motions (and K)."""
+        (depth, instance, motions), K = self._with_camera(maps)
+        motions, depth, K = self._at_one_precision(motions, depth=depth, K=K)
+        flow, valid = geometry.rigid_flow(depth, instance, K, motions)
+        if self.invalid != 0.0:
+            # Viewed as bytes, as inductor's CPU code fails to compile a `where` on a bool view.
+            flow = torch.where(valid.view(torch.uint8) != 0, flow, self.invalid)
+        made = [valid if name == "valid" else self._in_unit(name, flow) for name in self.outputs]
+        return (*made, *[valid] * len(self.masks))
+
+
+class FlowFactorize(FlowTransform):
+    """Optical flow split into ego flow and object flow, in one pass over the pixels.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `"raw"`, px/step | `"ego"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
+    | `("sensor", "depth")`, m | `"obj"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
+    | `("sensor", "prev_from_curr")` | `"raw"` if chosen | as above | any | as above |
+    | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
+
+    Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the
+    paper), obj = raw − ego is the objects' own flow (Eq. 6), both p_t − p_t' on the current frame's
+    grid, channels (u right, v down). `prev_from_curr` `[*B, 4, 4]` maps a point from the current
+    camera's frame to the previous camera's. Flow is 0 where it isn't known: where depth is `nan`,
+    the point was not in front of the previous camera, or the motion, K or raw flow isn't finite.
+    Raw flow isn't known either where the mask beside it, bool `"raw_valid"` (`RawFlow` and
+    `EstimatedFlow` write it; its key follows raw's), is False: a store of raw flow keeps both.
+    With the simulator's raw flow, obj is exactly 0 on everything static.
+
+    Args:
+        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
+            it, `[*B, 3, 3]`.
+        outputs: which of `"ego"`, `"obj"`, `"raw"` (the raw flow itself, in the chosen unit, 0
+            where it isn't finite) and `"valid"` to write. With ego alone, raw flow isn't read.
+        scale: factor on the flows, or a mapping from output to factor.
+        unit: `"px_per_step"` or `"px_per_s"`, or a mapping from output to unit.
+        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
+        compiled: whether `compute` runs through `torch.compile`, which is some five times as fast
+            on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
+            the result in torch's cache. Otherwise numba, where it is installed, computes large
+            float32 batches on a CPU two to five times as fast as PyTorch, with the same bits.
+        in_keys: raw flow (in px/step, unscaled), depth and camera motion; without raw flow for ego
+            alone.
+        out_keys: one key per output; their names by default.
+
+    Raises:
+        ValueError: for a K that can't be one, an unknown output or unit, or `"px_per_s"` without
+            `dt_s`.
+
+    Example:
+        The camera moved 0.1 m to the right, so a wall a metre away moves by fx · 0.1 = 5 px to the
+        left; a pixel with a measured flow of 0 has an object flow of +5 px.
+
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> motion = torch.eye(4)
+        >>> motion[0, 3] = 0.1
+        >>> raw = torch.tensor([[[-5.0, 0.0]], [[0.0, 0.0]]])
+        >>> sensor = {"depth": torch.ones(1, 1, 2), "prev_from_curr": motion}
+        >>> split = FlowFactorize([[50.0, 0, 1], [0, 50.0, 0.5], [0, 0, 1]])
+        >>> td = split(TensorDict({"raw": raw, "sensor": sensor}))
+        >>> td["ego"][0], td["obj"][0]
+        (tensor([[-5., -5.]]), tensor([[0., 5.]]))
+    """
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        *,
+        outputs: Sequence[str] = ("ego", "obj"),
+        scale: float | Mapping[str, float] = 1.0,
+        unit: str | Mapping[str, str] = "px_per_step",
+        dt_s: float | None = None,
+        compiled: bool = False,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
+    ) -> None:
+        outputs = checked_outputs(outputs, ("ego", "obj", "raw", "valid"))
+        reads, keys = [DEPTH, MOTION], _EGO_KEYS
+        if {"obj", "raw"} & set(outputs):
+            reads, keys = [FLOW, *reads], ["raw", *keys]
+        super().__init__(
+            intrinsics,
+            reads,
+            outputs=outputs,
+            scale=scale,
+            unit=unit,
+            dt_s=dt_s,
+            compiled=compiled,
+            in_keys=keys if in_keys is None else in_keys,
+            out_keys=out_keys,
+        )
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Returns the inputs, with nan in raw flow where its mask says that it isn't known."""
+        maps = super()._read(tensordict)
+        known = tensordict.get(mask_key(self.in_keys[0]), None) if self.reads[0] == FLOW else None
+        if known is None:
+            return maps
+        raw = maps[0]
+        if known.dtype != torch.bool or known.shape != raw[..., :1, :, :].shape:
+            raise ValueError(
+                f"representation {self.label}: key {mask_key(self.in_keys[0])!r} should be bool "
+                f"{list(raw[..., :1, :, :].shape)}, where {self.in_keys[0]!r} is known; "
+                f"got {known.dtype} {list(known.shape)}"
+            )
+        return [torch.where(known, raw, math.nan), *maps[1:]]
+
+    def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
+        """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""
+        (*raw, depth, motion), K = self._with_camera(maps)
+        *raw, motion, depth, K = self._at_one_precision(*raw, motion, depth=depth, K=K)
+        made: dict[str, Tensor] = {}
+        if raw:
+            factors = geometry.factorize(raw[0], depth, K, motion)
+            made["ego"], made["obj"], made["valid"] = factors
+            if "raw" in self.outputs:
+                made["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
+        else:
+            made["ego"], made["valid"] = geometry.ego_flow(depth, K, motion)
+        return tuple(
+            made[name] if name == "valid" else self._in_unit(name, made[name])
+            for name in self.outputs
+        )
+
+
 def mask_spec(batch: torch.Size, size: torch.Size, device: torch.device | None) -> TensorSpec:
     """Returns the spec of a mask, bool `[*B, 1, H, W]`."""
     return Categorical(2, shape=(*batch, 1, *size), device=device, dtype=torch.bool)
 
 
 def mask_key(flow: NestedKey) -> NestedKey:
-    """Returns the key of the mask that says where a raw flow is known: `"raw_valid"` for `"raw"`."""
+    """Returns the key of the mask beside a raw flow: `"raw_valid"` for `"raw"`."""
     *path, name = (flow,) if isinstance(flow, str) else flow
     return (*path, f"{name}_valid") if path else f"{name}_valid"
 

@@ -11,8 +11,7 @@ from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
-from flowrep.transforms.base import Keys, Reads, refuse_n_step
-from flowrep.transforms.recurrent import RecurrentTransform
+from flowrep.transforms.base import Keys, Reads, RecurrentTransform, refuse_n_step
 
 
 class FrameStack(RecurrentTransform):

@@ -13,8 +13,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.transforms.base import MOTION, MOTIONS, Keys, Reads, refuse_n_step
-from flowrep.transforms.recurrent import RecurrentTransform
+from flowrep.transforms.base import MOTION, MOTIONS, Keys, Reads, RecurrentTransform, refuse_n_step
 
 _CAMERA: NestedKey = ("sensor", "world_from_cam")
 _BODIES: NestedKey = ("sensor", "world_from_body")

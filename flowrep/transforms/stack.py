@@ -3,38 +3,27 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
 
 from flowrep.transforms.base import unknown_name
-from flowrep.transforms.depth import Depth
-from flowrep.transforms.flow import Intrinsics
-from flowrep.transforms.flow_factorize import FlowFactorize
-from flowrep.transforms.flow_source import (
-    ESTIMATED_FLOW_KEY,
-    PICTURES_KEY,
-    estimated_flow_makers,
-    estimator_options,
-    exact_flow_makers,
-)
+from flowrep.transforms.estimated_flow import EstimatedFlow
+from flowrep.transforms.flow import FlowFactorize, Intrinsics, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
-from flowrep.transforms.noise_source import (
-    NOISY_DEPTH_KEY,
-    NOISY_MOTION_KEY,
-    Sensed,
-    noise_makers,
-)
-from flowrep.transforms.raw_flow import RawFlow
-from flowrep.transforms.rgb import Rgb
-from flowrep.transforms.segmentation import Segmentation
+from flowrep.transforms.maps import Depth, Rgb, Segmentation
+from flowrep.transforms.noise import SensorNoise
 
+FLOW_SOURCES = ("exact", "estimated")
+NOISE_OPTIONS = ("depth_sigma_per_m", "depth_dropout", "drift_m", "drift_rad")
+_ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px")
 _FLOW_OPTIONS = ("scale", "unit")
 
 
-class _Recipe(NamedTuple):
+class _Representation(NamedTuple):
     """A representation's transform and the parameters of it that a user may set."""
 
     transform: type[Transform]
@@ -43,19 +32,36 @@ class _Recipe(NamedTuple):
 
 
 # In the order of computation.
-_RECIPES: dict[str, _Recipe] = {
-    "rgb": _Recipe(Rgb),
-    "seg": _Recipe(Segmentation, ("encoding",)),
-    "depth": _Recipe(Depth, ("range_m", "missing")),
-    "raw": _Recipe(RawFlow, _FLOW_OPTIONS),
-    "ego": _Recipe(FlowFactorize, _FLOW_OPTIONS),
-    "obj": _Recipe(FlowFactorize, _FLOW_OPTIONS),
-    "seg2": _Recipe(Segmentation, ("encoding",), frames_of="seg"),
-    "depth2": _Recipe(Depth, ("range_m", "missing"), frames_of="depth"),
+_REPRESENTATIONS: dict[str, _Representation] = {
+    "rgb": _Representation(Rgb),
+    "seg": _Representation(Segmentation, ("encoding",)),
+    "depth": _Representation(Depth, ("range_m", "missing")),
+    "raw": _Representation(RawFlow, _FLOW_OPTIONS),
+    "ego": _Representation(FlowFactorize, _FLOW_OPTIONS),
+    "obj": _Representation(FlowFactorize, _FLOW_OPTIONS),
+    "seg2": _Representation(Segmentation, ("encoding",), frames_of="seg"),
+    "depth2": _Representation(Depth, ("range_m", "missing"), frames_of="depth"),
 }
 _FLOWS = ("raw", "ego", "obj")
 
-REPRESENTATIONS: tuple[str, ...] = tuple(_RECIPES)
+REPRESENTATIONS: tuple[str, ...] = tuple(_REPRESENTATIONS)
+
+_UNSCALED_KEY = "_raw"  # exact raw flow in px/step, for FlowFactorize
+# Measurements, and what the next step needs, stay in the TensorDict.
+_PICTURES_KEY = "_rgb2"
+_ESTIMATED_FLOW_KEY = ("sensor", "flow")  # in px/step
+_NOISY_KEYS: dict[str, NestedKey] = {
+    "depth": ("sensor", "noisy_depth"),
+    "motion": ("sensor", "noisy_motion"),
+}
+_KEPT = (_PICTURES_KEY, _ESTIMATED_FLOW_KEY, *_NOISY_KEYS.values())
+
+
+class SensorKeys(NamedTuple):
+    """The keys under which representations read depth and the camera's motion."""
+
+    depth: NestedKey = ("sensor", "depth")
+    motion: NestedKey = ("sensor", "prev_from_curr")
 
 
 def representation_options(name: str) -> dict[str, Any]:
@@ -68,11 +74,11 @@ def representation_options(name: str) -> dict[str, Any]:
         >>> representation_options("depth2")
         {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
-    if name not in _RECIPES:
+    if name not in _REPRESENTATIONS:
         raise ValueError(unknown_name("representation", name, REPRESENTATIONS))
-    recipe = _RECIPES[name]
-    options = _defaults(FrameStack, ("k",)) if recipe.frames_of else {}
-    return options | _defaults(recipe.transform, recipe.options)
+    entry = _REPRESENTATIONS[name]
+    options = _defaults(FrameStack, ("k",)) if entry.frames_of else {}
+    return options | _defaults(entry.transform, entry.options)
 
 
 def _defaults(transform: type[Transform], names: Sequence[str]) -> dict[str, Any]:
@@ -126,21 +132,17 @@ def representation_stack(
     chosen = _with_options(representations)
     if num_classes is None and ("seg" in chosen or "seg2" in chosen):
         raise ValueError("representations seg and seg2 need num_classes=")
-    estimator = estimator_options(flow)
+    estimator = _estimator_options(flow)
     flows = {name: chosen[name] for name in _FLOWS if name in chosen}
-    if intrinsics is None and flows and not (estimator is not None and set(flows) == {"raw"}):
+    if intrinsics is None and flows and (estimator is None or set(flows) != {"raw"}):
         raise ValueError(f"representations {', '.join(_FLOWS)} need intrinsics=, the camera's K")
-    makers, sensed = noise_makers(noise, chosen)
-    makers += _frame_makers(chosen, num_classes, sensed)
+    transforms, keys = _noise_transforms(noise, chosen)
+    transforms += _map_transforms(chosen, num_classes, keys)
     context = {"dt_s": dt_s, "compiled": compiled}
-    if estimator is not None:
-        makers += estimated_flow_makers(flows, estimator, intrinsics, context, sensed)
-    elif intrinsics is not None:
-        makers += exact_flow_makers(flows, intrinsics, context, sensed)
-    written = [key for maker in makers for key in maker.out_keys]
-    kept = [*chosen, PICTURES_KEY, ESTIMATED_FLOW_KEY, NOISY_DEPTH_KEY, NOISY_MOTION_KEY]
-    hidden = [key for key in written if key not in kept]
-    return Compose(*makers, *([DropKeys(*hidden)] if hidden else []))
+    transforms += _flow_transforms(flows, estimator, intrinsics, keys, context)
+    written = [key for transform in transforms for key in transform.out_keys]
+    hidden = [key for key in written if key not in (*chosen, *_KEPT)]
+    return Compose(*transforms, *([DropKeys(*hidden)] if hidden else []))
 
 
 class DropKeys(ExcludeTransform):
@@ -181,19 +183,19 @@ def _with_options(
     return chosen
 
 
-def _frame_makers(
-    chosen: dict[str, dict[str, Any]], num_classes: int | None, sensed: Sensed
+def _map_transforms(
+    chosen: dict[str, dict[str, Any]], num_classes: int | None, keys: SensorKeys
 ) -> list[Transform]:
     """Returns the transforms of all representations except flow."""
-    makers: list[Transform] = []
+    transforms: list[Transform] = []
     stacks: list[Transform] = []
     for name, options in chosen.items():
         if name in _FLOWS:
             continue
-        recipe = _RECIPES[name]
-        key, frame = name, recipe.frames_of or name
-        frame_options = {option: options[option] for option in recipe.options}
-        if recipe.frames_of:
+        entry = _REPRESENTATIONS[name]
+        key, frame = name, entry.frames_of or name
+        frame_options = {option: options[option] for option in entry.options}
+        if entry.frames_of:
             shared = chosen.get(frame) == frame_options
             key = frame if shared else f"_{frame}"
             stacks.append(FrameStack(k=options["k"], in_keys=key, out_keys=name))
@@ -202,6 +204,101 @@ def _frame_makers(
         if frame == "seg":
             frame_options["num_classes"] = num_classes
         elif frame == "depth":
-            frame_options["in_keys"] = sensed.depth
-        makers.append(recipe.transform(**frame_options, out_keys=key))
-    return makers + stacks
+            frame_options["in_keys"] = keys.depth
+        transforms.append(entry.transform(**frame_options, out_keys=key))
+    return transforms + stacks
+
+
+def _estimator_options(flow: str | Mapping[str, Any]) -> dict[str, Any] | None:
+    """Returns `EstimatedFlow`'s options, or None if flow is exact."""
+    options: dict[str, Any] = {"source": flow} if isinstance(flow, str) else dict(flow)
+    source = options.pop("source", None)
+    if source not in FLOW_SOURCES:
+        raise ValueError(unknown_name("source of flow", source, FLOW_SOURCES))
+    known = _ESTIMATOR_OPTIONS if source == "estimated" else ()
+    for option in options:
+        if option not in known:
+            raise ValueError(unknown_name(f"option of {source} flow:", option, known))
+    return options if source == "estimated" else None
+
+
+def _flow_transforms(
+    flows: dict[str, dict[str, Any]],
+    estimator: dict[str, Any] | None,
+    intrinsics: Intrinsics | None,
+    keys: SensorKeys,
+    context: dict[str, Any],
+) -> list[Transform]:
+    """Returns the source of raw flow, if it is needed, and one FlowFactorize if ego or obj is."""
+    transforms: list[Transform] = []
+    factors = {name: options for name, options in flows.items() if name != "raw"}
+    unscaled: NestedKey = _UNSCALED_KEY
+    if estimator is not None and not set(flows) <= {"ego"}:
+        unscaled = _ESTIMATED_FLOW_KEY
+        estimate = EstimatedFlow(
+            **estimator,
+            outputs=["unscaled", "raw"] if "raw" in flows else ["unscaled"],
+            **flows.get("raw", {}),
+            dt_s=context["dt_s"],
+            in_keys=_PICTURES_KEY,
+            out_keys=[unscaled, "raw"] if "raw" in flows else [unscaled],
+        )
+        pictures = FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=[_PICTURES_KEY])
+        pictures.label = estimate.label = "raw and obj by estimated flow"
+        transforms += [pictures, estimate]
+    elif "obj" in flows:
+        factors = flows  # raw too, from the unscaled flow
+        transforms.append(RawFlow(intrinsics, out_keys=unscaled, **context))
+        transforms[0].label = "'obj'"
+    elif "raw" in flows:
+        transforms.append(RawFlow(intrinsics, **flows["raw"], **context))
+    if factors:
+        split = FlowFactorize(
+            intrinsics,
+            outputs=list(factors),
+            scale={name: options["scale"] for name, options in factors.items()},
+            unit={name: options["unit"] for name, options in factors.items()},
+            in_keys=[unscaled, *keys] if "obj" in factors else [*keys],
+            **context,
+        )
+        transforms.append(split)
+    return transforms
+
+
+def _noise_transforms(
+    noise: Mapping[str, float] | None, representations: Collection[str]
+) -> tuple[list[Transform], SensorKeys]:
+    """Returns one `SensorNoise`, if a representation reads a noisy sensor, and the keys to read.
+
+    The exact values keep their keys, so that raw flow and a second pass over the same frames start
+    from them. A frame's noise depends only on its name.
+
+    Raises:
+        ValueError: for an unknown option or an invalid value.
+    """
+    given: dict[str, Any] = dict(noise or {})
+    for option in given:
+        if option not in NOISE_OPTIONS:
+            raise ValueError(unknown_name("option of noise:", option, NOISE_OPTIONS))
+    SensorNoise(**given)  # checks all values, used or not
+    readers = {  # raw flow is not measured by a depth camera
+        "depth": {"depth", "depth2", "ego", "obj"},
+        "motion": {"ego", "obj"},
+    }
+    options = {"depth": NOISE_OPTIONS[:2], "motion": NOISE_OPTIONS[2:]}
+    noisy = [
+        sensor
+        for sensor in _NOISY_KEYS
+        if not readers[sensor].isdisjoint(representations) and any(map(given.get, options[sensor]))
+    ]
+    if not noisy:
+        return [], SensorKeys()
+    out_keys = {sensor: _NOISY_KEYS[sensor] for sensor in noisy}
+    transform = SensorNoise(
+        sensors=noisy,
+        **{name: given.get(name, 0.0) for sensor in noisy for name in options[sensor]},
+        frame_key=("sensor", "frame"),
+        out_keys=list(out_keys.values()),
+    )
+    transform.label = " and ".join(name for name in representations if name in readers["depth"])
+    return [transform], SensorKeys()._replace(**out_keys)

@@ -16,7 +16,7 @@ from flowrep.config.representations import EstimatedFlow, ExactFlow, Noise, Repr
 from flowrep.config.training import Evaluation, TrainConfig
 from flowrep.config.viewing import ViewConfig
 from flowrep.config_tree import CONF_DIR, config_groups, group_choices
-from flowrep.transforms.noise_source import NOISE_OPTIONS
+from flowrep.transforms.stack import NOISE_OPTIONS
 from tests.config.composing import plain
 
 OF_TRAINING = [group for group in config_groups() if group != "format"]

@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from flowrep.geometry import closed_form, ego_flow, factorize, rigid_flow, single_pass
+from flowrep.geometry import closed_form, ego_flow, factorize, numba_flow, rigid_flow
+from flowrep.geometry import flow as flow_module
 from tests.geometry.scenes import HEIGHT, MOTION, OTHER_MOTION, WIDTH, K, depth_map, rigid
 
 pytest.importorskip("numba")
@@ -21,14 +22,14 @@ LEAST = float(np.float32(closed_form.SMALLEST))
 
 @pytest.fixture(autouse=True)
 def _no_map_is_small(monkeypatch):
-    monkeypatch.setattr(single_pass, "SMALL", 0)
+    monkeypatch.setattr(flow_module, "SMALL", 0)
 
 
 @pytest.fixture
 def calls(monkeypatch):
     """Lists the arguments of each call of the single pass."""
-    seen, compute = [], single_pass.planes_of_motions
-    monkeypatch.setattr(single_pass, "planes_of_motions", lambda *a: seen.append(a) or compute(*a))
+    seen, compute = [], numba_flow.planes_of_motions
+    monkeypatch.setattr(numba_flow, "planes_of_motions", lambda *a: seen.append(a) or compute(*a))
     return seen
 
 
@@ -54,7 +55,7 @@ def scene(dtype=torch.float32):
 def by_torch(compute, *args, **options):
     """Returns what PyTorch computes without the kernel."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(single_pass, "SMALL", 1 << 30)
+        patch.setattr(flow_module, "SMALL", 1 << 30)
         return compute(*args, **options)
 
 
@@ -151,7 +152,7 @@ def test_other_floats_are_left_to_pytorch(calls, dtype):
 
 def test_small_maps_are_left_to_pytorch(calls, monkeypatch):
     depth, _, Ks, motions = scene()
-    monkeypatch.setattr(single_pass, "SMALL", depth.numel())
+    monkeypatch.setattr(flow_module, "SMALL", depth.numel())
     ego_flow(depth, Ks, motions[:, 0])
     assert not calls
     ego_flow(torch.cat([depth, depth[:1]]), K.float(), motions[0, 0])
@@ -159,7 +160,7 @@ def test_small_maps_are_left_to_pytorch(calls, monkeypatch):
 
 
 def test_without_numba_pytorch_computes(calls, monkeypatch):
-    monkeypatch.setattr(single_pass, "numba_is_installed", lambda: False)
+    monkeypatch.setattr(flow_module, "numba_is_installed", lambda: False)
     depth, _, Ks, motions = scene()
     ego_flow(depth, Ks, motions[:, 0])
     assert not calls
@@ -198,8 +199,8 @@ def test_forward_derivatives_and_vmap_are_pytorch_s(calls):
 def test_a_folder_that_cannot_be_written_is_no_hindrance():
     program = (
         "import numba.core.caching as c; c.CacheImpl._locator_classes = []\n"
-        "import torch; from flowrep.geometry import ego_flow, single_pass\n"
-        "single_pass.SMALL = 0\n"
+        "import torch; from flowrep.geometry import ego_flow, flow\n"
+        "flow.SMALL = 0\n"
         "print(ego_flow(torch.ones(1, 2, 2), torch.eye(3), torch.eye(4)).flow.abs().sum().item())"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

@@ -17,7 +17,7 @@ from flowrep.transforms import (
     SensorNoise,
 )
 from flowrep.transforms.frame_stack import push_frame
-from flowrep.transforms.sensor_noise import drifted_motion, noisy_depth
+from flowrep.transforms.noise import drifted_motion, noisy_depth
 from tests.transforms.fake_env import INTRINSICS
 from tests.transforms.test_base import TRANSFORMS, inputs, moments
 

@@ -1,4 +1,4 @@
-"""flowrep.transforms.configs: a config a transform, with the class's own names and defaults."""
+"""One config per transform, with the class's own names and defaults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl.envs.transforms import Transform
 from flowrep import transforms
 
 hydra = pytest.importorskip("hydra")
-configs = pytest.importorskip("flowrep.transforms.configs", exc_type=ImportError)
+configs = pytest.importorskip("flowrep.transforms.hydra_configs", exc_type=ImportError)
 omegaconf = pytest.importorskip("omegaconf")
 
 from hydra.core.config_store import ConfigStore  # noqa: E402

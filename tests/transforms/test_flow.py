@@ -185,7 +185,7 @@ def test_a_moving_camera_gives_bodies_of_unknown_flow_no_object_flow(make):
     obj = torch.zeros(2, 2, 4)
     obj[0, :, 3] = 7.5
     torch.testing.assert_close(td["obj"], obj)
-    if "valid" in td.keys():
+    if "valid" in td:
         assert td["valid"].tolist() == [[[True, False, False, True]] * 2]
 
 

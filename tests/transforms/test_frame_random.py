@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from flowrep.transforms.frame_random import frame_bits, normal, split_mix, uniform
+from flowrep.transforms.noise import frame_bits, normal, split_mix, uniform
 
 # The first outputs of the generator's reference implementation for seed 1234567.
 REFERENCE = [

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from flowrep.transforms import RAFT, EstimatedFlow, raft
+from flowrep.transforms import RAFT, EstimatedFlow, estimated_flow
 
 
 class KnownNetwork(nn.Module):
@@ -29,7 +29,7 @@ class KnownNetwork(nn.Module):
 @pytest.fixture
 def weights(tmp_path, monkeypatch):
     network = types.SimpleNamespace(raft_small=lambda weights: KnownNetwork())
-    monkeypatch.setattr(raft, "_optical_flow", lambda: network)
+    monkeypatch.setattr(estimated_flow, "_optical_flow", lambda: network)
     path = tmp_path / "weights.pth"
     torch.save({"factor": torch.tensor(1.0)}, path)
     return path

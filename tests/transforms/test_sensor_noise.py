@@ -16,7 +16,7 @@ from torchrl.envs.transforms import Compose
 from flowrep.geometry import check_rigid
 from flowrep.transforms import FlowFactorize, RawFlow, SensorNoise
 from flowrep.transforms.base import MissingKey
-from flowrep.transforms.sensor_noise import drifted_motion, noisy_depth
+from flowrep.transforms.noise import drifted_motion, noisy_depth
 from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
 
 ALL = {

@@ -130,10 +130,10 @@ def test_one_representation_s_options():
 @pytest.mark.parametrize(
     ("representations", "expected"),
     [
-        (["eggo"], r"'eggo', did you mean 'ego'\?.*'depth2'"),
+        (["eggo"], r"'eggo'.*'depth2'"),
         (["lidar"], r"unknown representation 'lidar'\. There are \["),
         (["ego", "obj", "ego"], "'ego' is named 2 times"),
-        ({"depth": {"rangem": 3}}, r"'depth': 'rangem', did you mean 'range_m'\?.*'missing'"),
+        ({"depth": {"rangem": 3}}, r"'depth': 'rangem'.*'missing'"),
         ({"obj": {"k": 3}}, "option of representation 'obj': 'k'"),
         ({"seg": "onehot"}, "options of representation 'seg' are a mapping.*'onehot'"),
         ("ego", r"a list of names, e\.g\. \['ego'\]"),
@@ -146,7 +146,7 @@ def test_mistakes_are_explained(representations, expected):
 
 
 def test_an_unknown_name_has_no_options():
-    with pytest.raises(ValueError, match=r"'dept', did you mean 'depth'\?"):
+    with pytest.raises(ValueError, match=r"'dept'.*'depth'"):
         representation_options("dept")
 
 
@@ -238,7 +238,7 @@ def test_a_second_pass_gives_the_same():
 @pytest.mark.parametrize(
     ("noise", "expected"),
     [
-        ({"depth_sigma": 0.1}, "unknown option of noise: 'depth_sigma', did you mean 'depth_si"),
+        ({"depth_sigma": 0.1}, "unknown option of noise: 'depth_sigma'.*'depth_sigma_per_m'"),
         ({"flow_sigma_px": 0.1}, "unknown option of noise: 'flow_sigma_px'"),
         ({"drift_m": -0.1}, "drift_m must be a finite number of at least 0, got -0.1"),
     ],

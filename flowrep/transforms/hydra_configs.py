@@ -25,16 +25,15 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from flowrep.extras import require
-
-require("flowrep.transforms.configs", "train", "hydra")
-
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from flowrep import transforms
+from flowrep.extras import require
 from flowrep.transforms.base import as_keys
+
+require("flowrep.transforms.hydra_configs", "train", "hydra")
 
 
 def config_class(

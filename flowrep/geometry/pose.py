@@ -1,11 +1,28 @@
-"""Rigid 4x4 transforms, named `<to>_from_<from>` so that neighbours in a product cancel."""
+"""Poses of cameras and bodies, and the motions between them, as rigid 4x4 matrices.
+
+A matrix is named `<to>_from_<from>`, so that neighbours in a product cancel.
+"""
 
 from __future__ import annotations
+
+from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor
 
-from flowrep.geometry.checks import broadcast_batch, check_shape
+from flowrep.geometry.checks import broadcast_batch, check_is_tensor, check_name, check_shape
+
+PoseLayout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz"]
+PoseDirection: TypeAlias = Literal["camera_to_world", "world_to_camera"]
+CameraAxes: TypeAlias = Literal["opencv", "opengl", "ned", "x_forward_z_up"]
+
+# The columns are OpenCV's right, down and forward, expressed in the other convention.
+_GIVEN_FROM_OPENCV: dict[str, list[list[float]]] = {
+    "opencv": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "opengl": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],  # x right, y up, z backward
+    "ned": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],  # x forward, y right, z down
+    "x_forward_z_up": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],  # x forward, y left, z up
+}
 
 
 def invert_rigid(a_from_b: Tensor) -> Tensor:
@@ -122,6 +139,41 @@ def instance_motion(
     return torch.cat([camera.expand(*bodies.shape[:-3], 1, 4, 4), bodies], -3)
 
 
+def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
+    """Returns each pixel's row of `instance_motion`, in the shape of `ids`.
+
+    Convention: id `body_ids[i]` becomes 1 + i; any other id, also a negative one, becomes 0, the
+    static world.
+
+    Args:
+        ids: integers of any shape, as the simulator renders them.
+        body_ids: `[N]`, integers, in the order of the bodies' poses.
+
+    Raises:
+        ValueError: `body_ids` is not `[N]`.
+        TypeError: not integers.
+
+    >>> ids = torch.tensor([[[0, 17, 3, -1, 18]]])
+    >>> instance_rows(ids, torch.tensor([17, 3]))
+    tensor([[[0, 1, 2, 0, 0]]], dtype=torch.uint8)
+    """
+    for name, value in {"ids": ids, "body_ids": body_ids}.items():
+        check_is_tensor(name, value)
+        if value.is_floating_point() or value.is_complex() or value.dtype is torch.bool:
+            raise TypeError(f"{name} must hold integer ids, got {value.dtype}")
+    if body_ids.ndim != 1:
+        raise ValueError(f"body_ids must be [N], got {list(body_ids.shape)}")
+    count = len(body_ids)
+    dtype = torch.uint8 if count < 256 else torch.int32
+    if count == 0:
+        return torch.zeros_like(ids, dtype=dtype)
+    # Sorted and searched instead of tabulated, as ids may be as large as a packed colour.
+    ascending, order = body_ids.long().sort()
+    ids = ids.long()
+    nearest = torch.searchsorted(ascending, ids.contiguous()).clamp(max=count - 1)
+    return torch.where(ascending[nearest] == ids, order[nearest] + 1, 0).to(dtype)
+
+
 def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None:
     """Checks that every transform is a rotation and a translation.
 
@@ -191,3 +243,106 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
     a_from_b = a_from_b.to(dtype).reshape(*a_from_b.shape[:-2], *[1] * point_dims, 4, 4)
     rotated = (a_from_b[..., :3, :3] @ points_b.to(dtype).unsqueeze(-1)).squeeze(-1)
     return rotated + a_from_b[..., :3, 3]
+
+
+def adapt_pose(
+    pose: Tensor,
+    *,
+    layout: PoseLayout = "matrix",
+    direction: PoseDirection = "camera_to_world",
+    axes: CameraAxes = "opencv",
+    check: bool = True,
+) -> Tensor:
+    """Returns `world_from_cam` `[*B, 4, 4]`, float64, of a camera with OpenCV's axes.
+
+    Convention: `axes` are the directions of the camera's own axes: `"opencv"` x right, y down,
+    z forward; `"opengl"` (also Blender) x right, y up, z backward; `"ned"` x forward, y right,
+    z down; `"x_forward_z_up"` x forward, y left, z up. The world's axes are left unchanged, as they
+    cancel in every relative motion.
+
+    Args:
+        pose: `[*B, 4, 4]`, or `[*B, 7]`: translation, then the unit quaternion.
+        layout: `"matrix"`, `"xyz_xyzw"` (real part of the quaternion last) or `"xyz_wxyz"`
+            (real part first).
+        direction: `"camera_to_world"` maps points in the camera's frame to the world's;
+            `"world_to_camera"` (extrinsics) is the inverse.
+        axes: the camera's.
+        check: whether an ill-formed pose raises ValueError. The check waits for a GPU.
+
+    Raises:
+        ValueError: an unknown name, a shape that does not fit, a pose that is not rigid.
+        TypeError: no float tensor.
+
+    >>> pose = torch.tensor([5.0, 6.0, 7.0, 0.0, 0.0, 0.0, 1.0])
+    >>> world_from_cam = adapt_pose(pose, layout="xyz_xyzw", axes="x_forward_z_up")
+    >>> world_from_cam @ torch.tensor([0.0, 0.0, 1.0, 1.0]).double()  # a metre ahead: along x
+    tensor([6., 6., 7., 1.], dtype=torch.float64)
+    """
+    check_name("layout", layout, PoseLayout)
+    check_name("direction", direction, PoseDirection)
+    check_name("axes", axes, CameraAxes)
+    if layout == "matrix":
+        check_shape("pose", pose, (4, 4))
+        matrix = pose.double()
+    else:
+        matrix = pose_from_quaternion(pose, layout, check=check)
+    if check:
+        check_rigid("pose", matrix)
+    if direction == "world_to_camera":
+        matrix = invert_rigid(matrix)
+    rotation, rest = matrix[..., :3], matrix[..., 3:]
+    # Each column is a given one or its opposite. They are picked, as a product would round and
+    # constants created here would be copied to a GPU in every call.
+    return torch.cat([*_columns(rotation, axes), rest], -1)
+
+
+def _columns(rotation: Tensor, axes: CameraAxes) -> list[Tensor]:
+    """Returns the columns of `world_from_given @ given_from_opencv`."""
+    columns = []
+    for opencv_axis in range(3):
+        signs = [row[opencv_axis] for row in _GIVEN_FROM_OPENCV[axes]]
+        given_axis = next(i for i, sign in enumerate(signs) if sign)
+        column = rotation[..., given_axis : given_axis + 1]
+        columns.append(column if signs[given_axis] > 0 else -column)
+    return columns
+
+
+def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True) -> Tensor:
+    """Returns the 4x4 matrix `[*B, 4, 4]`, float64, of a translation and a unit quaternion.
+
+    Args:
+        pose: `[*B, 7]`, x, y, z, then the quaternion.
+        layout: `"xyz_xyzw"` or `"xyz_wxyz"`.
+        check: whether a quaternion whose length is not 1 raises ValueError. Rounding errors are
+            normalised away in either case.
+
+    Raises:
+        ValueError: not `[*B, 7]`, or a quaternion that is not of unit length.
+        TypeError: no float tensor.
+
+    >>> half_turn_about_z = torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0])
+    >>> pose_from_quaternion(half_turn_about_z, "xyz_xyzw")[0]
+    tensor([-1.,  0.,  0.,  1.], dtype=torch.float64)
+    """
+    check_shape("pose", pose, (7,))
+    translation, quaternion = pose.double().split([3, 4], -1)
+    norm = quaternion.norm(dim=-1, keepdim=True)
+    if check and not bool(((norm - 1.0).abs() < 1e-3).all()):
+        raise ValueError(
+            f"pose: a quaternion must have length 1, got {norm.flatten().tolist()[:8]}; "
+            f"layout {layout!r} reads x, y, z and then the quaternion"
+        )
+    quaternion = quaternion / norm
+    if layout == "xyz_wxyz":
+        w, x, y, z = quaternion.unbind(-1)
+    else:
+        x, y, z, w = quaternion.unbind(-1)
+    tx, ty, tz = translation.unbind(-1)
+    zero, one = torch.zeros_like(w), torch.ones_like(w)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), ty),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), tz),
+        *(zero, zero, zero, one),
+    ]
+    return torch.stack(rows, -1).unflatten(-1, (4, 4))

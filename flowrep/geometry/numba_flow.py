@@ -1,0 +1,165 @@
+"""Flow of large maps on a CPU in a single pass over the pixels; importing this needs numba.
+
+PyTorch needs some twenty passes for `closed_form.flow_planes`, each through memory. Here numba's
+machine code does the same operations in the same order, each rounded to float32, so that the
+results are bitwise equal. `flow` decides which maps are computed here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flowrep.geometry.checks import check_rows
+from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, Planes, largest_raw
+from flowrep.jit import compiled
+
+_LEAST_DEPTH, _LEAST_RATIO = np.float32(SMALLEST), np.float32(MIN_DEPTH_RATIO)
+_LARGEST_RAW = np.float32(largest_raw(torch.float32))
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+
+# "numpy": a division by 0 is inf, as in PyTorch, and leaves no branch in the loop
+_compiled = compiled(error_model="numpy")
+
+
+def planes_of_motions(
+    depth: Tensor,
+    instance: Tensor | None,
+    coefficients: Tensor,
+    x: Tensor,
+    y: Tensor,
+    dt: float | Tensor,
+) -> Planes:
+    """Returns the flow planes of N motions per map.
+
+    Args:
+        depth: `[*B, H, W]`, float32, like all other floats.
+        instance: `[*B, H, W]`, integers, the motion of each pixel; None if all have motion 0.
+        coefficients: A and e of each motion, `[*B, N, 12]`.
+        x: pixel centres relative to the principal point, `[*B, 1, W]`.
+        y: the same, `[*B, H, 1]`.
+        dt: time between the frames, a number or `[*B]`.
+
+    Raises:
+        RuntimeError: an id without a motion.
+    """
+    *batch, height, width = depth.shape
+    maps, motions = math.prod(batch), coefficients.shape[-2]
+
+    def array(tensor: Tensor, *sizes: int) -> Any:
+        rows = tensor.detach().expand((*batch, *sizes)).reshape((maps, *sizes))
+        return rows.contiguous().numpy()
+
+    if instance is None:
+        ids = torch.empty(0, height, width, dtype=torch.uint8).numpy()
+    else:
+        ids = array(instance if instance.dtype is torch.uint8 else instance.long(), height, width)
+    u, v = torch.empty(2, maps, height, width).unbind()
+    valid = torch.empty(maps, height, width, dtype=torch.bool)
+    lowest, highest = _fill(
+        array(depth, height, width),
+        ids,
+        array(coefficients, motions, 12),
+        array(x.squeeze(-2), width),
+        array(y.squeeze(-1), height),
+        array(torch.as_tensor(dt, dtype=torch.float32)),
+        u.numpy(),
+        v.numpy(),
+        valid.numpy(),
+    )
+    check_rows(lowest, highest, motions)
+    return u.view(depth.shape), v.view(depth.shape), valid.view(depth.shape)
+
+
+def object_flow(raw: Tensor, u: Tensor, v: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns raw − ego, 0 where it isn't known, `[*B, 2, H, W]`, and where it is, `[*B, H, W]`.
+
+    Args:
+        raw: `[*B, 2, H, W]`, float32.
+        u: ego flow to the right, `[*B, H, W]`, float32.
+        v: ego flow downwards, likewise.
+        valid: where ego flow is known, bool `[*B, H, W]`.
+    """
+    *batch, height, width = valid.shape
+    maps = math.prod(batch)
+    obj = torch.empty(maps, 2, height, width)
+    known = torch.empty(maps, height, width, dtype=torch.bool)
+    _subtract(
+        raw.detach().reshape(maps, 2, height, width).contiguous().numpy(),
+        *(plane.reshape(known.shape).numpy() for plane in (u, v, valid)),
+        obj.numpy(),
+        known.numpy(),
+    )
+    return obj.view(*batch, 2, height, width), known.view(valid.shape)
+
+
+@_compiled
+def _flow(z, x, y, far, near, dt):
+    """Returns u, v and valid of a pixel; q is `far` at infinity."""
+    inverse_depth = _ONE / z
+    qx = far[0] + near[0] * inverse_depth
+    qy = far[1] + near[1] * inverse_depth
+    qz = far[2] + near[2] * inverse_depth
+    z_ratio = _ONE + qz
+    valid = (z >= _LEAST_DEPTH) & (z_ratio > _LEAST_RATIO)
+    per_z = _ONE / z_ratio / dt
+    u, v = (x * qz - qx) * per_z, (y * qz - qy) * per_z
+    return u if valid else _ZERO, v if valid else _ZERO, valid
+
+
+@_compiled
+def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
+    """Fills u, v and valid; returns the lowest and the highest id."""
+    lowest, highest = np.int64(0), np.int64(0)
+    maps, height, width = depth.shape
+    motions = coefficients.shape[1]
+    for n in range(maps):
+        c = coefficients[n, 0]
+        near = (c[9], c[10], c[11])
+        for i in range(height):
+            y = ys[n, i]
+            row = (c[1] * y + c[2], c[4] * y + c[5], c[7] * y + c[8])
+            for j in range(width):
+                x = xs[n, j]
+                far = (c[0] * x + row[0], c[3] * x + row[1], c[6] * x + row[2])
+                u[n, i, j], v[n, i, j], valid[n, i, j] = _flow(
+                    depth[n, i, j], x, y, far, near, dts[n]
+                )
+    # Apart from the loop above, which has no branches and so computes many pixels at once.
+    for n in range(len(ids)):
+        for i in range(height):
+            y = ys[n, i]
+            for j in range(width):
+                number = np.int64(ids[n, i, j])
+                if number == 0:
+                    continue
+                lowest, highest = min(lowest, number), max(highest, number)
+                if number < 0 or number >= motions:
+                    continue
+                x, c = xs[n, j], coefficients[n, number]
+                far = (
+                    c[0] * x + (c[1] * y + c[2]),
+                    c[3] * x + (c[4] * y + c[5]),
+                    c[6] * x + (c[7] * y + c[8]),
+                )
+                u[n, i, j], v[n, i, j], valid[n, i, j] = _flow(
+                    depth[n, i, j], x, y, far, (c[9], c[10], c[11]), dts[n]
+                )
+    return lowest, highest
+
+
+@_compiled
+def _subtract(raw, u, v, valid, obj, known):
+    """Fills obj and known."""
+    for n in range(len(raw)):
+        for i in range(raw.shape[2]):
+            for j in range(raw.shape[3]):
+                raw_u, raw_v = raw[n, 0, i, j], raw[n, 1, i, j]
+                is_known = valid[n, i, j] & (abs(raw_u) + abs(raw_v) < _LARGEST_RAW)
+                known[n, i, j] = is_known
+                obj[n, 0, i, j] = raw_u - u[n, i, j] if is_known else _ZERO
+                obj[n, 1, i, j] = raw_v - v[n, i, j] if is_known else _ZERO

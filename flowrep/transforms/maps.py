@@ -1,0 +1,250 @@
+"""One map a sensor: picture, segmentation, depth, and the rows of bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, TensorSpec
+
+from flowrep import geometry
+from flowrep.transforms.base import DEPTH, IDS, RGB, Keys, MapTransform, check_own_keys
+
+ENCODINGS = ("ids", "onehot")
+
+
+class Rgb(MapTransform):
+    """The camera's colour picture, unchanged.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "rgb")` | `"rgb"` | uint8 `[*B, 3, H, W]` | 0 … 255 | |
+
+    It stays uint8, which takes a quarter of the memory of float32 in a replay buffer. A network can
+    read the divisor from the spec's bounds.
+
+    Args:
+        in_keys: key of the picture.
+        out_keys: key of the representation.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> picture = torch.full((3, 2, 4), 7, dtype=torch.uint8)
+        >>> Rgb()(TensorDict({"sensor": {"rgb": picture}}))["rgb"].shape
+        torch.Size([3, 2, 4])
+    """
+
+    def __init__(
+        self,
+        *,
+        in_keys: Keys = ("sensor", "rgb"),
+        out_keys: Keys = "rgb",
+    ) -> None:
+        super().__init__([RGB], in_keys, out_keys)
+
+    def compute(self, rgb: Tensor) -> tuple[Tensor]:
+        """Returns the picture in uint8."""
+        return (rgb.to(torch.uint8),)
+
+    def output_specs(self, rgb: TensorSpec) -> tuple[TensorSpec]:
+        """Returns a spec bounded to 0 … 255."""
+        return (Bounded(0, 255, shape=rgb.shape, device=rgb.device, dtype=torch.uint8),)
+
+
+class Segmentation(MapTransform):
+    """Class of every pixel: the paper's semantic segmentation.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "semantic")` | `"seg"`, ids | uint8 `[*B, 1, H, W]` | 0 … n − 1 | class |
+    | | `"seg"`, onehot | float32 `[*B, n, H, W]` | 0 or 1 | |
+
+    In a replay buffer, ids take an eighth of the memory of a one-hot float map of two classes.
+    Their spec is a `Categorical` with n, so a network can expand them. An id outside 0 … n − 1 is a
+    pixel without a class, all zeros in the one-hot encoding.
+
+    In each call, ids of a wider or signed type are checked before conversion to uint8, which waits
+    for a GPU. Pass uint8 to avoid that.
+
+    Args:
+        num_classes: number n of classes, 1 to 256.
+        encoding: `"ids"` or `"onehot"`.
+        in_keys: key of the ids.
+        out_keys: key of the representation.
+
+    Raises:
+        ValueError: for an unknown encoding or a number of classes that uint8 can't hold, and in
+            each call for ids that it can't hold.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> sensor = {"semantic": torch.tensor([[[0, 2, 1]]], dtype=torch.uint8)}
+        >>> td = TensorDict({"sensor": sensor})
+        >>> Segmentation(num_classes=3, encoding="onehot")(td)["seg"][:, 0]
+        tensor([[1., 0., 0.],
+                [0., 0., 1.],
+                [0., 1., 0.]])
+    """
+
+    def __init__(
+        self,
+        num_classes: int,
+        *,
+        encoding: str = "ids",
+        in_keys: Keys = ("sensor", "semantic"),
+        out_keys: Keys = "seg",
+    ) -> None:
+        super().__init__([IDS], in_keys, out_keys)
+        if encoding not in ENCODINGS:
+            raise ValueError(f"encoding must be one of {list(ENCODINGS)}, got {encoding!r}")
+        if not 1 <= num_classes <= 256:
+            raise ValueError(f"num_classes must be 1 to 256 (ids are uint8), got {num_classes}")
+        self.num_classes = int(num_classes)
+        self.encoding = encoding
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        ids = next_tensordict.get(self.in_keys[0], None)
+        if self.encoding == "ids" and ids is not None:
+            self._check_layout([ids], next_tensordict.batch_size)
+            _check_fits_uint8(self.in_keys[0], ids)
+        return super()._call(next_tensordict)
+
+    def compute(self, ids: Tensor) -> tuple[Tensor]:
+        """Returns the classes in the chosen encoding."""
+        if self.encoding == "ids":
+            return (ids.to(torch.uint8),)
+        classes = torch.arange(self.num_classes, device=ids.device)[:, None, None]
+        return ((ids == classes).float(),)  # [*B, n, H, W]
+
+    def output_specs(self, ids: TensorSpec) -> tuple[TensorSpec]:
+        """Returns a categorical spec for ids, a bounded one for one-hot maps."""
+        if self.encoding == "ids":
+            spec = Categorical(
+                self.num_classes, shape=ids.shape, device=ids.device, dtype=torch.uint8
+            )
+            return (spec,)
+        shape = (*ids.shape[:-3], self.num_classes, *ids.shape[-2:])
+        return (Bounded(0.0, 1.0, shape=shape, device=ids.device, dtype=torch.float32),)
+
+
+def _check_fits_uint8(key: object, ids: Tensor) -> None:
+    """Raises ValueError for ids that wrap in uint8, where 300 would become 44."""
+    if ids.dtype is torch.uint8 or not ids.numel():
+        return
+    least, most = (int(bound) for bound in ids.aminmax())
+    if least < 0 or most > 255:
+        raise ValueError(
+            f"{key!r} holds class ids from {least} to {most}, but uint8 only ids "
+            "from 0 to 255; give pixels without a class an id in that range, e.g. "
+            "ids.where((ids >= 0) & (ids < num_classes), 255), or use encoding='onehot'"
+        )
+
+
+class Depth(MapTransform):
+    """Depth along the optical axis divided by `range_m`, clipped to [0, 1].
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "depth")`, m | `"depth"` | float32 `[*B, 1, H, W]` | 0 … 1 | `range_m` |
+
+    Sky (`inf`) and everything beyond `range_m` becomes 1, a hole (`nan`) becomes `missing`.
+
+    Args:
+        range_m: depth in metres that becomes 1.
+        missing: value for `nan`, in [0, 1].
+        in_keys: key of metric depth.
+        out_keys: key of the representation.
+
+    Raises:
+        ValueError: for a range that is not positive and finite, or `missing` outside [0, 1].
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> depth = torch.tensor([[[25.0, 400.0, torch.inf, torch.nan]]])
+        >>> Depth(range_m=100.0)(TensorDict({"sensor": {"depth": depth}}))["depth"]
+        tensor([[[0.2500, 1.0000, 1.0000, 0.0000]]])
+    """
+
+    def __init__(
+        self,
+        *,
+        range_m: float = 100.0,
+        missing: float = 0.0,
+        in_keys: Keys = ("sensor", "depth"),
+        out_keys: Keys = "depth",
+    ) -> None:
+        super().__init__([DEPTH], in_keys, out_keys)
+        if not 0 < range_m < math.inf:
+            raise ValueError(f"range_m must be a positive number of metres, got {range_m}")
+        if not 0 <= missing <= 1:
+            raise ValueError(f"missing must be in [0, 1], the value for nan, got {missing}")
+        self.range_m = float(range_m)
+        self.missing = float(missing)
+
+    def compute(self, depth: Tensor) -> tuple[Tensor]:
+        """Returns depth / range_m in [0, 1]."""
+        near = (depth / self.range_m).clamp(0.0, 1.0)  # inf becomes 1, nan stays
+        return (torch.where(near.isnan(), self.missing, near).float(),)
+
+    def output_specs(self, depth: TensorSpec) -> tuple[TensorSpec]:
+        """Returns a spec bounded to [0, 1]."""
+        spec = Bounded(0.0, 1.0, shape=depth.shape, device=depth.device, dtype=torch.float32)
+        return (spec,)
+
+
+class InstanceIds(MapTransform):
+    """Converts a simulator's segmentation ids to rows of `instance_motion`.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | ids | `("sensor", "instance")` | uint8 `[*B, 1, H, W]` (int32 from 256 bodies) | 0 … N | row |
+
+    Args:
+        body_ids: the ids of the bodies, in the order of their poses: the first becomes 1. Every
+            other id, also a negative one, becomes 0, the static world.
+        in_keys: key of the env's ids.
+        out_keys: key of the rows; must differ, so that nothing is adapted twice.
+
+    Raises:
+        ValueError: for a repeated id.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> rows = InstanceIds([17, 3], in_keys="segmentation")
+        >>> td = rows(TensorDict(segmentation=torch.tensor([[[0, 3, 17, -1]]])))
+        >>> td["sensor", "instance"]
+        tensor([[[0, 2, 1, 0]]], dtype=torch.uint8)
+    """
+
+    body_ids: Tensor
+
+    def __init__(
+        self,
+        body_ids: Sequence[int],
+        *,
+        in_keys: Keys = "segmentation",
+        out_keys: Keys = ("sensor", "instance"),
+    ) -> None:
+        super().__init__([IDS], in_keys, out_keys)
+        check_own_keys(self)
+        if len(set(body_ids)) != len(body_ids):
+            raise ValueError(f"body_ids must name each body once, got {list(body_ids)}")
+        ids = torch.tensor(list(body_ids), dtype=torch.long)
+        self.register_buffer("body_ids", ids, persistent=False)
+
+    def compute(self, ids: Tensor) -> tuple[Tensor]:
+        """Returns each pixel's row."""
+        return (geometry.instance_rows(ids, self.body_ids),)
+
+    def output_specs(self, ids: TensorSpec) -> tuple[TensorSpec]:
+        """Returns a categorical spec of 1 + N rows."""
+        rows = 1 + len(self.body_ids)
+        dtype = torch.uint8 if rows <= 256 else torch.int32
+        return (Categorical(rows, shape=ids.shape, device=ids.device, dtype=dtype),)
