@@ -4,7 +4,6 @@ Pydantic has checked each value for itself by then.
 """
 
 import dataclasses
-import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import combinations
@@ -15,7 +14,7 @@ from shapely.geometry import Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from flowrep.palette import CATEGORY_ID
-from flowrep.scenes.layout import Box, Layout, centrelines, free_ground
+from flowrep.scenes.layout import Box, Layout, free_ground
 from flowrep.scenes.pedestrians import (
     APART_M,
     PARTS,
@@ -29,7 +28,6 @@ from flowrep.scenes.pedestrians import (
 from flowrep.scenes.scene import (
     CATEGORY_OF_KIND,
     LEAST_HEIGHT_M,
-    MOST_METRES,
     BuildingRow,
     Obstacle,
     ObstacleRow,
@@ -46,6 +44,7 @@ _KEYS_OF_WALK = {
     "points": ("points_m",),
 }
 _MORE_KEYS_OF_WALK = {"along": ("offset_m",)}
+_LEAST_END_M = 1.0  # of an ending zone; the vehicle's place is checked at least every 0.42 m
 
 
 def check_consistency(scene: Scene, source: str) -> None:
@@ -177,79 +176,37 @@ def _known(source: str, key: str, names: Iterable[str], known: Iterable[str]) ->
             raise SceneError(source, key, f"unknown name {name!r}", f"choose from {known}")
 
 
-_MOST_PIECES = 300
-_MOST_GROUND_M2 = 1e6
-_MOST_BOXES = 1_000
-_LEAST_END_M = 1.0  # of an ending zone; the vehicle's place is checked at least every 0.42 m
-_BEYOND_M = 100.0  # how far rows may extend beyond either end of a road
+def check_places(layout: Layout, source: str) -> None:
+    """Checks that zones, closures, crosswalks and walks are on their roads, none without length.
 
-
-def check_extent(scene: Scene, source: str) -> None:
-    """Checks that a scene is small enough to lay out, and that its parts lie on its roads.
+    Rows may extend beyond their road.
 
     Raises:
         SceneError: names the key and the remedy.
     """
-    pieces = sum(len(road.pieces) for road in scene.roads)
-    if pieces > _MOST_PIECES:
-        problem = f"have {pieces} pieces together"
-        raise SceneError(source, "roads", problem, f"keep to {_MOST_PIECES}")
-    lines = centrelines(scene)
-    lengths = {name: line.length for name, line in lines.items()}
-    if sum(lengths.values()) > MOST_METRES:
-        problem = f"are {sum(lengths.values()):.0f} m long together"
-        raise SceneError(source, "roads", problem, f"keep to {MOST_METRES:.0f} m")
-    x0, y0, x1, y1 = shapely.total_bounds(list(lines.values()))
-    width, height = x1 - x0, y1 - y0
-    if max(width, 100.0) * max(height, 100.0) > _MOST_GROUND_M2:
-        problem = f"cover {width:.0f} m by {height:.0f} m"
-        remedy = f"keep to {_MOST_GROUND_M2 / 1e6:.0f} square kilometre"
-        raise SceneError(source, "roads", problem, remedy)
-    for key, road, stretch, beyond_m in _stretches(scene):
-        low, high = 0.0 - beyond_m, lengths[road] + beyond_m
-        if not all(low <= at <= high + 1e-6 for at in stretch):
-            there = " to ".join(f"{at:g}" for at in stretch)
-            remedy = f"stay within {low:g} and {high:.1f}"
-            raise SceneError(source, key, f"{there} m is not on road {road!r}", remedy)
-        if beyond_m == 0.0 and len(stretch) == 2 and stretch[0] == stretch[1]:
+    for key, road, places in _places(layout.scene):
+        length = layout.lines[road].length
+        if not all(0.0 <= at <= length + 1e-6 for at in places):
+            there = " to ".join(f"{at:g}" for at in places)
+            problem = f"{there} m is not on road {road!r}"
+            raise SceneError(source, key, problem, f"stay within 0 and {length:.1f}")
+        if len(places) == 2 and places[0] == places[1]:
             raise SceneError(source, key, "has no length", "give from_m and to_m that differ")
-    _check_numbers_of_boxes(scene, source)
 
 
-def _stretches(scene: Scene) -> Iterator[tuple[str, str, tuple[float, ...], float]]:
-    """Yields key, road, distances along the road, and their allowed overhang at its ends."""
+def _places(scene: Scene) -> Iterator[tuple[str, str, tuple[float, ...]]]:
+    """Yields key, road, and distances along the road."""
     for zone in scene.zones:
-        yield f"zones.{zone.name}", zone.road, (zone.from_m, zone.to_m), 0.0
+        yield f"zones.{zone.name}", zone.road, (zone.from_m, zone.to_m)
     for closure in scene.closures:
-        yield f"closures.{closure.name}.at_m", closure.road, (closure.at_m,), 0.0
+        yield f"closures.{closure.name}.at_m", closure.road, (closure.at_m,)
     for i, crosswalk in enumerate(scene.crosswalks):
-        yield f"crosswalks[{i}].at_m", crosswalk.road, (crosswalk.at_m,), 0.0
+        yield f"crosswalks[{i}].at_m", crosswalk.road, (crosswalk.at_m,)
     for group in scene.pedestrian_groups:
         walk, key = group.walk, f"pedestrian_groups.{group.name}.walk"
-        if walk.kind == "across" and walk.road is not None and walk.at_m is not None:
-            yield f"{key}.at_m", walk.road, (walk.at_m,), 0.0
-        if walk.kind == "along" and walk.road is not None:
-            yield (
-                key,
-                walk.road,
-                tuple(at for at in (walk.from_m, walk.to_m) if at is not None),
-                0.0,
-            )
-    for name in ("building_rows", "obstacle_rows"):
-        for i, row in enumerate(getattr(scene, name)):
-            yield f"{name}[{i}]", row.road, (row.from_m, row.to_m), _BEYOND_M
-
-
-def _check_numbers_of_boxes(scene: Scene, source: str) -> None:
-    for key, each in (("building_rows", "front_m"), ("obstacle_rows", "every_m")):
-        most = 0.0
-        for row in getattr(scene, key):
-            apart = row.front_m[0] if key == "building_rows" else row.every_m
-            most += max(0.0, (row.to_m - row.from_m) / apart)
-        if most > _MOST_BOXES:
-            problem = f"could be {math.ceil(most)} together"
-            remedy = f"keep to {_MOST_BOXES}: shorten the rows, or give a larger {each}"
-            raise SceneError(source, key, problem, remedy)
+        if walk.road is not None:
+            given = (walk.at_m, walk.from_m, walk.to_m)
+            yield key, walk.road, tuple(at for at in given if at is not None)
 
 
 def check_paths(layout: Layout, source: str) -> None:

@@ -1,4 +1,4 @@
-"""Throws odd inputs at flowrep: python -m tests.fuzz --parts scenes --mutations 10000.
+"""Throws odd inputs at flowrep: python -m tests.fuzz --parts recordings --mutations 10000.
 
 `--only NUMBER` shows and runs one input again.
 """

@@ -1,11 +1,26 @@
 """Walks against a timetable worked by hand."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flowrep.scenes.pedestrians import Crowd
+from flowrep.scenes import load_scene, scene_names
+from flowrep.scenes.layout import Layout
+from flowrep.scenes.pedestrians import (
+    PARTS,
+    Crowd,
+    draw_crowd,
+    draw_lanes,
+    keeps_its_stretches,
+    keeps_lanes_apart,
+    place_parts,
+    world_from_parts,
+)
+from flowrep.scenes.scene import PedestrianGroup, Walk
+from flowrep.simulator.meshes import person_meshes
 
 # A walks 10 m along x at 1 m/s; B a corner of 4 m along y and 3 m along x at 2 m/s; C stands.
 LINES = [
@@ -91,3 +106,141 @@ def test_legs_swing_with_the_distance_walked(crowd):
     # B is 2.4 rad ahead of A and twice as fast; C stands with one foot before the other.
     assert swing(0.35, 1) == pytest.approx(0.38 * math.sin(math.pi + 2.4))
     assert swing(3.21, 2) == swing(0.0, 2) == pytest.approx(0.38)
+
+
+# At (5, 2), looking along +y: its left is -x. The left leg swings back by 30°.
+POSE = np.array([[5.0, 2.0, math.pi / 2, math.radians(30.0)]])
+HIP_M, LEG_M = 0.82, 0.82
+
+
+def test_hips_are_to_the_left_and_right_of_where_one_looks():
+    _, left, right = world_from_parts(POSE)
+    np.testing.assert_allclose(left[:3, 3], [4.9, 2.0, HIP_M], atol=1e-12)
+    np.testing.assert_allclose(right[:3, 3], [5.1, 2.0, HIP_M], atol=1e-12)
+
+
+def test_a_leg_swings_back_while_the_other_swings_forward():
+    _, left, right = world_from_parts(POSE)
+    foot = np.array([0.0, 0.0, -LEG_M, 1.0])
+    # sin 30° = 0.5: the foot is 0.41 m behind or before the hip and at 0.82·(1 - cos 30°) m.
+    height = HIP_M - LEG_M * math.cos(math.radians(30.0))
+    np.testing.assert_allclose((left @ foot)[:3], [4.9, 2.0 - 0.41, height], atol=1e-12)
+    np.testing.assert_allclose((right @ foot)[:3], [5.1, 2.0 + 0.41, height], atol=1e-12)
+
+
+def test_the_upper_body_turns_with_the_person_alone():
+    body, _, _ = world_from_parts(POSE)
+    np.testing.assert_allclose(body @ [1.0, 0.0, 1.2, 1.0], [5.0, 3.0, 1.2, 1.0], atol=1e-12)
+
+
+def test_quaternions_are_the_matrices():
+    poses = np.array([*POSE, [1.0, -3.0, -2.0, -0.3]])
+    transforms = world_from_parts(poses)
+    parts = place_parts(poses)
+    np.testing.assert_allclose(parts.positions.reshape(-1, 3), transforms[:, :3, 3], atol=1e-12)
+    for (x, y, z, w), transform in zip(parts.quaternions_xyzw.reshape(-1, 4), transforms):
+        # Of a unit quaternion's matrix, the columns for x and z.
+        first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+        third = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+        np.testing.assert_allclose(transform[:3, 0], first, atol=1e-12)
+        np.testing.assert_allclose(transform[:3, 2], third, atol=1e-12)
+
+
+@pytest.mark.parametrize("swing", [0.0, 0.38, -0.38])
+def test_nobody_sinks_into_the_ground_or_outgrows_the_cylinder(swing):
+    poses = np.array([[0.0, 0.0, 0.0, swing]])
+    points = np.concatenate(
+        [
+            np.column_stack([mesh.vertices, np.ones(len(mesh.vertices))]) @ transform.T
+            for mesh, transform in zip(person_meshes(0), world_from_parts(poses), strict=True)
+        ]
+    )
+    assert len(PARTS) == 3
+    assert points[:, 2].min() > -0.05
+    assert points[:, 2].max() == pytest.approx(1.75)
+    assert np.abs(points[:, 1]).max() < 0.35
+
+
+def test_one_is_wide_enough_to_be_seen_from_the_side():
+    body, *_ = person_meshes(3)
+    assert np.ptp(np.array(body.vertices)[:, 0]) == pytest.approx(0.6)
+
+
+CROSSROADS = Path(__file__).parent / "crossroads.yaml"
+CORNER = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 3.0)])
+
+
+def test_a_stretch_is_lost_where_a_line_is_moved_further_inwards_than_it_is_long():
+    # A right angle takes a metre of either stretch for each metre to the left; the second has 3.
+    assert keeps_its_stretches(CORNER, 2.9)
+    assert not keeps_its_stretches(CORNER, 3.1)
+    assert keeps_its_stretches(CORNER, -9.0)
+
+
+def test_lanes_are_refused_where_a_walk_comes_back_beside_itself():
+    hairpin = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 2.0), (0.0, 2.0)])
+    # The two ways are 2 m apart: room for 0.3 m beside the outermost of lanes 1.3 m wide together.
+    assert keeps_lanes_apart(hairpin, 1.3)
+    assert not keeps_lanes_apart(hairpin, 1.5)
+    crossing = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 6.0), (5.0, 6.0), (5.0, -6.0)])
+    assert not keeps_lanes_apart(crossing, 0.7)
+
+
+def test_lanes_are_drawn_evenly_from_all_that_are_wide_enough():
+    rng = np.random.default_rng(0)
+    draws = np.array([draw_lanes(2, 1.61, rng) for _ in range(4000)])
+    gaps = np.abs(draws[:, 0] - draws[:, 1])
+    assert gaps.min() >= 0.61 - 1e-12
+    assert np.abs(draws).max() <= 1.61 / 2
+    # One metre is free: of two even draws from it, a quarter are more than half of it apart.
+    assert (gaps > 1.11).mean() == pytest.approx(0.25, abs=0.03)
+    assert (draws[:, 0] > draws[:, 1]).mean() == pytest.approx(0.5, abs=0.03)
+    assert draws.mean(axis=0) == pytest.approx(0.0, abs=0.03)
+    np.testing.assert_allclose(np.sort(draw_lanes(3, 1.22, rng)), [-0.61, 0.0, 0.61], atol=1e-9)
+
+
+def least_distance(scene, speed_mps, episodes):
+    """Returns how near two people of a scene come, looked at 24 times a second."""
+    layout, least = Layout(scene), np.inf
+    times = np.arange(0.0, scene.time_limit_s, 1 / 24)[:, None]
+    for episode in range(episodes):
+        rng = np.random.default_rng(episode)
+        places = draw_crowd(layout, scene.pedestrian_groups, speed_mps, rng).positions(times)
+        one, other = np.triu_indices(places.shape[1], 1)
+        gaps = places[:, one] - places[:, other]
+        least = min(least, np.hypot(gaps[..., 0], gaps[..., 1]).min())
+    return least
+
+
+@pytest.mark.parametrize("speed", ["low", "normal", "high", (0.0, 5.0)])
+@pytest.mark.parametrize("name", [*scene_names(), CROSSROADS])
+def test_nobody_ever_stands_in_another(name, speed):
+    scene = load_scene(name)
+    speed_mps = scene.pedestrian_speed_mps[speed] if isinstance(speed, str) else speed
+    assert least_distance(scene, speed_mps, episodes=20) >= 0.6
+
+
+@pytest.mark.parametrize("draw", ["group", "pedestrian"])
+@pytest.mark.parametrize(
+    "walk",
+    [
+        # Round the bend of the S, on its inside, and across it where it bends.
+        Walk("along", road="bends", from_m=35.0, to_m=85.0, offset_m=3.0),
+        Walk("across", road="bends", at_m=59.0),
+        Walk("points", points_m=((5.0, 2.0), (20.0, 3.0), (20.0, -3.0), (30.0, -3.0))),
+    ],
+)
+def test_lanes_hold_round_every_kind_of_bend(walk, draw):
+    group = PedestrianGroup("all", 4, 1.9, walk, standing=1, draw=draw)
+    scene = replace(load_scene("s_turn"), pedestrian_groups=(group,), building_rows=())
+    assert least_distance(load_scene(scene), (0.5, 3.0), episodes=20) >= 0.6
+
+
+def test_walks_that_just_keep_their_distance_are_taken(straight_road):
+    # From 49.5 to 50.5 m along the road, and from 51.1 to 52.1.
+    groups = [
+        PedestrianGroup(name, 2, 1.0, Walk("across", road="main", at_m=at_m))
+        for name, at_m in (("one", 50.0), ("two", 51.61))
+    ]
+    scene = load_scene(replace(straight_road, pedestrian_groups=tuple(groups)))
+    assert least_distance(scene, (1.0, 2.0), episodes=5) >= 0.6

@@ -1,0 +1,123 @@
+"""Scenes from names, files and data; files that can't be read; the schema for editors."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from flowrep.baselines import Planner, drives
+from flowrep.config_tree import CONF_DIR
+from flowrep.scenes import SceneError, load_scene
+from flowrep.scenes.load import json_schema
+
+CROSSROADS = Path(__file__).parent / "crossroads.yaml"
+SCHEMA = Path(__file__).parents[2] / "docs" / "scene.schema.json"
+
+
+@pytest.fixture
+def data():
+    return yaml.safe_load(CROSSROADS.read_text())
+
+
+def test_name_file_mapping_and_scene_give_the_same_scene(data):
+    scene = load_scene(CROSSROADS)
+    assert scene == load_scene(str(CROSSROADS)) == load_scene(data) == load_scene(scene)
+    assert load_scene("straight_road").name == "straight_road"
+    assert scene.num_pedestrians == 5
+    assert scene.time_limit_s == pytest.approx(12.5)
+
+
+def test_each_path_is_drawn_and_the_others_arm_is_closed(make_street):
+    env = make_street(CROSSROADS, sensors=("semantic",))
+    drawn = []
+    for _ in range(40):
+        _, info = env.reset(seed=0 if not drawn else None)
+        drawn.append(info["path"])
+    assert 10 <= drawn.count("left") <= 30
+    # Seen from the fork's mouth, the closed arm shows a house and the open one does not.
+    house, halves = 3, {}
+    for path in ("left", "right"):
+        env.reset(options={"path": path, "episode_seed": 1})
+        for _ in range(30):
+            observation = env.step(0)[0]
+        middle = observation["semantic"][0, 10:20]
+        halves[path] = [(middle[:, part] == house).mean() for part in (slice(30), slice(30, 60))]
+    assert halves["left"][0] < 0.05 < halves["left"][1]
+    assert halves["right"][1] < 0.05 < halves["right"][0]
+
+
+def test_a_closure_is_hit_where_it_stands(make_street):
+    env = make_street(CROSSROADS, sensors=())
+    # Someone who plans for the left arm and drives it while it is closed.
+    env.reset(seed=0, options={"path": "left", "episode_seed": 3})
+    actions = Planner().search(env.episode)
+    env.reset(options={"path": "right", "episode_seed": 3})
+    for action in actions:
+        _, _, ended, _, info = env.step(action)
+        if ended:
+            break
+    assert (info["outcome"], info["hit"]) == ("collision", "building")
+
+
+def test_the_planner_drives_a_scene_it_was_not_made_for(make_street):
+    env = make_street(CROSSROADS, sensors=())
+    outcomes = [drive.outcome for drive in drives(env, Planner(), 6, seed=0)]
+    assert outcomes.count("success") >= 5
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (b"name: [1\n", "the scene"),
+        (b"name: 2001-99-99", "the scene"),
+        (b"name: \xff\xfe", "the scene"),
+        (b"name: a\nname: b", "'name' is given twice"),
+        (b"- a\n- b", "the scene"),
+        (b"", "the scene"),
+        (b"nam: a", "nam: unknown key"),
+        (CROSSROADS.read_bytes().replace(b"layout_seed", b"layout_sed"), "layout_sed: unknown"),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_scene_is_refused_on_one_line(tmp_path, content, named):
+    file = tmp_path / "odd.yaml"
+    file.write_bytes(content)
+    with pytest.raises(SceneError) as caught:
+        load_scene(file)
+    assert str(caught.value).startswith(f"{file}: ")
+    assert named in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("scene", "named"), [("straight", "straight_road"), ("a.yaml", "a.yaml")])
+def test_a_scene_that_does_not_exist_is_refused(tmp_path, monkeypatch, scene, named):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneError, match=named):
+        load_scene(scene)
+
+
+def test_merge_keys_and_anchors_of_yaml_may_be_used(tmp_path, data):
+    data["building_rows"] = "ROWS"
+    rows = """
+  - &house {road: stem, side: left, from_m: 0.0, to_m: 10.0, setback_m: 2.0,
+            front_m: [7, 9], depth_m: [6, 9], height_m: [5, 9]}
+  - {<<: *house, from_m: 20.0, to_m: 38.0}"""
+    file = tmp_path / "merged.yaml"
+    file.write_text(yaml.dump(data).replace("ROWS", rows))
+    first, second = load_scene(file).building_rows
+    assert (first.to_m, second.to_m, second.front_m) == (10.0, 38.0, (7.0, 9.0))
+
+
+def test_the_schema_for_editors_is_that_of_the_code():
+    assert SCHEMA.read_text(encoding="utf-8") == json_schema(), "make schema"
+
+
+def test_the_schema_for_editors_knows_every_key_of_our_scenes():
+    schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    for file in (CONF_DIR / "scene").glob("*.yaml"):
+        data = yaml.safe_load(file.read_text(encoding="utf-8"))
+        assert set(data) <= set(schema["properties"])
+        assert set(schema["required"]) <= set(data)
+    assert schema["additionalProperties"] is False
+    camera = schema["$defs"]["CameraConfig"]["properties"]
+    assert (camera["fov_deg"]["minimum"], camera["fov_deg"]["maximum"]) == (1.0, 179.0)
