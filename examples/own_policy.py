@@ -1,6 +1,6 @@
 """A policy of your own on flowrep's benchmark: it steers around people by their object flow.
 
-    python -m flowrep.evaluate policy=examples/own_policy.py:make representations=[obj,depth] \
+    python -m flowrep.evaluate policy=examples/own_policy.py:make 'representations=[obj,depth]' \
         scene=straight_road
 
 It does not learn. Object flow and depth tell where a moving thing will be by the time that the

@@ -3,7 +3,7 @@
     pip install '.[train,learners]'
     python examples/stable_baselines3_ppo.py --steps 200000
     python -m flowrep.evaluate policy=examples/stable_baselines3_ppo.py:make \
-        representations=[ego,obj] scene=straight_road
+        'representations=[ego,obj]' scene=straight_road
 
 A few thousand steps show that it runs; learning to drive through the street takes about 100,000.
 """

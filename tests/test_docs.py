@@ -8,6 +8,7 @@ import torch
 import yaml
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
+from torchrl.envs import TransformedEnv, check_env_specs
 
 from flowrep import transforms
 from flowrep.transforms import RawFlow
@@ -117,3 +118,21 @@ def test_the_data_guide_runs_and_gives_what_it_says():
     exec(python_of(DOCS / "bring_your_own_data.md"), namespace)
     # TartanAir's NED: the camera's x is forward, so 2 m along x are 2 m along OpenCV's z.
     assert namespace["prev_from_curr"][:3, 3].tolist() == [0.0, 0.0, 2.0]
+
+
+def test_the_guides_own_representation_works_in_an_env():
+    scope: dict = {}
+    exec(python_of(DOCS / "adding_a_representation.md"), scope)
+    env = TransformedEnv(FakeSensorEnv((2,)), scope["Edges"]())
+    check_env_specs(env, seed=None)
+    near = torch.tensor([[[2.0, 2.0, 4.0], [2.0, 4.0, torch.inf]]])
+    (edges,) = scope["Edges"](factor=1.0).compute(near)
+    # 1/z is .5 .5 .25 over .5 .25 0: jumps to the right 0 .25 0, .25 .25 0; below 0 .25 .25
+    assert edges.tolist() == [[[0.0, 0.5, 1.0], [0.5, 1.0, 0.0]]]
+
+
+def test_commands_quote_their_lists_for_every_shell():
+    bare = re.compile(r"""(?<!['"\w.`(])\+?[\w./]+=\[[^\]\s]*\]""")
+    for page in (*PAGES, DOCS.parent / "README.md"):
+        for block in re.findall(r"```sh\n(.*?)```", page.read_text("utf-8"), re.DOTALL):
+            assert not bare.search(block), f"{page.name}: {block}"
