@@ -7,7 +7,7 @@ from pydantic import Field
 from flowrep.config.evaluating import POLICIES
 from flowrep.config.expectations import Count, CountOrZero, ListOf, OneOf, Text
 from flowrep.config.section import Section
-from flowrep.config.training import Device, Path, Trust
+from flowrep.config.training import Path
 
 
 class ReportConfig(Section):
@@ -21,5 +21,3 @@ class ReportConfig(Section):
     resamples: Count
     trajectories: CountOrZero
     videos: CountOrZero
-    device: Device
-    trust: Trust

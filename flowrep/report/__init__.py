@@ -1,1 +1,1 @@
-"""What a folder of runs says: figures, tables and a page, from their config, tables and metrics."""
+"""What runs say: figures, tables and a page of folders of runs, and the page of results."""

@@ -23,13 +23,11 @@ from flowrep.config.quoting import override
 from flowrep.config.reporting import ReportConfig
 from flowrep.config_tree import CONF_DIR
 from flowrep.experiment.run import RunFolderError
-from flowrep.report.assembly import assemble
-from flowrep.report.comparing import Settings
-from flowrep.report.drives import Drives
-from flowrep.report.files import write_files, write_page
-from flowrep.report.page import render_page, summary
-from flowrep.report.runs import read_runs
+from flowrep.report.drives import drives_of
+from flowrep.report.page import render_page, summary, write_files, write_page
+from flowrep.report.sections import Settings, assemble
 from flowrep.report.statistics import Bootstrap
+from flowrep.report.storage import is_archive, read_runs, without_repeats
 from flowrep.report.tables import Table
 
 
@@ -53,17 +51,19 @@ def report_on(asked: dict[str, Any]) -> Path:
     """
     given = asked["run"]
     folders = [Path(folder) for folder in (given if isinstance(given, list) else [given])]
-    output = Path(asked["output"] or folders[0] / "report")
-    runs, complaints = read_runs(folders)
-    for complaint in complaints:
-        print(f"left out: {complaint}")
+    is_of_runs = folders[0].is_dir() and not is_archive(folders[0])
+    output = Path(asked["output"] or (folders[0] if is_of_runs else Path("outputs")) / "report")
+    found, warnings = read_runs(folders)
+    runs, repeats = without_repeats(found)
+    for warning in (*warnings, *repeats):
+        print(f"left out: {warning}")
     if not runs:
         raise UsageError("none of the runs can be read, see above")
     print(summary(runs))
-    ask = Settings(asked["policy"], Bootstrap(asked["resamples"]))
-    report = assemble(runs, complaints, ask)
-    for complaint in report.complaints[len(complaints) :]:
-        print(f"in part: {complaint}")
+    settings = Settings(asked["policy"], Bootstrap(asked["resamples"]))
+    report = assemble(runs, [*warnings, *repeats], settings)
+    for warning in report.warnings[len(warnings) + len(repeats) :]:
+        print(f"in part: {warning}")
     for chapter in report.chapters:
         for section in chapter.sections:
             for table in section.tables:
@@ -71,43 +71,28 @@ def report_on(asked: dict[str, Any]) -> Path:
                     show(table, f"{section.title} {chapter.label}".strip())
     for folder in write_files(report, output):
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-    drives = _drives(report.runs, asked)
-    for complaint in drives.complaints:
-        print(f"drives: {complaint}")
-    page = write_page(render_page(report, drives, folders), output)
+    drives = drives_of(runs, trajectories=asked["trajectories"], videos=asked["videos"])
+    for warning in drives.warnings:
+        print(f"drives: {warning}")
+    page = write_page(render_page(report, drives), output)
     print(f"page: {page}")
     return page
 
 
 def show(table: Table, title: str) -> None:
     """Prints a table."""
-    said = Text(title, style="table.title")  # in a str, brackets would be markup
-    shown = rich.table.Table(title=said, box=rich.box.SIMPLE, pad_edge=False)
-    for place, heading in enumerate(table.header):
+    heading = Text(title, style="table.title")  # in a str, brackets would be markup
+    shown = rich.table.Table(title=heading, box=rich.box.SIMPLE, pad_edge=False)
+    for place, name in enumerate(table.header):
         justify: Any = "left" if table.is_text(place) else "right"
-        shown.add_column(Text(heading), justify=justify, no_wrap=True)
-    for heading, rows in table.blocks:
-        if heading:
-            shown.add_row(Text(heading, style="italic"))
+        shown.add_column(Text(name), justify=justify, no_wrap=True)
+    for block, rows in table.blocks:
+        if block:
+            shown.add_row(Text(block, style="italic"))
         for row in rows:
             shown.add_row(*map(Text, row))
         shown.add_section()
     Console(width=max(160, Console().width)).print(shown)
-
-
-def _drives(runs: Sequence[Any], asked: dict[str, Any]) -> Drives:
-    if not asked["trajectories"] and not asked["videos"]:
-        return Drives()
-    # only these need the simulator
-    from flowrep.report.replay import drive_again
-
-    return drive_again(
-        runs,
-        trajectories=asked["trajectories"],
-        videos=asked["videos"],
-        device=asked["device"],
-        trust=asked["trust"],
-    )
 
 
 def with_folders_named(arguments: Sequence[str]) -> list[str]:

@@ -1,7 +1,16 @@
-"""The figures: grouped bars and lines over frame rates, with intervals and their own legend."""
+"""The figures: bars by speed, lines over frame rates and over training, with intervals.
 
-from collections.abc import Sequence
+One colour per stack in every figure, safe for colour-blind readers; the same data give the same
+files, byte for byte.
+"""
+
+import base64
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -10,25 +19,157 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flowrep.report.results import Grid, Score
-from flowrep.report.style import COLUMN_IN, PAGE_IN, Theme, looks, styled, words
+from flowrep.report.outcomes import Curve, Grid, Score, mean_curve
 
+# Okabe and Ito's colours for single maps and for the two flows. A map added to the flows has its
+# own hue, darker, and a hatch or a dashed line.
+_COLOURS = {
+    "ego": "#e69f00",
+    "raw": "#56b4e9",
+    "obj": "#009e73",
+    "ego+obj": "#0072b2",
+    "seg2": "#d55e00",
+    "depth2": "#cc79a7",
+    "ego+obj+seg2": "#8a3c00",
+    "ego+obj+depth2": "#7d3f66",
+    "ego+obj+seg2+depth2": "#4a4a4a",
+}
+_ADDED = {"ego+obj+seg2": "////", "ego+obj+depth2": "\\\\\\\\", "ego+obj+seg2+depth2": "xxxx"}
+_OTHERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+_HATCHES = ("", "////", "xxxx", "....")
+_OF_VARIANTS = ("", "......", "++++", "||||")  # no stack uses them
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
+_TEXT, _FAINT = "#1b1f24", "#6b7480"
+
+_TITLES = {
+    "straight_road": "Straight Road",
+    "s_turn": "S-Turn",
+    "h_shaped_pathways": "H-Shaped Pathways",
+    "three_way_junction": "Three-Way Junction",
+}
 _BASELINE_LINES: dict[str, Any] = {"never_turn": ":", "random": "-.", "planner": "--"}
-_BASELINE_NAMES = {"never_turn": "never turns", "random": "random", "planner": "planner"}
+_COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page
 _PAPER_PT, _PAGE_PT = 7.5, 10.0
 _MOST_IN_A_ROW = 4  # panels
 _WIDEST_BAR = 0.3  # of a group
+_DPI = 300
 
 
-def canvas(panels: int, theme: Theme, *, for_page: bool) -> tuple[Figure, list[Axes]]:
+@dataclass(frozen=True)
+class Look:
+    """How a series is drawn: its colour, its bars' hatch, its line's marker; hatched is dashed."""
+
+    colour: str
+    hatch: str
+    marker: str
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """The style of its line."""
+        dashes = "--" if self.hatch else "-"
+        return {"color": self.colour, "marker": self.marker, "linestyle": dashes, "markersize": 3.5}
+
+
+def looks(names: Sequence[str]) -> dict[str, Look]:
+    """Returns how each series of a figure is drawn.
+
+    The paper's stacks look the same in all figures, and keep their colour under several configs
+    ("ego, noisy"). If other names are among them, colours are assigned in turn.
+    """
+    parts = {name: name.partition(", ")[::2] for name in names}
+    variants = list(dict.fromkeys(variant for _, variant in parts.values()))
+    places = list(_COLOURS)
+    found = {}
+    for turn, (name, (stack, variant)) in enumerate(parts.items()):
+        if all(of in _COLOURS for of, _ in parts.values()):
+            hatch = _OF_VARIANTS[variants.index(variant) % len(_OF_VARIANTS)]
+            marker = _MARKERS[places.index(stack)]
+            found[name] = Look(_COLOURS[stack], hatch or _ADDED.get(stack, ""), marker)
+        else:
+            hatch = _HATCHES[turn // len(_OTHERS) % len(_HATCHES)]
+            marker = _MARKERS[turn % len(_MARKERS)]
+            found[name] = Look(_OTHERS[turn % len(_OTHERS)], hatch, marker)
+    return found
+
+
+def words(name: str) -> str:
+    """Returns a config name as a heading; the paper's scenes are spelt as in the paper.
+
+    >>> words("s_turn"), words("my_crossing")
+    ('S-Turn', 'My crossing')
+    """
+    text = _TITLES.get(name, name.replace("_", " "))
+    return text[:1].upper() + text[1:]
+
+
+@contextmanager
+def styled(font_pt: float) -> Iterator[None]:
+    """Draws figures in one style."""
+    settings: Any = {
+        "font.size": font_pt,
+        "axes.titlesize": font_pt + 0.5,
+        "axes.labelsize": font_pt,
+        "xtick.labelsize": font_pt - 0.5,
+        "ytick.labelsize": font_pt - 0.5,
+        "legend.fontsize": font_pt - 0.5,
+        "text.color": _TEXT,
+        "axes.labelcolor": _TEXT,
+        "axes.edgecolor": _FAINT,
+        "xtick.color": _TEXT,
+        "ytick.color": _TEXT,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.linewidth": 0.7,
+        "grid.color": _FAINT,
+        "grid.alpha": 0.35,
+        "grid.linewidth": 0.5,
+        "legend.frameon": False,
+        "text.parse_math": False,  # $ is literal
+    }
+    with mpl.rc_context(settings):
+        yield
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a figure as PNG and PDF; the endings are added to the path."""
+    with _reproducible():
+        figure.savefig(path.with_name(f"{path.name}.png"), dpi=_DPI)
+        figure.savefig(path.with_name(f"{path.name}.pdf"), metadata={"CreationDate": None})
+
+
+def svg(figure: Figure) -> bytes:
+    """Returns a figure as an SVG."""
+    data = io.BytesIO()
+    with _reproducible():
+        figure.savefig(data, format="svg", metadata={"Date": None})
+    return data.getvalue()
+
+
+def _reproducible() -> Any:
+    return mpl.rc_context(
+        {"svg.hashsalt": "flowrep", "pdf.fonttype": 42, "hatch.linewidth": 0.7}  # text as text
+    )
+
+
+def data_uri(kind: str, data: bytes) -> str:
+    """Returns a file's content for embedding in a page."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def png_uri(figure: Figure, dpi: int) -> str:
+    """Returns a figure as a data URI of a PNG."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=dpi)
+    return data_uri("image/png", data.getvalue())
+
+
+def canvas(panels: int, *, for_page: bool) -> tuple[Figure, list[Axes]]:
     """Returns a figure with panels in rows, sized for a paper or for a web page."""
     columns = min(panels, _MOST_IN_A_ROW)
     rows = -(-panels // columns)
-    if for_page:
-        width, height = 5.6, 3.7
-    else:
-        width = COLUMN_IN if panels == 1 else PAGE_IN
-        height = 2.3 if panels == 1 else 2.1
+    width, height = (5.6, 3.7) if for_page else (_PAGE_IN, 2.1)
+    if panels == 1 and not for_page:
+        width, height = _COLUMN_IN, 2.3
     figure = Figure(figsize=(width, height * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel().tolist()
     for spare in axes[panels:]:
@@ -36,128 +177,131 @@ def canvas(panels: int, theme: Theme, *, for_page: bool) -> tuple[Figure, list[A
     return figure, axes[:panels]
 
 
-def style_for(theme: Theme, *, for_page: bool) -> Any:
-    """Returns the context in which a figure is drawn."""
-    return styled(theme, _PAGE_PT if for_page else _PAPER_PT)
-
-
-def draw_bars(grids: Sequence[Grid], theme: Theme, *, for_page: bool = False) -> Figure:
+def draw_bars(grids: Sequence[Grid], *, for_page: bool = False) -> Figure:
     """Returns grouped bars: a panel per scene, a group per speed mode, a bar per stack.
 
     Whiskers are the intervals, small dots the seeds, dotted lines the baselines.
     """
-    with style_for(theme, for_page=for_page):
-        figure, panels = canvas(len(grids), theme, for_page=for_page)
+    with styled(_PAGE_PT if for_page else _PAPER_PT):
+        figure, panels = canvas(len(grids), for_page=for_page)
         for axes, grid in zip(panels, grids):
-            _bars(axes, grid, theme)
+            _bars(axes, grid)
             axes.set_title(words(grid.scene))
         percent_axis(panels)
+        handles: list[Any] = [
+            Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="white", lw=0, label=name)
+            for name, look in looks(grids[0].series).items()
+        ]
         shown = {name for grid in grids for name, _ in grid.baselines}
-        legend(figure, _bar_handles(grids[0].series, shown, theme))
+        handles += [
+            Line2D([], [], linestyle=line, color=_TEXT, linewidth=1.0, label=words(name).lower())
+            for name, line in _BASELINE_LINES.items()
+            if name in shown
+        ]
+        legend(figure, handles)
     return figure
 
 
-def _bars(axes: Axes, grid: Grid, theme: Theme) -> None:
-    style = looks(grid.series, theme)
+def _bars(axes: Axes, grid: Grid) -> None:
     width = min(0.84 / len(grid.series), _WIDEST_BAR)
     for group, condition in enumerate(grid.conditions):
-        for place, name in enumerate(grid.series):
+        for place, (name, look) in enumerate(looks(grid.series).items()):
             at = group + (place - (len(grid.series) - 1) / 2) * width
             score = grid.scores[name, condition]
             if score is None:
-                axes.text(
-                    at, 1.5, "missing", rotation=90, ha="center", va="bottom", color=theme.faint,
-                    fontsize="x-small",
-                )  # fmt: skip
+                style: Any = {"rotation": 90, "ha": "center", "va": "bottom", "color": _FAINT}
+                axes.text(at, 1.5, "missing", fontsize="x-small", **style)
                 continue
-            look = style[name]
+            edge = "white" if look.hatch else _TEXT
             axes.bar(
-                at, 100 * score.estimate.value, 0.92 * width, facecolor=look.colour,
-                hatch=look.hatch, edgecolor=theme.ground if look.hatch else theme.text, linewidth=0,
+                at, 100 * score.estimate.value, 0.92 * width,
+                facecolor=look.colour, hatch=look.hatch, edgecolor=edge, linewidth=0,
             )  # fmt: skip
-            _whisker(axes, at, width, score, theme)
+            _whisker(axes, at, width, score)
         for name, line in _BASELINE_LINES.items():
             share = grid.baselines.get((name, condition))
             if share is not None:
                 ends = [group - 0.46, group + 0.46]
-                axes.plot(ends, [100 * share] * 2, line, color=theme.text, linewidth=1.0)
+                axes.plot(ends, [100 * share] * 2, line, color=_TEXT, linewidth=1.0)
     axes.set_xticks(range(len(grid.conditions)), [c.speed for c in grid.conditions])
     axes.set_xlim(-0.5, len(grid.conditions) - 0.5)
     axes.set_xlabel("pedestrians' speed mode")
     axes.tick_params(axis="x", length=0)
 
 
-def _whisker(axes: Axes, at: float, width: float, score: Score, theme: Theme) -> None:
+def _whisker(axes: Axes, at: float, width: float, score: Score) -> None:
     value, low, high = (100 * number for number in score.estimate)
     axes.errorbar(
-        at, value, [[max(value - low, 0)], [max(high - value, 0)]], color=theme.text,
+        at, value, [[max(value - low, 0)], [max(high - value, 0)]], color=_TEXT,
         linewidth=0.9, capsize=1.8, capthick=0.9, clip_on=False,
     )  # fmt: skip
     if len(score.of_seeds) > 1:
         dots = [100 * share for share in score.of_seeds]
-        offset = [at + 0.24 * width] * len(dots)
-        ring: Any = {"facecolor": theme.ground, "edgecolor": theme.text, "linewidth": 0.5}
-        axes.scatter(offset, dots, s=5, zorder=4, clip_on=False, **ring)
+        ring: Any = {"facecolor": "white", "edgecolor": _TEXT, "linewidth": 0.5}
+        axes.scatter([at + 0.24 * width] * len(dots), dots, s=5, zorder=4, clip_on=False, **ring)
 
 
-def _bar_handles(series: Sequence[str], baselines: set[str], theme: Theme) -> list[Any]:
-    handles: list[Any] = [
-        Patch(facecolor=look.colour, hatch=look.hatch, edgecolor=theme.ground, lw=0, label=name)
-        for name, look in looks(series, theme).items()
-    ]
-    handles += [
-        Line2D([], [], linestyle=line, color=theme.text, linewidth=1.0, label=_BASELINE_NAMES[name])
-        for name, line in _BASELINE_LINES.items()
-        if name in baselines
-    ]
-    return handles
-
-
-def draw_rates(grids: Sequence[Grid], theme: Theme, *, for_page: bool = False) -> Figure:
-    """Returns success over frame rates: a panel per scene, a line per stack, named at its end."""
-    with style_for(theme, for_page=for_page):
-        figure, panels = canvas(len(grids), theme, for_page=for_page)
+def draw_rates(grids: Sequence[Grid], *, for_page: bool = False) -> Figure:
+    """Returns success over frame rates: a panel per scene, a line per stack."""
+    with styled(_PAGE_PT if for_page else _PAPER_PT):
+        figure, panels = canvas(len(grids), for_page=for_page)
         for axes, grid in zip(panels, grids):
-            _rate_lines(axes, grid, theme)
+            _rate_lines(axes, grid)
             axes.set_title(words(grid.scene))
         percent_axis(panels)
-        legend(figure, line_handles(grids[0].series, theme))
+        legend(figure, _line_handles(grids[0].series))
     return figure
 
 
-def _rate_lines(axes: Axes, grid: Grid, theme: Theme) -> None:
-    style = looks(grid.series, theme)
+def _rate_lines(axes: Axes, grid: Grid) -> None:
     at = [condition.fps for condition in grid.conditions]
     step = min((b - a for a, b in pairwise(at)), default=1.0)
-    for place, name in enumerate(grid.series):
+    for place, (name, look) in enumerate(looks(grid.series).items()):
         # side by side, so that whiskers of equal scores are all visible
         aside = (place - (len(grid.series) - 1) / 2) * 0.08 * step
         found = [(c.fps + aside, grid.scores[name, c]) for c in grid.conditions]
         points = [(x, score.estimate) for x, score in found if score is not None]
-        if not points:
-            continue
-        xs, values = [x for x, _ in points], [100 * e.value for _, e in points]
-        below = [max(100 * (e.value - e.low), 0) for _, e in points]
-        above = [max(100 * (e.high - e.value), 0) for _, e in points]
-        look = style[name]
-        axes.errorbar(
-            xs, values, [below, above], color=look.colour, linestyle=look.dashes,
-            marker=look.marker, markersize=3.5, linewidth=1.3, elinewidth=0.9, capsize=1.8,
-            clip_on=False,
-        )  # fmt: skip
+        if points:
+            xs, values = [x for x, _ in points], [100 * e.value for _, e in points]
+            below = [max(100 * (e.value - e.low), 0) for _, e in points]
+            above = [max(100 * (e.high - e.value), 0) for _, e in points]
+            bars: Any = {"elinewidth": 0.9, "capsize": 1.8, "clip_on": False}
+            axes.errorbar(xs, values, [below, above], linewidth=1.3, **look.line, **bars)
     axes.set_xticks(at, [f"{rate:g}" for rate in at])
-    axes.set_xlabel("frames a second (Hz)")
+    axes.set_xlabel("frames per second (Hz)")
 
 
-def line_handles(series: Sequence[str], theme: Theme) -> list[Any]:
-    """Returns a legend's entries for lines."""
+def draw_curves(
+    panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]], *, for_page: bool = False
+) -> Figure:
+    """Returns a panel per scene: bold, the seeds' mean of evaluations; thin, their training."""
+    with styled(_PAGE_PT if for_page else _PAPER_PT):
+        figure, all_axes = canvas(len(panels), for_page=for_page)
+        names = list(dict.fromkeys(name for _, curves in panels for name in curves))
+        style = looks(names)
+        for axes, (scene, curves) in zip(all_axes, panels):
+            for name, of_runs in curves.items():
+                for curve in of_runs:
+                    xs, ys = _in_thousands(curve.training)
+                    axes.plot(xs, ys, color=style[name].colour, linewidth=0.6, alpha=0.6)
+                xs, ys = _in_thousands(mean_curve([curve.evaluated for curve in of_runs]))
+                axes.plot(xs, ys, linewidth=1.5, **style[name].line)
+            axes.set_title(words(scene))
+            axes.set_xlabel("frames (thousands)")
+        percent_axis(all_axes)
+        legend(figure, _line_handles(names))
+    return figure
+
+
+def _in_thousands(points: Sequence[tuple[int, float]]) -> tuple[list[float], list[float]]:
+    return [frames / 1000 for frames, _ in points], [100 * share for _, share in points]
+
+
+def _line_handles(series: Sequence[str]) -> list[Any]:
     return [
-        Line2D(
-            [], [], color=look.colour, marker=look.marker, markersize=3.5, linestyle=look.dashes,
-            linewidth=1.3, label=name,
-        )
-        for name, look in looks(series, theme).items()
-    ]  # fmt: skip
+        Line2D([], [], linewidth=1.3, label=name, **look.line)
+        for name, look in looks(series).items()
+    ]
 
 
 def percent_axis(panels: Sequence[Axes]) -> None:

@@ -1,4 +1,4 @@
-"""One self-contained HTML page: pictures, films and styles are embedded."""
+"""One self-contained HTML page, and the files of a report's figures and tables."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,47 +6,89 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from flowrep.report.assembly import Chapter, Report
 from flowrep.report.drives import Drives
-from flowrep.report.pictures import svg_uri
-from flowrep.report.runs import Run
-from flowrep.report.sections import Drawing, Section, listed
-from flowrep.report.style import DARK, LIGHT, words
+from flowrep.report.figures import data_uri, save, svg, words
+from flowrep.report.runs import Run, scenes_of
+from flowrep.report.sections import Report, Section
+from flowrep.report.tables import listed
+
+PAGE = "index.html"
 
 
-def render_page(report: Report, drives: Drives, sources: Sequence[Path]) -> str:
-    """Returns the page.
+def write_files(report: Report, folder: Path) -> list[Path]:
+    """Writes each section's figures and tables as PNG, PDF, LaTeX and CSV; returns their folders.
+
+    The same report gives the same files, byte for byte.
+    """
+    sections = [section for chapter in report.chapters for section in chapter.sections]
+    for section in sections:
+        place = folder / section.name
+        place.mkdir(parents=True, exist_ok=True)
+        for drawing in section.drawings:
+            save(drawing.draw(drawing.panels), place / drawing.name)
+            (place / f"{drawing.name}.tex").write_text(drawing.to_latex(), encoding="utf-8")
+        for table in section.tables:
+            (place / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
+            (place / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
+    return [folder / section.name for section in sections]
+
+
+def write_page(text: str, folder: Path) -> Path:
+    """Writes the page into the report's folder; returns its path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / PAGE
+    whole = path.with_suffix(".tmp")
+    whole.write_text(text, encoding="utf-8")
+    whole.replace(path)
+    return path
+
+
+def template(name: str, *, autoescape: bool) -> Any:
+    """Returns a template of this folder."""
+    loader = FileSystemLoader(Path(__file__).parent)
+    return Environment(
+        loader=loader, autoescape=autoescape, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+    ).get_template(name)  # fmt: skip
+
+
+def render_page(report: Report, drives: Drives) -> str:
+    """Returns the page of a report.
 
     Args:
         report: the report on the runs.
         drives: plans and films of some of their episodes, possibly none.
-        sources: the folders that were read, for the heading.
     """
-    folder = Path(__file__).parent
-    environment = Environment(
-        loader=FileSystemLoader(folder),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    chapters = [_chapter(number, chapter) for number, chapter in enumerate(report.chapters)]
-    return environment.get_template("page.html.jinja").render(
-        title=listed([str(source) for source in sources]),
+    chapters = [
+        {
+            "label": chapter.label,
+            "sections": [_section(f"{n}-{s.name}", s) for s in chapter.sections],
+        }
+        for n, chapter in enumerate(report.chapters)
+    ]
+    return template("page.html.jinja", autoescape=True).render(
+        title=title(report.runs),
         summary=summary(report.runs),
-        complaints=report.complaints,
+        warnings=report.warnings,
         chapters=chapters,
         drives=drives,
         runs=[_row(run) for run in report.runs],
     )
 
 
+def title(runs: Sequence[Run]) -> str:
+    """Returns what runs are about: their stacks if they are few, and their scenes."""
+    stacks = sorted({run.stack for run in runs})
+    what = listed(stacks) if len(stacks) < 4 else f"{len(stacks)} stacks"
+    return f"{what} in {listed([words(scene) for scene in scenes_of(runs)])}" if runs else "No runs"
+
+
 def summary(runs: Sequence[Run]) -> str:
     """Returns a sentence on the runs that were read."""
     finished = sum(run.is_finished for run in runs)
     stacks = sorted({run.stack for run in runs})
-    scenes = [words(scene) for scene in dict.fromkeys(run.scene for run in runs)]
-    episodes = sum(len(run.tested) for run in runs)
+    scenes = [words(scene) for scene in scenes_of(runs)]
+    episodes = sum(int(run.tested.sum()) for run in runs)
     return (
         f"{_count(len(runs), 'run')}, {finished} of them finished, of "
         f"{_count(len(stacks), 'stack')} ({listed(stacks)}) in {listed(scenes)}; {episodes:,} "
@@ -58,38 +100,21 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
-def _chapter(number: int, chapter: Chapter) -> dict[str, Any]:
-    return {
-        "label": chapter.label,
-        "sections": [_section(f"{number}-{section.name}", section) for section in chapter.sections],
-    }
-
-
 def _section(anchor: str, section: Section) -> dict[str, Any]:
-    return {
-        "anchor": anchor,
-        "title": section.title,
-        "notes": section.notes,
-        "drawings": [_drawing(drawing) for drawing in section.drawings],
-        "tables": section.tables,
-    }
+    drawings = [
+        {"caption": d.caption, "panels": [data_uri("image/svg+xml", svg(f)) for f in d.parts()]}
+        for d in section.drawings
+    ]
+    return {"anchor": anchor, "section": section, "drawings": drawings}
 
 
-def _drawing(drawing: Drawing) -> dict[str, Any]:
-    themes = zip(drawing.parts(LIGHT), drawing.parts(DARK))
-    return {
-        "caption": drawing.caption,
-        "panels": [{"light": svg_uri(light), "dark": svg_uri(dark)} for light, dark in themes],
-    }
-
-
-def _row(run: Run) -> dict[str, Any]:
-    return {
-        "path": str(run.path),
-        "experiment": run.config.get("experiment") or "",
-        "scene": words(run.scene),
-        "stack": run.stack,
-        "seed": run.seed,
-        "frames": f"{run.frames:,} of {run.total_frames:,}",
-        "episodes": f"{len(run.tested):,}",
-    }
+def _row(run: Run) -> tuple[str, ...]:
+    return (
+        run.name,
+        run.config.get("experiment") or "",
+        words(run.scene),
+        run.stack,
+        str(run.seed),
+        f"{run.frames:,} of {run.total_frames:,}",
+        f"{int(run.tested.sum()):,}",
+    )

@@ -1,23 +1,23 @@
-"""Reads run folders: configs, episodes and metrics, and a list of what can't be read."""
+"""Runs as a report sees them: config, columns of episodes and of metrics, and groups of runs."""
 
-import json
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
-from flowrep.experiment.evaluation import OUTCOMES
-from flowrep.experiment.run import RunFolder, RunFolderError, origin_of
-from flowrep.scenes.scene import SpeedMode
-from flowrep.tables import TableError
+import numpy as np
+from numpy.typing import NDArray
 
-_ORDER = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
-Rows = list[dict[str, str]]
+from flowrep.experiment.run import origin_of
 
-SPEEDS: tuple[str, ...] = get_args(SpeedMode)
+Columns = dict[str, NDArray[Any]]
+SPEEDS = ("low", "normal", "high")
 """Pedestrians' speed modes, in the order of figures."""
+SCENES = ("straight_road", "s_turn", "h_shaped_pathways", "three_way_junction")
+"""The paper's scenes in its order."""
+_ORDER = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
+_OF_EVERY_SCENE = ("camera", "frame_rate_hz")
 
 
 class Condition(NamedTuple):
@@ -30,44 +30,38 @@ class Condition(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The content of a run folder.
+    """A run's config and tables.
 
     Args:
-        path: the folder.
-        config: its config.yaml.
-        episodes: rows of evaluation.csv.
-        metrics: rows of metrics.csv.
+        name: its folder, or its name in packed tables.
+        config: the resolved config that it was started with.
+        episodes: the columns of evaluation.csv, see `EPISODE_COLUMNS`.
+        metrics: the columns of metrics.csv, nan where a cell is empty.
+        folder: where films and drives may lie; None for a run of packed tables.
+        machine: the commit, precision and CPU that trained it, "unknown" where not recorded.
     """
 
-    path: Path
+    name: str
     config: Mapping[str, Any]
-    episodes: Rows
-    metrics: Rows
+    episodes: Columns
+    metrics: Columns
+    folder: Path | None = None
+    machine: Mapping[str, str] | None = None
 
     @cached_property
-    def identity(self) -> dict[str, Any]:
-        """The settings that determine its weights, by dotted key, without the seed.
+    def settings(self) -> dict[str, Any]:
+        """What determines its weights, by dotted key, without the seed.
 
-        Keys that are specific to a scene are under the scene's name, and options of a
-        representation under its name, so that two runs differ in them only if both have them.
+        Keys of one scene alone are under the scene's name, and options of a representation under
+        its name: only runs that have the scene or the representation can differ in them.
         """
         parts = origin_of(self.config)
         del parts["flowrep"], parts["seed"]
         scene = parts.pop("scene")
         own = {key: value for key, value in scene.items() if key not in _OF_EVERY_SCENE}
         shared = {f"scene.{key}": scene[key] for key in _OF_EVERY_SCENE if key in scene}
-        return dict([*_flat(parts | shared), *_flat(own, f"scene.{self.scene}")])
-
-    def part_with(self, key: str) -> Any:
-        """Returns what decides whether its identity may have a key, None if it can't."""
-        place, _, rest = key.partition(".")
-        if place == "representations":
-            return next((n for n in self.config[place] if f"{rest}.".startswith(f"{n}.")), None)
-        if place == "scene":
-            parts = (*_OF_EVERY_SCENE, self.scene)
-            return next((part for part in parts if f"{rest}.".startswith(f"{part}.")), None)
-        deciding = {"algorithm": "_target_", "flow": "source"}.get(place)
-        return (place, self.identity.get(f"{place}.{deciding}") if deciding else None)
+        found = dict([*_flat(parts | shared), *_flat(own, f"scene.{self.scene}")])
+        return {k: v for k, v in found.items() if v != {}}  # a representation without options
 
     @property
     def scene(self) -> str:
@@ -85,7 +79,7 @@ class Run:
         return self.config["seed"]
 
     @property
-    def speed(self) -> Any:
+    def speed(self) -> str:
         """The pedestrians' speed mode in training."""
         return self.config["speed"]
 
@@ -100,9 +94,15 @@ class Run:
         return self.config["total_frames"]
 
     @property
+    def paths(self) -> Sequence[str]:
+        """The names of the scene's paths; an episode's column `path` counts them."""
+        return [path["name"] for path in self.config["scene"].get("paths", [{"name": ""}])]
+
+    @cached_property
     def frames(self) -> int:
         """The frames that it has been trained for, from its tables."""
-        return max((int(row["frames"]) for row in (*self.metrics, *self.episodes)), default=0)
+        columns = (self.metrics.get("frames"), self.episodes["frames"])
+        return max((int(c.max()) for c in columns if c is not None and len(c)), default=0)
 
     @property
     def is_finished(self) -> bool:
@@ -110,27 +110,24 @@ class Run:
         return self.frames >= self.total_frames
 
     @cached_property
-    def tested(self) -> Rows:
-        """Rows of the finished agent in its own scene, which no decision in training used."""
-        return [
-            row
-            for row in self.episodes
-            if row["evaluation"] != "training"
-            and row["scene"] == self.scene
-            and int(row["frames"]) >= self.total_frames
-        ]
+    def tested(self) -> NDArray[np.bool_]:
+        """Whether each episode is of the finished agent in its own scene, after training."""
+        e = self.episodes
+        is_after = (e["evaluation"] != "training") & (e["frames"] >= self.total_frames)
+        return is_after & (e["scene"] == self.scene)
 
     @cached_property
-    def by_condition(self) -> dict[Condition, Rows]:
-        """The tested rows by condition."""
-        rows: dict[Condition, Rows] = {}
-        for row in self.tested:
-            condition = Condition(row["policy"], row["speed"], float(row["fps"]))
-            rows.setdefault(condition, []).append(row)
-        return rows
+    def conditions(self) -> set[Condition]:
+        """The conditions of its tested episodes."""
+        columns = (self.episodes[name][self.tested].tolist() for name in Condition._fields)
+        return {Condition(*cells) for cells in zip(*columns)}
 
-
-_OF_EVERY_SCENE = ("camera", "frame_rate_hz")
+    def under(self, condition: Condition) -> Columns:
+        """Returns the tested episodes of a condition."""
+        e = self.episodes
+        asked = zip(Condition._fields, condition)
+        chosen = np.logical_and.reduce([self.tested, *(e[name] == v for name, v in asked)])
+        return {name: column[chosen] for name, column in e.items()}
 
 
 def stack_of(representations: Iterable[str]) -> str:
@@ -144,121 +141,59 @@ def stack_of(representations: Iterable[str]) -> str:
     return "+".join([*known, *sorted(set(names) - set(known))])
 
 
-def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
-    """Returns the runs in folders at any depth, and a line for each that was left out.
+def in_order(found: Iterable[str], known: Sequence[str]) -> list[str]:
+    """Returns the found names without repeats, the known ones first and in their order."""
+    names = set(found)
+    return [name for name in known if name in names] + sorted(names - set(known))
 
-    Raises:
-        RunFolderError: one of the folders holds no run at all.
+
+def scenes_of(runs: Sequence[Run]) -> list[str]:
+    """Returns the scenes that runs were trained in, the paper's first."""
+    return in_order([run.scene for run in runs], SCENES)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that may be compared: they differ in scene, representations and seed alone.
+
+    Args:
+        runs: the group's runs.
+        differences: the keys in which groups differ, with this one's values.
     """
-    runs: dict[Path, Run] = {}
-    complaints: list[str] = []
-    for folder in folders:
-        configs = sorted(path for path in folder.rglob("config.yaml") if _is_of_a_run(path, folder))
-        if not configs:
-            what = (
-                "holds no run: no config.yaml is in it or below"
-                if folder.is_dir()
-                else ("is a file" if folder.exists() else "does not exist")
-            )
-            raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
-        for config in configs:
-            if config.parent.resolve() in runs:
-                continue
-            try:
-                runs[config.parent.resolve()] = _read(config.parent)
-            except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
-                complaints.append(" ".join(str(error).split()))
-    return _without_repeats(list(runs.values()), complaints), complaints
+
+    runs: tuple[Run, ...]
+    differences: dict[str, Any]
+
+    @property
+    def label(self) -> str:
+        """What distinguishes it from other groups; empty if it is the only one."""
+        shown = [f"{key}={value}" for key, value in self.differences.items()]
+        shown = [text if len(text) < 60 else f"{text[:56]} ..." for text in shown]
+        more = [f"{len(shown) - 3} more keys"] if len(shown) > 4 else []
+        return ", ".join(shown[:3] + more if more else shown)
 
 
-def _is_of_a_run(config: Path, folder: Path) -> bool:
-    below = config.relative_to(folder).parts  # the folder itself may be called anything
-    return ".hydra" not in below and "wandb" not in below
-
-
-def _read(path: Path) -> Run:
-    folder = RunFolder.existing(path)
-    run = Run(path, folder.read_config(), folder.read_episodes(), folder.read_metrics())
-    remedy = "restore the file that the run was started with"
-    try:
-        wrong = [f"{key} is {value!r}" for key, value, is_right in _parts(run) if not is_right]
-    except KeyError as error:
-        raise RunFolderError(f"{path}/config.yaml has no {error.args[0]}; {remedy}") from None
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise RunFolderError(
-            f"{path}/config.yaml is not what a run leaves ({error}); {remedy}"
-        ) from None
-    if wrong:
-        raise RunFolderError(f"{path}/config.yaml: {wrong[0]}; {remedy}")
-    _check_cells(folder.metrics_path, run.metrics, {"success": lambda text: float(text or 0)})
-    _check_cells(folder.evaluation_path, run.episodes, _CELLS)
-    return run
-
-
-def _parts(run: Run) -> list[tuple[str, Any, bool]]:
-    """The parts of a config that a report reads, and whether a run can have left them."""
-    assert run.identity
-    json.dumps(run.config, default=str, ensure_ascii=False).encode()  # its texts can be written
-    rate, names = run.config["scene"]["frame_rate_hz"], run.config["representations"]
-    return [
-        ("scene.name", run.scene, _is_name(run.scene)),
-        ("scene.frame_rate_hz", rate, type(rate) in (float, int) and 0 < run.fps < math.inf),
-        ("representations", names, type(names) is dict),
-        *(("a name in representations", name, _is_name(name)) for name in names),
-        ("seed", run.seed, type(run.seed) is int),
-        ("speed", run.speed, run.speed in SPEEDS),
-        ("total_frames", run.total_frames, type(run.total_frames) is int),
-    ]
-
-
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and value.isprintable()
-
-
-def _rate(text: str) -> float:
-    if not 0 < float(text) < math.inf:
-        raise ValueError(text)
-    return float(text)
-
-
-_CELLS: dict[str, Callable[[str], Any]] = {
-    "fps": _rate,
-    "speed": SPEEDS.index,
-    "outcome": OUTCOMES[1:].index,
-    "length": int,
-}
-"""The columns of evaluation.csv that a report reads beside those that every reader checks."""
-
-
-def _check_cells(path: Path, rows: Rows, columns: Mapping[str, Callable[[str], Any]]) -> None:
-    for number, row in enumerate(rows, start=2):
-        for column, read in columns.items():
-            try:
-                read(row.get(column, ""))
-            except ValueError:
-                raise TableError(
-                    f"{path}, line {number}: {column} can't be {row[column]!r}; correct or delete "
-                    "the line"
-                ) from None
-
-
-def _without_repeats(runs: list[Run], complaints: list[str]) -> list[Run]:
-    """Keeps one run per config and seed, since two would count as two seeds."""
-    kept: dict[Any, Run] = {}
+def groups_of(runs: Sequence[Run]) -> list[Group]:
+    """Returns runs grouped by the settings in which they differ, the largest group first."""
+    values: dict[str, dict[str, Any]] = {}
+    for key in dict.fromkeys(key for run in runs for key in run.settings):
+        of_runs = [run.settings.get(key, "absent") for run in runs if _can_have(run, key)]
+        values[key] = {repr(value): value for value in of_runs}
+    differing = [key for key, found in values.items() if len(found) > 1]
+    groups: dict[tuple[tuple[str, str], ...], list[Run]] = {}
     for run in runs:
-        key = (run.stack, run.seed, repr(sorted(run.identity.items(), key=lambda item: item[0])))
-        other = kept.get(key)
-        if other is None:
-            kept[key] = run
-            continue
-        best = max(other, run, key=lambda r: (len(r.tested), r.frames))
-        left = run if best is other else other
-        complaints.append(
-            f"{left.path} is the same run as {best.path}, config and seed: left out, it would "
-            "count as another seed"
-        )
-        kept[key] = best
-    return list(kept.values())
+        own = {k: run.settings.get(k, "absent") for k in differing if _can_have(run, k)}
+        groups.setdefault(tuple((k, repr(v)) for k, v in own.items()), []).append(run)
+    found = [Group(tuple(g), {k: values[k][v] for k, v in key}) for key, g in groups.items()]
+    return sorted(found, key=lambda group: -len(group.runs))
+
+
+def _can_have(run: Run, key: str) -> bool:
+    place, _, rest = key.partition(".")
+    part = rest.split(".")[0]
+    if place == "representations":
+        return part in run.config[place]
+    return place != "scene" or part in (*_OF_EVERY_SCENE, run.scene)
 
 
 def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:

@@ -1,18 +1,109 @@
-"""The parts of a report: headings, notes, figures and tables, independent of the medium."""
+"""The sections of a report on runs: headings, figures and tables, independent of the medium."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, combinations, count, islice, product
+from string import ascii_uppercase
+from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from flowrep.report.results import Grid
-from flowrep.report.runs import Condition
-from flowrep.report.statistics import Estimate
-from flowrep.report.style import LIGHT, Theme, words
-from flowrep.report.tables import Table, latex_text
+from flowrep.config.command_line import folder_name
+from flowrep.report.figures import draw_bars, draw_curves, draw_rates, words
+from flowrep.report.outcomes import (
+    BASELINES,
+    Grid,
+    Metric,
+    by_stack,
+    change,
+    curve_of,
+    grid_of,
+    out_of_bounds_of_both,
+    outcomes_of,
+    rates_tested,
+    side_by_side,
+    speeds_tested,
+)
+from flowrep.report.runs import SCENES, Condition, Group, Run, groups_of, in_order, scenes_of
+from flowrep.report.statistics import FEWEST_RUNS, Array, Bootstrap, Comparison, Estimate, holm
+from flowrep.report.tables import MISSING, Table, latex_text, listed, p_text, percent, points
 
-MISSING = "missing"
+INTERVALS = (
+    "the mean over seeds with 95 % intervals, by a bootstrap over seeds and episodes; of a single "
+    "seed, or where all episodes end alike, Wilson's over the episodes"
+)
+_MOST_PAIRS = 15
+_MOST_LINES = 6  # in one panel of frame rates
+_ALL = "ego+obj+seg2+depth2"
+
+
+class Experiment(NamedTuple):
+    """One of the paper's comparisons: its stacks in the figure's order, its differences."""
+
+    name: str
+    title: str
+    stacks: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...]
+
+
+FLOW_COMPOSITION = Experiment(
+    "flow_composition",
+    "Composition of the flow maps",
+    ("ego", "raw", "obj", "ego+obj"),
+    (("ego+obj", "ego"), ("ego+obj", "raw"), ("ego+obj", "obj"), ("raw", "ego")),
+)
+COMPLEMENTARY = Experiment(
+    "complementary",
+    "Flow beside segmentation and depth",
+    ("seg2", "depth2", "ego+obj", "ego+obj+seg2", "ego+obj+depth2", _ALL),
+    (
+        ("ego+obj+seg2", "seg2"),
+        ("ego+obj+depth2", "depth2"),
+        ("ego+obj+seg2", "ego+obj"),
+        ("ego+obj+depth2", "ego+obj"),
+        (_ALL, "ego+obj"),
+        ("ego+obj", "seg2"),
+        ("ego+obj", "depth2"),
+    ),
+)
+_TABLE_III = ("ego+obj", "depth2", "seg2", "ego+obj+depth2", "ego+obj+seg2", _ALL)
+STACKS = tuple(dict.fromkeys((*FLOW_COMPOSITION.stacks, *COMPLEMENTARY.stacks)))
+"""All of the paper's, in the order of its figures."""
+
+
+class Variation(NamedTuple):
+    """Configs that differ in the keys with one prefix alone, and what a run's variant is called."""
+
+    prefix: str
+    name: str
+    title: str
+    stacks: tuple[str, ...]
+    variant_of: Callable[[Run], str]
+
+
+_VARIATIONS = (
+    Variation(
+        "flow.", "estimated_flow", "Flow estimated from pictures", ("raw", "ego+obj"),
+        lambda run: run.config["flow"]["source"],
+    ),
+    Variation(
+        "noise.", "sensor_noise", "Noise of depth and odometry", ("ego+obj", "raw", "depth2"),
+        lambda run: "noisy" if any(run.config["noise"].values()) else "exact",
+    ),
+    Variation(
+        "scene.camera.", "resolution", "Resolution of the maps", ("ego+obj", "seg2", "depth2"),
+        lambda run: f"{run.config['scene']['camera']['height_px']} px",
+    ),
+)  # fmt: skip
+_FIRST = ("exact", "48 px")  # variants that the others are compared with
+
+
+class Settings(NamedTuple):
+    """A report's choice of evaluations, "greedy" or "sampled", and of intervals."""
+
+    policy: str
+    bootstrap: Bootstrap
 
 
 @dataclass(frozen=True)
@@ -31,27 +122,21 @@ class Drawing:
     panels: tuple[Any, ...]
     draw: Callable[..., Figure]
 
-    def whole(self) -> Figure:
-        """Returns the figure for a paper."""
-        return self.draw(self.panels, LIGHT)
-
-    def parts(self, theme: Theme) -> list[Figure]:
+    def parts(self) -> list[Figure]:
         """Returns one figure per panel, for a page."""
-        return [self.draw([panel], theme, for_page=True) for panel in self.panels]
+        return [self.draw([panel], for_page=True) for panel in self.panels]
 
     def to_latex(self) -> str:
         """Returns a figure environment around the PDF, which lies beside it."""
-        kind, width = ("figure*", r"\textwidth") if len(self.panels) > 1 else (
-            "figure", r"\columnwidth"
-        )  # fmt: skip
+        star, width = ("*", r"\textwidth") if len(self.panels) > 1 else ("", r"\columnwidth")
         return "\n".join(
             [
-                rf"\begin{{{kind}}}[t]",
+                rf"\begin{{figure{star}}}[t]",
                 r"  \centering",
                 rf"  \includegraphics[width={width}]{{{self.name}.pdf}}",
                 rf"  \caption{{{latex_text(self.caption)}}}",
                 rf"  \label{{fig:{self.name}}}",
-                rf"\end{{{kind}}}",
+                rf"\end{{figure{star}}}",
                 "",
             ]
         )
@@ -59,15 +144,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a report.
-
-    Args:
-        name: the name of the folder of its files.
-        title: its heading.
-        notes: sentences before its figures on what is missing or left out.
-        drawings: its figures.
-        tables: its tables.
-    """
+    """One part of a report: the name of its folder, heading, notes, figures and tables."""
 
     name: str
     title: str
@@ -76,61 +153,423 @@ class Section:
     tables: tuple[Table, ...] = ()
 
 
-def percent(estimate: Estimate) -> str:
-    """Returns a share with its interval in %.
+class Chapter(NamedTuple):
+    """The sections of comparable runs; `label` says what distinguishes them from other runs."""
 
-    >>> percent(Estimate(0.854, 0.791, 0.901))
-    '85 [79–90]'
+    label: str
+    sections: tuple[Section, ...]
+
+
+class Report(NamedTuple):
+    """Everything that a page shows of runs, except their drives."""
+
+    runs: tuple[Run, ...]
+    warnings: tuple[str, ...]
+    chapters: tuple[Chapter, ...]
+
+
+def assemble(runs: Sequence[Run], warnings: Sequence[str], settings: Settings) -> Report:
+    """Returns the sections for runs, group by group, and the problems found in runs."""
+    groups = groups_of(runs)
+    wrong = [*warnings, *(w for w in (_unusable(run, settings) for run in runs) if w)]
+    chapters = []
+    for number, group in enumerate(groups):
+        sections = _group_sections(group, settings)
+        if len(groups) > 1:
+            sections = [replace(s, name=f"{number + 1}_{s.name}") for s in sections]
+        chapters.append(Chapter(group.label, tuple(sections)))
+    if len(groups) > 1:
+        chapters.append(Chapter("", tuple(_across(groups, settings))))
+    return Report(tuple(runs), tuple(wrong), tuple(c for c in chapters if c.sections))
+
+
+def _unusable(run: Run, settings: Settings) -> str | None:
+    """Returns why a run fills no cell, None if it does."""
+    policy = settings.policy
+    if not run.is_finished:
+        return (
+            f"{run.name} is not finished, at {run.frames:,} of {run.total_frames:,} frames: only "
+            "its learning curve is used"
+        )
+    if not any(condition.policy == policy for condition in run.conditions):
+        return (
+            f"{run.name} has no {policy} evaluation at its end: only its learning curve is used; "
+            f"python -m flowrep.evaluate run={run.name} policy={policy} adds one"
+        )
+    return None
+
+
+def _group_sections(group: Group, settings: Settings) -> list[Section]:
+    runs = [run for run in group.runs if _unusable(run, settings) is None]
+    sections = []
+    shown: set[str] = set()
+    stacks = in_order([run.stack for run in runs], STACKS)
+    for experiment in (FLOW_COMPOSITION, COMPLEMENTARY):
+        found = set(stacks) & set(experiment.stacks)
+        named = any(run.config.get("experiment") == experiment.name for run in group.runs)
+        if len(found) > 1 or (found and named):
+            sections.append(_experiment_section(experiment, runs, settings))
+            shown |= found
+    if runs:
+        if set(stacks) - shown:
+            sections.append(
+                success_section("success", "Success", by_stack(runs, stacks), None, settings)
+            )
+        sections.append(_failure_section(runs, settings))
+        if len(rates_tested(runs, settings.policy, runs[0].speed)) > 1:
+            sections.append(_rate_section(runs, settings))
+    return [*sections, *_curves(group.runs)]
+
+
+def _experiment_section(experiment: Experiment, runs: Sequence[Run], settings: Settings) -> Section:
+    ours = [run for run in runs if run.stack in experiment.stacks]
+    series = by_stack(ours, experiment.stacks)
+    section = success_section(experiment.name, experiment.title, series, experiment.pairs, settings)
+    absent = [words(scene) for scene in SCENES if scene not in scenes_of(ours)]
+    note = (f"No runs in {listed(absent)}.",) if absent else ()
+    return replace(section, notes=(*section.notes, *note))
+
+
+def success_section(
+    name: str,
+    title: str,
+    series: Mapping[str, Sequence[Run]],
+    pairs: Sequence[tuple[str, str]] | None,
+    settings: Settings,
+    baselines: Sequence[str] = BASELINES,
+) -> Section:
+    """Returns bars, a table of success and one of differences for series of runs.
+
+    Args:
+        name: the section's name.
+        title: the section's heading.
+        series: the runs of each series.
+        pairs: series whose differences are listed; None for all, up to 15.
+        settings: policy and intervals.
+        baselines: see `grid_of`.
     """
-    value, low, high = (f"{100 * number:.0f}" for number in estimate)
-    return f"{value} [{low}–{high}]"
+    runs = [run for members in series.values() for run in members]
+    policy, bootstrap, fps = settings.policy, settings.bootstrap, runs[0].fps
+    conditions = [Condition(policy, s, fps) for s in speeds_tested(runs, policy, fps)]
+    grids = [grid_of(s, series, conditions, bootstrap, baselines) for s in scenes_of(runs)]
+    trained = listed(sorted({run.speed for run in runs}))
+    caption = (
+        f"Success of agents trained at {trained} speed, {policy} actions, {fps:g} frames per "
+        f"second: {INTERVALS}; dots are the seeds."
+    )
+    tables = [_success_table(name, grids, caption, bootstrap)]
+    differences = _difference_table(name, grids, pairs, bootstrap)
+    drawing = Drawing(name, caption, tuple(grids), draw_bars)
+    return Section(
+        name,
+        title,
+        _what_is_missing(grids),
+        (drawing,),
+        (*tables, *([differences] if differences else [])),
+    )
 
 
-def points(estimate: Estimate) -> str:
-    """Returns a difference of shares with its interval in percentage points.
+def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bootstrap) -> Table:
+    """Returns success in % by scene and series, and over all scenes where there are several."""
+    conditions = grids[0].conditions
+    blocks = []
+    for grid in grids:
+        rows = []
+        for series in grid.series:
+            scores = [grid.scores[series, c] for c in conditions]
+            cells = [percent(score.estimate) if score else MISSING for score in scores]
+            counts = dict.fromkeys(score.counts for score in scores if score)
+            rows.append((series, *cells, ", ".join(counts) or "0"))
+        for baseline in dict.fromkeys(baseline for baseline, _ in grid.baselines):
+            shares = [grid.baselines.get((baseline, c)) for c in conditions]
+            cells = [MISSING if share is None else f"{100 * share:.0f}" for share in shares]
+            rows.append((baseline.replace("_", " "), *cells, ""))
+        blocks.append((words(grid.scene), tuple(rows)))
+    if len(grids) > 1:
+        rows = []
+        for series in grids[0].series:
+            found = [[grid.matrices[series, c] for grid in grids] for c in conditions]
+            here = [[m.outcomes for m in of if m is not None] for of in found]
+            cells = [
+                percent(bootstrap.success(o)) if len(o) == len(grids) else MISSING for o in here
+            ]
+            rows.append((series, *cells, ""))
+        blocks.append((f"All {len(grids)} scenes", tuple(rows)))
+    header = ("representations", *(f"{c.speed} (%)" for c in conditions), "seeds × episodes")
+    return Table(f"{name}_success", f"In %. {caption}", header, tuple(blocks))
 
-    >>> points(Estimate(0.123, -0.031, 0.2))
-    '+12 [−3, +20]'
-    """
-    value, low, high = (_signed(100 * number) for number in estimate)
-    return f"{value} [{low}, {high}]"
+
+def _difference_table(
+    name: str,
+    grids: Sequence[Grid],
+    pairs: Sequence[tuple[str, str]] | None,
+    bootstrap: Bootstrap,
+) -> Table | None:
+    """Returns the difference of each pair with its verdict; None if there is no pair to compare."""
+    every = list(combinations(reversed(grids[0].series), 2)) if pairs is None else pairs
+    chosen = every[:_MOST_PAIRS] if pairs is None else pairs
+    places = [(words(grid.scene), [grid]) for grid in grids]
+    if len(grids) > 1:
+        places.append((f"All {len(grids)} scenes", list(grids)))
+    blocks = []
+    for heading, members in places:
+        found = [
+            (f"{first} − {second}", c.speed, *compared)
+            for (first, second), c in product(chosen, grids[0].conditions)
+            if (compared := _compared(members, first, second, c, bootstrap)) is not None
+        ]
+        corrected = holm([c.p_value if c else np.nan for _, _, c, _ in found])
+        rows = [
+            (pair, speed, *_difference_cells(comparison, p), str(shared))
+            for (pair, speed, comparison, shared), p in zip(found, corrected)
+        ]
+        if rows:
+            blocks.append((heading, tuple(rows)))
+    if not blocks:
+        return None
+    caption = (
+        "First minus second in percentage points, on the episodes that all runs of both drove, "
+        "with 95 % bootstrap intervals over seeds and episodes; the probability that a run of the "
+        "first beats one of the second (a tie counts half); p of Welch's t-test over seeds, and "
+        "corrected by Holm for the comparisons of its block. A difference is told from noise where "
+        "its interval leaves out 0 and the corrected p < 0.05; of fewer than "
+        f"{FEWEST_RUNS} seeds a side it is one of these agents."
+    )
+    if len(chosen) < len(every):
+        caption += f" The first {len(chosen)} of {len(every)} pairs."
+    header = (
+        "first − second",
+        "speed",
+        "points",
+        "verdict",
+        "P(first better) (%)",
+        "p",
+        "p (Holm)",
+    )
+    columns = (*header, "shared")
+    return Table(f"{name}_differences", caption, columns, tuple(blocks), words=(1, 3))
 
 
-def _signed(number: float) -> str:
-    whole = round(number)
-    return f"{'+' if whole > 0 else '−' if whole < 0 else ''}{abs(whole)}"
+def _compared(
+    grids: Sequence[Grid], first: str, second: str, condition: Condition, bootstrap: Bootstrap
+) -> tuple[Comparison | None, int] | None:
+    """Returns a comparison over scenes and its shared episodes; None where a side is missing."""
+    sides = []
+    for grid in grids:
+        a, b = grid.matrices.get((first, condition)), grid.matrices.get((second, condition))
+        if a is None or b is None:
+            return None
+        sides.append(side_by_side(a, b))
+    shared = [ours.shape[1] for ours, _ in sides]
+    return (bootstrap.compare(sides), sum(shared)) if all(shared) else (None, 0)
 
 
-def listed(names: Sequence[str]) -> str:
-    """Returns names as a list in a sentence.
+def _difference_cells(comparison: Comparison | None, corrected: float) -> tuple[str, ...]:
+    if comparison is None:
+        return ("", "no shared episodes", "", "", "")
+    return (
+        points(comparison.difference),
+        comparison.verdict(corrected),
+        percent(comparison.improvement),
+        p_text(comparison.p_value),
+        p_text(corrected),
+    )
 
-    >>> listed(["a", "b", "c"]), listed(["a"])
-    ('a, b and c', 'a')
-    """
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
-
-def what_is_missing(grids: Sequence[Grid]) -> tuple[str, ...]:
+def _what_is_missing(grids: Sequence[Grid]) -> tuple[str, ...]:
     """Returns a sentence per scene on the cells that no finished run fills."""
     notes = []
     for grid in grids:
-        empty: dict[str, list[Condition]] = {}
+        parts = []
         for name in grid.series:
             lacking = [c for c in grid.conditions if grid.scores[name, c] is None]
-            if lacking:
-                empty[name] = lacking
-        if empty:
-            parts = [
-                name if len(lacking) == len(grid.conditions) else f"{name} ({_conditions(lacking)})"
-                for name, lacking in empty.items()
-            ]
+            if len(lacking) == len(grid.conditions):
+                parts.append(name)
+            elif lacking:
+                of_rates = len({c.fps for c in grid.conditions}) > 1
+                which = [f"{c.fps:g} Hz" if of_rates else c.speed for c in lacking]
+                parts.append(f"{name} ({listed(which)})")
+        if parts:
             notes.append(f"Missing in {words(grid.scene)}: {listed(parts)}.")
     return tuple(notes)
 
 
-def _conditions(conditions: Sequence[Condition]) -> str:
-    rates = {c.fps for c in conditions}
-    speeds = {c.speed for c in conditions}
-    if len(speeds) > 1 or len(rates) == 1:
-        return listed([c.speed for c in conditions])
-    return listed([f"{c.fps:g}" for c in conditions]) + " Hz"
+def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
+    """Returns Table III for the scenes of the runs, the paper's scene first.
+
+    At the speeds at which the paper evaluates, low and high together, or at that of training where
+    they were not both driven; time-outs are left out, as in the paper.
+    """
+    fps = runs[0].fps
+    driven = speeds_tested(runs, settings.policy, fps)
+    speeds = ["low", "high"] if {"low", "high"} <= {*driven} else [runs[0].speed]
+    conditions = [Condition(settings.policy, speed, fps) for speed in speeds]
+    stacks = in_order([run.stack for run in runs], _TABLE_III)
+    blocks, missing = [], []
+    for scene in in_order(scenes_of(runs), ("s_turn",)):
+        here = by_stack([run for run in runs if run.scene == scene], stacks)
+        rows = [_failure_row(stack, here[stack], conditions, settings) for stack in stacks]
+        missing += [f"{row[0]} in {words(scene)}" for row in rows if MISSING in row]
+        blocks.append((words(scene), tuple(rows)))
+    caption = (
+        "Causes of failure in % of collisions and departures from the road together, of all seeds; "
+        "time-outs are left out. 95 % intervals by a bootstrap over seeds and episodes, of a "
+        f"single seed Wilson's. {words(' and '.join(speeds))} speed, {fps:g} frames per second, "
+        f"{settings.policy} actions."
+    )
+    header = ("representations", "out of bounds (%)", "collision (%)", "out of bounds to collision")
+    counts = ("failures", "time-outs", "episodes")
+    notes = (f"Missing: {listed(missing)}.",) if missing else ()
+    table = Table("failure_causes", caption, (*header, *counts), tuple(blocks))
+    return Section("failure_causes", "Causes of failure", notes, tables=(table,))
+
+
+def _failure_row(
+    stack: str, runs: Sequence[Run], conditions: Sequence[Condition], settings: Settings
+) -> tuple[str, ...]:
+    outcomes = pooled(runs, conditions, out_of_bounds_of_both)
+    timeouts = pooled(runs, conditions, lambda ends: (ends == "timeout").astype(float))
+    if outcomes is None or timeouts is None:
+        return (stack, *[MISSING] * 3, "0", "0", "0")
+    share = settings.bootstrap.pooled_share(outcomes)
+    counts = ((~np.isnan(outcomes)).sum(), np.nansum(timeouts), (~np.isnan(timeouts)).sum())
+    counted = tuple(str(int(number)) for number in counts)
+    if np.isnan(share.value):
+        return (stack, *["no failures"] * 3, *counted)
+    collisions = Estimate(1 - share.value, 1 - share.high, 1 - share.low)
+    return (stack, percent(share, 1), percent(collisions, 1), ratio(share), *counted)
+
+
+def pooled(runs: Sequence[Run], conditions: Sequence[Condition], metric: Metric) -> Array | None:
+    """Returns `[R, E]` of the runs that drove under all conditions; None if none did."""
+    ours = [run for run in runs if run.conditions.issuperset(conditions)]
+    found = [outcomes_of(ours, condition, metric) for condition in conditions]
+    parts = [matrix.outcomes for matrix in found if matrix is not None]
+    return np.hstack(parts) if parts else None
+
+
+def ratio(share: Estimate) -> str:
+    """Returns share : rest with its interval, as text.
+
+    >>> ratio(Estimate(0.2, 0.1, 0.5))
+    '0.250 [0.111–1.000]'
+    """
+    value, low, high = (f"{number / (1 - number):.3f}" if number < 1 else "∞" for number in share)
+    return f"{value} [{low}–{high}]"
+
+
+def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
+    """Returns success at the training speed over all frame rates that were evaluated."""
+    policy, speed, trained = settings.policy, runs[0].speed, runs[0].fps
+    ours = [run for run in runs if len(rates_tested([run], policy, speed)) > 1]
+    conditions = [Condition(policy, speed, rate) for rate in rates_tested(ours, policy, speed)]
+    series = by_stack(ours, in_order([run.stack for run in ours], STACKS))
+    grids = [grid_of(scene, series, conditions, settings.bootstrap) for scene in scenes_of(ours)]
+    caption = (
+        f"Success over the frame rate of the evaluation, trained at {trained:g} frames per second, "
+        f"{speed} speed, {policy} actions: {INTERVALS}. Points of one rate stand side by side."
+    )
+    # the paper's figure, and another if there are more stacks than it can show
+    papers = [name for name in series if name in COMPLEMENTARY.stacks]
+    others = [name for name in series if name not in papers]
+    if len(series) <= _MOST_LINES or not papers:
+        papers, others = list(series), []
+    drawings = tuple(
+        Drawing(name, caption, tuple(replace(g, series=tuple(shown)) for g in grids), draw_rates)
+        for name, shown in (("frame_rate", papers), ("frame_rate_others", others))
+        if shown
+    )
+    table = _rate_table(grids, caption, settings)
+    title = "Sensitivity to the frame rate"
+    return Section("frame_rate", title, _what_is_missing(grids), drawings, (table,))
+
+
+def _rate_table(grids: Sequence[Grid], caption: str, settings: Settings) -> Table:
+    """Returns success in % by frame rate, and the change from the highest to the lowest."""
+    conditions = grids[0].conditions
+    low, high = conditions[0], conditions[-1]
+    blocks = []
+    for grid in grids:
+        rows = []
+        for series in grid.series:
+            scores = [grid.scores[series, c] for c in conditions]
+            cells = [percent(score.estimate) if score else MISSING for score in scores]
+            changes = change(grid.matrices[series, high], grid.matrices[series, low])
+            lost = MISSING if changes is None else points(settings.bootstrap.mean([changes]))
+            rows.append((series, *cells, lost))
+        blocks.append((words(grid.scene), tuple(rows)))
+    heads = (*(f"{c.fps:g} Hz (%)" for c in conditions), f"{high.fps:g} → {low.fps:g} Hz (points)")
+    extra = "The last column is the change of the same agents on the same episodes."
+    header = ("representations", *heads)
+    return Table("frame_rate_success", f"In %. {caption} {extra}", header, tuple(blocks))
+
+
+def _curves(runs: Sequence[Run]) -> list[Section]:
+    panels = []
+    for scene in scenes_of(runs):
+        here = [run for run in runs if run.scene == scene]
+        stacks = by_stack(here, in_order([run.stack for run in here], STACKS))
+        curves = {name: [curve_of(run) for run in members] for name, members in stacks.items()}
+        if any(curve.evaluated or curve.training for of in curves.values() for curve in of):
+            panels.append((scene, curves))
+    if not panels:
+        return []
+    caption = (
+        "Learning curves. Bold, with markers: greedy evaluations at the training speed, the mean "
+        "over seeds. Thin: each seed's training episodes, sampled actions."
+    )
+    drawing = Drawing("learning_curves", caption, tuple(panels), draw_curves)
+    return [Section("learning_curves", "Learning curves", drawings=(drawing,))]
+
+
+def _across(groups: Sequence[Group], settings: Settings) -> Iterator[Section]:
+    """Yields the results of stacks in groups whose configs differ, side by side, not pooled."""
+    keys = list(dict.fromkeys(key for group in groups for key in group.differences))
+    letters = _letters(len(groups))
+    rows = tuple((key, *(_value(g.differences.get(key, ""), 24) for g in groups)) for key in keys)
+    caption = "Keys of the configs in which the runs differ. No number is of runs of two columns."
+    columns = tuple(range(1, len(groups) + 1))
+    table = Table("configs", caption, ("key", *letters), (("", rows),), words=columns)
+    variation = next((v for v in _VARIATIONS if all(k.startswith(v.prefix) for k in keys)), None)
+    usable = [[r for r in g.runs if _unusable(r, settings) is None] for g in groups]
+    variants = [variation.variant_of(g.runs[0]) for g in groups] if variation else letters
+    if len(set(variants)) < len(variants):  # two kinds of noise have no names
+        variation, variants = None, letters
+    by_variant = dict(zip(variants, usable))
+    order = in_order(variants, _FIRST) if variation else variants
+    first, *others = order
+    found = in_order(
+        [r.stack for of in usable for r in of], variation.stacks if variation else STACKS
+    )
+    yield Section("configs", "Configs that differ", tables=(table,))
+    for stacks in [found] if variation else [[stack] for stack in found]:
+        series = {
+            f"{stack}, {v}" if variation else v: [r for r in by_variant[v] if r.stack == stack]
+            for stack, v in product(stacks, order)
+        }
+        if variation:
+            pairs = [(f"{stack}, {v}", f"{stack}, {first}") for stack in stacks for v in others]
+            pairs += [(f"{stacks[0]}, {v}", f"{s}, {v}") for v in order for s in stacks[1:]]
+            notes = tuple(f"{v}: {g.label}." for v, g in zip(variants, groups))
+            name, title = variation.name, variation.title
+        else:
+            series = {v: of for v, of in series.items() if of}
+            pairs, notes = None, ()
+            name, title = (
+                folder_name(f"across_{stacks[0]}"),
+                f"{stacks[0]} under configs that differ",
+            )
+        if sum(map(bool, series.values())) > 1:
+            section = success_section(name, title, series, pairs, settings, baselines=())
+            yield replace(section, notes=(*notes, *section.notes))
+
+
+def _value(value: Any, most: int) -> str:
+    text = str(value)
+    return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
+def _letters(number: int) -> list[str]:
+    """Returns that many names: A to Z, AA, AB and so on."""
+    texts = (map("".join, product(ascii_uppercase, repeat=length)) for length in count(1))
+    return list(islice(chain.from_iterable(texts), number))

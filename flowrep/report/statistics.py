@@ -1,12 +1,13 @@
-"""Statistics of the scores of a few runs: interquartile means, bootstrap intervals, comparisons.
+"""Statistics of the success of a few runs: means, bootstrap intervals, tests, corrections.
 
 As in rliable (Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical
-Precipice, NeurIPS 2021), scores are aggregated by their interquartile mean over runs, and runs are
-resampled within their scene. Two things differ. A run's score is itself a share of a few hundred
-episodes, so the episodes are resampled too, the same ones for all runs; otherwise two seeds that
-happen to agree would have an interval of no width. And scenes may have different numbers of runs:
-each has its own interquartile mean, and all scenes count the same in the mean over them. With all
-runs in one, whoever has more seeds in the easier scene would seem better.
+Precipice, NeurIPS 2021), runs are resampled within their scene. Three things differ. A run's score
+is itself a share of a few hundred episodes, so the episodes are resampled too, the same ones for
+all runs; otherwise two seeds that happen to agree would have an interval of no width. Scenes may
+have different numbers of runs: all count the same in the mean over them, otherwise whoever has more
+seeds in the easier scene would seem better. And the score is the mean over runs, not the
+interquartile mean: of four runs the latter is the mean of the middle two, which drops the one run
+that ended in another way, and p of a test on means would belong to another number.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ Array = NDArray[np.float64]
 
 _OF_RUNS, _OF_EPISODES = 0, 1  # keep the two draws independent
 
-FEWEST_SEEDS = 3
+FEWEST_RUNS = 3
 """With fewer per side, a difference is stated for these agents only, not for their stacks."""
 
 
@@ -39,7 +40,7 @@ class Comparison(NamedTuple):
     """How much better one side does than another.
 
     Args:
-        difference: of the interquartile means, in the mean over scenes, with its interval.
+        difference: of the means over runs, in the mean over scenes, with its bootstrap interval.
         improvement: the probability that a run of the first side beats one of the second.
         p_value: of Welch's t-test over the runs' scores; nan where a side has one run alone.
         runs: the number of runs per side; that of one scene if a scene has one run of a side.
@@ -50,35 +51,23 @@ class Comparison(NamedTuple):
     p_value: float
     runs: int
 
-    @property
-    def is_noise(self) -> bool:
-        """Returns whether the difference can't be told from noise.
+    def verdict(self, p_value: float | None = None) -> str:
+        """Returns in words how far the difference can be trusted.
 
-        That is so if its interval contains 0, or if the t-test finds nothing: a bootstrap over two
-        or three runs gives intervals that are too narrow.
+        It can't be told from noise if its interval contains 0, or if the t-test finds nothing: a
+        bootstrap over two or three runs gives intervals that are too narrow.
+
+        Args:
+            p_value: corrected for the number of comparisons; its own if None.
         """
         has_zero = self.difference.low <= 0 <= self.difference.high
-        return has_zero or self.p_value >= 0.05
-
-    @property
-    def verdict(self) -> str:
-        """Returns in words how far the difference can be trusted."""
-        if self.is_noise:
+        if has_zero or (self.p_value if p_value is None else p_value) >= 0.05:
             return "can't be told from noise"
         word = "higher" if self.difference.value > 0 else "lower"
-        if self.runs < FEWEST_SEEDS:
+        if self.runs < FEWEST_RUNS:
             seeds = "one seed" if self.runs == 1 else f"{self.runs} seeds"
             return f"{word} for these agents; {seeds} a side say no more"
         return word
-
-
-def interquartile_mean(scores: Any, axis: int = -1) -> Any:
-    """Returns the mean of the middle half of scores; of up to three, their mean.
-
-    >>> float(interquartile_mean([0.0, 0.5, 0.7, 1.0]))
-    0.6
-    """
-    return stats.trim_mean(scores, 0.25, axis=axis)
 
 
 def rates(outcomes: Array, weights: Array | None = None) -> Array:
@@ -115,24 +104,24 @@ class Bootstrap:
         self.resamples, self.confidence, self.seed = resamples, confidence, seed
 
     def success(self, scenes: Sequence[Array]) -> Estimate:
-        """Returns the interquartile mean over a scene's runs, in the mean over scenes.
+        """Returns the mean over a scene's runs, in the mean over scenes.
 
         Args:
-            scenes: for each scene [R, E], see `rates`. One run alone gives Wilson's interval.
+            scenes: for each scene [R, E], see `rates`. One run alone gives Wilson's interval, as
+                do runs that succeed always or never: every draw of them is the same.
         """
         if sum(map(len, scenes)) == 1:
             return self._wilson(scenes[0])
+        outcomes = np.concatenate([part[~np.isnan(part)] for part in scenes])
+        if outcomes.size and outcomes.min() == outcomes.max():  # the episodes are shared by runs
+            return self._wilson(np.full(sum(part.shape[1] for part in scenes), outcomes[0]))
         return self.mean(scenes)
 
     def mean(self, scenes: Sequence[Array]) -> Estimate:
         """Returns the same of outcomes of any kind, such as changes between two conditions."""
-        own = [rates(outcomes) for outcomes in scenes]
+        value = np.mean([rates(outcomes).mean() for outcomes in scenes])
         drawn = [self._draw(k, outcomes, [len(outcomes)])[0] for k, outcomes in enumerate(scenes)]
-        value, values = (
-            np.mean([interquartile_mean(scores) for scores in scores_of], axis=0)
-            for scores_of in (own, drawn)
-        )
-        return self._estimate(float(value), values)
+        return self._estimate(float(value), np.mean([d.mean(axis=-1) for d in drawn], axis=0))
 
     def pooled_share(self, outcomes: Array) -> Estimate:
         """Returns the share over the pooled episodes of all runs; nan without episodes.
@@ -142,14 +131,14 @@ class Bootstrap:
         """
         if np.isnan(outcomes).all():
             return Estimate(np.nan, np.nan, np.nan)
-        if len(outcomes) == 1:
+        if len(outcomes) == 1 or np.nanmin(outcomes) == np.nanmax(outcomes):
             return self._wilson(outcomes)
         rng = np.random.default_rng((self.seed, 0, _OF_RUNS))
         weights = _episode_weights(self.seed, 0, outcomes.shape[1], self.resamples)
         chosen = rng.integers(len(outcomes), size=(self.resamples, len(outcomes)))
         there = ~np.isnan(outcomes)
-        counts = np.take_along_axis(weights @ there.T, chosen, axis=1).sum(axis=1)
         found = np.where(there, outcomes, 0.0)
+        counts = np.take_along_axis(weights @ there.T, chosen, axis=1).sum(axis=1)
         sums = np.take_along_axis(weights @ found.T, chosen, axis=1).sum(axis=1)
         drawn = sums[counts > 0] / counts[counts > 0]
         return self._estimate(float(found.sum() / there.sum()), drawn)
@@ -167,7 +156,7 @@ class Bootstrap:
             for k, pair in enumerate(scenes)
         ]
         difference, differences = (
-            np.mean([interquartile_mean(a) - interquartile_mean(b) for a, b in pairs], axis=0)
+            np.mean([a.mean(axis=-1) - b.mean(axis=-1) for a, b in pairs], axis=0)
             for pairs in (own, drawn)
         )
         improvement = float(np.mean([_improvement(*pair) for pair in own]))
@@ -175,7 +164,7 @@ class Bootstrap:
         return Comparison(
             self._estimate(float(difference), differences),
             self._estimate(improvement, improvements),
-            _welch(own),
+            effect(own).p_value,
             _runs_a_side(own),
         )
 
@@ -228,15 +217,60 @@ def _runs_a_side(scenes: Sequence[tuple[Array, Array]]) -> int:
     return fewest if fewest < 2 else min(sum(len(pair[side]) for pair in scenes) for side in (0, 1))
 
 
-def _welch(scenes: Sequence[tuple[Array, Array]]) -> float:
-    """Two-sided p of no difference in the mean over scenes, variances unequal between sides."""
-    sides = [side for pair in scenes for side in pair]
-    if min(len(side) for side in sides) < 2:
-        return float("nan")
-    difference = sum(a.mean() - b.mean() for a, b in scenes)
-    parts = [side.var(ddof=1) / len(side) for side in sides]
-    if not sum(parts):
-        return 1.0 if difference == 0 else 0.0
+class Effect(NamedTuple):
+    """A difference in the mean over scenes, by the t distribution over runs.
+
+    Args:
+        value: the difference.
+        error: its standard error; nan where a scene has one run of a side alone.
+        freedom: Welch and Satterthwaite's degrees of freedom.
+    """
+
+    value: float
+    error: float
+    freedom: float
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided p of no difference."""
+        if self.error == 0:
+            return 1.0 if self.value == 0 else 0.0
+        return float(2 * stats.t.sf(abs(self.value) / self.error, self.freedom))
+
+    def interval(self, confidence: float = 0.95) -> Estimate:
+        """Returns the difference with its interval, which leaves out 0 exactly if p is small."""
+        if self.error == 0:
+            return Estimate(self.value, self.value, self.value)
+        half = self.error * float(stats.t.ppf(0.5 + confidence / 2, self.freedom))
+        return Estimate(self.value, self.value - half, self.value + half)
+
+
+def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
+    """Returns the mean over scenes of the first side's mean minus the second's.
+
+    Args:
+        scenes: for each scene the scores of the runs of both sides, or of one side alone. Variances
+            may differ between all of them: some stacks end in one of two ways.
+    """
+    means = [side[0].mean() - (side[1].mean() if len(side) > 1 else 0.0) for side in scenes]
+    parts = [(s.var(ddof=1) / len(s), len(s) - 1) for side in scenes for s in side if len(s) > 1]
+    if len(parts) < sum(map(len, scenes)):
+        return Effect(float(np.mean(means)), float("nan"), float("nan"))
+    variance = sum(part for part, _ in parts)
     # Welch and Satterthwaite's degrees of freedom of a sum of means
-    freedom = sum(parts) ** 2 / sum(p**2 / (len(s) - 1) for p, s in zip(parts, sides))
-    return float(2 * stats.t.sf(abs(difference) / sum(parts) ** 0.5, freedom))
+    freedom = variance**2 / sum(part**2 / df for part, df in parts) if variance else float("nan")
+    return Effect(float(np.mean(means)), variance**0.5 / len(scenes), freedom)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Returns p values corrected for their number by Holm's method, nan left as it is.
+
+    >>> holm([0.01, 0.04, 0.03])
+    [0.03, 0.06, 0.06]
+    """
+    known = sorted((p, i) for i, p in enumerate(p_values) if not np.isnan(p))
+    corrected, worst = list(p_values), 0.0
+    for place, (p, i) in enumerate(known):
+        worst = max(worst, min(1.0, p * (len(known) - place)))
+        corrected[i] = worst
+    return corrected

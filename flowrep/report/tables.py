@@ -1,16 +1,15 @@
-"""Tables of a report, as LaTeX (booktabs), CSV and pictures."""
+"""Tables of a report, as LaTeX (booktabs), CSV and Markdown, and numbers as text."""
 
 import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+import numpy as np
 
-from flowrep.report.style import Theme, styled
+from flowrep.report.statistics import Estimate
 
+MISSING = "missing"
 _LATEX = {
     "\\": r"\textbackslash{}",
     "&": r"\&",
@@ -31,8 +30,6 @@ _LATEX = {
     "<": r"$<$",
     ">": r"$>$",
 }
-_ROW_IN, _CHARACTER_IN, _GAP_IN = 0.19, 0.062, 0.18
-_FONT_PT = 7.5
 
 
 @dataclass(frozen=True)
@@ -72,10 +69,8 @@ class Table:
         for heading, rows in self.blocks:
             lines.append(r"    \midrule")
             if heading:
-                span = (
-                    rf"\multicolumn{{{len(self.header)}}}{{l}}{{\textit{{{latex_text(heading)}}}}}"
-                )
-                lines.append(rf"    {span} \\")
+                span = rf"\multicolumn{{{len(self.header)}}}{{l}}"
+                lines.append(rf"    {span}{{\textit{{{latex_text(heading)}}}}} \\")
             lines += [f"    {_latex_row(row)}" for row in rows]
         lines += [r"    \bottomrule", r"  \end{tabular}", r"\end{table}"]
         return "\n".join(lines) + "\n"
@@ -90,59 +85,11 @@ class Table:
             writer.writerows([*([heading] if has_blocks else []), *row] for row in rows)
         return text.getvalue()
 
-    def draw(self, theme: Theme) -> Figure:
-        """Returns the table as a figure that fits its text."""
-        rows = [row for _, members in self.blocks for row in (self.header, *members)]
-        widths = [
-            max(len(row[i]) for row in rows) * _CHARACTER_IN + _GAP_IN
-            for i in range(len(self.header))
-        ]
-        headings = sum(bool(heading) for heading, _ in self.blocks)
-        height = (1 + headings + sum(len(members) for _, members in self.blocks)) * _ROW_IN
-        height += 0.1 * (len(self.blocks) + 2)
-        with styled(theme, _FONT_PT):
-            figure = Figure(figsize=(sum(widths), height))
-            axes = figure.add_axes((0, 0, 1, 1), xlim=(0, sum(widths)), ylim=(height, 0))
-            axes.set_axis_off()
-            _Pen(axes, self, widths, theme).draw()
-        return figure
 
-
-class _Pen:
-    """Writes a table's rows downwards on axes whose units are inches."""
-
-    def __init__(self, axes: Axes, table: Table, widths: Sequence[float], theme: Theme) -> None:
-        self.axes, self.table, self.widths, self.theme = axes, table, widths, theme
-        self.y = 0.05
-
-    def draw(self) -> None:
-        self._rule(1.0)
-        self._row(self.table.header, weight="bold")
-        for heading, rows in self.table.blocks:
-            self._rule(0.5)
-            if heading:
-                self._text(heading, _GAP_IN / 2, "left", style="italic")
-                self.y += _ROW_IN
-            for row in rows:
-                self._row(row)
-        self._rule(1.0)
-
-    def _rule(self, width: float) -> None:
-        self.y += 0.05
-        self.axes.plot([0, sum(self.widths)], [self.y] * 2, color=self.theme.text, linewidth=width)
-        self.y += 0.05 if width < 1 else 0.02
-
-    def _row(self, row: Sequence[str], **style: Any) -> None:
-        left = 0.0
-        for i, (text, width) in enumerate(zip(row, self.widths)):
-            is_text = self.table.is_text(i)
-            at = left + _GAP_IN / 2 if is_text else left + width - _GAP_IN / 2
-            self._text(text, at, "left" if is_text else "right", **style)
-            left += width
-        self.y += _ROW_IN
-
-    def _text(self, text: str, x: float, align: str, **style: Any) -> None:
-        self.axes.text(x, self.y + _ROW_IN / 2, text, ha=align, va="center", **style)
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Returns a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def latex_text(text: str) -> str:
@@ -156,3 +103,49 @@ def latex_text(text: str) -> str:
 
 def _latex_row(row: Sequence[str]) -> str:
     return " & ".join(latex_text(cell) for cell in row) + r" \\"
+
+
+def percent(estimate: Estimate, digits: int = 0) -> str:
+    """Returns a share with its interval in %.
+
+    >>> percent(Estimate(0.854, 0.791, 0.901))
+    '85 [79–90]'
+    """
+    value, low, high = (100 * number for number in estimate)
+    return f"{value:.{digits}f} [{low:.0f}–{high:.0f}]"
+
+
+def points(estimate: Estimate) -> str:
+    """Returns a difference of shares with its interval in percentage points.
+
+    >>> points(Estimate(0.123, -0.031, 0.2))
+    '+12 [−3, +20]'
+    """
+    value, low, high = (signed(number) for number in estimate)
+    return f"{value} [{low}, {high}]"
+
+
+def signed(share: float) -> str:
+    """Returns a difference in points with its sign, as text."""
+    whole = round(100 * share)
+    return f"{'+' if whole > 0 else '−' if whole < 0 else ''}{abs(whole)}"
+
+
+def p_text(p_value: float) -> str:
+    """Returns a p value as text, nothing for one that isn't known.
+
+    >>> p_text(0.0449), p_text(0.0001), p_text(float("nan"))
+    ('0.045', '<0.001', '')
+    """
+    if np.isnan(p_value):
+        return ""
+    return "<0.001" if p_value < 0.0005 else f"{p_value:.3f}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Returns names as a list in a sentence.
+
+    >>> listed(["a", "b", "c"]), listed(["a"])
+    ('a, b and c', 'a')
+    """
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

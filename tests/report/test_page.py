@@ -10,20 +10,15 @@ import pytest
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
-from flowrep.report.assembly import Chapter, Report
 from flowrep.report.command import report_on
-from flowrep.report.drives import Drives, Plan
-from flowrep.report.experiments import COMPLEMENTARY
-from flowrep.report.figures import draw_bars
-from flowrep.report.files import save, write_files
+from flowrep.report.drives import Drives, Picture
+from flowrep.report.figures import draw_bars, save, svg
+from flowrep.report.outcomes import grid_of
 from flowrep.report.page import render_page
-from flowrep.report.pictures import svg_uri
-from flowrep.report.results import grid_of
-from flowrep.report.runs import Condition, read_runs
-from flowrep.report.sections import Section
+from flowrep.report.runs import Condition
+from flowrep.report.sections import COMPLEMENTARY, Report
 from flowrep.report.statistics import Bootstrap
-from flowrep.report.style import LIGHT
-from flowrep.report.tables import Table
+from flowrep.report.storage import read_run, write_archive
 from tests.report.folders import config_of, letters, rows_of, write_run
 
 pytestmark = pytest.mark.slow
@@ -34,10 +29,7 @@ ASKED = {
     "resamples": 200,
     "trajectories": 0,
     "videos": 0,
-    "device": "cpu",
-    "trust": None,
 }
-LIST = ".report_files"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 
 
@@ -95,9 +87,9 @@ def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
             ("failure_causes", "failure_causes"),
             ("frame_rate", "frame_rate_success"),
         )
-        for kind in ("png", "pdf", "tex", "csv")
+        for kind in ("tex", "csv")
     }
-    assert found == drawn | tables | {"index.html", LIST}
+    assert found == drawn | tables | {"index.html"}
 
 
 def test_names_are_drawn_as_they_are_and_nothing_is_written_elsewhere(tmp_path):
@@ -114,62 +106,30 @@ def test_names_are_drawn_as_they_are_and_nothing_is_written_elsewhere(tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["x"]
 
 
-def report_of(**sections):
-    """A report of sections with a table each, whose only cell is given."""
-    tables = {name: Table(name, "", ("x",), (("", ((cell,),)),)) for name, cell in sections.items()}
-    found = [Section(name, name, tables=(table,)) for name, table in tables.items()]
-    return Report((), (), (Chapter("", (), tuple(found)),))
-
-
-def files_in(folder):
-    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
-
-
-def test_what_an_earlier_report_wrote_is_removed_and_nothing_else(tmp_path):
-    folder, aside = tmp_path / "report", tmp_path / "aside.txt"
-    write_files(report_of(one="1", two="2", three="3"), folder)
-    (folder / "two" / "mine.txt").write_text("")
-    (folder / "two" / "two.tex").write_text("% mine by now")
-    aside.write_text("")
-    nothing = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"  # of no bytes
-    with (folder / LIST).open("a") as lines:
-        lines.write(f"{nothing} ../aside.txt\n{nothing} two/gone.txt\nabc\n")
-    (one,) = write_files(report_of(one="4"), folder)
-    assert one == folder / "one"
-    assert (one / "one.csv").read_text() == "x\n4\n"
-    of_one = [f"one/one.{kind}" for kind in ("csv", "pdf", "png", "tex")]
-    assert files_in(folder) == [LIST, *of_one, "two/mine.txt", "two/two.tex"]
-    assert not (folder / "three").exists()
-    assert aside.exists()
-    write_files(report_of(), folder)
-    assert files_in(folder) == [LIST, "two/mine.txt", "two/two.tex"]
-
-
-def test_a_report_that_was_interrupted_is_removed_by_the_next(tmp_path, monkeypatch):
-    def refuse(table):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Table, "to_csv", refuse)
-        with pytest.raises(KeyboardInterrupt):
-            write_files(report_of(one="1"), tmp_path)
-    assert files_in(tmp_path) == [LIST, "one/one.pdf", "one/one.png", "one/one.tex"]
-    write_files(report_of(), tmp_path)
-    assert files_in(tmp_path) == [LIST]
+def test_packed_runs_have_the_same_tables(sweep, page, tmp_path):
+    runs = [read_run(path.parent) for path in sorted(sweep.glob("*_*/config.yaml"))]
+    write_archive(runs, tmp_path / "packed")
+    again = report_on(ASKED | {"run": str(tmp_path / "packed"), "output": str(tmp_path / "out")})
+    tables = sorted(page.parent.rglob("*.csv"))
+    assert len(tables) == 6
+    for table in tables:
+        other = again.parent / table.relative_to(page.parent)
+        assert other.read_text() == table.read_text()
 
 
 def test_the_page_says_what_is_missing_and_what_is_wrong(page):
     text = page.read_text(encoding="utf-8")
     assert "Missing in S-Turn: raw." in text
     assert "No runs in H-Shaped Pathways and Three-Way Junction." in text
-    assert "damaged/config.yaml can&#39;t be read" in text
+    assert "damaged/config.yaml" in text
+    assert "<h1>9 stacks in Straight Road and S-Turn</h1>" in text
     assert "34 runs, 34 of them finished, of 9 stacks" in text
 
 
-@pytest.mark.parametrize("plans", [{}, {"S-Turn": [Plan("ego", "of 1, 1 collided", "data:,")]}])
-def test_the_page_names_agents_that_could_not_drive(plans):
-    text = render_page(Report((), (), ()), Drives(plans, [], ["a has no checkpoint"]), [])
-    assert text.count("a has no checkpoint") == 1
+@pytest.mark.parametrize("plans", [{}, {"S-Turn": [Picture("ego", "1 collision", "data:,")]}])
+def test_the_page_names_agents_without_drives(plans):
+    text = render_page(Report((), (), ()), Drives(plans, {}, ["a has no drives"]))
+    assert text.count("a has no drives") == 1
     assert text.count('id="drives"') == text.count('href="#drives"') == 1
     assert ("The scene from above" in text) == bool(plans)
 
@@ -178,13 +138,13 @@ def test_a_figure_saved_again_is_the_same_byte_for_byte(tmp_path):
     config = config_of()
     run = write_run(tmp_path / "run", config, rows_of(config, letters(3)))
     conditions = [Condition("greedy", "normal", 12.0)]
-    series = {"ego+obj": read_runs([run])[0], "ego+obj+seg2": []}
+    series = {"ego+obj": [read_run(run)], "ego+obj+seg2": []}
     grid = grid_of("straight_road", series, conditions, Bootstrap(50))
 
     def saved(name):
-        figure = draw_bars([grid], LIGHT)
+        figure = draw_bars([grid])
         save(figure, tmp_path / name)
-        return svg_uri(figure), *((tmp_path / f"{name}.{k}").read_bytes() for k in ("png", "pdf"))
+        return svg(figure), *((tmp_path / f"{name}.{k}").read_bytes() for k in ("png", "pdf"))
 
     assert saved("first") == saved("second")
 

@@ -7,15 +7,12 @@ import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.report.assembly import assemble
-from flowrep.report.cells import cell_of, side_by_side
-from flowrep.report.comparing import Settings
-from flowrep.report.learning import curve_of
-from flowrep.report.rates import change
-from flowrep.report.runs import Condition, read_runs
-from flowrep.report.sections import percent, points
+from flowrep.report.outcomes import change, curve_of, outcomes_of, side_by_side
+from flowrep.report.runs import Condition
+from flowrep.report.sections import Settings, assemble
 from flowrep.report.statistics import Bootstrap, Estimate
-from flowrep.report.tables import Table
+from flowrep.report.storage import read_runs
+from flowrep.report.tables import Table, percent, points
 from tests.report.folders import config_of, rows_of, write_run
 
 ASK = Settings("greedy", Bootstrap(100))
@@ -23,8 +20,8 @@ NORMAL = Condition("greedy", "normal", 12.0)
 
 
 def sections_of(folder):
-    runs, complaints = read_runs([folder])
-    report = assemble(runs, complaints, ASK)
+    runs, warnings = read_runs([folder])
+    report = assemble(runs, warnings, ASK)
     found = {section.name: section for chapter in report.chapters for section in chapter.sections}
     return found, report
 
@@ -46,9 +43,10 @@ def test_an_episode_has_one_column_whichever_runs_drove_it(tmp_path):
     late = [row | {"episode_seed": row["episode_seed"] + 1} for row in rows_of(other, "sc")]
     write_run(tmp_path / "a", config, rows_of(config, "cs"))
     write_run(tmp_path / "b", other, late)
-    cell = cell_of(read_runs([tmp_path])[0], NORMAL)
-    assert (cell.seeds, cell.episodes, cell.counts) == ((0, 1), (100, 101, 102), "2 × 2")
-    np.testing.assert_array_equal(cell.outcomes, [[0, 1, math.nan], [math.nan, 1, 0]])
+    found = outcomes_of(read_runs([tmp_path])[0], NORMAL)
+    assert (found.seeds, found.counts) == ((0, 1), "2 × 2")
+    assert found.episodes.tolist() == [100, 101, 102]
+    np.testing.assert_array_equal(found.outcomes, [[0, 1, math.nan], [math.nan, 1, 0]])
 
 
 def later(rows, episodes):
@@ -62,7 +60,9 @@ def test_two_cells_stand_side_by_side_in_the_episodes_that_all_their_runs_drove(
     write_run(tmp_path / "b", second, later(rows_of(second, "ccss"), 2))
     write_run(tmp_path / "c", other, later(rows_of(other, "csc"), 1))
     runs, _ = read_runs([tmp_path])
-    flows, seg = (cell_of([r for r in runs if r.stack == s], NORMAL) for s in ("ego+obj", "seg2"))
+    flows, seg = (
+        outcomes_of([r for r in runs if r.stack == s], NORMAL) for s in ("ego+obj", "seg2")
+    )
     ours, theirs = side_by_side(flows, seg)
     np.testing.assert_array_equal(ours, [[1, 0], [0, 0]])
     np.testing.assert_array_equal(theirs, [[1, 0]])
@@ -74,7 +74,7 @@ def test_a_difference_is_of_shared_episodes_alone(tmp_path):
     run_in(tmp_path, "b", "sscc" + "ssss", stack="raw")
     found, _ = sections_of(tmp_path)
     differences = found["flow_composition"].tables[1]
-    ((_, _, told, _, _, _, shared),) = rows_in(differences)
+    ((_, _, told, _, _, _, _, shared),) = rows_in(differences)
     assert (told, shared) == ("0 [0, 0]", "4")
 
 
@@ -86,9 +86,20 @@ def test_a_pair_without_shared_episodes_has_no_difference(tmp_path):
     found, _ = sections_of(tmp_path)
     differences = found["flow_composition"].tables[1]
     low, normal, high = rows_in(differences)
-    assert normal == ("raw − ego", "normal", "", "no shared episodes", "", "", "0")
+    assert normal == ("raw − ego", "normal", "", "no shared episodes", "", "", "", "0")
     assert low[-1] == high[-1] == "2"
-    assert "Of 2 comparisons" in differences.caption
+
+
+def test_p_is_corrected_for_the_comparisons_of_its_block(tmp_path):
+    # The same 4 against 1 and 2 of 8 in each of two speeds: twice the p value.
+    for seed in range(2):
+        ends = "s" * (6 + seed) + "c" * (2 - seed)
+        run_in(tmp_path, f"a{seed}", {"low": ends, "high": ends}, stack="raw", seed=seed)
+        ends = "s" * (1 + seed) + "c" * (7 - seed)
+        run_in(tmp_path, f"b{seed}", {"low": ends, "high": ends}, stack="ego", seed=seed)
+    low, high = rows_in(sections_of(tmp_path)[0]["flow_composition"].tables[1])
+    assert low[5] == high[5] == "0.019"  # Welch: 0.625 / 0.0884 = 7.07, 2 degrees
+    assert low[6] == high[6] == "0.039"
 
 
 def test_table_iii_leaves_time_outs_out_and_tells_the_ratio(tmp_path):
@@ -105,6 +116,15 @@ def test_table_iii_leaves_time_outs_out_and_tells_the_ratio(tmp_path):
     assert depth == ("depth2", "missing", "missing", "missing", "0", "0", "0")
     assert seg == ("seg2", "no failures", "no failures", "no failures", "0", "0", "8")
     assert found["failure_causes"].notes == ("Missing: depth2 in S-Turn.",)
+
+
+def test_table_iii_is_of_low_and_high_speed_together_where_both_were_driven(tmp_path):
+    # out of bounds 1 of 2 at low, 1 of 4 at high: 2 of 6; at the training speed 3 of 3
+    run_in(tmp_path, "a", {"low": "ocss", "normal": "ooo", "high": "occc"})
+    (table,) = sections_of(tmp_path)[0]["failure_causes"].tables
+    ((_, share, *_, failures, _, episodes),) = rows_in(table)
+    assert (share.split()[0], failures, episodes) == ("33.3", "6", "8")
+    assert "Low and high speed" in table.caption
 
 
 def test_a_cell_without_runs_is_missing_and_so_is_what_needs_it(tmp_path):
@@ -148,7 +168,7 @@ def test_the_change_with_the_frame_rate_is_that_of_the_same_agents_and_episodes(
 def test_a_change_needs_seeds_and_episodes_in_common(tmp_path):
     run_in(tmp_path, "a", {"low": "ss", "normal": "sc"})
     (run,), _ = read_runs([tmp_path])
-    low, normal = cell_of([run], Condition("greedy", "low", 12.0)), cell_of([run], NORMAL)
+    low, normal = outcomes_of([run], Condition("greedy", "low", 12.0)), outcomes_of([run], NORMAL)
     np.testing.assert_array_equal(change(low, normal), [[0, -1]])
     assert change(low, None) is None
 
@@ -161,9 +181,9 @@ def test_a_run_that_drove_other_episodes_in_each_condition_is_no_part_of_a_chang
     rows = later(rows_of(config, "ss", speed="low"), 50) + rows_of(config, "ss")
     write_run(tmp_path / "b", config, rows)
     runs, _ = read_runs([tmp_path])
-    low, normal = cell_of(runs, Condition("greedy", "low", 12.0)), cell_of(runs, NORMAL)
+    low, normal = outcomes_of(runs, Condition("greedy", "low", 12.0)), outcomes_of(runs, NORMAL)
     np.testing.assert_array_equal(change(low, normal), [[-1, -1]])
-    assert change(cell_of(runs[1:], Condition("greedy", "low", 12.0)), normal) is None
+    assert change(outcomes_of(runs[1:], Condition("greedy", "low", 12.0)), normal) is None
 
 
 def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):
@@ -229,8 +249,7 @@ def test_pairs_that_are_too_many_for_a_table_are_counted(tmp_path, stacks, pairs
     found, _ = sections_of(tmp_path)
     differences = found["success"].tables[1]
     assert len(rows_in(differences)) == 15
-    cut = f"The first 15 of {pairs} pairs; a report of fewer runs has the others."
-    assert differences.caption.endswith(cut) == (pairs > 15)
+    assert differences.caption.endswith(f"The first 15 of {pairs} pairs.") == (pairs > 15)
 
 
 def test_runs_of_none_of_the_papers_experiments_are_shown_all_the_same(tmp_path):
@@ -247,7 +266,7 @@ def test_an_unfinished_run_is_in_the_learning_curve_alone(tmp_path):
     write_run(tmp_path / "half", config, rows, [{"frames": 400, "success": 0.25}])
     found, report = sections_of(tmp_path)
     assert list(found) == ["learning_curves"]
-    assert "half is not finished, at 400 of 1,000 frames" in report.complaints[0]
+    assert "half is not finished, at 400 of 1,000 frames" in report.warnings[0]
 
 
 def test_a_learning_curve_is_of_the_speed_and_frame_rate_of_training(tmp_path):
@@ -257,6 +276,7 @@ def test_a_learning_curve_is_of_the_speed_and_frame_rate_of_training(tmp_path):
     rows += rows_of(config, "cccc", evaluation="final", fps=6.0)
     rows += rows_of(config, "cccc", evaluation="final", speed="high")
     rows += rows_of(config, "cccc", evaluation="evaluate")
+    rows += rows_of(config, "cccc", evaluation="training", frames=1000)  # other episodes
     write_run(tmp_path / "run", config, rows, [{"frames": 500, "success": 0.1}])
     curve = curve_of(read_runs([tmp_path])[0][0])
     assert curve == ([(500, 0.5), (1000, 0.75)], [(500, 0.1)])
@@ -315,7 +335,7 @@ def test_noise_is_told_stack_by_stack_and_against_the_other_stacks(tmp_path):
     }
     assert not any(name.startswith("across_") for name in found)
     (drawing,) = section.drawings
-    (axes,) = drawing.whole().axes
+    (axes,) = drawing.draw(drawing.panels).axes
     heights = {round(bar.get_height()) for bar in axes.patches}
     assert heights == {100, 50, 75, 25, 0}
     assert len(report.chapters) == 3

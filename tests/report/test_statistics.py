@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.report.statistics import Bootstrap, interquartile_mean, rates
+from flowrep.report.statistics import Bootstrap, effect, holm, rates
 
 NAN = np.nan
 
@@ -15,12 +15,6 @@ NAN = np.nan
 def runs(*successes, episodes=10):
     """A row a run, the first of its episodes successes."""
     return np.array([[1.0] * n + [0.0] * (episodes - n) for n in successes])
-
-
-def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
-    assert interquartile_mean(np.array([0.0, 0.4, 0.6, 9.0])) == 0.5  # the mean would be 2.5
-    assert interquartile_mean(np.array([0.0, 0.0, 0.6])) == pytest.approx(0.2)  # median: 0
-    assert interquartile_mean(np.array([9, 9, 1, 2, 3, 4, -9, -9.0])) == 2.5
 
 
 def test_a_rate_counts_the_episodes_that_a_run_drove():
@@ -63,9 +57,21 @@ def test_scenes_are_strata():
     assert found == (0.5, 0.5, 0.5)
 
 
+def test_the_run_that_ended_in_another_way_counts():
+    # Three of 0.5 and one of 1: 0.625; the interquartile mean, of the middle two, would be 0.5.
+    assert Bootstrap(100).success([runs(5, 5, 5, 10)]).value == 0.625
+
+
+@pytest.mark.parametrize(("ended", "whole"), [(0, 0.0), (8, 1.0)])
+def test_runs_that_all_end_alike_have_an_interval_all_the_same(ended, whole):
+    # Wilson's of 0 of 8 episodes, which two runs share: upper bound z² / (8 + z²) = 0.324
+    found = Bootstrap().success([runs(ended, ended, episodes=8)])
+    assert found.value == whole
+    assert found.high - found.low == pytest.approx(0.324, abs=0.001)
+
+
 def test_scenes_count_the_same_however_many_runs_they_have():
-    # 0.9 in one scene and 0.1 in the other: 0.5. Over all runs it would be (4 · 0.9 + 0.1) / 5,
-    # and the interquartile mean 0.9.
+    # 0.9 in one scene and 0.1 in the other: 0.5. Over all runs it would be (4 · 0.9 + 0.1) / 5.
     found = Bootstrap(500, confidence=0.5).success([runs(9, 9, 9, 9), runs(1)])
     assert found.value == pytest.approx(0.5)
     assert found.low < 0.5 < found.high
@@ -73,12 +79,13 @@ def test_scenes_count_the_same_however_many_runs_they_have():
 
 def test_more_runs_in_the_easier_scene_are_no_advantage():
     # 5 points better in both scenes, with two and four runs against four and two. Over all runs
-    # the middle ones are 0.15, 0.15, 0.15, 0.9 and 0.1, 0.85, 0.85, 0.85: 33 points worse.
+    # it would be (2 · 0.9 + 4 · 0.15) / 6 = 0.4 against 0.6.
     easy = (runs(90, 90, episodes=100), runs(85, 85, 85, 85, episodes=100))
     hard = (runs(15, 15, 15, 15, episodes=100), runs(10, 10, episodes=100))
     found = Bootstrap(500).compare([easy, hard])
     assert found.difference.value == pytest.approx(0.05)
-    assert found.verdict == "higher"
+    assert found.verdict() == "higher"
+    assert found.verdict(0.06) == "can't be told from noise"  # corrected for many comparisons
     assert found.p_value == 0
 
 
@@ -116,16 +123,15 @@ def test_a_difference_on_the_same_episodes_is_free_of_what_they_have_in_common()
     found = Bootstrap(500).compare([pair])
     assert found.difference == (0.0, 0.0, 0.0)
     assert found.improvement.value == 0.5  # a tie is half
-    assert found.is_noise
-    assert found.verdict == "can't be told from noise"
+    assert found.verdict() == "can't be told from noise"
 
 
 def test_the_difference_is_first_minus_second():
     found = Bootstrap(500).compare([(runs(9, 9, 9), runs(1, 1, 1))])
     assert found.difference.value == pytest.approx(0.8)
     assert found.improvement == (1.0, 1.0, 1.0)
-    assert found.verdict == "higher"
-    assert Bootstrap(500).compare([(runs(1, 1, 1), runs(9, 9, 9))]).verdict == "lower"
+    assert found.verdict() == "higher"
+    assert Bootstrap(500).compare([(runs(1, 1, 1), runs(9, 9, 9))]).verdict() == "lower"
 
 
 def test_improvement_is_the_share_of_pairs_in_which_the_first_is_higher():
@@ -139,18 +145,18 @@ def test_welchs_test_is_the_textbooks():
     # t = 0.2 / sqrt(0.05 / 3) = 1.549 at (0.05/3)² / ((0.01/3)²/2 + (0.04/3)²/2) = 2.94 degrees
     found = Bootstrap(500).compare([(runs(5, 6, 7), runs(2, 4, 6))])
     assert found.p_value == pytest.approx(0.221, abs=0.002)
-    assert found.is_noise
+    assert found.verdict() == "can't be told from noise"
 
 
 def test_few_seeds_say_it_of_these_agents_alone():
     one = Bootstrap(500).compare([(runs(90, episodes=100), runs(10, episodes=100))])
     assert math.isnan(one.p_value)
-    assert one.verdict == "higher for these agents; one seed a side say no more"
+    assert one.verdict() == "higher for these agents; one seed a side say no more"
     two = Bootstrap(500).compare([(runs(90, 91, episodes=100), runs(10, 11, episodes=100))])
-    assert two.verdict == "higher for these agents; 2 seeds a side say no more"
+    assert two.verdict() == "higher for these agents; 2 seeds a side say no more"
     # of two scenes there are four runs a side
     pair = (runs(90, 91, episodes=100), runs(10, 11, episodes=100))
-    assert Bootstrap(500).compare([pair, pair]).verdict == "higher"
+    assert Bootstrap(500).compare([pair, pair]).verdict() == "higher"
 
 
 def test_a_bootstrap_that_is_too_sure_is_overruled():
@@ -158,4 +164,43 @@ def test_a_bootstrap_that_is_too_sure_is_overruled():
     # two runs that differ by 0.8 among themselves tell nothing.
     found = Bootstrap(500).compare([(runs(10, 90, episodes=100), runs(0, 5, episodes=100))])
     assert found.difference.low > 0
-    assert found.is_noise
+    assert found.verdict() == "can't be told from noise"
+
+
+def scores(*values):
+    return np.array(values, dtype=float)
+
+
+def test_an_effect_over_scenes_is_the_mean_of_their_differences_with_a_t_interval():
+    # Differences 0.2 and 0.4; variances of the means 0.01/3 and 0.04/3 in the first scene, 0.02/2
+    # and 0 in the second: error sqrt(0.05/3 + 0.01) / 2 = 0.0816, with
+    # (0.02667)² / ((0.01/3)²/2 + (0.04/3)²/2 + 0.01²/1) = 3.66 degrees, t = 2.881
+    found = effect(
+        [(scores(0.5, 0.6, 0.7), scores(0.2, 0.4, 0.6)), (scores(0.8, 1.0), scores(0.5, 0.5))]
+    )
+    assert found.value == pytest.approx(0.3)
+    assert found.error == pytest.approx(0.0816, abs=1e-4)
+    assert found.freedom == pytest.approx(3.66, abs=0.01)
+    assert found.interval().low == pytest.approx(0.3 - 2.881 * 0.0816, abs=1e-3)
+    assert found.p_value == pytest.approx(0.024, abs=0.002)
+
+
+def test_an_effect_of_one_side_is_its_mean_against_0():
+    # 0.2, 0.3, 0.4: error 0.1 / sqrt(3), two degrees, t = 4.303
+    found = effect([(scores(0.2, 0.3, 0.4),)])
+    assert found.interval() == pytest.approx(
+        (0.3, 0.3 - 4.303 * 0.0577, 0.3 + 4.303 * 0.0577), abs=1e-3
+    )
+
+
+def test_one_run_alone_has_an_effect_without_an_interval():
+    found = effect([(scores(0.2), scores(0.1, 0.3))])
+    assert found.value == pytest.approx(0.0)
+    assert math.isnan(found.p_value)
+    assert math.isnan(found.interval().low)
+
+
+def test_holm_leaves_out_what_is_not_known():
+    assert holm([0.02, math.nan, 0.01])[::2] == [0.02, 0.02]
+    assert math.isnan(holm([0.02, math.nan])[1])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]

@@ -1,0 +1,265 @@
+"""Reads runs from folders and from packed tables, and packs them.
+
+    python -m flowrep.report.storage outputs/<sweep> ... --into outputs/reference
+
+Packed, `runs.jsonl` has a line per run: its name, commit, precision, CPU and config;
+`episodes.csv.gz` has a row per evaluated episode, `training.csv.gz` one per logged step.
+"""
+
+import argparse
+import csv
+import gzip
+import io
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from fnmatch import fnmatch
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.report.runs import Columns, Run
+from flowrep.tables import TableError
+
+RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
+_MACHINE = ("commit", "precision", "cpu")
+
+
+EPISODE_COLUMNS: dict[str, type] = {
+    "scene": str,
+    "frames": int,
+    "evaluation": str,
+    "policy": str,
+    "speed": str,
+    "fps": float,
+    "episode_seed": int,
+    "outcome": str,
+    "hit": str,
+    "length": int,
+}
+"""The columns of evaluation.csv that a report reads."""
+
+
+def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
+    """Returns the runs in folders at any depth, and a line for each that was left out.
+
+    A folder of packed tables stands for its runs; with a pattern after its name, such as
+    `outputs/reference/s_turn_*`, for those with such names.
+
+    Raises:
+        RunFolderError: one of the folders holds no run at all.
+    """
+    runs: dict[str, Run] = {}
+    warnings: list[str] = []
+    for folder in folders:
+        if is_archive(folder) or (not folder.exists() and is_archive(folder.parent)):
+            pattern = "*" if folder.exists() else folder.name
+            packed = read_archive(folder if folder.exists() else folder.parent)
+            found = [run for run in packed if fnmatch(run.name, pattern)]
+            if not found:
+                raise RunFolderError(f"'{folder}': no packed run in it has such a name")
+            runs |= {run.name: run for run in found}
+            continue
+        configs = sorted(path for path in folder.rglob("config.yaml") if _is_of_a_run(path, folder))
+        if not configs:
+            what = (
+                "holds no run: no config.yaml is in it or below"
+                if folder.is_dir()
+                else ("is a file" if folder.exists() else "does not exist")
+            )
+            raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
+        for config in configs:
+            key = str(config.parent.resolve())
+            if key not in runs:
+                try:
+                    runs[key] = read_run(config.parent)
+                except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
+                    warnings.append(" ".join(str(error).split()))
+    return list(runs.values()), warnings
+
+
+def _is_of_a_run(config: Path, folder: Path) -> bool:
+    below = config.relative_to(folder).parts  # the folder itself may be called anything
+    return ".hydra" not in below and "wandb" not in below
+
+
+def read_run(path: Path) -> Run:
+    """Returns the run in a folder.
+
+    Raises:
+        RunFolderError: its config is not what a run leaves.
+        TableError: one of its tables is damaged.
+    """
+    folder = RunFolder.existing(path)
+    config = folder.read_config()
+    rows, metrics = folder.read_episodes(), folder.read_metrics()
+    try:
+        episodes = columns_of((list(row.values()) for row in rows), list(rows[0]) if rows else ())
+    except ValueError as error:
+        raise TableError(f"{folder.evaluation_path}: {error}; correct or delete the row") from None
+    try:
+        logged = {
+            name: np.array([float(row[name] or "nan") for row in metrics])
+            for name in (metrics[0] if metrics else ())
+        }
+    except ValueError as error:
+        raise TableError(f"{folder.metrics_path}: {error}; correct or delete the row") from None
+    machine = {key: str(config.get(key) or "unknown") for key in ("commit", "cpu")}
+    run = Run(str(path), config, episodes, logged, path, machine)
+    try:
+        episodes["path"] = drawn_paths(episodes["episode_seed"], len(run.paths))
+        # what every part of a report asks a run for
+        _ = run.settings, run.stack, run.scene.title(), run.fps, run.speed.title(), run.seed + 0
+        _ = run.is_finished
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise RunFolderError(
+            f"{path}/config.yaml is not what a run leaves ({error!r}); restore the file that the "
+            "run was started with"
+        ) from None
+    return run
+
+
+def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Returns one run per config and seed, and a line for each other: it would be another seed."""
+    warnings: list[str] = []
+    kept: dict[Any, Run] = {}
+    for run in runs:
+        key = (run.stack, run.seed, repr(sorted(run.settings.items(), key=lambda item: item[0])))
+        other = kept.setdefault(key, run)
+        if other is run:
+            continue
+        best = max(other, run, key=lambda r: (int(r.tested.sum()), r.frames))
+        left = run if best is other else other
+        warnings.append(
+            f"{left.name} is the same run as {best.name}, config and seed: left out, it would "
+            "count as another seed"
+        )
+        kept[key] = best
+    return list(kept.values()), warnings
+
+
+def columns_of(rows: Iterable[Sequence[str]], header: Sequence[str]) -> Columns:
+    """Returns the episodes of rows of text as columns.
+
+    Raises:
+        ValueError: a cell is not of its column's kind.
+    """
+    cells = dict(zip(header, zip(*rows)))
+    return {
+        name: np.array(cells.get(name, ()), dtype=kind) for name, kind in EPISODE_COLUMNS.items()
+    }
+
+
+def drawn_paths(episode_seeds: NDArray[Any], paths: int) -> NDArray[Any]:
+    """Returns the path of each episode: the first draw of its generator, as an episode makes it."""
+    if paths < 2:
+        return np.zeros(len(episode_seeds), int)
+    seeds, places = np.unique(episode_seeds, return_inverse=True)
+    drawn = [int(np.random.default_rng(int(seed)).integers(paths)) for seed in seeds]
+    return np.array(drawn, int)[places]
+
+
+def is_archive(folder: Path) -> bool:
+    """Returns whether a folder holds packed runs."""
+    return (folder / RUNS).is_file()
+
+
+def read_archive(folder: Path) -> list[Run]:
+    """Returns the packed runs of a folder, without their training curves' losses."""
+    episodes, training = _read(folder / EPISODES), _read(folder / TRAINING)
+    runs = []
+    for line in (folder / RUNS).read_text(encoding="utf-8").splitlines():
+        entry = json.loads(line)
+        header, rows = episodes.get(entry["run"], ((), []))
+        columns = columns_of(rows, header)
+        header, rows = training.get(entry["run"], ((), []))
+        cells = zip(header, zip(*rows))
+        metrics = {n: np.array([float(c or "nan") for c in column]) for n, column in cells}
+        machine = {key: entry[key] for key in _MACHINE}
+        run = Run(entry["run"], entry["config"], columns, metrics, machine=machine)
+        columns["path"] = drawn_paths(columns["episode_seed"], len(run.paths))
+        runs.append(run)
+    return runs
+
+
+def _read(path: Path) -> dict[str, tuple[list[str], list[list[str]]]]:
+    """Returns the header and rows of each run in a table, without the run's name."""
+    if not path.is_file():
+        return {}
+    with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
+        lines = csv.reader(file)
+        header = next(lines)[1:]
+        of_runs = groupby(lines, key=lambda cells: cells[0])
+        return {name: (header, [cells[1:] for cells in rows]) for name, rows in of_runs}
+
+
+def write_archive(runs: Sequence[Run], folder: Path) -> None:
+    """Packs runs into a folder, byte for byte the same for the same runs.
+
+    A run of the same name that is packed there already is replaced; others stay.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    before = read_archive(folder) if is_archive(folder) else []
+    by_name = {Path(run.name).name: run for run in (*before, *runs)}
+    kept = sorted(by_name.items())
+    logged = list(dict.fromkeys(name for _, run in kept for name in run.metrics))
+    _write(folder / EPISODES, ("run", *EPISODE_COLUMNS), _rows(kept, "episodes", EPISODE_COLUMNS))
+    _write(folder / TRAINING, ("run", *logged), _rows(kept, "metrics", logged))
+    lines = (json.dumps(_entry(name, run), ensure_ascii=False) for name, run in kept)
+    (folder / RUNS).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+
+
+def _entry(name: str, run: Run) -> dict[str, Any]:
+    machine = {key: (run.machine or {}).get(key, "unknown") for key in _MACHINE}
+    return {"run": name, **machine, "config": run.config}
+
+
+def _rows(
+    runs: Iterable[tuple[str, Run]], table: str, names: Iterable[str]
+) -> Iterator[tuple[Any, ...]]:
+    for name, run in runs:
+        columns: Columns = getattr(run, table)
+        size = max(map(len, columns.values()), default=0)
+        absent = np.full(size, np.nan)
+        cells = [columns.get(column, absent).tolist() for column in names]
+        yield from ((name, *map(_text, row)) for row in zip(*cells))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):  # five digits of a loss are enough
+        return "" if value != value else f"{value:.5g}" if abs(value) < 1e5 else f"{value:.0f}"
+    return str(value)
+
+
+def _write(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    whole = path.with_suffix(".tmp")
+    whole.write_bytes(gzip.compress(text.getvalue().encode("utf-8"), mtime=0))
+    whole.replace(path)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description="Packs run folders into three tables.")
+    parser.add_argument("folders", nargs="+", type=Path, help="folders of runs or of sweeps")
+    parser.add_argument("--into", type=Path, required=True, help="the folder of the tables")
+    asked = parser.parse_args()
+    try:
+        runs, warnings = read_runs(asked.folders)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    for warning in warnings:
+        print(f"left out: {warning}")
+    write_archive(runs, asked.into)
+    print(f"{asked.into}: {len(runs)} runs packed")
+
+
+if __name__ == "__main__":
+    main()

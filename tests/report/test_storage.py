@@ -1,0 +1,168 @@
+"""Folders and packed tables in, runs and lines about what is wrong out."""
+
+import gzip
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("scipy", reason="reports are an extra")
+pytest.importorskip("shapely", reason="a path is the first draw of an episode")
+
+from flowrep.experiment.run import RunFolderError
+from flowrep.report.storage import (
+    EPISODES,
+    drawn_paths,
+    read_run,
+    read_runs,
+    without_repeats,
+    write_archive,
+)
+from tests.report.folders import config_of, letters, rows_of, write_run
+
+
+def run_in(folder, name, successes=4, *, scene="straight_road", stack="ego+obj", seed=0, **changes):
+    config = config_of(scene, stack, seed, **changes)
+    return write_run(folder / name, config, rows_of(config, letters(successes)))
+
+
+def names(runs):
+    return [run.folder.name for run in runs]
+
+
+def test_runs_are_found_however_deep_and_once(tmp_path):
+    run_in(tmp_path / "day" / "sweep", "a")
+    run_in(tmp_path / "day", "b", seed=1)
+    (tmp_path / "day" / "b" / ".hydra").mkdir()
+    (tmp_path / "day" / "b" / ".hydra" / "config.yaml").write_text("seed: 1\n")
+    runs, warnings = read_runs([tmp_path, tmp_path / "day" / "b"])
+    assert names(runs) == ["b", "a"]
+    assert warnings == []
+
+
+@pytest.mark.parametrize("name", ["wandb", ".hydra"])
+def test_a_folder_of_runs_may_lie_anywhere(tmp_path, name):
+    path = run_in(tmp_path / name / "sweep", "a")
+    (path / name).mkdir()
+    (path / name / "config.yaml").write_text("seed: 1\n")
+    for folder in (tmp_path / name, path):
+        runs, warnings = read_runs([folder])
+        assert ([run.folder for run in runs], warnings) == ([path], [])
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "expected"),
+    [
+        ("config.yaml", "seed: [", "config.yaml"),
+        ("config.yaml", "", "config.yaml"),
+        ("config.yaml", "seed: 1\n", "scene"),
+        ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
+        ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
+        ("metrics.csv", "frames,success\n9,high\n", "'high'"),
+    ],
+)
+def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, text, expected):
+    run_in(tmp_path, "good")
+    (run_in(tmp_path, "bad", seed=1) / file).write_text(text)
+    runs, (warning,) = read_runs([tmp_path])
+    assert names(runs) == ["good"]
+    assert "bad/" in warning
+    assert expected in warning
+    assert "\n" not in warning
+
+
+@pytest.mark.parametrize(("column", "value"), [("fps", "often"), ("length", "")])
+def test_a_cell_that_no_episode_can_have_is_one_line(tmp_path, column, value):
+    run_in(tmp_path, "good")
+    config = config_of(seed=1)
+    first, *rows = rows_of(config, "ssss")
+    write_run(tmp_path / "bad", config, [*rows, first | {column: value}])
+    runs, (warning,) = read_runs([tmp_path])
+    assert names(runs) == ["good"]
+    assert "bad/evaluation.csv" in warning
+
+
+@pytest.mark.parametrize("key", ["speed", "scene__name", "scene__frame_rate_hz", "total_frames"])
+@pytest.mark.parametrize("value", [[1], None])
+def test_a_config_that_is_not_a_runs_is_one_line(tmp_path, key, value):
+    config = config_of(**{key: value})
+    path = write_run(tmp_path / "bad", config, rows_of(config_of(), "s"))
+    (path / "config.yaml").write_text(yaml.safe_dump(config))
+    runs, warnings = read_runs([tmp_path])
+    assert runs == []
+    assert len(warnings) == 1
+    assert "bad/config.yaml" in warnings[0]
+
+
+@pytest.mark.parametrize(("name", "said"), [("none", "does not exist"), ("empty", "holds no run")])
+def test_a_folder_without_runs_is_named(tmp_path, name, said):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RunFolderError, match=f"{name}' {said}"):
+        read_runs([tmp_path / name])
+
+
+def test_a_run_that_is_there_twice_counts_as_one_seed(tmp_path):
+    run_in(tmp_path, "first")
+    config = config_of(device="cuda")  # of the machine
+    rows = rows_of(config, letters(5)) + rows_of(config, letters(5), speed="low")
+    write_run(tmp_path / "second", config, rows)
+    runs, (warning,) = without_repeats(read_runs([tmp_path])[0])
+    assert names(runs) == ["second"]  # which has more episodes
+    assert "first is the same run as" in warning
+
+
+def same(first, second):
+    assert first.config == second.config
+    for ours, theirs in ((first.episodes, second.episodes), (first.metrics, second.metrics)):
+        assert ours.keys() == theirs.keys()
+        for name, column in ours.items():
+            np.testing.assert_array_equal(column, theirs[name])
+
+
+def test_packed_runs_are_the_runs_of_the_folders(tmp_path):
+    config = config_of("s_turn", "raw")
+    metrics = [{"frames": 123456, "success": ""}, {"frames": 200000, "success": 0.25}]
+    write_run(tmp_path / "runs" / "a", config, rows_of(config, "sct", fps=6.5), metrics)
+    run_in(tmp_path / "runs", "b", seed=1)
+    folders, _ = read_runs([tmp_path / "runs"])
+    write_archive(folders, tmp_path / "packed")
+    packed, warnings = read_runs([tmp_path / "packed"])
+    assert ([run.name for run in packed], warnings) == (["a", "b"], [])
+    same(folders[0], packed[0])
+    same(folders[1], packed[1])
+    assert packed[0].machine == {"commit": "unknown", "precision": "unknown", "cpu": "unknown"}
+
+
+def test_packing_again_adds_and_replaces_and_gives_the_same_bytes(tmp_path):
+    first = read_run(run_in(tmp_path / "one", "a", 4))
+    write_archive([first], tmp_path / "packed")
+    before = (tmp_path / "packed" / EPISODES).read_bytes()
+    write_archive([first], tmp_path / "packed")
+    assert (tmp_path / "packed" / EPISODES).read_bytes() == before
+    better, other = read_run(run_in(tmp_path / "two", "a", 5)), read_run(run_in(tmp_path, "b"))
+    write_archive([better, other], tmp_path / "packed")
+    rows = gzip.decompress((tmp_path / "packed" / EPISODES).read_bytes()).decode().splitlines()
+    assert sum(row.startswith("a,") and ",success," in row for row in rows) == 5
+    assert sum(row.startswith("b,") for row in rows) == 8
+
+
+def test_packed_runs_are_chosen_by_name(tmp_path):
+    write_archive([read_run(run_in(tmp_path, name)) for name in ("ab", "ac", "b")], tmp_path / "p")
+    runs, _ = read_runs([tmp_path / "p" / "a?"])
+    assert [run.name for run in runs] == ["ab", "ac"]
+    with pytest.raises(RunFolderError):
+        read_runs([tmp_path / "p" / "z*"])
+
+
+def test_an_episodes_path_is_the_one_that_it_draws(tmp_path):
+    from flowrep.envs.episode import Episode, Rules
+    from flowrep.scenes import load_scene
+    from flowrep.scenes.layout import Layout
+
+    scene = load_scene("h_shaped_pathways")
+    rules = Rules(Layout(scene), 12.0, 2)
+    driven = [Episode(rules, seed, (1.2, 1.8), 10.0).path for seed in range(8)]
+    drawn = drawn_paths(np.arange(8), len(scene.paths))
+    assert [scene.paths[place] for place in drawn] == driven
+    assert len(set(drawn.tolist())) > 1
+    assert drawn_paths(np.arange(3), 1).tolist() == [0, 0, 0]
