@@ -8,7 +8,7 @@ maps; tests/examples/test_vizdoom_flow.py warps frames by this flow:
 
 - 32 map units are a metre, and depth is a byte, linear in z: 7.16 · (byte + 2) units on floors and
   ceilings, which have label 1, and 7.16 · (byte + 1.19) on walls and sprites at 240 rows;
-- the field of view is 90° across the width, and pixels are 1.2 times as tall as wide;
+- the field of view is 90° across the width, and pixels are 1.2 times as wide as tall;
 - labels change from frame to frame; `state.labels` says which object each stands for;
 - sprites are billboards that always face the camera, so a body's pose is its place alone;
 - after the last step there is no state any more.
@@ -25,11 +25,19 @@ import vizdoom
 from gymnasium import spaces
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
-from flowrep.transforms import BodyRows, CameraMotion, FlowFactorize, InstanceMotion, RawFlow
+from flowrep.geometry import intrinsics_from_fov
+from flowrep.transforms import (
+    AdaptPose,
+    BodyRows,
+    CameraMotion,
+    FlowFactorize,
+    InstanceMotion,
+    RawFlow,
+)
 
 HEIGHT, WIDTH, SKIP, BODIES = 240, 320, 2, 32
 UNITS_PER_M = 32.0
-K = [[WIDTH / 2, 0.0, WIDTH / 2], [0.0, 1.2 * WIDTH / 2, HEIGHT / 2], [0.0, 0.0, 1.0]]
+K = intrinsics_from_fov(90.0, axis="horizontal", height=HEIGHT, width=WIDTH, pixel_aspect=1.2)
 CAMERA = ("CAMERA_POSITION_X", "CAMERA_POSITION_Y", "CAMERA_POSITION_Z", "CAMERA_ANGLE")
 
 
@@ -63,9 +71,9 @@ class Doom(gym.Env):
                 rgb=spaces.Box(0, 255, (3, HEIGHT, WIDTH), np.uint8),
                 depth=spaces.Box(0.0, np.inf, (1, HEIGHT, WIDTH), np.float32),
                 instance=spaces.Box(0, BODIES, (1, HEIGHT, WIDTH), np.uint8),
-                world_from_cam=spaces.Box(-np.inf, np.inf, (4, 4), np.float64),
                 world_from_body=spaces.Box(-np.inf, np.inf, (BODIES, 4, 4), np.float64),
-            )
+            ),
+            camera_pose=spaces.Box(-np.inf, np.inf, (4,), np.float64),
         )
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
@@ -75,25 +83,20 @@ class Doom(gym.Env):
         self.game.new_episode()
         self.rows.clear()
         self.latest = self.observe()
-        return {"sensor": dict(self.latest)}, {}
+        return copied(self.latest), {}
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
         reward = self.game.make_action(self.buttons[int(action)], SKIP)
         ended = self.game.is_episode_finished()
         if not ended:
             self.latest = self.observe()
-        # A copy: transforms write beside what an env returns.
-        return {"sensor": dict(self.latest)}, reward, ended, False, {}
+        return copied(self.latest), reward, ended, False, {}
 
     def observe(self) -> dict[str, Any]:
         """Returns this step's maps and poses, in flowrep's conventions."""
         state = self.game.get_state()
-        x, y, z, angle_deg = state.game_variables
-        sine, cosine = np.sin(np.deg2rad(angle_deg)), np.cos(np.deg2rad(angle_deg))
-        world_from_cam = np.eye(4)  # its columns: right, down, ahead, place
-        world_from_cam[:3] = np.array(
-            [[sine, 0, cosine, x], [-cosine, 0, sine, y], [0, -1, 0, z]]
-        ) / [1, 1, 1, UNITS_PER_M]
+        *place, angle_deg = state.game_variables
+        camera_pose = np.array([*np.divide(place, UNITS_PER_M), np.deg2rad(angle_deg)])
         labels = torch.from_numpy(state.labels_buffer)
         offset = np.where(state.labels_buffer == 1, 2.0, 1.19)
         bodies = {each.object_id: each for each in state.labels if each.object_name != "DoomPlayer"}
@@ -105,21 +108,32 @@ class Doom(gym.Env):
         world_from_body = self.rows(poses).numpy()
         instance = self.rows.instance(labels, {body.value: i for i, body in bodies.items()})
         depth = 7.16 * (state.depth_buffer + offset) / UNITS_PER_M
-        return {
+        sensor = {
             "rgb": state.screen_buffer,
             "depth": depth[None].astype(np.float32),
             "instance": instance[None].numpy(),
-            "world_from_cam": world_from_cam,
             "world_from_body": world_from_body,
         }
+        return {"sensor": sensor, "camera_pose": camera_pose}
 
     def close(self) -> None:
         self.game.close()
 
 
+def copied(observation: dict[str, Any]) -> dict[str, Any]:
+    """Returns a copy, since transforms write beside what an env returns."""
+    return observation | {"sensor": dict(observation["sensor"])}
+
+
 def make_env(scenario: str = "defend_the_line") -> TransformedEnv:
     """Returns a scenario as a TorchRL env that writes raw, ego and obj."""
-    transforms = Compose(CameraMotion(), InstanceMotion(), RawFlow(K), FlowFactorize(K))
+    transforms = Compose(
+        AdaptPose(layout="xyz_yaw", axes="x_forward_z_up", in_keys="camera_pose"),
+        CameraMotion(),
+        InstanceMotion(),
+        RawFlow(K),
+        FlowFactorize(K),
+    )
     return TransformedEnv(GymWrapper(Doom(scenario), categorical_action_encoding=True), transforms)
 
 

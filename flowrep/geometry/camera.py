@@ -106,9 +106,10 @@ def intrinsics_from_fov(
     axis: FovAxis,
     height: int,
     width: int,
+    pixel_aspect: float = 1.0,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Returns K `[3, 3]` of a camera with square pixels and a centred principal point.
+    """Returns K `[3, 3]` of a camera with a centred principal point.
 
     Convention: `axis` is the side of the picture that `fov_deg` spans from border to border:
     `"horizontal"` its width (Habitat's hfov), `"vertical"` its height (MuJoCo's fovy, OpenGL's
@@ -119,6 +120,7 @@ def intrinsics_from_fov(
         axis: `"horizontal"` or `"vertical"`.
         height: of the picture, pixels.
         width: of the picture, pixels.
+        pixel_aspect: a pixel's width over its height, fy / fx; 1 for square pixels.
         dtype: of the result.
 
     Raises:
@@ -135,8 +137,13 @@ def intrinsics_from_fov(
     if height < 1 or width < 1:
         raise ValueError(f"height and width must be at least 1 pixel, got {height} and {width}")
     half_size = (width if axis == "horizontal" else height) / 2
+    if not 0 < pixel_aspect < math.inf:
+        raise ValueError(f"pixel_aspect must be positive, got {pixel_aspect}")
     focal = half_size / math.tan(math.radians(fov_deg) / 2)
-    rows = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+    fx, fy = focal, focal * pixel_aspect
+    if axis == "vertical":
+        fx, fy = focal / pixel_aspect, focal
+    rows = [[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]]
     return torch.tensor(rows, dtype=torch.float64).to(dtype)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, TypeAlias
 
 import torch
@@ -20,6 +21,8 @@ def adapt_depth(
     K: Tensor | None = None,
     near_m: float | None = None,
     far_m: float | None = None,
+    scale_m: float | None = None,
+    nothing: float | None = None,
 ) -> Tensor:
     """Returns depth along the optical axis, `[*B, 1, H, W]`, metres.
 
@@ -34,16 +37,27 @@ def adapt_depth(
         K: `[*B, 3, 3]`, pixels; only for `"ray_length"`.
         near_m: the near plane; only for `"z_buffer"`.
         far_m: the far plane, `math.inf` if the projection has none; only for `"z_buffer"`.
+        scale_m: metres per unit of `depth`, 1 if it is float; whole numbers, such as uint16
+            millimetres (0.001), need it. Not for `"z_buffer"`.
+        nothing: a value, before scaling, that means no measurement; it becomes nan.
 
     Raises:
         ValueError: an unknown kind, a shape that does not fit, or an argument that the kind needs
             and lacks or does not use.
-        TypeError: no float tensor.
+        TypeError: no float tensor, without `scale_m`.
 
     >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
     tensor([[[1., 2., inf]]])
+    >>> adapt_depth(torch.tensor([[[0, 2500]]]).short(), "z", scale_m=1e-3, nothing=0)
+    tensor([[[   nan, 2.5000]]])
     """
-    check_depth_options(kind, K is not None, near_m, far_m)
+    check_depth_options(kind, K is not None, near_m, far_m, scale_m)
+    unmeasured = None if nothing is None else depth == nothing
+    if scale_m is not None:
+        # Divided, since 1 / 0.001 is exact and 0.001 isn't: 3,000 mm are 3 m, not 3.0000002.
+        depth = (depth if depth.is_floating_point() else depth.float()) / (1.0 / scale_m)
+    if unmeasured is not None:
+        depth = torch.where(unmeasured, torch.nan, depth)
     check_shape("depth", depth, (1, "H", "W"))
     if kind == "ray_length":
         assert K is not None
@@ -106,7 +120,11 @@ def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
 
 
 def check_depth_options(
-    kind: str, has_camera: bool, near_m: float | None, far_m: float | None
+    kind: str,
+    has_camera: bool,
+    near_m: float | None,
+    far_m: float | None,
+    scale_m: float | None = None,
 ) -> None:
     """Raises ValueError if an argument that `kind` needs is missing, or an unused one is given."""
     check_name("kind", kind, DepthKind)
@@ -117,4 +135,9 @@ def check_depth_options(
         raise ValueError(
             "'z_buffer' needs near_m and far_m, the other kinds do not read them; "
             f"kind is {kind!r}, near_m={near_m}, far_m={far_m}"
+        )
+    if scale_m is not None and (kind == "z_buffer" or not 0 < scale_m < math.inf):
+        raise ValueError(
+            f"scale_m is metres per unit, positive, and 'z_buffer' has none; kind is {kind!r}, "
+            f"scale_m={scale_m}"
         )

@@ -12,7 +12,9 @@ from torch import Tensor
 
 from flowrep.geometry.checks import broadcast_batch, check_is_tensor, check_name, check_shape
 
-PoseLayout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz"]
+PoseLayout: TypeAlias = Literal[
+    "matrix", "matrix_3x4", "xyz_xyzw", "xyz_wxyz", "xyz_yaw", "xyz_yaw_pitch"
+]
 PoseDirection: TypeAlias = Literal["camera_to_world", "world_to_camera"]
 CameraAxes: TypeAlias = Literal["opencv", "opengl", "ned", "x_forward_z_up"]
 
@@ -261,9 +263,12 @@ def adapt_pose(
     cancel in every relative motion.
 
     Args:
-        pose: `[*B, 4, 4]`, or `[*B, 7]`: translation, then the unit quaternion.
-        layout: `"matrix"`, `"xyz_xyzw"` (real part of the quaternion last) or `"xyz_wxyz"`
-            (real part first).
+        pose: `[*B, 4, 4]`, or what `layout` says.
+        layout: `"matrix"`; `"matrix_3x4"`, the same without its last row; `"xyz_xyzw"` or
+            `"xyz_wxyz"`, `[*B, 7]`, translation and unit quaternion, its real part last or first;
+            `"xyz_yaw"` or `"xyz_yaw_pitch"`, `[*B, 4]` or `[*B, 5]`, translation and angles in
+            radians in a world whose z is up: yaw counter-clockwise from the world's x, pitch
+            upwards, of a camera that looks along its own x (`axes="x_forward_z_up"`).
         direction: `"camera_to_world"` maps points in the camera's frame to the world's;
             `"world_to_camera"` (extrinsics) is the inverse.
         axes: the camera's.
@@ -278,12 +283,17 @@ def adapt_pose(
     >>> world_from_cam @ torch.tensor([0.0, 0.0, 1.0, 1.0]).double()  # a metre ahead: along x
     tensor([6., 6., 7., 1.], dtype=torch.float64)
     """
-    check_name("layout", layout, PoseLayout)
+    check_pose_options(layout, axes)
     check_name("direction", direction, PoseDirection)
-    check_name("axes", axes, CameraAxes)
     if layout == "matrix":
         check_shape("pose", pose, (4, 4))
         matrix = pose.double()
+    elif layout == "matrix_3x4":
+        check_shape("pose", pose, (3, 4))
+        pose = torch.nn.functional.pad(pose.double(), (0, 0, 0, 1))
+        matrix = pose + torch.nn.functional.pad(torch.ones_like(pose[..., :1, :1]), (3, 0, 3, 0))
+    elif layout.startswith("xyz_yaw"):
+        matrix = _pose_from_angles(pose, has_pitch=layout == "xyz_yaw_pitch")
     else:
         matrix = pose_from_quaternion(pose, layout, check=check)
     if check:
@@ -294,6 +304,33 @@ def adapt_pose(
     # Each column is a given one or its opposite. They are picked, as a product would round and
     # constants created here would be copied to a GPU in every call.
     return torch.cat([*_columns(rotation, axes), rest], -1)
+
+
+def check_pose_options(layout: str, axes: str) -> None:
+    """Raises ValueError for an unknown layout or axes, and for angles of a camera along its z."""
+    check_name("layout", layout, PoseLayout)
+    check_name("axes", axes, CameraAxes)
+    if layout.startswith("xyz_yaw") and axes != "x_forward_z_up":
+        raise ValueError(
+            f"layout {layout!r} is of a camera that looks along its own x: "
+            f'axes="x_forward_z_up", not {axes!r}'
+        )
+
+
+def _pose_from_angles(pose: Tensor, has_pitch: bool) -> Tensor:
+    """Returns Rz(yaw) · Ry(−pitch) with the translation, `[*B, 4, 4]`, float64."""
+    check_shape("pose", pose, (5 if has_pitch else 4,))
+    x, y, z, yaw, *rest = pose.double().unbind(-1)
+    pitch = rest[0] if rest else torch.zeros_like(yaw)
+    cos, sin, up, ahead = yaw.cos(), yaw.sin(), pitch.sin(), pitch.cos()
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    rows = [
+        [cos * ahead, -sin, -cos * up, x],
+        [sin * ahead, cos, -sin * up, y],
+        [up, zero, ahead, z],
+        [zero, zero, zero, one],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def _columns(rotation: Tensor, axes: CameraAxes) -> list[Tensor]:

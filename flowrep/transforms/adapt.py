@@ -13,6 +13,7 @@ from flowrep import geometry
 from flowrep.geometry import checks
 from flowrep.geometry.depth import check_depth_options
 from flowrep.geometry.flow import check_flow_options
+from flowrep.geometry.pose import check_pose_options
 from flowrep.transforms.base import (
     DEPTH,
     FLOW,
@@ -25,7 +26,14 @@ from flowrep.transforms.base import (
 )
 from flowrep.transforms.flow import CameraTransform, Intrinsics
 
-VECTOR = Reads((7,), "float")
+_POSES = {
+    "matrix": MOTION,
+    "matrix_3x4": Reads((3, 4), "float"),
+    "xyz_xyzw": Reads((7,), "float"),
+    "xyz_wxyz": Reads((7,), "float"),
+    "xyz_yaw": Reads((4,), "float"),
+    "xyz_yaw_pitch": Reads((5,), "float"),
+}
 
 
 class AdaptDepth(CameraTransform):
@@ -43,6 +51,9 @@ class AdaptDepth(CameraTransform):
         intrinsics: K `[3, 3]` in pixels or its key; only for `"ray_length"`.
         near_m: the near plane; only for `"z_buffer"`.
         far_m: the far plane; only for `"z_buffer"`.
+        scale_m: metres per unit; whole numbers need it, e.g. 0.001 for millimetres.
+        nothing: a value, before scaling, that means no measurement; it becomes nan.
+        channels_last: whether the env's depth is `[*B, H, W, 1]`.
         in_keys: key of the env's depth.
         out_keys: key of depth in metres; must differ, so that nothing is adapted twice.
 
@@ -65,23 +76,39 @@ class AdaptDepth(CameraTransform):
         intrinsics: Intrinsics | None = None,
         near_m: float | None = None,
         far_m: float | None = None,
+        scale_m: float | None = None,
+        nothing: float | None = None,
+        channels_last: bool = False,
         in_keys: Keys = "depth",
         out_keys: Keys = ("sensor", "depth"),
     ) -> None:
-        check_depth_options(kind, intrinsics is not None, near_m, far_m)
-        super().__init__(intrinsics, [DEPTH], in_keys, out_keys)
+        check_depth_options(kind, intrinsics is not None, near_m, far_m, scale_m)
+        shape = ("H", "W", 1) if channels_last else DEPTH.shape
+        reads = Reads(shape, "float" if scale_m is None else "any")
+        super().__init__(intrinsics, [reads], in_keys, out_keys)
         check_own_keys(self)
         self.kind, self.near_m, self.far_m = kind, near_m, far_m
+        self.scale_m, self.nothing, self.channels_last = scale_m, nothing, channels_last
 
     def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:
         """Returns depth along the optical axis."""
-        K = self.K if K is None else K
-        z = geometry.adapt_depth(depth, self.kind, K=K, near_m=self.near_m, far_m=self.far_m)
+        z = geometry.adapt_depth(
+            depth.movedim(-1, -3) if self.channels_last else depth,
+            self.kind,
+            K=self.K if K is None else K,
+            near_m=self.near_m,
+            far_m=self.far_m,
+            scale_m=self.scale_m,
+            nothing=self.nothing,
+        )
         return (z,)
 
     def output_specs(self, depth: TensorSpec, *camera: TensorSpec) -> tuple[TensorSpec]:
-        """Returns an unbounded spec of depth's shape."""
-        return (Unbounded(depth.shape, device=depth.device, dtype=depth.dtype),)
+        """Returns an unbounded spec of depth's size."""
+        *batch, height, width, _ = depth.shape
+        size = (*batch, 1, height, width) if self.channels_last else depth.shape
+        dtype = depth.dtype if depth.dtype.is_floating_point else torch.float32
+        return (Unbounded(size, device=depth.device, dtype=dtype),)
 
 
 class AdaptPose(MapTransform):
@@ -91,12 +118,13 @@ class AdaptPose(MapTransform):
     | --- | --- | --- | --- | --- |
     | a pose | `("sensor", "world_from_cam")` | float64 `[*B, 4, 4]` | rigid | m |
 
-    Convention: see `flowrep.geometry.adapt_pose`; the input is `[*B, 4, 4]` or `[*B, 7]`. It also
+    Convention: see `flowrep.geometry.adapt_pose`, also for the input's shape by layout. It also
     converts poses of bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, as a body's own axes do not
     matter.
 
     Args:
-        layout: `"matrix"`, `"xyz_xyzw"` or `"xyz_wxyz"`.
+        layout: `"matrix"`, `"matrix_3x4"`, `"xyz_xyzw"`, `"xyz_wxyz"`, `"xyz_yaw"` or
+            `"xyz_yaw_pitch"`.
         direction: `"camera_to_world"` or `"world_to_camera"`.
         axes: `"opencv"`, `"opengl"` (Blender's), `"ned"` or `"x_forward_z_up"`.
         check: whether ill-formed poses raise ValueError at resets, in the envs that are reset, and
@@ -130,10 +158,9 @@ class AdaptPose(MapTransform):
         in_keys: Keys = "pose",
         out_keys: Keys = ("sensor", "world_from_cam"),
     ) -> None:
-        checks.check_name("layout", layout, geometry.PoseLayout)
         checks.check_name("direction", direction, geometry.PoseDirection)
-        checks.check_name("axes", axes, geometry.CameraAxes)
-        super().__init__([MOTION if layout == "matrix" else VECTOR], in_keys, out_keys)
+        check_pose_options(layout, axes)
+        super().__init__([_POSES[layout]], in_keys, out_keys)
         check_own_keys(self)
         self.layout, self.direction, self.axes = layout, direction, axes
         self.check = bool(check)
@@ -154,9 +181,10 @@ class AdaptPose(MapTransform):
             return
         self._check_layout([pose], tensordict.batch_size)
         if rows is not None:
-            # A stand-in for the others; the quaternion has length 1 in either layout.
+            # A stand-in for the others; a quaternion has length 1 with either end as its real part.
+            rank = len(self.reads[0].shape)
             still = torch.eye(pose.shape[-1], dtype=pose.dtype, device=pose.device)
-            still = still if self.layout == "matrix" else still[-1]
+            still = still[: pose.shape[-2]] if rank == 2 else still[-1]
             pose = torch.where(expand_as_right(rows, pose), pose, still)
         self._adapted(pose, check=True)
 

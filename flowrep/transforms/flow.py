@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
@@ -156,6 +157,7 @@ class FlowTransform(CameraTransform):
         """Returns an unbounded spec per flow and a boolean one for the mask."""
         depth = next(spec for spec, reads in zip(specs, self.reads) if reads == DEPTH)
         batch, size, device = depth.shape[:-3], depth.shape[-2:], depth.device
+        self._warn_of_foreign_camera(size)
         dtype = torch.promote_types(depth.dtype, torch.float32)
         return tuple(
             mask_spec(batch, size, device)
@@ -163,6 +165,19 @@ class FlowTransform(CameraTransform):
             else Unbounded((*batch, 2, *size), device=device, dtype=dtype)
             for name in (*self.outputs, *["valid"] * len(self.masks))
         )
+
+    def _warn_of_foreign_camera(self, size: torch.Size) -> None:
+        """Warns if the principal point is outside the maps, as K of a larger picture has it."""
+        if self.K is None or not size[0] or not size[1]:
+            return
+        (cx, cy), (height, width) = self.K[:2, 2].tolist(), size
+        if not (0 <= cx <= width and 0 <= cy <= height):
+            warnings.warn(
+                f"{type(self).__name__}: K has its principal point at ({cx:g}, {cy:g}), outside "
+                f"the maps ({width} wide, {height} high): is it of a picture of another "
+                "size? Scale its first two rows with the picture",
+                stacklevel=2,
+            )
 
 
 class RawFlow(FlowTransform):
@@ -257,6 +272,17 @@ class RawFlow(FlowTransform):
             flow = torch.where(valid.view(torch.uint8) != 0, flow, self.invalid)
         made = [valid if name == "valid" else self._in_unit(name, flow) for name in self.outputs]
         return (*made, *[valid] * len(self.masks))
+
+    def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
+        """Returns the outputs' specs; ids that say how many they are must be one per motion."""
+        _, ids, motions, *_ = specs
+        if isinstance(ids, Categorical) and ids.n != motions.shape[-3]:
+            raise ValueError(
+                f"{self.in_keys[1]!r} has ids from 0 to {ids.n - 1}, and {self.in_keys[2]!r} has "
+                f"{motions.shape[-3]} rows: give InstanceIds one id for each body, in the order of "
+                "the poses"
+            )
+        return super().output_specs(*specs)
 
 
 class FlowFactorize(FlowTransform):

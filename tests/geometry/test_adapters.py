@@ -87,6 +87,46 @@ def test_depth_options_are_checked(options, expected):
         adapt_depth(depth_of(0.5), **options)
 
 
+def test_whole_numbers_become_metres_and_nothing_becomes_nan():
+    millimetres = torch.tensor([[[0, 2500, 31000]]], dtype=torch.int16)
+    z = adapt_depth(millimetres, "z", scale_m=1e-3, nothing=0)
+    torch.testing.assert_close(z, torch.tensor([[[torch.nan, 2.5, 31.0]]]), equal_nan=True)
+    with pytest.raises(TypeError, match="depth"):  # 2500 m, if it were taken as it is
+        adapt_depth(millimetres, "z")
+    for wrong in (0.0, -1.0, torch.inf):
+        with pytest.raises(ValueError, match="scale_m"):
+            adapt_depth(millimetres, "z", scale_m=wrong)
+
+
+def test_a_pose_without_its_last_row():
+    whole = torch.tensor([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1.0]])
+    assert adapt_pose(whole[:3], layout="matrix_3x4").equal(whole.double())
+    inverted = adapt_pose(whole[:3], layout="matrix_3x4", direction="world_to_camera")
+    torch.testing.assert_close(inverted @ whole.double(), torch.eye(4).double())
+
+
+def test_angles_turn_left_and_look_up():
+    pose = torch.tensor([5.0, 6.0, 7.0, math.pi / 2, math.pi / 6], dtype=torch.float64)
+    camera = adapt_pose(pose, layout="xyz_yaw_pitch", axes="x_forward_z_up")
+    ahead = camera @ torch.tensor([0.0, 0.0, 2.0, 1.0], dtype=torch.float64)
+    # a quarter turn to the left of x is y; 30 degrees up: 2 sin 30 = 1, not -1
+    expected = torch.tensor([5.0, 6 + math.sqrt(3), 8.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(ahead, expected)
+    right = camera @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(right[:3], torch.tensor([6.0, 6.0, 7.0], dtype=torch.float64))
+    level = adapt_pose(pose[:4], layout="xyz_yaw", axes="x_forward_z_up")
+    torch.testing.assert_close(level[:3, 2], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    with pytest.raises(ValueError, match="x_forward_z_up"):
+        adapt_pose(pose[:4], layout="xyz_yaw")
+
+
+def test_pixels_that_are_not_square():
+    wide = intrinsics_from_fov(90.0, axis="horizontal", height=240, width=320, pixel_aspect=1.2)
+    assert [wide[0, 0].item(), wide[1, 1].item()] == pytest.approx([160.0, 192.0])
+    tall = intrinsics_from_fov(90.0, axis="vertical", height=240, width=320, pixel_aspect=1.2)
+    assert [tall[0, 0].item(), tall[1, 1].item()] == pytest.approx([100.0, 120.0])
+
+
 def test_field_of_view_across_the_width_or_the_height():
     # tan(45 deg) = 1: half of the picture, 3 or 2 px, lies as far out as the focal length.
     across_width = intrinsics_from_fov(90.0, axis="horizontal", height=4, width=6)
@@ -186,7 +226,7 @@ def test_a_quarter_turn_about_each_axis(axis, moves, to):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"layout": "xyzw"}, r"layout must be one of \['matrix', 'xyz_xyzw', 'xyz_wxyz'\]"),
+        ({"layout": "xyzw"}, r"layout.*'matrix_3x4'.*xyzw"),
         ({"direction": "cam2world"}, r"\['camera_to_world', 'world_to_camera'\], got 'cam2world'"),
         (
             {"axes": "blender"},

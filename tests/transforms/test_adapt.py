@@ -32,6 +32,17 @@ def test_a_z_buffer_becomes_metres():
     torch.testing.assert_close(z, torch.tensor([[[[0.5, 2.0, math.inf]]]]))
 
 
+def test_millimetres_with_channels_last_become_metres():
+    adapt = AdaptDepth("z", scale_m=1e-3, nothing=0, channels_last=True)
+    picture = torch.tensor([[0, 1500, 2000], [2500, 3000, 3500]], dtype=torch.int16)
+    z = adapt(TensorDict(depth=picture[None, ..., None], batch_size=[1]))["sensor", "depth"]
+    assert z.shape == (1, 1, 2, 3)
+    assert z[0, 0, 1].tolist() == [2.5, 3.0, 3.5]
+    assert z[0, 0, 0, 0].isnan()
+    spec = Composite(depth=Unbounded((2, 3, 1), dtype=torch.int16))
+    assert adapt.transform_observation_spec(spec)["sensor", "depth"].shape == (1, 2, 3)
+
+
 def test_intrinsics_of_each_sample_may_lie_under_a_key():
     # fx = 3 and 4: the last pixel looks along x = 1 and 0.75, a ray of sqrt(2) and 1.25.
     K = torch.tensor([[3.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
@@ -155,3 +166,22 @@ def test_a_missing_camera_key_is_named():
     del td["sensor", "K"]
     with pytest.raises(KeyError, match=r"'raw' needs key \('sensor', 'K'\)"):
         RawFlow(("sensor", "K"))(td)
+
+
+@pytest.mark.parametrize("ids", [[7], [7, 12, 31]])
+def test_a_number_of_ids_that_is_not_that_of_the_bodies_is_refused(ids):
+    spec = Composite(
+        sensor=Composite(
+            depth=Unbounded((1, 5, 7)), instance_motion=Unbounded((3, 4, 4)), shape=()
+        ),
+        segmentation=Unbounded((1, 5, 7), dtype=torch.int32),
+    )
+    stack = Compose(InstanceIds(ids), RawFlow(INTRINSICS))
+    with pytest.raises(ValueError, match="InstanceIds"):
+        stack.transform_observation_spec(spec)
+
+
+def test_a_camera_of_a_larger_picture_is_noticed():
+    large = [[600.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+    with pytest.warns(UserWarning, match="principal point"):
+        TransformedEnv(FakeSensorEnv(), RawFlow(large)).observation_spec  # noqa: B018
