@@ -236,6 +236,7 @@ class AdaptFlow(MapTransform):
         direction: `"forward"` (p_t − p_t') or `"backward"` (p_t' − p_t).
         grid: `"current"`; `"previous"` raises an error that names the remedy.
         channels: `"uv"` or `"row_column"`.
+        channels_last: whether the env's flow is `[*B, H, W, 2]`.
         in_keys: key of the env's flow.
         out_keys: key of raw flow; must differ, so that nothing is adapted twice.
 
@@ -257,21 +258,29 @@ class AdaptFlow(MapTransform):
         direction: geometry.Direction,
         grid: geometry.Grid,
         channels: geometry.Channels = "uv",
+        channels_last: bool = False,
         in_keys: Keys = "flow",
         out_keys: Keys = "raw",
     ) -> None:
         check_flow_options(direction, grid, channels)
-        super().__init__([FLOW], in_keys, out_keys)
+        reads = Reads(("H", "W", 2), "float") if channels_last else FLOW
+        super().__init__([reads], in_keys, out_keys)
         check_own_keys(self)
         self.direction, self.grid, self.channels = direction, grid, channels
+        self.channels_last = channels_last
 
     def compute(self, flow: Tensor) -> tuple[Tensor]:
         """Returns flow in flowrep's convention."""
         adapted = geometry.adapt_flow(
-            flow, direction=self.direction, grid=self.grid, channels=self.channels
+            flow.movedim(-1, -3) if self.channels_last else flow,
+            direction=self.direction,
+            grid=self.grid,
+            channels=self.channels,
         )
         return (adapted,)
 
     def output_specs(self, flow: TensorSpec) -> tuple[TensorSpec]:
-        """Returns an unbounded spec of flow's shape."""
-        return (Unbounded(flow.shape, device=flow.device, dtype=flow.dtype),)
+        """Returns an unbounded spec of flow's size."""
+        *batch, height, width, _ = flow.shape
+        size = (*batch, 2, height, width) if self.channels_last else flow.shape
+        return (Unbounded(size, device=flow.device, dtype=flow.dtype),)

@@ -185,3 +185,19 @@ def test_a_camera_of_a_larger_picture_is_noticed():
     large = [[600.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
     with pytest.warns(UserWarning, match="principal point"):
         TransformedEnv(FakeSensorEnv(), RawFlow(large)).observation_spec  # noqa: B018
+
+
+def test_isaac_labs_buffers_become_flow():
+    """Motion vectors: x to the left, y up; poses: position and (w, x, y, z) with ROS's axes."""
+    vectors = torch.zeros(1, 2, 3, 2)
+    vectors[0, 1, 2] = torch.tensor([-3.0, -1.0])  # 3 px to the right and 1 px down
+    adapt = AdaptFlow(direction="backward", grid="current", channels_last=True)
+    raw = adapt(TensorDict(flow=vectors, batch_size=[1]))["raw"]
+    assert raw.shape == (1, 2, 2, 3)
+    assert raw[0, :, 1, 2].tolist() == [3.0, 1.0]
+    spec = adapt.transform_observation_spec(Composite(flow=Unbounded((2, 3, 2))))
+    assert spec["raw"].shape == (2, 2, 3)
+    position, quaternion = torch.tensor([[5.0, 6.0, 7.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    pose = AdaptPose(layout="xyz_wxyz")  # ROS's axes are OpenCV's
+    camera = pose(TensorDict(pose=torch.cat([position, quaternion], -1), batch_size=[1]))
+    assert camera["sensor", "world_from_cam"][0, :3, 2:].tolist() == [[0, 5], [0, 6], [1, 7]]
