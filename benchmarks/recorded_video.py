@@ -13,16 +13,15 @@ import resource
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 
-from flowrep.sequences import EstimatedFlowSource, Frames, SevenScenes
-from flowrep.sequences.job import Job, JobOptions
-from flowrep.sequences.output import OutputFolder, OutputOptions
+from flowrep.sequences import EstimatedFlowSource, Frames, SevenScenes, recorded_motion
+from flowrep.sequences.job import Job
+from flowrep.sequences.output import Output, OutputOptions
 from flowrep.transforms import DIS
 
 FRAMES = 60
@@ -74,13 +73,11 @@ def measure(
             as_seven_scenes(folder / "in")
         stream = SevenScenes(folder / "in") if register else Frames(folder / "in")
         source = EstimatedFlowSource(DIS(preset), check_consistency=check_consistency)
-        out = OutputFolder(folder / "out", {}, resume=False)
-        job = Job(stream, source, out, JobOptions(output=OutputOptions(flow_files=flow_files)))
+        out = Output(folder / "out", OutputOptions(flow_files=flow_files), {})
+        job = Job(stream, source, recorded_motion, out)
         cpu, wall = time.process_time(), time.perf_counter()
-        diagnosis = job.run()
+        job.run()
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-        out.finish(job.summary())
-        assert diagnosis is not None
     print(f"{name:<44} {FRAMES / cpu:6.1f} {FRAMES / wall:6.1f}   {job.clock.summary()}")
 
 
@@ -107,21 +104,21 @@ def memory(frames: int = 10_000) -> None:
                 )
             lines.append(lines[i % 20])
         (folder / "in/poses.txt").write_text("\n".join(lines))
-        out = OutputFolder(folder / "out", {}, resume=False)
-        options = JobOptions(output=replace(OutputOptions(), flow_files=(), pictures_every=0))
-        job = WatchedJob(Frames(folder / "in"), EstimatedFlowSource(DIS("fast")), out, options)
-        job.run()
+        out = WatchedOutput(folder / "out", OutputOptions(flow_files=(), pictures_every=0), {})
+        source = EstimatedFlowSource(DIS("fast"))
+        Job(Frames(folder / "in"), source, recorded_motion, out).run()
 
 
-class WatchedJob(Job):
+class WatchedOutput(Output):
     """Prints the memory in use from time to time."""
 
-    def _take(self, index, made, writers, bar) -> None:
-        super()._take(index, made, writers, bar)
-        if self.done % 1000 == 0 or self.done == 100:
+    def append(self, index, made) -> None:
+        super().append(index, made)
+        done = len(self.rows)
+        if done % 1000 == 0 or done == 100:
             pages = int(Path("/proc/self/statm").read_text().split()[1])
             in_use = pages * resource.getpagesize() / 2**20
-            print(f"{self.done:>6} frames: {in_use:7.1f} MiB", flush=True)
+            print(f"{done:>6} frames: {in_use:7.1f} MiB", flush=True)
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,18 @@ from flowrep.config import UsageError, validated
 from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
 from flowrep.config.factorizing import FactorizeConfig
 from flowrep.config_tree import CONF_DIR
-from flowrep.sequences import EstimatedFlowSource, Recording, SequenceError, Stream, recorded_flow
-from flowrep.sequences.factorization import FlowSource
-from flowrep.sequences.job import Job, JobOptions, as_settings
-from flowrep.sequences.output import OutputFolder, OutputOptions
+from flowrep.sequences import (
+    EstimatedFlowSource,
+    Recording,
+    SequenceError,
+    Stream,
+    estimated_motion,
+    recorded_flow,
+    recorded_motion,
+)
+from flowrep.sequences.factorization import FlowSource, MotionSource
+from flowrep.sequences.job import Job
+from flowrep.sequences.output import Output, OutputOptions
 from flowrep.transforms import EstimatedFlow
 
 MISTAKES = (SequenceError, ValueError, ImportError, OSError)
@@ -56,53 +65,42 @@ def factorize_recording(settings: dict[str, Any]) -> int:
         UsageError: a value is invalid.
         SequenceError: a file can't be read.
     """
-    options = job_options(settings)
     stream = open_stream(settings)
     flow_source = open_flow_source(settings, stream)
-    if settings["resume"] and not isinstance(stream, Recording):
-        raise UsageError("a job from a camera can't be resumed: its frames are not kept")
+    motion_source = open_motion_source(settings, stream)
     for note in stream.notes:
         print(f"note: {note}")
-    folder = OutputFolder(settings["output"], as_settings(settings), resume=settings["resume"])
-    job = Job(stream, flow_source, folder, options)
-    try:
-        diagnosis = job.run()
-    except BaseException:
-        folder.discard_if_empty()
-        raise
-    if diagnosis is None:
-        print(f"stopped after {job.done} frames; resume=true continues {folder.partial}")
-        return 130
-    if not job.done:
-        folder.discard_if_empty()
-        chosen = {key: settings[key] for key in ("start", "stop", "stride")}
+    chosen = {key: settings[key] for key in ("start", "stop", "stride")}
+    output = Output(settings["output"], output_options(settings), settings)
+    job = Job(stream, flow_source, motion_source, output, **chosen)
+    with closing(output):
+        diagnosis = job.examine()
+        if diagnosis is not None:
+            print(f"{'warning: ' if diagnosis.suspects else ''}{diagnosis.words}")
+        if not job.run():
+            print(f"stopped after {len(output.rows)} frames, which are in {output.partial}")
+            return 130
+    if not output.rows:
         given = " ".join(f"{key}={value}" for key, value in chosen.items() if value is not None)
         raise SequenceError(
             settings["input"],
             f"has no two consecutive frames of one clip with {given}: choose others",
         )
-    folder.finish(job.summary())
-    warning = "warning: " if diagnosis.suspects else ""
-    print(f"{warning}{diagnosis.words}")
-    print(f"{job.done} frames in {folder.path}; time: {job.clock.summary()}")
+    output.finish(job.summary(diagnosis))
+    print(f"{len(output.rows)} frames in {output.path}; time: {job.clock.summary()}")
     return 0
 
 
-def job_options(settings: dict[str, Any]) -> JobOptions:
-    """Returns the options of a job."""
-    return JobOptions(
-        start=settings["start"],
-        stop=settings["stop"],
-        stride=settings["stride"],
+def output_options(settings: dict[str, Any]) -> OutputOptions:
+    """Returns what is written."""
+    return OutputOptions(
+        flow_files=settings["flow_files"],
+        pictures_every=settings["pictures_every"],
+        scale_px=settings["scale_px"],
+        depth_range_m=settings["depth_range_m"],
         moving_px=settings["moving_px"],
         video_fps=settings["video_fps"] if settings["video"] else None,
         rerun=settings["rerun"],
-        output=OutputOptions(
-            flow_files=settings["flow_files"],
-            pictures_every=settings["pictures_every"],
-            scale_px=settings["scale_px"],
-            depth_range_m=settings["depth_range_m"],
-        ),
     )
 
 
@@ -121,13 +119,23 @@ def open_flow_source(settings: dict[str, Any], stream: Stream) -> FlowSource:
     options = dict(settings["flow"])
     if options.pop("source") == "exact":
         if not stream.has_flow:
-            raise UsageError(
-                f"flow=exact: {settings['input']} has no flow on the current frame's grid; "
-                "use flow=estimated, or format.backwards=true if the format has it"
-            )
+            why = stream.no_flow if isinstance(stream, Recording) else "a video has none"
+            raise UsageError(f"flow=exact: {settings['input']} has no flow of its own; {why}")
         return recorded_flow
     estimator = EstimatedFlow(**options).estimator
     return EstimatedFlowSource(estimator, check_consistency=settings["check_consistency"])
+
+
+def open_motion_source(settings: dict[str, Any], stream: Stream) -> MotionSource:
+    """Returns the source of the camera's motion: the recorded poses, if there are any."""
+    if settings["poses"] == "estimated":
+        return estimated_motion
+    if stream.has_poses:
+        return recorded_motion
+    if settings["poses"] == "recorded":
+        raise UsageError(f"poses=recorded: {settings['input']} has none; use poses=estimated")
+    print("note: there are no poses, so the camera's motion is estimated from flow and depth")
+    return estimated_motion
 
 
 def main() -> None:

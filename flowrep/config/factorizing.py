@@ -27,7 +27,7 @@ class FactorizeConfig(Section):
     output: str = Field(examples=["<folder>"])
     format: Annotated[Any, BY_READER] = Field(examples=["tum"])
     flow: Annotated[Any, BY_SOURCE] = Field(examples=["estimated"])
-    resume: Switch
+    poses: Annotated[str | None, OneOf(("recorded", "estimated"), also=(None,))]
     start: CountOrZero
     stop: Annotated[int | None, Whole(0, also=(None,))]
     stride: Count

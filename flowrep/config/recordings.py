@@ -55,7 +55,7 @@ class Frames(Reader):
     pose_layout: Annotated[str, OneOf(get_args(PoseLayout))]
     pose_direction: Annotated[str, OneOf(get_args(PoseDirection))]
     pose_axes: Annotated[str, AXES]
-    depth_unit_m: Annotated[float, Number(above=0)]
+    depth_unit_m: Annotated[float | None, Number(above=0, also=(None,))]
     depth_kind: Annotated[str, OneOf(get_args(DepthKind))]
     near_m: Annotated[float | None, Number(above=0, also=(None,))]
     far_m: Annotated[float | None, Number(above=0, also=(None,))]
@@ -127,14 +127,10 @@ class Zed(Reader):
     pose_axes: Annotated[str, AXES]
 
 
-class ZedLive(Reader):
-    """A ZED by its SDK."""
-
-
 READERS: dict[str, type[Reader]] = {
     f"{PREFIX}{section.__name__}": section
     for section in (
-        Frames, Kitti, SevenScenes, Sintel, StillVideo, TartanAir, Tum, VKitti2, Zed, ZedLive
+        Frames, Kitti, SevenScenes, Sintel, StillVideo, TartanAir, Tum, VKitti2, Zed
     )
 }  # fmt: skip
 """The section of each reader, by its class."""

@@ -1,13 +1,20 @@
-"""Recorded RGB-D sequences with camera poses: readers, registration, factorisation, a doctor."""
+"""Recorded RGB-D sequences: readers, registration, factorisation, a doctor."""
+
+from flowrep.extras import require
+
+require("flowrep.sequences", "factorize", "cv2")
 
 from flowrep.sequences.calibration import Registration
 from flowrep.sequences.doctor import Diagnosis, Doctor, diagnose
 from flowrep.sequences.factorization import (
     EstimatedFlowSource,
     FactorizedFrame,
+    Motion,
+    estimated_motion,
     factorize_frames,
     factorize_pair,
     recorded_flow,
+    recorded_motion,
 )
 from flowrep.sequences.files import (
     read_flo,
@@ -25,7 +32,6 @@ from flowrep.sequences.tum import Tum
 from flowrep.sequences.video import StillVideo
 from flowrep.sequences.vkitti2 import VKitti2
 from flowrep.sequences.zed import Zed
-from flowrep.sequences.zed_live import ZedLive
 
 __all__ = [
     "RECORDINGS",
@@ -37,6 +43,7 @@ __all__ = [
     "Frame",
     "Frames",
     "Kitti",
+    "Motion",
     "Recording",
     "Registration",
     "SequenceError",
@@ -48,13 +55,14 @@ __all__ = [
     "Tum",
     "VKitti2",
     "Zed",
-    "ZedLive",
     "diagnose",
+    "estimated_motion",
     "factorize_frames",
     "factorize_pair",
     "read_flo",
     "read_kitti_flow",
     "recorded_flow",
+    "recorded_motion",
     "write_flo",
     "write_kitti_flow",
 ]
@@ -69,4 +77,4 @@ RECORDINGS: dict[str, type[Recording]] = {
     "vkitti2": VKitti2,
     "zed": Zed,
 }
-STREAMS = {"video": StillVideo, "zed_live": ZedLive}
+STREAMS = {"video": StillVideo}

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from flowrep.geometry import CameraAxes, PoseDirection, PoseLayout, adapt_pose
-from flowrep.sequences.files import check_pixels, finite_number, read_json, read_table
-from flowrep.sequences.recording import SequenceError
+from flowrep.sequences.files import read_json, read_table
+from flowrep.sequences.recording import Pose, SequenceError
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,13 @@ def four_intrinsics(name: str, numbers: Sequence[float]) -> tuple[float, float, 
     return values[0], values[1], values[2], values[3]
 
 
+INTRINSICS_REMEDY = (
+    'write {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
+    '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5} to it'
+)
+_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "first_pixel_centre")
+
+
 def read_cameras(path: Path) -> tuple[Camera, Camera | None, NDArray[np.float64] | None]:
     """Returns the depth camera, the colour camera if it is different, and `colour_from_depth`.
 
@@ -63,7 +69,7 @@ def read_cameras(path: Path) -> tuple[Camera, Camera | None, NDArray[np.float64]
     Raises:
         SequenceError: a key is missing, or its value is invalid.
     """
-    content = read_json(path)
+    content = read_json(path, INTRINSICS_REMEDY)
     camera = _camera(path, content)
     if "colour" not in content:
         return camera, None, None
@@ -76,33 +82,37 @@ def read_cameras(path: Path) -> tuple[Camera, Camera | None, NDArray[np.float64]
         extrinsics = np.empty(0)
     if extrinsics.shape != (4, 4):
         raise SequenceError(path, "colour.colour_from_depth should be four rows of four numbers")
-    return camera, _camera(path, colour, "colour."), extrinsics
+    return camera, _camera(path, colour, "colour."), as_pose(extrinsics, path)
 
 
 def _camera(path: Path, content: Mapping[str, Any], prefix: str = "") -> Camera:
-    keys = ("width", "height", "fx", "fy", "cx", "cy", "first_pixel_centre")
-    missing = [prefix + key for key in keys if key not in content]
+    missing = [prefix + key for key in _KEYS if key not in content]
     if missing:
-        raise SequenceError(path, f"lacks {', '.join(missing)}")
-    value = {key: finite_number(path, prefix + key, content[key]) for key in keys}
-    if value["first_pixel_centre"] not in (0.0, 0.5):
+        raise SequenceError(path, f"lacks {', '.join(missing)}; {INTRINSICS_REMEDY}")
+    value = {key: content[key] for key in _KEYS}
+    for key, number in value.items():
+        is_number = isinstance(number, int | float) and not isinstance(number, bool)
+        if not is_number or not math.isfinite(number):
+            raise SequenceError(path, f"{prefix}{key} should be a number, not {str(number)[:40]!r}")
+    if value["first_pixel_centre"] not in (0, 0.5):
         raise SequenceError(
             path, f"{prefix}first_pixel_centre is 0 (as OpenCV calibrates) or 0.5, "
             f"not {value['first_pixel_centre']}",
         )  # fmt: skip
     for key in ("width", "height"):
-        if not value[key].is_integer():
+        if value[key] < 1 or value[key] != int(value[key]):
             raise SequenceError(path, f"{prefix}{key} should be a whole number, not {value[key]}")
-    width, height = int(value["width"]), int(value["height"])
-    check_pixels(path, width, height)
+    if value["fx"] > 0 > value["fy"]:
+        raise SequenceError(
+            path,
+            f"{prefix}fy is negative: the camera is left-handed, with y up and z ahead (ICL-NUIM). "
+            "Write fy positive and mirror the poses: F @ pose @ F with F = diag(1, -1, 1, 1)",
+        )
     if not (value["fx"] > 0 and value["fy"] > 0):
         raise SequenceError(path, f"{prefix}fx and {prefix}fy should be positive")
     shift = 0.5 - value["first_pixel_centre"]
     K = intrinsics(value["fx"], value["fy"], value["cx"] + shift, value["cy"] + shift)
-    return Camera(K, height, width)
-
-
-Pose = NDArray[np.float64]  # world_from_cam [4, 4]
+    return Camera(K, int(value["height"]), int(value["width"]))
 
 
 def as_pose(
@@ -129,16 +139,23 @@ def as_pose(
     return pose.numpy()
 
 
-def read_pose_lines(path: Path, layout: PoseLayout, frames: int) -> NDArray[np.float64]:
-    """Returns the numbers of one pose per line, for a known number of frames.
+def read_pose_lines(path: Path, layout: PoseLayout) -> NDArray[np.float64]:
+    """Returns the numbers of one pose per line, `[N, 7]`, `[N, 12]` or `[N, 16]`.
 
     Raises:
-        SequenceError: there are too few or too many lines, or numbers in a line.
+        SequenceError: a line has another number of columns.
     """
-    table = read_table(path, [12, 16] if layout == "matrix" else [7])
-    if len(table) != frames:
-        raise SequenceError(path, f"has {len(table)} poses for {frames} frames")
-    return table
+    if layout == "matrix":
+        quaternions = "a position and a quaternion are format.pose_layout=xyz_xyzw (or xyz_wxyz)"
+        return read_table(path, [12, 16], remedies={7: quaternions})
+    matrices = "matrices are format.pose_layout=matrix"
+    return read_table(path, [7], remedies={12: matrices, 16: matrices})
+
+
+def check_count(path: Path, count: int, frames: int, what: str) -> None:
+    """Raises SequenceError if a file does not have a line for each frame."""
+    if count != frames:
+        raise SequenceError(path, f"has {count} {what} for {frames} frames")
 
 
 def check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
@@ -149,37 +166,6 @@ def check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
     if len(backwards):
         before, after = times_s[backwards[0]], times_s[backwards[0] + 1]
         raise SequenceError(path, f"timestamps go backwards: {after:.6f} follows {before:.6f}")
-
-
-def nearest(
-    times_s: NDArray[np.float64], wanted_s: NDArray[np.float64], tolerance_s: float
-) -> NDArray[np.int64]:
-    """Returns the index of the time nearest to each wanted one, -1 if none is near enough.
-
-    >>> nearest(np.array([0.0, 1.0, 2.0]), np.array([0.98, 1.5, 2.03]), 0.05).tolist()
-    [1, -1, 2]
-    """
-    after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
-    before = (after - 1).clip(0)
-    gap_after, gap_before = (np.abs(times_s[index] - wanted_s) for index in (after, before))
-    found = np.where(gap_before <= gap_after, before, after)
-    return np.where(np.minimum(gap_before, gap_after) <= tolerance_s, found, -1)
-
-
-def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
-    """Returns the pose at a share of the way, with constant velocity and angular velocity.
-
-    >>> before, after = np.eye(4), np.eye(4)
-    >>> after[0, 3] = 2.0
-    >>> interpolated_pose(before, after, 0.25)[0, 3].item()
-    0.5
-    """
-    relative = before[:3, :3].T @ after[:3, :3]
-    axis_angle, _ = cv2.Rodrigues(relative)
-    pose = np.eye(4)
-    pose[:3, :3] = before[:3, :3] @ cv2.Rodrigues(share * axis_angle)[0]
-    pose[:3, 3] = (1 - share) * before[:3, 3] + share * after[:3, 3]
-    return pose
 
 
 _LARGEST_FOOTPRINT_PX = 8

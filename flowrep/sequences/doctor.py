@@ -2,54 +2,146 @@
 
 A wrong convention raises no error and gives wrong flow. In most recordings, most of the picture is
 static, and there raw flow is ego flow, so that the median of |raw - ego| is small. If it is not,
-the doctor computes ego flow again under each of the usual mistakes, and names the one that would
-remove most of the residual.
+the doctor computes ego flow again under each of the usual mistakes, with depth times any factor,
+and with the camera's axes that fit the motion that flow and depth give by themselves
+(`flowrep.geometry.camera_motion`). It names the corrections that explain the flow, as options
+relative to those in force. If that other motion does not explain the flow either, nothing can be
+told of the poses.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, get_args
 
+import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from flowrep.geometry import adapt_pose, ego_flow, invert_rigid, relative_motion, z_from_ray_length
+from flowrep.geometry import (
+    CameraAxes,
+    adapt_pose,
+    ego_flow,
+    invert_rigid,
+    relative_motion,
+    z_from_ray_length,
+)
+from flowrep.sequences.factorization import estimate_motion
+
+# Residuals below these are normal: rounding of pixels, of estimators, of poses.
+_SMALL_PX, _SMALL_SHARE = 0.05, 0.05
+_SHRINKS = 0.5  # a suspect leaves at most this share of the residual,
+_EXPLAINS = 0.25  # and this share of raw flow, or little more than any motion
+_AS_GOOD = 1.5  # suspects this close to the best can't be told apart from it
+_LEAST_RAW_PX = 0.25  # pairs that hardly move say nothing
+_SAMPLED_PIXELS = 6000
+_NEARLY = 1.3  # a factor of depth whose residual is this close to the best one's may be right
+_KNOWN_UNIT = 3.0  # the unit of depth is known if the factors that may be right span less
+_POWERS = np.arange(-4, 4 + 1e-9, 1 / 8)  # of ten, the factors of depth that are tried
+_USUAL_FACTORS = (0.001, 0.01, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 100.0, 1000.0)
+_SAME_AXES_DEG = 15.0
+
+_ASSUMED = {
+    "pose_direction": "camera_to_world",
+    "pose_axes": "opencv",
+    "depth_kind": "z",
+    "flow_direction": "forward",
+    "flow_channels": "uv",
+}
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """One usual mistake.
+    """What the data may be instead, and how to compute with that.
 
     Attributes:
-        says: what the data would have to be, to complete "if ...".
-        options: the options of `frames` that say so, as on a command line.
-        poses: returns the correct poses from the given ones, or None.
+        says: completes "if ...".
+        poses: returns the correct poses of a pair from the given ones, or None.
         depth: returns the correct depth from depth and K, or None.
         flow: returns the correct raw flow from the given flow, or None.
+        K: returns the correct K from the given one, or None.
     """
 
     says: str
-    options: str
-    poses: Callable[[Tensor], Tensor] | None = None
+    poses: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
     depth: Callable[[Tensor, Tensor], Tensor] | None = None
     flow: Callable[[Tensor], Tensor] | None = None
+    K: Callable[[Tensor], Tensor] | None = None
 
 
-def _axes(name: Any) -> Callable[[Tensor], Tensor]:
-    return lambda pose: adapt_pose(pose, axes=name, check=False)
+def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict[str, Mistake]:
+    """Returns the usual mistakes by what would correct them: options, or a few words.
+
+    Args:
+        given: the options in force, as in `Recording.conventions`.
+        flow_is_recorded: whether raw flow is the recording's, so that its options may be wrong.
+    """
+    given = {**_ASSUMED, **given}
+    found: dict[str, Mistake] = {}
+
+    def suppose(says: str, options: Mapping[str, str], **corrections: Any) -> None:
+        changed = {key: value for key, value in options.items() if value != given[key]}
+        if changed:
+            name = " ".join(f"{key}={value}" for key, value in changed.items())
+            found[name] = Mistake(says, **corrections)
+
+    for direction in ("camera_to_world", "world_to_camera"):
+        for axes in get_args(CameraAxes):
+            says = f"the poses are {direction.replace('_', '-')}, of a camera with {axes} axes"
+            options = {"pose_direction": direction, "pose_axes": axes}
+            suppose(says, options, poses=_each(_readapted(given, direction, axes)))
+    if given["depth_kind"] != "z_buffer":
+        says = "depth is the length of the ray, not z"
+        suppose(says, {"depth_kind": "ray_length"}, depth=z_from_ray_length)
+        says = "depth is z, not the length of the ray"
+        suppose(says, {"depth_kind": "z"}, depth=_ray_from_z)
+    if flow_is_recorded:
+        for direction, points in (("backward", "back to"), ("forward", "away from")):
+            says = f"the flow points {points} the previous frame"
+            suppose(says, {"flow_direction": direction}, flow=lambda raw: -raw)
+        for channels in ("row_column", "uv"):
+            says = f"the flow's channels are {channels}"
+            suppose(says, {"flow_channels": channels}, flow=lambda raw: raw.flip(0))
+    else:
+        found["frames in reverse order"] = Mistake(
+            "the poses are in the reverse order of the pictures", lambda prev, curr: (curr, prev)
+        )
+    found["rotations transposed"] = Mistake(
+        "the rotations are stored column by column, or inverted", _each(_transposed)
+    )
+    for factor, size in ((2.0, "twice"), (0.5, "half")):
+        found[f"intrinsics times {factor:g}"] = Mistake(
+            f"the pictures are {size} as large as those that the intrinsics belong to",
+            K=_scaled(factor),
+        )
+    return found
 
 
-def _axes_undone(name: Any) -> Callable[[Tensor], Tensor]:
-    given_from_opencv = adapt_pose(torch.eye(4), axes=name)
-    return lambda pose: pose @ given_from_opencv.mT
+def _each(change: Callable[[Tensor], Tensor]) -> Callable[..., Any]:
+    return lambda prev, curr: (change(prev), change(curr))
 
 
-def _inverted(then: Callable[[Tensor], Tensor] = lambda pose: pose) -> Callable[[Tensor], Tensor]:
-    """Corrects poses that are world-to-camera, of a camera whose axes `then` corrects."""
-    return lambda pose: then(invert_rigid(pose))
+def _readapted(given: Mapping[str, str], direction: str, axes: Any) -> Callable[[Tensor], Tensor]:
+    """Undoes the options in force and applies others to `world_from_cam`."""
+    in_force: Any = given["pose_axes"]
+    opencv_from_given = adapt_pose(torch.eye(4), axes=in_force).mT
+
+    def readapt(pose: Tensor) -> Tensor:
+        stored = pose @ opencv_from_given
+        stored = stored if direction == given["pose_direction"] else invert_rigid(stored)
+        return adapt_pose(stored, axes=axes, check=False)
+
+    return readapt
+
+
+def _transposed(pose: Tensor) -> Tensor:
+    turned = pose.clone()
+    turned[:3, :3] = pose[:3, :3].mT
+    return turned
 
 
 def _ray_from_z(depth: Tensor, K: Tensor) -> Tensor:
@@ -57,80 +149,13 @@ def _ray_from_z(depth: Tensor, K: Tensor) -> Tensor:
     return torch.where(depth.isinf(), depth, ray)  # the sky stays at infinity
 
 
-def _unit(factor: float) -> Callable[[Tensor, Tensor], Tensor]:
-    return lambda depth, K: factor * depth
+def _scaled(factor: float) -> Callable[[Tensor], Tensor]:
+    return lambda K: K * torch.tensor([[factor], [factor], [1.0]], dtype=K.dtype)
 
 
-MISTAKES: Mapping[str, Mistake] = {
-    "poses_inverted": Mistake(
-        "the poses are world-to-camera (or were inverted once too often)",
-        "pose_direction=world_to_camera",
-        poses=_inverted(),
-    ),
-    "flow_sign": Mistake(
-        "the flow points back to the previous frame (or the frames are in the wrong order)",
-        "flow_direction=backward",
-        flow=lambda raw: -raw,
-    ),
-    "flow_channels": Mistake(
-        "the flow is (row, column)", "flow_channels=row_column", flow=lambda raw: raw.flip(0)
-    ),
-    "axes_opengl": Mistake(
-        "the camera's axes are OpenGL's (or were turned once too often)",
-        "pose_axes=opengl",
-        poses=_axes("opengl"),
-    ),
-    "axes_ned": Mistake(
-        "the camera's axes are north-east-down", "pose_axes=ned", poses=_axes("ned")
-    ),
-    "axes_x_forward": Mistake(
-        "the camera's axes are x forward, z up",
-        "pose_axes=x_forward_z_up",
-        poses=_axes("x_forward_z_up"),
-    ),
-    "axes_not_ned": Mistake(
-        "the camera's axes are OpenCV's, not north-east-down",
-        "pose_axes=opencv",
-        poses=_axes_undone("ned"),
-    ),
-    "axes_not_x_forward": Mistake(
-        "the camera's axes are OpenCV's, not x forward",
-        "pose_axes=opencv",
-        poses=_axes_undone("x_forward_z_up"),
-    ),
-    "poses_inverted_opengl": Mistake(
-        "the poses are world-to-camera with OpenGL's axes",
-        "pose_direction=world_to_camera pose_axes=opengl",
-        poses=_inverted(_axes("opengl")),
-    ),
-    "ray_length": Mistake(
-        "depth is the length of the ray, not z", "depth_kind=ray_length", depth=z_from_ray_length
-    ),
-    "not_ray_length": Mistake(
-        "depth is z already, not the length of the ray", "depth_kind=z", depth=_ray_from_z
-    ),
-    **{
-        f"depth_times_{factor:g}": Mistake(
-            f"depth in metres is {factor:g} times as large", "depth_unit_m", depth=_unit(factor)
-        )
-        for factor in (0.001, 0.01, 0.1, 0.2, 5.0, 10.0, 100.0, 1000.0)
-    },
-}
-
-
-def on_command_line(name: str) -> str:
-    """Returns the options of `frames` that correct a mistake, as they are typed."""
-    options = MISTAKES[name].options.split()
-    if name.startswith("depth_times_"):
-        return f"format.{options[0]} times {name.removeprefix('depth_times_')}"
-    return " ".join(f"format.{option}" for option in options)
-
-
-# Residuals below these are normal: rounding of pixels, of estimators, of poses.
-_SMALL_PX, _SMALL_SHARE = 0.05, 0.05
-_SHRINKS = 0.5
-_LEAST_RAW_PX = 0.25  # pairs that hardly move say nothing
-_SAMPLED_PIXELS = 6000
+def _times(*factors: float) -> Callable[[Tensor, Tensor], Tensor]:
+    """Returns depths `[factors, 1, H, W]`."""
+    return lambda depth, K: torch.tensor(factors)[:, None, None, None] * depth
 
 
 @dataclass(frozen=True)
@@ -141,44 +166,44 @@ class Diagnosis:
         pairs: the number of pairs of frames that moved enough to be examined.
         raw_px: median length of raw flow, the mean over the pairs.
         residual_px: median of |raw - ego|, the mean over the pairs.
-        rivals_px: `residual_px` under each of `MISTAKES`.
-        suspects: the mistakes that would shrink the residual by half, the likeliest first, and
-            others that would do as well.
+        estimated_px: the same with the motion that flow and depth give; nan if they give none.
+        depth_factors: the least and the most that depth can be multiplied by without explaining the
+            flow much worse than the best factor does; far apart, they leave the unit unknown.
+        rivals_px: `residual_px` under each mistake, by what would correct it.
+        suspects: the mistakes that would explain the flow, the likeliest first.
+        words: the diagnosis in a sentence or two.
     """
 
     pairs: int
-    raw_px: float
-    residual_px: float
-    rivals_px: dict[str, float]
-    suspects: tuple[str, ...]
+    raw_px: float = math.nan
+    residual_px: float = math.nan
+    estimated_px: float = math.nan
+    depth_factors: tuple[float, float] = (0.0, math.inf)
+    rivals_px: Mapping[str, float] = field(default_factory=dict)
+    suspects: tuple[str, ...] = ()
+    words: str = "conventions could not be checked: hardly anything moves"
 
-    @property
-    def words(self) -> str:
-        """The diagnosis in a sentence or two."""
-        if not self.pairs:
-            return "conventions could not be checked: hardly anything moves"
-        medians = (
-            f"|raw - ego| is {self.residual_px:.2f} px, raw flow {self.raw_px:.2f} px (medians)"
-        )
-        if not self.suspects:
-            if self.residual_px > _SHRINKS * self.raw_px:
-                return (
-                    f"ego flow does not explain the raw flow: {medians}. No usual mistake of "
-                    "conventions would halve that: are intrinsics, poses and pictures of one "
-                    "recording, and does most of the picture stand still?"
-                )
-            return f"conventions look right: {medians}"
-        told = "; or ".join(
-            f"{self.rivals_px[name]:.2f} px if {MISTAKES[name].says} "
-            f"(frames: {on_command_line(name)})"
-            for name in self.suspects
-        )
-        return f"a convention looks wrong: {medians}. It would be {told}"
+
+class _Pair(NamedTuple):
+    """What is kept of a pair of frames: maps on a coarse grid, and the motions."""
+
+    raw: Tensor
+    depth: Tensor
+    K: Tensor
+    known: Tensor
+    step: int  # coarse pixels are this many fine ones
+    poses: tuple[Tensor, Tensor]
+    estimated: Tensor | None  # prev_from_curr
 
 
 @dataclass
 class Doctor:
     """Examines pairs of frames, one after the other, and gives a diagnosis.
+
+    Args:
+        conventions: the options that the data were read with, see `Recording.conventions`.
+        flow_is_recorded: whether raw flow belongs to the data. Flow that flowrep estimated has no
+            options that may be wrong.
 
     >>> depth = torch.full((1, 8, 10), 4.0)
     >>> K = torch.tensor([[20.0, 0.0, 5.0], [0.0, 20.0, 4.0], [0.0, 0.0, 1.0]])
@@ -187,17 +212,18 @@ class Doctor:
     >>> raw = torch.tensor([2.5, 0.0]).reshape(2, 1, 1).expand(2, 8, 10)  # but this says right
     >>> doctor = Doctor()
     >>> doctor.look(raw, depth, K, before, now)
-    >>> "flow_sign" in doctor.diagnosis().suspects
+    >>> "flow_direction=backward" in doctor.diagnosis().suspects
     True
     """
 
-    _residuals: list[Tensor] = field(default_factory=list)
-    _raw_px: list[float] = field(default_factory=list)
+    conventions: Mapping[str, str] = field(default_factory=dict)
+    flow_is_recorded: bool = True
+    _pairs: list[_Pair] = field(default_factory=list)
 
     @property
     def pairs(self) -> int:
         """The number of pairs that moved enough to be examined."""
-        return len(self._raw_px)
+        return len(self._pairs)
 
     @torch.no_grad()
     def look(
@@ -208,6 +234,7 @@ class Doctor:
         world_from_prev: Tensor,
         world_from_curr: Tensor,
         *,
+        picture: Tensor | None = None,
         static: Tensor | None = None,
     ) -> None:
         """Examines a pair of frames, unless hardly anything moves in it.
@@ -218,32 +245,67 @@ class Doctor:
             K: `[3, 3]`, pixels.
             world_from_prev: `[4, 4]`, assumed camera-to-world with OpenCV's axes.
             world_from_curr: `[4, 4]`, the same for the current frame.
+            picture: uint8 `[3, H, W]`, whose texture says where estimated flow can be trusted.
             static: `[1, H, W]` bool, pixels known to be static; without it most of the picture
                 has to be.
         """
-        raw, depth, K, known, step = _sampled(raw, depth, K, static)
-        raw_px = step * _median_length(raw, known)
-        if not raw_px >= _LEAST_RAW_PX:
-            return
+        raw = raw if static is None else torch.where(static, raw, torch.nan)
+        coarse = _sampled(raw, depth, K)
         poses = world_from_prev.double(), world_from_curr.double()
-        self._raw_px.append(raw_px)
-        self._residuals.append(step * _residuals(raw, depth, K, poses, known))
+        pair = _Pair(*coarse, poses, estimated=None)
+        if float(_median_px(pair.raw, pair)) >= _LEAST_RAW_PX:
+            motion = estimate_motion(raw, depth, K, picture=picture)
+            estimated = torch.from_numpy(motion.prev_from_curr) if motion.known else None
+            self._pairs.append(pair._replace(estimated=estimated))
 
+    @torch.no_grad()
     def diagnosis(self) -> Diagnosis:
         """Returns the diagnosis from all pairs so far."""
-        if not self.pairs:
-            return Diagnosis(0, float("nan"), float("nan"), {}, ())
-        residual, *rivals = torch.stack(self._residuals).mean(0).tolist()
-        raw_px = float(np.mean(self._raw_px))
-        rivals_px = dict(zip(MISTAKES, rivals))
-        suspects: tuple[str, ...] = ()
-        if residual > max(_SMALL_PX, _SMALL_SHARE * raw_px):
-            least = min(rivals)
-            if least <= _SHRINKS * residual:
-                as_good = 1.2 * least + 0.01
-                ranked = sorted(rivals_px, key=lambda name: rivals_px[name])
-                suspects = tuple(name for name in ranked if rivals_px[name] <= as_good)
-        return Diagnosis(self.pairs, raw_px, residual, rivals_px, suspects)
+        if not self._pairs:
+            return Diagnosis(0)
+        rivals = mistakes(self.conventions, flow_is_recorded=self.flow_is_recorded)
+        rivals |= _other_axes(self._pairs)
+        best, least, most = self._depth_factors()
+        if not least <= 1 <= most:
+            correction = f"depth times {best:g}"
+            if "depth_unit_m" in self.conventions:
+                correction = f"depth_unit_m={best * float(self.conventions['depth_unit_m']):g}"
+            says = f"depth in metres is {best:g} times as large"
+            rivals[correction] = Mistake(says, depth=_times(best))
+        estimated = [
+            _residual_px(p, motion=p.estimated) for p in self._pairs if p.estimated is not None
+        ]
+        found = Diagnosis(
+            pairs=self.pairs,
+            raw_px=_mean([_median_px(pair.raw, pair) for pair in self._pairs]),
+            residual_px=_mean([_residual_px(pair) for pair in self._pairs]),
+            estimated_px=_mean(estimated),
+            depth_factors=(least, most),
+            rivals_px={
+                name: _mean([_residual_px(pair, mistake) for pair in self._pairs])
+                for name, mistake in rivals.items()
+            },
+        )
+        found = replace(found, suspects=_suspects(found))
+        return replace(found, words=_words(found, rivals, self.conventions))
+
+    def _depth_factors(self) -> tuple[float, float, float]:
+        """Returns the factor of depth that explains the flow best, and the range of good ones."""
+
+        def left_px(powers: NDArray[np.float64]) -> NDArray[np.float64]:
+            factors = Mistake("", depth=_times(*(10**powers).tolist()))
+            return (
+                torch.stack([_residual_px(pair, factors) for pair in self._pairs]).mean(0).numpy()
+            )
+
+        coarse = left_px(_POWERS)
+        finer = _POWERS[coarse.argmin()] + np.arange(-4, 5) / 40
+        fine = left_px(finer)
+        best = float(10 ** finer[fine.argmin()])
+        usual = min(_USUAL_FACTORS, key=lambda factor: abs(math.log(factor / best)))
+        best = usual if abs(math.log10(usual / best)) < 0.04 else float(f"{best:.2g}")
+        good = [*_POWERS[coarse <= _NEARLY * fine.min() + _SMALL_PX], finer[fine.argmin()]]
+        return best, float(10 ** (min(good) - 1 / 16)), float(10 ** (max(good) + 1 / 16))
 
 
 def diagnose(
@@ -261,29 +323,35 @@ def diagnose(
     return doctor.diagnosis()
 
 
-def _residuals(
-    raw: Tensor, depth: Tensor, K: Tensor, poses: tuple[Tensor, Tensor], known: Tensor
+def _residual_px(
+    pair: _Pair, mistake: Mistake | None = None, motion: Tensor | None = None
 ) -> Tensor:
-    """Returns the median of |raw - ego| as given, then under each mistake."""
-    residuals = []
-    for mistake in (None, *MISTAKES.values()):
-        there, z, flow = poses, depth, raw
-        if mistake is not None and mistake.poses:
-            there = mistake.poses(poses[0]), mistake.poses(poses[1])
-        if mistake is not None and mistake.depth:
-            z = mistake.depth(depth, K)
-        if mistake is not None and mistake.flow:
-            flow = mistake.flow(raw)
-        ego, valid = ego_flow(z, K, relative_motion(*there))
-        # A convention does not explain the points that it puts behind the camera.
-        left = torch.where(valid, flow - ego, torch.inf)
-        residuals.append(_median_length(left, known))
-    return torch.tensor(residuals, dtype=torch.float64).clamp(max=1e6)
+    """Returns the median of |raw - ego|, `[*B]` for depths `[*B, 1, H, W]`."""
+    poses, depth, flow, K = pair.poses, pair.depth, pair.raw, pair.K
+    if mistake is not None:
+        poses = mistake.poses(*poses) if mistake.poses else poses
+        K = mistake.K(K) if mistake.K else K
+        depth = mistake.depth(depth, K) if mistake.depth else depth
+        flow = mistake.flow(flow) if mistake.flow else flow
+    motion = relative_motion(*poses) if motion is None else motion.float()
+    ego, valid = ego_flow(depth, K, motion)
+    # A convention does not explain the points that it puts behind the camera.
+    return _median_px(torch.where(valid, flow - ego, torch.inf), pair).clamp(max=1e6)
 
 
-def _sampled(
-    raw: Tensor, depth: Tensor, K: Tensor, static: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+def _median_px(flow: Tensor, pair: _Pair) -> Tensor:
+    """Returns the median length of flow `[*B, 2, H, W]` where it is known, in fine pixels."""
+    lengths = torch.hypot(*flow.unbind(-3))[..., pair.known[0]]
+    if not lengths.shape[-1]:
+        return torch.full(flow.shape[:-3], torch.nan)
+    return pair.step * lengths.nan_to_num(nan=torch.inf).median(-1).values
+
+
+def _mean(values: list[Tensor]) -> float:
+    return float(np.mean([float(value) for value in values])) if values else math.nan
+
+
+def _sampled(raw: Tensor, depth: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
     """Returns the maps and K on a coarser grid, where all is known, and the grid's step.
 
     Pixel j of the coarser grid is pixel s j + o of the finer one. The centre of the latter,
@@ -298,11 +366,95 @@ def _sampled(
     coarse[:2, 2] -= offset + 0.5 - step / 2
     coarse[:2] /= step
     known = raw.isfinite().all(0, keepdim=True) & (depth > 0)
-    if static is not None:
-        known &= static[every]
     return raw, depth, coarse.float(), known, step
 
 
-def _median_length(flow: Tensor, where: Tensor) -> float:
-    lengths = flow.square().sum(0, keepdim=True).sqrt()[where]
-    return float(lengths.nan_to_num(nan=torch.inf).median()) if lengths.numel() else float("nan")
+def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
+    """Returns the camera's axes by which the recorded motions become the estimated ones.
+
+    That is Kabsch's rotation between rotation vectors and translations, each in units of its
+    spread. It isn't determined if the camera always moves along and turns about one line.
+    """
+    vectors = np.array(
+        [
+            [_vectors(relative_motion(*pair.poses, dtype=torch.float64)), _vectors(pair.estimated)]
+            for pair in pairs
+            if pair.estimated is not None
+        ]
+    )
+    spread = np.sqrt(np.square(vectors).sum(-1).mean(0)) if len(vectors) > 1 else np.zeros(1)
+    if not spread.all():
+        return {}
+    given, seen = (vectors / spread[..., None]).transpose(1, 0, 2, 3).reshape(2, -1, 3)
+    left, strengths, right = np.linalg.svd(given.T @ seen)
+    if strengths[1] < 0.1 * strengths[0]:
+        return {}
+    given_from_opencv = torch.eye(4, dtype=torch.float64)
+    handed = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
+    given_from_opencv[:3, :3] = torch.from_numpy(left @ handed @ right)
+    for name in get_args(CameraAxes):
+        off = adapt_pose(torch.eye(4), axes=name)[:3, :3].mT @ given_from_opencv[:3, :3]
+        if off.trace() > 1 + 2 * math.cos(math.radians(_SAME_AXES_DEG)):
+            return {}  # one of the usual ones
+    columns = given_from_opencv[:3, :3].round(decimals=1).tolist()
+    says = f"the camera's right, down and ahead are the columns of {columns} in the poses' axes"
+    return {"other axes": Mistake(says, _each(lambda pose: pose @ given_from_opencv))}
+
+
+def _vectors(motion: Tensor) -> NDArray[np.float64]:
+    """Returns rotation vector and translation, `[2, 3]`."""
+    matrix = motion.numpy()
+    return np.stack([cv2.Rodrigues(matrix[:3, :3])[0].ravel(), matrix[:3, 3]])
+
+
+def _suspects(found: Diagnosis) -> tuple[str, ...]:
+    """Returns the mistakes that explain the flow, where it is not explained as it is."""
+    if found.residual_px <= max(_SMALL_PX, _SMALL_SHARE * found.raw_px):
+        return ()
+    # No more is asked than the best motion does, given the errors of flow and depth.
+    possible_px = min(_AS_GOOD * found.estimated_px, _SHRINKS * found.raw_px)
+    of_depth = max(_SMALL_PX, _EXPLAINS * found.raw_px, possible_px)
+    # Another factor of depth has to do better; all other corrections, better by far.
+    most = min(_SHRINKS * found.residual_px, of_depth)
+    able = {
+        name: px
+        for name, px in sorted(found.rivals_px.items(), key=lambda item: item[1])
+        if px <= (of_depth if name.startswith(("depth times", "depth_unit_m")) else most)
+    }
+    least = min(able.values(), default=0.0)
+    return tuple(name for name, px in able.items() if px <= _AS_GOOD * least + 0.01)
+
+
+def _words(found: Diagnosis, rivals: Mapping[str, Mistake], conventions: Mapping[str, str]) -> str:
+    """Returns a diagnosis in a sentence or two."""
+    medians = (
+        f"|raw - ego| is {found.residual_px:.2f} px, raw flow {found.raw_px:.2f} px "
+        f"(medians of {found.pairs} pairs)"
+    )
+    if found.suspects:
+        told = "; or ".join(
+            f"{found.rivals_px[name]:.2f} px if {rivals[name].says}{_remedy(name, conventions)}"
+            for name in found.suspects
+        )
+        apart = "" if len(found.suspects) == 1 else ". This recording can't tell them apart"
+        return f"a convention looks wrong: {medians}. It would be {told}{apart}"
+    if found.residual_px > _SHRINKS * found.raw_px:
+        why = "no motion of the camera explains this flow: is there texture, and is most static?"
+        if found.estimated_px <= _SHRINKS * found.raw_px:
+            why = (
+                f"another motion of the camera would leave {found.estimated_px:.2f} px: are poses,"
+            )
+            why += " pictures and depth of one recording and one clock?"
+        return f"can't tell whether the conventions are right: {medians}; {why}"
+    least, most = found.depth_factors
+    unit = "; the unit of depth can't be told, for the camera hardly moves from its place"
+    return f"conventions look right: {medians}{unit if most > _KNOWN_UNIT * least else ''}"
+
+
+def _remedy(name: str, conventions: Mapping[str, str]) -> str:
+    """Returns the options that correct a mistake, as they are typed."""
+    if "=" not in name:
+        return ""
+    typed = " ".join(f"format.{option}" for option in name.split())
+    in_force = all(option.split("=")[0] in conventions for option in name.split())
+    return f" ({typed})" if in_force else f" (frames: {typed})"

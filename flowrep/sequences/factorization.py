@@ -2,22 +2,40 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from flowrep.geometry import factorize, relative_motion
 from flowrep.sequences.files import Flow
-from flowrep.sequences.recording import Frame, SequenceError
+from flowrep.sequences.recording import Frame, Pose, SequenceError
 from flowrep.transforms.estimated_flow import Estimator
 
 # The squared error of going there and back is below a hundredth of the squared lengths plus half a
 # square pixel: Sundaram, Brox and Keutzer, "Dense point trajectories", 2010.
 _CONSISTENT_SHARE, _CONSISTENT_PX2 = 0.01, 0.5
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The camera's motion between two frames.
+
+    Attributes:
+        prev_from_curr: `[4, 4]` float64, takes a point in the current camera's frame into the
+            previous camera's.
+        known: whether it is; the identity otherwise.
+        inlier_share: the share of the pixels that move as the estimate says; nan of a recorded one.
+    """
+
+    prev_from_curr: Pose = field(default_factory=lambda: np.eye(4))
+    known: bool = True
+    inlier_share: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -35,6 +53,7 @@ class FactorizedFrame:
         valid: `[H, W]`, where raw and ego are known and trusted.
         ego_valid: `[H, W]`, where ego is, whatever raw is: depth is known, and the point was in
             front of the previous camera.
+        motion: the camera's motion that ego flow was computed from.
     """
 
     frame: Frame
@@ -44,10 +63,13 @@ class FactorizedFrame:
     obj: Flow
     valid: NDArray[np.bool_]
     ego_valid: NDArray[np.bool_]
+    motion: Motion
 
 
 # From the previous and the current frame to raw flow on the current grid, nan where unknown.
 FlowSource = Callable[[Frame, Frame], Flow]
+# From the two frames and that flow to the camera's motion.
+MotionSource = Callable[[Frame, Frame, Flow], Motion]
 
 
 def recorded_flow(previous: Frame, current: Frame) -> Flow:
@@ -83,13 +105,13 @@ class EstimatedFlowSource:
     def __call__(self, previous: Frame, current: Frame) -> Flow:
         """Returns raw flow, nan where unknown.
 
-        If the picture repeats the previous one although the pose moved, all flow is unknown.
+        If the picture repeats the previous one although the camera moved, all flow is unknown.
         """
         if previous.rgb is None or current.rgb is None:
             raise SequenceError(current.source, "has no picture to estimate flow from")
         if np.array_equal(previous.rgb, current.rgb):
-            moved = not np.array_equal(previous.world_from_cam, current.world_from_cam)
-            return np.full((2, *current.size), np.nan if moved else 0.0, dtype=np.float32)
+            unknown = repeats(previous, current)
+            return np.full((2, *current.size), np.nan if unknown else 0.0, dtype=np.float32)
         ways = [(current.rgb, previous.rgb), (previous.rgb, current.rgb)]
         ways = ways if self.check_consistency else ways[:1]
         first, second = (
@@ -125,41 +147,152 @@ def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
     return inside & (missed < _CONSISTENT_SHARE * length + _CONSISTENT_PX2)
 
 
+def repeats(previous: Frame, current: Frame) -> bool:
+    """Returns whether a frame only repeats the previous picture, though the camera may have moved.
+
+    Kinects do so when they miss a picture; 7-Scenes has many such frames.
+    """
+    if previous.rgb is None or current.rgb is None or current.raw is not None:
+        return False
+    before, now = previous.world_from_cam, current.world_from_cam
+    stood_still = before is not None and now is not None and np.array_equal(before, now)
+    return not stood_still and np.array_equal(previous.rgb, current.rgb)
+
+
+def pairs(frames: Iterable[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
+    """Yields each frame after the one that its flow is measured from, None if a clip starts.
+
+    After a repeated picture, that is the frame in which the picture first appeared: its pose is
+    the picture's own.
+    """
+    previous: Frame | None = None
+    for current in frames:
+        if current.starts_clip:
+            previous = None
+        yield previous, current
+        if previous is None or not repeats(previous, current):
+            previous = current
+
+
+def recorded_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
+    """Returns the camera's motion by the recorded poses.
+
+    Raises:
+        SequenceError: a frame has none.
+    """
+    if previous.world_from_cam is None or current.world_from_cam is None:
+        raise SequenceError(current.source, "has no pose: use poses=estimated")
+    poses = (torch.from_numpy(frame.world_from_cam) for frame in (previous, current))
+    return Motion(relative_motion(*poses, dtype=torch.float64).numpy())
+
+
+def estimated_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
+    """Returns the camera's motion that most of the picture's flow and depth agree on."""
+    return estimate_motion(
+        torch.from_numpy(raw),
+        torch.from_numpy(current.depth)[None],
+        torch.from_numpy(current.K),
+        picture=None if raw is current.raw else picture_of(current),
+    )
+
+
+def picture_of(frame: Frame) -> Tensor | None:
+    """Returns a frame's picture `[3, H, W]`.
+
+    Its texture tells which estimated flow can be trusted: where there is none, flow is 0.
+    """
+    return None if frame.rgb is None else torch.from_numpy(frame.rgb).permute(2, 0, 1)
+
+
+_LEAST_PIXELS, _MOST_PIXELS = 50, 1500
+
+
+def estimate_motion(
+    raw: Tensor, depth: Tensor, K: Tensor, *, picture: Tensor | None = None
+) -> Motion:
+    """Returns the camera's motion from flow and depth.
+
+    Args:
+        raw: `[2, H, W]`, pixels; nan unknown.
+        depth: `[1, H, W]`, metres.
+        K: `[3, 3]`, pixels.
+        picture: uint8 `[3, H, W]`.
+    """
+    flow, z, camera = raw.numpy(), depth[0].numpy(), K.double().numpy()
+    usable = np.isfinite(flow).all(0) & np.isfinite(z) & (z > 0)
+    if picture is not None and usable.any():
+        rows, columns = np.gradient(picture.float().mean(0).numpy())
+        texture = cv2.blur(np.square(rows) + np.square(columns), (7, 7))
+        usable &= texture >= np.median(texture[usable])
+    v, u = np.nonzero(usable)
+    if len(u) < _LEAST_PIXELS:
+        return Motion(known=False, inlier_share=0.0)
+    chosen = np.random.default_rng(0).permutation(len(u))[:_MOST_PIXELS]
+    u, v = u[chosen], v[chosen]
+    pixels = np.stack([u + 0.5, v + 0.5, np.ones(len(u))])
+    unit = float(np.median(z[v, u]))
+    points = (np.linalg.inv(camera) @ pixels * (z[v, u] / unit)).T.copy()
+    seen = (pixels[:2] - flow[:, v, u]).T.copy()
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        points, seen, camera, None, reprojectionError=1.0, iterationsCount=300
+    )
+    if not found:
+        return Motion(known=False, inlier_share=0.0)
+    kept = inliers[:, 0]
+    turn, shift = cv2.solvePnPRefineLM(points[kept], seen[kept], camera, None, turn, shift)
+    prev_from_curr = np.eye(4)
+    prev_from_curr[:3, :3], prev_from_curr[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0] * unit
+    return Motion(prev_from_curr, inlier_share=len(kept) / len(u))
+
+
 def factorize_frames(
-    frames: Iterable[Frame], flow_source: FlowSource
+    frames: Iterable[Frame],
+    flow_source: FlowSource,
+    motion_source: MotionSource = recorded_motion,
 ) -> Iterator[FactorizedFrame | None]:
     """Yields the factorisation of each frame, None for a frame without a previous one.
 
     Two frames are held in memory.
 
+    Args:
+        frames: a `Recording` or any other frames in order.
+        flow_source: `recorded_flow` or an `EstimatedFlowSource`.
+        motion_source: `recorded_motion` or `estimated_motion`.
+
     Raises:
-        SequenceError: a frame can't be read or lacks what the flow source needs.
+        SequenceError: a frame can't be read or lacks what a source needs.
     """
-    previous: Frame | None = None
-    for current in frames:
-        if previous is None or current.starts_clip:
+    for previous, current in pairs(frames):
+        if previous is None:
             yield None
         else:
-            yield factorize_pair(previous, current, flow_source(previous, current))
-        previous = current
+            raw = flow_source(previous, current)
+            yield factorize_pair(previous, current, raw, motion_source(previous, current, raw))
 
 
-def factorize_pair(previous: Frame, current: Frame, raw: Flow) -> FactorizedFrame:
-    """Returns the factorisation of one frame, given its raw flow."""
+def factorize_pair(
+    previous: Frame, current: Frame, raw: Flow, motion: Motion | None = None
+) -> FactorizedFrame:
+    """Returns the factorisation of one frame, by default with the recorded motion."""
     if previous.size != current.size:
         raise SequenceError(current.source, "differs in size from the frame before")
-    motion = relative_motion(
-        torch.from_numpy(previous.world_from_cam), torch.from_numpy(current.world_from_cam)
-    )
+    motion = recorded_motion(previous, current, raw) if motion is None else motion
     measured = np.isfinite(raw).all(axis=0)
     ego, obj, ego_valid = factorize(
         torch.from_numpy(np.where(measured, raw, np.float32(0))),
         torch.from_numpy(current.depth)[None],
         torch.from_numpy(current.K).float(),
-        motion,
+        torch.from_numpy(motion.prev_from_curr).float(),
     )
-    valid = ego_valid[0].numpy() & measured
-    known_obj = np.where(valid, obj.numpy(), np.float32(0))
+    is_known = ego_valid[0].numpy() & motion.known
+    valid = is_known & measured
     return FactorizedFrame(
-        current, previous, raw, ego.numpy(), known_obj, valid, ego_valid[0].numpy()
+        frame=current,
+        previous=previous,
+        raw=raw,
+        ego=ego.numpy(),
+        obj=np.where(valid, obj.numpy(), np.float32(0)),
+        valid=valid,
+        ego_valid=is_known,
+        motion=motion,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from flowrep.sequences.calibration import (
     Registration,
     as_pose,
     check_ascending,
+    check_count,
     read_cameras,
     read_pose_lines,
 )
@@ -45,10 +47,11 @@ FLOW_FILES = (".flo", ".png")
 
 
 class Frames(Recording):
-    """A folder with `depth/`, `poses.txt`, `intrinsics.json` and `rgb/`, `flow/` or both.
+    """A folder with `depth/`, `intrinsics.json`, `rgb/`, `flow/` or both, and `poses.txt`.
 
     Files of one frame share their name up to the suffix; `poses.txt` has a line for each, in the
-    order of their numbers. `timestamps.txt` is optional. docs/factorize.md shows every file.
+    order of their numbers. Without it the camera's motion has to be estimated. `timestamps.txt` is
+    optional. docs/factorize.md shows every file.
 
     Args:
         folder: the recording's folder.
@@ -56,7 +59,7 @@ class Frames(Recording):
             numbers.
         pose_direction: see there.
         pose_axes: see there.
-        depth_unit_m: the length of 1 in a .png, metres.
+        depth_unit_m: the length of a stored 1, metres; None is 0.001 in a .png and 1 in a .npy.
         depth_kind: see `flowrep.geometry.adapt_depth`.
         near_m: only for `"z_buffer"`.
         far_m: only for `"z_buffer"`.
@@ -69,6 +72,8 @@ class Frames(Recording):
         ValueError: a name is unknown, or an option doesn't apply to the kind of depth.
     """
 
+    no_flow = "it has no folder flow/: use flow=estimated"
+
     def __init__(
         self,
         folder: str | Path,
@@ -76,7 +81,7 @@ class Frames(Recording):
         pose_layout: PoseLayout = "matrix",
         pose_direction: PoseDirection = "camera_to_world",
         pose_axes: CameraAxes = "opencv",
-        depth_unit_m: float = 0.001,
+        depth_unit_m: float | None = None,
         depth_kind: DepthKind = "z",
         near_m: float | None = None,
         far_m: float | None = None,
@@ -84,23 +89,31 @@ class Frames(Recording):
         flow_grid: Grid = "current",
         flow_channels: Channels = "uv",
     ) -> None:
-        self.folder = Path(folder)
         check_name("pose_layout", pose_layout, PoseLayout)
         check_name("pose_direction", pose_direction, PoseDirection)
         check_name("pose_axes", pose_axes, CameraAxes)
         check_depth_options(depth_kind, depth_kind == "ray_length", near_m, far_m)
         check_flow_options(flow_direction, flow_grid, flow_channels)
-        if not depth_unit_m > 0:
+        if depth_unit_m is not None and not depth_unit_m > 0:
             raise ValueError(f"depth_unit_m is positive, got {depth_unit_m}")
-        self.pose_layout, self.pose_direction, self.pose_axes = (
-            pose_layout, pose_direction, pose_axes,
-        )  # fmt: skip
-        self.depth_unit_m, self.depth_kind = float(depth_unit_m), depth_kind
-        self.near_m, self.far_m = near_m, far_m
-        self.flow_direction, self.flow_grid, self.flow_channels = (
-            flow_direction, flow_grid, flow_channels,
-        )  # fmt: skip
+        self.folder, self.depth_unit_m = Path(folder), depth_unit_m
+        self._pose_options: dict[str, Any] = {
+            "layout": pose_layout, "direction": pose_direction, "axes": pose_axes,
+        }  # fmt: skip
+        self._depth_options: dict[str, Any] = {"kind": depth_kind, "near_m": near_m, "far_m": far_m}
+        self._flow_options: dict[str, Any] = {
+            "direction": flow_direction, "grid": flow_grid, "channels": flow_channels,
+        }  # fmt: skip
         self._open()
+        unit_m = depth_unit_m or (1.0 if self._depths[0].suffix.lower() == ".npy" else 0.001)
+        self.conventions = {
+            "pose_direction": pose_direction,
+            "pose_axes": pose_axes,
+            "depth_kind": depth_kind,
+            "depth_unit_m": str(unit_m),
+            "flow_direction": flow_direction,
+            "flow_channels": flow_channels,
+        }
 
     def _open(self) -> None:
         self._depths = list_files(self.folder / "depth", DEPTH_FILES)
@@ -108,25 +121,38 @@ class Frames(Recording):
         self._flows = self._by_stem("flow", FLOW_FILES)
         if not self._rgbs and not self._flows:
             raise SequenceError(self.folder, "has neither rgb/ nor flow/: one of them is needed")
+        self._check_names()
         self.has_flow = bool(self._flows)
-        self._poses_path = self.folder / "poses.txt"
-        if not self._poses_path.is_file():
-            raise SequenceError(
-                self._poses_path,
-                "no such file: flow can't be factorised without the camera's poses; "
-                "a camera that stands still needs none, see format=video",
-            )
-        self._poses = read_pose_lines(self._poses_path, self.pose_layout, len(self))
-        self._times = self._timestamps()
+        self._poses_path, times_path = self.folder / "poses.txt", self.folder / "timestamps.txt"
+        self.has_poses = self._poses_path.is_file()
+        if self.has_poses:
+            self._poses = read_pose_lines(self._poses_path, self._pose_options["layout"])
+            check_count(self._poses_path, len(self._poses), len(self), "poses")
+        self._times: NDArray[np.float64] | None = None
+        if times_path.is_file():
+            self._times = read_table(times_path, [1])[:, 0]
+            check_count(times_path, len(self._times), len(self), "times")
+            check_ascending(times_path, self._times)
         self._camera, colour, colour_from_depth = read_cameras(self.folder / "intrinsics.json")
         self._registration, self.K = None, self._camera.K
         if colour is not None and colour_from_depth is not None:
-            path = self.folder / "intrinsics.json"
-            colour_from_depth = as_pose(colour_from_depth, path)
             self._registration = Registration(
                 self._camera.K, colour.K, colour_from_depth, colour.size
             )
             self.K = colour.K
+
+    def _check_names(self) -> None:
+        """Raises SequenceError if a frame lacks a file that the others have."""
+        names = [path.stem for path in self._depths]
+        for kind, found in (("rgb", self._rgbs), ("flow", self._flows)):
+            # The first frame has no flow since the frame before.
+            expected = names[1:] if kind == "flow" else names
+            for name in expected if found else ():
+                if name not in found:
+                    raise SequenceError(self.folder / kind, f"lacks a file for frame {name}")
+            for name, path in found.items():
+                if name not in names:
+                    raise SequenceError(self.folder / "depth", f"lacks a file for {path.name}")
 
     def __len__(self) -> int:
         """Returns the number of depth maps."""
@@ -135,21 +161,15 @@ class Frames(Recording):
     def _read(self, index: int) -> Frame:
         depth_path = self._depths[index]
         name = depth_path.stem
-        for kind, files in {"rgb": self._rgbs, "flow": self._flows}.items():
-            if files and name not in files and not (kind == "flow" and index == 0):
-                raise SequenceError(self.folder / kind, f"lacks a file for frame {name}")
-        world_from_cam = as_pose(
-            self._poses[index],
-            self._poses_path,
-            layout=self.pose_layout,
-            direction=self.pose_direction,
-            axes=self.pose_axes,
-        )
+        world_from_cam = None
+        if self.has_poses:
+            world_from_cam = as_pose(self._poses[index], self._poses_path, **self._pose_options)
         depth = self._depth(depth_path)
         if self._registration is not None:
             depth = self._registration(depth)
-            world_from_cam = world_from_cam @ self._registration.depth_from_colour
-        rgb, has_flow = self._rgbs.get(name), name in self._flows and index > 0
+            if world_from_cam is not None:
+                world_from_cam = world_from_cam @ self._registration.depth_from_colour
+        rgb, has_flow = self._rgbs.get(name), self.has_flow and index > 0
         return Frame(
             name=name,
             source=depth_path if rgb is None else rgb,
@@ -163,39 +183,17 @@ class Frames(Recording):
         )
 
     def _depth(self, path: Path) -> NDArray[np.float32]:
-        stored = read_depth(path, self.depth_unit_m, self._camera.size)
-        K = torch.from_numpy(self._camera.K).float() if self.depth_kind == "ray_length" else None
-        depth = adapt_depth(
-            torch.from_numpy(stored)[None],
-            self.depth_kind,
-            K=K,
-            near_m=self.near_m,
-            far_m=self.far_m,
-        )
-        return depth[0].numpy()
+        stored = read_depth(path, self._camera.size, unit_m=self.depth_unit_m)
+        is_ray = self._depth_options["kind"] == "ray_length"
+        K = torch.from_numpy(self._camera.K).float() if is_ray else None
+        return adapt_depth(torch.from_numpy(stored)[None], K=K, **self._depth_options)[0].numpy()
 
     def _flow(self, path: Path) -> NDArray[np.float32]:
         flow = read_kitti_flow(path) if path.suffix.lower() == ".png" else read_flo(path)
-        adapted = adapt_flow(
-            torch.from_numpy(flow),
-            direction=self.flow_direction,
-            grid=self.flow_grid,
-            channels=self.flow_channels,
-        )
-        return adapted.numpy()
+        return adapt_flow(torch.from_numpy(flow), **self._flow_options).numpy()
 
     def _by_stem(self, kind: str, suffixes: tuple[str, ...]) -> dict[str, Path]:
         folder = self.folder / kind
         if not folder.is_dir():
             return {}
         return {path.stem: path for path in list_files(folder, suffixes)}
-
-    def _timestamps(self) -> NDArray[np.float64] | None:
-        path = self.folder / "timestamps.txt"
-        if not path.is_file():
-            return None
-        times = read_table(path, [1])[:, 0]
-        if len(times) != len(self):
-            raise SequenceError(path, f"has {len(times)} times for {len(self)} frames")
-        check_ascending(path, times)
-        return times

@@ -7,16 +7,16 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.sequences.calibration import Pose, as_pose, intrinsics, opencv_intrinsics
 from flowrep.sequences.files import (
     list_files,
-    path_inside,
     read_kitti_flow,
     read_lines,
-    read_png16,
+    read_png,
     read_rgb,
     read_table,
 )
@@ -24,7 +24,6 @@ from flowrep.sequences.recording import Frame, Recording, SequenceError
 
 EARTH_RADIUS_M = 6378137.0
 _OXTS_NUMBERS = 30
-_MAX_DIGITS = 10  # of a frame number in a raw recording
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class Kitti(Recording):
         rgb, calibration = read_rgb(picture), self._calibration(pair)
         depth = np.full(rgb.shape[:2], np.nan, dtype=np.float32)
         if is_current:
-            disparity = read_png16(self.folder / "disp_occ_0" / f"{name}.png")
+            disparity = read_png(self.folder / "disp_occ_0" / f"{name}.png", np.uint16)
             depth = depth_from_disparity(disparity, calibration.focal_baseline)
         flow = self.folder / "flow_occ" / f"{name}.png"
         world_from_imu = self._world_from_imu(int(pair), 0 if is_current else 1)
@@ -104,9 +103,9 @@ class Kitti(Recording):
         found = {}
         text = {number: line.split() for number, line in read_lines(mapping)}
         for number, words in text.items():
-            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > _MAX_DIGITS:
+            if len(words) != 3 or not words[2].isdecimal():
                 raise SequenceError(mapping, f"line {number} is not a date, recording and frame")
-            drive = path_inside(self.raw_data, f"{words[0]}/{words[1]}", mapping)
+            drive = self.raw_data / words[0] / words[1]
             found[number - 1] = drive / "oxts" / "data", int(words[2])
         return found
 
@@ -172,7 +171,10 @@ def pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float, source: Pat
     latitude, longitude, altitude, roll, pitch, yaw = packet[:6]
     scale = math.cos(math.radians(latitude_deg)) * EARTH_RADIUS_M
     pose = np.eye(4)
-    pose[:3, :3] = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
+    about_x, about_y, about_z = (
+        cv2.Rodrigues(angle * axis)[0] for angle, axis in zip((roll, pitch, yaw), np.eye(3))
+    )
+    pose[:3, :3] = about_z @ about_y @ about_x
     pose[:3, 3] = (
         scale * math.radians(longitude),
         scale * math.log(math.tan(math.radians(90 + latitude) / 2)),
@@ -200,14 +202,3 @@ def _matrix(
     if values.size != math.prod(shape) or not np.isfinite(values).all():
         raise SequenceError(path, f"{name} should be {math.prod(shape)} numbers")
     return values.reshape(shape)
-
-
-def _about(axis: int, angle_rad: float) -> NDArray[np.float64]:
-    first, second = (i for i in range(3) if i != axis)
-    if axis == 1:
-        first, second = second, first
-    rotation = np.eye(3)
-    rotation[first, first] = rotation[second, second] = math.cos(angle_rad)
-    rotation[second, first] = math.sin(angle_rad)
-    rotation[first, second] = -math.sin(angle_rad)
-    return rotation

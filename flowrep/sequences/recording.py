@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +14,13 @@ import torch
 from numpy.typing import NDArray
 
 from flowrep.geometry import check_intrinsics, check_rigid
+
+Pose = NDArray[np.float64]  # world_from_cam [4, 4]
+
+PLAY_BACKWARDS = (
+    "its flow leads to the next frame: format.backwards=true plays it from the last frame to the "
+    "first, where that is the previous one"
+)
 
 
 class SequenceError(Exception):
@@ -32,7 +40,7 @@ class Frame:
     Attributes:
         name: unique in the recording; names the files written for the frame.
         source: the file that is named in errors about the frame.
-        world_from_cam: `[4, 4]` float64, the camera's pose.
+        world_from_cam: `[4, 4]` float64, the camera's pose; None where the recording has none.
         K: `[3, 3]` float64, pixels.
         depth: `[H, W]` float32, metres.
         rgb: `[H, W, 3]` uint8, None where the recording has no pictures.
@@ -45,7 +53,7 @@ class Frame:
 
     name: str
     source: Path
-    world_from_cam: NDArray[np.float64]
+    world_from_cam: Pose | None
     K: NDArray[np.float64]
     depth: NDArray[np.float32]
     rgb: NDArray[np.uint8] | None = None
@@ -69,6 +77,10 @@ class Stream(Protocol):
         """Whether frames may bring flow of their own."""
 
     @property
+    def has_poses(self) -> bool:
+        """Whether frames bring the camera's pose."""
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes for the user, a sentence each."""
 
@@ -81,15 +93,21 @@ class Recording(ABC):
 
     Attributes:
         has_flow: whether frames may bring flow of their own.
+        has_poses: whether frames bring the camera's pose.
+        no_flow: why it has no flow of its own, and what to do.
         notes: notes for the user about this recording, a sentence each.
         one_size: whether all frames must have one size.
+        conventions: the options about conventions that it was opened with, by name, for the
+            doctor's advice.
     """
 
     has_flow: bool = False
+    has_poses: bool = True
+    no_flow: str = "the format has none: use flow=estimated"
     notes: tuple[str, ...] = ()
     one_size: bool = True
+    conventions: Mapping[str, str] = MappingProxyType({})
     _size: tuple[int, int] | None = None
-    _named: dict[str, tuple[int, Path]] | None = None
 
     @abstractmethod
     def __len__(self) -> int:
@@ -108,13 +126,12 @@ class Recording(ABC):
 
         Raises:
             IndexError: there is no such frame.
-            SequenceError: it can't be read, does not fit the others, or has the name of another.
+            SequenceError: it can't be read, or does not fit the others.
         """
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         frame = self._read(index)
         check_frame(frame)
-        self._check_name(index, frame)
         if self._size is None:
             self._size = frame.size
         if self.one_size and frame.size != self._size:
@@ -127,18 +144,6 @@ class Recording(ABC):
     def __iter__(self) -> Iterator[Frame]:
         """Yields the frames in order."""
         return (self[index] for index in range(len(self)))
-
-    def _check_name(self, index: int, frame: Frame) -> None:
-        """Raises SequenceError if another frame has the name."""
-        if self._named is None:
-            self._named = {}
-        first, source = self._named.setdefault(frame.name, (index, frame.source))
-        if first != index:
-            raise SequenceError(
-                frame.source,
-                f"frame {index} is named {frame.name}, like frame {first} ({source}): "
-                "both would write the same files",
-            )
 
 
 def check_frame(frame: Frame) -> None:
@@ -156,7 +161,8 @@ def check_frame(frame: Frame) -> None:
         listing = ", ".join(f"{name} {_size_text(size)}" for name, size in sizes.items())
         raise SequenceError(frame.source, f"pictures of one frame differ in size: {listing}")
     try:
-        check_rigid("pose", torch.from_numpy(frame.world_from_cam))
+        if frame.world_from_cam is not None:
+            check_rigid("pose", torch.from_numpy(frame.world_from_cam))
         check_intrinsics("intrinsics", torch.from_numpy(frame.K))
     except ValueError as error:
         raise SequenceError(frame.source, str(error)) from None

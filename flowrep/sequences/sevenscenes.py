@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrep.sequences.calibration import Registration, as_pose, four_intrinsics, intrinsics
 from flowrep.sequences.files import (
     depth_from_integers,
     list_files,
-    read_matrix,
-    read_png16,
+    read_png,
     read_rgb,
+    read_table,
 )
 from flowrep.sequences.recording import Frame, Recording, SequenceError
 
@@ -25,7 +26,8 @@ class SevenScenes(Recording):
     """A folder with `frame-000000.color.png`, `.depth.png` and `.pose.txt`.
 
     Depth is registered to the colour camera, whose intrinsics the data set does not give; the
-    default is those of an uncalibrated Kinect. The poses are the depth camera's.
+    default is those of an uncalibrated Kinect. The poses are the depth camera's; without the files
+    `.pose.txt`, the camera's motion has to be estimated.
 
     Args:
         folder: the folder of one sequence, e.g. `chess/seq-01`.
@@ -62,6 +64,8 @@ class SevenScenes(Recording):
         ]
         if not self._colours:
             raise SequenceError(self.folder, "holds no frame-*.color.png or .color.jpg")
+        first = self._colours[0].name.split(".")[0]
+        self.has_poses = (self.folder / f"{first}.pose.txt").is_file()
         self._registration: Registration | None = None
 
     def __len__(self) -> int:
@@ -71,15 +75,17 @@ class SevenScenes(Recording):
     def _read(self, index: int) -> Frame:
         colour = self._colours[index]
         name = colour.name.split(".")[0]
-        pose_path = self.folder / f"{name}.pose.txt"
-        world_from_depth = as_pose(read_matrix(pose_path, 4, 4), pose_path)
         rgb = read_rgb(colour)
-        stored = read_png16(self.folder / f"{name}.depth.png")
+        stored = read_png(self.folder / f"{name}.depth.png", np.uint16)
         register = self._registered_to((rgb.shape[0], rgb.shape[1]))
+        world_from_cam = None
+        if self.has_poses:
+            path = self.folder / f"{name}.pose.txt"
+            world_from_cam = as_pose(_matrix(path), path) @ register.depth_from_colour
         return Frame(
             name=name,
             source=colour,
-            world_from_cam=world_from_depth @ register.depth_from_colour,
+            world_from_cam=world_from_cam,
             K=self.K,
             depth=register(depth_from_integers(stored, DEPTH_UNIT_M, missing=(0, 65535))),
             rgb=rgb,
@@ -89,3 +95,11 @@ class SevenScenes(Recording):
         if self._registration is None or self._registration.size != size:
             self._registration = Registration(self._K_depth, self.K, self._colour_from_depth, size)
         return self._registration
+
+
+def _matrix(path: Path) -> NDArray[np.float64]:
+    """Returns the pose's numbers, four in each of four lines."""
+    table = read_table(path, [4])
+    if len(table) != 4:
+        raise SequenceError(path, f"has {len(table)} lines, expected 4")
+    return table

@@ -14,11 +14,11 @@ from flowrep.sequences.files import (
     list_files,
     read_bytes,
     read_flo,
-    read_mask,
+    read_png,
     read_rgb,
     read_tagged_floats,
 )
-from flowrep.sequences.recording import Frame, Recording, SequenceError
+from flowrep.sequences.recording import PLAY_BACKWARDS, Frame, Recording, SequenceError
 
 
 class Sintel(Recording):
@@ -42,12 +42,12 @@ class Sintel(Recording):
         self, folder: str | Path, *, scene: str, render: str = "final", backwards: bool = False
     ) -> None:
         self.folder, self.scene = Path(folder), scene
-        if not scene or Path(scene).name != scene or scene in (".", ".."):
-            raise SequenceError(self.folder, f"scene is the name of a folder, not {scene!r}")
         self._pictures = list_files(self.folder / render / scene, (".png",), "frame_")
         if backwards:
             self._pictures.reverse()
-        self.has_flow = bool(backwards) and (self.folder / "flow" / scene).is_dir()
+        flow = self.folder / "flow" / scene
+        self.has_flow = bool(backwards) and flow.is_dir()
+        self.no_flow = f"no such folder: {flow}" if backwards else PLAY_BACKWARDS
 
     def __len__(self) -> int:
         """Returns the number of pictures."""
@@ -76,7 +76,7 @@ class Sintel(Recording):
         flow = -read_flo(self._file("flow", picture, ".flo"))
         invalid = self._file("invalid", picture, ".png")
         if invalid.is_file():
-            mask = read_mask(invalid)
+            mask = read_png(invalid, np.uint8) > 0
             if mask.shape != flow.shape[1:]:
                 raise SequenceError(invalid, "differs in size from its flow")
             flow[:, mask] = np.nan
@@ -92,13 +92,12 @@ def _next_name(picture: Path) -> str:
 
 def read_dpt(path: Path) -> NDArray[np.float32]:
     """Returns the depth `[H, W]` of a .dpt file, metres."""
-    width, height, values = read_tagged_floats(path, channels=1)
-    return values.reshape(height, width)
+    return read_tagged_floats(path, channels=1)[..., 0]
 
 
 def read_cam(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns K in flowrep's convention and `world_from_cam` of a .cam file."""
-    data = read_bytes(path, limit=4096)
+    data = read_bytes(path)
     if len(data) != 4 + 8 * (9 + 12) or struct.unpack_from("<f", data)[0] != FLO_TAG:
         raise SequenceError(path, f"is no .cam file: {FLO_TAG}, 9 and 12 doubles")
     K = np.frombuffer(data, "<f8", 9, offset=4).reshape(3, 3).copy()

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.calibration import as_pose, intrinsics, read_pose_lines
-from flowrep.sequences.files import list_files, read_npy, read_npy_mask, read_rgb
-from flowrep.sequences.recording import Frame, Recording, SequenceError
+from flowrep.sequences.calibration import as_pose, check_count, intrinsics, read_pose_lines
+from flowrep.sequences.files import list_files, read_npy, read_rgb
+from flowrep.sequences.recording import PLAY_BACKWARDS, Frame, Recording, SequenceError
 
 
 class TartanAir(Recording):
@@ -31,8 +31,11 @@ class TartanAir(Recording):
         self.folder, self.backwards = Path(folder), bool(backwards)
         self._pictures = list_files(self.folder / "image_left", (".png",))
         self._poses_path = self.folder / "pose_left.txt"
-        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw", len(self._pictures))
-        self.has_flow = self.backwards and (self.folder / "flow").is_dir()
+        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw")
+        check_count(self._poses_path, len(self._poses), len(self), "poses")
+        flow = self.folder / "flow"
+        self.has_flow = self.backwards and flow.is_dir()
+        self.no_flow = f"no such folder: {flow}" if backwards else PLAY_BACKWARDS
 
     def __len__(self) -> int:
         """Returns the number of pictures."""
@@ -68,7 +71,7 @@ class TartanAir(Recording):
         flow = -read_npy(path, channels=2).transpose(2, 0, 1)
         mask_path = path.with_name(path.name.replace("_flow", "_mask"))
         if mask_path.is_file():
-            mask = read_npy_mask(mask_path)
+            mask = read_npy(mask_path, kind="u")
             if mask.shape != flow.shape[1:]:
                 raise SequenceError(mask_path, "differs in size from its flow")
             flow[:, mask != 0] = np.nan

@@ -5,33 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.sequences.calibration import (
-    Pose,
     as_pose,
     check_ascending,
     four_intrinsics,
-    interpolated_pose,
-    nearest,
     opencv_intrinsics,
 )
 from flowrep.sequences.files import (
     depth_from_integers,
-    path_inside,
     read_lines,
-    read_png16,
+    read_png,
     read_rgb,
     read_table,
 )
-from flowrep.sequences.recording import Frame, Recording, SequenceError
+from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 DEPTH_UNIT_M = 1 / 5000
 
 
 class Tum(Recording):
-    """A folder with `rgb.txt`, `depth.txt` and `groundtruth.txt`.
+    """A folder with `rgb.txt`, `depth.txt` and, for poses, `groundtruth.txt`.
 
     The picture sets the time of a frame. It gets the nearest depth map and the nearest pose if they
     are near enough; a picture that lacks either is left out.
@@ -60,24 +57,29 @@ class Tum(Recording):
         self.tolerance_s, self.interpolate = float(tolerance_s), bool(interpolate)
         rgb_times, rgb_paths = self._index("rgb.txt")
         depth_times, depth_paths = self._index("depth.txt")
-        self.trajectory = self.folder / "groundtruth.txt"
-        poses = read_table(self.trajectory, [8])
-        check_ascending(self.trajectory, poses[:, 0])
-        self._pose_times, self._poses = poses[:, 0], poses[:, 1:]
-        depth_of = _one_to_one(nearest(depth_times, rgb_times, tolerance_s), depth_times, rgb_times)
-        posed = self._has_pose(rgb_times)
-        kept = np.flatnonzero((depth_of >= 0) & posed)
+        depth_of = nearest(depth_times, rgb_times, tolerance_s)
+        # Two pictures may be nearest to one depth map: it belongs to the nearer of them.
+        rgb_of = nearest(rgb_times, depth_times, tolerance_s)
+        found = (depth_of >= 0) & (rgb_of[depth_of] == np.arange(len(rgb_times)))
+        self.trajectory, needed = self.folder / "groundtruth.txt", "depth map"
+        self.has_poses = self.trajectory.is_file()
+        if self.has_poses:
+            poses = read_table(self.trajectory, [8])
+            check_ascending(self.trajectory, poses[:, 0])
+            self._pose_times, self._poses = poses[:, 0], poses[:, 1:]
+            found, needed = found & self._has_pose(rgb_times), "depth map or pose"
+        kept = np.flatnonzero(found)
         if not len(kept):
             raise SequenceError(
                 self.folder,
                 f"no picture has a depth map and a pose within {tolerance_s} s: raise tolerance_s, "
-                "or check that the three files share a clock",
+                "or check that the files share a clock",
             )
         self._times = rgb_times[kept]
         self._files = [(rgb_paths[i], depth_paths[depth_of[i]]) for i in kept]
         if left_out := len(rgb_times) - len(kept):
             self.notes = (
-                f"{left_out} of {len(rgb_times)} pictures have no depth map or pose within "
+                f"{left_out} of {len(rgb_times)} pictures have no {needed} within "
                 f"{tolerance_s} s and are left out",
             )
 
@@ -91,9 +93,9 @@ class Tum(Recording):
         return Frame(
             name=rgb.stem,
             source=rgb,
-            world_from_cam=self._pose_at(time_s),
+            world_from_cam=self._pose_at(time_s) if self.has_poses else None,
             K=self.K,
-            depth=depth_from_integers(read_png16(depth), DEPTH_UNIT_M, missing=(0,)),
+            depth=depth_from_integers(read_png(depth, np.uint16), DEPTH_UNIT_M, missing=(0,)),
             rgb=read_rgb(rgb),
             timestamp_s=time_s,
         )
@@ -101,11 +103,12 @@ class Tum(Recording):
     def _index(self, name: str) -> tuple[NDArray[np.float64], list[Path]]:
         path = self.folder / name
         times, files = [], []
-        for number, line in read_lines(path):
+        remedy = f"TUM lists its pictures in it, '<time> {path.stem}/<file>' per line"
+        for number, line in read_lines(path, remedy):
             words = line.split(maxsplit=1)
             try:
                 times.append(float(words[0]))
-                files.append(path_inside(self.folder, words[1], path))
+                files.append(self.folder / words[1])
             except (ValueError, IndexError):
                 raise SequenceError(
                     path, f"line {number} is not a timestamp and file name"
@@ -141,18 +144,32 @@ class Tum(Recording):
         return as_pose(self._poses[index], self.trajectory, layout="xyz_xyzw")
 
 
-def _one_to_one(
-    chosen: NDArray[np.int64], times_s: NDArray[np.float64], wanted_s: NDArray[np.float64]
+def nearest(
+    times_s: NDArray[np.float64], wanted_s: NDArray[np.float64], tolerance_s: float
 ) -> NDArray[np.int64]:
-    """Returns `chosen` with each index only where it is nearest in time; -1 for the others."""
-    alone = np.full_like(chosen, -1)
-    taken: dict[int, int] = {}
-    for i, choice in enumerate(chosen.tolist()):
-        rival = taken.get(choice)
-        gap = abs(times_s[choice] - wanted_s[i])
-        if choice < 0 or (rival is not None and abs(times_s[choice] - wanted_s[rival]) <= gap):
-            continue
-        if rival is not None:
-            alone[rival] = -1
-        taken[choice], alone[i] = i, choice
-    return alone
+    """Returns the index of the time nearest to each wanted one, -1 if none is near enough.
+
+    >>> nearest(np.array([0.0, 1.0, 2.0]), np.array([0.98, 1.5, 2.03]), 0.05).tolist()
+    [1, -1, 2]
+    """
+    after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
+    before = (after - 1).clip(0)
+    gap_after, gap_before = (np.abs(times_s[index] - wanted_s) for index in (after, before))
+    found = np.where(gap_before <= gap_after, before, after)
+    return np.where(np.minimum(gap_before, gap_after) <= tolerance_s, found, -1)
+
+
+def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
+    """Returns the pose at a share of the way, with constant velocity and angular velocity.
+
+    >>> before, after = np.eye(4), np.eye(4)
+    >>> after[0, 3] = 2.0
+    >>> interpolated_pose(before, after, 0.25)[0, 3].item()
+    0.5
+    """
+    relative = before[:3, :3].T @ after[:3, :3]
+    axis_angle, _ = cv2.Rodrigues(relative)
+    pose = np.eye(4)
+    pose[:3, :3] = before[:3, :3] @ cv2.Rodrigues(share * axis_angle)[0]
+    pose[:3, 3] = (1 - share) * before[:3, 3] + share * after[:3, 3]
+    return pose

@@ -9,15 +9,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flowrep.sequences.files import check_pixels
 from flowrep.sequences.recording import Frame, SequenceError, check_frame
 
 
 class StillVideo:
     """Frames of a camera that does not move, so that all flow is object flow.
 
-    The flow of a moving camera can't be factorised without poses and depth, which neither a webcam
-    nor a video file gives. The user has to declare explicitly that the camera stands still.
+    The flow of a moving camera can't be factorised without depth, which neither a webcam nor a
+    video file gives. The user has to declare explicitly that the camera stands still.
 
     Args:
         source: a camera's number (`0`), or a video file that OpenCV reads.
@@ -28,6 +27,7 @@ class StillVideo:
     """
 
     has_flow = False
+    has_poses = True
     notes: tuple[str, ...] = ()
 
     def __init__(self, source: str | Path | int, *, still: bool = False) -> None:
@@ -35,9 +35,8 @@ class StillVideo:
         if not still:
             raise SequenceError(
                 source,
-                "a video gives neither poses nor depth, without which flow can't be factorised; "
-                "if the camera stands still say format.still=true, else record with a format that "
-                "brings both: tum, sevenscenes, zed, zed_live, frames",
+                "a video has no depth, without which flow of a moving camera can't be split; if it "
+                "stands still say format.still=true, else bring depth too: format=frames",
             )
         self._is_camera = str(source).isdecimal()
         if not self._is_camera and not self.source.is_file():
@@ -51,11 +50,6 @@ class StillVideo:
         try:
             if not capture.isOpened():
                 raise SequenceError(self.source, "OpenCV can't open it as a video")
-            width, height = (
-                int(capture.get(key))
-                for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-            )
-            check_pixels(self.source, width, height)
             number = 0
             while True:
                 found, picture = capture.read()

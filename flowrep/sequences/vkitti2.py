@@ -13,8 +13,7 @@ from flowrep.sequences.files import (
     Flow,
     depth_from_integers,
     list_files,
-    read_png16,
-    read_png16_rgb,
+    read_png,
     read_rgb,
     read_table,
 )
@@ -44,6 +43,7 @@ class VKitti2(Recording):
         self._intrinsics = self._of_camera(self.folder / "intrinsic.txt", 6)
         self._pictures = list_files(self._maps("rgb"), (".jpg", ".png"))
         self.has_flow = self._maps("backwardFlow").is_dir()
+        self.no_flow = f"no such folder: {self._maps('backwardFlow')}"
 
     def __len__(self) -> int:
         """Returns the number of pictures."""
@@ -57,7 +57,7 @@ class VKitti2(Recording):
         number = int(found[1])
         if number not in self._poses or number not in self._intrinsics:
             raise SequenceError(self._poses_path, f"has no pose or intrinsics of frame {number}")
-        depth = read_png16(self._maps("depth") / f"depth_{found[1]}.png")
+        depth = read_png(self._maps("depth") / f"depth_{found[1]}.png", np.uint16)
         flow = self._maps("backwardFlow") / f"backwardFlow_{found[1]}.png"
         has_flow = self.has_flow and index > 0
         return Frame(
@@ -78,8 +78,6 @@ class VKitti2(Recording):
 
     def _of_camera(self, path: Path, columns: int) -> dict[int, NDArray[np.float64]]:
         table = read_table(path, [columns], header=True)
-        if not np.isfinite(table[:, :2]).all():
-            raise SequenceError(path, "holds a frame or camera that is not a number")
         rows = table[table[:, 1] == self.camera]
         if not len(rows):
             raise SequenceError(path, f"says nothing of camera {self.camera}")
@@ -88,7 +86,7 @@ class VKitti2(Recording):
 
 def read_vkitti_flow(path: Path) -> Flow:
     """Returns the flow `[2, H, W]` of a Virtual KITTI 2 PNG, nan where its blue channel is 0."""
-    red, green, blue = read_png16_rgb(path).transpose(2, 0, 1)
+    red, green, blue = read_png(path, np.uint16, 3).transpose(2, 0, 1)
     height, width = red.shape
     share = np.stack([red, green]).astype(np.float32) * np.float32(2 / 65535) - 1
     flow = share * np.array([width - 1, height - 1], np.float32)[:, None, None]

@@ -9,18 +9,17 @@ from numpy.typing import NDArray
 
 from flowrep.geometry import CameraAxes
 from flowrep.geometry.checks import check_name
-from flowrep.sequences.calibration import as_pose, read_cameras, read_pose_lines
+from flowrep.sequences.calibration import as_pose, check_count, read_cameras, read_pose_lines
 from flowrep.sequences.files import DEPTH_FILES, PICTURES, list_files, read_depth, read_rgb
 from flowrep.sequences.recording import Frame, Recording, SequenceError
-
-DEPTH_UNIT_M = 0.001
 
 
 class Zed(Recording):
     """A folder with `left000000.png`, `depth000000.png` (or `.npy`), and two other files.
 
     `poses.txt` has a line for each picture, `tx ty tz qx qy qz qw`, the left camera's pose in the
-    world; `intrinsics.json` describes the rectified left camera, as in `frames`.
+    world; without it, the motion has to be estimated. `intrinsics.json` describes the rectified
+    left camera, as in `frames`.
 
     Args:
         folder: the exported folder.
@@ -39,7 +38,10 @@ class Zed(Recording):
         depths = list_files(self.folder, DEPTH_FILES, "depth")
         self._depths = {path.stem.removeprefix("depth"): path for path in depths}
         self._poses_path = self.folder / "poses.txt"
-        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw", len(self._pictures))
+        self.has_poses, self.conventions = self._poses_path.is_file(), {"pose_axes": pose_axes}
+        if self.has_poses:
+            self._poses = read_pose_lines(self._poses_path, "xyz_xyzw")
+            check_count(self._poses_path, len(self._poses), len(self), "poses")
         camera, other, _ = read_cameras(self.folder / "intrinsics.json")
         if other is not None:
             raise SequenceError(
@@ -57,14 +59,17 @@ class Zed(Recording):
         number = picture.stem.removeprefix("left")
         if number not in self._depths:
             raise SequenceError(self.folder, f"lacks depth{number} for {picture.name}")
+        world_from_cam = None
+        if self.has_poses:
+            world_from_cam = as_pose(
+                self._poses[index], self._poses_path, layout="xyz_xyzw", axes=self.pose_axes
+            )
         return Frame(
             name=number,
             source=picture,
-            world_from_cam=as_pose(
-                self._poses[index], self._poses_path, layout="xyz_xyzw", axes=self.pose_axes
-            ),
+            world_from_cam=world_from_cam,
             K=self.K,
-            depth=measured(read_depth(self._depths[number], DEPTH_UNIT_M, self._camera.size)),
+            depth=measured(read_depth(self._depths[number], self._camera.size)),
             rgb=read_rgb(picture),
         )
 

@@ -224,26 +224,57 @@ def write_png(path: str | Path, image: Image) -> None:
     pillow.fromarray(image).save(path)
 
 
-def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
-    """Writes frames `[H, W, 3]` of the same size as an mp4 (H.264) that browsers play.
+class Video:
+    """An mp4 (H.264) that browsers play, written frame by frame.
 
     Odd sizes, which the codec does not support, are padded with a white row or column, and frames
-    that are too large for it are sampled.
+    that are too large for it are sampled. Frames of other sizes than the first are cut or padded.
+
+    Args:
+        path: the file; its folder is created if needed.
+        fps: frames per second.
     """
-    import imageio.v2 as imageio
 
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    video: Any
-    with imageio.get_writer(
-        path, fps=fps, codec="libx264", quality=8, pixelformat="yuv420p", macro_block_size=1
-    ) as video:
-        for frame in map(sampled_for_codec, frames):
-            odd_rows, odd_columns = frame.shape[0] % 2, frame.shape[1] % 2
-            fill = ((0, odd_rows), (0, odd_columns), (0, 0))
-            video.append_data(np.pad(frame, fill, constant_values=255))
+    def __init__(self, path: str | Path, *, fps: float) -> None:
+        self.path, self.fps = Path(path), fps
+        self._writer: Any = None
+        self._size = 0, 0
+
+    def append(self, image: Image) -> None:
+        """Adds a frame `[H, W, 3]`."""
+        image = _sampled_for_codec(image)
+        if self._writer is None:
+            self._size = (image.shape[0] + 1) // 2 * 2, (image.shape[1] + 1) // 2 * 2
+            self._writer = self._open()
+        height, width = self._size
+        image = image[:height, :width]
+        fill = ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0))
+        self._writer.append_data(np.pad(image, fill, constant_values=255))
+
+    def close(self) -> None:
+        """Completes the file; without frames there is none."""
+        if self._writer is not None:
+            self._writer.close()
+
+    def _open(self) -> Any:
+        import imageio.v2 as imageio
+
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        options: dict[str, Any] = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
+        return imageio.get_writer(self.path, fps=self.fps, macro_block_size=1, **options)
 
 
-def sampled_for_codec(image: Image) -> Image:
+def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
+    """Writes frames `[H, W, 3]` as an mp4, see `Video`."""
+    video = Video(path, fps=fps)
+    try:
+        for frame in frames:
+            video.append(frame)
+    finally:
+        video.close()
+
+
+def _sampled_for_codec(image: Image) -> Image:
     """Returns every n-th row and column, with the least n for which H.264 takes the image."""
     step = math.ceil(max(image.shape[:2]) / _MOST_CODEC_PX)
     return image[::step, ::step]

@@ -10,7 +10,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 import cv2
 
 from flowrep.sequences import SequenceError, Tum
-from flowrep.sequences.calibration import interpolated_pose
+from flowrep.sequences.tum import interpolated_pose
 from tests.sequences.synthetic import png, text
 
 

@@ -21,7 +21,7 @@ from flowrep.viz import (
     write_png,
     write_video,
 )
-from flowrep.viz.maps import sampled_for_codec
+from flowrep.viz.maps import Video, _sampled_for_codec
 
 
 def flow_of(u: float, v: float) -> np.ndarray:
@@ -195,12 +195,23 @@ def test_video_of_odd_size_can_be_played(tmp_path):
     assert np.abs(played[:, 16, 25, 0].astype(int) - [20, 120, 220]).max() <= 6
 
 
+def test_a_video_keeps_the_size_of_its_first_frame(tmp_path):
+    imageio = pytest.importorskip("imageio.v3")
+    video = Video(tmp_path / "a.mp4", fps=5)
+    video.append(np.zeros((20, 32, 3), np.uint8))
+    video.append(np.zeros((26, 30, 3), np.uint8))
+    video.close()
+    played = imageio.imread(tmp_path / "a.mp4")
+    assert played.shape == (2, 20, 32, 3)
+    assert played[1, :, 31].min() > 240  # filled up in white
+
+
 def test_frames_that_the_codec_cannot_take_are_sampled():
     wide = np.arange(20_000, dtype=np.uint8)[None, :, None].repeat(6, 0).repeat(3, 2)
-    small = sampled_for_codec(wide)
+    small = _sampled_for_codec(wide)
     assert small.shape == (3, 10_000, 3)
     assert (small == wide[::2, ::2]).all()
-    assert sampled_for_codec(wide[:, :16_384]).shape == (6, 16_384, 3)
+    assert _sampled_for_codec(wide[:, :16_384]).shape == (6, 16_384, 3)
 
 
 def test_a_strip_of_narrow_pictures_has_no_wheels():

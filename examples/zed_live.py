@@ -1,17 +1,27 @@
-"""A ZED camera, or an SVO file, through Stereolabs' SDK."""
+"""Object flow of a live ZED camera, or of an SVO file, through Stereolabs' SDK (`pyzed`).
+
+`python examples/zed_live.py live out` factorises until Ctrl-C, `python examples/zed_live.py
+walk.svo2 out` a file. A folder exported from an SVO needs no SDK: `flowrep.factorize format=zed`.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from flowrep.sequences import EstimatedFlowSource, Frame, SequenceError, recorded_motion
 from flowrep.sequences.calibration import opencv_intrinsics
-from flowrep.sequences.recording import Frame, SequenceError, check_frame
+from flowrep.sequences.job import Job
+from flowrep.sequences.output import Output, OutputOptions
+from flowrep.sequences.recording import check_frame
 from flowrep.sequences.zed import measured
+from flowrep.transforms import DIS
 
 
 class ZedLive:
@@ -26,7 +36,7 @@ class ZedLive:
         SequenceError: the SDK is not installed, or the camera or file can't be opened.
     """
 
-    has_flow = False
+    has_flow, has_poses = False, True
     notes: tuple[str, ...] = ()
 
     def __init__(self, source: str | Path) -> None:
@@ -99,8 +109,24 @@ def _sdk() -> Any:
         from pyzed import sl
     except ImportError:
         raise SequenceError(
-            "format=zed_live",
-            "needs Stereolabs' ZED SDK and its Python package pyzed, which comes with it; "
-            "a folder exported from a recording is read without them: format=zed",
+            "pyzed",
+            "the Python package of Stereolabs' ZED SDK is not installed; a folder exported from a "
+            "recording is read without it: flowrep.factorize format=zed",
         ) from None
     return sl
+
+
+def main(source: str, folder: str) -> None:
+    stream = ZedLive(source)
+    options = OutputOptions(flow_files=(), video_fps=15)
+    with closing(Output(folder, options, {"input": source})) as output:
+        job = Job(stream, EstimatedFlowSource(DIS("fast")), recorded_motion, output)
+        job.run()
+    output.finish(job.summary(None))
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:])
+    except SequenceError as error:
+        sys.exit(f"error: {error}")

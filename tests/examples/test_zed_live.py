@@ -10,7 +10,8 @@ import pytest
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
-from flowrep.sequences import SequenceError, ZedLive
+from examples.zed_live import ZedLive
+from flowrep.sequences import SequenceError
 
 OK, END, FAILED = "SUCCESS", "END_OF_SVOFILE_REACHED", "CAMERA_NOT_DETECTED"
 
@@ -116,3 +117,9 @@ def test_a_camera_that_is_not_there_is_named(sdk, monkeypatch):
 def test_a_file_that_is_not_there_is_named(sdk, tmp_path):
     with pytest.raises(SequenceError, match=r"a\.svo: no such file"):
         ZedLive(tmp_path / "a.svo")
+
+
+def test_without_the_sdk_it_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyzed", None)
+    with pytest.raises(SequenceError, match="ZED SDK"):
+        ZedLive("live")
