@@ -28,7 +28,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "tables": set(),
     "viz": {"viz", "experiment", "envs", "scenes", "geometry", "palette"},
     "exchange": {"exchange", "agent"},
-    "sequences": {"sequences", "progress", "tables", "transforms", "geometry", "viz"},
+    "sequences": {"sequences", "progress", "extras", "transforms", "geometry", "viz"},
     "sweeps": {"sweeps", "tables", "train", "config", "config_tree", "experiment", "scenes"},
     "config": {
         "config",

@@ -251,7 +251,7 @@ def test_without_poses_the_cameras_motion_is_estimated(moments, tmp_path, capsys
     for row in table(out):
         assert float(row["inlier_share"]) > 0.7
         assert row["rotation_off_deg"] == row["recorded_obj_median_px"] == ""
-        assert float(row["obj_median_px"]) < 0.05
+        assert float(row["obj_median_px"]) < 0.1
 
 
 def test_an_estimated_motion_stands_beside_the_recorded_one(moments, tmp_path):
