@@ -1,0 +1,517 @@
+"""The page of results: `python -m flowrep.report.results` writes docs/results.md and its figure.
+
+What is tested is declared in claims.yaml, the words around the numbers in results.md.jinja, and
+all numbers come from the packed runs. A run counts with its success rate: its episodes are those
+that all compared runs drove.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatch
+from functools import reduce
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from matplotlib.figure import Figure
+from scipy import stats
+
+from flowrep.report.figures import styled, svg, words
+from flowrep.report.outcomes import baseline_share, out_of_bounds_of_both, outcomes_of, success
+from flowrep.report.page import template
+from flowrep.report.runs import SPEEDS, Columns, Condition, Run, in_order
+from flowrep.report.sections import STACKS, pooled
+from flowrep.report.statistics import Array, Bootstrap, Effect, effect, holm, rates
+from flowrep.report.storage import read_archive
+from flowrep.report.tables import markdown, p_text, percent, points, signed
+
+ROOT = Path(__file__).parents[2]
+DATA, PAGE = ROOT / "outputs" / "reference", ROOT / "docs" / "results.md"
+FIGURE = "images/results_claims.svg"
+CLAIMS = Path(__file__).with_name("claims.yaml")
+SHORT = {
+    "straight_road": "SR",
+    "s_turn": "ST",
+    "h_shaped_pathways": "H",
+    "three_way_junction": "T",
+}
+_MEASURES = ("success", "out_of_bounds", "kept")
+_SCENE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")
+_WIDEST = 80  # points of the figure's axis
+_LEVEL, _POWER = 0.05, 0.8
+_FOUND, _NEVER = 0.5, 0.05  # a run finds a way if it succeeds in this share of its episodes
+
+
+class Contrast(NamedTuple):
+    """One comparison and its outcome.
+
+    Args:
+        asked: its keys in claims.yaml.
+        effect: the difference in the mean over its scenes; None without runs on both sides.
+        by_scene: the difference in each scene of its study.
+        fewest: the fewest runs of a side in a scene.
+        p_value: of its test, corrected if the claim is primary.
+    """
+
+    asked: Mapping[str, Any]
+    effect: Effect | None
+    by_scene: Mapping[str, Effect]
+    fewest: int
+    p_value: float
+
+    @property
+    def verdict(self) -> str:
+        """Returns "holds", "contradicted", "not seen" or "can't be tested here"."""
+        if self.effect is None or np.isnan(self.p_value):
+            return "can't be tested here"
+        value, expect = self.effect.value, self.asked["expect"]
+        if expect == "equal":
+            _, low, high = self.effect.interval()
+            is_apart = low > self.asked["margin"] or high < -self.asked["margin"]
+            return "contradicted" if is_apart else "holds" if self.p_value < _LEVEL else "not seen"
+        if self.p_value >= _LEVEL:
+            return "not seen"
+        return "holds" if (value > 0) == (expect == "more") else "contradicted"
+
+
+class Claim(NamedTuple):
+    """A claim of the paper with its contrasts."""
+
+    number: int
+    text: str
+    limits: str
+    contrasts: tuple[Contrast, ...]
+
+    @property
+    def verdict(self) -> str:
+        """Returns the verdict on all of its contrasts."""
+        found = {contrast.verdict for contrast in self.contrasts}
+        if len(found) == 1:
+            return found.pop()
+        if "holds" in found:
+            return "holds in part"
+        return "contradicted" if "contradicted" in found else "not seen"
+
+
+def claims_of(
+    declared: Mapping[str, Any], runs: Sequence[Run], study: str = "main"
+) -> dict[str, list[Claim]]:
+    """Returns the primary and secondary claims with their contrasts, of one protocol's runs."""
+    found: dict[str, list[Claim]] = {}
+    number = 0
+    for family in ("primary", "secondary"):
+        found[family] = []
+        for entry in declared[family]:
+            number += 1
+            contrasts = tuple(_contrast(declared, x, runs, study) for x in entry["contrasts"])
+            found[family].append(Claim(number, entry["claim"], entry["limits"], contrasts))
+    every = [contrast for claim in found["primary"] for contrast in claim.contrasts]
+    corrected = iter(holm([contrast.p_value for contrast in every]))
+    found["primary"] = [
+        c._replace(contrasts=tuple(x._replace(p_value=next(corrected)) for x in c.contrasts))
+        for c in found["primary"]
+    ]
+    return found
+
+
+def _contrast(
+    declared: Mapping[str, Any], asked: Mapping[str, Any], runs: Sequence[Run], study: str
+) -> Contrast:
+    firsts = asked["first"] if isinstance(asked["first"], list) else [asked["first"]]
+    strata: dict[str, list[list[Array]]] = {}
+    for scene, here in of_study(declared, asked.get("study", study), runs).items():
+        found = []
+        for first in firsts:
+            stacks = [first, *([asked["second"]] if "second" in asked else [])]
+            sides = scores([[run for run in here if run.stack == stack] for stack in stacks], asked)
+            if sides is not None and not np.isnan(np.concatenate(sides)).any():
+                found.append(sides)
+        if len(found) == len(firsts):
+            strata[scene] = found
+    chosen = asked.get("scenes", declared["scenes"])
+    has_all = {*chosen} <= {*strata}
+    together = effect([sides for s in chosen for sides in strata[s]]) if has_all else None
+    p_value = float("nan") if together is None else _p_value(together, asked)
+    by_scene = {scene: effect(found) for scene, found in strata.items()}
+    fewest = min((len(side) for of in strata.values() for x in of for side in x), default=0)
+    return Contrast(asked, together, by_scene, fewest, p_value)
+
+
+def _p_value(found: Effect, asked: Mapping[str, Any]) -> float:
+    if asked["expect"] != "equal":
+        return found.p_value
+    # two one-sided tests against the margin, each the half of a two-sided one
+    halves = [found._replace(value=found.value - sign * asked["margin"]) for sign in (1, -1)]
+    one_sided = [
+        half.p_value / 2 if half.value * sign < 0 else 1 - half.p_value / 2
+        for half, sign in zip(halves, (1, -1))
+    ]
+    return max(one_sided)
+
+
+def of_study(declared: Mapping[str, Any], study: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Returns the finished runs of a study by scene."""
+    patterns = declared["studies"][study]
+    return {
+        scene: [run for run in runs if fnmatch(run.name, pattern) and run.is_finished]
+        for scene, pattern in patterns.items()
+    }
+
+
+def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Array] | None:
+    """Returns the score of each run of each side; None if a side has no run.
+
+    Args:
+        sides: runs of one scene and study.
+        asked: names the measure and its conditions, see claims.yaml.
+    """
+    kind = next(name for name in _MEASURES if name in asked)
+    names = list(asked[kind])
+    driven = [[_under(run, names) for run in side] for side in sides]
+    driven = [[found for found in side if all(len(c["outcome"]) for c in found)] for side in driven]
+    if not all(driven):
+        return None
+    seeds = [c["episode_seed"] for side in driven for found in side for c in found]
+    shared = reduce(np.intersect1d, seeds)
+    if not len(shared):
+        return None
+    metric = out_of_bounds_of_both if kind == "out_of_bounds" else success
+    scored = []
+    for side in driven:
+        of_runs = []
+        for found in side:
+            values = [metric(c["outcome"][np.isin(c["episode_seed"], shared)]) for c in found]
+            of_runs.append(_score(kind, values, asked[kind]))
+        scored.append(np.array(of_runs))
+    return scored
+
+
+def _under(run: Run, names: Sequence[str | int]) -> list[Columns]:
+    conditions = [
+        Condition("greedy", n, run.fps)
+        if isinstance(n, str)
+        else Condition("greedy", run.speed, float(n))
+        for n in names
+    ]
+    return [run.under(condition) for condition in conditions]
+
+
+def _score(kind: str, values: Sequence[Array], asked: Any) -> float:
+    if kind == "out_of_bounds":
+        share = np.concatenate(values)
+        return float(np.nanmean(share)) if not np.isnan(share).all() else float("nan")
+    means = [float(v.mean()) for v in values]
+    if kind == "kept":
+        return means[0] / means[1]
+    return float(np.dot(means, list(asked.values())))
+
+
+def claims_table(claims: Sequence[Claim], p_name: str) -> str:
+    """Returns the table of claims in Markdown."""
+    effect_name = f"effect over scenes [95 %], {p_name}"
+    header = ("claim", "verdict", effect_name, "by scene", "figure", "what limits it")
+    rows = []
+    for claim in claims:
+        effects = "; ".join(map(_effect_text, claim.contrasts))
+        by_scene = "; ".join(map(_scenes_text, claim.contrasts))
+        row = f"[row {claim.number}](#the-claims-in-one-figure)"
+        rows.append((claim.text, f"**{claim.verdict}**", effects, by_scene, row, claim.limits))
+    return markdown(header, rows)
+
+
+def _effect_text(contrast: Contrast) -> str:
+    if contrast.effect is None:
+        return "no runs"
+    if np.isnan(contrast.p_value):
+        return f"{signed(contrast.effect.value)}, one run a side"
+    p = p_text(contrast.p_value)
+    p = f"p {p}" if p.startswith("<") else f"p = {p}"
+    return f"{points(contrast.effect.interval())}, {p}"
+
+
+def _scenes_text(contrast: Contrast) -> str:
+    return " / ".join(
+        f"{SHORT[scene]} {signed(found.value)}" for scene, found in contrast.by_scene.items()
+    )
+
+
+def draw_claims(claims: Sequence[Claim]) -> Figure:
+    """Returns the forest plot: each contrast's effect over scenes, and by scene beside it."""
+    rows = [(claim, contrast) for claim in claims for contrast in claim.contrasts]
+    with styled(8.0):
+        figure = Figure(figsize=(7.4, 0.42 * len(rows) + 1.0), layout="constrained")
+        axes = figure.add_subplot()
+        axes.axvline(0, color="#6b7480", linewidth=0.8)
+        for row, (_, contrast) in enumerate(rows):
+            for place, (scene, colour) in enumerate(zip(SHORT, _SCENE_COLOURS)):
+                if scene in contrast.by_scene:
+                    at = row + 0.1 + 0.15 * place
+                    _draw_effect(axes, contrast.by_scene[scene], at, colour, "o", 3.5)
+            if contrast.effect is not None:
+                _draw_effect(axes, contrast.effect, row - 0.12, "#1b1f24", "D", 5.0)
+        axes.set_yticks(range(len(rows)), [_label(*row) for row in rows])
+        axes.set_ylim(len(rows) - 0.3, -0.7)
+        axes.set_xlim(-_WIDEST, _WIDEST)
+        axes.grid(axis="x")
+        axes.set_xlabel("points (95 % intervals; an arrow where one goes on)")
+        names = [*(words(scene) for scene in SHORT), "over scenes"]
+        colours = (*_SCENE_COLOURS, "#1b1f24")
+        for name, colour in zip(names, colours):
+            axes.plot([], [], color=colour, marker="D" if name == names[-1] else "o", label=name)
+        figure.legend(loc="outside upper center", ncols=5)
+    return figure
+
+
+def _label(claim: Claim, contrast: Contrast) -> str:
+    asked = contrast.asked
+    sides = [asked[side] for side in ("first", "second") if side in asked]
+    names = ["all stacks" if isinstance(x, list) else _stack(x).strip("`") for x in sides]
+    kind = next(name for name in _MEASURES if name in asked)
+    what = {"out_of_bounds": "out of bounds", "kept": "share kept"}.get(kind, "")
+    if not what:
+        units = [f"{n} Hz" if isinstance(n, int) else n for n in asked[kind]]
+        weights = list(asked[kind].values())
+        what = " − ".join(units) if min(weights) < 0 else " and ".join(units)
+    study = asked.get("study", "")
+    return f"{claim.number}  {' − '.join(names)}, {what}{', 84 px' * (study == 'resolution')}"
+
+
+def _draw_effect(
+    axes: Any, found: Effect, at: float, colour: str, marker: str, size: float
+) -> None:
+    value, low, high = (100 * number for number in found.interval())
+    axes.plot(value, at, marker, color=colour, markersize=size)
+    if np.isnan(low):
+        return
+    left, right = -_WIDEST, _WIDEST
+    axes.plot([max(low, left), min(high, right)], [at, at], color=colour, linewidth=1.2)
+    for end, is_cut, sign in ((left, low < left, "<"), (right, high > right, ">")):
+        if is_cut:
+            axes.plot(end, at, sign, color=colour, markersize=3.0, clip_on=False)
+
+
+def scene_tables(declared: Mapping[str, Any], runs: Sequence[Run]) -> list[dict[str, str]]:
+    """Returns a block per scene: success by stack and speed, and how many runs find all ways."""
+    blocks = []
+    for scene, here in of_study(declared, "main", runs).items():
+        is_fork = scene in declared["forks"]
+        header = ["", "low", "normal (training)", "high", "each run, normal"]
+        header += [f"find all {len(here[0].paths)} ways"] if is_fork else []
+        rows = []
+        for stack in in_order([run.stack for run in here], STACKS):
+            members = [run for run in here if run.stack == stack]
+            each = outcomes_of(members, Condition("greedy", members[0].speed, members[0].fps))
+            of_runs = [] if each is None else [f"{100 * r:.0f}" for r in rates(each.outcomes)]
+            cells = [_success(members, speed) for speed in SPEEDS]
+            rows.append([_stack(stack), *cells, ", ".join(of_runs)])
+            if is_fork:
+                found = sum(min(_by_way(run)) >= _FOUND for run in members)
+                rows[-1].append(f"{found} of {len(members)}")
+        of_speeds = [Condition("never_turn", speed, here[0].fps) for speed in SPEEDS]
+        shares = [baseline_share(here, condition) for condition in of_speeds]
+        never = ["" if share is None else f"{100 * share:.0f}" for share in shares]
+        rows.append(["never turning", *never, *[""] * (len(header) - 4)])
+        blocks.append({"title": words(scene), "table": markdown(header, rows)})
+    return blocks
+
+
+def one_way(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[int, int]:
+    """Returns how many runs don't find all ways where the road forks, and how many of them do so
+    because they drive some ways and never others; those that arrive nowhere are not counted."""
+    missed = [
+        ways
+        for scene in declared["forks"]
+        for run in of_study(declared, "main", runs)[scene]
+        if max(ways := _by_way(run)) > _NEVER and min(ways) < _FOUND
+    ]
+    return len(missed), sum(max(ways) >= _FOUND and min(ways) <= _NEVER for ways in missed)
+
+
+def _by_way(run: Run) -> list[float]:
+    """Returns a run's greedy success on each path at its training speed."""
+    driven = run.under(Condition("greedy", run.speed, run.fps))
+    on_path = [driven["outcome"][driven["path"] == place] for place in range(len(run.paths))]
+    return [float(success(ends).mean()) if len(ends) else 0.0 for ends in on_path]
+
+
+def _success(runs: Sequence[Run], speed: str, fps: float | None = None) -> str:
+    matrix = outcomes_of(runs, Condition("greedy", speed, fps or runs[0].fps))
+    return "" if matrix is None else percent(Bootstrap().success([matrix.outcomes]))
+
+
+def _stack(stack: str) -> str:
+    return f"`[{stack.replace('+', ',')}]`"
+
+
+def failure_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
+    """Returns Table III beside the paper's, at low and high speed together and in training."""
+    rows = []
+    for stack, papers in declared["table_iii"].items():
+        members = [run for run in runs if run.stack == stack]
+        shares = []
+        for speeds in (("low", "high"), ("normal",)):
+            conditions = [Condition("greedy", speed, members[0].fps) for speed in speeds]
+            outcomes = pooled(members, conditions, out_of_bounds_of_both)
+            shares.append("" if outcomes is None else percent(Bootstrap().pooled_share(outcomes)))
+        rows.append((_stack(stack), f"{papers:.1f}", *shares, str(len(members))))
+    header = ("", "the paper", "low and high", "training", "runs")
+    return markdown(header, rows)
+
+
+def rate_table(runs: Sequence[Run]) -> str:
+    """Returns success by frame rate on the episodes driven at all of them, and what is kept."""
+    frame_rates = sorted({c.fps for run in runs for c in run.conditions})
+    rows = []
+    for stack in in_order([run.stack for run in runs], STACKS):
+        members = [run for run in runs if run.stack == stack]
+        means = []
+        for rate in frame_rates:
+            weights = {int(r): float(r == rate) for r in frame_rates}
+            found = scores([members], {"success": weights})
+            means.append(float(found[0].mean()) if found else float("nan"))
+        cells = [f"{100 * mean:.0f}" for mean in means]
+        lost = signed(means[0] - means[-1])
+        rows.append((_stack(stack), *cells, lost, f"{means[0] / means[-1]:.2f}", str(len(members))))
+    first, last = f"{frame_rates[-1]:g}", f"{frame_rates[0]:g}"
+    header = ("", *(f"{r:g} Hz" for r in frame_rates), f"{first} → {last}, points", "kept", "runs")
+    return markdown(header, rows)
+
+
+def variation_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
+    """Returns success of the stacks of each further study."""
+    rows = []
+    for study, title in declared["variations"].items():
+        for members in of_study(declared, study, runs).values():
+            for stack in in_order([run.stack for run in members], STACKS):
+                ours = [run for run in members if run.stack == stack]
+                cells = [_success(ours, speed) for speed in SPEEDS]
+                rows.append((title, _stack(stack), *cells, str(len(ours))))
+    return markdown(("", "", "low", "normal", "high", "runs"), rows)
+
+
+def runs_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
+    """Returns the number of runs of each stack in each study and scene."""
+    places = {
+        f"{'' if study == 'main' else study.replace('_', ' ')} {SHORT[scene]}".strip(): members
+        for study in declared["studies"]
+        for scene, members in of_study(declared, study, runs).items()
+        if members
+    }
+    stacks = in_order([run.stack for members in places.values() for run in members], STACKS)
+    rows = [
+        (_stack(stack), *(_blank(sum(r.stack == stack for r in of)) for of in places.values()))
+        for stack in stacks
+    ]
+    return markdown(("", *places), rows)
+
+
+def _blank(number: int) -> str:
+    return str(number) if number else ""
+
+
+def smallest_differences(claims: Sequence[Claim]) -> tuple[float, float]:
+    """Returns the range of the differences that primary contrasts see with 80 % power."""
+    found = []
+    for contrast in (contrast for claim in claims for contrast in claim.contrasts):
+        if contrast.effect is not None and not np.isnan(contrast.effect.error):
+            freedom = contrast.effect.freedom
+            factor = stats.t.ppf(1 - _LEVEL / 2, freedom) + stats.t.ppf(_POWER, freedom)
+            found.append(100 * factor * contrast.effect.error)
+    return (min(found), max(found)) if found else (float("nan"), float("nan"))
+
+
+def repeats(main: Sequence[Run], runs: Sequence[Run]) -> list[float]:
+    """Returns how much better runs are that repeat one of the main study, in points.
+
+    Those that drive every episode as the main study's run does are the same run.
+    """
+    found = []
+    thirds = {"success": dict.fromkeys(SPEEDS, 1 / 3)}
+    for run, other in product(main, runs):
+        if (run.scene, run.stack, run.seed) != (other.scene, other.stack, other.seed):
+            continue
+        sides = scores([[other], [run]], thirds)
+        if run.settings == other.settings and sides is not None and not _are_equal(run, other):
+            found.append(100 * float(sides[0][0] - sides[1][0]))
+    return found
+
+
+def _are_equal(first: Run, second: Run) -> bool:
+    ends = [r.under(Condition("greedy", "low", r.fps))["outcome"].tolist() for r in (first, second)]
+    return ends[0] == ends[1]
+
+
+def collapses(runs: Sequence[Run]) -> dict[bool, list[float]]:
+    """Returns success at high speed of runs with several flow maps, by whether entropy collapsed.
+
+    That is so if it falls below 0.1 nat within the first 10,000 frames.
+    """
+    found: dict[bool, list[float]] = {True: [], False: []}
+    for run in runs:
+        flows = {"raw", "ego", "obj"} & {*run.stack.split("+")}
+        ends = run.under(Condition("greedy", "high", run.fps))["outcome"]
+        if len(flows) > 1 and len(ends) and "entropy" in run.metrics:
+            early = run.metrics["entropy"][run.metrics["frames"] <= 10_000]
+            found[bool(np.nanmin(early) < 0.1)].append(100 * float(success(ends).mean()))
+    return found
+
+
+def sampled_minus_greedy(runs: Sequence[Run]) -> list[float]:
+    """Returns how much better each run is with sampled actions, in points, at each speed."""
+    found = []
+    for run in runs:
+        for speed in SPEEDS:
+            ends = [
+                run.under(Condition(p, speed, run.fps))["outcome"] for p in ("sampled", "greedy")
+            ]
+            if all(map(len, ends)):
+                sampled, greedy = (float(success(of).mean()) for of in ends)
+                found.append(100 * (sampled - greedy))
+    return found
+
+
+def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figure]:
+    """Returns the page and its figure."""
+    claims = claims_of(declared, runs)
+    wide = claims_of(declared, runs, "wide_speeds")["primary"]
+    main = of_study(declared, "main", runs)
+    every = [run for of in main.values() for run in of]
+    low, high = smallest_differences(claims["primary"])
+    text = template("results.md.jinja", autoescape=False).render(
+        primary=claims_table(claims["primary"], "p (Holm)"),
+        secondary=claims_table(claims["secondary"], "p"),
+        wide=claims_table(wide, "p (Holm)") if all(c.contrasts[0].effect for c in wide) else "",
+        figure=FIGURE,
+        scenes=scene_tables(declared, runs),
+        one_way=one_way(declared, runs),
+        failures=failure_table(declared, main["s_turn"]),
+        frame_rates=rate_table(of_study(declared, "frame_rate", runs)["straight_road"]),
+        variations=variation_table(declared, runs),
+        runs=runs_table(declared, runs),
+        commands=declared["commands"],
+        number=len(runs),
+        episodes=sum(len(run.episodes["outcome"]) for run in runs),
+        fewest=min(c.fewest for claim in claims["primary"] for c in claim.contrasts),
+        smallest=f"{low:.0f} to {high:.0f}",
+        repeats=repeats(every, [run for run in runs if run not in every]),
+        sampled=sampled_minus_greedy(every),
+        collapsed=collapses(main["straight_road"]),
+        unknown=sum((run.machine or {}).get("precision") == "unknown" for run in runs),
+        np=np,
+    )
+    return text, draw_claims([*claims["primary"], *claims["secondary"]])
+
+
+def main(data: Path = DATA, page: Path = PAGE) -> None:
+    """Entry point."""
+    declared = yaml.safe_load(CLAIMS.read_text(encoding="utf-8"))
+    text, figure = render(declared, read_archive(data))
+    page.write_text(text, encoding="utf-8")
+    (page.parent / FIGURE).write_bytes(svg(figure))
+    print(f"{page}: {len(text.split()):,} words")
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))

@@ -1,0 +1,190 @@
+"""The page of results: verdicts worked by hand, and a page that says what the stored runs say."""
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("scipy", reason="reports are an extra")
+pytest.importorskip("jinja2", reason="reports are an extra")
+
+from flowrep.report import results
+from flowrep.report.results import Claim, Contrast, claims_of, one_way, rate_table, scores
+from flowrep.report.runs import Run
+from flowrep.report.statistics import Effect
+from flowrep.report.storage import columns_of, drawn_paths, read_archive
+from tests.report.folders import config_of, letters, rows_of
+
+DECLARED = yaml.safe_load(results.CLAIMS.read_text(encoding="utf-8"))
+SCENES = {"straight_road": "sr_*", "s_turn": "st_*"}
+
+
+def run_of(name, ends, *, scene="straight_road", stack="ego+obj", seed=0, paths=1):
+    """A run whose episodes end as the letters say, by speed mode or frame rate."""
+    config = config_of(scene, stack, seed, scene__paths=[{"name": str(k)} for k in range(paths)])
+    rows = []
+    for condition, outcomes in ends.items():
+        where = {"speed": condition} if isinstance(condition, str) else {"fps": float(condition)}
+        rows += rows_of(config, outcomes, **where)
+    episodes = columns_of(([str(c) for c in row.values()] for row in rows), list(rows[0]))
+    episodes["path"] = drawn_paths(episodes["episode_seed"], paths)
+    return Run(name, config, episodes, {})
+
+
+def declared(*contrasts, **changes):
+    claim = {"claim": "c", "contrasts": list(contrasts), "limits": ""}
+    base = {"studies": {"main": SCENES}, "scenes": [*SCENES], "primary": [claim], "secondary": []}
+    return base | changes
+
+
+def runs_with(**successes):
+    """Runs of [ego,obj] and [raw] in two scenes with these successes of 8 at high speed."""
+    found = []
+    for prefix, scene in (("sr", "straight_road"), ("st", "s_turn")):
+        for stack, numbers in successes.items():
+            for seed, number in enumerate(numbers):
+                ends = {"high": letters(number)}
+                name = f"{prefix}_{stack}_{seed}"
+                stack_name = {"both": "ego+obj"}.get(stack, stack)
+                found.append(run_of(name, ends, scene=scene, stack=stack_name, seed=seed))
+    return found
+
+
+HIGH = {"first": "ego+obj", "second": "raw", "success": {"high": 1}, "expect": "more"}
+
+
+@pytest.mark.parametrize(
+    ("expect", "both", "raw", "verdict"),
+    [
+        ("more", (6, 7), (2, 3), "holds"),  # +50, error 6.3 points
+        ("less", (6, 7), (2, 3), "contradicted"),
+        ("less", (2, 3), (6, 7), "holds"),
+        ("more", (2, 8), (3, 4), "not seen"),
+        ("more", (6,), (2, 3), "can't be tested here"),
+        ("more", (), (2, 3), "can't be tested here"),
+    ],
+)
+def test_a_contrast_is_judged_by_its_test_and_its_direction(expect, both, raw, verdict):
+    asked = HIGH | {"expect": expect}
+    (claim,) = claims_of(declared(asked), runs_with(both=both, raw=raw))["primary"]
+    assert claim.verdict == verdict
+    if verdict == "holds":
+        assert abs(claim.contrasts[0].effect.value) == pytest.approx(0.5)
+
+
+def test_a_scene_beside_the_others_is_shown_and_not_in_the_mean():
+    runs = runs_with(both=(6, 7), raw=(2, 3))
+    runs = [run for run in runs if not (run.scene == "s_turn" and run.stack == "raw")]
+    runs += [
+        run_of("st_raw", {"high": letters(8)}, scene="s_turn", stack="raw", seed=s) for s in (0, 1)
+    ]
+    (claim,) = claims_of(declared(HIGH, scenes=["straight_road"]), runs)["primary"]
+    (contrast,) = claim.contrasts
+    assert contrast.effect.value == pytest.approx(0.5)
+    assert contrast.by_scene["s_turn"].value == pytest.approx(-3 / 16)
+
+
+def test_primary_contrasts_are_corrected_together_and_others_are_not():
+    runs = runs_with(both=(6, 7), raw=(2, 3))
+    claim = {"claim": "c", "contrasts": [HIGH], "limits": ""}
+    found = claims_of(declared(primary=[claim, claim], secondary=[claim]), runs)
+    first, second = (c.contrasts[0].p_value for c in found["primary"])
+    assert first == second == pytest.approx(2 * found["secondary"][0].contrasts[0].p_value)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "verdict"),
+    [
+        (0.01, 0.01, "holds"),  # 90 % interval inside ±0.05
+        (0.01, 0.05, "not seen"),
+        (0.2, 0.01, "contradicted"),  # all of it beyond the margin
+        (0.07, 0.02, "not seen"),
+    ],
+)
+def test_alike_means_within_the_margin(value, error, verdict):
+    asked = HIGH | {"expect": "equal", "margin": 0.05}
+    found = Effect(value, error, 10.0)
+    contrast = Contrast(asked, found, {}, 3, results._p_value(found, asked))
+    assert contrast.verdict == verdict
+
+
+def test_two_one_sided_tests_have_the_larger_of_their_p_values():
+    # 0.01 within ±0.05: the nearer side is (0.01 − 0.05) / 0.02 = −2, of 10 degrees p = 0.0367
+    asked = HIGH | {"expect": "equal", "margin": 0.05}
+    for value in (0.01, -0.01):
+        p = results._p_value(Effect(value, 0.02, 10.0), asked)
+        assert p == pytest.approx(0.0367, abs=1e-4)
+
+
+def test_a_claim_of_several_contrasts_may_hold_in_part():
+    held = Contrast(HIGH, Effect(0.5, 0.01, 5.0), {}, 3, 0.001)
+    unseen, against = held._replace(p_value=0.5), held._replace(effect=Effect(-0.5, 0.01, 5.0))
+    for contrasts, verdict in (
+        ((held, unseen), "holds in part"),
+        ((held, against), "holds in part"),
+        ((unseen, against), "contradicted"),
+        ((held, held), "holds"),
+    ):
+        assert Claim(1, "", "", contrasts).verdict == verdict
+
+
+def test_scores_are_of_the_episodes_that_all_drove():
+    # episodes 100 to 103 and 100 to 101: 1 of 2 and 2 of 2
+    sides = [[run_of("a", {"high": "scss"})], [run_of("b", {"high": "ss"})]]
+    first, second = scores(sides, {"success": {"high": 1}})
+    assert (first.tolist(), second.tolist()) == ([0.5], [1.0])
+    assert scores([[run_of("c", {"low": "s"})]], {"success": {"high": 1}}) is None
+
+
+def test_scores_weigh_conditions():
+    run = run_of("a", {"low": "ssso", "high": "sccc", 12: "ssss", 6: "sscc"})
+    asked = [
+        ({"success": {"low": 1, "high": -1}}, 0.5),
+        ({"success": {"low": 0.5, "high": 0.5}}, 0.5),
+        ({"success": {12: 1, 6: -1}}, 0.5),
+        ({"kept": [6, 12]}, 0.5),
+        ({"out_of_bounds": ["low", "high"]}, 0.25),  # 1 of 4 failures
+    ]
+    for measure, value in asked:
+        ((score,),) = scores([[run]], measure)
+        assert score == pytest.approx(value)
+
+
+def test_a_run_finds_a_way_by_half_of_its_episodes():
+    seeds = np.arange(100, 108)
+    on_first = drawn_paths(seeds, 2) == 0
+    one = "".join("s" if first else "c" for first in on_first)
+    runs = [
+        run_of("t_one", {"normal": one}, paths=2),
+        run_of("t_all", {"normal": "s" * 8}, paths=2),
+        run_of("t_none", {"normal": "c" * 8}, paths=2),
+    ]
+    forked = {"studies": {"main": {"straight_road": "t_*"}}, "forks": ["straight_road"]}
+    assert one_way(forked, runs) == (1, 1)
+    (block,) = results.scene_tables(forked, runs)
+    assert "1 of 3" in block["table"]
+
+
+def test_frame_rates_are_compared_on_the_same_episodes():
+    # at 12 Hz four more episodes were driven, all failures
+    table = rate_table([run_of("a", {12: "sssscccc", 6: "sscc"})])
+    assert "|50|100|−50|0.50|1|" in table
+
+
+def test_the_primary_contrasts_are_those_of_the_protocol():
+    text = (results.PAGE.parent / "protocol.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("| ") and line[2].isdigit()]
+    assert len(rows) == len(DECLARED["primary"])
+    for row, claim in zip(rows, DECLARED["primary"]):
+        (contrast,) = claim["contrasts"]
+        for side in ("first", "second"):
+            if side in contrast:
+                assert f"[{contrast[side].replace('+', ',')}]" in row
+        assert all(speed in row for speed in contrast["success"])
+
+
+@pytest.mark.slow
+def test_the_page_says_what_the_stored_runs_say():
+    text, _ = results.render(DECLARED, read_archive(results.DATA))
+    assert text == results.PAGE.read_text(encoding="utf-8"), "run `make results`"
+    assert len(text.split()) <= 2500
+    assert (results.PAGE.parent / results.FIGURE).is_file()
