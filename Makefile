@@ -13,7 +13,7 @@ INSTALLED := $(ENV)/.installed
 DEVELOPED := $(ENV)/.developed
 
 .DEFAULT_GOAL := help
-.PHONY: help install develop train evaluate view gallery test test-fast test-python schema lint types format bench bench-gpu smoke docs wheel clean check-python
+.PHONY: help install develop train evaluate view results gallery test test-fast test-python schema lint types format bench bench-gpu smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -49,6 +49,9 @@ smoke: $(INSTALLED)  ## A whole run in seconds
 
 view: $(INSTALLED)  ## Look at a scene: make view ARGS="scene=s_turn"
 	$(BIN)/python -m flowrep.view $(ARGS)
+
+results: $(INSTALLED)  ## Make the page of results from the stored runs
+	$(BIN)/python -m flowrep.report.results
 
 SCENES = straight_road s_turn h_shaped_pathways three_way_junction
 
