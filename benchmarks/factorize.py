@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from flowrep.agent.algorithm import keep_freed_memory
+from flowrep.agent import keep_freed_memory
 from flowrep.geometry import factorize
 
 SIZES = [(64, 84, 84), (1, 720, 1280)]

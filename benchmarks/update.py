@@ -25,7 +25,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
-from flowrep.agent import DiscreteSAC, keep_freed_memory, use_threads
+from flowrep.agent import DiscreteSAC, keep_freed_memory
 from flowrep.agent.algorithm import WARM_UP
 from flowrep.agent.observation import has_fast_bf16
 
@@ -80,16 +80,7 @@ def flowrep_update(
     if eager:
         agent.step_eagerly()
     sample = agent.sample()
-
-    def update() -> None:
-        """Uses threads as training does: all for the update, one for everything else."""
-        threads = torch.get_num_threads()
-        if steps.device.type == "cpu":
-            torch.set_num_threads(1)
-        agent.update(sample)
-        torch.set_num_threads(threads)
-
-    return update
+    return lambda: agent.update(sample)
 
 
 class StockNetwork(nn.Module):
@@ -213,10 +204,8 @@ def main() -> None:
         updates["TorchRL stock, separate fp32"] = stock_update(steps)
         width = 8192 if args.device.type == "cuda" else 2048
         products = {n: matrix_product(t, args.device, width) for n, t in dtypes.items()}
-        # counted first: operations of a CUDA graph or another thread are invisible later
-        use_threads(1)
+        # counted first: operations inside a CUDA graph are invisible later
         counts = {n: None if "stock" in n else operations(u) for n, u in updates.items()}
-        use_threads(threads)
         seconds = interleaved({**updates, **products}, args.rounds, args.device, clock)
         rates = {name: 2 * width**3 / seconds[name] for name in products}
         print(f"\n{size}: {side}x{side}, {len(MAPS)} maps of {CHANNELS} channels, batch {batch}")

@@ -2,7 +2,7 @@
 
 import logging
 import sys
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from functools import partial
 
 from flowrep.console import prepare
@@ -20,9 +20,8 @@ from omegaconf import DictConfig
 from flowrep.agent import (
     CheckpointError,
     DivergenceError,
+    FasterThreads,
     keep_freed_memory,
-    threads_in_use,
-    use_threads,
 )
 from flowrep.config import UsageError, validated
 from flowrep.config.command_line import (
@@ -158,29 +157,31 @@ def make_training(config: Config, folder: RunFolder) -> Training:
     if not is_new and not is_saved:
         folder.start_again(config)
     keep_freed_memory()
-    share_cores(config)
+    threads = share_cores(config)
     torch.manual_seed(config["seed"])
     env = env_from_config(config, compiled=config["compiled"])
     env.set_seed(config["seed"] * config["num_envs"])
     # the class of a new run was named on the command line
     trusted = config["algorithm"]["_target_"] if is_new else config["trust"]
     agent = agent_from_config(config, env, trust=trusted)
+    agent.threads = threads
     training = Training(env, agent, folder, origin_of(config))
     if not is_new and is_saved:
         training.load()
     return training
 
 
-def share_cores(config: Config) -> None:
-    """Gives the updates one thread per core, as many as PyTorch would use.
+def share_cores(config: Config) -> AbstractContextManager[None]:
+    """Returns the context of the updates, which may use as many threads as PyTorch would.
 
     Everything else is small and gets one thread, except estimated flow.
     """
     if choose_device(config["device"]).type != "cpu":
-        return
-    use_threads(min(threads_in_use(), available_cores()))
+        return nullcontext()
+    most = min(torch.get_num_threads(), available_cores())
     if config["flow"]["source"] == "exact":
         torch.set_num_threads(1)
+    return FasterThreads(most)
 
 
 def log_evaluation(

@@ -4,14 +4,14 @@ from flowrep.extras import require
 
 require("flowrep.agent", "train", "safetensors")
 
-from flowrep.agent.algorithm import Algorithm, DivergenceError, keep_freed_memory
+from flowrep.agent.algorithm import Algorithm, DivergenceError
 from flowrep.agent.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from flowrep.agent.cpu import FasterThreads, keep_freed_memory
 from flowrep.agent.dqn import DoubleDQN
 from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.dsac_v import DiscreteSACWithValue
 from flowrep.agent.ppo import PPO
 from flowrep.agent.replay import ReplayMemory
-from flowrep.agent.team import one_thread_an_operation, threads_in_use, use_threads
 
 __all__ = [
     "PPO",
@@ -21,11 +21,9 @@ __all__ = [
     "DiscreteSACWithValue",
     "DivergenceError",
     "DoubleDQN",
+    "FasterThreads",
     "ReplayMemory",
     "keep_freed_memory",
     "load_checkpoint",
-    "one_thread_an_operation",
     "save_checkpoint",
-    "threads_in_use",
-    "use_threads",
 ]

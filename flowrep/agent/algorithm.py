@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import inspect
 import math
-import platform
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar, Protocol
 
 import torch
@@ -19,170 +18,10 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
 
+Step = Callable[[TensorDictBase], TensorDictBase]
+WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
 GIVEN_BY_THE_RUN = ("observation_spec", "action_spec", "keys", "total_frames", "device")
 GIVEN_BY_THE_CLASS = ("self", "rate_factors", "policy_options", "network", "actor", "actions")
-
-
-def options_of(makers: Iterable[Any]) -> dict[str, inspect.Parameter]:
-    """Returns the classes' parameters by name, up to the first class without `**kwargs`.
-
-    >>> from flowrep.agent import DoubleDQN
-    >>> DoubleDQN.options()["final_epsilon"].default, DoubleDQN.options()["tau"].default
-    (0.05, 0.005)
-    """
-    found: dict[str, inspect.Parameter] = {}
-    for maker in filter(None, makers):
-        parameters = dict(inspect.signature(maker.__init__).parameters)
-        rest = [n for n, p in parameters.items() if p.kind is inspect.Parameter.VAR_KEYWORD]
-        given = (*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS, *rest)
-        found = {n: p for n, p in parameters.items() if n not in given} | found
-        if not rest:
-            break
-    return found
-
-
-class FastSoftUpdate(SoftUpdate):
-    """TorchRL's `SoftUpdate`, which lists the weights once instead of at every step.
-
-    Args:
-        loss: has target parameters.
-        tau: share of the weights in each move of the targets.
-    """
-
-    def __init__(self, loss: LossModule, *, tau: float) -> None:
-        super().__init__(loss, tau=tau)
-        targets = dict(self._targets.flatten_keys(".").items())
-        weights = self._sources.flatten_keys(".")
-        self._moved = [*targets.values()]
-        self._followed = [weights[name.removeprefix("target_")] for name in targets]
-
-    @torch.no_grad()
-    def step(self) -> None:
-        """Moves each target towards its weight."""
-        torch._foreach_lerp_(self._moved, self._followed, 1 - self.eps)
-
-
-class DivergenceError(ArithmeticError):
-    """A loss or another watched metric became nan or infinite; the message names it."""
-
-
-class DivergenceWatch:
-    """Keeps, on the device, the metrics of the first update that diverged.
-
-    Args:
-        watched: the metrics that have to be finite.
-        others: further metrics to report with them.
-        device: where the metrics are.
-
-    >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
-    >>> for q_loss in (0.5, float("nan"), 0.25):
-    ...     watch.look({"q_loss": torch.tensor(q_loss), "entropy": torch.tensor(1.0)})
-    >>> watch.check()
-    Traceback (most recent call last):
-    flowrep.agent.algorithm.DivergenceError: q_loss became nan in update 2 (q_loss=nan, entropy=1)
-    """
-
-    def __init__(
-        self,
-        watched: Sequence[str],
-        others: Sequence[str] = (),
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.watched, self.names = tuple(watched), (*watched, *others)
-        self._values = torch.zeros(len(self.names), device=device)
-        self._good_updates = torch.zeros((), dtype=torch.long, device=device)
-        self.is_bad = torch.zeros((), device=device)
-        """0.0 before the first bad update and 1.0 from then on, on the device."""
-
-    def reset(self, good_updates: int = 0) -> None:
-        """Forgets what it has seen, changing its own tensors in place.
-
-        Args:
-            good_updates: updates before the next one, for its number in messages.
-        """
-        self._values.zero_()
-        self._good_updates.fill_(good_updates)
-        self.is_bad.zero_()
-
-    def look(self, metrics: Mapping[str, Tensor]) -> None:
-        """Records an update's metrics, changing its own tensors in place."""
-        values = torch.stack([metrics[name].float() for name in self.names])
-        self._values.copy_(torch.where(self.is_bad.bool(), self._values, values))
-        is_good = self._values[: len(self.watched)].isfinite().all()
-        self._good_updates += is_good
-        self.is_bad.copy_(~is_good)
-
-    def check(self) -> None:
-        """Waits for the device and raises if an update has diverged.
-
-        Raises:
-            DivergenceError: if a watched metric is not finite; the message names the first such
-                metric and lists all metrics of that update.
-        """
-        values = dict(zip(self.names, self._values.tolist()))
-        bad = [name for name in self.watched if not math.isfinite(values[name])]
-        if bad:
-            raise DivergenceError(
-                f"{bad[0]} became {values[bad[0]]:g} in update {int(self._good_updates) + 1} "
-                f"({', '.join(f'{name}={value:g}' for name, value in values.items())})"
-            )
-
-
-Step = Callable[[TensorDictBase], TensorDictBase]
-
-WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
-
-
-def as_cuda_graph(step: Step, device: torch.device) -> Step:
-    """Returns an equivalent of `step` that runs as a CUDA graph from its fourth call on.
-
-    The graph replays the same kernels on the same memory. Values that change between calls must
-    therefore reach `step` through its argument or through tensors changed in place, and `step`
-    must not copy numbers between host and device. On any device but CUDA, `step` itself is
-    returned.
-
-    Args:
-        step: takes and returns a TensorDict. On CUDA, a batch whose keys, shapes or dtypes differ
-            from the first one's raises ValueError.
-        device: where `step` computes.
-    """
-    if device.type != "cuda":
-        return step
-    return OfOneShape(CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device))
-
-
-class OfOneShape:
-    """Passes batches on to `step` and rejects those whose layout differs from the first one's.
-
-    A graph copies each batch into the first one's memory. Without the check, a batch of one row
-    would silently be broadcast, numbers be cast and a missing map keep its old values.
-    """
-
-    def __init__(self, step: Step) -> None:
-        self.step = step
-        self._expected: dict[Any, tuple[Any, ...]] | None = None
-
-    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns `step(batch)`.
-
-        Raises:
-            ValueError: if an entry differs from the first batch's; the message names it.
-        """
-        layout = {
-            key: (tuple(value.shape), value.dtype)
-            for key, value in batch.items(include_nested=True, leaves_only=True)
-        }
-        if self._expected is None:
-            self._expected = layout
-        # only the first batch's keys count: a loss may add its own to a batch that is reused
-        for key, expected in self._expected.items():
-            if layout.get(key) != expected:
-                raise ValueError(
-                    f"the update is a CUDA graph of batches with {key!r} {expected}, this one has "
-                    f"it {layout.get(key, 'absent')}: keep the layout of batches fixed, or call "
-                    "step_eagerly() on the algorithm"
-                )
-        return self.step(batch)
 
 
 class Memory(Protocol):
@@ -238,6 +77,8 @@ class Algorithm(ABC):
 
     policy: Any
     memory: Memory
+    threads: AbstractContextManager[Any]
+    """Entered for each update; `FasterThreads` on a CPU whose cores are free."""
 
     def __init__(
         self,
@@ -266,6 +107,7 @@ class Algorithm(ABC):
         self.divergence = DivergenceWatch([*losses, "grad_norm"], others, self.device)
         # the fused optimizer skips its step if this is 1, which it reads on the device
         self.optimizer.found_inf = self.divergence.is_bad  # type: ignore[attr-defined]
+        self.threads = nullcontext()
         self.updates = 0
         self._is_eager = not self.CAPTURABLE
         self._capture()
@@ -384,7 +226,8 @@ class Algorithm(ABC):
         learning_rate = self.learning_rate * max(0.0, 1 - self.updates / self.total_updates)
         for group in self.optimizer.param_groups:
             group["lr"].fill_(learning_rate * group["factor"])
-        metrics = dict(self._step(batch).items())
+        with self.threads:
+            metrics = dict(self._step(batch).items())
         self.updates += 1
         return metrics | {"learning_rate": torch.tensor(learning_rate)}
 
@@ -460,25 +303,158 @@ def weights_of(loss: LossModule) -> dict[str, Tensor]:
     return {name: weights[name] for name in (*encoders, *weights)}
 
 
-# mallopt's parameter numbers, from glibc's malloc.h.
-_M_TRIM_THRESHOLD = -1
-_M_MMAP_THRESHOLD = -3
-_THRESHOLD_BYTES = 1 << 30
+def options_of(makers: Iterable[Any]) -> dict[str, inspect.Parameter]:
+    """Returns the classes' parameters by name, up to the first class without `**kwargs`.
 
-
-def keep_freed_memory() -> bool:
-    """Tells glibc to reuse large freed blocks; returns whether it did.
-
-    By default glibc maps every block above a threshold (32 MiB at most) afresh and unmaps it when
-    freed, so the kernel zeroes each activation of a large batch page by page in every update. With
-    both thresholds at 1 GiB the blocks stay in the heap. With any other C library, nothing changes
-    and the function returns False.
-
-    Call it once and early, as blocks already allocated are not moved.
+    >>> from flowrep.agent import DoubleDQN
+    >>> DoubleDQN.options()["final_epsilon"].default, DoubleDQN.options()["tau"].default
+    (0.05, 0.005)
     """
-    if platform.libc_ver()[0] != "glibc":
-        return False
-    mallopt = ctypes.CDLL(None).mallopt
-    mallopt.argtypes, mallopt.restype = (ctypes.c_int, ctypes.c_int), ctypes.c_int
-    accepted = mallopt(_M_MMAP_THRESHOLD, _THRESHOLD_BYTES)
-    return bool(accepted and mallopt(_M_TRIM_THRESHOLD, _THRESHOLD_BYTES))
+    found: dict[str, inspect.Parameter] = {}
+    for maker in filter(None, makers):
+        parameters = dict(inspect.signature(maker.__init__).parameters)
+        rest = [n for n, p in parameters.items() if p.kind is inspect.Parameter.VAR_KEYWORD]
+        given = (*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS, *rest)
+        found = {n: p for n, p in parameters.items() if n not in given} | found
+        if not rest:
+            break
+    return found
+
+
+class FastSoftUpdate(SoftUpdate):
+    """TorchRL's `SoftUpdate`, which lists the weights once instead of at every step.
+
+    Args:
+        loss: has target parameters.
+        tau: share of the weights in each move of the targets.
+    """
+
+    def __init__(self, loss: LossModule, *, tau: float) -> None:
+        super().__init__(loss, tau=tau)
+        targets = dict(self._targets.flatten_keys(".").items())
+        weights = self._sources.flatten_keys(".")
+        self._moved = [*targets.values()]
+        self._followed = [weights[name.removeprefix("target_")] for name in targets]
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Moves each target towards its weight."""
+        torch._foreach_lerp_(self._moved, self._followed, 1 - self.eps)
+
+
+class DivergenceError(ArithmeticError):
+    """A loss or another watched metric became nan or infinite; the message names it."""
+
+
+class DivergenceWatch:
+    """Keeps, on the device, the metrics of the first update that diverged.
+
+    Args:
+        watched: the metrics that have to be finite.
+        others: further metrics to report with them.
+        device: where the metrics are.
+
+    >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
+    >>> for q_loss in (0.5, float("nan"), 0.25):
+    ...     watch.look({"q_loss": torch.tensor(q_loss), "entropy": torch.tensor(1.0)})
+    >>> watch.check()
+    Traceback (most recent call last):
+    flowrep.agent.algorithm.DivergenceError: q_loss became nan in update 2 (q_loss=nan, entropy=1)
+    """
+
+    def __init__(
+        self,
+        watched: Sequence[str],
+        others: Sequence[str] = (),
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.watched, self.names = tuple(watched), (*watched, *others)
+        self._values = torch.zeros(len(self.names), device=device)
+        self._good_updates = torch.zeros((), dtype=torch.long, device=device)
+        self.is_bad = torch.zeros((), device=device)
+        """0.0 before the first bad update and 1.0 from then on, on the device."""
+
+    def reset(self, good_updates: int = 0) -> None:
+        """Forgets what it has seen, changing its own tensors in place.
+
+        Args:
+            good_updates: updates before the next one, for its number in messages.
+        """
+        self._values.zero_()
+        self._good_updates.fill_(good_updates)
+        self.is_bad.zero_()
+
+    def look(self, metrics: Mapping[str, Tensor]) -> None:
+        """Records an update's metrics, changing its own tensors in place."""
+        values = torch.stack([metrics[name].float() for name in self.names])
+        self._values.copy_(torch.where(self.is_bad.bool(), self._values, values))
+        is_good = self._values[: len(self.watched)].isfinite().all()
+        self._good_updates += is_good
+        self.is_bad.copy_(~is_good)
+
+    def check(self) -> None:
+        """Waits for the device and raises if an update has diverged.
+
+        Raises:
+            DivergenceError: if a watched metric is not finite; the message names the first such
+                metric and lists all metrics of that update.
+        """
+        values = dict(zip(self.names, self._values.tolist()))
+        bad = [name for name in self.watched if not math.isfinite(values[name])]
+        if bad:
+            raise DivergenceError(
+                f"{bad[0]} became {values[bad[0]]:g} in update {int(self._good_updates) + 1} "
+                f"({', '.join(f'{name}={value:g}' for name, value in values.items())})"
+            )
+
+
+def as_cuda_graph(step: Step, device: torch.device) -> Step:
+    """Returns an equivalent of `step` that runs as a CUDA graph from its fourth call on.
+
+    The graph replays the same kernels on the same memory. Values that change between calls must
+    therefore reach `step` through its argument or through tensors changed in place, and `step`
+    must not copy numbers between host and device. On any device but CUDA, `step` itself is
+    returned.
+
+    Args:
+        step: takes and returns a TensorDict. On CUDA, a batch whose keys, shapes or dtypes differ
+            from the first one's raises ValueError.
+        device: where `step` computes.
+    """
+    if device.type != "cuda":
+        return step
+    return OfOneShape(CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device))
+
+
+class OfOneShape:
+    """Passes batches on to `step` and rejects those whose layout differs from the first one's.
+
+    A graph copies each batch into the first one's memory. Without the check, a batch of one row
+    would silently be broadcast, numbers be cast and a missing map keep its old values.
+    """
+
+    def __init__(self, step: Step) -> None:
+        self.step = step
+        self._expected: dict[Any, tuple[Any, ...]] | None = None
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Returns `step(batch)`.
+
+        Raises:
+            ValueError: if an entry differs from the first batch's; the message names it.
+        """
+        layout = {
+            key: (tuple(value.shape), value.dtype)
+            for key, value in batch.items(include_nested=True, leaves_only=True)
+        }
+        if self._expected is None:
+            self._expected = layout
+        # only the first batch's keys count: a loss may add its own to a batch that is reused
+        for key, expected in self._expected.items():
+            if layout.get(key) != expected:
+                raise ValueError(
+                    f"the update is a CUDA graph of batches with {key!r} {expected}, this one has "
+                    f"it {layout.get(key, 'absent')}: keep the layout of batches fixed, or call "
+                    "step_eagerly() on the algorithm"
+                )
+        return self.step(batch)

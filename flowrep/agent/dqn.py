@@ -17,7 +17,6 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 from flowrep.agent.networks import (
     DiscreteActions,
     MapNetwork,
-    PackedNetwork,
     PolicyNetwork,
     acting_network,
 )
@@ -52,7 +51,7 @@ class EpsilonGreedyPolicy(TensorDictSequential):
 
 
 class DoubleDQNMapLoss(DQNLoss):
-    """TorchRL's double Q-learning loss on packed maps, with a target; see `DoubleDQN`.
+    """TorchRL's double Q-learning loss on stored maps, with a target; see `DoubleDQN`.
 
     Args:
         network: the policy's.
@@ -64,7 +63,7 @@ class DoubleDQNMapLoss(DQNLoss):
         self, network: MapNetwork, actions: DiscreteActions, *, gamma: float = 0.99
     ) -> None:
         keys = [codec.key for codec in network.codecs]
-        learning = TensorDictModule(PackedNetwork(network.codecs, network), keys, ["action_value"])
+        learning = TensorDictModule(PolicyNetwork(network), keys, ["action_value"])
         super().__init__(
             TensorDictSequential(learning, QValueModule(action_space=actions.space)),
             loss_function="l2",

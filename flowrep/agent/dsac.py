@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -23,13 +22,12 @@ from flowrep.agent.networks import (
 )
 from flowrep.agent.observation import MapCodec, decode_maps
 from flowrep.agent.off_policy import OffPolicy
-from flowrep.agent.team import begin_task
 
 ENCODERS = ("shared", "separate")
 
 
 class DiscreteSACMapLoss(DiscreteSACLoss):
-    """Discrete SAC loss on packed maps, as `ReplayMemory` samples them; see `DiscreteSAC`.
+    """Discrete SAC loss on stored maps, as `ReplayMemory` samples them; see `DiscreteSAC`.
 
     TorchRL's loss evaluates Q1 and Q2 one after the other (or by vmap), and twice at `s`: for L_Q
     with gradients, for L_π without. Here both share one hidden layer of twice the width and are
@@ -95,7 +93,6 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.codecs, self.encoder_is_shared = actor.codecs, shared
-        self._target_encoder = (actor.another_encoder().to("meta"),)  # in a tuple: no submodule
         self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
         if not shared:
             self.convert_to_functional(actor.encoder, "actor_encoder")
@@ -111,9 +108,8 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
         alpha = self.log_alpha.detach().exp()
-        target = partial(self._target, tensordict, alpha)
-        # a CUDA graph captures the work of one thread
-        wait_for_target = begin_task(target) if self.log_alpha.is_cpu else target
+        # before the other maps are decoded: one-hot maps are large
+        target = self._target(tensordict, alpha)
         images = decode_maps(self.codecs, tensordict)
         embedding = self.critic_encoder(images)
         # neither L_π nor Q in it may train the critic's encoder
@@ -126,7 +122,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         if self.action_space != "categorical":
             action = action.to(torch.uint8).argmax(-1)
         chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
-        td_error = chosen - wait_for_target()
+        td_error = chosen - target
         expected_q = (policy * q.detach().amin(0)).sum(-1)
         surplus = (negative_entropy.detach() + self.target_entropy).mean()
         return TensorDict(
@@ -146,10 +142,8 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         """Returns y `[N]`."""
         outcome = batch["next"]
         images = decode_maps(self.codecs, outcome)
-        # not `critic_encoder`, whose weights another thread reads
-        (encoder,) = self._target_encoder
-        with self.target_critic_encoder_params.to_module(encoder):
-            embedding = encoder(images)
+        with self.target_critic_encoder_params.to_module(self.critic_encoder):
+            embedding = self.critic_encoder(images)
         seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
         log_policy = self._log_policy(seen)
         q = heads_together(embedding, self.target_qvalue_network_params["module"]).amin(0)

@@ -18,7 +18,7 @@ from flowrep.agent.observation import decode_maps
 
 
 class DiscreteSACValueLoss(LossModule):
-    """The losses of `DiscreteSACWithValue` on packed maps, as `ReplayMemory` samples them.
+    """The losses of `DiscreteSACWithValue` on stored maps, as `ReplayMemory` samples them.
 
     Reads the same keys as `DiscreteSACMapLoss`. Returns `loss_qvalue`, `loss_value`, `loss_actor`
     and `loss_alpha`, to be minimised as a sum, with `alpha`, `entropy`, `q_mean` and `value_mean`.

@@ -1,11 +1,14 @@
-"""Networks and policies: one Nature encoder per map, then a head with one number per action."""
+"""Networks and policies: one Nature encoder per map, then a head with one number per action.
+
+Weights are float32. Encoders and hidden layers compute in the codec's dtype, by autocast; the last
+layer, whose numbers are compared, in float32.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
 import torch
@@ -18,12 +21,12 @@ from tensordict.nn import (
     TensorDictModule,
 )
 from torch import Tensor, nn
-from torch.compiler import is_exporting
 from torchrl.data import Categorical, Composite, OneHot, TensorSpec
 from torchrl.modules import OneHotCategorical
 
-from flowrep.agent.layers import SLOPE, convolve, linear
-from flowrep.agent.observation import BLOCK, KERNEL, MapCodec, compute_dtype, map_codecs
+from flowrep.agent.observation import MapCodec, compute_dtype, map_codecs
+
+EMBEDDING_SIZE = 512
 
 
 @dataclass(frozen=True)
@@ -50,42 +53,36 @@ class DiscreteActions:
         )
 
 
-EMBEDDING_SIZE = 512
-STRIDES = (1, 2, 1)  # of the convolutions, in packed pixels
+def _autocast_like(x: Tensor) -> AbstractContextManager[Any]:
+    """Returns a context in which stock layers compute in the dtype of `x`."""
+    if x.dtype is torch.float32:
+        return nullcontext()
+    return torch.autocast(x.device.type, x.dtype)
 
 
 class NatureEncoder(nn.Module):
     """Returns 512 features of a map: 32 × 8/4, 64 × 4/2, 64 × 3/1, linear; LeakyReLU after each.
 
-    Weights are those of ordinary convolutions in float32; they are cast to the codec's dtype. The
-    last map is flattened rows first, channels last.
+    The last map is flattened rows first, channels last: of a channels-last map, that is a view.
     """
 
     def __init__(self, codec: MapCodec) -> None:
         super().__init__()
-        self.codec = codec
-        self.conv1 = nn.Conv2d(codec.network_channels, 32, KERNEL, stride=BLOCK)
+        self.conv1 = nn.Conv2d(codec.network_channels, 32, 8, stride=4)
         self.conv2 = nn.Conv2d(32, 64, 4, stride=2)
         self.conv3 = nn.Conv2d(64, 64, 3)
-        rows, columns = ((((size - 1) - 4) // 2 + 1) - 2 for size in codec.grid)
+        rows, columns = (
+            ((size - 8) // 4 + 1 - 4) // 2 + 1 - 2 for size in (codec.height, codec.width)
+        )
         self.linear = nn.Linear(64 * rows * columns, EMBEDDING_SIZE)
 
-    def convolutions(self) -> list[Tensor]:
-        """Returns weights and biases of the convolutions, the first kernel packed like the maps."""
-        kernel = self.codec.pack_weight(self.conv1.weight)
-        weights = (kernel, self.conv2.weight, self.conv3.weight)
-        biases = (self.conv1.bias, self.conv2.bias, self.conv3.bias)
-        both = chain.from_iterable(zip(weights, biases))
-        return [tensor for tensor in both if tensor is not None]
-
-    def embed(self, features: Tensor, rows: int | None = None) -> Tensor:
-        """Returns the embeddings `[N, 512]` of convolved features; `rows` as in `linear`."""
-        return F.leaky_relu_(linear(features, self.linear.weight, self.linear.bias, rows), SLOPE)
-
     def forward(self, image: Tensor) -> Tensor:
-        """Returns the embeddings `[N, 512]` of a decoded map `[N, 16 * C, h, w]`."""
-        (features,) = convolve([image], self.convolutions(), STRIDES, self.codec.dtype)
-        return self.embed(features)
+        """Returns the embeddings `[N, 512]` of a decoded map `[N, C, H, W]`, in its dtype."""
+        with _autocast_like(image):
+            x = image
+            for convolution in (self.conv1, self.conv2, self.conv3):
+                x = F.leaky_relu_(convolution(x))
+            return F.leaky_relu_(self.linear(x.permute(0, 2, 3, 1).flatten(1)))
 
 
 class Encoder(nn.Module):
@@ -107,58 +104,43 @@ class Encoder(nn.Module):
         """Width of the concatenation."""
         return EMBEDDING_SIZE * len(self.encoders)
 
-    def forward(self, images: Sequence[Tensor], rows: int | None = None) -> Tensor:
-        """Returns the embeddings `[N, 512 * maps]` of decoded maps, in the maps' order.
-
-        Args:
-            images: the decoded maps.
-            rows: as in `linear`.
-        """
-        encoders: list[NatureEncoder] = list(self.encoders)  # type: ignore[arg-type]
-        weights = [w for encoder in encoders for w in encoder.convolutions()]
-        features = convolve(images, weights, STRIDES, encoders[0].codec.dtype)
-        embeddings = [encoder.embed(x, rows) for encoder, x in zip(encoders, features)]
+    def forward(self, images: Sequence[Tensor]) -> Tensor:
+        """Returns the embeddings `[N, 512 * maps]` of decoded maps, in the maps' order."""
+        embeddings = [encoder(image) for encoder, image in zip(self.encoders, images)]
         if self.layer_norm:
             embeddings = [F.layer_norm(x, x.shape[-1:]) for x in embeddings]
         return torch.cat(embeddings, dim=-1)
 
 
 class Head(nn.Module):
-    """Maps `[N, embedding]` to `[N, n_actions]` float32: linear, Swish, linear.
+    """Maps `[N, embedding]` to `[N, outputs]` float32: linear, Swish, linear."""
 
-    The hidden layer computes in the dtype of its input, the output layer in float32.
-    """
-
-    def __init__(self, embedding_size: int, hidden_size: int, n_actions: int) -> None:
+    def __init__(self, embedding_size: int, hidden_size: int, outputs: int) -> None:
         super().__init__()
         self.hidden = nn.Linear(embedding_size, hidden_size)
-        self.output = nn.Linear(hidden_size, n_actions)
+        self.output = nn.Linear(hidden_size, outputs)
 
-    def forward(self, embedding: Tensor, rows: int | None = None) -> Tensor:
-        """Returns one float32 number per action; `rows` as in `linear`."""
-        hidden = F.silu(linear(embedding, self.hidden.weight, self.hidden.bias, rows))
-        if rows is None:
-            return self.output(hidden.float())
-        return linear(hidden.float(), self.output.weight, self.output.bias, rows)
+    def forward(self, embedding: Tensor) -> Tensor:
+        """Returns one float32 number per output."""
+        with _autocast_like(embedding):
+            hidden = F.silu(self.hidden(embedding))
+        return self.output(hidden.float())
 
 
 def heads_together(embedding: Tensor, weights: Mapping[str, Any]) -> Tensor:
-    """Returns the outputs `[heads, N, n_actions]` of several heads on one embedding.
+    """Returns the outputs `[heads, N, outputs]` of several heads on one embedding.
+
+    Their hidden layers are one product, where TorchRL would use vmap.
 
     Args:
         embedding: `[N, embedding]`, the input of all heads.
         weights: those of `Head` by module and name, stacked along a first dim of heads.
     """
     hidden, output = weights["hidden"], weights["output"]
-    x = linear(embedding, hidden["weight"].flatten(0, 1), hidden["bias"].flatten())
-    x = F.silu(x).float().unflatten(-1, hidden["bias"].shape).movedim(-2, 0)
+    with _autocast_like(embedding):
+        x = F.silu(F.linear(embedding, hidden["weight"].flatten(0, 1), hidden["bias"].flatten()))
+    x = x.float().unflatten(-1, hidden["bias"].shape).movedim(-2, 0)
     return torch.baddbmm(output["bias"].unsqueeze(-2), x, output["weight"].mT)
-
-
-# Convolutions of fewer maps are rounded differently, and so are products of another number of rows;
-# actions would depend on the size of the batch.
-SMALLEST_BATCH = 8
-ROWS = 32
 
 
 class MapNetwork(nn.Module):
@@ -184,14 +166,9 @@ class MapNetwork(nn.Module):
         self.encoder = Encoder(codecs, layer_norm=layer_norm)
         self.head = Head(self.encoder.embedding_size, hidden_size, outputs)
 
-    def forward(self, images: Sequence[Tensor], rows: int | None = None) -> Tensor:
-        """Returns `[N, outputs]`.
-
-        Args:
-            images: the decoded maps.
-            rows: of each product on a CPU, see `flowrep.agent.layers.linear`.
-        """
-        return self.head(self.encoder(images, rows), rows)
+    def forward(self, images: Sequence[Tensor]) -> Tensor:
+        """Returns `[N, outputs]`."""
+        return self.head(self.encoder(images))
 
     def another_encoder(self) -> Encoder:
         """Returns an encoder for the same maps with its own weights."""
@@ -203,47 +180,22 @@ class MapNetwork(nn.Module):
         return MapNetwork(self.codecs, self.hidden_size, outputs, layer_norm=layer_norm)
 
 
-class PackedNetwork(nn.Module):
-    """Applies `network` to packed maps `[N, h, w, C * 16]`, one argument per map."""
-
-    def __init__(self, codecs: Sequence[MapCodec], network: MapNetwork) -> None:
-        super().__init__()
-        self.codecs, self.network = tuple(codecs), network
-
-    def forward(self, *packed: Tensor) -> Tensor:
-        """Returns the network's output for the decoded maps."""
-        return self.network([codec.decode(x) for codec, x in zip(self.codecs, packed)])
-
-
 class PolicyNetwork(nn.Module):
-    """Maps raw maps `[*B, C, H, W]`, one argument each, to one number per action `[*B, n]`.
+    """Maps raw or stored maps `[*B, C, H, W]`, one argument each, to `[*B, outputs]`.
 
-    On a CPU the numbers of an observation are the same, bit for bit, in a batch of any size.
+    Raw maps are rounded as in the replay memory first, so that acting sees what learning sees.
     """
 
-    def __init__(self, codecs: Sequence[MapCodec], network: MapNetwork) -> None:
+    def __init__(self, network: MapNetwork) -> None:
         super().__init__()
-        self.codecs, self.network = tuple(codecs), network
+        self.codecs, self.network = network.codecs, network
 
     def forward(self, *maps: Tensor) -> Tensor:
-        """Returns the network's output; the maps are stored and decoded first, as in training."""
-        images = []
-        for codec, x in zip(self.codecs, maps):
-            batch = codec.batch_shape(x)
-            packed = codec.store(x.reshape(-1, *x.shape[-3:]))
-            images.append(codec.decode(packed if is_exporting() else _padded(packed)))
-        outputs = self.network(images, ROWS)
-        if not is_exporting():
-            outputs = outputs[: math.prod(batch)]
+        """Returns the network's output."""
+        batch = maps[0].shape[:-3]
+        stored = [codec.store(x).reshape(-1, *x.shape[-3:]) for codec, x in zip(self.codecs, maps)]
+        outputs = self.network([codec.decode(x) for codec, x in zip(self.codecs, stored)])
         return outputs.reshape(*batch, outputs.shape[-1])
-
-
-def _padded(packed: Tensor) -> Tensor:
-    """Returns at least `SMALLEST_BATCH` rows, the last one repeated."""
-    missing = SMALLEST_BATCH - len(packed)
-    if missing <= 0 or not len(packed):
-        return packed
-    return torch.cat([packed, packed[-1:].expand(missing, *packed.shape[1:])])
 
 
 def acting_network(
@@ -261,7 +213,7 @@ def acting_network(
     actions = DiscreteActions.from_spec(action_spec)
     with device:
         network = MapNetwork(codecs, hidden_size, actions.count, layer_norm=layer_norm)
-    return PolicyNetwork(codecs, network)
+    return PolicyNetwork(network)
 
 
 def stochastic_policy(

@@ -1,4 +1,14 @@
-"""Packs observation maps for storage and decodes them for a network, given their specs."""
+"""Stores observation maps compactly and decodes them for a network, given their specs.
+
+| spec | means | stored as | the network sees |
+| --- | --- | --- | --- |
+| `Categorical(n)` | a class id per pixel, C stacked frames | uint8 | one-hot, `C * n` channels |
+| `Bounded(0, 255, uint8)` | intensity | uint8 | `x / 255`, C channels |
+| any float | a quantity | two-byte float | itself, C channels |
+
+An id from n to 255 is a pixel without a class, all zeros. One-hot maps are made when a batch is
+decoded, never stored.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +16,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec
 
 PRECISIONS = ("auto", "bf16", "fp32")
+MIN_SIZE = 36  # convolutions of 8/4, 4/2 and 3/1 reduce 36 pixels to one
+_FLOAT16_MAX = torch.finfo(torch.float16).max
 
 
 def compute_dtype(precision: str, device: torch.device) -> torch.dtype:
-    """Returns the dtype of activations for `precision` on `device`.
+    """Returns the dtype of activations; weights, losses and optimizer stay in float32.
 
     Args:
         precision: `"bf16"`, `"fp32"`, or `"auto"`: bfloat16 where the device multiplies it faster
@@ -41,12 +54,6 @@ def has_fast_bf16(device: torch.device) -> bool:
     return False
 
 
-BLOCK = 4  # the stride of the first convolution
-KERNEL = 2 * BLOCK
-MIN_SIZE = 36  # convolutions of 8/4, 4/2 and 3/1 reduce 36 pixels to one
-_FLOAT16_MAX = torch.finfo(torch.float16).max
-
-
 @dataclass(frozen=True)
 class MapCodec:
     """One map: its key in the TensorDict, its size, the meaning of its numbers and their encoding.
@@ -64,17 +71,8 @@ class MapCodec:
 
     @property
     def network_channels(self) -> int:
-        """Channels of the map that the network sees, before packing."""
+        """Channels of the map that the network sees."""
         return self.channels * (self.num_classes or 1)
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """Height and width in blocks, without rows and columns that no kernel reaches.
-
-        The second convolution has kernel 4 and stride 2, so it skips one of an odd number of rows.
-        """
-        height, width = ((size - KERNEL) // BLOCK + 1 for size in (self.height, self.width))
-        return height // 2 * 2 + 1, width // 2 * 2 + 1
 
     @property
     def stored_dtype(self) -> torch.dtype:
@@ -83,8 +81,10 @@ class MapCodec:
             return torch.uint8
         return torch.bfloat16 if self.dtype is torch.bfloat16 else torch.float16
 
-    def batch_shape(self, x: Tensor) -> tuple[int, ...]:
-        """Returns the leading dims of a raw map `[*B, C, H, W]`.
+    def store(self, x: Tensor) -> Tensor:
+        """Returns a raw map `[*B, C, H, W]` in `stored_dtype`.
+
+        Numbers beyond float16's range saturate.
 
         Raises:
             ValueError: if the last three dims are not those of the spec.
@@ -94,49 +94,22 @@ class MapCodec:
             raise ValueError(
                 f"{self.key!r}: the agent was built for maps {expected}, got {tuple(x.shape[-3:])}"
             )
-        return tuple(x.shape[:-3])
-
-    def pack(self, x: Tensor) -> Tensor:
-        """Returns `x` `[*B, C, H, W]` as blocks `[*B, h, w, C * 16]` of the same dtype."""
-        rows, columns = self.grid
-        x = x[..., : rows * BLOCK, : columns * BLOCK]
-        x = x.unflatten(-1, (columns, BLOCK)).unflatten(-3, (rows, BLOCK))  # [*B, C, h, 4, w, 4]
-        x = x.movedim((-4, -2), (-5, -4))  # [*B, h, w, C, 4, 4]
-        return x.flatten(-3)
-
-    def compact(self, x: Tensor) -> Tensor:
-        """Returns `x` in `stored_dtype`; numbers beyond float16's range saturate."""
         if self.stored_dtype is torch.float16:
             x = x.clamp(-_FLOAT16_MAX, _FLOAT16_MAX)
         return x.to(self.stored_dtype)
 
-    def store(self, x: Tensor) -> Tensor:
-        """Returns a raw map `[*B, C, H, W]` in its stored form, compact and packed.
+    def decode(self, stored: Tensor) -> Tensor:
+        """Returns a stored map `[N, C, H, W]` as the network sees it, channels last in memory.
 
-        Raises:
-            ValueError: as `batch_shape`.
+        Channel c * num_classes + id of a one-hot map is 1 where frame c shows that id.
         """
-        self.batch_shape(x)
-        return self.pack(self.compact(x))
-
-    def decode(self, packed: Tensor) -> Tensor:
-        """Returns `[N, C * 16, h, w]`, channels last in memory, for the encoder.
-
-        Class ids stay uint8, and `convolve` takes them for their one-hot maps; other maps have the
-        network's dtype.
-        """
-        if not self.num_classes:
-            packed = packed.to(self.dtype)
-            if self.is_byte:
-                packed = packed.div_(255)
-        return packed.permute(0, 3, 1, 2)
-
-    def pack_weight(self, weight: Tensor) -> Tensor:
-        """Returns a `[out, C * n, 8, 8]` kernel as `[out, C * 16 * n, 2, 2]` over packed maps."""
-        classes = self.num_classes or 1
-        weight = weight.unflatten(-1, (2, BLOCK)).unflatten(-3, (2, BLOCK))
-        weight = weight.unflatten(1, (self.channels, classes))  # [out, C, n, 2, 4, 2, 4]
-        return weight.permute(0, 1, 4, 6, 2, 3, 5).flatten(1, 4)
+        if self.num_classes:
+            # looking up rows of the identity is several times faster than comparing ids
+            identity = torch.eye(256, self.num_classes, device=stored.device, dtype=self.dtype)
+            ids = stored.permute(0, 2, 3, 1).int()
+            return F.embedding(ids, identity).flatten(-2).permute(0, 3, 1, 2)
+        x = stored.to(self.dtype, memory_format=torch.channels_last)
+        return x / 255 if self.is_byte else x
 
 
 def map_codecs(
@@ -186,14 +159,14 @@ def _codec(key: NestedKey, spec: TensorSpec, dtype: torch.dtype) -> MapCodec:
     return MapCodec(key, channels, height, width, num_classes, is_byte, dtype)
 
 
-def decode_maps(codecs: Sequence[MapCodec], packed: TensorDictBase) -> tuple[Tensor, ...]:
-    """Returns the decoded maps of a batch `[N]` of packed maps."""
-    return tuple(codec.decode(packed[codec.key]) for codec in codecs)
-
-
 def store_maps(codecs: Sequence[MapCodec], observation: TensorDictBase) -> TensorDictBase:
     """Returns only the observation's maps, in their stored form."""
     stored = observation.empty()
     for codec in codecs:
         stored[codec.key] = codec.store(observation[codec.key])
     return stored
+
+
+def decode_maps(codecs: Sequence[MapCodec], stored: TensorDictBase) -> tuple[Tensor, ...]:
+    """Returns the maps of a batch `[N]` as the network sees them."""
+    return tuple(codec.decode(stored[codec.key]) for codec in codecs)

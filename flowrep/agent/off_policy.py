@@ -104,5 +104,5 @@ class OffPolicy(Algorithm):
         return max(0, frames - self.learning_starts) // self.frames_per_update - self.updates
 
     def sample(self) -> TensorDictBase:
-        """Returns `batch_size` transitions, uniform with replacement, maps packed."""
+        """Returns `batch_size` transitions, uniform with replacement, maps in their stored form."""
         return self.memory.sample()

@@ -21,7 +21,7 @@ from flowrep.agent.replay import time_first
 
 
 class Rollout:
-    """Keeps steps of N environments until `clear`, with their packed maps and next maps.
+    """Keeps steps of N environments until `clear`, with their stored maps and next maps.
 
     Args:
         codecs: the maps to keep; see `flowrep.agent.observation`.
@@ -97,7 +97,7 @@ class Rollout:
 
 
 class ClipPPOMapLoss(ClipPPOLoss):
-    """TorchRL's clipped loss on packed maps, with one encoder for policy and V; see `PPO`.
+    """TorchRL's clipped loss on stored maps, with one encoder for policy and V; see `PPO`.
 
     TorchRL makes the host wait to check that the entropy is finite. Here the divergence check
     covers it, see `Algorithm.update`.
@@ -138,11 +138,11 @@ class ClipPPOMapLoss(ClipPPOLoss):
         self.convert_to_functional(network.encoder, "encoder")
 
     def embed(self, maps: TensorDictBase) -> Tensor:
-        """Returns the embeddings of packed maps."""
+        """Returns the embeddings of stored maps."""
         return self.encoder(decode_maps(self.codecs, maps))
 
     def state_value(self, maps: TensorDictBase) -> Tensor:
-        """Returns V `[n, 1]` for packed maps."""
+        """Returns V `[n, 1]` for stored maps."""
         embedded = TensorDict({"embedding": self.embed(maps)}, maps.batch_size)
         return self.critic_network(embedded)["state_value"]
 

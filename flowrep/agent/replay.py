@@ -1,4 +1,4 @@
-"""Replay of packed maps: a storage, a sampler and a transform for a TorchRL replay buffer.
+"""Replay of stored maps: a storage, a sampler and a transform for a TorchRL replay buffer.
 
 Each observation is stored once. A row holds the maps observed, the action and its outcome; the
 next observation is in the row of the following step.
@@ -25,7 +25,7 @@ OUTCOME = ("reward", "done", "terminated")
 class ReplayMemory(TensorDictReplayBuffer):
     """TorchRL's replay buffer with `RowStorage`, `SuccessorSampler` and `PackSteps`.
 
-    `sample` returns `batch_size` transitions, uniform with replacement: the maps, packed, `action`,
+    `sample` returns `batch_size` transitions, uniform with replacement: the maps, stored, `action`,
     `steps_to_next_obs` `[batch_size, 1]` and, under `next`, the maps, `reward` (the discounted sum
     over those steps), `done` and `terminated`.
 
@@ -67,14 +67,14 @@ class ReplayMemory(TensorDictReplayBuffer):
 
 
 class PackSteps(Transform):
-    """Turns steps into packed rows on `extend`.
+    """Turns steps into rows on `extend`.
 
-    Samples keep their maps packed, because networks read packed maps and decode them themselves.
+    Samples keep their maps in their stored form, which losses decode.
 
     | steps, on `extend` | rows |
     | --- | --- |
     | `[N]`, `[N, T]`, or with a dim named `time` | `[T * N]`, time first |
-    | the maps | packed |
+    | the maps | in their stored form |
     | `action`, `is_init` | unchanged |
     | `("next", name)` of `reward`, `done`, `terminated` | `name` |
     | | `env`: index of the environment, from 0 to N - 1 |

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from flowrep.agent import keep_freed_memory, one_thread_an_operation
+from flowrep.agent import keep_freed_memory
 from flowrep.baselines.baselines import Drive
 from flowrep.envs.workers import WorkerGroup
 from flowrep.experiment.arena import Agent, Arena, Job
@@ -54,8 +54,12 @@ class ArenaTeam:
 
     def run(self, jobs: Sequence[Job]) -> Iterator[tuple[int, Episode]]:
         """Yields the jobs' episodes with their numbers, as they end; see `Arena.run`."""
-        with one_thread_an_operation():
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
             yield from self._shared("run", jobs, _packed(self._agents))
+        finally:
+            torch.set_num_threads(threads)
 
     def drive(self, jobs: Sequence[tuple[str, Options]]) -> Iterator[tuple[int, Drive]]:
         """Yields the episodes of baselines, see `EnvPool.drive`."""

@@ -18,7 +18,6 @@ from flowrep.agent import (
     DivergenceError,
     load_checkpoint,
     save_checkpoint,
-    threads_in_use,
 )
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
 from flowrep.experiment.evaluation import OUTCOMES
@@ -260,7 +259,7 @@ def train(
     should_save = Every(config["checkpoint_every_frames"], t.frames)
     total = config["total_frames"]
     is_on_gpu = t.agent.device.type == "cuda"
-    steps_meanwhile = is_on_gpu or has_spare_cores(t.env, threads_in_use())
+    steps_meanwhile = is_on_gpu or has_spare_cores(t.env, torch.get_num_threads())
     if t.observation is None:
         t.observation = t.env.reset()
     if t.evaluation_pending:

@@ -2,9 +2,6 @@
 
 import copy
 import math
-import platform
-import subprocess
-import sys
 from unittest.mock import patch
 
 import pytest
@@ -14,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from flowrep.agent import algorithm, layers, load_checkpoint, save_checkpoint
+from flowrep.agent import load_checkpoint, save_checkpoint
 from flowrep.agent.algorithm import (
     WARM_UP,
     DivergenceError,
@@ -339,12 +336,6 @@ def state_of(agent):
     return agent.weights | moments | {"watched": watch._values, "good": watch._good_updates}
 
 
-@pytest.fixture
-def layers_of_cuda(monkeypatch):
-    """Layers that are PyTorch's operations alone, as on CUDA; a tape records no others."""
-    monkeypatch.setattr(layers, "_is_shared_out", lambda x: False)
-
-
 class Taped:
     """Stands in for a CUDA graph: some steps as they are, one on tape, the rest from the tape."""
 
@@ -367,7 +358,6 @@ class Taped:
 
 
 @pytest.mark.slow_after_first
-@pytest.mark.usefixtures("layers_of_cuda")
 def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
     eager, taped = make_any(learning_rate=0.01), make_any(learning_rate=0.01)
     batches = batches_of([eager, taped], random_steps)
@@ -382,7 +372,6 @@ def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
 
 
 @pytest.mark.slow_after_first
-@pytest.mark.usefixtures("layers_of_cuda")
 def test_a_loss_that_is_no_number_stops_the_weights_on_tape_too(make_any, random_steps):
     agent = make_any()
     batches = batches_of([agent], random_steps)
@@ -478,33 +467,3 @@ def test_an_agent_on_cuda_resumes_into_a_graph_of_its_own(make_any, random_steps
         resumed.update(batch.clone())
     for name, weight in whole.weights.items():
         torch.testing.assert_close(resumed.weights[name], weight, rtol=1e-3, atol=1e-4)
-
-
-COUNT_PAGE_FAULTS = """
-import resource, sys
-from flowrep.agent import keep_freed_memory
-if sys.argv[1] == "keep":
-    assert keep_freed_memory()
-def faults():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(5):
-        bytearray(b"x") * 80_000_000  # some 20,000 pages
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-faults()
-print(faults())
-"""
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator")
-def test_a_freed_block_is_reused_without_page_faults():
-    faults = {}
-    for mode in ("default", "keep"):
-        command = [sys.executable, "-c", COUNT_PAGE_FAULTS, mode]
-        result = subprocess.run(command, capture_output=True, text=True, check=True)
-        faults[mode] = int(result.stdout)
-    assert faults["keep"] < 0.1 * faults["default"]
-
-
-def test_another_c_library_is_left_alone(monkeypatch):
-    monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
-    assert algorithm.keep_freed_memory() is False

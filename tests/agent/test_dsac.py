@@ -1,4 +1,4 @@
-"""Gradient steps against the same losses written plainly, in float64."""
+"""Discrete SAC: its parts by hand, and gradient steps against the same losses in plain float64."""
 
 import math
 
@@ -7,40 +7,7 @@ import torch
 import torch.nn.functional as F
 from torchrl.data import Binary, Categorical, Composite, OneHot, Unbounded
 
-from flowrep.agent import DiscreteSACWithValue, load_checkpoint, save_checkpoint
-
-
-def weights(agent):
-    return {name: w.clone() for name, w in agent.state_dict()["weights"].items()}
-
-
-def test_the_learning_rate_falls_linearly_to_zero(make_agent, random_steps, as_batch):
-    # (1000 frames - 16 before learning) // 10 = 98 updates
-    agent = make_agent(total_frames=1000, batch_size=16, frames_per_update=10, learning_rate=0.98)
-    assert agent.total_updates == 98
-    batch = as_batch(agent, random_steps(4))
-    assert agent.update(batch)["learning_rate"] == pytest.approx(0.98)
-    agent.updates = 49
-    assert agent.update(batch)["learning_rate"] == pytest.approx(0.49)
-    agent.updates = 98
-    before = weights(agent)
-    assert agent.update(batch)["learning_rate"] == 0
-    trained = agent.trained.keys()
-    assert all(torch.equal(before[name], weights(agent)[name]) for name in trained)
-
-
-def test_metrics_are_detached_and_named(make_agent, random_steps, as_batch):
-    agent = make_agent()
-    metrics = agent.update(as_batch(agent, random_steps(8)))
-    assert sorted(metrics.keys()) == [
-        "actor_loss", "alpha", "alpha_loss", "entropy", "grad_norm", "learning_rate", "q_loss",
-        "q_mean", "td_error",
-    ]  # fmt: skip
-    assert not any(value.requires_grad for value in metrics.values())
-    assert metrics["alpha"] == pytest.approx(0.5)
-    assert 0 < metrics["entropy"] <= math.log(3) + 1e-6
-    gradients = torch.cat([weight.grad.flatten() for weight in agent.trained.values()])
-    assert metrics["grad_norm"] == pytest.approx(gradients.norm().item(), rel=1e-5)
+from flowrep.agent import DiscreteSACWithValue
 
 
 def test_alpha_is_trained_toward_the_target_entropy(make_agent, random_steps, as_batch):
@@ -102,52 +69,12 @@ def test_one_hot_actions_learn_what_categorical_ones_do(make_agent, random_steps
     torch.testing.assert_close(agent.losses(as_batch(agent, steps))["q_loss"], expected)
 
 
-@pytest.mark.slow_after_first
-@pytest.mark.parametrize("encoder", ["shared", "separate"])
-def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(
-    make_agent, random_steps, tmp_path, encoder
-):
-    def learn(agent, seed):
-        torch.manual_seed(seed)
-        metrics = []
-        for _ in range(3):
-            agent.memory.extend(random_steps(12))
-            metrics += [agent.update(agent.memory.sample()) for _ in range(2)]
-        return metrics
-
-    whole = make_agent(encoder=encoder, replay_capacity=40)
-    learn(whole, seed=1)
-    save_checkpoint(
-        tmp_path / "c.safetensors",
-        {"agent": whole.state_dict(), "replay": whole.memory.state_dict()},
-    )
-    expected = learn(whole, seed=2)
-
-    resumed = make_agent(encoder=encoder, replay_capacity=40, seed=9)
-    state = load_checkpoint(tmp_path / "c.safetensors")
-    resumed.load_state_dict(state["agent"])
-    resumed.memory.load_state_dict(state["replay"])
-    actual = learn(resumed, seed=2)
-
-    for a, b in zip(expected, actual):
-        assert all(torch.equal(a[name], b[name]) for name in a.keys())  # noqa: SIM118
-    expected, actual = weights(whole), weights(resumed)
-    assert actual["log_alpha"] != math.log(0.5)
-    assert all(torch.equal(expected[name], actual[name]) for name in expected)
-
-
-def test_a_state_of_other_maps_is_refused_with_the_first_difference(make_agent):
-    saved = make_agent(keys=["flow"]).state_dict()
-    with pytest.raises(ValueError, match=r"\(32, 1024\) here, \(32, 512\) there"):
-        make_agent(keys=["flow", "seg"]).load_state_dict(saved)
-
-
 def test_settings_that_do_not_exist_are_refused(make_agent):
-    with pytest.raises(ValueError, match="encoder='both': expected one of shared, separate"):
+    with pytest.raises(ValueError, match="encoder='both'"):
         make_agent(encoder="both")
-    with pytest.raises(ValueError, match="precision='fp16': expected one of auto, bf16, fp32"):
+    with pytest.raises(ValueError, match="precision='fp16'"):
         make_agent(precision="fp16")
-    with pytest.raises(TypeError, match="Categorical or OneHot action spec, got Binary"):
+    with pytest.raises(TypeError, match="Binary"):
         make_agent(action_spec=Binary(3))
 
 
@@ -191,8 +118,8 @@ def test_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch, encoder):
     assert dist.probs.argmax(1).tolist() == [2, 2, 2, 2]
     critic = agent.loss.qvalue_network
     with torch.no_grad(), agent.loss.qvalue_network_params[0].to_module(critic):
-        packed = agent.codecs[0].pack(seen["view"]).movedim(-1, 1)
-        q = critic.module(agent.loss.critic_encoder([packed]))
+        images = agent.codecs[0].decode(seen["view"])
+        q = critic.module(agent.loss.critic_encoder([images]))
     # going right is worth gamma to the power of the cells left to go: 0.125, 0.25, 0.5, 1
     torch.testing.assert_close(q[:, 2], torch.tensor([0.125, 0.25, 0.5, 1.0]), atol=0.1, rtol=0)
 
@@ -348,30 +275,3 @@ def assert_follows(agent, batch, steps, reference_losses):
             tolerance = 1e-5 if update == 0 else 1e-3
             assert error <= tolerance * expected.abs().max(), name
     assert agent.updates == 3
-
-
-# docs/metrics.md states what was measured: 0.2 %, 1.8 % and 12 %.
-LOSS, ALL_GRADIENTS, ANY_GRADIENT = 0.005, 0.03, 0.15
-
-
-def relative(value, exact):
-    return ((value - exact).norm() / exact.norm()).item()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("encoder", ["shared", "separate"])
-def test_bf16_stays_within_what_was_measured(make_agent, random_steps, as_batch, encoder):
-    settings = {"encoder": encoder, "hidden_size": 128, "learning_rate": 1e-3}
-    exact, fast = (make_agent(precision=p, **settings) for p in ("fp32", "bf16"))
-    steps = random_steps(128)
-    for _ in range(20):
-        exact.update(as_batch(exact, steps))
-    fast.load_state_dict(exact.state_dict())
-    expected, actual = (agent.update(as_batch(agent, steps)) for agent in (exact, fast))
-    for name in ("q_loss", "actor_loss", "alpha_loss"):
-        assert relative(actual[name], expected[name]) < LOSS, name
-    for name, weight in fast.trained.items():
-        assert relative(weight.grad, exact.trained[name].grad) < ANY_GRADIENT, name
-    every = [torch.cat([w.grad.flatten() for w in a.trained.values()]) for a in (fast, exact)]
-    deviation = relative(*every)
-    assert 1e-4 < deviation < ALL_GRADIENTS  # below, it would not be bfloat16 that was computed

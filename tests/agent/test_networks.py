@@ -3,11 +3,10 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import Categorical, Composite, OneHot, Unbounded
+from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from flowrep.agent.networks import Encoder, NatureEncoder, acting_network
+from flowrep.agent.networks import Encoder, NatureEncoder
 from flowrep.agent.observation import map_codecs
 
 
@@ -38,9 +37,7 @@ def test_encodes_like_the_plain_network(height, width, features):
     x = torch.randn(3, 2, height, width)
     assert encoder.linear.in_features == features
     expected = plain_nature(encoder, x.double())
-    torch.testing.assert_close(
-        encoder(c.decode(c.pack(x))).double(), expected, rtol=1e-4, atol=1e-6
-    )
+    torch.testing.assert_close(encoder(c.decode(x)).double(), expected, rtol=1e-4, atol=1e-6)
 
 
 def test_bfloat16_stays_within_its_precision():
@@ -48,7 +45,7 @@ def test_bfloat16_stays_within_its_precision():
     (c,) = codecs((2, 48, 48), dtype=torch.bfloat16)
     encoder = NatureEncoder(c)
     x = torch.randn(8, 2, 48, 48)
-    encoded = encoder(c.decode(c.pack(x)))
+    encoded = encoder(c.decode(x))
     expected = plain_nature(encoder, x.double())
     assert encoded.dtype is torch.bfloat16
     # eight bits of mantissa, four layers: some 1 % of the spread of the features
@@ -60,7 +57,7 @@ def test_embeddings_stand_side_by_side_in_the_maps_order():
     first, second = codecs((2, 40, 40), (1, 36, 44))
     encoder = Encoder([first, second])
     x, y = torch.randn(2, 2, 40, 40), torch.randn(2, 1, 36, 44)
-    images = [first.decode(first.pack(x)), second.decode(second.pack(y))]
+    images = [first.decode(x), second.decode(y)]
     embedding = encoder(images)
     assert embedding.shape == (2, encoder.embedding_size) == (2, 1024)
     assert torch.equal(embedding[:, :512], encoder.encoders[0](images[0]))
@@ -71,17 +68,12 @@ def test_a_normalised_embedding_has_mean_0_and_variance_1_whatever_the_scale_of_
     torch.manual_seed(3)
     two = codecs((2, 40, 44), (1, 40, 44))
     encoder = Encoder(two, layer_norm=True)
-    images = [c.decode(c.pack(torch.randn(5, *s))) for c, s in zip(two, [(2, 40, 44), (1, 40, 44)])]
+    images = [c.decode(torch.randn(5, *s)) for c, s in zip(two, [(2, 40, 44), (1, 40, 44)])]
     embedding = encoder([images[0] * 1000, images[1]]).reshape(5, 2, 512)
     torch.testing.assert_close(embedding.mean(-1), torch.zeros(5, 2), atol=1e-5, rtol=0)
     # of 512 numbers, 1e-5 added to the variance, which is small for the second map
     torch.testing.assert_close(embedding.var(-1, correction=0), torch.ones(5, 2), atol=0.1, rtol=0)
     assert len(list(encoder.parameters())) == len(list(Encoder(two).parameters()))
-
-
-def acting(agent, maps, kind=ExplorationType.RANDOM):
-    with torch.no_grad(), set_exploration_type(kind):
-        return agent.policy(maps.clone())["action"]
 
 
 def probabilities(agent, maps):
@@ -96,31 +88,7 @@ def test_any_leading_batch_acts_like_a_loop(make_agent, random_maps, batch):
     assert probs.shape == (*batch, 3)
     looped = [probabilities(agent, one) for one in (maps.reshape(-1) if batch else [maps])]
     torch.testing.assert_close(probs.reshape(-1, 3), torch.stack(looped))
-    assert acting(agent, maps).shape == batch
-
-
-def test_deterministic_exploration_takes_the_likeliest_action(make_agent, random_maps):
-    agent, maps = make_agent(), random_maps(20)
-    expected = probabilities(agent, maps).argmax(-1)
-    for _ in range(3):
-        assert torch.equal(acting(agent, maps, ExplorationType.DETERMINISTIC), expected)
-
-
-def test_otherwise_actions_are_drawn_from_the_policy(make_agent, random_maps):
-    agent, maps = make_agent(), random_maps(1)
-    agent.policy[0].module.network.head.output.bias.data = torch.tensor([0.0, 1.0, -1.0])
-    expected = probabilities(agent, maps)[0]
-    actions = acting(agent, maps.expand(3000).contiguous())
-    shares = torch.bincount(actions, minlength=3) / 3000
-    # three standard deviations of a share are 0.027
-    torch.testing.assert_close(shares, expected, atol=0.03, rtol=0)
-
-
-def test_one_hot_actions(make_agent, random_maps):
-    agent, maps = make_agent(action_spec=OneHot(3)), random_maps(4)
-    action = acting(agent, maps, ExplorationType.DETERMINISTIC)
-    assert action.shape == (4, 3)
-    assert torch.equal(action.argmax(-1), probabilities(agent, maps).argmax(-1))
+    assert agent.policy(maps)["action"].shape == batch
 
 
 def test_writes_the_action_and_nothing_else(make_agent, random_maps):
@@ -191,23 +159,3 @@ def test_a_torchrl_collector_acts_with_it_and_the_replay_takes_its_frames(make_a
     assert terminated.any()
     assert torch.equal(batch["next", "reward"].squeeze(1), now.float() + 1)
     assert torch.equal(later[~terminated], now[~terminated] + 1)
-
-
-@pytest.mark.parametrize("precision", ["bf16", "fp32"])
-def test_an_observation_gets_the_same_bits_in_a_batch_of_any_size(precision):
-    # With products of as many rows as the batch, 1 to 15 or 33 to 36 rows differ, by the CPU.
-    spec = Composite(
-        flow=Unbounded((2, 84, 88)), seg=Categorical(5, (1, 84, 88), dtype=torch.uint8)
-    )
-    torch.manual_seed(0)
-    cpu = torch.device("cpu")
-    actions = Categorical(3)
-    keys = ["flow", "seg"]
-    network = acting_network(spec, actions, keys, device=cpu, precision=precision, hidden_size=512)
-    flow, seg = torch.randn(133, 2, 84, 88), torch.randint(5, (133, 1, 84, 88)).byte()
-    with torch.no_grad():
-        whole = network(flow, seg)
-        for count in (1, 2, 3, 4, 7, 32, 65, 130):
-            rows = slice(133 - count, 133)
-            assert torch.equal(network(flow[rows], seg[rows]), whole[rows]), count
-        assert torch.equal(network(flow[5], seg[5]), whole[5])
