@@ -264,9 +264,11 @@ def known(kind: str, made: FactorizedFrame) -> NDArray[np.bool_]:
     return made.ego_valid if kind == "ego" else made.valid
 
 
-def shown(kind: str, made: FactorizedFrame) -> Flow:
-    """Returns a flow with nan, which is drawn in grey, where it is unknown."""
-    return np.where(known(kind, made), getattr(made, kind), np.float32(np.nan))
+def shown(kind: str, made: FactorizedFrame, places: Any = ...) -> Flow:
+    """Returns a flow, or places of it, with nan, which is drawn in grey, where it is unknown."""
+    flow = getattr(made, kind)
+    u, v = (np.where(known(kind, made)[places], plane[places], np.nan) for plane in flow)
+    return np.stack([u, v])
 
 
 def flow_picture(kind: str, made: FactorizedFrame, scale_px: float) -> Image:
@@ -282,15 +284,14 @@ def video_frame(made: FactorizedFrame, options: OutputOptions) -> Image:
     height, width = frame.size
     shrink = min(1.0, _TILE_PX / max(height, width))
     size = round(height * shrink), round(width * shrink)
-    rows, columns = (
-        (np.arange(small) + 0.5) * full // small for small, full in zip(size, frame.size)
+    places: Any = np.ix_(
+        *(((np.arange(n) + 0.5) * full / n).astype(int) for n, full in zip(size, frame.size))
     )
-    places: Any = np.ix_(rows.astype(int), columns.astype(int))
     above: dict[str, Any] = {"depth": frame.depth[places][None]}
     if frame.rgb is not None:
         small = cv2.resize(frame.rgb, size[::-1], interpolation=cv2.INTER_AREA)
         above["rgb"] = np.moveaxis(small, -1, 0)
-    below = {kind: shown(kind, made)[(slice(None), *places)] for kind in FLOW_NAMES}
+    below = {kind: shown(kind, made, places) for kind in FLOW_NAMES}
     scales: Any = {"flow_scale_px": options.scale_px, "depth_range_m": options.depth_range_m}
     return contact_sheet([representation_strip(maps, **scales) for maps in (above, below)])
 
