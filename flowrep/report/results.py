@@ -298,7 +298,7 @@ def scene_tables(declared: Mapping[str, Any], runs: Sequence[Run]) -> list[dict[
     for scene, here in of_study(declared, "main", runs).items():
         is_fork = scene in declared["forks"]
         header = ["", "low", "normal (training)", "high", "each run, normal"]
-        header += [f"find all {len(here[0].paths)} ways"] if is_fork else []
+        header += [f"find all {here[0].paths} ways"] if is_fork else []
         rows = []
         for stack in in_order([run.stack for run in here], STACKS):
             members = [run for run in here if run.stack == stack]
@@ -332,7 +332,7 @@ def one_way(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[int, int]
 def _by_way(run: Run) -> list[float]:
     """Returns a run's greedy success on each path at its training speed."""
     driven = run.under(Condition("greedy", run.speed, run.fps))
-    on_path = [driven["outcome"][driven["path"] == place] for place in range(len(run.paths))]
+    on_path = [driven["outcome"][driven["path"] == place] for place in range(run.paths)]
     return [float(success(ends).mean()) if len(ends) else 0.0 for ends in on_path]
 
 
@@ -498,7 +498,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         repeats=repeats(every, [run for run in runs if run not in every]),
         sampled=sampled_minus_greedy(every),
         collapsed=collapses(main["straight_road"]),
-        unknown=sum((run.machine or {}).get("precision") == "unknown" for run in runs),
+        unknown=sum(run.machine.get("precision") == "unknown" for run in runs),
         np=np,
     )
     return text, draw_claims([*claims["primary"], *claims["secondary"]])

@@ -28,93 +28,58 @@ class Condition(NamedTuple):
     fps: float
 
 
-@dataclass(frozen=True, eq=False)
 class Run:
-    """A run's config and tables.
+    """A run's config and tables, and what a report asks for of them.
 
     Args:
         name: its folder, or its name in packed tables.
         config: the resolved config that it was started with.
-        episodes: the columns of evaluation.csv, see `EPISODE_COLUMNS`.
+        episodes: the columns of evaluation.csv; `path` counts the scene's paths.
         metrics: the columns of metrics.csv, nan where a cell is empty.
         folder: where films and drives may lie; None for a run of packed tables.
         machine: the commit, precision and CPU that trained it, "unknown" where not recorded.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: the config is not what a run leaves.
     """
 
-    name: str
-    config: Mapping[str, Any]
-    episodes: Columns
-    metrics: Columns
-    folder: Path | None = None
-    machine: Mapping[str, str] | None = None
-
-    @cached_property
-    def settings(self) -> dict[str, Any]:
-        """What determines its weights, by dotted key, without the seed.
-
-        Keys of one scene alone are under the scene's name, and options of a representation under
-        its name: only runs that have the scene or the representation can differ in them.
-        """
-        parts = origin_of(self.config)
-        del parts["flowrep"], parts["seed"]
-        scene = parts.pop("scene")
-        own = {key: value for key, value in scene.items() if key not in _OF_EVERY_SCENE}
-        shared = {f"scene.{key}": scene[key] for key in _OF_EVERY_SCENE if key in scene}
-        found = dict([*_flat(parts | shared), *_flat(own, f"scene.{self.scene}")])
-        return {k: v for k, v in found.items() if v != {}}  # a representation without options
-
-    @property
-    def scene(self) -> str:
-        """The name of the scene that it was trained in."""
-        return self.config["scene"]["name"]
-
-    @property
-    def stack(self) -> str:
-        """What the agent sees, e.g. `ego+obj`, in a fixed order."""
-        return stack_of(self.config["representations"])
-
-    @property
-    def seed(self) -> int:
-        """The seed of the training."""
-        return self.config["seed"]
-
-    @property
-    def speed(self) -> str:
-        """The pedestrians' speed mode in training."""
-        return self.config["speed"]
-
-    @property
-    def fps(self) -> float:
-        """The frame rate in training, in Hz."""
-        return float(self.config["scene"]["frame_rate_hz"])
-
-    @property
-    def total_frames(self) -> int:
-        """The frames that it should be trained for."""
-        return self.config["total_frames"]
-
-    @property
-    def paths(self) -> Sequence[str]:
-        """The names of the scene's paths; an episode's column `path` counts them."""
-        return [path["name"] for path in self.config["scene"].get("paths", [{"name": ""}])]
-
-    @cached_property
-    def frames(self) -> int:
-        """The frames that it has been trained for, from its tables."""
-        columns = (self.metrics.get("frames"), self.episodes["frames"])
-        return max((int(c.max()) for c in columns if c is not None and len(c)), default=0)
-
-    @property
-    def is_finished(self) -> bool:
-        """Returns whether it was trained for `total_frames`."""
-        return self.frames >= self.total_frames
+    def __init__(
+        self,
+        name: str,
+        config: Mapping[str, Any],
+        episodes: Columns,
+        metrics: Columns,
+        folder: Path | None = None,
+        machine: Mapping[str, str] | None = None,
+    ) -> None:
+        self.name, self.config, self.folder = name, config, folder
+        self.metrics, self.machine = metrics, machine or {}
+        scene = config["scene"]
+        self.scene: str = scene["name"]
+        self.stack = stack_of(config["representations"])
+        self.seed = int(config["seed"])
+        self.speed: str = config["speed"]  # of the pedestrians in training
+        self.fps = float(scene["frame_rate_hz"])
+        self.total_frames = int(config["total_frames"])
+        self.paths = max(len(scene.get("paths") or ()), 1)
+        if not (isinstance(self.scene, str) and isinstance(self.speed, str)):
+            raise TypeError("a name is none")
+        columns = (metrics.get("frames", np.zeros(0)), episodes["frames"])
+        self.frames = max((int(c.max()) for c in columns if len(c)), default=0)
+        self.is_finished = self.frames >= self.total_frames
+        self.settings = _settings(config)
+        drawn = drawn_paths(episodes["episode_seed"], self.paths)
+        self.episodes = episodes | {"path": drawn}
 
     @cached_property
     def tested(self) -> NDArray[np.bool_]:
         """Whether each episode is of the finished agent in its own scene, after training."""
         e = self.episodes
-        is_after = (e["evaluation"] != "training") & (e["frames"] >= self.total_frames)
-        return is_after & (e["scene"] == self.scene)
+        is_own = e["scene"] == self.scene
+        while_training = e["scene_id"][is_own & (e["evaluation"] != "evaluate")]
+        if len(while_training):  # the scene may have been changed under the same name since
+            is_own &= e["scene_id"] == while_training[0]
+        return is_own & (e["evaluation"] != "training") & (e["frames"] >= self.total_frames)
 
     @cached_property
     def conditions(self) -> set[Condition]:
@@ -128,6 +93,30 @@ class Run:
         asked = zip(Condition._fields, condition)
         chosen = np.logical_and.reduce([self.tested, *(e[name] == v for name, v in asked)])
         return {name: column[chosen] for name, column in e.items()}
+
+
+def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what determines a run's weights, by dotted key, without the seed.
+
+    Keys of one scene alone are under the scene's name, and options of a representation under its
+    name: only runs that have the scene or the representation can differ in them.
+    """
+    parts = origin_of(config)
+    del parts["flowrep"], parts["seed"]
+    scene = parts.pop("scene")
+    own = {key: value for key, value in scene.items() if key not in _OF_EVERY_SCENE}
+    shared = {f"scene.{key}": scene[key] for key in _OF_EVERY_SCENE if key in scene}
+    found = dict([*_flat(parts | shared), *_flat(own, f"scene.{scene['name']}")])
+    return {k: v for k, v in found.items() if v != {}}  # a representation without options
+
+
+def drawn_paths(episode_seeds: NDArray[Any], paths: int) -> NDArray[Any]:
+    """Returns the path of each episode: the first draw of its generator, as an episode makes it."""
+    if paths < 2:
+        return np.zeros(len(episode_seeds), int)
+    seeds, places = np.unique(episode_seeds, return_inverse=True)
+    drawn = [int(np.random.default_rng(int(seed)).integers(paths)) for seed in seeds]
+    return np.array(drawn, int)[places]
 
 
 def stack_of(representations: Iterable[str]) -> str:

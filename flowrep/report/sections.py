@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, combinations, count, islice, product
-from string import ascii_uppercase
+from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +33,6 @@ INTERVALS = (
     "seed, or where all episodes end alike, Wilson's over the episodes"
 )
 _MOST_PAIRS = 15
-_MOST_LINES = 6  # in one panel of frame rates
 _ALL = "ego+obj+seg2+depth2"
 
 
@@ -469,19 +467,10 @@ def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
         f"Success over the frame rate of the evaluation, trained at {trained:g} frames per second, "
         f"{speed} speed, {policy} actions: {INTERVALS}. Points of one rate stand side by side."
     )
-    # the paper's figure, and another if there are more stacks than it can show
-    papers = [name for name in series if name in COMPLEMENTARY.stacks]
-    others = [name for name in series if name not in papers]
-    if len(series) <= _MOST_LINES or not papers:
-        papers, others = list(series), []
-    drawings = tuple(
-        Drawing(name, caption, tuple(replace(g, series=tuple(shown)) for g in grids), draw_rates)
-        for name, shown in (("frame_rate", papers), ("frame_rate_others", others))
-        if shown
-    )
+    drawing = Drawing("frame_rate", caption, tuple(grids), draw_rates)
     table = _rate_table(grids, caption, settings)
     title = "Sensitivity to the frame rate"
-    return Section("frame_rate", title, _what_is_missing(grids), drawings, (table,))
+    return Section("frame_rate", title, _what_is_missing(grids), (drawing,), (table,))
 
 
 def _rate_table(grids: Sequence[Grid], caption: str, settings: Settings) -> Table:
@@ -525,16 +514,16 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
 def _across(groups: Sequence[Group], settings: Settings) -> Iterator[Section]:
     """Yields the results of stacks in groups whose configs differ, side by side, not pooled."""
     keys = list(dict.fromkeys(key for group in groups for key in group.differences))
-    letters = _letters(len(groups))
+    numbers = [f"config {number}" for number in range(1, len(groups) + 1)]
     rows = tuple((key, *(_value(g.differences.get(key, ""), 24) for g in groups)) for key in keys)
     caption = "Keys of the configs in which the runs differ. No number is of runs of two columns."
     columns = tuple(range(1, len(groups) + 1))
-    table = Table("configs", caption, ("key", *letters), (("", rows),), words=columns)
+    table = Table("configs", caption, ("key", *numbers), (("", rows),), words=columns)
     variation = next((v for v in _VARIATIONS if all(k.startswith(v.prefix) for k in keys)), None)
     usable = [[r for r in g.runs if _unusable(r, settings) is None] for g in groups]
-    variants = [variation.variant_of(g.runs[0]) for g in groups] if variation else letters
+    variants = [variation.variant_of(g.runs[0]) for g in groups] if variation else numbers
     if len(set(variants)) < len(variants):  # two kinds of noise have no names
-        variation, variants = None, letters
+        variation, variants = None, numbers
     by_variant = dict(zip(variants, usable))
     order = in_order(variants, _FIRST) if variation else variants
     first, *others = order
@@ -567,9 +556,3 @@ def _across(groups: Sequence[Group], settings: Settings) -> Iterator[Section]:
 def _value(value: Any, most: int) -> str:
     text = str(value)
     return text if len(text) <= most else f"{text[: most - 4]} ..."
-
-
-def _letters(number: int) -> list[str]:
-    """Returns that many names: A to Z, AA, AB and so on."""
-    texts = (map("".join, product(ascii_uppercase, repeat=length)) for length in count(1))
-    return list(islice(chain.from_iterable(texts), number))

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.report.runs import Columns, Run
@@ -29,19 +28,12 @@ RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
 _MACHINE = ("commit", "precision", "cpu")
 
 
-EPISODE_COLUMNS: dict[str, type] = {
-    "scene": str,
-    "frames": int,
-    "evaluation": str,
-    "policy": str,
-    "speed": str,
-    "fps": float,
-    "episode_seed": int,
-    "outcome": str,
-    "hit": str,
-    "length": int,
-}
-"""The columns of evaluation.csv that a report reads."""
+_NUMBERS = {"frames": int, "fps": float, "episode_seed": int, "length": int}
+EPISODE_COLUMNS = (
+    "scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed",
+    "outcome", "hit", "length",
+)  # fmt: skip
+"""The columns of evaluation.csv that are packed; `scene_id` is empty in tables without it."""
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
@@ -66,11 +58,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
             continue
         configs = sorted(path for path in folder.rglob("config.yaml") if _is_of_a_run(path, folder))
         if not configs:
-            what = (
-                "holds no run: no config.yaml is in it or below"
-                if folder.is_dir()
-                else ("is a file" if folder.exists() else "does not exist")
-            )
+            what = "holds no run" if folder.exists() else "does not exist"
             raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
         for config in configs:
             key = str(config.parent.resolve())
@@ -95,32 +83,21 @@ def read_run(path: Path) -> Run:
         TableError: one of its tables is damaged.
     """
     folder = RunFolder.existing(path)
-    config = folder.read_config()
-    rows, metrics = folder.read_episodes(), folder.read_metrics()
+    config, tables = folder.read_config(), (folder.read_episodes(), folder.read_metrics())
+    (header, rows), (logged, metrics) = (
+        (list(table[0]) if table else [], [list(row.values()) for row in table]) for table in tables
+    )
     try:
-        episodes = columns_of((list(row.values()) for row in rows), list(rows[0]) if rows else ())
+        episodes, curves = _episodes(header, rows), _metrics(logged, metrics)
     except ValueError as error:
-        raise TableError(f"{folder.evaluation_path}: {error}; correct or delete the row") from None
+        raise TableError(f"{path}: a cell of its tables is damaged ({error})") from None
     try:
-        logged = {
-            name: np.array([float(row[name] or "nan") for row in metrics])
-            for name in (metrics[0] if metrics else ())
-        }
-    except ValueError as error:
-        raise TableError(f"{folder.metrics_path}: {error}; correct or delete the row") from None
-    machine = {key: str(config.get(key) or "unknown") for key in ("commit", "cpu")}
-    run = Run(str(path), config, episodes, logged, path, machine)
-    try:
-        episodes["path"] = drawn_paths(episodes["episode_seed"], len(run.paths))
-        # what every part of a report asks a run for
-        _ = run.settings, run.stack, run.scene.title(), run.fps, run.speed.title(), run.seed + 0
-        _ = run.is_finished
+        return Run(str(path), config, episodes, curves, path)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RunFolderError(
             f"{path}/config.yaml is not what a run leaves ({error!r}); restore the file that the "
             "run was started with"
         ) from None
-    return run
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
@@ -142,25 +119,17 @@ def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     return list(kept.values()), warnings
 
 
-def columns_of(rows: Iterable[Sequence[str]], header: Sequence[str]) -> Columns:
-    """Returns the episodes of rows of text as columns.
-
-    Raises:
-        ValueError: a cell is not of its column's kind.
-    """
-    cells = dict(zip(header, zip(*rows)))
+def _episodes(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Columns:
+    cells, empty = dict(zip(header, zip(*rows))), ("",) * len(rows)
     return {
-        name: np.array(cells.get(name, ()), dtype=kind) for name, kind in EPISODE_COLUMNS.items()
+        name: np.array(cells.get(name, empty), dtype=_NUMBERS.get(name, str))
+        for name in EPISODE_COLUMNS
     }
 
 
-def drawn_paths(episode_seeds: NDArray[Any], paths: int) -> NDArray[Any]:
-    """Returns the path of each episode: the first draw of its generator, as an episode makes it."""
-    if paths < 2:
-        return np.zeros(len(episode_seeds), int)
-    seeds, places = np.unique(episode_seeds, return_inverse=True)
-    drawn = [int(np.random.default_rng(int(seed)).integers(paths)) for seed in seeds]
-    return np.array(drawn, int)[places]
+def _metrics(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Columns:
+    cells = zip(header, zip(*rows))
+    return {name: np.array([float(cell or "nan") for cell in column]) for name, column in cells}
 
 
 def is_archive(folder: Path) -> bool:
@@ -169,20 +138,15 @@ def is_archive(folder: Path) -> bool:
 
 
 def read_archive(folder: Path) -> list[Run]:
-    """Returns the packed runs of a folder, without their training curves' losses."""
+    """Returns the packed runs of a folder, in the order of their names."""
     episodes, training = _read(folder / EPISODES), _read(folder / TRAINING)
     runs = []
     for line in (folder / RUNS).read_text(encoding="utf-8").splitlines():
         entry = json.loads(line)
-        header, rows = episodes.get(entry["run"], ((), []))
-        columns = columns_of(rows, header)
-        header, rows = training.get(entry["run"], ((), []))
-        cells = zip(header, zip(*rows))
-        metrics = {n: np.array([float(c or "nan") for c in column]) for n, column in cells}
+        name, empty = entry["run"], (list[str](), list[list[str]]())
+        columns = _episodes(*episodes.get(name, empty)), _metrics(*training.get(name, empty))
         machine = {key: entry[key] for key in _MACHINE}
-        run = Run(entry["run"], entry["config"], columns, metrics, machine=machine)
-        columns["path"] = drawn_paths(columns["episode_seed"], len(run.paths))
-        runs.append(run)
+        runs.append(Run(name, entry["config"], *columns, machine=machine))
     return runs
 
 
@@ -214,7 +178,7 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
 
 
 def _entry(name: str, run: Run) -> dict[str, Any]:
-    machine = {key: (run.machine or {}).get(key, "unknown") for key in _MACHINE}
+    machine = {key: run.machine.get(key, "unknown") for key in _MACHINE}
     return {"run": name, **machine, "config": run.config}
 
 

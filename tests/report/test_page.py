@@ -72,7 +72,6 @@ def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
             ("flow_composition", "flow_composition"),
             ("complementary", "complementary"),
             ("frame_rate", "frame_rate"),
-            ("frame_rate", "frame_rate_others"),
             ("learning_curves", "learning_curves"),
         )
         for kind in ("png", "pdf", "tex")
@@ -205,7 +204,7 @@ def test_a_browser_shows_the_page_on_wide_and_narrow_screens(page, tmp_path):
     for width in ("1400", "400"):
         seen = found[width]
         assert (seen["overflow"], seen["broken"], seen["fetched"]) == (0, 0, 0)
-        assert seen["images"] == 10  # five figures of two scenes
+        assert seen["images"] == 8  # four figures of two scenes
         assert seen["anchors"]
     assert found["1400"]["in_a_row"] == 2
     assert found["400"]["in_a_row"] == 1

@@ -9,9 +9,9 @@ pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.report import results
 from flowrep.report.results import Claim, Contrast, claims_of, one_way, rate_table, scores
-from flowrep.report.runs import Run
+from flowrep.report.runs import Run, drawn_paths
 from flowrep.report.statistics import Effect
-from flowrep.report.storage import columns_of, drawn_paths, read_archive
+from flowrep.report.storage import _episodes, read_archive
 from tests.report.folders import config_of, letters, rows_of
 
 DECLARED = yaml.safe_load(results.CLAIMS.read_text(encoding="utf-8"))
@@ -25,8 +25,7 @@ def run_of(name, ends, *, scene="straight_road", stack="ego+obj", seed=0, paths=
     for condition, outcomes in ends.items():
         where = {"speed": condition} if isinstance(condition, str) else {"fps": float(condition)}
         rows += rows_of(config, outcomes, **where)
-    episodes = columns_of(([str(c) for c in row.values()] for row in rows), list(rows[0]))
-    episodes["path"] = drawn_paths(episodes["episode_seed"], paths)
+    episodes = _episodes(list(rows[0]), [[str(c) for c in row.values()] for row in rows])
     return Run(name, config, episodes, {})
 
 

@@ -10,9 +10,9 @@ pytest.importorskip("scipy", reason="reports are an extra")
 from flowrep.report.outcomes import change, curve_of, outcomes_of, side_by_side
 from flowrep.report.runs import Condition
 from flowrep.report.sections import Settings, assemble
-from flowrep.report.statistics import Bootstrap, Estimate
+from flowrep.report.statistics import Bootstrap
 from flowrep.report.storage import read_runs
-from flowrep.report.tables import Table, percent, points
+from flowrep.report.tables import Table
 from tests.report.folders import config_of, rows_of, write_run
 
 ASK = Settings("greedy", Bootstrap(100))
@@ -165,14 +165,6 @@ def test_the_change_with_the_frame_rate_is_that_of_the_same_agents_and_episodes(
     assert lost.startswith("−75 [−100, ")
 
 
-def test_a_change_needs_seeds_and_episodes_in_common(tmp_path):
-    run_in(tmp_path, "a", {"low": "ss", "normal": "sc"})
-    (run,), _ = read_runs([tmp_path])
-    low, normal = outcomes_of([run], Condition("greedy", "low", 12.0)), outcomes_of([run], NORMAL)
-    np.testing.assert_array_equal(change(low, normal), [[0, -1]])
-    assert change(low, None) is None
-
-
 def test_a_run_that_drove_other_episodes_in_each_condition_is_no_part_of_a_change(tmp_path):
     # Seed 0 loses both of its episodes; seed 1 drove others at low speed. As a change of 0 it
     # would halve the loss.
@@ -197,21 +189,11 @@ def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):
     ]
     assert rows_in(found["configs"].tables[0]) == [("algorithm.tau", "0.02", "0.005")]
     success, differences = found["across_ego+obj"].tables
-    assert [(row[0], row[-1]) for row in rows_in(success)] == [("A", "1 × 4"), ("B", "1 × 4")]
-    assert [row[0] for row in rows_in(differences)] == ["B − A"]
-
-
-def test_after_26_configs_letters_are_doubled(tmp_path):
-    for number in range(28):
-        run_in(tmp_path, f"{number:02}", "s", algorithm__tau=number / 100)
-    found, _ = sections_of(tmp_path)
-    configs = found["configs"].tables[0]
-    ((_, *values),) = rows_in(configs)
-    assert (len(configs.header), len(values)) == (29, 28)
-    assert configs.header[25:] == ("Y", "Z", "AA", "AB")
-    assert values[26:] == ["0.26", "0.27"]
-    shown = [row[0] for row in rows_in(found["across_ego+obj"].tables[0])]
-    assert shown == list(configs.header[1:])
+    assert [(row[0], row[-1]) for row in rows_in(success)] == [
+        ("config 1", "1 × 4"),
+        ("config 2", "1 × 4"),
+    ]
+    assert [row[0] for row in rows_in(differences)] == ["config 2 − config 1"]
 
 
 def test_a_section_of_any_stack_has_the_name_of_a_folder(tmp_path):
@@ -292,11 +274,6 @@ def test_a_table_is_latex_that_compiles_and_csv_that_reads():
     assert r"    \multicolumn{2}{l}{\textit{S-Turn}} \\" in latex
     assert r"    c & $-$3 \\" in latex
     assert table.to_csv() == ("group,what,value (%)\nS-Turn,a_b,85 [79–90]\n,c,−3\n")
-
-
-def test_numbers_are_whole_percent_with_their_sign():
-    assert percent(Estimate(0.005, 0.0, 1.0)) == "0 [0–100]"
-    assert points(Estimate(-0.004, -0.126, 0.006)) == "0 [−13, +1]"
 
 
 NOISY = {"noise__depth_sigma_per_m": 0.002, "noise__drift_m": 0.02}

@@ -10,9 +10,9 @@ pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("shapely", reason="a path is the first draw of an episode")
 
 from flowrep.experiment.run import RunFolderError
+from flowrep.report.runs import drawn_paths
 from flowrep.report.storage import (
     EPISODES,
-    drawn_paths,
     read_run,
     read_runs,
     without_repeats,
@@ -66,7 +66,7 @@ def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, te
     (run_in(tmp_path, "bad", seed=1) / file).write_text(text)
     runs, (warning,) = read_runs([tmp_path])
     assert names(runs) == ["good"]
-    assert "bad/" in warning
+    assert "/bad" in warning
     assert expected in warning
     assert "\n" not in warning
 
@@ -79,7 +79,7 @@ def test_a_cell_that_no_episode_can_have_is_one_line(tmp_path, column, value):
     write_run(tmp_path / "bad", config, [*rows, first | {column: value}])
     runs, (warning,) = read_runs([tmp_path])
     assert names(runs) == ["good"]
-    assert "bad/evaluation.csv" in warning
+    assert "/bad" in warning
 
 
 @pytest.mark.parametrize("key", ["speed", "scene__name", "scene__frame_rate_hz", "total_frames"])
@@ -130,7 +130,7 @@ def test_packed_runs_are_the_runs_of_the_folders(tmp_path):
     assert ([run.name for run in packed], warnings) == (["a", "b"], [])
     same(folders[0], packed[0])
     same(folders[1], packed[1])
-    assert packed[0].machine == {"commit": "unknown", "precision": "unknown", "cpu": "unknown"}
+    assert set(packed[0].machine.values()) == {"unknown"}
 
 
 def test_packing_again_adds_and_replaces_and_gives_the_same_bytes(tmp_path):
