@@ -152,14 +152,13 @@ def training(
 def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, float], list[str]]:
     """Trains as `python -m flowrep.train` does, without evaluations."""
     from hydra import compose, initialize_config_dir
-    from omegaconf import OmegaConf
 
-    from flowrep.config.command_line import register_resolvers
-    from flowrep.config_tree import CONF_DIR
+    from flowrep.config import CONF_DIR
+    from flowrep.config.cli import plain_config, register_resolvers
+    from flowrep.config.schema import TrainConfig, validated
     from flowrep.experiment.run import RunFolder
-    from flowrep.experiment.runner import train
+    from flowrep.experiment.runner import Runner
     from flowrep.progress import StopRequest
-    from flowrep.train import make_training
 
     register_resolvers()
     size = ["debug=smoke"] if quick else ["preset=paper", "total_frames=20_000"]
@@ -168,19 +167,21 @@ def simulated_training(device: torch.device, quick: bool) -> tuple[tuple[int, fl
     cadence = [f"evaluation.every_frames={total // 2}", "checkpoint_every_frames=1_000_000_000"]
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         composed = compose("train", [*size, *cadence, f"device={device}"])
-    config: Any = OmegaConf.to_container(composed, resolve=True)
+    config = validated(TrainConfig, plain_config(composed))
     marks: list[tuple[int, float]] = []
 
-    def mark(frames: int) -> bool:
-        marks.append((frames, finish(device)))
-        return False
+    class Marked(Runner):
+        def evaluate(self, kind: str, stop: StopRequest) -> bool:
+            marks.append((self.frames, finish(device)))
+            return True
 
     with tempfile.TemporaryDirectory() as folder:
-        run = make_training(config, RunFolder(Path(folder)))
+        runner = Marked(config, RunFolder(Path(folder)))
         try:
-            clock = train(run, config, StopRequest(), mark)
+            runner.train(StopRequest())
         finally:
-            run.env.close()
+            runner.close()
+        clock = runner.clock
     (frames, start), (last, end) = marks[0], marks[-1]
     shares = "of the host's time; kernels that nobody waited for count where somebody did"
     return (last - frames, end - start), [f"{clock.summary()} ({shares})."]

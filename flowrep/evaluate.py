@@ -2,46 +2,32 @@
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from flowrep.console import prepare
 from flowrep.extras import require
 
-if __name__ == "__main__":
-    prepare()
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
-import hydra
-from omegaconf import DictConfig
-
 from flowrep.agent import CheckpointError
-from flowrep.config import UsageError, validated
-from flowrep.config.command_line import (
-    EXIT_USAGE,
-    exit_with,
-    folder_name,
-    own_keys,
-    plain_config,
-    print_error,
-    run_command,
-)
-from flowrep.config.evaluating import EvaluateConfig
-from flowrep.config_tree import CONF_DIR
+from flowrep.config import UsageError
+from flowrep.config.cli import EXIT_USAGE, folder_name, print_error, run_command
+from flowrep.config.schema import EvaluateConfig
 from flowrep.envs import WorkerError
-from flowrep.exchange.policies import ForeignPolicy, PolicyError, is_reference
+from flowrep.exchange.policies import ForeignPolicy, PolicyError
+from flowrep.experiment import build
 from flowrep.experiment.comparison import Comparison, Row, print_table
 from flowrep.experiment.failures import print_failures, write_failures
 from flowrep.experiment.run import RunFolder
-from flowrep.from_config import Config, arena_from_config, env_from_config
 from flowrep.progress import StopRequest
 from flowrep.subjects import Subject, load_own, load_subject
 from flowrep.viz.film import record_episode
 
+Config = Mapping[str, Any]
 MISTAKES = (
     UsageError,
     CheckpointError,
@@ -53,19 +39,12 @@ MISTAKES = (
 )
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="evaluate")
-def run(config: DictConfig) -> None:
+def run(config: EvaluateConfig) -> None:
     """Runs episodes of saved agents and of baselines, prints tables and saves the rows."""
-    try:
-        asked = plain_config(config)
-        validated(EvaluateConfig, asked, own_keys())
-        own = [name for name in as_list(asked["policy"]) if is_reference(name)]
-        if own:
-            evaluate_own(asked, own)
-            return
-        evaluate(asked, runs_in(as_list(asked["run"])))
-    except MISTAKES as error:
-        exit_with(error)
+    if config.own_policies:
+        evaluate_own(config.plain(), config.own_policies)
+    else:
+        evaluate(config.plain(), runs_in(config.run or []))
 
 
 def runs_in(paths: Sequence[str]) -> list[RunFolder]:
@@ -92,7 +71,7 @@ def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
     with ExitStack() as locks:
         by_street: dict[str, list[Subject]] = {}
         for subject in load_subjects(asked, runs, locks):
-            street = json.dumps([subject.config[key] for key in ("scene", "renderer")])
+            street = json.dumps([subject.config.scene, subject.config.renderer])
             by_street.setdefault(street, []).append(subject)
         with StopRequest() as stop:
             for group in by_street.values():
@@ -148,8 +127,8 @@ def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> li
             subject.save(subject.rows(comparison, number))
 
     config = subjects[0].config
-    num_envs = min(comparison.rides, config["num_envs"])
-    arena = arena_from_config(config, [subject.agent for subject in subjects], num_envs)
+    num_envs = min(comparison.rides, config.num_envs)
+    arena = build.arena(config, [subject.agent for subject in subjects], num_envs)
     with closing(arena):
         try:
             comparison.run(arena, lambda: bool(stop), save)
@@ -228,7 +207,7 @@ def load_subjects(asked: Config, runs: Sequence[RunFolder], locks: ExitStack) ->
 def film(asked: Config, subject: Subject, stop: StopRequest) -> None:
     """Writes `video` episodes for each speed and frame rate, until a stop is asked for."""
     config, run = subject.config, subject.run
-    name = config["scene"]["name"]
+    name = config.scene["name"]
     where = "" if name == subject.trained_in else f"{name}_"
     for speed, rate in product(as_list(asked["speed"]), as_list(asked["fps"])):
         for number in range(asked["video"]):
@@ -236,8 +215,8 @@ def film(asked: Config, subject: Subject, stop: StopRequest) -> None:
                 return
             episode_seed = (asked["seed"] + number) % (1 << 31)
             path = run.video_path(f"{where}{speed}_{rate:g}fps_{episode_seed}")
-            make = partial(env_from_config, config, speed=speed, frame_rate_hz=float(rate))
-            seen, policy = config["representations"], subject.agent.policy
+            make = partial(build.env, config, speed=speed, frame_rate_hz=float(rate))
+            seen, policy = config.representations, subject.agent.policy
             if isinstance(policy, ForeignPolicy):
                 policy = policy.alone()
             record_episode(make, policy, seen, path, episode_seed=episode_seed)

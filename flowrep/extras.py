@@ -2,6 +2,7 @@
 
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 
 def is_installed(package: str) -> bool:
@@ -27,6 +28,6 @@ def require(what: str, extra: str, *packages: str, module: str = "") -> None:
     for package in packages:
         if not is_installed(package):
             message = f"{what} needs {package}; run: pip install 'flowrep[{extra}]'"
-            if module == "__main__":
+            if module == "__main__" or Path(sys.argv[0]).name.startswith("flowrep-"):
                 sys.exit(f"error: {message}")
             raise ImportError(message)

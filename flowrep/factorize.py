@@ -7,22 +7,16 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from flowrep.console import prepare
 from flowrep.extras import require
 
-if __name__ == "__main__":
-    prepare()
 require("factorising", "factorize", "cv2", "hydra", "imageio", "pydantic", "tqdm", module=__name__)
 
 import cv2
-import hydra
 from hydra.utils import get_class
-from omegaconf import DictConfig
 
-from flowrep.config import UsageError, validated
-from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
-from flowrep.config.factorizing import FactorizeConfig
-from flowrep.config_tree import CONF_DIR
+from flowrep.config import UsageError
+from flowrep.config.cli import exit_with, run_command
+from flowrep.config.schema import FactorizeConfig, check_options
 from flowrep.sequences import (
     EstimatedFlowSource,
     Recording,
@@ -40,19 +34,12 @@ from flowrep.transforms import EstimatedFlow
 MISTAKES = (SequenceError, ValueError, ImportError, OSError)
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="factorize")
-def run(config: DictConfig) -> None:
+def run(config: FactorizeConfig) -> None:
     """Writes raw, ego and object flow of a recording."""
     # OpenCV's messages about broken files would clutter the one-line error.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        settings = plain_config(config)
-        validated(FactorizeConfig, settings, own_keys())
-        code = factorize_recording(settings)
-    except UsageError as error:
-        exit_with(error)
-    except BrokenPipeError as error:
-        exit_with(error)
+        code = factorize_recording(config.plain())
     except MISTAKES as error:
         exit_with(" ".join(str(error).split()))
     sys.exit(code)
@@ -109,6 +96,7 @@ def open_stream(settings: dict[str, Any]) -> Stream:
     format_options = dict(settings["format"])
     target = get_class(format_options.pop("_target_"))
     source = str(settings["input"])
+    check_options(target, format_options, "format")
     if issubclass(target, Recording) and not Path(source).is_dir():
         raise SequenceError(source, "no such folder")
     return target(source, **format_options)

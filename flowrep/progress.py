@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
@@ -15,13 +15,16 @@ class StopRequest:
     The first signal sets `received`. Another Ctrl-C ends the process at once; another SIGTERM
     doesn't, since schedulers send it to each process of a job and more than once. Use it as a
     context manager; the previous handlers are restored on exit.
+
+    Args:
+        then: called once, by the first signal.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-    def __init__(self) -> None:
-        """Starts without a signal; handlers are installed on entering."""
+    def __init__(self, then: Callable[[], Any] = lambda: None) -> None:
         self.received: signal.Signals | None = None
+        self._then = then
         self._previous: dict[signal.Signals, Any] = {}
 
     @property
@@ -44,7 +47,9 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _receive(self, number: int, _: FrameType | None) -> None:
-        self.received = self.received or signal.Signals(number)
+        if self.received is None:
+            self.received = signal.Signals(number)
+            self._then()
         signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
 
 

@@ -1,7 +1,7 @@
 """Agents to evaluate, with what they see: those of runs, and policies of the user's own."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,19 +10,18 @@ from torchrl.data import Composite
 
 from flowrep.agent import CheckpointError, load_checkpoint
 from flowrep.config import UsageError
-from flowrep.config.command_line import folder_name
-from flowrep.config.run_names import OF_THE_MACHINE
-from flowrep.config.training import validated_run
-from flowrep.config.violations import shown
+from flowrep.config.cli import OF_THE_MACHINE, folder_name
+from flowrep.config.schema import EnvConfig, Noise, validated, validated_run
 from flowrep.envs import street_envs
 from flowrep.exchange.cards import check_card
 from flowrep.exchange.policies import Task, load_policy
+from flowrep.experiment import build
 from flowrep.experiment.arena import Agent
 from flowrep.experiment.comparison import Comparison, Row, with_origin
 from flowrep.experiment.row_meanings import keep, known, maps_file, scene_file
 from flowrep.experiment.run import Rows, RunFolder, check_origin, differences, origin_of
-from flowrep.from_config import Config, choose_device, env_from_config, policy_from_config
 
+Config = Mapping[str, Any]
 OF_THE_EVALUATION = (*OF_THE_MACHINE, "num_envs")  # not of the run
 
 
@@ -41,7 +40,7 @@ class Subject:
     """
 
     run: RunFolder
-    config: Config
+    config: EnvConfig
     agent: Agent
     frames: int
     table: Rows
@@ -50,7 +49,7 @@ class Subject:
 
     def rows(self, comparison: Comparison, number: int) -> list[Row]:
         """Returns the rows of its episodes so far; `number` is its number in the comparison."""
-        return with_origin(comparison.rows(number), self.config, self.frames, "evaluate")
+        return with_origin(comparison.rows(number), self.config.plain(), self.frames, "evaluate")
 
     def save(self, rows: Sequence[Row]) -> None:
         """Saves rows, with the scene and the maps that they name unless the run's config has them.
@@ -58,11 +57,11 @@ class Subject:
         Raises:
             OSError: they can't be written.
         """
-        scene = self.config["scene"]
+        scene = self.config.scene
         if rows and scene["name"] != self.trained_in:
             keep(scene_file(self.run, scene["name"]), scene)
         if rows and self.policy is not None:
-            keep(maps_file(self.run, folder_name(self.policy)), maps_of(self.config))
+            keep(maps_file(self.run, folder_name(self.policy)), maps_of(self.config.plain()))
         self.run.save_episodes(rows, self.table)
 
 
@@ -78,27 +77,26 @@ def load_subject(asked: Config, run: RunFolder) -> Subject:
     table = run.read_episodes()
     path = run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
-    check_origin(state["origin"], origin_of(own), path)
+    check_origin(state["origin"], origin_of(own.plain()), path)
     here = {key: asked[key] for key in OF_THE_EVALUATION}
     scene = asked.get("scene")
     if scene is not None:  # the agent keeps its camera in other scenes
-        here["scene"] = scene | {"camera": own["scene"]["camera"]}
-    config = own | here
-    check_scene(run, config["scene"], table, own=own["scene"])
-    env = env_from_config(config, num_envs=1, num_workers=0)
-    policy = policy_from_config(config, env, trust=config["trust"])
+        here["scene"] = scene | {"camera": own.scene["camera"]}
+    config = own.model_copy(update=here)
+    check_scene(run, config.scene, table, own=own.scene)
+    env = build.env(config, num_envs=1, num_workers=0)
+    policy = build.policy(config, env)
     env.close()
     try:
         policy.load_state_dict(state["policy"])
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise CheckpointError(
-            f"the agent of {run.path} can't look at scene '{config['scene']['name']}', which has "
+            f"the agent of {run.path} can't look at scene '{config.scene['name']}', which has "
             f"other classes than its own ({reason})"
         ) from error
-    device = choose_device(config["device"])
-    agent = Agent.from_config(policy, config, device)
-    return Subject(run, config, agent, state["frames"], table, own["scene"]["name"])
+    agent = Agent.from_config(policy, config, build.device(config.device))
+    return Subject(run, config, agent, state["frames"], table, own.scene["name"])
 
 
 def check_scene(run: RunFolder, asked: Config, table: Rows, own: Config | None = None) -> None:
@@ -120,7 +118,7 @@ def check_scene(run: RunFolder, asked: Config, table: Rows, own: Config | None =
         before = known(scene_file(run, name))
     for place, there, here in differences(before or asked, asked, "scene"):
         raise UsageError(
-            f"in {run.path} scene '{name}' has {place}={shown(there)}, and rows with {shown(here)} "
+            f"in {run.path} scene '{name}' has {place}={there}, and rows with {here} "
             "would be taken for the same scene: give this one another name with scene.name="
             f"{', or leave scene= out' if before is own else ''}"
         )
@@ -145,8 +143,8 @@ def check_maps(folder: RunFolder, config: Config, policy: str, table: Rows) -> N
     asked = json.loads(json.dumps(maps_of(config)))
     for place, there, here in differences(known(path) or asked, asked):
         raise UsageError(
-            f"the rows of {policy} in {folder.path} have {place}={shown(there)}, and rows with "
-            f"{shown(here)} would be taken for the same: give these another folder with output="
+            f"the rows of {policy} in {folder.path} have {place}={there}, and rows with "
+            f"{here} would be taken for the same: give these another folder with output="
         )
 
 
@@ -158,19 +156,20 @@ def load_own(asked: Config, name: str, folder: RunFolder) -> Subject:
         UsageError, RunFolderError: as `check_scene` and `check_maps`.
     """
     table = folder.read_episodes()
-    config = {key: asked[key] for key in (*OF_THE_EVALUATION, "scene", "representations")}
-    config |= {"flow": asked.get("flow") or {"source": "exact"}, "noise": asked.get("noise")}
-    config |= {"renderer": "auto"}
-    config |= {"speed": "normal", "seed": ""}  # of its training, which is unknown
-    check_scene(folder, config["scene"], table)
-    check_maps(folder, config, name, table)
-    env = env_from_config(config, num_envs=1, num_workers=0)
-    device = choose_device(config["device"])
+    plain = {key: asked[key] for key in (*OF_THE_EVALUATION, "scene", "representations")}
+    plain |= {"flow": asked.get("flow") or {"source": "exact"}, "renderer": "auto"}
+    plain["noise"] = asked.get("noise") or dict.fromkeys(Noise.key_names(), 0.0)
+    plain |= {"speed": "normal", "seed": 0}  # of its training, which is unknown
+    config = validated(EnvConfig, plain)
+    check_scene(folder, config.scene, table)
+    check_maps(folder, config.plain(), name, table)
+    env = build.env(config, num_envs=1, num_workers=0)
+    device = build.device(config.device)
     task = Task(
-        scene=config["scene"]["name"],
-        representations=config["representations"],
+        scene=config.scene["name"],
+        representations=config.representations,
         observation_spec=Composite(
-            {name: env.observation_spec[name][0] for name in config["representations"]}
+            {name: env.observation_spec[name][0] for name in config.representations}
         ),
         action_spec=env.action_spec[0],
         intrinsics=torch.from_numpy(street_envs(env)[0].K),

@@ -3,60 +3,38 @@
 import csv
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 
 class TableError(ValueError):
-    """A table was changed or damaged; the message says where, and what to do."""
+    """A table is not what was written; the message says where, and what to do."""
 
 
-def read_rows(path: Path, columns: Sequence[str] | None = None) -> list[dict[str, str]]:
+def read_rows(path: Path, columns: Iterable[str] = ()) -> list[dict[str, str]]:
     """Returns a table's rows, none if there is no file; an incomplete last line is left out.
 
     Args:
         path: the table, as `append_rows` writes it.
-        columns: exactly the columns that it should have, in any order; None for any.
+        columns: those that it must have, among others.
 
     Raises:
-        TableError: another program changed it, such as a spreadsheet.
+        TableError: it lacks one, as after a spreadsheet saved it with semicolons.
     """
     if not path.is_file():
         return []
     data = path.read_bytes()
-    try:
-        text = data[: data.rfind(b"\n") + 1].decode("utf-8-sig")
-        lines = csv.reader(io.StringIO(text, newline=""), strict=True)
-        names = next(lines, None)
-        if names is None:
-            return []
-        _check_columns(path, names, columns)
-        rows = []
-        for cells in lines:
-            if len(cells) != len(names):
-                raise TableError(
-                    f"{path}, line {lines.line_num}: {len(cells)} cells in a table of "
-                    f"{len(names)} columns; correct or delete the line"
-                )
-            rows.append(dict(zip(names, cells)))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise TableError(f"{path} is no CSV table in UTF-8 ({error}); {_ASIDE}") from error
+    text = data[: data.rfind(b"\n") + 1].decode("utf-8-sig", errors="replace")
+    table = csv.DictReader(io.StringIO(text, newline=""))
+    rows = list(table)
+    missing = [name for name in columns if name not in (table.fieldnames or ())]
+    if rows and (missing or any(None in row.values() or None in row for row in rows)):
+        raise TableError(
+            f"{path} lacks {', '.join(missing) or 'cells in a line'}: perhaps another program or "
+            "version wrote it; move it aside, or export it again with commas"
+        )
     return rows
-
-
-_ASIDE = "move it aside, or export it again with commas"
-
-
-def _check_columns(path: Path, names: Sequence[str], columns: Sequence[str] | None) -> None:
-    if columns is None or sorted(names) == sorted(columns):
-        return
-    missing, unknown = set(columns) - set(names), set(names) - set(columns)
-    what = f"lacks the columns {', '.join(sorted(missing))}" if missing else ""
-    if unknown or not missing:
-        what += " and " if what else ""
-        what += f"has unexpected ones: {', '.join(sorted(unknown) or names)}"
-    raise TableError(f"{path} {what}. Perhaps another program or version wrote it; {_ASIDE}")
 
 
 def is_whole(path: Path) -> bool:

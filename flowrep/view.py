@@ -4,74 +4,61 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from flowrep.console import prepare
 from flowrep.extras import require
 
-if __name__ == "__main__":
-    prepare()
 require("viewing", "train", "hydra", "pydantic", module=__name__)
 
-import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from tqdm.auto import tqdm
 
 from flowrep.baselines import BASELINES
-from flowrep.config import UsageError, validated
-from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
-from flowrep.config.viewing import ViewConfig
-from flowrep.config_tree import CONF_DIR
+from flowrep.config import UsageError
+from flowrep.config.cli import run_command
+from flowrep.config.schema import ViewConfig
 from flowrep.envs import StreetEnv
 from flowrep.envs.sensing import SENSORS
 from flowrep.experiment.viewing import CategoryCount, Viewed, view_episode
-from flowrep.scenes import SceneError, load_scene
+from flowrep.scenes import load_scene
 from flowrep.scenes.layout import Layout
 from flowrep.tables import append_rows
 from flowrep.viz import contact_sheet, representation_strip, write_png, write_video
 from flowrep.viz.film import Maps, maps_of
 from flowrep.viz.plan import Track, draw_plan
-from flowrep.viz.window import KeyboardDriver, NoScreenError, drive_by_hand
+from flowrep.viz.window import KeyboardDriver, drive_by_hand
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="view")
-def run(config: DictConfig) -> None:
+def run(config: ViewConfig) -> None:
     """Writes pictures, a video and tables of the scene, or opens a window on it."""
-    try:
-        check(config)
-        scene = OmegaConf.to_container(config.scene, resolve=True)
-        street: dict[str, Any] = {
-            "scene": scene,
-            "speed": config.speed,
-            "frame_rate_hz": config.frame_rate_hz,
-        }
-        if config.interactive:
-            env = StreetEnv(**street, sensors=SENSORS)
-            drive_by_hand(KeyboardDriver(env, seed=config.seed, path=config.path))
-        else:
-            look_at(config, street, Path(HydraConfig.get().runtime.output_dir))
-    except (UsageError, SceneError, NoScreenError, ValueError, OSError) as error:
-        exit_with(error)
+    check(config)
+    street: dict[str, Any] = {
+        "scene": config.scene,
+        "speed": config.speed,
+        "frame_rate_hz": config.frame_rate_hz,
+    }
+    if config.interactive:
+        env = StreetEnv(**street, sensors=SENSORS)
+        drive_by_hand(KeyboardDriver(env, seed=config.seed, path=config.path))
+    else:
+        look_at(config, street, Path(HydraConfig.get().runtime.output_dir))
 
 
-def check(config: DictConfig) -> None:
-    """Checks the config.
+def check(config: ViewConfig) -> None:
+    """Checks that the scene is valid and has the path.
 
     Raises:
-        UsageError: if a key is unknown or a value invalid.
-        SceneError: if the scene is invalid.
+        UsageError: it has no such path.
+        SceneError: the scene is invalid.
     """
-    plain = plain_config(config)
-    validated(ViewConfig, plain, own_keys())
-    paths = [path.name for path in load_scene(plain["scene"]).paths]
-    if plain["path"] not in (*paths, None):
-        raise UsageError(f"path should be {', '.join(paths)} or null, not '{plain['path']}'")
+    paths = [path.name for path in load_scene(config.scene).paths]
+    if config.path not in (*paths, None):
+        raise UsageError(f"path should be {', '.join(paths)} or null, not '{config.path}'")
 
 
-def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
+def look_at(config: ViewConfig, street: dict[str, Any], folder: Path) -> None:
     """Drives the episodes and writes their pictures, plan, video and tables."""
     frames, first, counts, fps = film(config, street)
     others = drive_on(config, street, config.episodes - 1)
@@ -100,7 +87,7 @@ def look_at(config: DictConfig, street: dict[str, Any], folder: Path) -> None:
 
 
 def film(
-    config: DictConfig, street: dict[str, Any]
+    config: ViewConfig, street: dict[str, Any]
 ) -> tuple[list[Maps], Viewed, CategoryCount, float]:
     """Returns the first episode's maps, the drive, its category counts and its frame rate."""
     env = StreetEnv(**street, sensors=SENSORS)
@@ -120,7 +107,7 @@ def film(
     return frames, first, counts, env.frame_rate_hz
 
 
-def drive_on(config: DictConfig, street: dict[str, Any], episodes: int) -> list[Viewed]:
+def drive_on(config: ViewConfig, street: dict[str, Any], episodes: int) -> list[Viewed]:
     """Returns the episodes after the first, driven without rendering."""
     env, baseline = StreetEnv(**street, sensors=()), BASELINES[config.policy]()
     env.reset(seed=config.seed)

@@ -9,8 +9,9 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
-from flowrep.config.command_line import register_resolvers
-from flowrep.config_tree import CONF_DIR, config_groups, group_choices
+from flowrep.config import CONF_DIR, config_groups, group_choices
+from flowrep.config.cli import register_resolvers
+from flowrep.config.schema import TrainConfig, validated
 
 pytest.importorskip("pybullet", reason="composed configs are built into environments")
 
@@ -30,13 +31,13 @@ GROUP_FILES = [(group, name) for group in GROUPS for name in group_choices(group
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
 def test_every_choice_builds_an_env_and_an_agent_that_act(group, name):
-    from flowrep.from_config import agent_from_config, env_from_config
+    from flowrep.experiment import build
 
     choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
     small = [] if group == "debug" else ["num_envs=1", "algorithm.batch_size=16"]
-    config = composed(choice, *small, "device=cpu")
-    env = env_from_config(config)
-    agent = agent_from_config(config, env)
+    config = validated(TrainConfig, composed(choice, *small, "device=cpu"))
+    env = build.env(config)
+    agent = build.agent(config, env)
     action = agent.policy(env.reset())["action"]
     env.close()
     assert action.shape == env.batch_size
@@ -53,11 +54,6 @@ def test_an_algorithm_spells_out_every_option_of_its_class_with_its_default(name
     options = composed(f"algorithm={name}")["algorithm"]
     parameters = get_class(options.pop("_target_")).options()
     assert options == {name: parameter.default for name, parameter in parameters.items()}
-
-
-def test_representations_keep_the_order_of_the_command_line():
-    config = composed("representations=[seg2,ego,obj]")
-    assert list(config["representations"]) == ["seg2", "ego", "obj"]
 
 
 def test_the_default_is_the_papers_table_ii():
@@ -124,14 +120,15 @@ def test_the_longer_presets_change_laptop_in_the_documented_keys():
 def test_workers_step_environments_where_cores_are_free(
     monkeypatch, cores, device, change, workers
 ):
-    from flowrep import from_config
+    from flowrep.experiment import build
 
     pytest.importorskip("numba", reason="without it PyBullet always renders")
     made = Mock()
-    monkeypatch.setattr(from_config, "make_env", made)
-    monkeypatch.setattr(from_config, "available_cores", lambda: cores)
-    monkeypatch.setattr(from_config, "choose_device", torch.device)
-    from_config.env_from_config(composed(change, "num_envs=4", f"device={device}"))
+    monkeypatch.setattr(build, "make_env", made)
+    monkeypatch.setattr(build, "available_cores", lambda: cores)
+    monkeypatch.setattr(build, "device", torch.device)
+    config = composed(change, "num_envs=4", "algorithm.batch_size=64", f"device={device}")
+    build.env(validated(TrainConfig, config))
     assert made.call_args.kwargs["num_workers"] == workers
 
 
@@ -143,23 +140,14 @@ def flat(config, prefix=""):
     return leaves
 
 
-def test_run_folders_are_named_by_scene_representations_and_seed():
-    register_resolvers()
-    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        config = compose("train", ["representations=[ego,obj]", "seed=3"], return_hydra_config=True)
-        noisy = compose("train", ["noise=depth_camera"], return_hydra_config=True)
-    assert config.hydra.run.dir.endswith("_straight_road_ego+obj_s3")
-    assert noisy.hydra.run.dir.endswith("_straight_road_ego+obj_noisy_s0")
-
-
 def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
-    from flowrep.from_config import env_from_config
+    from flowrep.experiment import build
 
     crossroads = CONF_DIR.parent / "tests" / "scenes" / "crossroads.yaml"
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "mine.yaml").write_text(crossroads.read_text())
     config = composed(f"hydra.searchpath=[file://{tmp_path}]", "scene=mine", "num_envs=1")
-    env = env_from_config(config, device="cpu")
+    env = build.env(validated(TrainConfig, config), device="cpu")
     assert env.rollout(2)["ego"].shape == (1, 2, 2, 40, 60)
     env.close()
 

@@ -16,20 +16,20 @@ pytest.importorskip("pybullet", reason="agents are evaluated in the simulated st
 from flowrep.agent import CheckpointError
 from flowrep.baselines import Drive
 from flowrep.config import UsageError
+from flowrep.config.schema import EvaluateConfig, validated, validated_run
 from flowrep.envs import WorkerError, make_env, street_envs
 from flowrep.evaluate import evaluate, runs_in
 from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.evaluation import Episode
 from flowrep.experiment.run import RunFolder, RunFolderError
-from flowrep.experiment.runner import train
+from flowrep.experiment.runner import Runner
 from flowrep.export import export
 from flowrep.progress import StopRequest
 from flowrep.subjects import Subject, load_subject
 from flowrep.tables import TableError
-from flowrep.train import make_training
 from flowrep.viz.curves import _evaluated
 from flowrep.viz.film import film_episode
-from tests.test_configs import composed
+from tests.config.composing import composed, plain
 
 pytestmark = pytest.mark.slow
 
@@ -42,15 +42,16 @@ def trained(path, *overrides):
         "debug=smoke", "total_frames=64", "device=cpu", "evaluation.every_frames=1000", *overrides
     )
     run = RunFolder(path)
-    run.write_config(config)
-    training = make_training(config, run)
-    train(training, config, StopRequest(), lambda frames: False)
-    training.env.close()
+    run.write_config(config.plain())
+    runner = Runner(config, run)
+    runner.train(StopRequest())
+    runner.close()
     return run
 
 
 def asked(run, *overrides):
-    return composed(f"run={run.path}", *QUICK, *overrides, name="evaluate")
+    config = plain("evaluate", f"run={run.path}", *QUICK, *overrides)
+    return validated(EvaluateConfig, config).plain()
 
 
 def rows_of(run):
@@ -181,8 +182,8 @@ def offsets_in(data):
 
 READERS = {
     "evaluate": lambda run: evaluate(asked(run), [run]),
-    "export": lambda run: export(composed(f"run={run.path}", name="export"), run),
-    "resume": lambda run: make_training(run.read_config() | {"resume": str(run.path)}, run),
+    "export": export,
+    "resume": lambda run: Runner(validated_run(run.read_config(), "config.yaml"), run).load(),
 }
 
 
@@ -204,7 +205,7 @@ def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypa
     run = untouched
     run.evaluation_path.write_text("scene;fps\nstraight_road;12\n")
     monkeypatch.setattr("flowrep.evaluate.compare", lambda *_: pytest.fail("too late"))
-    with pytest.raises(TableError, match="lacks the columns"):
+    with pytest.raises(TableError, match="lacks"):
         evaluate(asked(run), [run])
 
 
@@ -237,10 +238,9 @@ def some(tmp_path, monkeypatch):
                 raise CheckpointError(f"no checkpoint in {run.path}")
             return Subject(run, config, None, 64, run.read_episodes())
 
-        same = {"representations": {"obj": {}}, "flow": {"source": "exact"}, "renderer": "auto"}
-        config = same | {"scene": {"name": "s_turn"}, "seed": 0, "num_envs": 2}
+        config = composed("representations=[obj]", "scene=s_turn")
         monkeypatch.setattr("flowrep.evaluate.load_subject", load)
-        monkeypatch.setattr("flowrep.evaluate.arena_from_config", lambda *_: arena or SomeArena())
+        monkeypatch.setattr("flowrep.experiment.build.arena", lambda *_: arena or SomeArena())
         return [RunFolder(tmp_path / name) for name in names]
 
     return make
@@ -273,17 +273,6 @@ def test_a_run_that_can_not_be_saved_costs_no_other_its_episodes(some, capsys):
     said = capsys.readouterr()
     assert f"error: {runs[0].path}: " in said.err
     assert f"2 episodes are in {runs[1].evaluation_path}" in said.out
-
-
-def test_all_is_saved_before_the_first_line_is_printed(some, monkeypatch):
-    def closed(*_):
-        raise BrokenPipeError
-
-    runs = some("good_1", "good_2")
-    monkeypatch.setattr("flowrep.evaluate.print_table", closed)
-    with pytest.raises(BrokenPipeError):
-        evaluate(asked(runs[0]), runs)
-    assert len(rows_of(runs[0])) == len(rows_of(runs[1])) == 2
 
 
 def test_a_run_that_can_not_be_evaluated_is_named_and_the_others_are(some, capsys):

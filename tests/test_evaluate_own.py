@@ -9,10 +9,11 @@ import pytest
 pytest.importorskip("pybullet", reason="agents are evaluated in the simulated street")
 
 from flowrep.config import UsageError
+from flowrep.config.schema import EvaluateConfig, validated
 from flowrep.evaluate import evaluate, evaluate_own
 from flowrep.exchange.policies import PolicyError
 from flowrep.export import export
-from tests.test_configs import composed
+from tests.config.composing import plain
 from tests.test_evaluate import trained
 
 pytestmark = pytest.mark.slow
@@ -22,8 +23,8 @@ QUICK = ["speed=normal", "num_workers=0", "num_envs=2", "device=cpu", "scene=str
 
 
 def own(name, output, *overrides):
-    asked = composed(f"output={output}", *QUICK, *overrides, name="evaluate")
-    evaluate_own(asked, [name])
+    config = plain("evaluate", f"output={output}", f"policy='{name}'", *QUICK, *overrides)
+    evaluate_own(validated(EvaluateConfig, config).plain(), [name])
     with (output / "evaluation.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -99,11 +100,10 @@ def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
     given = ["algorithm.precision=fp32", "representations=[ego,obj]"]
     run = trained(tmp_path / "run", *given)
     quick = ["speed=normal", "num_workers=0", "num_envs=2", "device=cpu"]
-    evaluate(
-        composed(f"run={run.path}", *quick, "episodes=3", "baselines=[]", name="evaluate"), [run]
-    )
+    asked = plain("evaluate", f"run={run.path}", *quick, "episodes=3", "baselines=[]")
+    evaluate(validated(EvaluateConfig, asked).plain(), [run])
     mine = episodes(run.read_episodes(), "greedy")
-    folder = export(composed(f"run={run.path}", name="export"), run)
+    folder = export(run)
     assert folder == run.path / "export"
     card = json.loads((folder / "agent.json").read_text())
     assert [(each["name"], each["shape"]) for each in card["maps"]] == [

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 
 import flowrep
 from flowrep import extras
-from flowrep.config_tree import CONF_DIR, config_groups
+from flowrep.config import CONF_DIR, config_groups
 
 PACKAGE = Path(flowrep.__file__).parent
 MODULES = {

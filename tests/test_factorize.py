@@ -21,10 +21,8 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 import cv2
 import imageio.v3 as imageio
 
-from flowrep.config import UsageError, validated
-from flowrep.config.composition import check_command
-from flowrep.config.factorizing import FactorizeConfig
-from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.config import CONF_DIR, UsageError, group_choices
+from flowrep.config.schema import FactorizeConfig, validated
 from flowrep.factorize import factorize_recording, main
 from flowrep.sequences import (
     RECORDINGS,
@@ -276,7 +274,6 @@ def test_an_estimated_motion_stands_beside_the_recorded_one(moments, tmp_path):
         "flow_files=[flo,exr]",
         "poses=guessed",
         "flow.preset=best",
-        "format.interpolate=often",
     ],
 )
 def test_what_cannot_be_is_refused_by_name(override):
@@ -290,9 +287,24 @@ def test_flow_on_the_other_grid_is_refused(moments, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 
 
-def test_unknown_formats_are_refused_and_the_known_ones_listed():
-    with pytest.raises(UsageError, match=r"unknown format 'tumm' \(did you mean 'tum'"):
-        check_command("factorize", ["input=a", "output=b", "format=tumm"], FactorizeConfig)
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [
+        ("tum", "interpolate", "often"),
+        ("tum", "tolerance_s", None),
+        ("frames", "pose_axes", "left_handed"),
+        ("vkitti2", "camera", 0.5),
+        ("sintel", "scale", 2),
+    ],
+)
+def test_an_option_that_its_reader_has_not_is_refused_by_name(moments, tmp_path, name, key, value):
+    asked = settings(f"input={tmp_path / 'in'}", "output=b", f"format={name}")
+    asked["format"][key] = value
+    with pytest.raises(UsageError, match=f"format.{key}"):
+        factorize_recording(asked)
+
+
+def test_every_format_has_its_reader():
     assert set(group_choices("format")) == {*RECORDINGS, *STREAMS}
 
 

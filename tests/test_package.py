@@ -81,7 +81,7 @@ def test_the_sdist_has_what_a_clone_has(built):
 def test_installed_its_commands_and_configs_are_there(installed, tmp_path):
     where = {"cwd": tmp_path, "env": {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}}
     code = (
-        "import flowrep, flowrep.geometry; from flowrep.config_tree import CONF_DIR;"
+        "import flowrep, flowrep.geometry; from flowrep.config import CONF_DIR;"
         "print(flowrep.__version__, flowrep.__file__, (CONF_DIR / 'train.yaml').is_file())"
     )
     version, place, has_configs = python(

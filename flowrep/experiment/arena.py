@@ -33,10 +33,10 @@ class Agent(NamedTuple):
     device: torch.device | str = "cpu"
 
     @classmethod
-    def from_config(cls, policy: Any, config: Mapping[str, Any], device: torch.device) -> "Agent":
+    def from_config(cls, policy: Any, config: Any, device: torch.device) -> "Agent":
         """Returns a policy with the observations of a run's config."""
-        seen = {key: config[key] for key in ("representations", "flow", "noise")}
-        return cls(policy, **seen, device=device)
+        flow, noise = config.flow.plain(), config.noise.plain()
+        return cls(policy, config.representations, flow, noise, device)
 
     def eye(self, scene: Scene, frame_rate_hz: float) -> Eye:
         """Returns the `Eye` that computes its observations in a scene."""

@@ -5,23 +5,52 @@ import fcntl
 import json
 import os
 import platform
+import subprocess
 import sys
+import time
 import uuid
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import torch
 import yaml
 from torchrl.record.loggers import TensorboardLogger
 
 from flowrep import __version__
 from flowrep.agent import CheckpointError
 from flowrep.experiment.evaluation import OUTCOMES
-from flowrep.tables import TableError, append_rows, is_whole, read_rows, write_rows
+from flowrep.extras import require
+from flowrep.tables import append_rows, is_whole, read_rows, write_rows
+
+Rows = Sequence[Mapping[str, str]]
+
+EVALUATION_COLUMNS = (
+    "scene", "representations", "flow", "seed", "frames", "evaluation",
+    "policy", "speed", "fps", "episode_seed", "outcome", "hit", "return", "length",
+)  # fmt: skip
+_EPISODE = ("scene", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
+"""The columns that identify a row's policy and episode."""
+
+_IDENTITY = (
+    "scene", "representations", "flow", "noise", "algorithm", "speed", "seed", "num_envs",
+)  # fmt: skip
+"""The parts of a config that determine the weights after some number of frames."""
+
+
+_NEEDED = (
+    "scene", "representations", "flow", "noise", "algorithm", "seed", "total_frames", "num_envs",
+)  # fmt: skip
+"""The keys that every run's config has."""
+
+
+class RunFolderError(ValueError):
+    """A folder is not that of a run, or holds a run where none is wanted."""
+
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some network file systems
 
@@ -31,7 +60,7 @@ class FolderInUseError(OSError):
 
 
 @contextmanager
-def folder_lock(folder: Path, doing: str) -> Iterator[None]:
+def folder_lock(folder: Path, doing: str, patience_s: float = 0.0) -> Iterator[None]:
     """Locks a folder against other processes.
 
     The lock is released when the process ends, however it ends.
@@ -39,21 +68,29 @@ def folder_lock(folder: Path, doing: str) -> Iterator[None]:
     Args:
         folder: an existing folder; `.lock` is created in it and kept.
         doing: the activity, for the error that other processes get, e.g. "training".
+        patience_s: how long to wait for a process that still saves.
 
     Raises:
         FolderInUseError: another process holds the folder; gives its id, host and start time.
     """
     with (folder / ".lock").open("a+", encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise FolderInUseError(
-                f"'{folder}' is in use: {_holder(file.name)}. Wait until it has ended, or stop it"
-            ) from None
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                raise
-            print(f"warning: no locks on the disk of '{folder}' ({error})", file=sys.stderr)
+        until = time.monotonic() + patience_s
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() >= until:
+                    raise FolderInUseError(
+                        f"'{folder}' is in use: {_holder(file.name)}. Wait until it has ended, or "
+                        "stop it"
+                    ) from None
+                time.sleep(0.5)
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                print(f"warning: no locks on the disk of '{folder}' ({error})", file=sys.stderr)
+                break
         file.truncate(0)
         now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
         holder = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
@@ -72,22 +109,6 @@ def _holder(lock: str) -> str:
         return "process {pid} on {host} has been {doing} in it since {since}".format(**holder)
     except (ValueError, KeyError, TypeError):  # it has not written its description yet
         return "another process has just begun in it"
-
-
-_IDENTITY = (
-    "scene",
-    "representations",
-    "flow",
-    "noise",
-    "algorithm",
-    "speed",
-    "seed",
-    "num_envs",
-    "total_frames",
-)
-"""The parts of a config that determine the weights."""
-
-_ABSENT = "absent"
 
 
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -112,7 +133,8 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
             "install that version, or start a new run"
         )
-    for place, there, here in differences(saved, expected):
+    known = {key: value for key, value in saved.items() if key in expected}
+    for place, there, here in differences(known, expected):
         raise CheckpointError(
             f"{path} belongs to a run with {place}={there}, the config.yaml of its folder says "
             f"{place}={here}: restore the file that was there, or start a new run"
@@ -126,8 +148,36 @@ def differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[st
             yield place, saved, expected
         return
     for key in dict.fromkeys([*saved, *expected]):
-        there, here = saved.get(key, _ABSENT), expected.get(key, _ABSENT)
+        there, here = saved.get(key, "absent"), expected.get(key, "absent")
         yield from differences(there, here, f"{place}.{key}" if place else key)
+
+
+def machine_of(precision: torch.dtype) -> dict[str, Any]:
+    """Returns what a run is computed with: versions, commit, processor and number format."""
+    home, found = Path(__file__).parents[2], ""
+    if (home / ".git").exists():
+        ask = ["git", "-C", str(home), "describe", "--always", "--dirty", "--abbrev=40"]
+        found = subprocess.run([*ask, "--exclude=*"], capture_output=True, text=True).stdout.strip()
+    is_gpu = torch.cuda.is_available()
+    return {
+        "flowrep": __version__,
+        "commit": found or None,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "precision": str(precision).removeprefix("torch."),
+        "cpu": cpu_name(),
+        "cores": os.cpu_count(),
+        "gpu": torch.cuda.get_device_name() if is_gpu else None,
+    }
+
+
+def cpu_name() -> str:
+    """Returns the processor's name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(x for x in lines if x.startswith("model name")).partition(":")[2].strip()
+    except (OSError, StopIteration):  # not on Linux, or not on this processor
+        return platform.processor() or platform.machine()
 
 
 _TITLES = {"training": "evaluation"}  # training itself has scalars too
@@ -159,9 +209,6 @@ def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str,
     return dict(scalars)
 
 
-MODES = ("off", "offline", "online")
-
-
 def open_wandb(folder: Path, mode: str, config: Mapping[str, Any]) -> Any:
     """Returns a TorchRL logger to the folder's own wandb run, the same one whenever it is resumed.
 
@@ -173,12 +220,7 @@ def open_wandb(folder: Path, mode: str, config: Mapping[str, Any]) -> Any:
     Raises:
         ImportError: wandb is not installed.
     """
-    try:
-        import wandb  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            f"wandb={mode} needs packages of an extra: pip install 'flowrep[train,wandb]'"
-        ) from error
+    require(f"wandb={mode}", "train,wandb", "wandb")
     from torchrl.record.loggers.wandb import WandbLogger
 
     return WandbLogger(
@@ -196,29 +238,8 @@ def run_id(folder: Path) -> str:
     """Returns wandb's id of the run, generated once and kept in its folder."""
     kept = folder / "wandb_id"
     if not kept.is_file():
-        fresh = folder / "wandb_id.tmp"
-        fresh.write_text(uuid.uuid4().hex[:12], encoding="utf-8")
-        fresh.replace(kept)
+        _replace(kept, uuid.uuid4().hex[:12])
     return kept.read_text(encoding="utf-8")
-
-
-Rows = Sequence[Mapping[str, str]]
-
-EVALUATION_COLUMNS = (
-    "scene", "representations", "flow", "seed", "frames", "evaluation",
-    "policy", "speed", "fps", "episode_seed", "outcome", "hit", "return", "length",
-)  # fmt: skip
-_EPISODE = ("scene", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
-"""The columns that identify a row's policy and episode."""
-
-_NEEDED = (
-    "scene", "representations", "flow", "noise", "algorithm", "seed", "total_frames", "num_envs",
-)  # fmt: skip
-"""The keys that every run's config has."""
-
-
-class RunFolderError(ValueError):
-    """A folder is not that of a run, or holds a run where none is wanted."""
 
 
 class RunFolder:
@@ -231,6 +252,7 @@ class RunFolder:
     evaluation.csv           a row for each evaluated episode; `evaluation` says whether it was run
                              while training, at the end of it ("final"), or by flowrep.evaluate
     failures.csv             why episodes failed, by policy and speed
+    machine.json             what it was computed with, for each machine
     scenes/                  the scenes of flowrep.evaluate's rows, except the run's own
     maps/                    what policies of one's own saw in flowrep.evaluate's rows
     videos/                  what the agent saw and did
@@ -284,9 +306,9 @@ class RunFolder:
                 "folder of its own with hydra.run.dir="
             )
 
-    def held(self, doing: str) -> AbstractContextManager[None]:
+    def held(self, doing: str, patience_s: float = 0.0) -> AbstractContextManager[None]:
         """Locks the folder against other processes; see `folder_lock`."""
-        return folder_lock(self.path, doing)
+        return folder_lock(self.path, doing, patience_s)
 
     @property
     def checkpoint_path(self) -> Path:
@@ -322,32 +344,33 @@ class RunFolder:
         """Writes the resolved config, and the typed overrides where Hydra keeps them."""
         (self.path / ".hydra").mkdir(exist_ok=True)
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
-        (self.path / ".hydra" / "overrides.yaml").write_text(typed, encoding="utf-8")
-        text = yaml.safe_dump(dict(config), sort_keys=False)
-        whole = self.path / "config.yaml.tmp"
-        whole.write_text(text, encoding="utf-8")
-        whole.replace(self.path / "config.yaml")
+        _replace(self.path / ".hydra" / "overrides.yaml", typed)
+        _replace(self.path / "config.yaml", yaml.safe_dump(dict(config), sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:
-        """Returns the resolved config that the run was started with.
+        """Returns the resolved config that the run was started with, as plain data.
 
         Raises:
             RunFolderError: the file is damaged; names what is missing.
         """
         path = self.path / "config.yaml"
-        remedy = "restore the file that the run was started with"
         try:
             config = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
+        except (yaml.YAMLError, ValueError) as error:
             reason = " ".join(str(error).split())
-            raise RunFolderError(f"{path} can't be read: {reason}; {remedy}") from error
-        if not isinstance(config, dict):
-            kind = "is empty" if config is None else f"holds a {type(config).__name__}"
-            raise RunFolderError(f"{path} {kind}, where a run's config should be; {remedy}")
-        missing = [key for key in _NEEDED if config.get(key) is None]
+            raise RunFolderError(f"{path} can't be read: {reason}; restore the file") from error
+        given = config if isinstance(config, dict) else {}
+        missing = [key for key in _NEEDED if given.get(key) is None]
         if missing:
-            raise RunFolderError(f"{path} has no {missing[0]}; {remedy}")
-        return config
+            raise RunFolderError(f"{path} has no {missing[0]}: restore the file of the run")
+        return given
+
+    def note_machine(self, machine: Mapping[str, Any]) -> None:
+        """Adds what the run is computed with to machine.json, unless it was there last."""
+        path = self.path / "machine.json"
+        noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+        if noted[-1:] != [machine]:
+            _replace(path, json.dumps([*noted, machine], indent=1) + "\n")
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
         """Appends one row to metrics.csv and logs the same values to TensorBoard and wandb."""
@@ -379,17 +402,15 @@ class RunFolder:
             if len(kept) < len(rows) or not is_whole(path):
                 write_rows(path, kept, columns)
 
-    def start_again(self, config: Mapping[str, Any]) -> None:
+    def start_again(self, first_save: int) -> None:
         """Drops all rows of a run that was killed before its first checkpoint, to start it again.
 
         Args:
-            config: its config.
+            first_save: the frames after which the first checkpoint is written, at the latest.
 
         Raises:
             RunFolderError: it had a checkpoint, as its results show; nothing is dropped then.
         """
-        due = min(config["checkpoint_every_frames"], config["total_frames"])
-        first_save = due + config["num_envs"] - 1  # at the latest
         episodes = self.read_episodes()
         rows = [*self.read_metrics(), *episodes]
         if any(row["evaluation"] != "training" for row in episodes) or any(
@@ -416,29 +437,12 @@ class RunFolder:
         return len(final) >= episodes
 
     def read_metrics(self) -> list[dict[str, str]]:
-        """Returns the rows of metrics.csv, none if there is no such file.
-
-        Raises:
-            TableError: another program changed the table.
-        """
-        rows = read_rows(self.metrics_path)
-        for number, row in enumerate(rows, start=2):
-            _check_cell(self.metrics_path, number, row, "frames", int)
-        return rows
+        """Returns the rows of metrics.csv, none if there is no such file."""
+        return read_rows(self.metrics_path, ["frames"])
 
     def read_episodes(self) -> list[dict[str, str]]:
-        """Returns the rows of evaluation.csv, none if there is no such file.
-
-        Raises:
-            TableError: another program changed the table, or is of another version.
-        """
-        path = self.evaluation_path
-        rows = read_rows(path, EVALUATION_COLUMNS)
-        for number, row in enumerate(rows, start=2):
-            for column, kind in (("frames", int), ("fps", float), ("episode_seed", int)):
-                _check_cell(path, number, row, column, kind)
-            _check_cell(path, number, row, "outcome", OUTCOMES.index)
-        return rows
+        """Returns the rows of evaluation.csv, none if there is no such file."""
+        return read_rows(self.evaluation_path, EVALUATION_COLUMNS)
 
     def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Saves evaluated episodes and plots them, see `save_episodes` and `plot_episodes`."""
@@ -461,9 +465,6 @@ class RunFolder:
             rows: the episodes.
             table: the rows to add them to, those of the file if None. With the rows from before an
                 evaluation, episodes can be saved as they end and still stand in order.
-
-        Raises:
-            TableError: as `read_episodes`; nothing is written then.
         """
         before = self.read_episodes() if table is None else table
         new = [{name: str(row[name]) for name in EVALUATION_COLUMNS} for row in rows]
@@ -471,14 +472,8 @@ class RunFolder:
         write_rows(self.evaluation_path, by_episode.values(), EVALUATION_COLUMNS)
 
 
-def _check_cell(
-    path: Path, line: int, row: Mapping[str, str], column: str, read: Callable[[str], Any]
-) -> None:
-    try:
-        read(row[column])
-    except KeyError:
-        raise TableError(f"{path} has no column {column}; restore the column") from None
-    except ValueError:
-        raise TableError(
-            f"{path}, line {line}: {column} can't be {row[column]!r}; correct or delete the line"
-        ) from None
+def _replace(path: Path, text: str) -> None:
+    """Writes a file; if it is interrupted, the file is the old one or the new one."""
+    whole = path.with_name(f"{path.name}.tmp")
+    whole.write_text(text, encoding="utf-8")
+    whole.replace(path)

@@ -1,28 +1,350 @@
-"""The training loop: act, store, learn; at intervals log, evaluate and save."""
+"""A run from its start, or its checkpoint, to its last evaluation."""
+
+from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from statistics import fmean
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
 from flowrep.agent import (
-    Algorithm,
     DivergenceError,
+    FasterThreads,
+    keep_freed_memory,
     load_checkpoint,
     save_checkpoint,
 )
+from flowrep.config.schema import FINAL_POLICIES, TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
+from flowrep.envs.workers import available_cores
+from flowrep.experiment import build
+from flowrep.experiment.arena import Agent
+from flowrep.experiment.arena_team import AnyArena
+from flowrep.experiment.comparison import Comparison, print_table, with_origin
 from flowrep.experiment.evaluation import OUTCOMES
-from flowrep.experiment.run import RunFolder, check_origin
+from flowrep.experiment.failures import print_failures, write_failures
+from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch
+
+EVALUATION_ENVS = 96  # side by side at least: more make a step of each cheaper
+EVALUATION_SEED = 1_000_000  # of the first episode evaluated during training
+FINAL_SEED = 1_500_000  # not the episodes evaluated during training
+
+
+class Runner:
+    """Holds the env, the agent, the folder and the clock of a run; `train` is its loop.
+
+    `state` and `load` are its checkpoint: all that the rest of the run depends on.
+
+    Args:
+        config: of the run.
+        folder: the folder that it writes to.
+
+    Attributes:
+        frames: environment frames so far.
+        observation: what the policy acts on next; None before the first reset.
+        evaluation_pending: whether the last evaluation was interrupted and has to be run again.
+        metrics: means over the updates since the last row of metrics.csv.
+        recent: the latest episodes that ended.
+        clock: the wall time by activity.
+    """
+
+    def __init__(self, config: TrainConfig, folder: RunFolder) -> None:
+        self.config, self.folder, self.clock = config, folder, Stopwatch()
+        keep_freed_memory()
+        threads = share_cores(config)
+        torch.manual_seed(config.seed)
+        self.env = build.env(config, compiled=config.compiled)
+        self.env.set_seed(config.seed * config.num_envs)
+        self.agent = build.agent(config, self.env)
+        self.agent.threads = threads
+        self.frames = 0
+        self.observation: TensorDictBase | None = None
+        self.evaluation_pending = False
+        self.metrics, self.recent = Means(), RecentEpisodes()
+        self._arena: AnyArena | None = None
+
+    def train(self, stop: StopRequest) -> None:
+        """Trains until `total_frames` or until a stop is requested, and saves the last state.
+
+        The updates that the previous frames allow are taken between choosing an action and waiting
+        for its step. Environments that have processes and cores of their own step meanwhile, which
+        TorchRL's sequential `Trainer` does not support. The order of operations, and so the result,
+        is the same where they do not.
+        """
+        total = self.config.total_frames
+        log = Every(self.config.log_every_frames, self.frames)
+        evaluate = Every(self.config.evaluation.every_frames, self.frames)
+        save = Every(self.config.checkpoint_every_frames, self.frames)
+        is_on_gpu = self.agent.device.type == "cuda"
+        steps_meanwhile = is_on_gpu or has_spare_cores(self.env, torch.get_num_threads())
+        if self.observation is None:
+            self.observation = self.env.reset()
+        if self.evaluation_pending:
+            self.evaluation_pending = not self.evaluate("training", stop)
+        progress = {"total": total, "initial": self.frames, "unit": "frame", "unit_scale": True}
+        with tqdm(**progress, mininterval=0.5, dynamic_ncols=True) as bar:
+            while self.frames < total and not stop:
+                with self.clock("policy"):
+                    acted = self.act()
+                if steps_meanwhile:
+                    begin_step(self.env, acted)
+                self.learn()
+                with self.clock("environment"):
+                    stepped, self.observation = self.env.step_and_maybe_reset(acted)
+                with self.clock("memory"):
+                    self.agent.remember(stepped)
+                self.frames += stepped.numel()
+                self.recent.add(stepped)
+                if self.frames >= total:
+                    self.learn()  # there is no next step to overlap with
+                bar.update(self.frames - bar.n)
+                if log(self.frames):
+                    row = self.log(bar.format_dict["rate"])
+                    bar.set_postfix_str(progress_text(row))
+                if evaluate(self.frames):
+                    self.evaluation_pending = not self.evaluate("training", stop)
+                if save(self.frames):
+                    self.save()
+        self.save()
+
+    def act(self) -> TensorDictBase:
+        """Returns the current observation with the policy's actions.
+
+        Raises:
+            DivergenceError: the policy's outputs are nan or infinite.
+        """
+        assert self.observation is not None
+        try:
+            with torch.no_grad():
+                return self.agent.policy(self.observation)
+        except RuntimeError as error:
+            self.check()  # an update may have seen it first, and its error says more
+            if "probability tensor" not in str(error):
+                raise
+            maps = [key for key in self.agent.policy.in_keys if _is_bad(self.observation[key])]
+            cause = f"{maps[0]!r} is not finite: lower its scale" if maps else "weights too large"
+            raise self._diverged(
+                f"the policy gives actions no probabilities after {self.agent.updates} updates "
+                f"({cause})"
+            ) from error
+
+    def learn(self) -> None:
+        """Takes the updates that are due after the frames so far."""
+        for _ in range(self.agent.updates_due(self.frames)):
+            with self.clock("memory"):
+                batch = self.agent.sample()
+            with self.clock("update"):
+                self.metrics.add(self.agent.update(batch))
+
+    def log(self, rate: float | None) -> dict[str, float]:
+        """Adds a row to metrics.csv and returns it; missing values are nan.
+
+        docs/metrics.md explains the columns.
+
+        Args:
+            rate: frames per second.
+
+        Raises:
+            DivergenceError: see `check`.
+        """
+        self.check()
+        means = self.metrics.take()
+        row = self.recent.summary()
+        row |= {"updates": self.agent.updates, "frames_per_second": rate or math.nan}
+        row["share_outside_updates"] = 1 - self.clock.share("update")
+        row |= {name: means.get(name, math.nan) for name in self.agent.metric_names()}
+        self.folder.log_metrics(self.frames, row)
+        return row
+
+    def evaluate(self, kind: str, stop: StopRequest) -> bool:
+        """Adds episodes to evaluation.csv; returns whether all were run before a stop.
+
+        Args:
+            kind: "training": greedy ones at the training speed; "final": at each speed and frame
+                rate, beside the baselines.
+            stop: checked after each episode.
+        """
+        config, asked = self.config, self.config.evaluation
+        if kind == "final":
+            comparison = Comparison(
+                speeds=asked.speeds,
+                fps=asked.fps,
+                episodes=asked.final_episodes,
+                seed=FINAL_SEED,
+                policies=FINAL_POLICIES,
+                baselines=asked.baselines,
+            )
+        else:
+            comparison = Comparison(
+                speeds=[config.speed],
+                fps=[config.scene["frame_rate_hz"]],
+                episodes=asked.episodes,
+                seed=EVALUATION_SEED,
+                policies=["greedy"],
+            )
+        with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
+            comparison.run(self._evaluator(), lambda: bool(stop))
+        if not comparison.is_complete:
+            return False
+        rows = with_origin(comparison.rows(), config.plain(), self.frames, kind)
+        self.folder.log_episodes(rows)
+        if kind == "final":
+            print_table(rows)
+            print_failures(rows)
+        return True
+
+    def _evaluator(self) -> AnyArena:
+        """Returns what runs episodes of the agent in training, the same one each time."""
+        if self._arena is None:
+            config = self.config
+            agent = Agent.from_config(self.agent.policy, config, self.agent.device)
+            asked = config.evaluation.episodes, config.evaluation.final_total
+            num_envs = min(max(asked), max(EVALUATION_ENVS, config.num_envs))
+            self._arena = build.arena(config, [agent], num_envs)
+        return self._arena
+
+    def film(self) -> None:
+        """Writes causes of failure and learning curve, and films an episode unless it is there.
+
+        The processes of the evaluation end first, as filming takes memory as well.
+        """
+        # drawing takes seconds to import
+        from flowrep.viz.curves import draw_learning_curve
+        from flowrep.viz.film import record_episode
+
+        self.close()
+        write_failures(self.folder.failures_path, self.folder.read_episodes())
+        draw_learning_curve(self.folder)
+        path = self.folder.video_path(f"episode_{self.config.speed}")
+        if self.config.evaluation.video and not path.exists():
+            make_env, seen = partial(build.env, self.config), self.config.representations
+            record_episode(make_env, self.agent.policy, seen, path, episode_seed=FINAL_SEED)
+            print(f"video: {path}")
+
+    def close(self) -> None:
+        """Ends the processes of environments and evaluation."""
+        if self._arena is not None:
+            self._arena.close()
+            self._arena = None
+        if not self.env.is_closed:
+            self.env.close()
+
+    def check(self) -> None:
+        """Checks that losses and metrics are finite.
+
+        Raises:
+            DivergenceError: one is not; names the last good checkpoint.
+        """
+        try:
+            self.agent.divergence.check()
+        except DivergenceError as error:
+            raise self._diverged(str(error)) from error
+
+    def _diverged(self, what: str) -> DivergenceError:
+        path = self.folder.checkpoint_path
+        good = f"the last good checkpoint is {path}" if path.exists() else "none was saved yet"
+        return DivergenceError(f"{what}; {good}")
+
+    def save(self) -> None:
+        """Writes the checkpoint; the previous one stays intact until the new one is complete.
+
+        Raises:
+            DivergenceError: see `check`; nothing is written.
+        """
+        self.check()
+        with self.clock("checkpoint"):
+            save_checkpoint(self.folder.checkpoint_path, self.state())
+
+    def load(self) -> None:
+        """Continues from the checkpoint and drops what was logged after it.
+
+        Without one, a run that was killed before the first begins again.
+
+        Raises:
+            CheckpointError: it can't be read, or belongs to another run.
+            RunFolderError: it is gone.
+        """
+        path, config = self.folder.checkpoint_path, self.config
+        if not path.exists():
+            due = min(config.checkpoint_every_frames, config.total_frames)
+            self.folder.start_again(first_save=due + config.num_envs - 1)
+            return
+        state = load_checkpoint(path)
+        check_origin(state["origin"], origin_of(config.plain()), path)
+        self.restore(state)
+        self.folder.forget_after(self.frames)
+
+    def state(self) -> dict[str, Any]:
+        """Returns all that the rest of the run depends on: nested plain data and tensors."""
+        assert self.observation is not None
+        return {
+            "origin": origin_of(self.config.plain()),
+            "frames": self.frames,
+            "evaluation_pending": self.evaluation_pending,
+            "metrics": self.metrics.state(),
+            "recent": self.recent.state(),
+            "observation": self.observation.to_dict(),
+            "policy": dict(self.agent.policy.state_dict()),
+            "agent": self.agent.state_dict(),
+            "memory": self.agent.memory.state_dict(),
+            "env": get_states(self.env),
+            "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state_all(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continues from a `state`."""
+        self.env.reset()
+        self.frames = state["frames"]
+        self.evaluation_pending = state["evaluation_pending"]
+        self.metrics.restore(state["metrics"])
+        self.recent.restore(state["recent"])
+        self.observation = TensorDict(
+            state["observation"], self.env.batch_size, device=self.env.device
+        )
+        self.agent.load_state_dict(state["agent"])
+        self.agent.memory.load_state_dict(state["memory"])
+        set_states(self.env, state["env"])
+        torch.set_rng_state(state["torch_rng"])
+        if len(state["cuda_rng"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state["cuda_rng"])
+
+
+def share_cores(config: TrainConfig) -> AbstractContextManager[None]:
+    """Returns the context of the updates, which may use as many threads as PyTorch would.
+
+    Everything else is small and gets one thread, except estimated flow.
+    """
+    if build.device(config.device).type != "cpu":
+        return nullcontext()
+    most = min(torch.get_num_threads(), available_cores())
+    if config.flow.source == "exact":
+        torch.set_num_threads(1)
+    return FasterThreads(most)
+
+
+def _is_bad(values: Tensor) -> bool:
+    return values.is_floating_point() and not bool(values.isfinite().all())
+
+
+def progress_text(row: Mapping[str, float]) -> str:
+    """Returns the end of the progress line; nan values are left out."""
+    losses = [name for name in row if name.endswith("_loss")]
+    shown = {"success": f"{row['success']:.0%}"}
+    shown |= {name: f"{row[name]:.3g}" for name in ("alpha", "entropy", *losses) if name in row}
+    return ", ".join(
+        f"{name.replace('_', ' ')} {text}" for name, text in shown.items() if "nan" not in text
+    )
+
 
 RECENT_EPISODES = 100
 
@@ -107,228 +429,3 @@ class Means:
         """Continues from a `state`."""
         self._sums = {name: total.clone() for name, total in state["sums"].items()}
         self._count = state["count"]
-
-
-@dataclass
-class Training:
-    """Everything that a run resumes from; `state` and `restore` are its checkpoint.
-
-    Args:
-        env: batched TorchRL env.
-        agent: the algorithm and its memory.
-        run: the folder that the run writes to.
-        origin: the identity of the run that its checkpoints belong to, see `origin_of`.
-        frames: environment frames so far.
-        evaluation_pending: whether the last evaluation was interrupted and has to be run again.
-        observation: what the policy acts on next; None before the first reset.
-        metrics: means over the updates since the last row of metrics.csv.
-        recent: the latest episodes that ended.
-    """
-
-    env: EnvBase
-    agent: Algorithm
-    run: RunFolder
-    origin: Mapping[str, Any]
-    frames: int = 0
-    evaluation_pending: bool = False
-    observation: TensorDictBase | None = None
-    metrics: Means = field(default_factory=Means)
-    recent: RecentEpisodes = field(default_factory=RecentEpisodes)
-
-    def state(self) -> dict[str, Any]:
-        """Returns everything that the rest of the run depends on: nested plain data and tensors."""
-        assert self.observation is not None
-        return {
-            "origin": self.origin,
-            "frames": self.frames,
-            "evaluation_pending": self.evaluation_pending,
-            "metrics": self.metrics.state(),
-            "recent": self.recent.state(),
-            "observation": self.observation.to_dict(),
-            "policy": dict(self.agent.policy.state_dict()),
-            "agent": self.agent.state_dict(),
-            "memory": self.agent.memory.state_dict(),
-            "env": get_states(self.env),
-            "torch_rng": torch.get_rng_state(),
-            "cuda_rng": torch.cuda.get_rng_state_all(),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state`."""
-        self.env.reset()
-        self.frames = state["frames"]
-        self.evaluation_pending = state["evaluation_pending"]
-        self.metrics.restore(state["metrics"])
-        self.recent.restore(state["recent"])
-        self.observation = TensorDict(
-            state["observation"], self.env.batch_size, device=self.env.device
-        )
-        self.agent.load_state_dict(state["agent"])
-        self.agent.memory.load_state_dict(state["memory"])
-        set_states(self.env, state["env"])
-        torch.set_rng_state(state["torch_rng"])
-        if len(state["cuda_rng"]) == torch.cuda.device_count():
-            torch.cuda.set_rng_state_all(state["cuda_rng"])
-
-    def save(self) -> None:
-        """Writes the checkpoint; the previous one stays intact until the new one is complete.
-
-        Raises:
-            DivergenceError: see `check`; nothing is written.
-        """
-        self.check()
-        save_checkpoint(self.run.checkpoint_path, self.state())
-
-    def check(self) -> None:
-        """Checks that losses and metrics are finite.
-
-        Raises:
-            DivergenceError: if one is not; names the last good checkpoint.
-        """
-        try:
-            self.agent.divergence.check()
-        except DivergenceError as error:
-            raise self._diverged(str(error)) from error
-
-    def act(self) -> TensorDictBase:
-        """Returns the current observation with the policy's actions.
-
-        Raises:
-            DivergenceError: if the policy's outputs are nan or infinite.
-        """
-        assert self.observation is not None
-        try:
-            with torch.no_grad():
-                return self.agent.policy(self.observation)
-        except RuntimeError as error:
-            self.check()  # an update may have seen it first, and its error says more
-            if "probability tensor" not in str(error):
-                raise
-            maps = [key for key in self.agent.policy.in_keys if _is_bad(self.observation[key])]
-            cause = f"{maps[0]!r} is not finite: lower its scale" if maps else "weights too large"
-            raise self._diverged(
-                f"the policy gives actions no probabilities after {self.agent.updates} updates "
-                f"({cause})"
-            ) from error
-
-    def _diverged(self, what: str) -> DivergenceError:
-        path = self.run.checkpoint_path
-        good = f"the last good checkpoint is {path}" if path.exists() else "none was saved yet"
-        return DivergenceError(f"{what}; {good}")
-
-    def load(self) -> None:
-        """Continues from the checkpoint, and deletes what was logged after it.
-
-        Raises:
-            CheckpointError: if it can't be read, or belongs to another run.
-        """
-        path = self.run.checkpoint_path
-        state = load_checkpoint(path)
-        check_origin(state["origin"], self.origin, path)
-        self.restore(state)
-        self.run.forget_after(self.frames)
-
-
-def train(
-    training: Training,
-    config: Mapping[str, Any],
-    stop: StopRequest,
-    evaluate: Callable[[int], bool],
-) -> Stopwatch:
-    """Trains until `total_frames` or until a stop is requested, and saves the last state.
-
-    The updates that the previous frames allow are taken between choosing an action and waiting for
-    its step. Environments that have processes and cores of their own step meanwhile, which
-    TorchRL's sequential `Trainer` does not support. The order of operations, and so the result, is
-    the same where they do not.
-
-    Args:
-        training: a new or a restored run.
-        config: the resolved config.
-        stop: checked between two steps.
-        evaluate: takes the number of frames; returns whether it was interrupted and has to be run
-            again when the run is resumed.
-
-    Returns:
-        The wall time by activity.
-    """
-    t = training
-    clock = Stopwatch()
-    should_log = Every(config["log_every_frames"], t.frames)
-    should_evaluate = Every(config["evaluation"]["every_frames"], t.frames)
-    should_save = Every(config["checkpoint_every_frames"], t.frames)
-    total = config["total_frames"]
-    is_on_gpu = t.agent.device.type == "cuda"
-    steps_meanwhile = is_on_gpu or has_spare_cores(t.env, torch.get_num_threads())
-    if t.observation is None:
-        t.observation = t.env.reset()
-    if t.evaluation_pending:
-        with clock("evaluation"):
-            t.evaluation_pending = evaluate(t.frames)
-    with tqdm(total=total, initial=t.frames, unit="frame", unit_scale=True, mininterval=0.5) as bar:
-        while t.frames < total and not stop:
-            with clock("policy"):
-                acted = t.act()
-            if steps_meanwhile:
-                begin_step(t.env, acted)
-            learn(t, clock)
-            with clock("environment"):
-                stepped, t.observation = t.env.step_and_maybe_reset(acted)
-            with clock("memory"):
-                t.agent.remember(stepped)
-            t.frames += stepped.numel()
-            t.recent.add(stepped)
-            if t.frames >= total:
-                learn(t, clock)  # there is no next step to overlap with
-            bar.update(t.frames - bar.n)
-            if should_log(t.frames):
-                t.check()
-                row = metrics_row(t, bar.format_dict["rate"], clock)
-                t.run.log_metrics(t.frames, row)
-                bar.set_postfix_str(progress_text(row))
-            if should_evaluate(t.frames):
-                with clock("evaluation"):
-                    t.evaluation_pending = evaluate(t.frames)
-            if should_save(t.frames):
-                with clock("checkpoint"):
-                    t.save()
-    with clock("checkpoint"):
-        t.save()
-    return clock
-
-
-def learn(training: Training, clock: Stopwatch) -> None:
-    """Takes the updates that are due after the frames so far."""
-    agent = training.agent
-    for _ in range(agent.updates_due(training.frames)):
-        with clock("memory"):
-            batch = agent.sample()
-        with clock("update"):
-            training.metrics.add(agent.update(batch))
-
-
-def _is_bad(values: Tensor) -> bool:
-    return values.is_floating_point() and not bool(values.isfinite().all())
-
-
-def metrics_row(training: Training, rate: float | None, clock: Stopwatch) -> dict[str, float]:
-    """Returns one row of metrics.csv and starts the next; missing values are nan.
-
-    docs/metrics.md explains the columns.
-    """
-    row = training.recent.summary()
-    row["updates"] = training.agent.updates
-    row["frames_per_second"] = rate or math.nan
-    row["share_outside_updates"] = 1 - clock.share("update")
-    means = training.metrics.take()
-    return row | {name: means.get(name, math.nan) for name in training.agent.metric_names()}
-
-
-def progress_text(row: Mapping[str, float]) -> str:
-    """Returns the end of the progress line; nan values are left out."""
-    losses = [name for name in row if name.endswith("_loss")]
-    shown = {"success": f"{row['success']:.0%}"}
-    shown |= {name: f"{row[name]:.3g}" for name in ("alpha", "entropy", *losses) if name in row}
-    return ", ".join(
-        f"{name.replace('_', ' ')} {text}" for name, text in shown.items() if "nan" not in text
-    )

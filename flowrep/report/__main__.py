@@ -1,6 +1,6 @@
 """`python -m flowrep.report outputs/<sweep>`."""
 
-from flowrep.console import report
+from flowrep.report.command import main
 
 if __name__ == "__main__":
-    report()
+    main()

@@ -1,7 +1,5 @@
 """Reports on runs: `python -m flowrep.report outputs/<sweep>`."""
 
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,20 +7,14 @@ from flowrep.extras import require
 
 require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja2", module=__name__)
 
-import hydra
 import rich.box
 import rich.table
-from hydra._internal.utils import get_args_parser
-from omegaconf import DictConfig
 from rich.console import Console
 from rich.text import Text
 
-from flowrep.config import UsageError, validated
-from flowrep.config.command_line import exit_with, own_keys, plain_config, run_command
-from flowrep.config.quoting import override
-from flowrep.config.reporting import ReportConfig
-from flowrep.config_tree import CONF_DIR
-from flowrep.experiment.run import RunFolderError
+from flowrep.config import UsageError
+from flowrep.config.cli import run_command
+from flowrep.config.schema import ReportConfig
 from flowrep.report.drives import drives_of
 from flowrep.report.page import render_page, summary, write_files, write_page
 from flowrep.report.sections import Settings, assemble
@@ -31,15 +23,9 @@ from flowrep.report.storage import is_archive, read_runs, without_repeats
 from flowrep.report.tables import Table
 
 
-@hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name="report")
-def run(config: DictConfig) -> None:
+def run(config: ReportConfig) -> None:
     """Writes figures, tables and a page of runs."""
-    try:
-        asked = plain_config(config)
-        validated(ReportConfig, asked, own_keys())
-        report_on(asked)
-    except (UsageError, RunFolderError, ValueError, ImportError, OSError) as error:
-        exit_with(error)
+    report_on(config.plain())
 
 
 def report_on(asked: dict[str, Any]) -> Path:
@@ -95,39 +81,6 @@ def show(table: Table, title: str) -> None:
     Console(width=max(160, Console().width)).print(shown)
 
 
-def with_folders_named(arguments: Sequence[str]) -> list[str]:
-    """Returns a command line in which folders given without a key are the value of `run`.
-
-    >>> with_folders_named(["outputs/a", "outputs/b", "videos=1", "--cfg", "job"])
-    ['run=[outputs/a,outputs/b]', 'videos=1', '--cfg', 'job']
-
-    Raises:
-        UsageError: `run=` is given too.
-    """
-    overrides = get_args_parser().parse_args([*arguments]).overrides
-    bare = [text for text in overrides if _is_folder(text)]
-    if not bare:
-        return list(arguments)
-    for text in overrides:
-        if text.startswith("run=") and text not in bare:
-            raise UsageError(
-                f"'{bare[0]}' and '{text}' are folders in two ways: write the names alone"
-            )
-    if len(bare) == 1:
-        value = override("run", bare[0])
-    else:
-        value = f"run=[{','.join(override('run', text)[len('run=') :] for text in bare)}]"
-    return [value, *(text for text in arguments if text not in bare)]
-
-
-def _is_folder(text: str) -> bool:
-    return not text.startswith(("~", "+")) and ("=" not in text or Path(text).exists())
-
-
 def main() -> None:
-    """Entry point; a mistake on the command line ends in one line that lists the choices."""
-    try:
-        sys.argv[1:] = with_folders_named(sys.argv[1:])
-    except UsageError as error:
-        exit_with(error)
+    """Entry point; a mistake on the command line ends in one line that names the remedy."""
     run_command("report", run, ReportConfig)

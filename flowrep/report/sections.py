@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from flowrep.config.command_line import folder_name
+from flowrep.config.cli import folder_name
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, words
 from flowrep.report.outcomes import (
     BASELINES,

@@ -12,7 +12,7 @@ import shapely
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from flowrep.config_tree import CONF_DIR
+from flowrep.config import CONF_DIR
 from flowrep.scenes.checks import check_consistency, check_paths, check_places, check_walks
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.scene import Scene, SceneError

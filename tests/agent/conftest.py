@@ -6,7 +6,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 import flowrep.agent
 from flowrep.agent import DiscreteSAC
 from flowrep.agent.observation import store_maps
-from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.config import CONF_DIR, group_choices
 
 ALGORITHMS = group_choices("algorithm")
 SMALL = {"precision": "fp32", "hidden_size": 32, "batch_size": 16, "replay_capacity": 100}

@@ -9,7 +9,7 @@ import yaml
 from torchrl.data import Categorical
 
 from flowrep.agent import Algorithm
-from flowrep.config_tree import CONF_DIR
+from flowrep.config import CONF_DIR
 
 DOCS = Path(__file__).parents[2] / "docs" / "adding_an_algorithm.md"
 

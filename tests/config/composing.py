@@ -6,8 +6,9 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
 
-from flowrep.config.command_line import register_resolvers
-from flowrep.config_tree import CONF_DIR, config_groups
+from flowrep.config import CONF_DIR, config_groups
+from flowrep.config.cli import register_resolvers
+from flowrep.config.schema import TrainConfig, validated
 
 
 @functools.cache
@@ -24,7 +25,7 @@ def plain(name, *overrides):
     """
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     groups = config_groups()
-    choices = [o for o in parsed if o.key_or_group in groups]
+    choices = [o for o in parsed if o.key_or_group in groups or "searchpath" in o.key_or_group]
     config = _composed(name, tuple(o.input_line for o in choices)).copy()
     with open_dict(config):
         for override in (o for o in parsed if o not in choices):
@@ -34,3 +35,8 @@ def plain(name, *overrides):
             else:
                 OmegaConf.update(config, override.key_or_group, override.value())
     return OmegaConf.to_container(config, resolve=True)
+
+
+def composed(*overrides):
+    """Returns the config of `flowrep.train` as its model."""
+    return validated(TrainConfig, plain("train", *overrides))

@@ -1,104 +1,246 @@
-"""Every key of conf/ is in the schema, every key of the schema in conf/, and neither repeats."""
+"""The schema: what can't be is refused by its key, and it says what the code and conf/ say."""
+
+from typing import get_args
 
 import pytest
 from omegaconf import OmegaConf
 
-pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
-
-from flowrep.config import validated
-from flowrep.config.algorithms import ALGORITHMS
-from flowrep.config.evaluating import EvaluateConfig
-from flowrep.config.exporting import ExportConfig
-from flowrep.config.factorizing import FactorizeConfig
-from flowrep.config.recordings import READERS
-from flowrep.config.reporting import ReportConfig
-from flowrep.config.representations import EstimatedFlow, ExactFlow, Noise, Representations
-from flowrep.config.training import Evaluation, TrainConfig
-from flowrep.config.viewing import ViewConfig
-from flowrep.config_tree import CONF_DIR, config_groups, group_choices
-from flowrep.transforms.stack import NOISE_OPTIONS
-from tests.config.composing import plain
+from flowrep.config import CONF_DIR, UsageError, config_groups, group_choices, schema
+from flowrep.config.schema import (
+    ALGORITHMS,
+    EvaluateConfig,
+    ExportConfig,
+    FactorizeConfig,
+    ReportConfig,
+    TrainConfig,
+    ViewConfig,
+    validated,
+    validated_run,
+)
+from tests.config.composing import composed, plain
 
 OF_TRAINING = [group for group in config_groups() if group != "format"]
 GROUP_FILES = [(group, name) for group in OF_TRAINING for name in group_choices(group)]
 
 
+def refusal(command, model, line):
+    with pytest.raises(UsageError) as caught:
+        validated(model, plain(command, *line.split()))
+    return str(caught.value)
+
+
 @pytest.mark.parametrize(
-    ("name", "schema", "given"),
+    "line",
+    [
+        "algorithm.gamma=2",
+        "algorithm.gamma=true",
+        "algorithm.gamma=nan",
+        "algorithm.n_steps=0",
+        "algorithm.layer_norm=1",
+        "algorithm.tau=0",
+        "algorithm.learning_rate=inf",
+        "algorithm.learning_rate=abc",
+        "algorithm.learning_rate=null",
+        "algorithm.frames_per_update=-1",
+        "algorithm.target_entropy_weight=50",
+        "algorithm.initial_alpha=-1",
+        "algorithm.batch_size=1.5",
+        "algorithm.encoder=none",
+        "algorithm.initial_epsilon=3 algorithm=dqn",
+        "algorithm.epochs=0 algorithm=ppo",
+        "algorithm.clip=-1 algorithm=ppo",
+        "evaluation.every_frames=-1",
+        "evaluation.every_frames=null",
+        "evaluation.speeds=[]",
+        "evaluation.speeds=normal",
+        "evaluation.speeds=[low,low]",
+        "evaluation.speeds=[low,hgih]",
+        "evaluation.fps=[12,0.1]",
+        "evaluation.video=maybe",
+        "evaluation=null",
+        "speed=norml",
+        "total_frames=true",
+        "total_frames=2e6",
+        "seed=-1",
+        "device=meta",
+        "num_workers=-1",
+        "num_workers=33",
+        "wandb=true",
+        "representations.ego.scale=nan",
+        "representations=[]",
+        "noise.depth_dropout=1.5",
+        "flow.estimator=abc flow=estimated",
+        "~seed",
+        "~algorithm.gamma",
+        "total_frames=???",
+        # what does not go together
+        "algorithm.replay_capacity=1023",
+        "algorithm.learning_starts=4991 total_frames=5000",
+        "algorithm.batch_size=31",
+        "algorithm.final_epsilon=0.2 algorithm=dqn algorithm.initial_epsilon=0.1",
+        "algorithm.batch_size=225 algorithm=ppo algorithm.rollout_length=7",
+        "algorithm.rollout_length=64 algorithm=ppo total_frames=2047",
+    ],
+)
+def test_a_value_that_can_not_be_is_named(line):
+    key = line.split()[0].split("=")[0].lstrip("~").split(".")[-1]
+    assert key in refusal("train", TrainConfig, line)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "algorithm.replay_capacity=1024",
+        "total_frames=5000 algorithm.learning_starts=4990",
+        "algorithm.batch_size=32",
+        "algorithm=ppo algorithm.rollout_length=8",
+        "algorithm=ppo total_frames=2048",
+        "num_workers=32",
+        "seed=2147483647",
+        "algorithm.gamma=1 algorithm.tau=1 evaluation.baselines=[]",
+        "resume=there total_frames=512",  # the run's own algorithm decides whether that is enough
+    ],
+)
+def test_what_just_can_be_passes(line):
+    assert composed(*line.split()).seed >= 0
+
+
+def test_a_key_that_an_algorithm_does_not_have_is_named():
+    assert "gama" in refusal("train", TrainConfig, "+algorithm.gama=0.9")
+    assert "tau" in refusal("train", TrainConfig, "algorithm=ppo +algorithm.tau=0.1")
+    assert (
+        composed("+algorithm.mine=3", "algorithm._target_=my.Own").algorithm.options()["mine"] == 3
+    )
+
+
+def test_a_key_of_one_s_own_passes_where_it_was_added():
+    config = plain("train", "+note=pilot")
+    assert validated(TrainConfig, config, own_keys={"note"}).plain() == config
+    with pytest.raises(UsageError, match="note"):
+        validated(TrainConfig, config)
+
+
+def test_everything_that_is_wrong_is_said_at_once():
+    message = refusal("train", TrainConfig, "algorithm.gamma=2 evaluation.episodes=0 seed=x")
+    assert {line.split(":")[0] for line in message.splitlines()} == {
+        "seed", "evaluation.episodes", "algorithm.gamma"
+    }  # fmt: skip
+
+
+def test_representations_keep_the_order_of_the_command_line():
+    assert list(composed("representations=[seg2,ego,obj]").representations) == [
+        "seg2",
+        "ego",
+        "obj",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ("", "run"),
+        ("run=3", "run"),
+        ("run=here policy=mine.py:make scene=s_turn representations=[ego]", "policy=mine.py:make"),
+        ("run=here output=out", "output"),
+        ("run=here speed=[]", "speed"),
+        ("run=here speed=hihg", "speed"),
+        ("run=here fps=nan", "fps"),
+        ("run=here fps=[12,12.0]", "fps"),
+        ("run=here fps=[12,0]", "fps"),
+        ("run=here policy=[]", "policy"),
+        ("run=here policy=gredy", "policy"),
+        ("policy=[greedy,mine.py:make]", "policy"),
+        ("policy=mine.py:make representations=[ego]", "scene"),
+        ("policy=mine.py:make scene=s_turn", "representations"),
+        ("run=here episodes=0", "episodes"),
+        ("run=here video=true", "video"),
+    ],
+)
+def test_an_evaluation_that_can_not_be_is_refused(line, key):
+    assert key in refusal("evaluate", EvaluateConfig, line)
+
+
+def test_an_evaluation_takes_one_value_or_a_list():
+    line = "run=here speed=low fps=6 policy=sampled baselines=[]"
+    one = validated(EvaluateConfig, plain("evaluate", *line.split()))
+    assert (one.run, one.speed, one.fps, one.baselines) == (["here"], ["low"], [6], [])
+    more = validated(EvaluateConfig, plain("evaluate", "run=[a,b]", "fps=[6,7.5]"))
+    assert (more.run, more.fps) == (["a", "b"], [6, 7.5])
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["policy=pilot", "speed=fast", "episodes=0", "sheet_rows=true", "seed=-1", "frame_rate_hz=0"],
+)
+def test_a_look_that_can_not_be_is_refused(line):
+    assert line.partition("=")[0] in refusal("view", ViewConfig, line)
+
+
+def test_what_is_wrong_in_a_run_folder_is_named_with_the_file():
+    config = plain("train", "+note=pilot") | {"of_an_older_version": None}
+    assert validated_run(config, "config.yaml").plain() == config
+    config["algorithm"]["n_steps"] = 0
+    with pytest.raises(UsageError, match=r"^config.yaml: algorithm.n_steps"):
+        validated_run(config, "config.yaml")
+    config = plain("train") | {"device": "${oc.env:HOME}"}  # it is text there
+    with pytest.raises(UsageError, match="device"):
+        validated_run(config, "config.yaml")
+    with pytest.raises(UsageError, match=r"config.yaml"):
+        validated_run(None, "config.yaml")
+
+
+# The schema's literals are those of the code and of conf/.
+
+
+def test_names_in_the_schema_are_those_of_the_code():
+    pytest.importorskip("pybullet", reason="the environments are built with it")
+    from flowrep.agent import dsac, observation
+    from flowrep.baselines import BASELINES
+    from flowrep.scenes import scene
+    from flowrep.simulator.camera import RENDERERS
+    from flowrep.transforms.stack import NOISE_OPTIONS
+
+    def literal(model, field):
+        return set(get_args(model.model_fields[field].annotation))
+
+    assert set(get_args(schema.SpeedMode)) == set(get_args(scene.SpeedMode))
+    assert set(get_args(schema.BaselineName)) == set(BASELINES)
+    assert set(get_args(schema.Renderer)) == set(RENDERERS)
+    assert literal(schema.DiscreteSAC, "encoder") == set(dsac.ENCODERS)
+    assert literal(schema.PPO, "precision") == set(observation.PRECISIONS)
+    assert schema.Noise.key_names() == list(NOISE_OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "given"),
     [
         ("train", TrainConfig, []),
-        (
-            "evaluate",
-            EvaluateConfig,
-            [
-                "policy=a.py:make",
-                "scene=s_turn",
-                "flow=exact",
-                "noise=none",
-                "representations=[ego]",
-            ],
-        ),
+        ("evaluate", EvaluateConfig, [
+            "policy=a.py:make", "scene=s_turn", "flow=exact", "noise=none", "representations=[ego]",
+        ]),
         ("export", ExportConfig, ["run=x"]),
         ("view", ViewConfig, []),
         ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
         ("report", ReportConfig, ["run=x"]),
     ],
-    ids=["train", "evaluate", "export", "view", "factorize", "report"],
-)
-def test_a_command_has_the_keys_of_its_schema(name, schema, given):
+)  # fmt: skip
+def test_a_command_has_the_keys_of_its_schema(name, model, given):
     config = plain(name, *given)
-    assert sorted(config) == sorted(schema.keys())
-    validated(schema, config)
+    assert sorted(config) == sorted(model.key_names())
+    validated(model, config)
 
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
-def test_every_choice_of_every_group_is_right(group, name):
+def test_every_choice_of_every_group_is_valid_and_comes_back_as_it_is(group, name):
     choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
-    given = ["flow.weights=file"] if name == "raft" else []
-    config = plain("train", choice, *given)
-    assert validated(TrainConfig, config).algorithm.target == config["algorithm"]["_target_"]
-
-
-def keys_of(*place):
-    return sorted(OmegaConf.load(CONF_DIR.joinpath(*place).with_suffix(".yaml")))
-
-
-@pytest.mark.parametrize("name", group_choices("algorithm"))
-def test_an_algorithm_has_the_keys_of_its_section(name):
-    section = plain("train", f"algorithm={name}")["algorithm"]
-    assert sorted(section) == sorted(ALGORITHMS[section["_target_"]].keys())
-
-
-@pytest.mark.parametrize("name", group_choices("format"))
-def test_a_format_has_the_keys_of_its_section(name):
-    target = OmegaConf.load(CONF_DIR / "format" / f"{name}.yaml")["_target_"]
-    assert keys_of("format", name) == sorted(READERS[target].keys())
+    assert composed(choice).plain() == plain("train", choice)
 
 
 def test_every_section_has_its_file():
-    formats = {
-        OmegaConf.load(CONF_DIR / "format" / f"{name}.yaml")["_target_"]
-        for name in group_choices("format")
-    }
-    assert formats == set(READERS)
     targets = {
         OmegaConf.load(CONF_DIR / "algorithm" / f"{name}.yaml")["_target_"]
         for name in group_choices("algorithm")
     }
     assert targets == set(ALGORITHMS)
-    assert group_choices("representations") == sorted(Representations.keys())
-
-
-@pytest.mark.slow
-def test_the_other_sections_have_the_keys_of_their_files():
-    assert keys_of("flow", "exact") == sorted(ExactFlow.keys())
-    assert keys_of("flow", "estimated") == sorted(EstimatedFlow.keys())
-    for name in group_choices("noise"):
-        assert keys_of("noise", name) == sorted(Noise.keys()) == sorted(NOISE_OPTIONS)
-    assert sorted(plain("train")["evaluation"]) == sorted(Evaluation.keys())
-    for name in group_choices("representations"):
-        section = Representations.model_fields[name].annotation
-        assert sorted(plain("train", f"representations=[{name}]")["representations"][name]) == (
-            sorted(section.keys())
-        )
+    assert group_choices("representations") == sorted(schema.Representations.key_names())

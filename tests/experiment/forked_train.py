@@ -27,6 +27,7 @@ import torch.utils.tensorboard  # noqa: F401
 
 import flowrep.agent.checkpoint as checkpoint
 import flowrep.train
+from flowrep.config.schema import validated_run
 from flowrep.experiment.run import RunFolder
 
 
@@ -86,7 +87,8 @@ def child(request: dict, output) -> None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (request["largest_file"],) * 2)
         folder = RunFolder.existing(request["run"])
-        flowrep.train.carry_out(folder.read_config() | {"resume": request["run"]}, folder)
+        config = validated_run(folder.read_config(), "config.yaml")
+        flowrep.train.finish(config.model_copy(update={"resume": request["run"]}), folder)
     except SystemExit as end:
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)

@@ -13,11 +13,12 @@ pytest.importorskip("pybullet", reason="policies drive the simulated street")
 from flowrep.agent.networks import DiscreteActions, stochastic_policy
 from flowrep.envs import WorkerError
 from flowrep.exchange.policies import ForeignPolicy
+from flowrep.experiment import build
 from flowrep.experiment.arena import Agent, Job
 from flowrep.experiment.arena_team import ArenaTeam, can_travel
-from flowrep.from_config import ENVS_PER_ARENA, arena_from_config
+from flowrep.experiment.build import ENVS_PER_ARENA
 from flowrep.scenes import load_scene
-from tests.test_configs import composed
+from tests.config.composing import composed
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +48,7 @@ def config():
 
 @pytest.fixture(scope="module")
 def scene(config):
-    return load_scene(config["scene"])
+    return load_scene(config.scene)
 
 
 def leaning(action):
@@ -125,19 +126,19 @@ def test_what_was_left_unfinished_is_not_in_the_next_run(to_the_left):
 def test_only_what_can_be_sent_to_a_process_is(config):
     agent = leaning(LEFT)
     many, few = 2 * ENVS_PER_ARENA, 2 * ENVS_PER_ARENA - 1
-    arena = arena_from_config(config, [agent], many)
+    arena = build.arena(config, [agent], many)
     assert isinstance(arena, ArenaTeam)
     arena.close()
     assert can_travel([agent])
     assert not can_travel([agent._replace(device="cuda")])
     assert not can_travel([agent._replace(policy=lambda maps: maps)])
     assert not can_travel([agent, Agent(ForeignPolicy("mine", print, None), {"depth": {}})])
-    in_one = config | {"num_workers": 0}
+    in_one = config.model_copy(update={"num_workers": 0})
     stays = agent._replace(policy=lambda maps: maps)
     for arena in (
-        arena_from_config(config, [agent], few),
-        arena_from_config(in_one, [agent], many),
-        arena_from_config(config, [stays], many),
+        build.arena(config, [agent], few),
+        build.arena(in_one, [agent], many),
+        build.arena(config, [stays], many),
     ):
         assert not isinstance(arena, ArenaTeam)
         arena.close()

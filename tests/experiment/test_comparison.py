@@ -18,7 +18,7 @@ from flowrep.experiment.env_pool import EnvPool
 from flowrep.experiment.eye import Eye
 from flowrep.experiment.run import EVALUATION_COLUMNS
 from flowrep.scenes import load_scene
-from tests.test_configs import composed
+from tests.config.composing import composed
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +30,7 @@ ACTIONS = DiscreteActions(3, "categorical", torch.distributions.Categorical)
 @pytest.fixture(scope="module")
 def scene():
     small = ["scene.camera.height_px=12", "scene.camera.width_px=20"]
-    return load_scene(composed(*small)["scene"])
+    return load_scene(composed(*small).scene)
 
 
 class Weigher(nn.Module):

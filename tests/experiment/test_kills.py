@@ -16,7 +16,7 @@ pytest.importorskip("pybullet", reason="training drives the simulated street")
 from tests.experiment.test_training import differing
 
 from flowrep.agent import load_checkpoint
-from flowrep.config_tree import group_choices
+from flowrep.config import group_choices
 from flowrep.experiment.run import RunFolder
 from tests.test_configs import composed
 

@@ -8,12 +8,11 @@ import pytest
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
-from flowrep.config_tree import group_choices
+from flowrep.config import group_choices
 from flowrep.experiment.run import RunFolder
-from flowrep.experiment.runner import train
+from flowrep.experiment.runner import Runner
 from flowrep.progress import StopRequest
-from flowrep.train import make_training
-from tests.test_configs import composed
+from tests.config.composing import composed
 
 pytestmark = pytest.mark.slow
 
@@ -40,10 +39,10 @@ def test_every_algorithm_has_its_section():
 @pytest.mark.parametrize("algorithm", group_choices("algorithm"))
 def test_a_smoke_run_logs_what_is_explained(tmp_path, algorithm):
     config = composed("debug=smoke", f"algorithm={algorithm}", "device=cpu")
-    training = make_training(config, RunFolder(tmp_path))
-    train(training, config, StopRequest(), lambda frames: False)
-    training.env.close()
-    with training.run.metrics_path.open(newline="") as file:
+    training = Runner(config, RunFolder(tmp_path))
+    training.train(StopRequest())
+    training.close()
+    with training.folder.metrics_path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     sections = explained()
     assert set(rows[0]) == sections["Every run"] | sections[f"algorithm={algorithm}"]

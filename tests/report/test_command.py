@@ -7,48 +7,10 @@ import pytest
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
 
-from flowrep.config import UsageError
-from flowrep.config.composition import check_command
-from flowrep.config.reporting import ReportConfig
 from flowrep.report import command
-from flowrep.report.command import main, show, with_folders_named
+from flowrep.report.command import main, show
 from flowrep.report.tables import Table
-from tests.config.composing import plain
 from tests.report.folders import config_of, rows_of, write_run
-
-
-@pytest.mark.parametrize(
-    "names", [["plain"], ["a=b"], ["with space", "ego+obj_s0"], ["a,b", "c'd", "[e]"]]
-)
-def test_folders_may_have_any_name(tmp_path, monkeypatch, names):
-    monkeypatch.chdir(tmp_path)
-    for name in names:
-        (tmp_path / name).mkdir()
-    arguments = with_folders_named([*names, "videos=1"])
-    check_command("report", arguments, ReportConfig)
-    given = plain("report", *arguments)["run"]
-    assert (given if isinstance(given, list) else [given]) == names
-
-
-def test_what_is_no_folder_stays_what_it_is():
-    typed = ["run=[a,b]", "+note=x", "~policy", "trajectories=2", "--cfg", "job"]
-    assert with_folders_named(typed) == typed
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ([], "run"),
-        (["x", "policy=best"], "policy"),
-        (["x", "trajectories=-1"], "trajectories"),
-        (["x", "vidoes=1"], "vidoes"),
-        (["x", "run=y"], "'x' and 'run=y'"),
-    ],
-)
-def test_a_wrong_command_is_refused_by_name(arguments, expected):
-    with pytest.raises(UsageError) as caught:
-        check_command("report", with_folders_named(arguments), ReportConfig)
-    assert expected in str(caught.value)
 
 
 def ended(monkeypatch, capsys, *arguments):

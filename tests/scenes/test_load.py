@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from flowrep.baselines import Planner, drives
-from flowrep.config_tree import CONF_DIR
+from flowrep.config import CONF_DIR
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.load import json_schema
 

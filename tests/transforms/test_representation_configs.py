@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from flowrep.config_tree import CONF_DIR, group_choices
+from flowrep.config import CONF_DIR, group_choices
 from flowrep.transforms import REPRESENTATIONS, representation_options, representation_stack
 
 yaml = pytest.importorskip("yaml")

@@ -1,0 +1,405 @@
+"""Runs a command from its command line; a mistake ends in `error:` lines and exit code 2.
+
+Hydra composes the config and `flowrep.config.schema` checks it. What either refuses is caught here,
+at the edge, and printed as a line that names the key and the remedy. `HYDRA_FULL_ERROR=1` shows the
+traceback as well.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import sys
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from hashlib import sha1
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ValueType
+from hydra.core.utils import env_override
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from flowrep import __version__
+from flowrep.config import CONF_DIR, UsageError, config_groups, group_choices
+from flowrep.config.schema import Section, validated
+
+EXIT_USAGE = 2
+FOLDERS = ("resume", "run", "input", "output")
+"""Keys whose values are folders, which may have any name."""
+CAMERAS = ("input",)
+"""Those of them that may also be a camera's number."""
+OF_THE_MACHINE = ("device", "num_workers")
+"""Keys that don't define a run and may change when it is resumed."""
+_IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
+_VALUE_FOLLOWS = (
+    "-c", "-p", "-cp", "-cn", "-cd", "-i", "-sc", "--cfg", "--package", "--config-path",
+    "--config-name", "--config-dir", "--info", "--shell-completion",
+)  # fmt: skip
+"""Hydra's flags that may be followed by a value."""
+
+
+def run_command(config_name: str, command: Callable[[Any], Any], schema: type[Section]) -> None:
+    """Composes the config of `sys.argv`, checks it and runs the command.
+
+    Args:
+        config_name: a file of conf/, without its ending.
+        command: takes the config as its model.
+        schema: the model.
+    """
+
+    def job(config: DictConfig) -> Any:
+        try:
+            return command(checked(config, schema))
+        except Exception as error:
+            if _IS_DEBUGGING or not is_a_mistake(error):
+                traceback.print_exc()
+                sys.exit(1)
+            exit_with(explained(error, schema))
+
+    run_hydra(config_name, job, schema)
+
+
+def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[Section]) -> None:
+    """Runs a Hydra job; what Hydra refuses ends the process in an `error:` line.
+
+    Args:
+        config_name: a file of conf/, without its ending.
+        job: takes the composed config.
+        schema: the model of the config.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace", line_buffering=True)
+    register_resolvers()
+    main = hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)
+    try:
+        sys.argv[1:] = as_typed(sys.argv[1:], schema)
+        _show_if_asked(sys.argv[1:], config_name)
+        with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra raises its errors, not prints them
+            main(job)()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        if _IS_DEBUGGING or not is_a_mistake(error):
+            raise
+        exit_with(explained(error, schema))
+
+
+def is_a_mistake(error: Exception) -> bool:
+    """Returns whether an error is about something that a user can change.
+
+    These are flowrep's and Hydra's own errors, refused values, missing packages, and what the disk
+    reports.
+    """
+    of_hydra = HydraException, OmegaConfBaseException
+    is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
+    is_own = type(error).__module__.startswith("flowrep.")
+    return is_own or is_plugin or isinstance(error, (*of_hydra, ValueError, ImportError, OSError))
+
+
+def checked(config: DictConfig, schema: type[Section]) -> Any:
+    """Returns a composed config as its model.
+
+    Top-level keys that the user added (`+note=pilot`) are not checked.
+
+    Raises:
+        UsageError: a key or a value is wrong, or a copied scene file kept the name of its original.
+    """
+    plain, job = plain_config(config), HydraConfig.get()
+    model = validated(schema, plain, own_keys())
+    choice = str(job.runtime.choices.get("scene") or "").rpartition("/")[2]
+    name = (plain.get("scene") or {}).get("name")
+    is_typed = any(text.startswith("scene.name=") for text in job.overrides.task)
+    if name in group_choices("scene") and choice not in ("", name) and not is_typed:
+        raise UsageError(
+            f"scene={choice} has the name '{name}', under which its results would be filed: write "
+            f"name: {choice} in its file, or add scene.name={choice}"
+        )
+    return model
+
+
+def plain_config(config: DictConfig) -> dict[str, Any]:
+    """Returns a composed config as plain data, with interpolations resolved."""
+    plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return plain
+
+
+def own_keys() -> set[str]:
+    """Returns the top-level keys that were added to the running job's config (`+note=pilot`)."""
+    added = [text.lstrip("+") for text in HydraConfig.get().overrides.task if text[0] == "+"]
+    keys = (text.partition("=")[0].rpartition("@")[2] for text in added)  # +group@key=choice
+    return {key.partition(".")[0] for key in keys}
+
+
+def exit_with(problem: str | Exception, remedy: str = "") -> NoReturn:
+    """Ends the process with the exit code of a usage error, printing each line of the problem.
+
+    Args:
+        problem: what is wrong.
+        remedy: a line to print after it; the last `error:` line of a sweep's job is its reason.
+    """
+    print_error(problem)
+    if remedy:
+        print(remedy, file=sys.stderr)
+    sys.exit(EXIT_USAGE)
+
+
+def print_error(problem: str | Exception) -> None:
+    """Prints each line of a problem, without ending the process."""
+    for line in str(problem).splitlines():
+        print(f"error: {line}", file=sys.stderr)
+
+
+# What Hydra says in several lines, and what a newcomer types.
+
+
+def explained(error: Exception, schema: type[Section]) -> str:
+    """Returns an error of Hydra's in one line, with what exists instead; others as they are."""
+    text = str(error)
+    if isinstance(error, OverrideParseException):
+        return _unreadable(error.override)
+    missing = re.match(r"In '[^']*': Could not (?:find|load) '([^']+)/([^/']+)'", text)
+    if isinstance(error, MissingConfigException) and missing:
+        group, name = missing.groups()
+        if name.endswith(".yaml"):
+            top, stem = group.partition("/")[0], name.removesuffix(".yaml")
+            return (
+                f"{group}/{name} is a file: put it into a folder {top}/ and write "
+                f"--config-dir <the folder that holds {top}/> {top}={stem}"
+            )
+        there = ", ".join(sorted(error.options or group_choices(group)))
+        return f"unknown {group} '{name}'; there are: {there}"
+    several = re.match(r"Ambiguous value for argument '(([^=]+)=(.*))'", text)
+    if several:
+        typed, key, values = several.groups()
+        return f"'{typed}' is several values: add -m to run each, or write {key}=[{values}]"
+    unknown = re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text)
+    if unknown:
+        return _unknown_key(unknown[1], schema)
+    if text.startswith("Config group override must be"):
+        return "a group can't be null: write the name of a choice, --help lists them"
+    if text.startswith("Unknown plugin class"):
+        package = text.partition("'")[2].split(".")[1].replace("_", "-")
+        return f"{text.partition('.')[0]}...: pip install {package}"
+    value = re.match(r"(?:Missing mandatory value: |Interpolation key ')([\w.]+)", text)
+    if value:
+        return f"{value[1]} needs a value: {value[1]}=..."
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    place = ("full_key:", "object_type=", "See http", "provider=")
+    return " ".join(x for x in lines if not x.startswith(place)).partition(" Config search path")[0]
+
+
+def _unreadable(typed: str) -> str:
+    """Returns why Hydra can't read an argument, and how it could."""
+    key, equals, value = typed.partition("=")
+    if not equals:
+        return f"can't read '{typed}': write key=value; --help lists the keys"
+    if value.startswith("[") and not value.endswith("]"):
+        return f"can't read '{typed}': write a list without spaces, {key}=[a,b], or in quotes"
+    if value.startswith(("[", "{", "(")):
+        return f"can't read '{typed}'"
+    return f"can't read '{typed}'; quoted it is {shell_line(override(key, value))}"
+
+
+def _unknown_key(key: str, schema: type[Section]) -> str:
+    """Returns that there is no such key, and where its last part is one, or all keys."""
+    name, places = key.rpartition(".")[2], set()
+    for group in config_groups():
+        for path in CONF_DIR.glob(f"{group}/**/*.yaml"):
+            keys = OmegaConf.load(path)
+            if group in schema.key_names() and isinstance(keys, DictConfig) and name in keys:
+                own = f"{path.stem}." if group == "representations" else ""
+                places.add(f"{group}.{own}{name}")
+    there = ", ".join(sorted(places)) if places and key == name else ""
+    if there:
+        return f"unknown key '{key}': do you mean {there}?"
+    if "." in key:
+        return f"unknown key '{key}': --cfg job shows the keys that there are"
+    return f"unknown key '{key}'; there are: {', '.join([*schema.key_names(), 'preset', 'debug'])}"
+
+
+def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
+    """Prints the version or the keys with the comments of conf/, and ends, if it was asked to."""
+    if "--version" in arguments:
+        print(f"flowrep {__version__}")
+        sys.exit(0)
+    if not {"--help", "-h"} & {*arguments}:
+        return
+    text = (CONF_DIR / f"{config_name}.yaml").read_text(encoding="utf-8")
+    print(text.partition("\nhydra:")[0].rstrip())
+    print("\nChoices of the groups:")
+    for group in config_groups():
+        if re.search(rf"^ +- (optional )?{group}:", text, re.MULTILINE):
+            print(f"  {group}: {', '.join(group_choices(group))}")
+    print("\nkey=value sets a key, group=choice chooses, -m runs each of several values.")
+    print("--cfg job shows the resulting config, --hydra-help lists Hydra's own flags.")
+    sys.exit(0)
+
+
+# Texts with any characters, for Hydra and the shell.
+
+
+def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
+    """Returns a command line as Hydra reads it: folders quoted, those without a key named `run`.
+
+    A folder is quoted if it exists, or if Hydra would take its name for a number or the like.
+
+    Raises:
+        UsageError: a flag is a key, or folders are given in two ways.
+    """
+    bare, others, may_be_value = [], [], False
+    for text in arguments:
+        key = text.removeprefix("--").partition("=")[0]
+        if text.startswith("--") and key in {*schema.key_names(), *config_groups()}:
+            raise UsageError(f"'{text}': write {key}=<value>, without --")
+        is_folder = "=" not in text or Path(text).exists()
+        if is_folder and "run" in schema.key_names() and text[0] not in "-~+" and not may_be_value:
+            bare.append(text)
+        else:
+            others.append(_as_typed(text))
+        may_be_value = text in _VALUE_FOLLOWS
+    if not bare:
+        return others
+    if any(text.startswith("run=") for text in others):
+        raise UsageError(f"'{bare[0]}' and run= name folders in two ways: write the names alone")
+    quoted = [override("run", text).removeprefix("run=") for text in bare]
+    return [f"run=[{','.join(quoted)}]" if bare[1:] else f"run={quoted[0]}", *others]
+
+
+def _as_typed(argument: str) -> str:
+    key, _, text = argument.partition("=")
+    if key not in FOLDERS or not text:
+        return argument
+    parsed = _parsed(argument)
+    is_misread = (
+        key not in CAMERAS
+        and parsed is not None
+        and parsed.value_type is ValueType.ELEMENT
+        and isinstance(parsed.value(), int | float)  # a bool is an int
+    )
+    return override(key, text) if is_misread or Path(text).exists() else argument
+
+
+def _parsed(text: str) -> Any:
+    """Returns an override as Hydra reads it, None if it can't."""
+    try:
+        return OverridesParser.create().parse_overrides([text])[0]
+    except HydraException:
+        return None
+
+
+def override(key: str, text: str) -> str:
+    """Returns an override that sets `key` to exactly `text`, quoted only if necessary.
+
+    >>> print(override("resume", "outputs/a"), override("resume", "a=b, c"))
+    resume=outputs/a resume='a=b, c'
+    """
+    plain = f"{key}={text}"
+    parsed = None if "${" in text else _parsed(plain)  # OmegaConf would replace an interpolation
+    if parsed is not None and parsed.value_type is ValueType.ELEMENT and parsed.value() == text:
+        return plain
+    text = re.sub(r"(\\*)\$\{", lambda found: found[1] * 2 + r"\${", text)
+    # backslashes escape only before a quote, including the closing one
+    text = re.sub(r"(\\*)(')", lambda found: found[1] * 2 + r"\'", text)
+    text = re.sub(r"(\\+)$", lambda found: found[1] * 2, text)
+    return f"{key}='{text}'"
+
+
+def shell_line(*words: str) -> str:
+    """Returns words as a line to paste into a shell.
+
+    >>> print(shell_line("flowrep-train", override("resume", "a=b")))
+    flowrep-train 'resume='"'"'a=b'"'"''
+    """
+    return shlex.join(words)
+
+
+def line_for(command: str, **values: str) -> str:
+    """Returns a shell line for a flowrep command, called in the same way as this one.
+
+    Args:
+        command: the command's name, e.g. "train".
+        values: the values of its keys, with any characters.
+    """
+    is_script = Path(sys.argv[0]).name.startswith("flowrep-")
+    program = [f"flowrep-{command}"] if is_script else ["python", "-m", f"flowrep.{command}"]
+    return shell_line(*program, *(override(key, text) for key, text in values.items()))
+
+
+# Names of folders.
+
+
+def register_resolvers() -> None:
+    """Adds the resolvers for paths of run folders in conf/run_folder.yaml and conf/view.yaml.
+
+    `${run_name:scene,representations,flow,noise,seed}` names a run; `${folder_name:text}` makes any
+    text the name of a single folder; `${run_of_sweep:overrides}` names a run of a sweep;
+    `${unless_resumed:resume,folder}` is the folder of a new run.
+    """
+
+    def run_name(
+        scene: str,
+        representations: Iterable[str],
+        flow: str,
+        noise: Mapping[str, float],
+        seed: int,
+    ) -> str:
+        source = "" if flow == "exact" else f"_{flow}"
+        source += "_noisy" if any(noise.values()) else ""
+        return folder_name(f"{scene}_{'+'.join(representations)}{source}_s{seed}")
+
+    def unless_resumed(resume: str | None, folder: str) -> str:
+        return folder if resume is None else "."  # Hydra makes no folder then
+
+    resolvers: list[Callable[..., str]] = [run_name, folder_name, run_of_sweep, unless_resumed]
+    for resolver in resolvers:
+        OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
+
+
+def folder_name(text: str) -> str:
+    """Returns a text as the name of a single folder, without path separators.
+
+    >>> folder_name("s_turn"), folder_name("../../etc"), folder_name("..")
+    ('s_turn', '.._.._etc', '_')
+    """
+    name = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in str(text))[:200]
+    return "_" if name in ("", ".", "..") else name
+
+
+_BY_VALUE = (
+    "experiment", "preset", "debug", "scene", "representations", "flow", "algorithm", "speed",
+)  # fmt: skip
+
+
+def run_of_sweep(overrides: Iterable[str]) -> str:
+    """Returns the folder name of a sweep's run, which needs no quotes in a shell or in Hydra.
+
+    It depends on the overrides alone. Those whose value is clear by itself are shortened to it;
+    settings of the machine are left out.
+
+    >>> run_of_sweep(["seed=0", "scene=s_turn", "representations=[ego,obj]", "device=cpu"])
+    's_turn_ego+obj_s0'
+    >>> run_of_sweep(["preset=laptop", "algorithm.tau=0.01", "seed=1"])
+    'laptop_s1_algorithm.tau-0.01'
+    """
+
+    def plain(text: str) -> str:
+        joined = re.sub(r"[\[\]{}()'\"\s]", "", text.lstrip("+")).replace(",", "+")
+        return re.sub(r"[^A-Za-z0-9.+_-]", "_", joined)
+
+    values = dict(sorted(text.partition("=")[::2] for text in overrides))
+    for key in OF_THE_MACHINE:
+        values.pop(key, None)
+    seed = values.pop("seed", None)
+    words = [plain(values.pop(key)) for key in _BY_VALUE if key in values]
+    words += [] if seed is None else [f"s{plain(seed)}"]
+    words += [plain(f"{key}-{value}" if value else key) for key, value in values.items()]
+    name = "_".join(words) or "run"
+    return name if len(name) <= 100 else f"{name[:100]}_{sha1(name.encode()).hexdigest()[:8]}"

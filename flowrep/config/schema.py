@@ -1,0 +1,619 @@
+"""The commands' configs as pydantic models: every key, its type and its range.
+
+`conf/` holds the defaults, so nothing has one here. Names of classes, scenes and options are
+written out, so that reading a config imports neither torch nor a simulator;
+tests/config/test_schema.py holds them equal to the code and to conf/.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainSerializer,
+    PrivateAttr,
+    Tag,
+    ValidationError,
+    WrapValidator,
+    create_model,
+    model_validator,
+)
+
+from flowrep.config import UsageError
+
+Model = TypeVar("Model", bound="Section")
+
+# Larger whole numbers are not exact as floats, larger seeds are more than numpy takes.
+Count = Annotated[int, Field(ge=1, le=2**53)]
+CountOrZero = Annotated[int, Field(ge=0, le=2**53)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+PositiveShare = Annotated[float, Field(gt=0, le=1)]
+Text = Annotated[str, Field(min_length=1)]
+
+SpeedMode = Literal["low", "normal", "high"]
+FrameRate = Annotated[float, Field(ge=0.5, le=1000)]
+BaselineName = Literal["planner", "never_turn", "random"]
+Renderer = Literal["auto", "rasteriser", "pybullet"]
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+Workers = CountOrZero | Literal["auto"]
+
+
+def _distinct(values: Any) -> Any:
+    if isinstance(values, list) and any(value in values[:i] for i, value in enumerate(values)):
+        raise ValueError("one value is there twice")
+    return values
+
+
+def _listed(value: Any) -> Any:
+    return value if isinstance(value, list) or value is None else [value]
+
+
+Distinct = BeforeValidator(_distinct)
+OneOrMore = BeforeValidator(_listed)
+"""Lets a list of one be written without brackets."""
+
+
+class Section(BaseModel):
+    """Keys of a config: none is unknown, none is missing, and types are strict."""
+
+    model_config = ConfigDict(
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, populate_by_name=True
+    )
+
+    @classmethod
+    def key_names(cls) -> list[str]:
+        """Returns the keys as they are written in a config."""
+        return [field.alias or name for name, field in cls.model_fields.items()]
+
+    def plain(self) -> dict[str, Any]:
+        """Returns the keys and values as they are written in a config."""
+        return self.model_dump(by_alias=True) | self._own
+
+    _own: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+
+# What the agent sees.
+
+
+class Rgb(Section):
+    """The picture, which has no options."""
+
+
+class Segmentation(Section):
+    """A class id per pixel."""
+
+    encoding: Literal["ids", "onehot"]
+
+
+class Depth(Section):
+    """Distances."""
+
+    range_m: Positive
+    missing: Share
+
+
+class FlowMap(Section):
+    """Raw, ego or object flow."""
+
+    scale: float
+    unit: Literal["px_per_step", "px_per_s"]
+
+
+class SegmentationStack(Segmentation):
+    """The same maps of the last `k` frames."""
+
+    k: Count
+
+
+class DepthStack(Depth):
+    """The same maps of the last `k` frames."""
+
+    k: Count
+
+
+NOT_CHOSEN: Any = None
+
+
+class Representations(Section):
+    """The options of each representation, by its name."""
+
+    rgb: Rgb = NOT_CHOSEN
+    seg: Segmentation = NOT_CHOSEN
+    depth: Depth = NOT_CHOSEN
+    raw: FlowMap = NOT_CHOSEN
+    ego: FlowMap = NOT_CHOSEN
+    obj: FlowMap = NOT_CHOSEN
+    seg2: SegmentationStack = NOT_CHOSEN
+    depth2: DepthStack = NOT_CHOSEN
+
+
+def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
+    """Checks options and returns them as they are: a model would forget the order of its keys."""
+    check(value)
+    if not value:
+        raise ValueError("is empty; choose at least one: representations=[ego,obj]")
+    return {name: dict(options) for name, options in value.items()}
+
+
+if TYPE_CHECKING:
+    Stack = dict[str, dict[str, Any]]
+else:
+    Stack = Annotated[
+        Representations, WrapValidator(_in_their_order), PlainSerializer(lambda value: value)
+    ]
+
+
+class ExactFlow(Section):
+    """`flow=exact`."""
+
+    source: Literal["exact"]
+
+
+class EstimatedFlow(Section):
+    """`flow=estimated`."""
+
+    source: Literal["estimated"]
+    estimator: Literal["dis", "raft_small", "raft_large"]
+    weights: Text | None
+    preset: Literal["ultrafast", "fast", "medium"]
+    min_side_px: Count
+
+
+Flow = Annotated[ExactFlow | EstimatedFlow, Field(discriminator="source")]
+
+
+class Noise(Section):
+    """Errors of the depth camera and of odometry."""
+
+    depth_sigma_per_m: NotNegative
+    depth_dropout: Share
+    drift_m: NotNegative
+    drift_rad: NotNegative
+
+
+# The algorithms.
+
+
+class AnyAlgorithm(Section):
+    """A user's own class, whose options are those of its signature."""
+
+    model_config = ConfigDict(extra="allow")
+    target: Text = Field(alias="_target_")
+
+    def options(self) -> dict[str, Any]:
+        """Returns the options by name, without the class."""
+        return self.model_dump(by_alias=True, exclude={"target"})
+
+    def check_length(self, total_frames: int, num_envs: int) -> None:
+        """Checks that something is learnt in a run.
+
+        Raises:
+            ValueError: names the key to change.
+        """
+
+
+class _Learner(AnyAlgorithm):
+    """The options that the algorithms of `flowrep.agent` have in common."""
+
+    model_config = ConfigDict(extra="forbid")
+    precision: Literal["auto", "bf16", "fp32"]
+    learning_rate: Positive
+    gamma: Share
+    hidden_size: Count
+    batch_size: Count
+
+
+class _OffPolicy(_Learner):
+    """The options that algorithms with a replay memory have in common."""
+
+    tau: PositiveShare
+    replay_capacity: Count
+    frames_per_update: Count
+    learning_starts: Count | None
+    n_steps: Count
+    layer_norm: bool
+
+    def check_length(self, total_frames: int, num_envs: int) -> None:
+        """Checks that the memory holds a batch and the run is long enough for an update."""
+        if self.replay_capacity < self.batch_size:
+            raise ValueError(
+                f"algorithm.replay_capacity={self.replay_capacity} is less than "
+                f"algorithm.batch_size={self.batch_size}: raise it, or lower batch_size"
+            )
+        key = "batch_size" if self.learning_starts is None else "learning_starts"
+        starts = getattr(self, key)
+        if starts < num_envs:
+            raise ValueError(
+                f"algorithm.{key}={starts} is less than num_envs={num_envs}: before their second "
+                "step there is nothing to learn from; raise learning_starts, or lower num_envs"
+            )
+        first = starts + self.frames_per_update
+        if first > total_frames:
+            raise ValueError(
+                f"algorithm.{key}={starts}: the first update would come after {first} frames, and "
+                f"total_frames is {total_frames}: raise total_frames, or lower algorithm.{key}"
+            )
+
+
+class DiscreteSAC(_OffPolicy):
+    """`algorithm=dsac`."""
+
+    target: Literal["flowrep.agent.DiscreteSAC"] = Field(alias="_target_")
+    encoder: Literal["shared", "separate"]
+    initial_alpha: Positive
+    target_entropy_weight: Share
+    alpha_rate_factor: NotNegative
+
+
+class DiscreteSACWithValue(_OffPolicy):
+    """`algorithm=dsac_v`."""
+
+    target: Literal["flowrep.agent.DiscreteSACWithValue"] = Field(alias="_target_")
+    initial_alpha: Positive
+    target_entropy_weight: Share
+    alpha_rate_factor: NotNegative
+
+
+class DoubleDQN(_OffPolicy):
+    """`algorithm=dqn`."""
+
+    target: Literal["flowrep.agent.DoubleDQN"] = Field(alias="_target_")
+    initial_epsilon: Share
+    final_epsilon: Share
+    exploration_share: Share
+
+    @model_validator(mode="after")
+    def _exploration_falls(self) -> DoubleDQN:
+        if self.final_epsilon > self.initial_epsilon:
+            raise ValueError(
+                f"final_epsilon={self.final_epsilon} is more than "
+                f"initial_epsilon={self.initial_epsilon}"
+            )
+        return self
+
+
+class PPO(_Learner):
+    """`algorithm=ppo`."""
+
+    target: Literal["flowrep.agent.PPO"] = Field(alias="_target_")
+    rollout_length: Count
+    epochs: Count
+    gae_lambda: Share
+    clip: PositiveShare
+    value_weight: NotNegative
+    entropy_weight: NotNegative
+    max_grad_norm: Positive
+
+    def check_length(self, total_frames: int, num_envs: int) -> None:
+        """Checks that a rollout fills a batch, and that the run is long enough for one."""
+        frames = self.rollout_length * num_envs
+        if self.batch_size > frames:
+            raise ValueError(
+                f"algorithm.batch_size={self.batch_size} is more than the {frames} frames of a "
+                "rollout: lower it, or raise algorithm.rollout_length or num_envs"
+            )
+        if frames > total_frames:
+            raise ValueError(
+                f"algorithm.rollout_length={self.rollout_length} makes {frames} frames, and "
+                f"total_frames is {total_frames}: lower it, or raise total_frames"
+            )
+
+
+ALGORITHMS: dict[str, type[AnyAlgorithm]] = {
+    f"flowrep.agent.{section.__name__}": section
+    for section in (DiscreteSAC, DiscreteSACWithValue, DoubleDQN, PPO)
+}
+"""The sections of flowrep's own algorithms, by `_target_`."""
+
+
+def _algorithm_tag(value: Any) -> str:
+    target = value.get("_target_") if isinstance(value, Mapping) else value.target
+    return target if target in ALGORITHMS else "own"
+
+
+Algorithm = Annotated[
+    Annotated[DiscreteSAC, Tag("flowrep.agent.DiscreteSAC")]
+    | Annotated[DiscreteSACWithValue, Tag("flowrep.agent.DiscreteSACWithValue")]
+    | Annotated[DoubleDQN, Tag("flowrep.agent.DoubleDQN")]
+    | Annotated[PPO, Tag("flowrep.agent.PPO")]
+    | Annotated[AnyAlgorithm, Tag("own")],
+    Discriminator(_algorithm_tag),
+]
+_TAGS = {*ALGORITHMS, "own", "exact", "estimated"}
+"""Names of a union's members, which pydantic puts between the keys in an error's place."""
+
+
+# The commands.
+
+
+class EnvConfig(Section):
+    """What an environment is made of, on this machine."""
+
+    seed: Seed
+    device: Device
+    speed: SpeedMode
+    num_envs: Count
+    num_workers: Workers
+    renderer: Renderer
+    representations: Stack
+    flow: Flow
+    noise: Noise
+    scene: dict[str, Any]  # flowrep.scenes.load_scene checks it
+
+    @model_validator(mode="after")
+    def _each_worker_has_an_env(self) -> EnvConfig:
+        if getattr(self, "resume", None) is None:  # the run's own num_envs counts then
+            check_workers(self.num_workers, self.num_envs)
+        return self
+
+
+def check_workers(num_workers: int | str, num_envs: int) -> None:
+    """Checks that each process has an environment to step.
+
+    Raises:
+        ValueError: there are more processes than environments.
+    """
+    if isinstance(num_workers, int) and num_workers > num_envs:
+        raise ValueError(f"num_workers={num_workers} is more than num_envs={num_envs}: lower it")
+
+
+FINAL_POLICIES = ("greedy", "sampled")
+"""How the agent acts in its final evaluation, beside the baselines."""
+
+
+class Evaluation(Section):
+    """How the agent is evaluated while it learns and at the end."""
+
+    every_frames: CountOrZero
+    episodes: Count
+    final_episodes: Count
+    speeds: Annotated[list[SpeedMode], Field(min_length=1), Distinct]
+    fps: Annotated[list[FrameRate], Field(min_length=1), Distinct]
+    baselines: Annotated[list[BaselineName], Distinct]
+    video: bool
+
+    @property
+    def final_total(self) -> int:
+        """The number of episodes of the final evaluation."""
+        policies = len(FINAL_POLICIES) + len(self.baselines)
+        return len(self.speeds) * len(self.fps) * policies * self.final_episodes
+
+
+class TrainConfig(EnvConfig):
+    """The whole config of `flowrep.train`."""
+
+    total_frames: Count
+    compiled: bool
+    log_every_frames: Count
+    checkpoint_every_frames: Count
+    wandb: Literal["off", "offline", "online"]
+    resume: Text | None
+    experiment: Text | None
+    evaluation: Evaluation
+    algorithm: Algorithm
+
+    @model_validator(mode="after")
+    def _learns_something(self) -> TrainConfig:
+        if self.resume is None:  # the run's own algorithm counts then
+            self.algorithm.check_length(self.total_frames, self.num_envs)
+        return self
+
+
+class EvaluateConfig(Section):
+    """The whole config of `flowrep.evaluate`."""
+
+    run: Annotated[list[Text] | None, OneOrMore]
+    scene: dict[str, Any] | None = None
+    representations: Stack | None = None
+    flow: Flow | None = None
+    noise: Noise | None = None
+    speed: Annotated[list[SpeedMode], Field(min_length=1), Distinct, OneOrMore]
+    fps: Annotated[list[FrameRate], Field(min_length=1), Distinct, OneOrMore]
+    episodes: Count
+    policy: Annotated[list[Text], Field(min_length=1), Distinct, OneOrMore]
+    output: Text | None
+    baselines: Annotated[list[BaselineName], Distinct, OneOrMore]
+    seed: Seed
+    num_envs: Count
+    num_workers: Workers
+    device: Device
+    video: CountOrZero
+
+    @property
+    def own_policies(self) -> list[str]:
+        """The policies that are not a run's: path.py:make, package.module:make or path.pt2."""
+        return [name for name in self.policy if name not in ("greedy", "sampled")]
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> EvaluateConfig:
+        check_workers(self.num_workers, self.num_envs)
+        own = self.own_policies
+        for name in own:
+            if ":" not in name and not name.endswith(".pt2"):
+                raise ValueError(
+                    f"policy={name}: should be greedy, sampled, path.py:make, package.module:make "
+                    "or path.pt2"
+                )
+        if own and len(own) < len(self.policy):
+            raise ValueError("policy: greedy and sampled are a run's; evaluate your own apart")
+        if own and self.run is not None:
+            raise ValueError(f"run= and policy={own[0]} can't be combined: give one of them")
+        if not own and self.run is None:
+            raise ValueError("run needs a value: run=<a run's or a sweep's folder>")
+        needed = ("scene", "representations") if own else ()
+        for key in needed:
+            if getattr(self, key) is None:
+                raise ValueError(f"{key} needs a value for policy={own[0]}")
+        for key in () if own else ("representations", "flow", "noise", "output"):
+            if getattr(self, key) is not None:
+                raise ValueError(f"{key}= is for a policy of your own; a run's is in its config")
+        return self
+
+
+class ExportConfig(Section):
+    """The whole config of `flowrep.export`."""
+
+    run: Text
+    output: Text | None
+
+
+class ViewConfig(Section):
+    """The whole config of `flowrep.view`."""
+
+    scene: dict[str, Any]
+    policy: BaselineName
+    speed: SpeedMode
+    frame_rate_hz: FrameRate | None
+    path: Text | None
+    seed: Seed
+    episodes: Count
+    sheet_rows: Count
+    video: bool
+    interactive: bool
+
+
+class ReportConfig(Section):
+    """The whole config of `flowrep.report`."""
+
+    run: Annotated[list[Text], Field(min_length=1), OneOrMore]
+    output: Text | None
+    policy: Literal["greedy", "sampled"]
+    resamples: Count
+    trajectories: CountOrZero
+    videos: CountOrZero
+
+
+class Reader(Section):
+    """A reader of recordings, whose options are those of its class's signature."""
+
+    model_config = ConfigDict(extra="allow")
+    target: Annotated[str, Field(pattern=r"^flowrep\.sequences\.\w+$")] = Field(alias="_target_")
+
+    def options(self) -> dict[str, Any]:
+        """Returns the options by name, without the class."""
+        return self.model_dump(by_alias=True, exclude={"target"})
+
+
+class FlowScale(Section):
+    """Flow of full colour, pixels."""
+
+    raw: Positive
+    ego: Positive
+    obj: Positive
+
+
+class FactorizeConfig(Section):
+    """The whole config of `flowrep.factorize`."""
+
+    input: Text | int
+    output: Text
+    format: Reader
+    flow: Flow
+    poses: Literal["recorded", "estimated"] | None
+    start: CountOrZero
+    stop: CountOrZero | None
+    stride: Count
+    check_consistency: bool
+    moving_px: Positive
+    flow_files: Annotated[list[Literal["flo", "kitti", "npz"]], Distinct]
+    pictures_every: CountOrZero
+    video: bool
+    video_fps: Positive
+    rerun: bool
+    scale_px: FlowScale
+    depth_range_m: Positive
+
+    @model_validator(mode="after")
+    def _has_a_pair(self) -> FactorizeConfig:
+        if self.stop is not None and self.stop < self.start + self.stride + 1:
+            least = self.start + self.stride + 1
+            raise ValueError(f"stop={self.stop} leaves no pair of frames: at least {least}")
+        return self
+
+
+def validated(
+    schema: type[Model], plain: Mapping[str, Any], own_keys: Iterable[str] = (), source: str = ""
+) -> Model:
+    """Returns a resolved config as its model.
+
+    Args:
+        schema: the model of the whole config.
+        plain: the config as plain data.
+        own_keys: top-level keys that the user added (`+note=pilot`); they are kept as they are.
+        source: the file that the config comes from, for messages.
+
+    Raises:
+        UsageError: a line for each key that is unknown, missing or invalid.
+    """
+    own = {key: plain[key] for key in own_keys if key not in schema.key_names()}
+    try:
+        model = schema.model_validate({k: v for k, v in plain.items() if k not in own})
+    except ValidationError as error:
+        lines = [_line(details) for details in error.errors(include_url=False)]
+        raise UsageError("\n".join(f"{source}: {x}" if source else x for x in lines)) from None
+    model._own = own
+    return model
+
+
+def validated_run(plain: Any, source: str) -> TrainConfig:
+    """Returns the config of a run's folder.
+
+    Raises:
+        UsageError: it is not a run's config; has a line for each invalid key.
+    """
+    if not isinstance(plain, Mapping):
+        raise UsageError(f"{source} holds no run's config: restore the file")
+    return validated(TrainConfig, plain, plain.keys() - {*TrainConfig.key_names()}, source)
+
+
+def check_options(maker: type, options: Mapping[str, Any], section: str) -> None:
+    """Checks options against the signature of the class that they are for.
+
+    Args:
+        maker: its constructor's first argument is not an option.
+        options: by name.
+        section: their place in the config, for messages.
+
+    Raises:
+        UsageError: a line for each option that is unknown, missing or of another type.
+    """
+    hints = get_type_hints(maker.__init__)  # type: ignore[misc]
+    _, *parameters = inspect.signature(maker).parameters.values()
+    fields: dict[str, Any] = {
+        p.name: (hints[p.name], ... if p.default is p.empty else p.default) for p in parameters
+    }
+    rules = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    try:
+        create_model("Options", __config__=rules, **fields).model_validate(options)
+    except ValidationError as error:
+        lines = [_line(details, section) for details in error.errors(include_url=False)]
+        raise UsageError("\n".join(lines)) from None
+
+
+def _line(details: Any, *section: str) -> str:
+    """Returns pydantic's error in a line that begins with the key."""
+    key = ".".join(str(part) for part in (*section, *details["loc"]) if part not in _TAGS)
+    kind, value = details["type"], details["input"]
+    message = details["msg"].removeprefix("Value error, ")
+    if kind == "extra_forbidden":
+        return f"{key}: there is no such key"
+    if kind == "missing":
+        return f"{key} needs a value: {key}=..."
+    if kind == "value_error":
+        return f"{key}: {message}" if key else message
+    remedy = ""
+    if kind == "list_type":
+        remedy = f"; write {key}=[{value}]"
+    elif kind == "int_type" and isinstance(value, float) and value.is_integer():
+        remedy = f"; write {value:.0f}"
+    return f"{key}: {message[0].lower()}{message[1:]}, not {value!r}{remedy}"

@@ -1,0 +1,154 @@
+"""Builds what a config describes: env, agent, policy, device. Below it nobody sees a config."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Sequence
+from functools import partial
+from pkgutil import resolve_name
+from typing import Any
+
+import torch
+from torchrl.envs import EnvBase, InitTracker
+
+from flowrep.agent import Algorithm
+from flowrep.config import UsageError
+from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
+from flowrep.envs import make_env
+from flowrep.envs.workers import available_cores
+from flowrep.experiment.arena import Agent, Arena
+from flowrep.experiment.arena_team import AnyArena, ArenaTeam, can_travel
+from flowrep.experiment.env_pool import EnvPool
+from flowrep.scenes import load_scene
+from flowrep.simulator.camera import choose_renderer
+
+ENVS_PER_ARENA = 24  # at least, in a process of its own: a step of few costs as much as one of many
+
+
+def device(name: str) -> torch.device:
+    """Returns the named device; "auto" is a CUDA device if there is one, else the CPU.
+
+    Raises:
+        UsageError: torch does not know the device, or this machine lacks it.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise UsageError(f"device={name} can't be used: {reason}. Try device=cpu") from None
+
+
+def env(config: EnvConfig, **changes: Any) -> EnvBase:
+    """Returns the env that the config describes.
+
+    Observations include `is_init`, which marks the beginning of an episode for the replay memory.
+
+    Args:
+        config: of the run.
+        changes: arguments of `make_env` that take precedence.
+    """
+    arguments: dict[str, Any] = {
+        "scene": config.scene,
+        "representations": config.representations,
+        "flow": config.flow.plain(),
+        "noise": config.noise.plain(),
+        "num_envs": config.num_envs,
+        "device": device(config.device),
+        "speed": config.speed,
+        "renderer": config.renderer,
+    }
+    arguments |= changes
+    num_workers = changes.get("num_workers", config.num_workers)
+    if num_workers == "auto" and not _workers_help(config):
+        num_workers = 0
+    arguments["num_workers"] = worker_count(num_workers, arguments["num_envs"])
+    return make_env(**arguments).append_transform(InitTracker())
+
+
+def worker_count(num_workers: int | str, num_envs: int) -> int:
+    """Returns the number of worker processes; for "auto" one per core, if there are several.
+
+    In a process of a pool, such as that of `hydra/launcher=joblib`, "auto" is 0, since other jobs
+    use the other cores.
+    """
+    if isinstance(num_workers, int):
+        return num_workers
+    cores = available_cores()
+    is_in_pool = multiprocessing.current_process().name != "MainProcess"
+    return 0 if is_in_pool or min(cores, num_envs) < 2 else min(cores, num_envs)
+
+
+def _workers_help(config: EnvConfig) -> bool:
+    """Returns whether training is faster if other processes step the environments.
+
+    A learner on a CPU of two cores needs both, and the rasteriser makes steps cheap.
+    """
+    if available_cores() > 2 or device(config.device).type != "cpu":
+        return True
+    return config.flow.source != "exact" or choose_renderer(config.renderer) == "pybullet"
+
+
+def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
+    """Returns the config's algorithm, untrained, for the env's specs."""
+    arguments, options = _arguments(config, env)
+    return algorithm_class(config.algorithm)(*arguments, **options)
+
+
+def policy(config: TrainConfig, env: EnvBase) -> Any:
+    """Returns the untrained policy of the config's algorithm alone."""
+    arguments, options = _arguments(config, env)
+    return algorithm_class(config.algorithm).make_policy(*arguments, **options)
+
+
+def _arguments(config: TrainConfig, env: EnvBase) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Returns the arguments of the config's algorithm, by position and by name."""
+    specs = env.observation_spec, env.action_spec, list(config.representations)
+    of_the_run = {"total_frames": config.total_frames, "device": device(config.device)}
+    return specs, of_the_run | config.algorithm.options()
+
+
+def algorithm_class(section: AnyAlgorithm) -> Any:
+    """Returns the class that a config names, after checking that it is one of an algorithm.
+
+    Raises:
+        UsageError: it can't be imported, is no `Algorithm`, or has other options.
+    """
+    target = section.target
+    try:
+        found = resolve_name(target)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(
+            f"algorithm._target_={target} can't be imported: {error}; is its folder in PYTHONPATH?"
+        ) from None
+    if not (isinstance(found, type) and issubclass(found, Algorithm)):
+        raise UsageError(
+            f"algorithm._target_={target} is not a subclass of flowrep.agent.Algorithm"
+        )
+    if target in ALGORITHMS:
+        return found
+    given, known = section.options(), found.options()
+    for key in given.keys() - known.keys():
+        raise UsageError(f"unknown key 'algorithm.{key}'; {target} has: {', '.join(known)}")
+    for key, parameter in known.items():
+        if parameter.default is parameter.empty and key not in given:
+            raise UsageError(f"algorithm.{key} needs a value: +algorithm.{key}=...")
+    return found
+
+
+def arena(config: EnvConfig, agents: Sequence[Agent], num_envs: int) -> AnyArena:
+    """Returns what evaluates agents in the config's scene.
+
+    On a CPU, each of several processes takes whole episodes if it has enough environments;
+    otherwise workers step the environments of one arena.
+    """
+    scene = load_scene(config.scene)
+    workers = min(worker_count(config.num_workers, config.num_envs), num_envs)
+    processes = min(workers, num_envs // ENVS_PER_ARENA)
+    if processes > 1 and can_travel(agents):
+        return ArenaTeam(
+            scene, agents, num_envs=num_envs, num_processes=processes, renderer=config.renderer
+        )
+    pool = partial(EnvPool, num_envs=num_envs, num_workers=workers, renderer=config.renderer)
+    return Arena(scene, agents, pool)

@@ -1,0 +1,311 @@
+"""Sweeps: `python -m flowrep.train -m seed=0,1,2` is a run for each job, in a folder of its own.
+
+A job is the command `python -m flowrep.train <its overrides> hydra.run.dir=<folder>`, or
+`resume=<folder>` where it has begun, and nothing where its final evaluation is there. So a sweep
+continues where it was stopped, whatever stopped it. Hydra's launchers (one after the other, joblib,
+SLURM, Ray) call `job` in their workers, which therefore import no torch here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from flowrep.config import UsageError
+from flowrep.config.cli import (
+    OF_THE_MACHINE,
+    exit_with,
+    override,
+    plain_config,
+    register_resolvers,
+    run_hydra,
+    shell_line,
+)
+from flowrep.config.schema import TrainConfig, validated
+from flowrep.progress import StopRequest
+from flowrep.tables import read_rows
+
+register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
+
+LOG = "job.log"
+STOP = ".stop"
+"""A file in the sweep's folder that tells its jobs, on whatever machine, to save and stop."""
+POLL_S = 0.5
+PARENT = os.getppid()
+TRAIN = (sys.executable, "-m", "flowrep.train")
+FINISHED, STOPPED, RUNNING = "finished", "stopped", "running"
+_ONLY_SHOWS = {"--cfg", "-c", "--info", "-i", "--help", "-h", "--hydra-help", "--version"}
+_NEEDED_BY = {
+    # finished jobs take no time, so batches would grow and delay the unfinished ones
+    "hydra/launcher=joblib": ("hydra.launcher.batch_size=1",),
+    # a run returns its success, and a failed run should not end the study
+    "hydra/sweeper=optuna": (
+        "hydra.sweeper.direction=maximize",
+        "hydra.sweeper.max_failure_rate=1.0",
+    ),
+}
+"""Options of plugins that a sweep needs, added unless they are typed."""
+
+
+class RunFailedError(RuntimeError):
+    """A run of a sweep has no result."""
+
+
+def is_sweep(arguments: list[str]) -> bool:
+    """Returns whether a command line asks for several runs, and not only shows their config."""
+    given = {"-m", "--multirun", "hydra.mode=MULTIRUN"} & {*arguments}
+    return bool(given) and not _ONLY_SHOWS & {*arguments}
+
+
+def run_sweep() -> NoReturn:
+    """Runs the sweep of `sys.argv`, prints how it ended, and ends the process.
+
+    The exit code is 0 if all runs have finished, that of a signal that stopped it, else 1.
+    """
+    typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
+    folder = _folder(sys.argv[1:])
+    if any(text.startswith("resume=") for text in typed):
+        exit_with(
+            "resume= continues one run; continue a sweep with its own command and "
+            "hydra.sweep.dir=<its folder>"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / STOP).unlink(missing_ok=True)
+    except OSError as error:
+        exit_with(f"the sweep's folder can't be made ({error}): give another with hydra.sweep.dir=")
+    given = override("hydra.sweep.dir", str(folder))
+    keys = {text.partition("=")[0] for text in typed}
+    options = [o for choice in typed for o in _NEEDED_BY.get(choice, ())]
+    sys.argv[1:] = [*typed, given, *(o for o in options if o.partition("=")[0] not in keys)]
+    begun, failure = time.time(), 0
+    with StopRequest(then=(folder / STOP).touch) as stop:
+        try:
+            run_hydra("train", job, TrainConfig)
+        except SystemExit as end:
+            failure = end.code if isinstance(end.code, int) else 1
+            if failure == 2 and not _states(folder, since=begun):
+                raise  # a mistake on the command line, which has been printed
+        except Exception as error:  # of the launcher or the sweeper
+            failure = 1
+            if "No trials are completed" not in str(error):  # says Optuna; so does the summary
+                traceback.print_exc()
+    states = _states(folder)
+    is_whole = not stop and not failure and all(s.startswith(FINISHED) for s in states.values())
+    print(f"sweep: {folder}")
+    counts = [sum(s.startswith(word) for s in states.values()) for word in (FINISHED, "failed")]
+    print(
+        f"{counts[0]} of {len(states)} runs finished" + (f", {counts[1]} failed" * bool(counts[1]))
+    )
+    for name, state in states.items():
+        print(f"  {name}: {state}")
+        if state.startswith("failed"):
+            print(f"    log: {folder / name / LOG}")
+    if counts[0]:
+        print(f"Compare them with\n  {shell_line('python', '-m', 'flowrep.report', str(folder))}")
+    if not is_whole:
+        again = shell_line("python", "-m", "flowrep.train", *typed, given)
+        print(f"Continue the remaining runs with\n  {again}")
+    sys.exit(stop.exit_code if stop else failure or int(not is_whole))
+
+
+def _folder(arguments: list[str]) -> Path:
+    """Returns the sweep's folder: the one that is given, or a new one."""
+    given = [text.partition("=")[2] for text in arguments if text.startswith("hydra.sweep.dir=")]
+    name = given[-1].strip("'") if given else f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
+    return Path(name).absolute()
+
+
+def _states(sweep: Path, since: float = 0.0) -> dict[str, str]:
+    """Returns what the last line of each run's log says of it, by name."""
+    states = {}
+    for log in sorted(sweep.glob(f"*/{LOG}")):
+        if log.stat().st_mtime < since:
+            continue
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+        said = lines[-1] if lines and lines[-1].startswith("--- ") else f"--- {STOPPED}"
+        states[log.parent.name] = said.removeprefix("--- ")
+    return states
+
+
+def job(config: DictConfig) -> float:
+    """Does what remains of one run in a process of its own; called by Hydra's launchers.
+
+    Returns:
+        Its share of final greedy episodes that succeed; nan if a run of a grid has none, so that
+        the other runs go on.
+
+    Raises:
+        RunFailedError: the run has no result, and its sweeper needs one.
+    """
+    hydra = HydraConfig.get()
+    folder, sweep = Path(hydra.runtime.output_dir), Path(hydra.sweep.dir)
+    is_worker = multiprocessing.current_process().name != "MainProcess"  # of a pool, as joblib's
+    if is_worker:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launching process leaves a `.stop`
+
+    def should_stop() -> bool:
+        return (sweep / STOP).exists() or (is_worker and os.getppid() != PARENT)
+
+    try:
+        state = attempted(
+            folder, plain_config(config), _line(folder, config, is_worker), should_stop
+        )
+    except Exception as error:  # the other runs go on
+        state = f"failed: error: {' '.join(str(error).split())}"
+        _say(folder, state)
+    print(f"{folder.name}: {state}", flush=True)
+    if is_worker and os.getppid() != PARENT:
+        os._exit(1)  # nobody waits for its result
+    if state.startswith(FINISHED):
+        return success_of(folder)
+    if hydra.sweeper["_target_"].endswith("BasicSweeper"):
+        return float("nan")
+    raise RunFailedError(f"{folder} {state}")
+
+
+def _line(folder: Path, config: DictConfig, is_worker: bool) -> list[str]:
+    """Returns the arguments of `flowrep.train` for a job's run."""
+    hydra = HydraConfig.get()
+    typed = list(hydra.overrides.task)
+    machine = [text for text in typed if text.partition("=")[0] in OF_THE_MACHINE]
+    if is_worker and config.num_workers == "auto":  # it has only its own core
+        machine = [*(text for text in machine if "device" in text), "num_workers=0"]
+    if (folder / "config.yaml").is_file():
+        return [override("resume", str(folder)), *machine]
+    line = [f"hydra.run.dir={override('', str(folder))[1:]}", *typed, *machine]
+    line += [text for text in hydra.overrides.hydra if text.startswith("hydra.searchpath=")]
+    for source in hydra.runtime.config_sources:
+        if source.provider == "command-line":
+            line += ["--config-dir", source.path]
+    return [*line, "--config-name", str(hydra.job.config_name)]
+
+
+def attempted(folder: Path, asked: dict[str, Any], line: list[str], should_stop: Any) -> str:
+    """Returns how a run stands after what remains of it was done: "failed: error: no space".
+
+    Args:
+        folder: of the run.
+        asked: its config, as the sweep composes it.
+        line: the arguments of `flowrep.train`.
+        should_stop: polled; once it returns true, the run saves and ends.
+
+    Raises:
+        UsageError: the config is invalid, or the folder holds a run with another one.
+    """
+    own = asked.keys() - {*TrainConfig.key_names()}
+    config = validated(TrainConfig, asked, own)
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_is_same(folder, config.plain())
+    if is_finished(folder, config):
+        return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
+    if should_stop():
+        return STOPPED
+    print(f"{folder.name}: {RUNNING}", flush=True)
+    _say(folder, f"{datetime.now():%Y-%m-%d %H:%M:%S}")
+    begin = (folder / LOG).stat().st_size
+    with (folder / LOG).open("ab", buffering=0) as log, _process(line, log) as run:
+        while run.poll() is None:
+            if should_stop():
+                run.terminate()
+                break
+            time.sleep(POLL_S)
+        code = run.wait()
+    if is_finished(folder, config):
+        return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
+    if code in (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGTERM, -signal.SIGINT):
+        return _say(folder, STOPPED)
+    return _say(folder, f"failed: {_reason(folder / LOG, begin, code)}")
+
+
+@contextmanager
+def _process(line: list[str], log: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """Runs `flowrep.train`; it saves and ends when this process ends, however it does."""
+
+    def prepare() -> None:
+        for number in (signal.SIGUSR1, signal.SIGUSR2):  # SLURM's, meant for its launcher
+            signal.signal(number, signal.SIG_IGN)
+        if sys.platform == "linux":
+            ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+
+    environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
+    run = subprocess.Popen(
+        [*TRAIN, *line], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment,
+        preexec_fn=prepare,
+    )  # fmt: skip
+    try:
+        yield run
+    finally:
+        if run.poll() is None:
+            run.terminate()
+        run.wait()
+
+
+def _say(folder: Path, state: str) -> str:
+    """Adds a line to a run's log, whose last such line is how the run stands, and returns it."""
+    with (folder / LOG).open("a", encoding="utf-8") as log:
+        log.write(f"--- {state}\n")
+    return state
+
+
+def _reason(log: Path, begin: int, code: int) -> str:
+    """Returns why a run failed: the last error in its log, or the signal that ended it."""
+    if code < 0:
+        hint = ": is there enough memory?" if -code == signal.SIGKILL else ""
+        return f"ended by {signal.Signals(-code).name}{hint}"
+    text = log.read_bytes()[begin:].decode(errors="replace")
+    lines = [line.strip() for line in re.split(r"[\r\n]", text)]  # a bar's line ends in "\r"
+    errors = [line for line in lines if line.startswith("error: ")]
+    return (errors or [x for x in lines if x] or [f"exit code {code}"])[-1]
+
+
+def _check_is_same(folder: Path, asked: Mapping[str, Any]) -> None:
+    """Checks that a folder holds no other run than the one that a sweep asks for."""
+    if not (folder / "config.yaml").is_file():
+        return
+    stored = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    there, here = (json.loads(json.dumps(each, default=str)) for each in (stored or {}, asked))
+    for key in here.keys() - {*OF_THE_MACHINE, "resume"}:
+        if there.get(key) != here[key]:
+            raise UsageError(
+                f"'{folder}' holds a run with {key}={there.get(key)}, the sweep asks for "
+                f"{here[key]}: give the sweep another folder with hydra.sweep.dir=, or move it away"
+            )
+
+
+def is_finished(folder: Path, config: TrainConfig) -> bool:
+    """Returns whether a run's final evaluation is in its folder."""
+    frames = [int(row["frames"]) for row in _final(folder)]
+    enough = sum(each >= config.total_frames for each in frames)
+    return enough >= config.evaluation.final_total
+
+
+def success_of(folder: Path) -> float:
+    """Returns the share of a run's last final greedy episodes that succeed; nan without any."""
+    greedy = [row for row in _final(folder) if row["policy"] == "greedy"]
+    last = max((int(row["frames"]) for row in greedy), default=0)
+    ends = [row["outcome"] for row in greedy if int(row["frames"]) == last]
+    return ends.count("success") / len(ends) if ends else float("nan")
+
+
+def _final(folder: Path) -> list[dict[str, str]]:
+    columns = ("evaluation", "policy", "frames", "outcome")
+    rows = read_rows(folder / "evaluation.csv", columns)
+    return [row for row in rows if row["evaluation"] == "final"]

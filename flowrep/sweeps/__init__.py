@@ -1,1 +1,0 @@
-"""Many runs by one command, each with its own process and folder, so that sweeps can continue."""

@@ -1,0 +1,314 @@
+"""A mistake ends in `error:` lines and code 2; odd names pass through shell and Hydra unharmed."""
+
+import os
+import random
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+import flowrep
+from flowrep.config import CONF_DIR, cli, schema
+
+SCHEMAS = {
+    "train": schema.TrainConfig,
+    "evaluate": schema.EvaluateConfig,
+    "factorize": schema.FactorizeConfig,
+    "report": schema.ReportConfig,
+    "view": schema.ViewConfig,
+}
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Runs a command line up to the command; returns exit code, config and output."""
+
+    def run(command, *arguments):
+        found = []
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["flowrep-train", *arguments])
+        code = 0
+        try:
+            cli.run_command(command, found.append, SCHEMAS[command])
+        except SystemExit as end:
+            code = end.code
+        return code, found, capsys.readouterr()
+
+    return run
+
+
+MISTAKES = [
+    # a choice that doesn't exist
+    ("train representations=[eggo]", ["eggo", "ego", "depth2", "seg"]),
+    ("train scene=straight", ["straight", "straight_road", "s_turn"]),
+    ("train preset=lap", ["lap", "laptop", "overnight", "paper"]),
+    ("train algorithm=dqm", ["dqm", "dqn", "dsac_v", "ppo"]),
+    ("train hydra/launcher=joblb", ["joblb", "basic"]),
+    ("train -m representations=[ego],[raw,eggo]", ["eggo", "depth2"]),
+    ("train scene=my/x.yaml", ["x.yaml", "--config-dir", "scene=x"]),
+    ("factorize input=x output=y", ["format", "tum", "vkitti2"]),
+    # a key that doesn't exist
+    ("train sed=3", ["sed", "seed", "total_frames", "preset"]),
+    ("train ~sed", ["sed", "seed"]),
+    ("train batch_size=16", ["algorithm.batch_size"]),
+    ("train scene.camera.heigth_px=84", ["scene.camera.heigth_px"]),
+    ("train seed.value=3", ["seed.value"]),
+    ("train hydra.run.dirr=x", ["hydra.run.dirr"]),
+    ("report x vidoes=1", ["vidoes", "videos"]),
+    ("train +algorithm.gama=0.9", ["algorithm.gama"]),
+    # nothing where something is needed
+    ("train scene=null", ["null"]),
+    ("train representations=null", ["null"]),
+    ("train representations=[]", ["representations"]),
+    ("train ~algorithm", ["algorithm"]),
+    ("train ~seed", ["seed"]),
+    ("train total_frames=???", ["total_frames"]),
+    ("report", ["run"]),
+    ("evaluate", ["run"]),
+    # what Hydra can't read
+    ("train 'representations=[ego,' 'obj]'", ["representations=[ego,", "without spaces"]),
+    ("train representations=[ego", ["representations=[ego"]),
+    ("train hydra.run.dir=/home/josé/x", ["'hydra.run.dir='\"'\"'/home/josé/x'\"'\"''"]),
+    ("train outputs", ["outputs", "key=value"]),
+    ("train --preset laptop", ["preset=<value>"]),
+    ("train seed=0,1", ["seed=0,1", "-m", "seed=[0,1]"]),
+    ("report x run=y", ["x", "run="]),
+    # places that don't exist, flags that contradict each other
+    ("train --config-dir nowhere", ["nowhere"]),
+    ("train --config-name nope", ["nope"]),
+    ("train --config-path pkg://nowhere", ["nowhere"]),
+    ("train -m --cfg job", ["--multirun", "--cfg"]),
+    ("train --resolve", ["--resolve", "--cfg"]),
+    # values
+    ("train speed=fast", ["speed", "low", "normal", "high", "fast"]),
+    ("train evaluation.baselines=[never]", ["evaluation.baselines", "never_turn"]),
+    ("train algorithm.gamma=2 evaluation.episodes=0 seed=x", ["gamma", "episodes", "seed"]),
+    ("train -m seed=0 hydra/launcher=ray_jobs", ["pip install hydra-ray-launcher"]),
+]
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize(("line", "names"), MISTAKES, ids=[line for line, _ in MISTAKES])
+def test_a_mistake_ends_in_lines_that_name_it_and_what_exists(run, line, names):
+    command, *arguments = shlex.split(line)
+    code, found, said = run(command, *arguments)
+    assert code == 2
+    assert not found
+    lines = said.err.splitlines()
+    assert lines
+    assert all(line.startswith("error: ") for line in lines)
+    for name in names:
+        assert name in said.err
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize(
+    "line",
+    [
+        "train",
+        "train representations=[ego,obj,seg2] scene=straight_road preset=laptop seed=1",
+        "train representations.ego.scale=0.5 scene.camera.height_px=64 debug=smoke",
+        "train hydra.run.dir=elsewhere algorithm.encoder=separate",
+        "train hydra/job_logging=default hydra/hydra_logging=none",
+        "train +note=pilot ++seed=4 +mine.deep=1 +algorithm@beside=dqn +hydra.job.env_set.A=1",
+        "train ~debug",
+        "train --config-path pkg://flowrep.conf",
+        "evaluate outputs/a outputs/b speed=low fps=6 policy=sampled baselines=[]",
+        "view scene=s_turn",
+        "report outputs/a",
+    ],
+)
+def test_what_hydra_accepts_passes(run, line):
+    command, *arguments = line.split()
+    code, found, said = run(command, *arguments)
+    assert (code, said.err) == (0, "")
+    assert isinstance(found[0], SCHEMAS[command])
+
+
+def test_a_key_of_ones_own_is_kept(run):
+    _, (config,), _ = run("train", "+note=pilot")
+    assert config.plain()["note"] == "pilot"
+
+
+def test_errors_of_the_command_are_lines_too_unless_they_are_bugs(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for error, code in ((OSError("no space"), 2), (KeyError("a bug"), 1)):
+        monkeypatch.setattr(sys, "argv", ["flowrep-train"])
+
+        def fails(config, error=error):
+            raise error
+
+        with pytest.raises(SystemExit) as ended:
+            cli.run_command("train", fails, schema.TrainConfig)
+        assert ended.value.code == code
+        assert ("Traceback" in capsys.readouterr().err) is (code == 1)
+
+
+def test_help_has_the_comments_of_conf_and_the_choices(run):
+    code, _, said = run("train", "--help")
+    assert code == 0
+    assert "environment steps" in said.out
+    assert "laptop_long" in said.out
+    code, _, said = run("train", "--version")
+    assert said.out == f"flowrep {flowrep.__version__}\n"
+
+
+@pytest.mark.parametrize("form", ["hydra.searchpath=[pkg://mypkg.conf]", "--config-dir"])
+def test_configs_of_ones_own_are_found(run, form, tmp_path, monkeypatch):
+    """An algorithm of the user's, by a package on the path or by a folder."""
+    folder = tmp_path / "mypkg" / "conf"
+    (folder / "algorithm").mkdir(parents=True)
+    for place in (folder.parent, folder):
+        (place / "__init__.py").touch()
+    dqn = (CONF_DIR / "algorithm" / "dqn.yaml").read_text()
+    mine = dqn.replace("final_epsilon: 0.05", "final_epsilon: 0.1")
+    (folder / "algorithm" / "mine.yaml").write_text(mine)
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = [form, str(folder)] if form.startswith("--") else [form]
+    _, (config,), _ = run("train", *arguments, "algorithm=mine")
+    assert config.algorithm.final_epsilon == 0.1
+    code, _, said = run("train", *arguments, "algorithm=mein")
+    assert code == 2
+    assert "mine" in said.err
+
+
+def test_a_scene_file_that_kept_the_name_of_its_original_is_refused(run, tmp_path):
+    (tmp_path / "scene").mkdir()
+    original = (CONF_DIR / "scene" / "s_turn.yaml").read_text()
+    mine = tmp_path / "scene" / "back_alley.yaml"
+    mine.write_text(original)
+    line = ["--config-dir", str(tmp_path), "scene=back_alley"]
+    for command in ("train", "evaluate"):
+        code, _, said = run(command, *line, *(["run=here"] if command == "evaluate" else []))
+        assert code == 2
+        assert "scene.name=back_alley" in said.err
+    assert run("train", *line, "scene.name=back_alley")[0] == 0
+    mine.write_text(original.replace("name: s_turn", "name: back_alley", 1))
+    assert run("train", *line)[0] == 0
+
+
+# Names with any characters.
+
+ODD = [
+    "outputs/a", "a=b", "a,b", "[x]", "{a:b}", "it's", 'say "hi"', "both ' and \"", "a b", " a ",
+    "josé (2)", "日本", "$HOME", "${x}", "\\${x}", "$${x}", "a\\", "a\\'", "\\\\'", "#a", "~a",
+    "-a", "2026", "true", "null", "1e5", "a:b", "choice(a,b)", "???", "'x'", "a\nb", "%", "!x", "*",
+]  # fmt: skip
+
+
+def read(line):
+    """Returns what a config holds after a line was typed into a shell."""
+    overrides = OverridesParser.create().parse_overrides(shlex.split(line)[1:])
+    config = OmegaConf.create()
+    for one in overrides:
+        OmegaConf.update(config, one.key_or_group, one.value())
+    return OmegaConf.to_container(config, resolve=True)
+
+
+@pytest.mark.parametrize("text", ODD)
+def test_a_pasted_line_gives_the_very_text(text):
+    line = cli.shell_line("flowrep-train", cli.override("resume", text))
+    assert read(line) == {"resume": text}
+
+
+def test_so_does_a_line_of_any_characters():
+    draw = random.Random(0)
+    characters = "a1=,[]{}'\"\\$ é日#%~+-:()!&;*?`|<>@^\t."
+    for _ in range(100):
+        text = "".join(draw.choice(characters) for _ in range(draw.randint(1, 8)))
+        line = cli.shell_line("flowrep-train", cli.override("resume", text))
+        assert read(line) == {"resume": text}
+
+
+def test_what_needs_no_quotes_has_none(monkeypatch):
+    folder = "outputs/2026-01-31/12_ego+obj_s1"
+    assert cli.shell_line("a", cli.override("resume", folder)) == f"a resume={folder}"
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/flowrep-train"])
+    assert cli.line_for("evaluate", run=folder) == f"flowrep-evaluate run={folder}"
+
+
+@pytest.mark.parametrize("name", ["josé (2)", "a,b=[c]", 'José\'s "runs"', "${seed}", "2026"])
+def test_a_folder_that_is_there_is_taken_as_it_was_typed(run, tmp_path, name):
+    (tmp_path / name).mkdir()
+    for line in ([f"run={name}"], [name]):
+        _, (config,), _ = run("report", *line)
+        assert config.run == [name]
+
+
+def test_several_folders_are_named_without_a_key(run, tmp_path):
+    names = ["a,b", "c'd", "[e]", "with space"]
+    for name in names:
+        (tmp_path / name).mkdir()
+    _, (config,), _ = run("report", *names, "videos=1")
+    assert config.run == names
+
+
+def test_what_is_no_folder_stays_what_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    typed = ["run=[a,b]", "+note=x", "~policy", "trajectories=2", "--cfg", "job", "resume="]
+    assert cli.as_typed(typed, schema.ReportConfig) == typed
+
+
+@pytest.mark.parametrize("name", ["20240501", "1e3", "0x10", "true", "inf"])
+def test_a_folder_named_like_a_number_is_a_folder(name):
+    typed = cli.as_typed([f"output={name}", f"input={name}", "start=7"], schema.FactorizeConfig)
+    assert read(cli.shell_line("flowrep-factorize", typed[0])) == {"output": name}
+    assert typed[1:] == [f"input={name}", "start=7"]  # a camera's number
+
+
+# Names of folders.
+
+
+def test_run_folders_are_named_by_scene_representations_and_seed():
+    def folder(*overrides):
+        cli.register_resolvers()
+        with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+            return compose("train", list(overrides), return_hydra_config=True).hydra.run.dir
+
+    assert folder("representations=[ego,obj]", "seed=3").endswith("_straight_road_ego+obj_s3")
+    assert folder("noise=depth_camera").endswith("_straight_road_ego+obj_noisy_s0")
+    assert folder("resume=there") == "."  # nothing is made for a run that has a folder
+
+
+@pytest.mark.parametrize("name", ["../../etc", "/etc", "..", "a/b", "..\\b", "x" * 500, ""])
+def test_a_scenes_name_stays_in_the_output_folder(name):
+    folder = cli.folder_name(name)
+    assert folder not in ("", ".", "..")
+    assert Path(folder).name == folder
+    assert len(folder) <= 255
+
+
+def test_names_of_a_sweeps_runs_need_no_quotes_and_stay_apart():
+    odd = ["+note='a b/../c'", "representations=[ego,obj]", "~debug", "num_workers=2"]
+    assert cli.run_of_sweep(odd) == "ego+obj_note-ab_.._c__debug"
+    long = ["seed=3", *(f"evaluation.some_long_key_{i}=123456" for i in range(9))]
+    other = [*long[:-1], "evaluation.some_long_key_8=123457"]
+    names = {cli.run_of_sweep(long), cli.run_of_sweep(other)}
+    assert len(names) == 2
+    assert all(name.startswith("s3_") and len(name) < 120 for name in names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["flowrep.train", "representations=[eggo]"], "eggo"),
+        (["flowrep.train", "resume=nowhere"], "nowhere"),
+        (["flowrep.evaluate", "run=nowhere"], "nowhere"),
+    ],
+)
+def test_the_commands_end_with_one_line_and_code_2(arguments, says, tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-m", *arguments], cwd=tmp_path, capture_output=True, text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert result.returncode == 2, result.stderr
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    assert result.stderr.startswith("error: ")
+    assert says in result.stderr
+    assert not (tmp_path / "nowhere").exists()

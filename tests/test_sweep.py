@@ -1,0 +1,343 @@
+"""A sweep is runs: each is begun or resumed by its own command, and what it left says the rest."""
+
+import csv
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from flowrep import sweep
+from flowrep.config import UsageError, group_choices
+from flowrep.progress import StopRequest
+from flowrep.tables import write_rows
+from tests.config.composing import plain
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("-m seed=0,1", True),
+        ("seed=0 --multirun", True),
+        ("hydra.mode=MULTIRUN seed=0,1", True),
+        ("seed=0", False),
+        ("-m seed=0,1 --cfg job", False),
+        ("", False),
+    ],
+)
+def test_several_runs_are_asked_for_in_hydras_ways(line, expected):
+    assert sweep.is_sweep(line.split()) is expected
+
+
+# One run, in whose place a piece of code ends in each possible way.
+
+CONFIG = plain("train", "debug=smoke", "evaluation.final_episodes=1", "evaluation.speeds=[low]")
+
+
+@pytest.fixture
+def attempt(tmp_path, monkeypatch):
+    """Attempts a run that does what a piece of code says."""
+
+    def attempt(code, config=CONFIG, should_stop=lambda: False):
+        head = (
+            f"import os, signal, sys, time; from pathlib import Path; folder = {str(tmp_path)!r}\n"
+        )
+        monkeypatch.setattr(sweep, "TRAIN", (sys.executable, "-c", head + code))
+        return sweep.attempted(tmp_path, config, ["given"], should_stop)
+
+    monkeypatch.setattr(sweep, "POLL_S", 0.01)
+    return attempt
+
+
+FINISHES = """
+sys.path[:0] = [os.getcwd()]
+from tests.test_sweep import finish
+open(folder + "/times", "a").write("x")
+finish(Path(folder))
+"""
+
+
+def finish(folder, frames=256, successes=1):
+    """Leaves the final evaluation of `CONFIG`: one episode of each of four policies."""
+    row = {"evaluation": "final", "frames": frames}
+    policies = ("greedy", "sampled", "never_turn", "random")
+    ends = ["success"] * successes + ["timeout"] * 4
+    rows = [row | {"policy": p, "outcome": end} for p, end in zip(policies, ends)]
+    write_rows(folder / "evaluation.csv", rows)
+
+
+def test_a_run_that_finishes_gives_its_success_and_is_not_run_again(attempt, tmp_path):
+    for _ in range(2):
+        assert attempt(FINISHES).startswith("finished, success 100%")
+    assert (tmp_path / "times").read_text() == "x"
+    assert sweep.success_of(tmp_path) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("print('error: no such device', file=sys.stderr); sys.exit(2)", "error: no such device"),
+        # after a progress bar, which ends its lines in another way
+        ("print('\\revaluating: 0%|  \\r  \\rerror: no space'); sys.exit(2)", "error: no space"),
+        # of a traceback, the last line; what to do about it is no reason
+        ("print('error: it\\nContinue'); sys.exit(2)", "error: it"),
+        ("raise ValueError('what happened')", "ValueError: what happened"),
+        ("sys.exit(3)", "exit code 3"),
+        ("os.kill(os.getpid(), signal.SIGKILL)", "ended by SIGKILL.*memory"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "ended by SIGSEGV"),
+        ("", "exit code 0"),  # without its final evaluation
+    ],
+)
+def test_a_run_that_fails_says_why_and_is_tried_again(attempt, tmp_path, code, expected):
+    attempt("print('error: old'); sys.exit(2)")
+    state = attempt(code)
+    assert re.match(f"failed: {expected}", state)
+    assert sweep._states(tmp_path.parent)[tmp_path.name] == state
+    assert attempt(FINISHES).startswith("finished")
+
+
+SAVES = """
+def save(*_):
+    open(folder + "/saved", "w").close()
+    sys.exit(143)
+signal.signal(signal.SIGTERM, save)
+open(folder + "/ready", "w").close()
+time.sleep(60)
+"""
+
+
+def test_a_run_is_told_to_save_when_the_sweep_is_stopped(attempt, tmp_path):
+    assert attempt(SAVES, should_stop=(tmp_path / "ready").exists) == "stopped"
+    assert (tmp_path / "saved").exists()
+
+
+def test_no_run_begins_once_the_sweep_is_stopped(attempt, tmp_path):
+    assert attempt(FINISHES, should_stop=lambda: True) == "stopped"
+    assert not (tmp_path / "times").exists()
+
+
+def test_a_run_saves_when_its_worker_is_ended_by_an_exception(attempt, tmp_path):
+    def preempted():
+        if (tmp_path / "ready").exists():
+            raise SystemExit(-1)
+        return False
+
+    with pytest.raises(SystemExit):
+        attempt(SAVES, should_stop=preempted)
+    assert (tmp_path / "saved").exists()
+
+
+def test_a_folder_with_another_run_is_not_taken_for_the_one_asked_for(attempt, tmp_path):
+    import yaml
+
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG | {"device": "cuda"}))
+    assert attempt(FINISHES).startswith("finished")
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG | {"seed": 9}))
+    with pytest.raises(UsageError, match="seed=9"):
+        attempt(FINISHES)
+
+
+def test_the_line_of_a_run_begins_or_resumes_it(tmp_path, monkeypatch):
+    source = SimpleNamespace(provider="command-line", path="/mine")
+    hydra = SimpleNamespace(
+        overrides=SimpleNamespace(task=["seed=1", "device=cpu"], hydra=["hydra.searchpath=[x]"]),
+        runtime=SimpleNamespace(config_sources=[source]),
+        job=SimpleNamespace(config_name="train"),
+    )
+    monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra)
+    config, odd = SimpleNamespace(num_workers="auto"), tmp_path / "josé (2)"
+    line = sweep._line(odd, config, is_worker=True)
+    assert line[0].startswith("hydra.run.dir='")
+    assert {"seed=1", "device=cpu", "num_workers=0", "hydra.searchpath=[x]"} <= {*line}
+    assert line[line.index("--config-dir") + 1] == "/mine"
+    odd.mkdir()
+    (odd / "config.yaml").touch()
+    assert sweep._line(odd, config, is_worker=False) == [f"resume='{odd}'", "device=cpu"]
+
+
+def test_a_failed_run_stops_a_sweeper_that_needs_its_result_and_no_grid(monkeypatch, tmp_path):
+    def hydra_with(sweeper):
+        return SimpleNamespace(
+            runtime=SimpleNamespace(output_dir=str(tmp_path)),
+            sweep=SimpleNamespace(dir=str(tmp_path)),
+            sweeper={"_target_": sweeper},
+        )
+
+    monkeypatch.setattr(sweep, "plain_config", lambda config: {})
+    monkeypatch.setattr(sweep, "_line", lambda *_: [])
+    monkeypatch.setattr(sweep, "attempted", lambda *_: "failed: why")
+    monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra_with("x.BasicSweeper"))
+    assert math.isnan(sweep.job({}))
+    monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra_with("elsewhere.OptunaSweeper"))
+    with pytest.raises(sweep.RunFailedError, match="failed: why"):
+        sweep.job({})
+
+
+def test_the_first_signal_leaves_a_file_for_jobs_elsewhere(tmp_path):
+    with StopRequest(then=(tmp_path / sweep.STOP).touch) as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop
+    assert (tmp_path / sweep.STOP).exists()
+
+
+def test_a_sweep_of_one_run_to_continue_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["flowrep-train", "-m", "resume=outputs/a"])
+    with pytest.raises(SystemExit) as ended:
+        sweep.run_sweep()
+    assert ended.value.code == 2
+    assert "hydra.sweep.dir=" in capsys.readouterr().err
+
+
+# The sweeps of conf/experiment/.
+
+
+@pytest.fixture
+def runs_of(monkeypatch, tmp_path, capsys):
+    """The overrides of each run of a sweep, as mappings."""
+    from flowrep.config import cli
+    from flowrep.config.schema import TrainConfig
+
+    def runs_of(*arguments):
+        found = []
+
+        def job(config):
+            overrides = cli.HydraConfig.get().overrides.task
+            found.append(dict(text.split("=", 1) for text in overrides))
+
+        line = ["flowrep-train", "-m", f"hydra.sweep.dir={tmp_path}", *arguments]
+        monkeypatch.setattr(sys, "argv", line)
+        cli.run_hydra("train", job, TrainConfig)
+        return found
+
+    return runs_of
+
+
+SCENES = ["straight_road", "s_turn", "h_shaped_pathways", "three_way_junction"]
+STACKS = [
+    "[seg2]", "[depth2]", "[ego,obj]", "[ego,obj,seg2]", "[ego,obj,depth2]",
+    "[ego,obj,seg2,depth2]",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "scenes", "stacks"),
+    [
+        ("flow_composition", SCENES[1:2], ["[ego]", "[raw]", "[obj]", "[ego,obj]"]),
+        ("failure_causes", ["s_turn"], STACKS),
+        ("frame_rate", ["straight_road"], STACKS),
+    ],
+)
+def test_an_experiment_has_each_stack_with_three_seeds(runs_of, name, scenes, stacks):
+    scene = ["scene=s_turn"] if name == "flow_composition" else []  # typed, it replaces the four
+    runs = runs_of(f"experiment={name}", "preset=laptop", *scene)
+    cells = [(run["scene"], run["representations"], run["seed"]) for run in runs]
+    assert sorted(cells) == sorted((s, r, k) for s in scenes for r in stacks for k in "012")
+    assert {(run["experiment"], run["preset"]) for run in runs} == {(name, "laptop")}
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("name", group_choices("experiment"))
+def test_an_experiment_is_named_in_the_config_of_its_runs(name):
+    assert plain("train", f"experiment={name}")["experiment"] == name
+
+
+def test_an_agent_is_evaluated_at_lower_frame_rates_than_it_was_trained_at():
+    config = plain("train", "experiment=frame_rate", "preset=laptop")
+    assert config["scene"]["frame_rate_hz"] == 12
+    assert config["evaluation"]["fps"] == [6, 7, 8, 9, 10, 12]
+    assert plain("train", "scene=s_turn")["evaluation"]["fps"] == [12]
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("height_px", [48, 84])
+def test_pictures_stay_square_where_resolution_is_compared(height_px):
+    sides = [f"scene.camera.height_px={height_px}", "preset=laptop", "scene=straight_road"]
+    camera = plain("train", "experiment=resolution", *sides)["scene"]["camera"]
+    assert (camera["height_px"], camera["width_px"]) == (height_px, height_px)
+    assert camera["fov_deg"] == 60
+
+
+# A sweep as a person runs it.
+
+LINE = [
+    sys.executable, "-m", "flowrep.train", "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2",
+    "debug=smoke", "representations=[obj]", "device=cpu", "num_envs=2", "algorithm.hidden_size=16",
+    "total_frames=240", "checkpoint_every_frames=40", "log_every_frames=20",
+    "evaluation.every_frames=0", "evaluation.final_episodes=1", "evaluation.speeds=[high]",
+    "evaluation.baselines=[]", "evaluation.video=false", "scene.time_limit_steps=30",
+]  # fmt: skip
+# the second learning rate makes the weights too large for actions to have probabilities
+RATES = "algorithm.learning_rate=3e-4,1e9"
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
+
+
+def started(folder):
+    return subprocess.Popen(
+        [*LINE, RATES, f"hydra.sweep.dir={folder}"],
+        stdout=(folder / "printed").open("w"),  # a pipe would be held open by its workers
+        stderr=subprocess.STDOUT,
+        env=ENVIRONMENT,
+        start_new_session=True,
+    )
+
+
+def wait_for(find, seconds=180):
+    deadline = time.monotonic() + seconds
+    while not find() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert find()
+
+
+def ctrl_c(process):
+    """As a terminal does."""
+    os.killpg(process.pid, signal.SIGINT)
+
+
+def saved(folder):
+    """When the checkpoint of the run that can succeed was written."""
+    paths = folder.glob("*learning_rate-0.0003*/checkpoint/latest.safetensors")
+    return [path.stat().st_mtime_ns for path in paths]
+
+
+@pytest.mark.slow
+def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path):
+    """Ctrl-C stops it after its first checkpoint, SIGKILL after one more; the third start ends."""
+    pytest.importorskip("pybullet", reason="training drives the simulated street")
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="it runs two at a time")
+    before = []
+    for end, code in ((ctrl_c, 130), (subprocess.Popen.kill, -signal.SIGKILL)):
+        process = started(tmp_path)
+        wait_for(lambda before=before: saved(tmp_path) not in ([], before))
+        end(process)
+        assert process.wait(timeout=180) == code
+        before = saved(tmp_path)
+    assert started(tmp_path).wait(timeout=300) == 1
+    printed = (tmp_path / "printed").read_text()
+    assert "1 of 2 runs finished, 1 failed" in printed
+    (failed,) = tmp_path.glob("*learning_rate-1000000000.0*")
+    assert f"log: {failed}/job.log" in printed
+    assert "error: after " in (failed / "job.log").read_text()
+    assert f"hydra.sweep.dir={tmp_path}" in printed
+    (whole,) = tmp_path.glob("*learning_rate-0.0003*")
+    with (whole / "metrics.csv").open(newline="") as file:
+        assert [int(row["frames"]) for row in csv.DictReader(file)] == list(range(20, 241, 20))
+    assert (whole / "job.log").read_text().count("run folder: ") == 3  # begun, and resumed twice
+
+
+@pytest.mark.slow
+def test_what_is_finished_is_not_run_again(tmp_path):
+    pytest.importorskip("pybullet", reason="training drives the simulated street")
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="it runs two at a time")
+    line = [*LINE, "total_frames=40", "seed=0,1", f"hydra.sweep.dir={tmp_path}"]
+    for _ in range(2):
+        done = subprocess.run(line, capture_output=True, text=True, env=ENVIRONMENT)
+        assert done.returncode == 0, done.stderr
+        assert "2 of 2 runs finished" in done.stdout
+    logs = [log.read_text() for log in tmp_path.glob("*/job.log")]
+    assert [log.count("run folder: ") for log in logs] == [1, 1]
