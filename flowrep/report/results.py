@@ -492,6 +492,10 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         runs=runs_table(declared, runs),
         commands=declared["commands"],
         number=len(runs),
+        pixels=sorted(
+            {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
+        ),
+        frames=sorted({run.total_frames for run in every}),
         episodes=sum(len(run.episodes["outcome"]) for run in runs),
         fewest=min(c.fewest for claim in claims["primary"] for c in claim.contrasts),
         smallest=f"{low:.0f} to {high:.0f}",

