@@ -24,6 +24,7 @@ from torch import Tensor
 
 from flowrep.geometry import (
     CameraAxes,
+    PoseDirection,
     adapt_pose,
     ego_flow,
     invert_rigid,
@@ -83,28 +84,31 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
     given = {**_ASSUMED, **given}
     found: dict[str, Mistake] = {}
 
-    def suppose(says: str, options: Mapping[str, str], **corrections: Any) -> None:
+    def suppose(says: Mapping[str, str], options: Mapping[str, str], **corrections: Any) -> None:
         changed = {key: value for key, value in options.items() if value != given[key]}
         if changed:
             name = " ".join(f"{key}={value}" for key, value in changed.items())
-            found[name] = Mistake(says, **corrections)
+            found[name] = Mistake(" and ".join(says[key] for key in changed), **corrections)
 
-    for direction in ("camera_to_world", "world_to_camera"):
+    for direction in get_args(PoseDirection):
         for axes in get_args(CameraAxes):
-            says = f"the poses are {direction.replace('_', '-')}, of a camera with {axes} axes"
             options = {"pose_direction": direction, "pose_axes": axes}
+            says = {
+                "pose_direction": f"the poses are {direction.replace('_', '-')}",
+                "pose_axes": f"the camera's axes are {axes}",
+            }
             suppose(says, options, poses=_each(_readapted(given, direction, axes)))
     if given["depth_kind"] != "z_buffer":
-        says = "depth is the length of the ray, not z"
+        says = {"depth_kind": "depth is the length of the ray, not z"}
         suppose(says, {"depth_kind": "ray_length"}, depth=z_from_ray_length)
-        says = "depth is z, not the length of the ray"
+        says = {"depth_kind": "depth is z, not the length of the ray"}
         suppose(says, {"depth_kind": "z"}, depth=_ray_from_z)
     if flow_is_recorded:
         for direction, points in (("backward", "back to"), ("forward", "away from")):
-            says = f"the flow points {points} the previous frame"
+            says = {"flow_direction": f"the flow points {points} the previous frame"}
             suppose(says, {"flow_direction": direction}, flow=lambda raw: -raw)
         for channels in ("row_column", "uv"):
-            says = f"the flow's channels are {channels}"
+            says = {"flow_channels": f"the flow's channels are {channels}"}
             suppose(says, {"flow_channels": channels}, flow=lambda raw: raw.flip(0))
     else:
         found["frames in reverse order"] = Mistake(
