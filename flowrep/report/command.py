@@ -23,44 +23,39 @@ from flowrep.report.storage import is_archive, read_runs, without_repeats
 from flowrep.report.tables import Table
 
 
-def run(config: ReportConfig) -> None:
-    """Writes figures, tables and a page of runs."""
-    report_on(config.plain())
-
-
-def report_on(asked: dict[str, Any]) -> Path:
-    """Writes the report; returns the page's path.
+def report(config: ReportConfig) -> Path:
+    """Writes figures, tables and a page of runs; returns the page's path.
 
     Raises:
         UsageError: nothing in the folders can be read.
         RunFolderError: a folder holds no run.
     """
-    given = asked["run"]
-    folders = [Path(folder) for folder in (given if isinstance(given, list) else [given])]
+    folders = list(map(Path, config.run))
     is_of_runs = folders[0].is_dir() and not is_archive(folders[0])
-    output = Path(asked["output"] or (folders[0] if is_of_runs else Path("outputs")) / "report")
-    found, warnings = read_runs(folders)
+    output = Path(config.output or (folders[0] if is_of_runs else Path("outputs")) / "report")
+    found, unreadable = read_runs(folders)
     runs, repeats = without_repeats(found)
-    for warning in (*warnings, *repeats):
+    warnings = [*unreadable, *repeats]
+    for warning in warnings:
         print(f"left out: {warning}")
     if not runs:
         raise UsageError("none of the runs can be read, see above")
     print(summary(runs))
-    settings = Settings(asked["policy"], Bootstrap(asked["resamples"]))
-    report = assemble(runs, [*warnings, *repeats], settings)
-    for warning in report.warnings[len(warnings) + len(repeats) :]:
+    settings = Settings(config.policy, Bootstrap(config.resamples))
+    assembled = assemble(runs, warnings, settings)
+    for warning in assembled.warnings[len(warnings) :]:
         print(f"in part: {warning}")
-    for chapter in report.chapters:
-        for section in chapter.sections:
+    for label, sections in assembled.chapters:
+        for section in sections:
             for table in section.tables:
                 if not table.name.endswith("_differences"):  # too long for a screen
-                    show(table, f"{section.title} {chapter.label}".strip())
-    for folder in write_files(report, output):
+                    show(table, f"{section.title} {label}".strip())
+    for folder in write_files(assembled, output):
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-    drives = drives_of(runs, trajectories=asked["trajectories"], videos=asked["videos"])
+    drives = drives_of(runs, trajectories=config.trajectories, videos=config.videos)
     for warning in drives.warnings:
         print(f"drives: {warning}")
-    page = write_page(render_page(report, drives), output)
+    page = write_page(render_page(assembled, drives), output)
     print(f"page: {page}")
     return page
 
@@ -83,4 +78,4 @@ def show(table: Table, title: str) -> None:
 
 def main() -> None:
     """Entry point; a mistake on the command line ends in one line that names the remedy."""
-    run_command("report", run, ReportConfig)
+    run_command("report", report, ReportConfig)

@@ -101,7 +101,7 @@ def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
     Keys of one scene alone are under the scene's name, and options of a representation under its
     name: only runs that have the scene or the representation can differ in them.
     """
-    parts = origin_of(config)
+    parts = origin_of(config) | {"total_frames": config["total_frames"]}
     del parts["flowrep"], parts["seed"]
     scene = parts.pop("scene")
     own = {key: value for key, value in scene.items() if key not in _OF_EVERY_SCENE}

@@ -89,10 +89,11 @@ def read_run(path: Path) -> Run:
     )
     try:
         episodes, curves = _episodes(header, rows), _metrics(logged, metrics)
+        machine = _machine(path / "machine.json")
     except ValueError as error:
         raise TableError(f"{path}: a cell of its tables is damaged ({error})") from None
     try:
-        return Run(str(path), config, episodes, curves, path)
+        return Run(str(path), config, episodes, curves, path, machine)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RunFolderError(
             f"{path}/config.yaml is not what a run leaves ({error!r}); restore the file that the "
@@ -125,6 +126,13 @@ def _episodes(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Columns:
         name: np.array(cells.get(name, empty), dtype=_NUMBERS.get(name, str))
         for name in EPISODE_COLUMNS
     }
+
+
+def _machine(path: Path) -> dict[str, str]:
+    """Returns what a run was computed with; several machines where it was resumed on another."""
+    noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    of_each = {key: dict.fromkeys(str(machine.get(key)) for machine in noted) for key in _MACHINE}
+    return {key: " | ".join(found) or "unknown" for key, found in of_each.items()}
 
 
 def _metrics(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Columns:

@@ -10,7 +10,8 @@ import pytest
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
-from flowrep.report.command import report_on
+from flowrep.config.schema import ReportConfig
+from flowrep.report.command import report
 from flowrep.report.drives import Drives, Picture
 from flowrep.report.figures import draw_bars, save, svg
 from flowrep.report.outcomes import grid_of
@@ -23,13 +24,12 @@ from tests.report.folders import config_of, letters, rows_of, write_run
 
 pytestmark = pytest.mark.slow
 
-ASKED = {
-    "output": None,
-    "policy": "greedy",
-    "resamples": 200,
-    "trajectories": 0,
-    "videos": 0,
-}
+
+def report_on(folder, output=None):
+    numbers = {"resamples": 200, "trajectories": 0, "videos": 0}
+    return report(ReportConfig(run=[str(folder)], output=output, policy="greedy", **numbers))
+
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 
 
@@ -59,7 +59,7 @@ def sweep(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(sweep):
-    return report_on(ASKED | {"run": str(sweep)})
+    return report_on(sweep)
 
 
 def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
@@ -79,7 +79,7 @@ def test_names_are_drawn_as_they_are_and_nothing_is_written_elsewhere(tmp_path):
         rows = rows_of(config, "sc") + rows_of(config, "sc", fps=6.0)
         metrics = [{"frames": 1000, "success": 0.5}]
         write_run(tmp_path / "runs" / f"run{len(str(tau))}", config, rows, metrics)
-    page = report_on(ASKED | {"run": str(tmp_path / "runs"), "output": str(tmp_path / "out" / "x")})
+    page = report_on(tmp_path / "runs", str(tmp_path / "out" / "x"))
     text = page.read_text(encoding="utf-8")
     assert "Success over" in text
     assert "[/red]" in text
@@ -90,7 +90,7 @@ def test_names_are_drawn_as_they_are_and_nothing_is_written_elsewhere(tmp_path):
 def test_packed_runs_have_the_same_tables(sweep, page, tmp_path):
     runs = [read_run(path.parent) for path in sorted(sweep.glob("*_*/config.yaml"))]
     write_archive(runs, tmp_path / "packed")
-    again = report_on(ASKED | {"run": str(tmp_path / "packed"), "output": str(tmp_path / "out")})
+    again = report_on(tmp_path / "packed", str(tmp_path / "out"))
     tables = sorted(page.parent.rglob("*.csv"))
     assert len(tables) == 6
     for table in tables:

@@ -1,6 +1,7 @@
 """Folders and packed tables in, runs and lines about what is wrong out."""
 
 import gzip
+import json
 
 import numpy as np
 import pytest
@@ -131,6 +132,15 @@ def test_packed_runs_are_the_runs_of_the_folders(tmp_path):
     same(folders[0], packed[0])
     same(folders[1], packed[1])
     assert set(packed[0].machine.values()) == {"unknown"}
+
+
+def test_what_a_run_was_computed_with_is_packed(tmp_path):
+    path = run_in(tmp_path, "a")
+    first, second = ({"commit": "abc", "precision": p, "cpu": "x"} for p in ("bfloat16", "float32"))
+    (path / "machine.json").write_text(json.dumps([first, second]))
+    write_archive([read_run(path)], tmp_path / "packed")
+    ((run,), _) = read_runs([tmp_path / "packed"])
+    assert run.machine == {"commit": "abc", "precision": "bfloat16 | float32", "cpu": "x"}
 
 
 def test_packing_again_adds_and_replaces_and_gives_the_same_bytes(tmp_path):
