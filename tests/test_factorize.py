@@ -33,17 +33,15 @@ from flowrep.sequences import (
     read_kitti_flow,
     recorded_motion,
 )
-from flowrep.sequences.job import Job
+from flowrep.sequences.job import Job, Selection
 from flowrep.sequences.output import COLUMNS, Output, OutputOptions
 from tests.config.composing import plain
 from tests.sequences import synthetic
 from tests.sequences.real_frames import FOLDER, needs_7scenes
 
 
-def settings(*overrides) -> dict:
-    made = plain("factorize", *overrides)
-    validated(FactorizeConfig, made)
-    return made
+def settings(*overrides) -> FactorizeConfig:
+    return validated(FactorizeConfig, plain("factorize", *overrides))
 
 
 def factorize(tmp_path, *overrides, source="in", format="frames"):
@@ -164,7 +162,7 @@ def test_a_broken_file_leaves_nothing_that_looks_whole(moments, tmp_path):
 
 
 def test_one_frame_alone_has_no_flow(moments, tmp_path):
-    with pytest.raises(SequenceError, match="no two consecutive frames of one clip with start=2"):
+    with pytest.raises(SequenceError, match="start=2"):
         factorize(tmp_path, "start=2", "video=false")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 
@@ -189,7 +187,7 @@ def test_a_stride_does_not_pair_frames_of_two_clips(tmp_path):
     # frames in order: a later, a earlier, b later, b earlier; every third is the first and the last
     options = ["stride=3", "video=false"]
     options += [f"format.raw_data={tmp_path}/in/raw", f"format.mapping={mapping}"]
-    with pytest.raises(SequenceError, match=r"no two .* frames of one clip with start=0 stride=3"):
+    with pytest.raises(SequenceError, match="stride=3"):
         factorize(tmp_path, *options, source="in/training", format="kitti")
 
 
@@ -218,7 +216,9 @@ def test_a_camera_whose_skipped_frame_begins_a_clip_gives_no_pair_across_it(tmp_
         return np.zeros((2, 6, 8), np.float32)
 
     out = Output(tmp_path / "out", OutputOptions(), {})
-    Job(Camera(), flow_source, recorded_motion, out, stop=7, stride=2).run()  # 0, 2, 4 and 6
+    Job(
+        Camera(), flow_source, recorded_motion, out, Selection(stop=7, stride=2)
+    ).run()  # 0, 2, 4 and 6
     assert pairs == [("0", "2"), ("4", "6")]
 
 
@@ -298,8 +298,9 @@ def test_flow_on_the_other_grid_is_refused(moments, tmp_path):
     ],
 )
 def test_an_option_that_its_reader_has_not_is_refused_by_name(moments, tmp_path, name, key, value):
-    asked = settings(f"input={tmp_path / 'in'}", "output=b", f"format={name}")
+    asked = plain("factorize", f"input={tmp_path / 'in'}", "output=b", f"format={name}")
     asked["format"][key] = value
+    asked = validated(FactorizeConfig, asked)
     with pytest.raises(UsageError, match=f"format.{key}"):
         factorize_recording(asked)
 

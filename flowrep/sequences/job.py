@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import astuple, dataclass, replace
 from itertools import count, islice
 from typing import Any
 
@@ -28,6 +28,20 @@ from flowrep.sequences.recording import Frame, Recording, Stream
 DOCTOR_PAIRS, DOCTOR_TRIES = 10, 3
 
 
+@dataclass(frozen=True)
+class Selection:
+    """The frames that are used: from `start` to before `stop` (None: to the end), every n-th."""
+
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+
+    def __str__(self) -> str:
+        """Returns it as on the command line."""
+        stop = "" if self.stop is None else f" stop={self.stop}"
+        return f"the frames start={self.start}{stop} stride={self.stride}"
+
+
 class Job:
     """The factorisation of one recording.
 
@@ -36,9 +50,7 @@ class Job:
         flow_source: the source of raw flow.
         motion_source: the source of the camera's motion.
         output: the output folder.
-        start: index of the first frame.
-        stop: index after the last frame, None for all.
-        stride: every `stride`-th frame is used.
+        selection: the frames that are used.
     """
 
     def __init__(
@@ -47,14 +59,11 @@ class Job:
         flow_source: FlowSource,
         motion_source: MotionSource,
         output: Output,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
+        selection: Selection | None = None,
     ) -> None:
         self.stream, self.output = stream, output
         self.flow_source, self.motion_source = flow_source, motion_source
-        self.start, self.stop, self.stride = start, stop, stride
+        self.selection = selection or Selection()
         self.clock = Stopwatch()
 
     def examine(self) -> Diagnosis | None:
@@ -130,10 +139,10 @@ class Job:
 
     def _total(self) -> int | None:
         """Returns the number of frames to read, None for a camera."""
-        stop = self.stop
+        start, stop, stride = astuple(self.selection)
         if isinstance(self.stream, Recording):
             stop = len(self.stream) if stop is None else min(stop, len(self.stream))
-        return None if stop is None else len(range(self.start, stop, self.stride))
+        return None if stop is None else len(range(start, stop, stride))
 
     def _frame(self, place: int) -> Frame:
         """Returns a frame that is used, by its place among them, of a recording.
@@ -141,8 +150,10 @@ class Job:
         It starts a clip if a frame skipped before it does.
         """
         assert isinstance(self.stream, Recording)
-        index = self.start + place * self.stride
-        frame, skipped = self.stream[index], range(max(0, index - self.stride + 1), index)
+        start, _, stride = astuple(self.selection)
+        index = start + place * stride
+        skipped = range(max(0, index - stride + 1), index)
+        frame = self.stream[index]
         starts_clip = frame.starts_clip or any(map(self.stream.starts_clip, skipped))
         return replace(frame, starts_clip=starts_clip)
 
@@ -151,17 +162,18 @@ class Job:
         if isinstance(self.stream, Recording):
             yield from map(self._frame, range(self._total() or 0))
             return
+        start, stop, stride = astuple(self.selection)
         starts_clip = False
-        for index, frame in islice(enumerate(self.stream), self.stop):
+        for index, frame in islice(enumerate(self.stream), stop):
             starts_clip |= frame.starts_clip
-            if index >= self.start and (index - self.start) % self.stride == 0:
+            if index >= start and (index - start) % stride == 0:
                 yield replace(frame, starts_clip=starts_clip)
                 starts_clip = False
 
     def _pairs(self) -> Iterator[tuple[int, Frame | None, Frame]]:
         """Yields the index of each frame, the frame its flow is measured from, and itself."""
         found = pairs(self._frames())
-        for index in count(self.start, self.stride):
+        for index in count(self.selection.start, self.selection.stride):
             with self.clock("reading"):
                 pair = next(found, None)
             if pair is None:

@@ -167,6 +167,10 @@ def test_a_kitti_pair_without_a_raw_recording_is_left_out(tmp_path):
     recording = open_kitti(tmp_path)
     assert [frame.name for frame in recording] == ["000000_11", "000000_10"]
     assert recording.notes == ("1 of 2 pairs have no raw recording, so no poses",)
+    without_poses = Kitti(tmp_path / "training")
+    assert not without_poses.has_poses
+    assert without_poses[1].world_from_cam is None
+    np.testing.assert_array_equal(without_poses[1].depth, recording[1].depth)
 
 
 def test_zed_depth_beyond_its_range_is_missing(tmp_path):
