@@ -152,12 +152,12 @@ def _p_value(found: Effect, asked: Mapping[str, Any]) -> float:
 
 
 def of_study(declared: Mapping[str, Any], study: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Returns the finished runs of a study by scene."""
-    patterns = declared["studies"][study]
-    return {
-        scene: [run for run in runs if fnmatch(run.name, pattern) and run.is_finished]
-        for scene, pattern in patterns.items()
+    """Returns the finished runs of a study by scene, where there are any."""
+    patterns = declared["studies"][study].items()
+    found = {
+        scene: [r for r in runs if fnmatch(r.name, of) and r.is_finished] for scene, of in patterns
     }
+    return {scene: members for scene, members in found.items() if members}
 
 
 def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Array] | None:
@@ -223,7 +223,7 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
 
 def _effect_text(contrast: Contrast) -> str:
     if contrast.effect is None:
-        return "no runs"
+        return "runs are missing"
     if np.isnan(contrast.p_value):
         return f"{signed(contrast.effect.value)}, one run a side"
     p = p_text(contrast.p_value)
@@ -318,12 +318,14 @@ def scene_tables(declared: Mapping[str, Any], runs: Sequence[Run]) -> list[dict[
 
 
 def one_way(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[int, int]:
-    """Returns how many runs don't find all ways where the road forks, and how many of them do so
-    because they drive some ways and never others; those that arrive nowhere are not counted."""
+    """Returns how many runs don't find all ways where roads fork, and how many never drive one.
+
+    Those that arrive nowhere are not counted.
+    """
     missed = [
         ways
         for scene in declared["forks"]
-        for run in of_study(declared, "main", runs)[scene]
+        for run in of_study(declared, "main", runs).get(scene, ())
         if max(ways := _by_way(run)) > _NEVER and min(ways) < _FOUND
     ]
     return len(missed), sum(max(ways) >= _FOUND and min(ways) <= _NEVER for ways in missed)
@@ -336,8 +338,8 @@ def _by_way(run: Run) -> list[float]:
     return [float(success(ends).mean()) if len(ends) else 0.0 for ends in on_path]
 
 
-def _success(runs: Sequence[Run], speed: str, fps: float | None = None) -> str:
-    matrix = outcomes_of(runs, Condition("greedy", speed, fps or runs[0].fps))
+def _success(runs: Sequence[Run], speed: str) -> str:
+    matrix = outcomes_of(runs, Condition("greedy", speed, runs[0].fps))
     return "" if matrix is None else percent(Bootstrap().success([matrix.outcomes]))
 
 
@@ -349,8 +351,9 @@ def failure_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
     """Returns Table III beside the paper's, at low and high speed together and in training."""
     rows = []
     for stack, papers in declared["table_iii"].items():
-        members = [run for run in runs if run.stack == stack]
-        shares = []
+        members, shares = [run for run in runs if run.stack == stack], []
+        if not members:
+            continue
         for speeds in (("low", "high"), ("normal",)):
             conditions = [Condition("greedy", speed, members[0].fps) for speed in speeds]
             outcomes = pooled(members, conditions, out_of_bounds_of_both)
@@ -397,18 +400,11 @@ def runs_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
         f"{'' if study == 'main' else study.replace('_', ' ')} {SHORT[scene]}".strip(): members
         for study in declared["studies"]
         for scene, members in of_study(declared, study, runs).items()
-        if members
     }
     stacks = in_order([run.stack for members in places.values() for run in members], STACKS)
-    rows = [
-        (_stack(stack), *(_blank(sum(r.stack == stack for r in of)) for of in places.values()))
-        for stack in stacks
-    ]
+    counts = [[sum(r.stack == stack for r in of) for of in places.values()] for stack in stacks]
+    rows = [(_stack(s), *(str(n or "") for n in of)) for s, of in zip(stacks, counts)]
     return markdown(("", *places), rows)
-
-
-def _blank(number: int) -> str:
-    return str(number) if number else ""
 
 
 def smallest_differences(claims: Sequence[Claim]) -> tuple[float, float]:
@@ -461,14 +457,11 @@ def collapses(runs: Sequence[Run]) -> dict[bool, list[float]]:
 def sampled_minus_greedy(runs: Sequence[Run]) -> list[float]:
     """Returns how much better each run is with sampled actions, in points, at each speed."""
     found = []
-    for run in runs:
-        for speed in SPEEDS:
-            ends = [
-                run.under(Condition(p, speed, run.fps))["outcome"] for p in ("sampled", "greedy")
-            ]
-            if all(map(len, ends)):
-                sampled, greedy = (float(success(of).mean()) for of in ends)
-                found.append(100 * (sampled - greedy))
+    for run, speed in product(runs, SPEEDS):
+        of_both = (run.under(Condition(p, speed, run.fps)) for p in ("sampled", "greedy"))
+        sampled, greedy = (success(driven["outcome"]) for driven in of_both)
+        if len(sampled) and len(greedy):
+            found.append(100 * float(sampled.mean() - greedy.mean()))
     return found
 
 
@@ -486,8 +479,11 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         figure=FIGURE,
         scenes=scene_tables(declared, runs),
         one_way=one_way(declared, runs),
-        failures=failure_table(declared, main["s_turn"]),
-        frame_rates=rate_table(of_study(declared, "frame_rate", runs)["straight_road"]),
+        failures=failure_table(declared, main.get("s_turn", [])),
+        frame_rates={
+            words(scene): rate_table(members)
+            for scene, members in of_study(declared, "frame_rate", runs).items()
+        },
         variations=variation_table(declared, runs),
         runs=runs_table(declared, runs),
         commands=declared["commands"],
@@ -501,7 +497,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         smallest=f"{low:.0f} to {high:.0f}",
         repeats=repeats(every, [run for run in runs if run not in every]),
         sampled=sampled_minus_greedy(every),
-        collapsed=collapses(main["straight_road"]),
+        collapsed=collapses(main.get("straight_road", [])),
         unknown=sum(run.machine.get("precision") == "unknown" for run in runs),
         np=np,
     )
