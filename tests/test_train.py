@@ -42,7 +42,7 @@ def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
     assert {path.name for path in run.iterdir() if not path.name.startswith(".")} == {
         "config.yaml", "metrics.csv", "tensorboard", "learning_curve.png", "checkpoint",
-        "evaluation.csv", "failures.csv", "videos",
+        "evaluation.csv", "failures.csv", "machine.json", "videos",
     }  # fmt: skip
 
 
@@ -56,8 +56,17 @@ def test_a_run_is_evaluated_beside_baselines_at_every_speed(smoke_run):
         assert word in result.stdout
 
 
-def test_a_run_says_where_its_time_went(smoke_run):
-    assert "outside gradient updates: " in smoke_run[1].stdout
+def test_a_run_says_what_it_is_where_it_runs_and_where_its_time_went(smoke_run):
+    printed = smoke_run[1].stdout
+    for word in (
+        "DiscreteSAC",
+        "[ego,obj]",
+        "straight_road",
+        "preset=paper",
+        "device: ",
+        "wall time: ",
+    ):
+        assert word in printed
 
 
 def test_a_complete_run_is_not_evaluated_twice(smoke_run):

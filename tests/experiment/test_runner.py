@@ -124,7 +124,7 @@ def new_run(
 
 
 def trained(runner: Runner, stop: StopRequest | None = None) -> Runner:
-    runner.train(stop or StopRequest())
+    runner.train(StopRequest() if stop is None else stop)
     runner.close()
     return runner
 
