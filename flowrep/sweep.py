@@ -30,6 +30,7 @@ from omegaconf import DictConfig
 
 from flowrep.config import UsageError
 from flowrep.config.cli import (
+    EXIT_USAGE,
     OF_THE_MACHINE,
     exit_with,
     override,
@@ -37,6 +38,7 @@ from flowrep.config.cli import (
     register_resolvers,
     run_hydra,
     shell_line,
+    value_of,
 )
 from flowrep.config.schema import TrainConfig, validated
 from flowrep.progress import StopRequest
@@ -50,7 +52,7 @@ STOP = ".stop"
 POLL_S = 0.5
 PARENT = os.getppid()
 TRAIN = (sys.executable, "-m", "flowrep.train")
-FINISHED, STOPPED, RUNNING = "finished", "stopped", "running"
+FINISHED, FAILED, STOPPED = "finished", "failed", "stopped"
 _ONLY_SHOWS = {"--cfg", "-c", "--info", "-i", "--help", "-h", "--hydra-help", "--version"}
 _NEEDED_BY = {
     # finished jobs take no time, so batches would grow and delay the unfinished ones
@@ -80,46 +82,31 @@ def run_sweep() -> NoReturn:
     The exit code is 0 if all runs have finished, that of a signal that stopped it, else 1.
     """
     typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
-    folder = _folder(sys.argv[1:])
-    if any(text.startswith("resume=") for text in typed):
+    keys = {text.partition("=")[0] for text in typed}
+    if "resume" in keys:
         exit_with(
             "resume= continues one run; continue a sweep with its own command and "
             "hydra.sweep.dir=<its folder>"
         )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / STOP).unlink(missing_ok=True)
-    except OSError as error:
-        exit_with(f"the sweep's folder can't be made ({error}): give another with hydra.sweep.dir=")
+    folder = _folder(sys.argv[1:])
+    (folder / STOP).unlink(missing_ok=True)
     given = override("hydra.sweep.dir", str(folder))
-    keys = {text.partition("=")[0] for text in typed}
-    options = [o for choice in typed for o in _NEEDED_BY.get(choice, ())]
-    sys.argv[1:] = [*typed, given, *(o for o in options if o.partition("=")[0] not in keys)]
+    needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
+    sys.argv[1:] = [*typed, given, *(o for o in needed if o.partition("=")[0] not in keys)]
     begun, failure = time.time(), 0
-    with StopRequest(then=(folder / STOP).touch) as stop:
+    with StopRequest(then=lambda: folder.is_dir() and (folder / STOP).touch()) as stop:
         try:
             run_hydra("train", job, TrainConfig)
         except SystemExit as end:
-            failure = end.code if isinstance(end.code, int) else 1
-            if failure == 2 and not _states(folder, since=begun):
+            if not _states(folder, since=begun):
                 raise  # a mistake on the command line, which has been printed
-        except Exception as error:  # of the launcher or the sweeper
+            failure = end.code if isinstance(end.code, int) and end.code != EXIT_USAGE else 1
+        except Exception:  # of the launcher or the sweeper
+            traceback.print_exc()
             failure = 1
-            if "No trials are completed" not in str(error):  # says Optuna; so does the summary
-                traceback.print_exc()
     states = _states(folder)
-    is_whole = not stop and not failure and all(s.startswith(FINISHED) for s in states.values())
-    print(f"sweep: {folder}")
-    counts = [sum(s.startswith(word) for s in states.values()) for word in (FINISHED, "failed")]
-    print(
-        f"{counts[0]} of {len(states)} runs finished" + (f", {counts[1]} failed" * bool(counts[1]))
-    )
-    for name, state in states.items():
-        print(f"  {name}: {state}")
-        if state.startswith("failed"):
-            print(f"    log: {folder / name / LOG}")
-    if counts[0]:
-        print(f"Compare them with\n  {shell_line('python', '-m', 'flowrep.report', str(folder))}")
+    is_whole = not (stop or failure) and all(s.startswith(FINISHED) for s in states.values())
+    _sum_up(folder, states)
     if not is_whole:
         again = shell_line("python", "-m", "flowrep.train", *typed, given)
         print(f"Continue the remaining runs with\n  {again}")
@@ -128,21 +115,35 @@ def run_sweep() -> NoReturn:
 
 def _folder(arguments: list[str]) -> Path:
     """Returns the sweep's folder: the one that is given, or a new one."""
-    given = [text.partition("=")[2] for text in arguments if text.startswith("hydra.sweep.dir=")]
-    name = given[-1].strip("'") if given else f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
-    return Path(name).absolute()
+    given = [text for text in arguments if text.startswith("hydra.sweep.dir=")]
+    name = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
+    return Path(value_of(given[-1]) if given else name).absolute()
 
 
 def _states(sweep: Path, since: float = 0.0) -> dict[str, str]:
     """Returns what the last line of each run's log says of it, by name."""
     states = {}
     for log in sorted(sweep.glob(f"*/{LOG}")):
-        if log.stat().st_mtime < since:
-            continue
-        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-        said = lines[-1] if lines and lines[-1].startswith("--- ") else f"--- {STOPPED}"
-        states[log.parent.name] = said.removeprefix("--- ")
+        if log.stat().st_mtime >= since:
+            last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-1:]
+            is_state = bool(last) and last[0].startswith("--- ")
+            states[log.parent.name] = last[0].removeprefix("--- ") if is_state else STOPPED
     return states
+
+
+def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
+    """Prints how each run stands, where the logs of failed ones are, and how to compare them."""
+    finished, failed = (
+        sum(state.startswith(word) for state in states.values()) for word in (FINISHED, FAILED)
+    )
+    print(f"sweep: {folder}")
+    print(f"{finished} of {len(states)} runs finished{f', {failed} failed' if failed else ''}")
+    for name, state in states.items():
+        print(f"  {name}: {state}")
+        if state.startswith(FAILED):
+            print(f"    log: {folder / name / LOG}")
+    if finished:
+        print(f"Compare them with\n  {shell_line('python', '-m', 'flowrep.report', str(folder))}")
 
 
 def job(config: DictConfig) -> float:
@@ -169,7 +170,7 @@ def job(config: DictConfig) -> float:
             folder, plain_config(config), _line(folder, config, is_worker), should_stop
         )
     except Exception as error:  # the other runs go on
-        state = f"failed: error: {' '.join(str(error).split())}"
+        state = f"{FAILED}: error: {' '.join(str(error).split())}"
         _say(folder, state)
     print(f"{folder.name}: {state}", flush=True)
     if is_worker and os.getppid() != PARENT:
@@ -218,7 +219,7 @@ def attempted(folder: Path, asked: dict[str, Any], line: list[str], should_stop:
         return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
     if should_stop():
         return STOPPED
-    print(f"{folder.name}: {RUNNING}", flush=True)
+    print(f"{folder.name}: running", flush=True)
     _say(folder, f"{datetime.now():%Y-%m-%d %H:%M:%S}")
     begin = (folder / LOG).stat().st_size
     with (folder / LOG).open("ab", buffering=0) as log, _process(line, log) as run:
@@ -232,7 +233,7 @@ def attempted(folder: Path, asked: dict[str, Any], line: list[str], should_stop:
         return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
     if code in (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGTERM, -signal.SIGINT):
         return _say(folder, STOPPED)
-    return _say(folder, f"failed: {_reason(folder / LOG, begin, code)}")
+    return _say(folder, f"{FAILED}: {_reason(folder / LOG, begin, code)}")
 
 
 @contextmanager

@@ -137,9 +137,7 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
 def complete(runner: Runner, stop: StopRequest) -> bool:
     """Trains and evaluates as far as that is not done yet; returns whether all is done."""
     config, folder = runner.config, runner.folder
-    if runner.frames >= config.total_frames and folder.is_evaluated(
-        runner.frames, config.evaluation.final_total
-    ):
+    if sweep.is_finished(folder.path, config):
         print(
             f"this run is complete; evaluate it with: {line_for('evaluate', run=str(folder.path))}"
         )

@@ -14,6 +14,7 @@ import pytest
 
 from flowrep import sweep
 from flowrep.config import UsageError, group_choices
+from flowrep.config.schema import TrainConfig, validated
 from flowrep.progress import StopRequest
 from flowrep.tables import write_rows
 from tests.config.composing import plain
@@ -76,6 +77,16 @@ def test_a_run_that_finishes_gives_its_success_and_is_not_run_again(attempt, tmp
         assert attempt(FINISHES).startswith("finished, success 100%")
     assert (tmp_path / "times").read_text() == "x"
     assert sweep.success_of(tmp_path) == 1.0
+
+
+def test_only_its_own_final_evaluation_finishes_a_run(tmp_path):
+    config = validated(TrainConfig, CONFIG)
+    finish(tmp_path, frames=128)  # before it was made longer
+    assert not sweep.is_finished(tmp_path, config)
+    finish(tmp_path)
+    assert sweep.is_finished(tmp_path, config)
+    more = config.model_copy(update={"total_frames": 512})
+    assert not sweep.is_finished(tmp_path, more)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +211,6 @@ def test_a_sweep_of_one_run_to_continue_is_refused(monkeypatch, capsys):
 def runs_of(monkeypatch, tmp_path, capsys):
     """The overrides of each run of a sweep, as mappings."""
     from flowrep.config import cli
-    from flowrep.config.schema import TrainConfig
 
     def runs_of(*arguments):
         found = []

@@ -89,6 +89,10 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[S
     except Exception as error:
         if _IS_DEBUGGING or not is_a_mistake(error):
             raise
+        if isinstance(error, OSError) and not isinstance(error, HydraException):
+            exit_with(
+                f"the output folder can't be made ({error}): give another with hydra.run.dir="
+            )
         exit_with(explained(error, schema))
 
 
@@ -285,6 +289,12 @@ def _as_typed(argument: str) -> str:
         and isinstance(parsed.value(), int | float)  # a bool is an int
     )
     return override(key, text) if is_misread or Path(text).exists() else argument
+
+
+def value_of(text: str) -> str:
+    """Returns the value of an override of a text, without Hydra's quotes."""
+    parsed = _parsed(text)
+    return text.partition("=")[2] if parsed is None else str(parsed.value())
 
 
 def _parsed(text: str) -> Any:

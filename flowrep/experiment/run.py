@@ -209,39 +209,6 @@ def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str,
     return dict(scalars)
 
 
-def open_wandb(folder: Path, mode: str, config: Mapping[str, Any]) -> Any:
-    """Returns a TorchRL logger to the folder's own wandb run, the same one whenever it is resumed.
-
-    Args:
-        folder: the run's folder; wandb writes its files to `wandb/` in it.
-        mode: "offline" keeps them there for `wandb sync`, "online" sends them.
-        config: shown beside the run.
-
-    Raises:
-        ImportError: wandb is not installed.
-    """
-    require(f"wandb={mode}", "train,wandb", "wandb")
-    from torchrl.record.loggers.wandb import WandbLogger
-
-    return WandbLogger(
-        folder.name,
-        project="flowrep",
-        save_dir=str(folder),
-        id=run_id(folder),
-        mode=mode,
-        config=dict(config),
-        log_env_packages=False,
-    )
-
-
-def run_id(folder: Path) -> str:
-    """Returns wandb's id of the run, generated once and kept in its folder."""
-    kept = folder / "wandb_id"
-    if not kept.is_file():
-        _replace(kept, uuid.uuid4().hex[:12])
-    return kept.read_text(encoding="utf-8")
-
-
 class RunFolder:
     """The files of one run, by name.
 
@@ -263,6 +230,12 @@ class RunFolder:
         """Creates the folder if it is missing."""
         self.path = Path(path)
         self.path.mkdir(parents=True, exist_ok=True)
+        self.config_path = self.path / "config.yaml"
+        self.metrics_path = self.path / "metrics.csv"
+        self.checkpoint_path = self.path / "checkpoint" / "latest.safetensors"
+        self.evaluation_path = self.path / "evaluation.csv"
+        self.failures_path = self.path / "failures.csv"
+        self.curve_path = self.path / "learning_curve.png"
         self._loggers: list[Any] = []
 
     @classmethod
@@ -296,11 +269,11 @@ class RunFolder:
         Raises:
             RunFolderError: the folder holds a run, or remains of one.
         """
-        config, checkpoint = self.path / "config.yaml", self.checkpoint_path
-        files = (config, self.metrics_path, self.evaluation_path, checkpoint)
+        files = (self.config_path, self.metrics_path, self.evaluation_path, self.checkpoint_path)
         found = [file for file in files if file.exists()]
         if found:
-            how = f"continue it with resume={self.path}, or " if found[0] == config else ""
+            is_run = found[0] == self.config_path
+            how = f"continue it with resume={self.path}, or " if is_run else ""
             raise RunFolderError(
                 f"'{self.path}' holds a run already ({found[0].name}): {how}give the new one a "
                 "folder of its own with hydra.run.dir="
@@ -309,31 +282,6 @@ class RunFolder:
     def held(self, doing: str, patience_s: float = 0.0) -> AbstractContextManager[None]:
         """Locks the folder against other processes; see `folder_lock`."""
         return folder_lock(self.path, doing, patience_s)
-
-    @property
-    def checkpoint_path(self) -> Path:
-        """The file that holds the last complete state of the run."""
-        return self.path / "checkpoint" / "latest.safetensors"
-
-    @property
-    def evaluation_path(self) -> Path:
-        """The table of evaluated episodes."""
-        return self.path / "evaluation.csv"
-
-    @property
-    def failures_path(self) -> Path:
-        """The table of causes of failure."""
-        return self.path / "failures.csv"
-
-    @property
-    def metrics_path(self) -> Path:
-        """The table of logged training steps."""
-        return self.path / "metrics.csv"
-
-    @property
-    def curve_path(self) -> Path:
-        """The picture of the learning curve."""
-        return self.path / "learning_curve.png"
 
     def video_path(self, name: str) -> Path:
         """The file for a video of that name."""
@@ -345,7 +293,7 @@ class RunFolder:
         (self.path / ".hydra").mkdir(exist_ok=True)
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
         _replace(self.path / ".hydra" / "overrides.yaml", typed)
-        _replace(self.path / "config.yaml", yaml.safe_dump(dict(config), sort_keys=False))
+        _replace(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:
         """Returns the resolved config that the run was started with, as plain data.
@@ -353,7 +301,7 @@ class RunFolder:
         Raises:
             RunFolderError: the file is damaged; names what is missing.
         """
-        path = self.path / "config.yaml"
+        path = self.config_path
         try:
             config = yaml.safe_load(path.read_text(encoding="utf-8"))
         except (yaml.YAMLError, ValueError) as error:
@@ -386,11 +334,33 @@ class RunFolder:
     def log_to_wandb(self, mode: str, config: Mapping[str, Any]) -> None:
         """Sends everything logged from now on to Weights & Biases too, unless `mode` is "off".
 
+        A resumed run continues its own wandb run, whose id is kept in the folder.
+
+        Args:
+            mode: "offline" keeps the files in `wandb/` for `wandb sync`, "online" sends them.
+            config: shown beside the run.
+
         Raises:
             ImportError: wandb is not installed.
         """
-        if mode != "off":
-            self._loggers.append(open_wandb(self.path, mode, config))
+        if mode == "off":
+            return
+        require(f"wandb={mode}", "train,wandb", "wandb")
+        from torchrl.record.loggers.wandb import WandbLogger
+
+        kept = self.path / "wandb_id"
+        if not kept.is_file():
+            _replace(kept, uuid.uuid4().hex[:12])
+        logger = WandbLogger(
+            self.path.name,
+            project="flowrep",
+            save_dir=str(self.path),
+            id=kept.read_text(encoding="utf-8"),
+            mode=mode,
+            config=dict(config),
+            log_env_packages=False,
+        )
+        self._loggers.append(logger)
 
     def forget_after(self, frames: int) -> None:
         """Drops the rows logged after `frames`; a resumed run writes them again."""
@@ -421,20 +391,6 @@ class RunFolder:
                 "results: restore that file, or move the folder away and start a new run"
             )
         self.forget_after(0)
-
-    def is_evaluated(self, frames: int, episodes: int) -> bool:
-        """Returns whether the final evaluation is in evaluation.csv.
-
-        Args:
-            frames: the frames that the run was trained for.
-            episodes: the evaluation's episodes, over all policies and speeds.
-        """
-        final = [
-            row
-            for row in self.read_episodes()
-            if row["evaluation"] == "final" and int(row["frames"]) == frames
-        ]
-        return len(final) >= episodes
 
     def read_metrics(self) -> list[dict[str, str]]:
         """Returns the rows of metrics.csv, none if there is no such file."""

@@ -24,7 +24,6 @@ from flowrep.experiment.run import (
     folder_lock,
     machine_of,
     origin_of,
-    run_id,
 )
 from flowrep.tables import TableError, append_rows
 from tests.test_configs import composed
@@ -121,11 +120,6 @@ def test_another_version_is_refused(config):
         check_origin(saved, origin_of(config), PATH)
 
 
-def test_a_resumed_run_keeps_its_name_and_another_has_its_own(tmp_path):
-    first, other = RunFolder(tmp_path / "a").path, RunFolder(tmp_path / "b").path
-    assert run_id(first) == run_id(first) != run_id(other)
-
-
 def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     RunFolder(tmp_path).log_to_wandb("off", {})
@@ -145,7 +139,7 @@ def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_p
         assert wandb.run.config["seed"] == 3
         assert dict(wandb.run.summary)["alpha"] == 1 / frames
         wandb.finish()
-    assert names == [run_id(tmp_path)] * 2
+    assert names == [(tmp_path / "wandb_id").read_text()] * 2
     assert list((tmp_path / "wandb").glob(f"offline-run-*/run-{names[0]}.wandb"))
     assert (tmp_path / "metrics.csv").read_text().splitlines()[1:] == ["10,0.1", "20,0.05"]
 
@@ -311,18 +305,6 @@ def test_an_episode_that_is_evaluated_again_takes_its_place(tmp_path):
     assert [(row["episode_seed"], row["outcome"]) for row in run.read_episodes()] == [
         ("7", "collision"), ("8", "timeout"), ("9", "collision"), ("8", "collision"),
     ]  # fmt: skip
-
-
-def test_a_run_is_evaluated_by_its_own_final_evaluation_alone(tmp_path):
-    run = RunFolder(tmp_path)
-    asked = [episode(i, frames="100", evaluation="evaluate", policy="sampled") for i in range(5)]
-    run.log_episodes(asked)
-    assert not run.is_evaluated(100, 2)
-    run.log_episodes([episode(1, frames="100", evaluation="final")])
-    assert not run.is_evaluated(100, 2)
-    run.log_episodes([episode(2, frames="100", evaluation="final")])
-    assert run.is_evaluated(100, 2)
-    assert not run.is_evaluated(90, 2)
 
 
 HEADER = ",".join(EVALUATION_COLUMNS)
