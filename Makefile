@@ -91,8 +91,8 @@ format: $(DEVELOPED)  ## Mend style and formatting
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Those against ML-Agents need an environment of its own, those of a GPU a GPU.
-BENCHMARKS = $(filter-out %mlagents.py %mlagents_worker.py benchmarks/gpu%,$(wildcard benchmarks/*.py))
+# Without the one that needs a GPU.
+BENCHMARKS = $(filter-out benchmarks/gpu.py,$(wildcard benchmarks/*.py))
 
 bench: $(INSTALLED)  ## Run the benchmarks, one after the other
 	$(PIP) --editable ".[bench]"

@@ -1,4 +1,4 @@
-"""Time of factorize beside the same maths composed from kornia, and a copy of the same bytes.
+"""Times `factorize` beside the same maths composed from kornia, and a copy of the same bytes.
 
 Bounds, compiled on the CPU: at least 30 x kornia, and 70 % of the machine's copy bandwidth at
 28 bytes a pixel (raw and depth read, ego and obj written; the mask's byte is not counted). The

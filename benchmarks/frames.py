@@ -1,10 +1,11 @@
-"""Frames a second of 32 envs in one process with ego and obj, and a breakdown of their time.
+"""Time of one env's step beside PyBullet's picture, and frames per second of 32 envs together.
 
     python benchmarks/frames.py [--scenes straight_road ...] [--sizes 84 48] [--num-envs 32]
 
-Two ways take turns: the rasteriser drawing all envs at once, and PyBullet drawing each on its own.
-Policy and replay memory are left out; actions are random. Times are CPU times, so that other work
-on the machine does not count.
+First a table of single envs: a planner drives, and each view is also drawn by PyBullet. Then 32 in
+one process with ego and obj and random actions, without policy and replay memory, in two ways that
+take turns: the rasteriser drawing all envs at once, and PyBullet drawing each on its own. Times are
+CPU times, so that other work on the machine does not count.
 """
 
 import argparse
@@ -13,20 +14,57 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 from unittest.mock import patch
 
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from torchrl.envs import Compose, EnvBase, GymWrapper, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from flowrep.envs import make_env
+from flowrep.baselines import Planner
+from flowrep.envs import StreetEnv, make_env
 from flowrep.envs.episode import Episode
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.scene import Scene
 
 MAPS = ("ego", "obj")
+SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion")
 ONE_BY_ONE = partial(SyncVectorEnv, autoreset_mode=AutoresetMode.DISABLED)
+
+
+def in_size(name: str, size: int) -> Scene:
+    """Returns a scene whose camera has `size` pixels a side."""
+    scene = load_scene(name)
+    camera = dataclasses.replace(scene.camera, height_px=size, width_px=size)
+    return dataclasses.replace(scene, camera=camera)
+
+
+def timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    started = time.process_time()
+    result = call()
+    return time.process_time() - started, result
+
+
+def single_row(name: str, size: int, count: int) -> str:
+    """Times steps of one env; the planner's own time is not counted."""
+    scene = in_size(name, size)
+    env = StreetEnv(scene, sensors=SENSORS)
+    planner, steps, pictures = Planner(), [], []
+    env.reset(seed=0)
+    while len(steps) < count:
+        action = planner(env)
+        seconds, (*_, terminated, _, _) = timed(lambda action=action: env.step(action))
+        steps.append(seconds)
+        env.sensing.rgb(env.episode)  # puts everyone where they are
+        pictures.append(timed(lambda: env.sensing.look(env.episode))[0])
+        if terminated:
+            env.reset()
+    env.close()
+    step, picture = statistics.median(steps), statistics.median(pictures)
+    paired = statistics.median(p / s for s, p in zip(steps, pictures))
+    cells = f"{1e3 * step:.2f} | {1e3 * picture:.2f} | {paired:.1f} | {1 / step:.0f}"
+    return f"| {name} | {size} | {scene.num_pedestrians} | {cells} |"
 
 
 def together(scene: Scene, num_envs: int) -> EnvBase:
@@ -38,23 +76,21 @@ def one_by_one(scene: Scene, num_envs: int) -> EnvBase:
         return make_env(scene, MAPS, num_envs=num_envs, seed=0, renderer="pybullet")
 
 
-def stepper(env: EnvBase) -> Callable[[int], float]:
-    """Returns a function that takes a number of steps in every env and returns ms a frame."""
+def stepper(env: EnvBase, clock: Callable[[], float] = time.process_time) -> Callable[[int], float]:
+    """Returns a function that takes a number of steps in every env and returns ms per frame."""
     observation = [env.reset()]
 
     def take(steps: int) -> float:
-        started = time.process_time()
+        started = clock()
         for _ in range(steps):
             _, observation[0] = env.step_and_maybe_reset(env.rand_action(observation[0]))
-        return 1e3 * (time.process_time() - started) / (steps * env.batch_size.numel())
+        return 1e3 * (clock() - started) / (steps * env.batch_size.numel())
 
     return take
 
 
-def row(name: str, size: int, num_envs: int, steps: int, rounds: int) -> str:
-    scene = load_scene(name)
-    camera = dataclasses.replace(scene.camera, height_px=size, width_px=size)
-    scene = dataclasses.replace(scene, camera=camera)
+def batch_row(name: str, size: int, num_envs: int, steps: int, rounds: int) -> str:
+    scene = in_size(name, size)
     envs = [make(scene, num_envs) for make in (together, one_by_one)]
     takers = [stepper(env) for env in envs]
     times = [[take(steps) for take in takers] for _ in range(rounds + 1)][1:]  # one to warm up
@@ -68,31 +104,29 @@ def row(name: str, size: int, num_envs: int, steps: int, rounds: int) -> str:
 
 
 def shares(env: EnvBase, take: Callable[[int], float], steps: int) -> list[float]:
-    """Returns milliseconds a frame for driving, sensing, representations and TorchRL."""
+    """Returns milliseconds per frame for driving, sensing, representations and TorchRL."""
     owners = [
-        (Episode, "step"), (StreetVectorEnv, "_observe"), (Compose, "_step"), (GymWrapper, "_step"),
+        (Episode, "step"), (StreetVectorEnv, "_observe"), (Compose, "_step"),
         (TransformedEnv, "_step"),
     ]  # fmt: skip
     spent = dict.fromkeys(owners, 0.0)
 
-    def timed(key: tuple, method: Callable) -> Callable:
+    def watched(key: tuple, method: Callable) -> Callable:
         def wrapped(*args, **kwargs):
-            started = time.process_time()
-            try:
-                return method(*args, **kwargs)
-            finally:
-                spent[key] += 1e3 * (time.process_time() - started)
+            seconds, result = timed(lambda: method(*args, **kwargs))
+            spent[key] += 1e3 * seconds
+            return result
 
         return wrapped
 
-    patches = [patch.object(*key, timed(key, getattr(*key))) for key in owners]
+    patches = [patch.object(*key, watched(key, getattr(*key))) for key in owners]
     for each in patches:
         each.start()
     whole = take(steps)
     for each in patches:
         each.stop()
     frames = steps * env.batch_size.numel()
-    drive, see, represent, *_ = (spent[key] / frames for key in owners)
+    drive, see, represent, _ = (spent[key] / frames for key in owners)
     return [drive, see, represent, whole - drive - see - represent]
 
 
@@ -101,11 +135,16 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=scene_names())
     parser.add_argument("--sizes", type=int, nargs="+", default=[84, 48])
     parser.add_argument("--num-envs", type=int, default=32)
-    parser.add_argument("--steps", type=int, default=10, help="of every street in each round")
+    parser.add_argument("--steps", type=int, default=10, help="of every env in each round")
     parser.add_argument("--rounds", type=int, default=9)
     args = parser.parse_args()
     torch.manual_seed(0)
-    print(f"{args.num_envs} streets in one process, {torch.get_num_threads()} threads, ms a frame")
+    torch.set_num_threads(1)
+    print("| scene | pixels | people | step, ms | picture, ms | picture / step | steps/s |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name in args.scenes:
+        print(single_row(name, args.sizes[0], 60 * args.steps), flush=True)
+    print(f"\n{args.num_envs} envs in one process, one thread, ms per frame")
     print(
         "| scene | pixels | PyBullet | flowrep | ratio | frames/s "
         "| drive | see | represent | the rest |"
@@ -113,7 +152,7 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for name in args.scenes:
         for size in args.sizes:
-            print(row(name, size, args.num_envs, args.steps, args.rounds), flush=True)
+            print(batch_row(name, size, args.num_envs, args.steps, args.rounds), flush=True)
 
 
 if __name__ == "__main__":

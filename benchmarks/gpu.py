@@ -4,11 +4,10 @@
 
 Four parts, each a table: an update (as a CUDA graph and eager, bf16 and fp32, against TorchRL's
 stock recipe and the floor at the measured rate of matrix products), factorising flow (against
-kornia, if installed, and a copy), frames a second of the envs by number of worker processes, and a
-short training at the paper's size, from which the wall time of the full one is projected. The
-report is printed, and written to report.md and report.json after every part. Without PyBullet, or
-with `--recorded`, synthetic sensor maps replace the simulator and the report says so. `--device cpu
---quick` runs a tiny version of everything, whose numbers are meaningless.
+kornia, if installed, and a copy), frames per second of the envs by number of worker processes, and
+a short training at the paper's size, from which the wall time of the full one is projected. The
+report is printed, and written to report.md and report.json after every part. `--device cpu --quick`
+runs a tiny version of everything, whose numbers are meaningless.
 """
 
 import argparse
@@ -27,9 +26,11 @@ import torch
 from factorize import BYTES_PER_PIXEL, copier, cuda_clock, inputs, kornia_factorize
 from factorize import repeats_for as repeats_for_a_turn
 from factorize import timed as seconds_of_a_call
-from gpu_run import RECORDED_NOTE, street_rates, training
-from update import SIZES as UPDATE_SIZES
+from frames import in_size, stepper
+from training import train
 from update import (
+    SIZES,
+    STOCK,
     flowrep_update,
     interleaved,
     matrix_product,
@@ -38,14 +39,13 @@ from update import (
     stock_update,
 )
 
+from flowrep.envs import make_env
 from flowrep.geometry import factorize
 
 FACTORIZE_SIZES = [(64, 84, 84), (1024, 84, 84), (1, 720, 1280)]
-QUICK_UPDATE_SIZES = {"tiny": (40, 8)}
-QUICK_FACTORIZE_SIZES = [(2, 12, 16)]
-PARTS = ("update", "transforms", "streets", "training")
+PAPER_FRAMES = 2_000_000
+WORKERS, NUM_ENVS, SIDE = (0, 1, 4, 8, 16), 32, 84
 NO_GPU = 2  # the exit code
-STOCK = "TorchRL stock, separate fp32"
 
 
 @dataclass
@@ -76,44 +76,34 @@ def updates(args: argparse.Namespace) -> Part:
     part = Part("An update of discrete SAC")
     if args.device.type != "cuda":
         part.notes.append("There are no graphs on a CPU: both kinds are eager here.")
-    for name, size in (QUICK_UPDATE_SIZES if args.quick else UPDATE_SIZES).items():
-        rows, rates = updates_of_a_size(args, *size)
-        part.rows += [{"size": name, **row} for row in rows]
+    for name, (side, batch) in ({"tiny": (40, 8)} if args.quick else SIZES).items():
+        torch.manual_seed(0)
+        steps = random_steps(side, batch, args.device)
+        variants = {
+            f"{encoder} {precision}, {kind}": flowrep_update(
+                steps, encoder, precision, eager=kind == "eager"
+            )
+            for encoder in ("shared", "separate")
+            for precision in ("bf16", "fp32")
+            for kind in ("graph", "eager")
+        }
+        counts = {variant: operations(update) for variant, update in variants.items()}
+        width = 256 if args.quick else 8192
+        types = {"bf16 products": torch.bfloat16, "fp32 products": torch.float32}
+        products = {n: matrix_product(dtype, args.device, width) for n, dtype in types.items()}
+        everything = {**variants, STOCK: stock_update(steps), **products}
+        seconds = interleaved(everything, args.rounds, args.device, time.perf_counter)
+        rates = {n: 2 * width**3 / seconds[n] for n in products}
+        for variant in (*variants, STOCK):
+            row = {"size": name, "update": variant, "ms": 1e3 * seconds[variant]}
+            if variant in counts:
+                floor = counts[variant] / rates["bf16 products"]
+                row |= {"bf16 floor, ms": 1e3 * floor, "x floor": seconds[variant] / floor}
+            row["x faster than stock"] = seconds[STOCK] / seconds[variant]
+            part.rows.append(row)
         measured = ", ".join(f"{n} {rate / 1e12:.4g} TFLOP/s" for n, rate in rates.items())
-        part.notes.append(f"{name}: {size[0]}x{size[0]}, batch {size[1]}; {measured}.")
+        part.notes.append(f"{name}: {side}x{side}, batch {batch}; {measured}.")
     return part
-
-
-def updates_of_a_size(
-    args: argparse.Namespace, side: int, batch: int
-) -> tuple[list[dict[str, Any]], dict[str, float]]:
-    """Returns a row for each update, and the measured rates of products in operations a second."""
-    torch.manual_seed(0)
-    steps = random_steps(side, batch, args.device)
-    variants = {
-        f"{encoder} {precision}, {kind}": flowrep_update(
-            steps, encoder, precision, eager=kind == "eager"
-        )
-        for encoder in ("shared", "separate")
-        for precision in ("bf16", "fp32")
-        for kind in ("graph", "eager")
-    }
-    # counted in the first call: operations inside a graph are invisible later
-    counts = {variant: operations(update) for variant, update in variants.items()}
-    width = 256 if args.quick else 8192
-    types = {"bf16 products": torch.bfloat16, "fp32 products": torch.float32}
-    products = {n: matrix_product(dtype, args.device, width) for n, dtype in types.items()}
-    everything = {**variants, STOCK: stock_update(steps), **products}
-    seconds = interleaved(everything, args.rounds, args.device, time.perf_counter)
-    rates = {n: 2 * width**3 / seconds[n] for n in products}
-    rows = []
-    for variant in (*variants, STOCK):
-        row = {"update": variant, "ms": 1e3 * seconds[variant]}
-        if variant in counts:
-            floor = counts[variant] / rates["bf16 products"]
-            row |= {"bf16 floor, ms": 1e3 * floor, "x floor": seconds[variant] / floor}
-        rows.append(row | {"x faster than stock": seconds[STOCK] / seconds[variant]})
-    return rows, rates
 
 
 @torch.no_grad()
@@ -128,7 +118,7 @@ def transforms(args: argparse.Namespace) -> Part:
         part.notes.append("kornia is not installed: pip install kornia for its column.")
     if args.quick:
         part.notes.append("Nothing is compiled in the quick version.")
-    for batch, height, width in QUICK_FACTORIZE_SIZES if args.quick else FACTORIZE_SIZES:
+    for batch, height, width in [(2, 12, 16)] if args.quick else FACTORIZE_SIZES:
         given = [tensor.to(args.device) for tensor in inputs(batch, height, width)]
         compiled = torch.compile(factorize, backend="eager" if args.quick else "inductor")
         calls: dict[str, Callable[..., Any]] = {"compiled": compiled, "eager": factorize}
@@ -151,18 +141,36 @@ def seconds_of(call: Callable[[], object], clock: Callable[[], float]) -> float:
     return seconds_of_a_call(call, repeats_for_a_turn(call, clock), clock)
 
 
-def streets(args: argparse.Namespace) -> Part:
-    """Measures frames a second by number of worker processes."""
-    rows = street_rates(args.device, recorded=args.recorded, quick=args.quick)
-    part = Part("Streets with ego and obj, random actions", rows)
-    part.notes += [RECORDED_NOTE] if args.recorded else []
+def envs(args: argparse.Namespace) -> Part:
+    """Measures frames per second by number of worker processes; 0 is this process alone."""
+    part = Part("Envs with ego and obj, random actions")
+    num_envs, side, steps = (2, 40, 3) if args.quick else (NUM_ENVS, SIDE, 60)
+    clock = cuda_clock if args.device.type == "cuda" else time.perf_counter
+    for workers in (0, 1) if args.quick else WORKERS:
+        env = make_env(
+            in_size("straight_road", side), ("ego", "obj"), num_envs=num_envs,
+            num_workers=workers, device=args.device, seed=0,
+        )  # fmt: skip
+        take = stepper(env, clock)
+        take(steps)  # warms up
+        rate = 1e3 / take(steps)
+        env.close()
+        part.rows.append({"workers": workers, "num_envs": num_envs, "frames/s": rate})
     return part
 
 
 def whole_training(args: argparse.Namespace) -> Part:
     """Projects the time of the paper's 2,000,000 frames, without evaluations."""
-    row, notes = training(args.device, recorded=args.recorded, quick=args.quick)
-    return Part("A training at the paper's size, projected", [row], notes)
+    size = ["debug=smoke"] if args.quick else ["preset=paper", "total_frames=20_000"]
+    found = train(*size, f"device={args.device}")
+    rate = found["frames_per_second"]
+    row = {"frames/s": rate, f"min for {PAPER_FRAMES:,}": PAPER_FRAMES / rate / 60}
+    row["outside updates"] = found["share_outside_updates"]
+    note = "Shares are of the host's time; kernels count where something waited for them."
+    return Part("A training at the paper's size, projected", [row], [note])
+
+
+PARTS = {"update": updates, "transforms": transforms, "envs": envs, "training": whole_training}
 
 
 def write(folder: Path, machine: str, parts: dict[str, Part]) -> str:
@@ -180,22 +188,19 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--device", type=torch.device, default=torch.device("cuda"))
     parser.add_argument("--output", type=Path, default=Path("outputs/gpu"))
     parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--recorded", action="store_true", help="made-up maps, no simulator")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=[*PARTS])
     parser.add_argument("--quick", action="store_true", help="tiny sizes, to try the script")
     args = parser.parse_args(argv)
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces each storage, on stdout
     if args.device.type == "cuda" and not torch.cuda.is_available():
         print("no CUDA device here; --device cpu --quick tries the script", file=sys.stderr)
         sys.exit(NO_GPU)
-    args.recorded = args.recorded or find_spec("pybullet") is None
     name = torch.cuda.get_device_name(args.device) if args.device.type == "cuda" else "CPU"
     machine = f"{name}, {torch.get_num_threads()} CPU threads, torch {torch.__version__}"
-    makers = dict(zip(PARTS, (updates, transforms, streets, whole_training)))
     parts: dict[str, Part] = {}
     for part in args.parts:
         print(f"measuring: {part}", file=sys.stderr, flush=True)
-        parts[part] = makers[part](args)
+        parts[part] = PARTS[part](args)
         text = write(args.output, machine, parts)
     print(text)
 

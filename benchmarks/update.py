@@ -1,14 +1,13 @@
-"""Times a gradient step of discrete SAC against TorchRL's stock recipe and the machine's floor.
+"""Times a gradient step of discrete SAC beside plain PyTorch, TorchRL's recipe and the floor.
 
-    python benchmarks/update.py [--device cuda] [--rounds 5] [--threads 2] [--default-malloc]
-        [--busy]
+    python benchmarks/update.py [--device cuda] [--rounds 5] [--threads 2] [--cpu-time]
 
-All variants learn from the same transitions; each round times every variant once, in turn, and the
-machine's matrix products between them, so that a change of load affects all alike. The floor is the
-update's own count of operations at the highest measured rate of products. A CPU without
-instructions for bfloat16 is measured in float32 alone. `--default-malloc` keeps glibc's default
-allocator settings, to show the effect of `keep_freed_memory`. For machines under other load,
-`--busy` runs on one thread and measures CPU time instead of wall time.
+All variants learn from the same transitions and take turns, as do the machine's matrix products, so
+that a change of load affects all alike. The floor is the update's own count of operations at the
+highest measured rate of products. "Plain" is the same update with a shared encoder written without
+TorchRL. A CPU without instructions for bfloat16 is measured in float32 alone. `--default-malloc`
+keeps glibc's default allocator settings, to show the effect of `keep_freed_memory`. For machines
+under other load, `--cpu-time` runs on one thread and measures CPU time.
 """
 
 import argparse
@@ -17,6 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -31,7 +31,9 @@ from flowrep.agent.observation import has_fast_bf16
 
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3
-SIZES = {"laptop": (48, 128), "paper": (84, 1024)}  # pixels a side, batch
+GAMMA, TAU, TARGET_ENTROPY_WEIGHT = 0.99, 0.005, 0.2
+SIZES = {"48 px, batch 128": (48, 128), "48 px, batch 256": (48, 256), "paper": (84, 1024)}
+STOCK = "TorchRL stock, separate fp32"
 
 
 def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
@@ -48,78 +50,121 @@ def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
     return TensorDict({**seen, "next": following}, [batch], device=device)
 
 
-def agent_for(
-    spec: Composite, actions: Categorical, keys: Sequence[str], **changes: object
-) -> DiscreteSAC:
-    """Returns discrete SAC with the paper's hyperparameters."""
-    return DiscreteSAC(spec, actions, list(keys), total_frames=10**9, **changes)
-
-
 def dtypes_of(device: torch.device) -> dict[str, torch.dtype]:
     """Returns the precisions worth measuring: emulated bfloat16 takes minutes for an update."""
     fast = {"bf16": torch.bfloat16} if has_fast_bf16(device) else {}
     return fast | {"fp32": torch.float32}
 
 
-def flowrep_agent(steps: TensorDict, encoder: str, precision: str) -> DiscreteSAC:
-    """Returns an agent that has stored these steps and learns from all of them at once."""
-    side, batch = steps["ego"].shape[-1], len(steps)
-    spec = Composite({name: Unbounded((CHANNELS, side, side)) for name in MAPS})
-    agent = agent_for(
-        spec, Categorical(ACTIONS), MAPS, device=steps.device, encoder=encoder,
-        precision=precision, batch_size=batch, replay_capacity=2 * batch,
-    )  # fmt: skip
-    agent.memory.extend(steps)
-    return agent
-
-
 def flowrep_update(
     steps: TensorDict, encoder: str, precision: str, *, eager: bool = False
 ) -> Callable[[], object]:
-    agent = flowrep_agent(steps, encoder, precision)
+    """Returns an update of an agent that has stored these steps and learns from all at once."""
+    side, batch = steps["ego"].shape[-1], len(steps)
+    spec = Composite({name: Unbounded((CHANNELS, side, side)) for name in MAPS})
+    agent = DiscreteSAC(
+        spec, Categorical(ACTIONS), list(MAPS), total_frames=10**9, device=steps.device,
+        encoder=encoder, precision=precision, batch_size=batch, replay_capacity=2 * batch,
+    )  # fmt: skip
+    agent.memory.extend(steps)
     if eager:
         agent.step_eagerly()
     sample = agent.sample()
     return lambda: agent.update(sample)
 
 
-class StockNetwork(nn.Module):
-    """A plain network: Nature encoders, a hidden layer and one output for each action."""
+def nature(side: int) -> nn.Sequential:
+    final = ((((side - 8) // 4 + 1) - 4) // 2 + 1) - 2
+    return nn.Sequential(
+        nn.Conv2d(CHANNELS, 32, 8, 4), nn.LeakyReLU(), nn.Conv2d(32, 64, 4, 2), nn.LeakyReLU(),
+        nn.Conv2d(64, 64, 3), nn.LeakyReLU(), nn.Flatten(-3),
+        nn.Linear(64 * final * final, 512), nn.LeakyReLU(),
+    )  # fmt: skip
 
-    def __init__(self, side: int) -> None:
+
+def head(outputs: int, hidden: int = 512) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(512 * len(MAPS), hidden), nn.SiLU(), nn.Linear(hidden, outputs))
+
+
+class Network(nn.Module):
+    """Nature encoders, a hidden layer and one output for each action."""
+
+    def __init__(self, side: int, outputs: int = ACTIONS, hidden: int = 512) -> None:
         super().__init__()
-        final = ((((side - 8) // 4 + 1) - 4) // 2 + 1) - 2
-        self.encoders = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(CHANNELS, 32, 8, 4), nn.LeakyReLU(), nn.Conv2d(32, 64, 4, 2),
-                nn.LeakyReLU(), nn.Conv2d(64, 64, 3), nn.LeakyReLU(), nn.Flatten(-3),
-                nn.Linear(64 * final * final, 512), nn.LeakyReLU(),
-            )
-            for _ in MAPS
-        )  # fmt: skip
-        self.head = nn.Sequential(
-            nn.Linear(512 * len(MAPS), 512), nn.SiLU(), nn.Linear(512, ACTIONS)
-        )
+        self.encoders = nn.ModuleList(nature(side) for _ in MAPS)
+        self.head = head(outputs, hidden)
+
+    def embed(self, maps: Sequence[torch.Tensor]) -> torch.Tensor:
+        return torch.cat([encode(x) for encode, x in zip(self.encoders, maps)], -1)
 
     def forward(self, *maps: torch.Tensor) -> torch.Tensor:
-        return self.head(torch.cat([encode(x) for encode, x in zip(self.encoders, maps)], -1))
+        return self.head(self.embed(maps))
+
+
+def plain_update(steps: TensorDict, dtype: torch.dtype) -> Callable[[], object]:
+    """Returns the shared-encoder update in plain PyTorch; both Qs are one head of twice the width.
+
+    Its Qs mix their hidden layers, which costs a little more in the last one.
+    """
+    side, device = steps["ego"].shape[-1], steps.device
+    with torch.device(device):
+        critic = Network(side, 2 * ACTIONS, 1024).to(memory_format=torch.channels_last)
+        target = Network(side, 2 * ACTIONS, 1024).to(memory_format=torch.channels_last)
+        actor, log_alpha = head(ACTIONS), torch.tensor(-0.7, requires_grad=True)
+    weights = [*critic.parameters(), *actor.parameters(), log_alpha]
+    optimizer = torch.optim.Adam(weights, lr=3e-4, fused=True)
+    maps, following = (
+        [x[name].to(dtype, memory_format=torch.channels_last) for name in MAPS]
+        for x in (steps, steps["next"])
+    )
+    action = steps["action"].unsqueeze(-1)
+    reward, ended = (steps["next", name].squeeze(-1) for name in ("reward", "terminated"))
+    target_entropy = TARGET_ENTROPY_WEIGHT * torch.tensor(ACTIONS, device=device).log()
+
+    def two(q: torch.Tensor) -> torch.Tensor:
+        return q.float().unflatten(-1, (2, ACTIONS))
+
+    def update() -> None:
+        alpha = log_alpha.detach().exp()
+        with torch.autocast(device.type, dtype, enabled=dtype is not torch.float32):
+            with torch.no_grad():
+                embedded = target.embed(following)
+                log_policy = actor(embedded).float().log_softmax(-1)
+                q = two(target.head(embedded)).amin(1)
+                value = (log_policy.exp() * (q - alpha * log_policy)).sum(-1)
+                y = reward + GAMMA * value.masked_fill(ended, 0.0)
+            embedded = critic.embed(maps)
+            q = two(critic.head(embedded))
+            log_policy = actor(embedded.detach()).float().log_softmax(-1)
+        chosen = q.gather(-1, action.unsqueeze(-1).expand(-1, 2, -1)).squeeze(-1)
+        policy = log_policy.exp()
+        loss = 2 * F.mse_loss(chosen, y.unsqueeze(-1).expand(-1, 2))
+        loss = loss + (policy * (alpha * log_policy - q.detach().amin(1))).sum(-1).mean()
+        surplus = (policy * log_policy).sum(-1).mean().detach() + target_entropy
+        (loss - log_alpha * surplus).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        with torch.no_grad():
+            torch._foreach_lerp_([*target.parameters()], [*critic.parameters()], TAU)
+
+    return update
 
 
 def stock_update(steps: TensorDict) -> Callable[[], object]:
     """Returns an update of TorchRL's `DiscreteSACLoss` as in its examples, in float32."""
     side = steps["ego"].shape[-1]
     with torch.device(steps.device):
-        actor = TensorDictModule(StockNetwork(side), in_keys=[*MAPS], out_keys=["logits"])
-        critic = TensorDictModule(StockNetwork(side), in_keys=[*MAPS], out_keys=["action_value"])
+        actor = TensorDictModule(Network(side), in_keys=[*MAPS], out_keys=["logits"])
+        critic = TensorDictModule(Network(side), in_keys=[*MAPS], out_keys=["action_value"])
     policy = ProbabilisticActor(
         actor, in_keys=["logits"], distribution_class=torch.distributions.Categorical
     )
     loss = DiscreteSACLoss(
         policy, critic, action_space="categorical", num_actions=ACTIONS, loss_function="l2",
-        alpha_init=0.5, target_entropy_weight=0.2,
+        alpha_init=0.5, target_entropy_weight=TARGET_ENTROPY_WEIGHT,
     )  # fmt: skip
-    loss.make_value_estimator(gamma=0.99)
-    targets = SoftUpdate(loss, tau=0.005)
+    loss.make_value_estimator(gamma=GAMMA)
+    targets = SoftUpdate(loss, tau=TAU)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
 
     def update() -> None:
@@ -170,6 +215,7 @@ class NoModules:
 
 
 def operations(update: Callable[[], object]) -> int:
+    """Returns the operations of an update, to be counted in its first call: graphs hide them."""
     counter = FlopCounterMode(display=False)
     counter.mod_tracker = NoModules()
     with counter:
@@ -180,15 +226,14 @@ def operations(update: Callable[[], object]) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--sizes", nargs="+", choices=SIZES, default=[*SIZES])
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--default-malloc", action="store_true")
-    parser.add_argument("--busy", action="store_true")
+    parser.add_argument("--cpu-time", action="store_true")
     args = parser.parse_args()
-    clock = time.process_time if args.busy else time.perf_counter
-    threads = 1 if args.busy else args.threads
-    torch.set_num_threads(threads)
+    clock = time.process_time if args.cpu_time else time.perf_counter
+    torch.set_num_threads(1 if args.cpu_time else args.threads)
     kept = not args.default_malloc and keep_freed_memory()
     print(f"{args.device}, {torch.get_num_threads()} threads, freed memory kept: {kept}")
     for size in args.sizes:
@@ -201,28 +246,22 @@ def main() -> None:
             for precision in dtypes
             for encoder in ("shared", "separate")
         }
-        updates["TorchRL stock, separate fp32"] = stock_update(steps)
+        counts = {name: operations(update) for name, update in updates.items()}
+        plain = {f"plain shared {name}": plain_update(steps, t) for name, t in dtypes.items()}
+        updates |= plain | {STOCK: stock_update(steps)}
         width = 8192 if args.device.type == "cuda" else 2048
         products = {n: matrix_product(t, args.device, width) for n, t in dtypes.items()}
-        # counted first: operations inside a CUDA graph are invisible later
-        counts = {n: None if "stock" in n else operations(u) for n, u in updates.items()}
         seconds = interleaved({**updates, **products}, args.rounds, args.device, clock)
         rates = {name: 2 * width**3 / seconds[name] for name in products}
         print(f"\n{size}: {side}x{side}, {len(MAPS)} maps of {CHANNELS} channels, batch {batch}")
         print(", ".join(f"{n} products {r / 1e9:.0f} GFLOP/s" for n, r in rates.items()))
-        print("| update | s | GFLOP | floor, s | x floor | faster than stock |")
-        print("| --- | --- | --- | --- | --- | --- |")
-        stock = seconds["TorchRL stock, separate fp32"]
-        for name, count in counts.items():
-            floor = count / max(rates.values()) if count else None
-            columns = [
-                f"{seconds[name]:.4f}",
-                f"{count / 1e9:.1f}" if count else "",
-                f"{floor:.4f}" if floor else "",
-                f"{seconds[name] / floor:.2f}" if floor else "",
-                f"{stock / seconds[name]:.1f}",
-            ]
-            print(f"| {name} | " + " | ".join(columns) + " |")
+        print("| update | ms | x floor | faster than stock |")
+        print("| --- | --- | --- | --- |")
+        for name in updates:
+            floor = counts[name] / max(rates.values()) if name in counts else None
+            of_floor = f"{seconds[name] / floor:.2f}" if floor else ""
+            faster = seconds[STOCK] / seconds[name]
+            print(f"| {name} | {1e3 * seconds[name]:.1f} | {of_floor} | {faster:.1f} |")
 
 
 if __name__ == "__main__":

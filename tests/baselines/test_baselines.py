@@ -1,4 +1,4 @@
-"""Is Straight Road a fair task? A small count here; `benchmarks/scene_validity.py` has the rest."""
+"""Is Straight Road a fair task? A small count here; `examples/scene_validity.py` has the rest."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,6 @@
 """The paper's four environments: Table I, their paths, what is seen there, that they are fair.
 
-Counts are small here; `benchmarks/scene_validity.py` runs hundreds of episodes a cell.
+Counts are small here; `examples/scene_validity.py` runs hundreds of episodes a cell.
 """
 
 from dataclasses import replace

@@ -13,11 +13,10 @@ import pytest
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
-from tests.experiment.test_training import differing
-
 from flowrep.agent import load_checkpoint
 from flowrep.config import group_choices
 from flowrep.experiment.run import RunFolder
+from tests.experiment.test_runner import differing
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow

@@ -1,6 +1,6 @@
 """Checks that scenes are fair tasks: the planner reaches the ending zone, simple baselines don't.
 
-python benchmarks/scene_validity.py --scenes straight_road --episodes 500
+python examples/scene_validity.py --scenes straight_road --episodes 500
 """
 
 import argparse
