@@ -28,7 +28,6 @@ from flowrep.sequences import (
 from flowrep.sequences.factorization import FlowSource, MotionSource
 from flowrep.sequences.job import Job, Selection
 from flowrep.sequences.output import Output, OutputOptions
-from flowrep.transforms import EstimatedFlow
 
 MISTAKES = (SequenceError, ValueError, ImportError, OSError)
 
@@ -99,6 +98,9 @@ def open_flow_source(config: FactorizeConfig, stream: Stream) -> FlowSource:
             why = stream.no_flow if isinstance(stream, Recording) else "a video has none"
             raise UsageError(f"flow=exact: {config.input} has no flow of its own; {why}")
         return recorded_flow
+    # Here, since TorchRL's import takes as long as all others: a mistake is told before.
+    from flowrep.transforms import EstimatedFlow
+
     estimator = EstimatedFlow(**options).estimator
     return EstimatedFlowSource(estimator, check_consistency=config.check_consistency)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,7 +16,9 @@ from torch import Tensor
 from flowrep.geometry import factorize, relative_motion
 from flowrep.sequences.files import Flow
 from flowrep.sequences.recording import Frame, Pose, SequenceError
-from flowrep.transforms.estimated_flow import Estimator
+
+if TYPE_CHECKING:
+    from flowrep.transforms.estimated_flow import Estimator
 
 # The squared error of going there and back is below a hundredth of the squared lengths plus half a
 # square pixel: Sundaram, Brox and Keutzer, "Dense point trajectories", 2010.

@@ -68,7 +68,6 @@ class Frames(Recording):
         flow_channels: see there.
 
     Raises:
-        SequenceError: a file is missing or invalid; names the file and the cause.
         ValueError: a name is unknown, or an option doesn't apply to the kind of depth.
     """
 
@@ -117,6 +116,7 @@ class Frames(Recording):
 
     def _open(self) -> None:
         self._depths = list_files(self.folder / "depth", DEPTH_FILES)
+        self.count = len(self._depths)
         self._rgbs = self._by_stem("rgb", PICTURES)
         self._flows = self._by_stem("flow", FLOW_FILES)
         if not self._rgbs and not self._flows:
@@ -153,10 +153,6 @@ class Frames(Recording):
             for name, path in found.items():
                 if name not in names:
                     raise SequenceError(self.folder / "depth", f"lacks a file for {path.name}")
-
-    def __len__(self) -> int:
-        """Returns the number of depth maps."""
-        return len(self._depths)
 
     def _read(self, index: int) -> Frame:
         depth_path = self._depths[index]

@@ -38,9 +38,6 @@ class Kitti(Recording):
         raw_data: the raw recordings, `<date>/<drive>/oxts/data/*.txt`; None for no poses.
         mapping: the development kit's `train_mapping.txt`, for poses; line n names the recording
             and frame of pair n. Pairs without one are left out.
-
-    Raises:
-        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     has_flow = True
@@ -56,6 +53,7 @@ class Kitti(Recording):
         self.folder, self.has_poses = Path(folder), raw_data is not None
         names = [path.stem for path in list_files(self.folder / "image_2", (".png",))]
         self._pairs = [name[:6] for name in names if re.fullmatch(r"\d{6}_10", name)]
+        self.count = 2 * len(self._pairs)
         if raw_data is None:
             return
         if mapping is None:
@@ -68,11 +66,7 @@ class Kitti(Recording):
             self.notes = (
                 f"{left_out} of {len(self._pairs)} pairs have no raw recording, so no poses",
             )
-        self._pairs = posed
-
-    def __len__(self) -> int:
-        """Returns the number of frames: two per pair."""
-        return 2 * len(self._pairs)
+        self._pairs, self.count = posed, 2 * len(posed)
 
     def starts_clip(self, index: int) -> bool:
         """Returns whether it is the earlier frame of a pair."""

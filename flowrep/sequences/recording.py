@@ -91,7 +91,11 @@ class Stream(Protocol):
 class Recording(ABC):
     """Frames on disk, read on demand and not kept.
 
+    A reader's constructor and its frames raise `SequenceError` for files that are missing or
+    invalid.
+
     Attributes:
+        count: the number of frames.
         has_flow: whether frames may bring flow of their own.
         has_poses: whether frames bring the camera's pose.
         no_flow: why it has no flow of its own, and what to do.
@@ -101,6 +105,7 @@ class Recording(ABC):
             doctor's advice.
     """
 
+    count: int
     has_flow: bool = False
     has_poses: bool = True
     no_flow: str = "the format has none: use flow=estimated"
@@ -109,9 +114,9 @@ class Recording(ABC):
     conventions: Mapping[str, str] = MappingProxyType({})
     _size: tuple[int, int] | None = None
 
-    @abstractmethod
     def __len__(self) -> int:
         """Returns the number of frames."""
+        return self.count
 
     def starts_clip(self, index: int) -> bool:
         """Returns whether the frames before this one belong to another shot, without reading it."""

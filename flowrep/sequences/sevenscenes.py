@@ -35,9 +35,6 @@ class SevenScenes(Recording):
         colour_intrinsics: those of the colour camera.
         colour_from_depth_m: a point's position in the colour camera's frame minus that in the depth
             camera's: x, y, z in metres. The data set does not give it either.
-
-    Raises:
-        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(
@@ -64,13 +61,10 @@ class SevenScenes(Recording):
         ]
         if not self._colours:
             raise SequenceError(self.folder, "holds no frame-*.color.png or .color.jpg")
+        self.count = len(self._colours)
         first = self._colours[0].name.split(".")[0]
         self.has_poses = (self.folder / f"{first}.pose.txt").is_file()
         self._registration: Registration | None = None
-
-    def __len__(self) -> int:
-        """Returns the number of colour pictures."""
-        return len(self._colours)
 
     def _read(self, index: int) -> Frame:
         colour = self._colours[index]

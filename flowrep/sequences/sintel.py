@@ -33,9 +33,6 @@ class Sintel(Recording):
         scene: e.g. `alley_1`.
         render: the pass of the pictures, `"final"` or `"clean"`.
         backwards: whether time runs backwards.
-
-    Raises:
-        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(
@@ -45,13 +42,10 @@ class Sintel(Recording):
         self._pictures = list_files(self.folder / render / scene, (".png",), "frame_")
         if backwards:
             self._pictures.reverse()
+        self.count = len(self._pictures)
         flow = self.folder / "flow" / scene
         self.has_flow = bool(backwards) and flow.is_dir()
         self.no_flow = f"no such folder: {flow}" if backwards else PLAY_BACKWARDS
-
-    def __len__(self) -> int:
-        """Returns the number of pictures."""
-        return len(self._pictures)
 
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]

@@ -22,24 +22,18 @@ class TartanAir(Recording):
     Args:
         folder: the folder of `image_left/`, `depth_left/`, `pose_left.txt` and, for flow, `flow/`.
         backwards: whether time runs backwards.
-
-    Raises:
-        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(self, folder: str | Path, *, backwards: bool = False) -> None:
         self.folder, self.backwards = Path(folder), bool(backwards)
         self._pictures = list_files(self.folder / "image_left", (".png",))
+        self.count = len(self._pictures)
         self._poses_path = self.folder / "pose_left.txt"
         self._poses = read_pose_lines(self._poses_path, "xyz_xyzw")
         check_count(self._poses_path, len(self._poses), len(self), "poses")
         flow = self.folder / "flow"
         self.has_flow = self.backwards and flow.is_dir()
         self.no_flow = f"no such folder: {flow}" if backwards else PLAY_BACKWARDS
-
-    def __len__(self) -> int:
-        """Returns the number of pictures."""
-        return len(self._pictures)
 
     def _read(self, index: int) -> Frame:
         place = len(self) - 1 - index if self.backwards else index

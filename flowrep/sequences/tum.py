@@ -39,9 +39,6 @@ class Tum(Recording):
         tolerance_s: the largest time difference of a depth map or a pose from its picture.
         interpolate: whether the pose is interpolated to the picture's time between the poses before
             and after it, each of which must be within `tolerance_s`.
-
-    Raises:
-        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(
@@ -64,10 +61,12 @@ class Tum(Recording):
         self.trajectory, needed = self.folder / "groundtruth.txt", "depth map"
         self.has_poses = self.trajectory.is_file()
         if self.has_poses:
+            needed = "depth map or pose"
             poses = read_table(self.trajectory, [8])
             check_ascending(self.trajectory, poses[:, 0])
-            self._pose_times, self._poses = poses[:, 0], poses[:, 1:]
-            found, needed = found & self._has_pose(rgb_times), "depth map or pose"
+            self._poses = poses[:, 1:]
+            self._before, self._after, self._share = self._between(poses[:, 0], rgb_times)
+            found &= self._before >= 0
         kept = np.flatnonzero(found)
         if not len(kept):
             raise SequenceError(
@@ -75,29 +74,25 @@ class Tum(Recording):
                 f"no picture has a depth map and a pose within {tolerance_s} s: raise tolerance_s, "
                 "or check that the files share a clock",
             )
-        self._times = rgb_times[kept]
-        self._files = [(rgb_paths[i], depth_paths[depth_of[i]]) for i in kept]
+        self._kept, self._times, self.count = kept, rgb_times, len(kept)
+        self._rgbs, self._depths = rgb_paths, [depth_paths[i] for i in depth_of]
         if left_out := len(rgb_times) - len(kept):
             self.notes = (
                 f"{left_out} of {len(rgb_times)} pictures have no {needed} within "
                 f"{tolerance_s} s and are left out",
             )
 
-    def __len__(self) -> int:
-        """Returns the number of pictures with depth and a pose."""
-        return len(self._files)
-
     def _read(self, index: int) -> Frame:
-        rgb, depth = self._files[index]
-        time_s = float(self._times[index])
+        place = int(self._kept[index])
+        rgb, stored = self._rgbs[place], read_png(self._depths[place], np.uint16)
         return Frame(
             name=rgb.stem,
             source=rgb,
-            world_from_cam=self._pose_at(time_s) if self.has_poses else None,
+            world_from_cam=self._pose(place) if self.has_poses else None,
             K=self.K,
-            depth=depth_from_integers(read_png(depth, np.uint16), DEPTH_UNIT_M, missing=(0,)),
+            depth=depth_from_integers(stored, DEPTH_UNIT_M, missing=(0,)),
             rgb=read_rgb(rgb),
-            timestamp_s=time_s,
+            timestamp_s=float(self._times[place]),
         )
 
     def _index(self, name: str) -> tuple[NDArray[np.float64], list[Path]]:
@@ -118,30 +113,27 @@ class Tum(Recording):
         check_ascending(path, np.array(times))
         return np.array(times), files
 
-    def _has_pose(self, times_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def _between(
+        self, pose_times: NDArray[np.float64], times_s: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Returns the poses before and after each time, -1 if too far, and the share between."""
         if not self.interpolate:
-            return nearest(self._pose_times, times_s, self.tolerance_s) >= 0
-        before, after = self._neighbours(times_s)
-        inside = (times_s >= self._pose_times[0]) & (times_s <= self._pose_times[-1])
-        gaps = times_s - self._pose_times[before], self._pose_times[after] - times_s
-        return inside & (np.maximum(*gaps) <= self.tolerance_s)
+            chosen = nearest(pose_times, times_s, self.tolerance_s)
+            return chosen, chosen, np.zeros(len(times_s))
+        after = np.searchsorted(pose_times, times_s).clip(0, len(pose_times) - 1)
+        before = np.where(pose_times[after] == times_s, after, after - 1)
+        gaps = times_s - pose_times[before], pose_times[after] - times_s
+        inside = (before >= 0) & (np.minimum(*gaps) >= 0) & (np.maximum(*gaps) <= self.tolerance_s)
+        span = np.maximum(pose_times[after] - pose_times[before], 1e-9)
+        return np.where(inside, before, -1), after, gaps[0] / span
 
-    def _neighbours(self, times_s: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        after = np.searchsorted(self._pose_times, times_s).clip(0, len(self._pose_times) - 1)
-        exact = self._pose_times[after] == times_s
-        return np.where(exact, after, after - 1).clip(0), after
-
-    def _pose_at(self, time_s: float) -> Pose:
-        wanted = np.array([time_s])
-        if not self.interpolate:
-            return self._pose(int(nearest(self._pose_times, wanted, self.tolerance_s)[0]))
-        before, after = (int(index[0]) for index in self._neighbours(wanted))
-        span = self._pose_times[after] - self._pose_times[before]
-        share = float((time_s - self._pose_times[before]) / span) if span > 0 else 0.0
-        return interpolated_pose(self._pose(before), self._pose(after), share)
-
-    def _pose(self, index: int) -> Pose:
-        return as_pose(self._poses[index], self.trajectory, layout="xyz_xyzw")
+    def _pose(self, place: int) -> Pose:
+        before, after = (
+            as_pose(self._poses[i], self.trajectory, layout="xyz_xyzw")
+            for i in (self._before[place], self._after[place])
+        )
+        share = float(self._share[place])
+        return interpolated_pose(before, after, share) if share else before
 
 
 def nearest(

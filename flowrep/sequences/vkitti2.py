@@ -31,9 +31,6 @@ class VKitti2(Recording):
     Args:
         folder: the folder of `extrinsic.txt`, `intrinsic.txt` and `frames/`.
         camera: 0 for the left camera, 1 for the right one.
-
-    Raises:
-        SequenceError: a file is missing or invalid; names the file and the cause.
     """
 
     def __init__(self, folder: str | Path, *, camera: int = 0) -> None:
@@ -42,12 +39,9 @@ class VKitti2(Recording):
         self._poses = self._of_camera(self._poses_path, 18)
         self._intrinsics = self._of_camera(self.folder / "intrinsic.txt", 6)
         self._pictures = list_files(self._maps("rgb"), (".jpg", ".png"))
+        self.count = len(self._pictures)
         self.has_flow = self._maps("backwardFlow").is_dir()
         self.no_flow = f"no such folder: {self._maps('backwardFlow')}"
-
-    def __len__(self) -> int:
-        """Returns the number of pictures."""
-        return len(self._pictures)
 
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]

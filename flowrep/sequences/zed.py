@@ -27,7 +27,6 @@ class Zed(Recording):
             IMAGE, `"opengl"` for RIGHT_HANDED_Y_UP, `"x_forward_z_up"` for RIGHT_HANDED_Z_UP_X_FWD.
 
     Raises:
-        SequenceError: a file is missing or invalid; names the file and the cause.
         ValueError: the axes are unknown.
     """
 
@@ -37,6 +36,7 @@ class Zed(Recording):
         self._pictures = list_files(self.folder, PICTURES, "left")
         depths = list_files(self.folder, DEPTH_FILES, "depth")
         self._depths = {path.stem.removeprefix("depth"): path for path in depths}
+        self.count = len(self._pictures)
         self._poses_path = self.folder / "poses.txt"
         self.has_poses, self.conventions = self._poses_path.is_file(), {"pose_axes": pose_axes}
         if self.has_poses:
@@ -49,10 +49,6 @@ class Zed(Recording):
                 "names a colour camera; a ZED's depth belongs to the left picture already",
             )
         self._camera, self.K = camera, camera.K
-
-    def __len__(self) -> int:
-        """Returns the number of left pictures."""
-        return len(self._pictures)
 
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]
