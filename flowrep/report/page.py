@@ -36,11 +36,8 @@ def write_files(report: Report, folder: Path) -> list[Path]:
 def write_page(text: str, folder: Path) -> Path:
     """Writes the page into the report's folder; returns its path."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / PAGE
-    whole = path.with_suffix(".tmp")
-    whole.write_text(text, encoding="utf-8")
-    whole.replace(path)
-    return path
+    (folder / PAGE).write_text(text, encoding="utf-8")
+    return folder / PAGE
 
 
 def template(name: str, *, autoescape: bool) -> Any:

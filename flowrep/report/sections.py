@@ -548,7 +548,8 @@ def _across(groups: Sequence[Group], settings: Settings) -> Iterator[Section]:
                 folder_name(f"across_{stacks[0]}"),
                 f"{stacks[0]} under configs that differ",
             )
-        if sum(map(bool, series.values())) > 1:
+        places = [scene for of in series.values() for scene in {run.scene for run in of}]
+        if len(set(places)) < len(places):  # some scene has more than one of them
             section = success_section(name, title, series, pairs, settings, baselines=())
             yield replace(section, notes=(*notes, *section.notes))
 
