@@ -20,7 +20,14 @@ from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_p
 
 Step = Callable[[TensorDictBase], TensorDictBase]
 WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
-GIVEN_BY_THE_RUN = ("observation_spec", "action_spec", "keys", "total_frames", "device")
+GIVEN_BY_THE_RUN = (
+    "observation_spec",
+    "action_spec",
+    "keys",
+    "total_frames",
+    "device",
+    "mirror_image",
+)
 GIVEN_BY_THE_CLASS = ("self", "rate_factors", "policy_options", "network", "actor", "actions")
 
 

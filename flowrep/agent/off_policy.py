@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, TensorSpec
+from torchrl.envs import Transform
 
 from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.networks import DiscreteActions
@@ -37,9 +38,15 @@ class OffPolicy(Algorithm):
         n_steps: frames that a transition spans: r becomes the discounted sum of its rewards, and γ
             becomes γ to that power.
         layer_norm: normalise each map's embedding, see `Encoder`.
+        mirror: replace half of each batch by its left-right images, with `mirror_image`.
+        mirror_image: TorchRL transform that does so with a batch, maps in their stored form; for
+            what it has to know of maps, camera and actions, it comes from where they are known.
         rate_factors: see `Algorithm`.
         policy_options: further arguments of `make_policy`.
         loss_options: arguments of `LOSS` besides `gamma`.
+
+    Raises:
+        ValueError: if `mirror` is set without `mirror_image`.
     """
 
     memory: ReplayMemory
@@ -63,6 +70,8 @@ class OffPolicy(Algorithm):
         learning_starts: int | None = None,
         n_steps: int = 1,
         layer_norm: bool = False,
+        mirror: bool = False,
+        mirror_image: Transform | None = None,
         rate_factors: Mapping[str, float] | None = None,
         policy_options: Mapping[str, Any] | None = None,
         **loss_options: Any,
@@ -98,6 +107,10 @@ class OffPolicy(Algorithm):
             n_steps=n_steps,
             gamma=gamma,
         )
+        if mirror:
+            if mirror_image is None:
+                raise ValueError("mirror=True needs mirror_image, a transform of sampled batches")
+            self.memory.append_transform(mirror_image)
 
     def updates_due(self, frames: int) -> int:
         """Returns how many updates `frames` frames allow, less those already taken."""

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         get_states,
         has_spare_cores,
         make_env,
+        make_mirror,
         set_states,
         street_envs,
     )
@@ -52,6 +53,7 @@ __all__ = [
     "get_states",
     "has_spare_cores",
     "make_env",
+    "make_mirror",
     "set_states",
     "street_envs",
 ]

@@ -18,9 +18,10 @@ from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.vector_env import StreetVectorEnv, sensed
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import Range, Scene, SpeedMode
-from flowrep.simulator.camera import choose_renderer
-from flowrep.transforms import representation_stack
+from flowrep.scenes.scene import YAW_SIGN, Range, Scene, SpeedMode
+from flowrep.simulator.camera import choose_renderer, sampled_intrinsics
+from flowrep.transforms import Mirror, representation_stack
+from flowrep.transforms.stack import FLOWS
 
 
 def sensors_read(transforms: Iterable[Any]) -> list[str]:
@@ -202,6 +203,29 @@ def make_env(
     if seed is not None:
         env.set_seed(seed)
     return env
+
+
+def make_mirror(
+    scene: str | Path | Mapping[str, Any] | Scene, representations: Iterable[str]
+) -> Mirror:
+    """Returns the transform that replaces half of a replay batch by its left-right images.
+
+    Args:
+        scene: as for `make_env`; its camera says which columns see opposite directions.
+        representations: the keys of the maps, named as in `make_env`.
+
+    >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
+    tensor([0, 2, 1])
+    """
+    camera = load_scene(scene).camera
+    names = list(representations)
+    focal = camera.focal_px
+    return Mirror(
+        names,
+        flow_keys=[name for name in names if name in FLOWS],
+        swapped_actions=[YAW_SIGN.index(-sign) for sign in YAW_SIGN],
+        intrinsics=sampled_intrinsics(focal, focal, camera.height_px, camera.width_px).tolist(),
+    )
 
 
 def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:

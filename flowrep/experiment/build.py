@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, InitTracker
 from flowrep.agent import Algorithm
 from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
-from flowrep.envs import make_env
+from flowrep.envs import make_env, make_mirror
 from flowrep.envs.workers import available_cores
 from flowrep.experiment.arena import Agent, Arena
 from flowrep.experiment.arena_team import AnyArena, ArenaTeam, can_travel
@@ -93,6 +93,8 @@ def _workers_help(config: EnvConfig) -> bool:
 def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
     """Returns the config's algorithm, untrained, for the env's specs."""
     arguments, options = _arguments(config, env)
+    if options.get("mirror"):
+        options["mirror_image"] = make_mirror(config.scene, config.representations)
     return algorithm_class(config.algorithm)(*arguments, **options)
 
 

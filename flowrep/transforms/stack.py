@@ -42,7 +42,7 @@ _REPRESENTATIONS: dict[str, _Representation] = {
     "seg2": _Representation(Segmentation, ("encoding",), frames_of="seg"),
     "depth2": _Representation(Depth, ("range_m", "missing"), frames_of="depth"),
 }
-_FLOWS = ("raw", "ego", "obj")
+FLOWS = ("raw", "ego", "obj")  # of two channels, u and v
 
 REPRESENTATIONS: tuple[str, ...] = tuple(_REPRESENTATIONS)
 
@@ -133,9 +133,9 @@ def representation_stack(
     if num_classes is None and ("seg" in chosen or "seg2" in chosen):
         raise ValueError("representations seg and seg2 need num_classes=")
     estimator = _estimator_options(flow)
-    flows = {name: chosen[name] for name in _FLOWS if name in chosen}
+    flows = {name: chosen[name] for name in FLOWS if name in chosen}
     if intrinsics is None and flows and (estimator is None or set(flows) != {"raw"}):
-        raise ValueError(f"representations {', '.join(_FLOWS)} need intrinsics=, the camera's K")
+        raise ValueError(f"representations {', '.join(FLOWS)} need intrinsics=, the camera's K")
     transforms, keys = _noise_transforms(noise, chosen)
     transforms += _map_transforms(chosen, num_classes, keys)
     context = {"dt_s": dt_s, "compiled": compiled}
@@ -190,7 +190,7 @@ def _map_transforms(
     transforms: list[Transform] = []
     stacks: list[Transform] = []
     for name, options in chosen.items():
-        if name in _FLOWS:
+        if name in FLOWS:
             continue
         entry = _REPRESENTATIONS[name]
         key, frame = name, entry.frames_of or name

@@ -5,6 +5,7 @@ from torchrl.data import Composite, Unbounded
 
 from flowrep.agent.observation import map_codecs
 from flowrep.agent.replay import ReplayMemory
+from flowrep.transforms import Mirror
 
 SPEC = Composite(view=Unbounded((1, 36, 36)))
 
@@ -290,3 +291,25 @@ def test_a_memory_restored_before_any_frame_works():
     replay.load_state_dict(memory().state_dict())
     replay.extend(step([1], [2], ended="t"))
     assert transitions(replay) == [(1, 1, 2, 1, 1)]
+
+
+def test_an_agent_that_mirrors_learns_from_what_was_seen_and_from_its_image(
+    make_agent, random_steps
+):
+    mirror = Mirror(["flow", "seg"], flow_keys="flow", swapped_actions=[0, 2, 1])
+    agent = make_agent(mirror=True, mirror_image=mirror, batch_size=200)
+    steps = random_steps(1)
+    steps["next", "terminated"] = steps["next", "done"] = torch.ones(1, 1, dtype=torch.bool)
+    agent.remember(steps)
+    batch, u = agent.sample(), steps["flow"][0, 0]
+    is_image = [torch.equal(seen[0].float(), -u.flip(-1)) for seen in batch["flow"]]
+    assert 60 < sum(is_image) < 140
+    assert all(torch.equal(seen[0].float(), u) for seen in batch["flow"][~torch.tensor(is_image)])
+    # what is stored has no image
+    assert torch.equal(agent.memory.storage[:]["flow"][0, 0].float(), u)
+    assert torch.isfinite(agent.update(batch)["q_loss"])
+
+
+def test_mirror_needs_to_be_told_how(make_agent):
+    with pytest.raises(ValueError, match="mirror_image"):
+        make_agent(mirror=True)

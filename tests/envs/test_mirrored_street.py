@@ -7,12 +7,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from flowrep.envs import StreetEnv
+from flowrep.envs import StreetEnv, make_mirror
 from flowrep.envs.sensing import _parts
 from flowrep.geometry import factorize, rigid_flow
 from flowrep.scenes import load_scene, scene_names
 from flowrep.simulator.rasteriser import Rasteriser
-from flowrep.transforms import Mirror
 
 LEFT, RIGHT = 1, 2
 SIDEWAYS = np.diag([1.0, -1.0, 1.0, 1.0])  # of the world and of bodies: y to the left
@@ -54,13 +53,13 @@ def test_maps_of_the_mirrored_street(name):
     there["instance_motion"] = motion @ here["instance_motion"] @ motion
     there["prev_from_curr"] = motion @ here["prev_from_curr"] @ motion
     K = torch.from_numpy(env.K).float()
-    td = TensorDict(with_flow(here, K), []).set("action", torch.tensor(0))
+    td = TensorDict(with_flow(here, K), []).set("action", torch.tensor(LEFT))
     keys = ["depth", "semantic", "instance", "raw", "ego", "obj"]
-    mirror = Mirror(
-        keys, flow_keys=["raw", "ego", "obj"], swapped_actions=[0, 2, 1], intrinsics=K, images="all"
-    )
+    mirror = make_mirror(env.scene, keys)
+    mirror.images = "all"
     image, want = mirror(td), with_flow(there, K)
     assert (want["obj"] != 0).any()
+    assert image["action"] == RIGHT
     for key in keys:
         # equal to the last bit, but for column 0, which shows what the camera didn't see
         assert torch.equal(image[key][..., 1:], want[key][..., 1:])
