@@ -222,7 +222,7 @@ class _OffPolicy(_Learner):
     learning_starts: Count | None
     n_steps: Count
     layer_norm: bool
-    mirror: bool
+    mirror: bool = False  # not in runs before it
 
     def check_length(self, total_frames: int, num_envs: int) -> None:
         """Checks that the memory holds a batch and the run is long enough for an update."""
