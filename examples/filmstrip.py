@@ -6,12 +6,12 @@ python examples/filmstrip.py docs/images
 """
 
 import sys
+from functools import partial
 from pathlib import Path
 
-import torch
-
-from flowrep.baselines import Planner
-from flowrep.envs import make_env, street_envs
+from flowrep.baselines import BaselinePolicy
+from flowrep.envs import make_env
+from flowrep.experiment.film import film_episode, make_filmed
 from flowrep.viz import (
     FLOW_SCALE_PX,
     flow_note,
@@ -20,22 +20,16 @@ from flowrep.viz import (
     strip,
     write_png,
 )
-from flowrep.viz.film import film_episode
 
 
-def main(folder: Path, seed: int = 2) -> None:
-    env = make_env("straight_road", ["rgb"], keep_sensor=True, seed=seed)
-    street, planner = street_envs(env)[0], Planner()
-
-    def drive(tensordict):
-        return tensordict.set("action", torch.tensor([planner(street)]))
-
-    frames, outcome = film_episode(env, drive)
+def main(folder: Path, seed: int = 561807780) -> None:
+    env = make_filmed(partial(make_env, "straight_road"), {})
+    frames, episode = film_episode(env, BaselinePolicy("planner", env), {"episode_seed": seed})
     env.close()
     chosen = liveliest(frames)
     write_png(folder / "strip.png", representation_strip(chosen))
     write_png(folder / "obj_scale.png", three_ways(chosen))
-    print(f"{folder}: one of {len(frames)} steps of an episode that ended in {outcome}")
+    print(f"{folder}: one of {len(frames)} steps of an episode that ended in {episode.outcome}")
 
 
 def liveliest(frames):

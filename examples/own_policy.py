@@ -33,12 +33,12 @@ def make(task):
         near = (flow.norm(dim=1) > 0.05) & (depth_m < NEAR_M)  # and moving, in pixels a step
         in_the_way = near & (right_m.abs() < IN_THE_WAY_M)
         actions = []
-        for row, street in enumerate(maps["street"].tolist()):
+        for row, env_id in enumerate(maps["env_id"].tolist()):
             if maps["is_init"][row]:
-                pilots[street] = Pilot()
+                pilots[env_id] = Pilot()
             people_m = right_m[row][in_the_way[row]]
             goal_m = math.copysign(EVADE_M, people_m.mean()) if len(people_m) else 0.0
-            actions.append(pilots[street].steer(goal_m))
+            actions.append(pilots[env_id].steer(goal_m))
         return torch.tensor(actions)
 
     return act

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from flowrep.baselines import Planner
-from flowrep.envs import StreetEnv
-from flowrep.envs.sensing import SENSORS
-from flowrep.experiment.viewing import view_episode
+from flowrep.baselines import BaselinePolicy
+from flowrep.envs import make_env, street_envs
+from flowrep.experiment.film import film_episode, make_filmed
 from flowrep.geometry import ego_flow, unproject
 from flowrep.scenes import load_scene
 from flowrep.transforms import DIS
@@ -29,9 +28,8 @@ from flowrep.viz import (
     strip,
     write_png,
 )
-from flowrep.viz.film import maps_of
 
-SCENE, SEED, SIZE_PX = "h_shaped_pathways", 4, 160
+SCENE, SEED, SIZE_PX = "h_shaped_pathways", 1560023975, 160
 NOTES = {name: flow_note(scale) for name, scale in FLOW_SCALE_PX.items()}
 NOTES |= {"depth": partial(depth_bar, DEPTH_RANGE_M), "z": partial(depth_bar, DEPTH_RANGE_M)}
 PARTS = np.array([(235, 235, 235), (222, 40, 60), (46, 64, 196), (60, 160, 90)], dtype=np.uint8)
@@ -40,15 +38,11 @@ PARTS = np.array([(235, 235, 235), (222, 40, 60), (46, 64, 196), (60, 160, 90)],
 def main(folder: str) -> None:
     scene = load_scene(SCENE)
     camera = replace(scene.camera, height_px=SIZE_PX, width_px=SIZE_PX)
-    env = StreetEnv(replace(scene, camera=camera), sensors=SENSORS)
-    K, steps = torch.as_tensor(env.K), []
-
-    def look(observation):
-        steps.append({name: torch.as_tensor(value) for name, value in observation.items()})
-
-    view_episode(env, Planner(), look=look, seed=SEED)
+    env = make_filmed(partial(make_env, replace(scene, camera=camera)), {})
+    K, steps = torch.as_tensor(street_envs(env)[0].K), []
+    policy = BaselinePolicy("planner", env)
+    maps, _ = film_episode(env, policy, {"episode_seed": SEED}, on_frame=steps.append)
     env.close()
-    maps = [maps_of(step, K) for step in steps]
     # The step with the most motion, but nobody right in front of the camera.
     motion = [int(((frame["obj"] != 0) & (frame["depth"] > 5)).sum()) for frame in maps]
     at = max(range(1, len(maps)), key=lambda i: motion[i])

@@ -1,13 +1,12 @@
 """Evaluates agents: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
 
-import json
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowrep.extras import require
 
@@ -18,16 +17,21 @@ from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, print_error, run_command
 from flowrep.config.schema import EvaluateConfig
 from flowrep.envs import WorkerError
-from flowrep.exchange.policies import ForeignPolicy, PolicyError
-from flowrep.experiment import build
-from flowrep.experiment.comparison import Comparison, Row, print_table
-from flowrep.experiment.failures import print_failures, write_failures
+from flowrep.experiment.agents import Agent, PolicyError, load_external, load_trained
+from flowrep.experiment.evaluation import (
+    Comparison,
+    evaluation_seeds,
+    print_failures,
+    print_table,
+    save_drives,
+    scene_id,
+    write_failures,
+)
+from flowrep.experiment.film import record_episode
 from flowrep.experiment.run import RunFolder
 from flowrep.progress import StopRequest
-from flowrep.subjects import Subject, load_own, load_subject
-from flowrep.viz.film import record_episode
+from flowrep.scenes import load_scene
 
-Config = Mapping[str, Any]
 MISTAKES = (
     UsageError,
     CheckpointError,
@@ -39,192 +43,155 @@ MISTAKES = (
 )
 
 
+class Target(NamedTuple):
+    """An agent to evaluate: the folder of its table, how it is loaded, and its ways to act."""
+
+    folder: RunFolder
+    load: Callable[[], Agent]
+    policies: Sequence[str]
+
+
 def run(config: EvaluateConfig) -> None:
-    """Runs episodes of saved agents and of baselines, prints tables and saves the rows."""
-    if config.own_policies:
-        evaluate_own(config.plain(), config.own_policies)
-    else:
-        evaluate(config.plain(), runs_in(config.run or []))
+    """Runs episodes of agents and of baselines one agent after the other, and saves the rows.
 
-
-def runs_in(paths: Sequence[str]) -> list[RunFolder]:
-    """Returns the runs in folders of runs and of sweeps, each once.
-
-    Raises:
-        RunFolderError: there is no run in one of them.
+    An agent whose folder is in use, or that can't be evaluated or saved, is reported and does not
+    stop the others; the exit code is then 1. Baselines drive once in each scene.
     """
-    runs: dict[Path, RunFolder] = {}
-    for path in paths:
-        for run in RunFolder.all_in(path):
-            runs.setdefault(run.path.resolve(), run)
-    return list(runs.values())
-
-
-def evaluate(asked: Config, runs: Sequence[RunFolder]) -> None:
-    """Evaluates the agents of runs, and locks their folders meanwhile.
-
-    Runs with the same scene, camera and renderer share environments and episodes. A run that is in
-    use, or can't be evaluated or saved, is reported and does not stop the others; the exit code is
-    then 1.
-    """
-    saved: list[Subject] = []
-    with ExitStack() as locks:
-        by_street: dict[str, list[Subject]] = {}
-        for subject in load_subjects(asked, runs, locks):
-            street = json.dumps([subject.config.scene, subject.config.renderer])
-            by_street.setdefault(street, []).append(subject)
-        with StopRequest() as stop:
-            for group in by_street.values():
-                saved += compare(asked, group, stop)
-                if stop:
-                    break
-            else:
-                for subject in saved:
-                    film(asked, subject, stop)
-    if stop:
-        sys.exit(stop.exit_code)
-    done = [subject.run for subject in saved]
-    if missing := [str(run.path) for run in runs if run not in done]:
-        print_error(f"not evaluated or not saved, see above: {', '.join(missing)}")
-        sys.exit(1 if done else EXIT_USAGE)
-
-
-def evaluate_own(asked: Config, names: Sequence[str]) -> None:
-    """Evaluates the user's own policies, one after the other.
-
-    Raises:
-        PolicyError: a policy can't be loaded, fails, or returns no actions.
-    """
+    targets = targets_of(config)
+    comparisons: dict[str, Comparison] = {}
+    failed: list[str] = []
     with StopRequest() as stop:
-        for name in names:
-            folder = asked["output"] or f"outputs/evaluate/{folder_name(name)}"
-            if Path(folder, "config.yaml").exists():
-                raise UsageError(f"output={folder} is a run's folder; give another")
-            run = RunFolder(folder)
-            with run.held("evaluating"):
-                subject = load_own(asked, name, run)
-                saved = compare({**asked, "policy": name}, [subject], stop)
-                if stop:
-                    break
-                if not saved:
-                    sys.exit(EXIT_USAGE)
-                film(asked, subject, stop)
-    if stop:
-        sys.exit(stop.exit_code)
+        for target in targets:
+            try:
+                with target.folder.held("evaluating"):
+                    evaluate_one(config, target, comparisons, stop)
+            except MISTAKES as error:
+                if len(targets) == 1:
+                    raise
+                print_error(error)
+                failed.append(str(target.folder.path))
+            if stop:
+                sys.exit(stop.exit_code)
+    if failed:
+        print_error(f"not evaluated or not saved, see above: {', '.join(failed)}")
+        sys.exit(1 if len(failed) < len(targets) else EXIT_USAGE)
 
 
-def compare(asked: Config, subjects: Sequence[Subject], stop: StopRequest) -> list[Subject]:
-    """Runs the episodes of agents of one scene; keeps finished ones even if interrupted.
-
-    Returns:
-        The agents whose episodes are saved; why others can't be is printed.
-    """
-    comparison = comparison_of(asked, len(subjects))
-
-    def save(number: int) -> None:
-        subject = subjects[number]
-        with suppress(OSError):  # `keep` tries again and reports it
-            subject.save(subject.rows(comparison, number))
-
-    config = subjects[0].config
-    num_envs = min(comparison.rides, config.num_envs)
-    arena = build.arena(config, [subject.agent for subject in subjects], num_envs)
-    with closing(arena):
-        try:
-            comparison.run(arena, lambda: bool(stop), save)
-        finally:
-            results = [(s, s.rows(comparison, number)) for number, s in enumerate(subjects)]
-            saved = [(subject, rows) for subject, rows in results if keep(subject, rows)]
-            for subject, rows in saved:  # after all are saved, since the output may be closed
-                show(subject, rows)
-    return [subject for subject, _ in saved]
-
-
-def comparison_of(asked: Config, agents: int) -> Comparison:
-    """Returns the requested episodes of so many agents."""
-    speeds, policies, baselines = (as_list(asked[key]) for key in ("speed", "policy", "baselines"))
-    return Comparison(
-        speeds=speeds,
-        fps=[float(rate) for rate in as_list(asked["fps"])],
-        episodes=asked["episodes"],
-        seed=asked["seed"],
-        policies=policies,
-        baselines=baselines,
-        agents=agents,
-    )
-
-
-def keep(subject: Subject, rows: Sequence[Row]) -> bool:
-    """Adds episodes to a run's table; returns False after printing why they can't be."""
-    run = subject.run
-    if not rows:
-        return True
-    try:
-        subject.save(rows)
-        run.plot_episodes(rows)
-        write_failures(run.failures_path, run.read_episodes())
-    except OSError as error:
-        print_error(
-            f"{run.path}: {error}. Free some space or make the folder writable, then evaluate again"
-        )
-        return False
-    return True
-
-
-def show(subject: Subject, rows: Sequence[Row]) -> None:
-    """Prints the results of one run's episodes, if there are any."""
-    if not rows:
-        return
-    print(subject.run.path)
-    print_table(rows)
-    print_failures(rows)
-    print(f"{len(rows)} episodes are in {subject.run.evaluation_path}")
-
-
-def as_list(value: Any) -> list[Any]:
-    """Returns a list unchanged, and a single value as a list of one."""
-    return value if isinstance(value, list) else [value]
-
-
-def load_subjects(asked: Config, runs: Sequence[RunFolder], locks: ExitStack) -> list[Subject]:
-    """Returns the agents of runs, whose folders `locks` holds; prints why some can't be loaded.
+def targets_of(config: EvaluateConfig) -> list[Target]:
+    """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own.
 
     Raises:
-        one of `MISTAKES`, if none can be.
+        RunFolderError: there is no run in one of the folders.
+        UsageError: the folder for the rows of a policy of the user's own holds a run.
     """
-    subjects = []
-    for run in runs:
-        try:
-            locks.enter_context(run.held("evaluating"))
-            subjects.append(load_subject(asked, run))
-        except MISTAKES as error:
-            if not subjects and run is runs[-1]:
-                raise
-            print_error(error)
-    return subjects
+    machine: dict[str, Any] = {
+        "device": config.device,
+        "num_envs": config.num_envs,
+        "num_workers": config.num_workers,
+    }
+    if not config.own_policies:
+        runs: dict[Path, RunFolder] = {}  # each once, under whatever names
+        for path in config.run or []:
+            for run in RunFolder.all_in(path):
+                runs.setdefault(run.path.resolve(), run)
+        load = partial(load_trained, scene=config.scene, **machine)
+        return [Target(run, partial(load, run), config.policy) for run in runs.values()]
+    targets = []
+    for name in config.own_policies:
+        folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
+        if (folder / "config.yaml").exists():
+            raise UsageError(f"output={folder} is a run's folder; give another")
+        load = partial(
+            load_external,
+            name,
+            scene=config.scene or {},
+            representations=config.representations or {},
+            flow=None if config.flow is None else config.flow.plain(),
+            noise=None if config.noise is None else config.noise.plain(),
+            **machine,
+        )
+        targets.append(Target(RunFolder(folder), load, [name]))
+    return targets
 
 
-def film(asked: Config, subject: Subject, stop: StopRequest) -> None:
+def evaluate_one(
+    config: EvaluateConfig, target: Target, comparisons: dict[str, Comparison], stop: StopRequest
+) -> None:
+    """Runs an agent's episodes, keeps finished ones even if interrupted, and films some."""
+    agent, folder = target.load(), target.folder
+    scene = load_scene(agent.config.scene)
+    # agents of one scene share the baselines' episodes
+    comparison = comparisons.setdefault(
+        f"{scene_id(scene)} {target.policies}",
+        Comparison(
+            speeds=config.speed,
+            fps=config.fps,
+            episodes=config.episodes,
+            seed=config.seed,
+            policies=target.policies,
+            baselines=config.baselines,
+        ),
+    )
+    table = folder.read_episodes()
+
+    def save() -> list[dict[str, Any]]:
+        rows = comparison.rows(
+            scene=scene.name,
+            scene_id=scene_id(scene),
+            representations="+".join(agent.config.representations),
+            flow=agent.config.flow.source,
+            seed=agent.config.seed if agent.frames else "",
+            frames=agent.frames,
+            evaluation="evaluate",
+        )
+        folder.save_episodes(rows, table)
+        return rows
+
+    def try_to_save() -> None:
+        with suppress(OSError):  # the last time, it is reported
+            save()
+
+    try:
+        comparison.run(
+            agent.make_env, agent.policy, agent.config.num_envs, lambda: bool(stop), try_to_save
+        )
+    finally:
+        if results := comparison.results():
+            try:
+                rows = save()
+                save_drives(folder.drives_path, rows, [e.positions for _, e in results])
+                folder.plot_episodes(rows)
+                write_failures(folder.failures_path, folder.read_episodes())
+            except OSError as error:
+                raise OSError(
+                    f"{folder.path}: {error}. Free some space or make the folder writable, then "
+                    "evaluate again"
+                ) from error
+            print(folder.path)
+            print_table(rows)
+            print_failures(rows)
+            print(f"{len(rows)} episodes are in {folder.evaluation_path}")
+    film(config, agent, folder, stop)
+
+
+def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequest) -> None:
     """Writes `video` episodes for each speed and frame rate, until a stop is asked for."""
-    config, run = subject.config, subject.run
-    name = config.scene["name"]
-    where = "" if name == subject.trained_in else f"{name}_"
-    for speed, rate in product(as_list(asked["speed"]), as_list(asked["fps"])):
-        for number in range(asked["video"]):
-            if stop:
-                return
-            episode_seed = (asked["seed"] + number) % (1 << 31)
-            path = run.video_path(f"{where}{speed}_{rate:g}fps_{episode_seed}")
-            make = partial(build.env, config, speed=speed, frame_rate_hz=float(rate))
-            seen, policy = config.representations, subject.agent.policy
-            if isinstance(policy, ForeignPolicy):
-                policy = policy.alone()
-            record_episode(make, policy, seen, path, episode_seed=episode_seed)
-            print(f"video: {path}")
+    name = agent.config.scene["name"]
+    where = "" if name == agent.trained_in else f"{name}_"
+    conditions = product(config.speed, config.fps, range(config.video))
+    for speed, rate, number in conditions:
+        if stop:
+            return
+        (episode_seed,) = evaluation_seeds(config.seed + number, 1)
+        path = folder.video_path(f"{where}{speed}_{rate:g}fps_{episode_seed}")
+        make_env = partial(agent.make_env, speed=speed, frame_rate_hz=float(rate))
+        seen = agent.config.representations
+        record_episode(make_env, agent.policy, seen, path, episode_seed=episode_seed)
+        print(f"video: {path}")
 
 
 def main() -> None:
-    """Entry point; a mistake on the command line ends in one line that lists the choices."""
+    """Entry point; a mistake on the command line ends in one line that names the remedy."""
     run_command("evaluate", run, EvaluateConfig)
 
 

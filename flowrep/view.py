@@ -1,122 +1,217 @@
-"""Shows a scene: `python -m flowrep.view scene=s_turn`, or drives it: `interactive=true`."""
+"""Shows a scene and how a policy drives in it: `python -m flowrep.view scene=s_turn`."""
 
-from itertools import pairwise
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import cycle, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flowrep.extras import require
 
 require("viewing", "train", "hydra", "pydantic", module=__name__)
 
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
-from flowrep.baselines import BASELINES
+from flowrep.baselines import BASELINES, BaselinePolicy
 from flowrep.config import UsageError
 from flowrep.config.cli import run_command
 from flowrep.config.schema import ViewConfig
-from flowrep.envs import StreetEnv
-from flowrep.envs.sensing import SENSORS
-from flowrep.experiment.viewing import CategoryCount, Viewed, view_episode
-from flowrep.scenes import load_scene
+from flowrep.envs import make_env, street_envs
+from flowrep.experiment.agents import load_external, load_trained
+from flowrep.experiment.evaluation import Episode, Policy, evaluate, evaluation_seeds
+from flowrep.experiment.film import Maps, film_episode, make_filmed, maps_of
+from flowrep.experiment.run import RunFolder
+from flowrep.palette import CATEGORY_ID
+from flowrep.scenes import Scene
 from flowrep.scenes.layout import Layout
-from flowrep.tables import append_rows
+from flowrep.scenes.scene import NO_OP, TURN_LEFT, TURN_RIGHT
+from flowrep.tables import write_rows
 from flowrep.viz import contact_sheet, representation_strip, write_png, write_video
-from flowrep.viz.film import Maps, maps_of
 from flowrep.viz.plan import Track, draw_plan
-from flowrep.viz.window import KeyboardDriver, drive_by_hand
+
+ENVS = 16  # side by side, for the episodes that are not filmed
+
+
+class Driver(NamedTuple):
+    """What drives: its env, what it sees, and its policy in an env."""
+
+    make_env: Callable[..., EnvBase]
+    representations: Mapping[str, Any]
+    policy_in: Callable[[EnvBase], Policy]
 
 
 def run(config: ViewConfig) -> None:
     """Writes pictures, a video and tables of the scene, or opens a window on it."""
-    check(config)
-    street: dict[str, Any] = {
-        "scene": config.scene,
-        "speed": config.speed,
-        "frame_rate_hz": config.frame_rate_hz,
-    }
+    job = HydraConfig.get()
+    is_scene_given = any(text.startswith("scene") for text in job.overrides.task)
+    driver = driver_of(config, is_scene_given)
+    with_every_sensor = make_filmed(driver.make_env, driver.representations)
+    scene = with_every_sensor.base_env.scene
+    check_path(config, scene)
     if config.interactive:
-        env = StreetEnv(**street, sensors=SENSORS)
-        drive_by_hand(KeyboardDriver(env, seed=config.seed, path=config.path))
+        drive_by_hand(config, driver, with_every_sensor)
     else:
-        look_at(config, street, Path(HydraConfig.get().runtime.output_dir))
+        view(config, driver, with_every_sensor, Path(job.runtime.output_dir))
+    with_every_sensor.close()
 
 
-def check(config: ViewConfig) -> None:
-    """Checks that the scene is valid and has the path.
+def driver_of(config: ViewConfig, is_scene_given: bool) -> Driver:
+    """Returns the baseline, run or policy of the user's own that drives.
+
+    Args:
+        config: names it with `policy`.
+        is_scene_given: whether the scene was typed; if not, a run's agent drives in its own.
+    """
+    rates: dict[str, Any] = {"speed": config.speed, "frame_rate_hz": config.frame_rate_hz}
+    name = config.policy
+    if name in BASELINES:
+        return Driver(partial(make_env, config.scene, **rates), {}, partial(BaselinePolicy, name))
+    machine: dict[str, Any] = {"device": "cpu", "num_envs": 1, "num_workers": 0}
+    if Path(name).is_dir():
+        scene = config.scene if is_scene_given else None
+        agent = load_trained(RunFolder.existing(name), scene=scene, **machine)
+    elif ":" in name or name.endswith(".pt2"):
+        if config.representations is None:
+            raise UsageError(f"representations needs a value for policy={name}")
+        agent = load_external(
+            name, scene=config.scene, representations=config.representations, **machine
+        )
+    else:
+        raise UsageError(
+            f"policy={name}: give {', '.join(BASELINES)}, a run's folder, path.py:make, "
+            "package.module:make or path.pt2"
+        )
+    return Driver(
+        partial(agent.make_env, **rates), agent.config.representations, lambda env: agent.policy
+    )
+
+
+def check_path(config: ViewConfig, scene: Scene) -> None:
+    """Checks that the scene has the path.
 
     Raises:
         UsageError: it has no such path.
-        SceneError: the scene is invalid.
     """
-    paths = [path.name for path in load_scene(config.scene).paths]
+    paths = [path.name for path in scene.paths]
     if config.path not in (*paths, None):
         raise UsageError(f"path should be {', '.join(paths)} or null, not '{config.path}'")
 
 
-def look_at(config: ViewConfig, street: dict[str, Any], folder: Path) -> None:
-    """Drives the episodes and writes their pictures, plan, video and tables."""
-    frames, first, counts, fps = film(config, street)
-    others = drive_on(config, street, config.episodes - 1)
-    episodes = [first, *others]
+def episodes_of(config: ViewConfig) -> list[dict[str, Any]]:
+    """Returns the options of the episodes to view."""
+    path = {} if config.path is None else {"path": config.path}
+    seeds = evaluation_seeds(config.seed, config.episodes)
+    return [{"episode_seed": seed, "speed": config.speed} | path for seed in seeds]
+
+
+def view(config: ViewConfig, driver: Driver, env: EnvBase, folder: Path) -> None:
+    """Drives the episodes and writes their pictures, plan, video and tables.
+
+    Args:
+        config: of the command.
+        driver: what drives.
+        env: keeps every sensor, for the first episode.
+        folder: where the files are written.
+    """
+    scene, fps = env.base_env.scene, env.base_env.frame_rate_hz
+    first, *others = episodes_of(config)
+    counts = CategoryCount(scene.categories)
+    with tqdm(desc="driving", unit="frame") as bar:
+
+        def look(sensor: TensorDictBase) -> None:
+            counts.add(sensor["semantic"].numpy())
+            bar.update()
+
+        frames, episode = film_episode(env, driver.policy_in(env), first, look)
+    episodes = [episode, *drive_on(driver, others)]
     strips = [representation_strip(maps) for maps in tqdm(frames, desc="drawing", unit="frame")]
     chosen = moments([moving_pixels(maps) for maps in frames], config.sheet_rows)
+    folder.mkdir(parents=True, exist_ok=True)
     write_png(folder / "sheet.png", contact_sheet(strips[i] for i in chosen))
     written = ["sheet.png", "plan.png", "episodes.csv", "categories.csv"]
     if config.video:
         write_video(folder / "episode.mp4", strips, fps=fps)
         written.insert(1, "episode.mp4")
-    layout = Layout(StreetEnv(**street, sensors=()).scene)
-    tracks = [Track(episode.points_m, episode.outcome) for episode in episodes]
-    paths = {episode.path for episode in episodes}
+    paths = {each.path for each in episodes}
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = paths.pop() if len(paths) == 1 else None
-    draw_plan(layout, tracks, path=path).savefig(folder / "plan.png", dpi=110)
+    tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
+    draw_plan(Layout(scene), tracks, path=path).savefig(folder / "plan.png", dpi=110)
     for name, rows in (
-        ("episodes.csv", [episode.row() for episode in episodes]),
+        ("episodes.csv", [row_of(each) for each in episodes]),
         ("categories.csv", counts.rows()),
     ):
-        (folder / name).unlink(missing_ok=True)
-        append_rows(folder / name, rows)
+        write_rows(folder / name, rows)
         print_rows(name.removesuffix(".csv"), rows)
     print(f"{folder}: {', '.join(written)}")
 
 
-def film(
-    config: ViewConfig, street: dict[str, Any]
-) -> tuple[list[Maps], Viewed, CategoryCount, float]:
-    """Returns the first episode's maps, the drive, its category counts and its frame rate."""
-    env = StreetEnv(**street, sensors=SENSORS)
-    intrinsics, frames = torch.as_tensor(env.K), []
-    counts = CategoryCount(env.scene.categories)
-    with tqdm(desc="driving", unit="frame") as bar:
-
-        def look(observation: Any) -> None:
-            counts(observation)
-            maps = {name: torch.as_tensor(value) for name, value in observation.items()}
-            frames.append(maps_of(maps, intrinsics))
-            bar.update()
-
-        baseline = BASELINES[config.policy]()
-        first = view_episode(env, baseline, look=look, seed=config.seed, path=config.path)
+def drive_on(driver: Driver, options: list[dict[str, Any]]) -> list[Episode]:
+    """Returns the episodes after the first, in their order, with what the policy sees alone."""
+    if not options:
+        return []
+    env = driver.make_env(
+        representations=driver.representations, num_envs=min(ENVS, len(options)), num_workers=0
+    )
+    found = evaluate(env, driver.policy_in(env), options)
+    episodes = list(tqdm(found, desc="driving on", unit="episode", total=len(options)))
     env.close()
-    return frames, first, counts, env.frame_rate_hz
+    seeds = [each["episode_seed"] for each in options]
+    return sorted(episodes, key=lambda episode: seeds.index(episode.seed))
 
 
-def drive_on(config: ViewConfig, street: dict[str, Any], episodes: int) -> list[Viewed]:
-    """Returns the episodes after the first, driven without rendering."""
-    env, baseline = StreetEnv(**street, sensors=()), BASELINES[config.policy]()
-    env.reset(seed=config.seed)
-    viewed = [
-        view_episode(env, baseline, path=config.path)
-        for _ in tqdm(range(episodes), desc="driving on", unit="episode")
-    ]
-    env.close()
-    return viewed
+def row_of(episode: Episode) -> dict[str, Any]:
+    """Returns an episode's row in a table."""
+    return {
+        "episode_seed": episode.seed,
+        "path": episode.path,
+        "outcome": episode.outcome,
+        "hit": episode.hit,
+        "steps": episode.length,
+        "return": round(episode.total_reward, 2),
+    }
+
+
+class CategoryCount:
+    """Counts the pixels of each category and the pictures that show it."""
+
+    def __init__(self, categories: tuple[str, ...]) -> None:
+        """Starts at 0 for the categories of a scene."""
+        self.categories = categories
+        self._pixels = np.zeros(256, dtype=np.int64)
+        self._pictures = np.zeros(256, dtype=np.int64)
+        self._seen = 0
+
+    def add(self, semantic: Any) -> None:
+        """Adds a semantic map."""
+        pixels = np.bincount(np.asarray(semantic).ravel(), minlength=256)
+        self._pixels += pixels
+        self._pictures += pixels > 0
+        self._seen += 1
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Returns each category's share of the pixels and of the pictures, in %."""
+        total = max(1, int(self._pixels.sum()))
+        return [
+            {
+                "category": name,
+                "pixels": int(self._pixels[CATEGORY_ID[name]]),
+                "pixels_percent": round(100 * self._pixels[CATEGORY_ID[name]] / total, 3),
+                "pictures_percent": round(
+                    100 * self._pictures[CATEGORY_ID[name]] / max(1, self._seen), 1
+                ),
+            }
+            for name in self.categories
+        ]
 
 
 def moving_pixels(maps: Maps) -> int:
@@ -144,8 +239,144 @@ def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
     Console().print(table)
 
 
+# The interactive window.
+
+
+class NoScreenError(UsageError):
+    """A window can't be opened."""
+
+
+class NewEpisode(Exception):
+    """The episode was left for the next one."""
+
+
+class Keyboard:
+    """A policy that takes the action of the held keys, or lets another policy drive.
+
+    A key acts while it is held; both together cancel out. A key press switches between the drivers.
+
+    Args:
+        other: drives after a switch.
+        name: its name.
+    """
+
+    ACTIONS = {"left": TURN_LEFT, "right": TURN_RIGHT}  # noqa: RUF012 - never changed
+    HELP = "← → steer    S switch driver    R new episode    Q quit"
+
+    def __init__(self, other: Policy, name: str) -> None:
+        self.is_over = self.is_new = False
+        self._other, self._held = other, set[str]()
+        self._names = cycle([name, "you"])
+        self.driver = "you"
+
+    def press(self, key: str | None) -> None:
+        """Handles a key press."""
+        key = (key or "").lower()
+        if key in self.ACTIONS:
+            self._held.add(key)
+        elif key == "s":
+            self.driver = next(self._names)
+        elif key == "r":
+            self.is_new = True
+        elif key in ("q", "escape"):
+            self.is_over = True
+
+    def release(self, key: str | None) -> None:
+        """Handles a key release."""
+        self._held.discard((key or "").lower())
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes `action`."""
+        if self.driver != "you":
+            return self._other(tensordict)
+        actions = [self.ACTIONS[key] for key in self._held]
+        action = actions[0] if len(actions) == 1 else NO_OP
+        return tensordict.set("action", torch.full(tensordict.shape, action))
+
+
+def drive_by_hand(config: ViewConfig, driver: Driver, env: EnvBase) -> None:
+    """Opens a window and drives one episode after the other until it is closed.
+
+    A finished episode stays in view until R begins the next.
+
+    Args:
+        config: of the command.
+        driver: drives after a switch.
+        env: keeps every sensor.
+
+    Raises:
+        NoScreenError: there is no screen, or no GUI toolkit.
+    """
+    import matplotlib.pyplot as plt
+
+    keyboard = Keyboard(driver.policy_in(env), Path(config.policy).name)
+    # Disable Matplotlib's own shortcuts for the driver's keys (left: back, r: home, q: quit).
+    shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
+    with plt.rc_context(shortcuts):
+        figure = plt.figure(figsize=(15, 3.2))
+        if type(figure.canvas).required_interactive_framework is None:
+            plt.close(figure)
+            raise NoScreenError(
+                "interactive=true needs a screen, and tkinter or PyQt to open a window on it "
+                f"(matplotlib found only the backend {plt.get_backend()!r})"
+            )
+        drive_in_window(figure, keyboard, env, episodes_of(config)[0], plt.pause)
+        plt.close(figure)
+
+
+def drive_in_window(
+    figure: Any,
+    keyboard: Keyboard,
+    env: EnvBase,
+    options: dict[str, Any],
+    pause: Callable[[float], None],
+) -> None:
+    """Draws each step into a figure at the env's frame rate, and listens to its keys.
+
+    Args:
+        figure: of matplotlib.
+        keyboard: chooses the actions, and tells when to go on and to end.
+        env: keeps every sensor.
+        options: of the first episode; later ones have the seeds after it.
+        pause: draws, and handles key presses for some seconds.
+    """
+    axes = figure.add_axes((0, 0, 1, 0.92))
+    axes.set_axis_off()
+    title = figure.suptitle("", fontfamily="monospace", fontsize=10)
+    canvas = figure.canvas
+    canvas.mpl_connect("key_press_event", lambda event: keyboard.press(event.key))
+    canvas.mpl_connect("key_release_event", lambda event: keyboard.release(event.key))
+    canvas.mpl_connect("close_event", lambda event: keyboard.press("q"))
+    intrinsics = torch.from_numpy(street_envs(env)[0].K)
+    image, drawn_at = None, time.monotonic()
+
+    def draw(tensordict: TensorDictBase) -> None:
+        nonlocal image, drawn_at
+        if keyboard.is_over or keyboard.is_new:
+            raise NewEpisode
+        picture = representation_strip(maps_of(tensordict["sensor"][0].cpu(), intrinsics))
+        image = image or axes.imshow(picture, interpolation="nearest")
+        image.set_data(picture)
+        title.set_text(f"{keyboard.driver} drives    {keyboard.HELP}")
+        pause(max(1e-3, 1 / env.base_env.frame_rate_hz - (time.monotonic() - drawn_at)))
+        drawn_at = time.monotonic()
+
+    while not keyboard.is_over:
+        keyboard.is_new = False
+        try:
+            for episode in evaluate(env, keyboard, [options], on_frame=draw):
+                hit = f" ({episode.hit})" if episode.hit else ""
+                outcome = f"{episode.outcome.replace('_', ' ')}{hit} after {episode.length} steps"
+                title.set_text(f"{outcome}, return {episode.total_reward:.2f}    {keyboard.HELP}")
+                while not (keyboard.is_over or keyboard.is_new):
+                    pause(0.05)
+        except NewEpisode:
+            pass
+        options = options | {"episode_seed": options["episode_seed"] + 1}
+
+
 def main() -> None:
-    """Entry point; a mistake on the command line ends in one line that lists the choices."""
+    """Entry point; a mistake on the command line ends in one line that names the remedy."""
     run_command("view", run, ViewConfig)
 
 

@@ -76,6 +76,23 @@ def make_street():
 
 
 @pytest.fixture
+def drive():
+    """Drives episodes 0, 1, ... with a baseline, and returns them as they end."""
+    from flowrep.baselines import BaselinePolicy
+    from flowrep.envs import make_env
+    from flowrep.experiment.evaluation import evaluate
+
+    def drive(baseline, count, scene="straight_road", **options):
+        env = make_env(scene, num_envs=min(count, 20))
+        episodes = [{"episode_seed": seed, **options} for seed in range(count)]
+        found = list(evaluate(env, BaselinePolicy(baseline, env), episodes))
+        env.close()
+        return found
+
+    return drive
+
+
+@pytest.fixture
 def short_folder():
     """A folder for what commands leave in TMPDIR: sockets want a short path."""
     with tempfile.TemporaryDirectory(prefix="fr") as folder:

@@ -23,15 +23,15 @@ FLOWREP_IMPORTS_ALLOWED = {
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
-    | {"transforms", "palette", "progress", "tables", "config", "extras", "viz"},
+    | {"transforms", "geometry", "palette", "progress", "tables", "config", "extras", "viz"},
     "progress": set(),
     "tables": set(),
-    "viz": {"viz", "experiment", "envs", "scenes", "geometry", "palette"},
-    "exchange": {"exchange", "agent"},
+    "viz": {"viz", "scenes", "geometry", "palette"},
+    "load_agent": set(),
     "sequences": {"sequences", "progress", "extras", "transforms", "geometry", "viz"},
     "sweep": {"config", "progress", "tables"},
     "config": {"config"},
-    "report": {"report", "subjects", "viz", "config", "experiment", "agent", "envs", "scenes"}
+    "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
     | {"extras", "tables"},
 }
 THIRD_PARTY_ONLY_IN = {

@@ -42,8 +42,8 @@ def test_the_agent_and_the_film_see_one_estimate():
     import torch
 
     from flowrep.envs import make_env, street_envs
+    from flowrep.experiment.film import maps_of
     from flowrep.geometry import rigid_flow
-    from flowrep.viz.film import maps_of
 
     env = make_env("straight_road", ["raw", "rgb"], keep_sensor=True, seed=0, flow="estimated")
     tensordict = env.reset()

@@ -1,32 +1,52 @@
-"""`python -m flowrep.view` from start to pictures."""
+"""`python -m flowrep.view` from start to pictures, and its window."""
 
 import csv
 import subprocess
 import sys
-from dataclasses import replace
+from functools import partial
 
 import imageio.v3 as imageio
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 import torch
+from matplotlib.backend_bases import CloseEvent, KeyEvent
+from tensordict import TensorDict
 
 pytest.importorskip("pybullet", reason="the command needs the simulator")
 
-from flowrep.baselines import drives, never_turn
 from flowrep.config import UsageError
 from flowrep.config.schema import ViewConfig, validated
-from flowrep.envs import StreetEnv
-from flowrep.scenes import load_scene
-from flowrep.scenes.scene import CameraConfig
-from flowrep.view import check, drive_on, film, moments, moving_pixels
-from tests.config.composing import plain
+from flowrep.envs import make_env, street_envs
+from flowrep.experiment.film import make_filmed
+from flowrep.view import (
+    CategoryCount,
+    Driver,
+    Keyboard,
+    NoScreenError,
+    check_path,
+    drive_by_hand,
+    drive_in_window,
+    drive_on,
+    driver_of,
+    episodes_of,
+    moments,
+    moving_pixels,
+)
+from tests.test_configs import composed
 
-TINY = CameraConfig(6, 8, 90.0, 1.5, 0.0, -5.0, 0.2, 300.0)
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
+NO_OP, LEFT, RIGHT = 0, 1, 2
 
 
 def view(*arguments):
     command = [sys.executable, "-m", "flowrep.view", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def asked(*overrides):
+    return validated(ViewConfig, composed(*overrides, name="view"))
 
 
 @pytest.mark.slow
@@ -40,7 +60,7 @@ def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
     with (out / "episodes.csv").open(newline="") as file:
         first, second = csv.DictReader(file)
     assert (first["outcome"], first["hit"]) == ("out_of_bounds", "")
-    assert first["episode_seed"] != second["episode_seed"]
+    assert [first["episode_seed"], second["episode_seed"]] == ["0", "1"]
     with (out / "categories.csv").open(newline="") as file:
         seen = {row["category"]: int(row["pixels"]) for row in csv.DictReader(file)}
     assert len(seen) == 11
@@ -51,37 +71,56 @@ def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
     assert frames.shape[2] > 6 * 200
 
 
-def config_of(*overrides):
-    return validated(ViewConfig, plain("view", *overrides))
-
-
-def test_a_path_that_the_scene_lacks_is_named():
-    with pytest.raises(UsageError, match="main"):
-        check(config_of("path=up"))
-
-
 @pytest.mark.slow
-def test_the_episodes_that_are_shown_are_those_of_the_seed():
-    def shown(seed):
-        config = config_of("policy=never_turn", f"seed={seed}")
-        street = {"scene": replace(load_scene("straight_road"), camera=TINY)}
-        episodes = [film(config, street)[1], *drive_on(config, street, 2)]
-        return [episode.episode_seed for episode in episodes]
+def test_a_run_and_a_policy_of_ones_own_drive_as_baselines_do(tmp_path):
+    from tests.test_evaluate import trained
 
-    env = StreetEnv("straight_road", sensors=())
-    expected = [drive.episode_seed for drive in drives(env, never_turn, 3, seed=7)]
-    env.close()
-    assert shown(7) == expected
-    assert shown(8) != expected
+    run = trained(tmp_path / "run", "representations=[obj]")
+    path = tmp_path / "mine.py"
+    path.write_text("def make(task):\n    return lambda maps: [0] * len(maps)\n")
+    driven = {}
+    for policy, scene in ((str(run.path), "straight_road"), (f"{path}:make", "s_turn")):
+        config = asked(f"policy={policy}", "scene=s_turn", "representations=[seg]", "episodes=3")
+        driver = driver_of(config, is_scene_given=False)
+        env = make_filmed(driver.make_env, driver.representations)
+        assert env.base_env.scene.name == scene  # a run's agent is at home in its own
+        env.close()
+        driven[policy] = drive_on(driver, episodes_of(config))
+        assert [episode.seed for episode in driven[policy]] == [0, 1, 2]
+    never = drive_on(
+        driver_of(asked("policy=never_turn", "scene=s_turn"), True), episodes_of(config)
+    )
+    assert [e.outcome for e in driven[f"{path}:make"]] == [e.outcome for e in never]
 
 
-@pytest.mark.slow
-def test_without_a_screen_the_command_ends_in_one_line(tmp_path, monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "agg")
-    done = view("interactive=true", f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: interactive=true needs a screen")
-    assert done.stderr.count("\n") == 1
+def test_what_is_no_policy_is_named():
+    with pytest.raises(UsageError, match="policy=pilot"):
+        driver_of(asked("policy=pilot"), True)
+    with pytest.raises(UsageError, match="representations"):
+        driver_of(asked("policy=mine.py:make"), True)
+
+
+def test_a_path_that_is_not_there_is_named(straight_road):
+    with pytest.raises(UsageError, match="path"):
+        check_path(asked("path=up"), straight_road)
+
+
+def test_the_path_can_be_chosen():
+    config = asked("policy=never_turn", "scene=three_way_junction", "path=right", "episodes=6")
+    episodes = drive_on(driver_of(config, True), episodes_of(config))
+    assert [episode.path for episode in episodes] == ["right"] * 6
+
+
+def test_pixels_are_counted_by_category():
+    count = CategoryCount(("sky", "road", "car"))
+    count.add(np.array([[[0, 1, 1, 9]]], dtype=np.uint8))
+    count.add(np.array([[[1, 1, 1, 1]]], dtype=np.uint8))
+    # 8 pixels: 1 of sky (id 0), 6 of road (id 1), 1 of a car (id 9); the road is in both pictures.
+    assert count.rows() == [
+        {"category": "sky", "pixels": 1, "pixels_percent": 12.5, "pictures_percent": 50.0},
+        {"category": "road", "pixels": 6, "pixels_percent": 75.0, "pictures_percent": 100.0},
+        {"category": "car", "pixels": 1, "pixels_percent": 12.5, "pictures_percent": 50.0},
+    ]
 
 
 @pytest.mark.parametrize(
@@ -101,3 +140,91 @@ def test_what_is_right_before_the_lens_does_not_make_a_moment_lively():
     obj[1, 0, 1:] = 0.5  # v alone
     depth = torch.tensor([[[9.0, 3.0, 9.0, torch.inf]]])
     assert moving_pixels({"obj": obj, "depth": depth}) == 2
+
+
+# The window.
+
+
+def never(tensordict):
+    return tensordict.set("action", torch.full(tensordict.shape, NO_OP))
+
+
+def action_of(keyboard):
+    return int(keyboard(TensorDict({}, [1]))["action"])
+
+
+def test_a_key_acts_while_it_is_held():
+    keyboard = Keyboard(never, "never_turn")
+    assert action_of(keyboard) == NO_OP
+    keyboard.press("left")
+    assert action_of(keyboard) == LEFT
+    keyboard.press("right")  # both at once cancel
+    assert action_of(keyboard) == NO_OP
+    keyboard.release("left")
+    assert action_of(keyboard) == RIGHT
+    keyboard.press("S")  # another drives, whatever is held
+    assert (keyboard.driver, action_of(keyboard)) == ("never_turn", NO_OP)
+    keyboard.press("s")
+    assert (keyboard.driver, action_of(keyboard)) == ("you", RIGHT)
+    keyboard.release("right")
+    keyboard.release(None)
+    assert action_of(keyboard) == NO_OP
+
+
+@pytest.fixture
+def env(straight_road):
+    env = make_filmed(partial(make_env, straight_road), {})
+    yield env
+    env.close()
+
+
+def drive_with_keys(env, keys):
+    """Drives in a window; at each pause the next key is pressed, None presses none."""
+    figure, seen, keys = plt.figure(), [], iter(keys)
+
+    def pause(seconds):
+        title = figure.texts[0].get_text() if figure.texts else figure._suptitle.get_text()
+        episode = street_envs(env)[0].episode
+        seen.append((title, episode.seed, episode.steps, episode.now.vehicle.yaw_rad))
+        key = next(keys, "q")
+        if key == "close":
+            figure.canvas.callbacks.process("close_event", CloseEvent("close_event", figure.canvas))
+        elif key:
+            event = KeyEvent("key_press_event", figure.canvas, key)
+            figure.canvas.callbacks.process("key_press_event", event)
+
+    with matplotlib.rc_context({"backend": "agg"}):
+        drive_in_window(figure, Keyboard(never, "planner"), env, {"episode_seed": 1}, pause)
+    plt.close(figure)
+    return seen
+
+
+def test_the_window_hears_the_keys_and_an_ended_episode_waits_for_r(env):
+    seen = drive_with_keys(env, ["left", *[None] * 40, "r", None])
+    assert [steps for _, _, steps, _ in seen[:4]] == [0, 1, 2, 3]
+    assert seen[3][3] > 0  # left turns left
+    ended = [title for title, *_ in seen if title.startswith("out of bounds")]
+    assert "return -4." in ended[0]
+    (_, seed, steps, _), last = seen[-2:][0], seen[-1]
+    assert (seed, steps, last[1]) == (2, 0, 2)
+
+
+def test_an_episode_can_be_left_for_the_next_and_the_window_be_closed(env):
+    seen = drive_with_keys(env, [None, "r", None, "close"])
+    assert [(seed, steps) for _, seed, steps, _ in seen] == [(1, 0), (1, 1), (2, 0), (2, 1)]
+
+
+def test_without_a_screen_one_line_says_what_is_missing(env):
+    with matplotlib.rc_context({"backend": "agg"}), pytest.raises(NoScreenError) as caught:
+        drive_by_hand(asked(), Driver(make_env, {}, lambda env: never), env)
+    assert "needs a screen" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_without_a_screen_the_command_ends_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    done = view("interactive=true", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: interactive=true needs a screen")
+    assert done.stderr.count("\n") == 1

@@ -1,14 +1,14 @@
 """Baselines to compare an agent with: policies without learning that may read the env's state."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
 
 from flowrep.baselines.planner import Planner
-from flowrep.envs.episode import Outcome, reward
-from flowrep.envs.street_env import StreetEnv
+from flowrep.envs import StreetEnv, street_envs
 from flowrep.scenes.scene import NO_OP
 
 Baseline = Callable[[StreetEnv], int]
@@ -35,56 +35,29 @@ class RandomActions:
         return int(self._rng.integers(3))
 
 
-@dataclass(frozen=True)
-class Drive:
-    """A finished episode: its seed, outcome, category hit, return and number of steps."""
-
-    episode_seed: int
-    outcome: str
-    hit: str
-    total_reward: float
-    steps: int
-
-
-def drive_episode(env: StreetEnv, baseline: Baseline, options: dict[str, Any]) -> Drive:
-    """Drives one episode to its end without rendering, and returns it.
-
-    Args:
-        env: the environment.
-        baseline: chooses the actions.
-        options: passed to `StreetEnv.reset`; they select the episode.
-    """
-    env.begin(options=options)
-    return _drive_on(env, baseline)
-
-
-def drives(
-    env: StreetEnv, baseline: Baseline, episodes: int, *, seed: int | None = None
-) -> Iterator[Drive]:
-    """Yields finished episodes, the same for every baseline, without rendering.
-
-    If `seed` is None, the env continues its own sequence of episodes.
-
-    >>> env = StreetEnv("straight_road", sensors=())
-    >>> [drive.outcome in ("success", "collision") for drive in drives(env, never_turn, 2, seed=0)]
-    [True, True]
-    """
-    for number in range(episodes):
-        env.begin(seed=seed if number == 0 else None)
-        yield _drive_on(env, baseline)
-
-
-def _drive_on(env: StreetEnv, baseline: Baseline) -> Drive:
-    total, outcome = 0.0, Outcome.RUNNING
-    while not outcome:
-        outcome = env.drive(baseline(env))
-        total += reward(outcome)
-    episode = env.episode
-    return Drive(episode.seed, outcome.label, episode.hit, total, episode.steps)
-
-
 BASELINES: dict[str, Callable[[], Baseline]] = {
     "planner": Planner,
     "never_turn": lambda: never_turn,
     "random": RandomActions,
 }
+
+
+class BaselinePolicy:
+    """Lets a baseline choose the actions of an env's streets, as a policy of `evaluate`.
+
+    It needs no observation: an env without representations renders nothing.
+
+    Args:
+        name: one of `BASELINES`.
+        env: made by `make_env` without workers.
+    """
+
+    def __init__(self, name: str, env: TransformedEnv) -> None:
+        self._streets = street_envs(env)
+        self._baselines = [BASELINES[name]() for _ in self._streets]
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes `action` for the streets that `env_id` names."""
+        ids = tensordict["env_id"].tolist()
+        actions = [self._baselines[i](self._streets[i]) for i in ids]
+        return tensordict.set("action", torch.tensor(actions, device=tensordict.device))

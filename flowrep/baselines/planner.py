@@ -7,6 +7,7 @@ the present to the ending zone and keeps only drives without a collision.
 import heapq
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,11 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from flowrep.envs.episode import Episode, Rules
+from flowrep.envs.episode import Episode
 from flowrep.envs.street_env import StreetEnv
-from flowrep.scenes.layout import free_ground
+from flowrep.scenes.layout import Layout, free_ground
 from flowrep.scenes.pedestrians import RADIUS_M as PERSON_RADIUS_M
-from flowrep.scenes.scene import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
+from flowrep.scenes.scene import NO_OP, YAW_SIGN, Path, VehicleState, footprint_corners, roll, turn
 
 Array = NDArray[Any]
 _ACTIONS = np.array([0, 1, 2])
@@ -42,7 +43,6 @@ class Planner:
     def __init__(self, beams: Sequence[int] = (100, 600)) -> None:
         """Starts without a plan."""
         self.beams = tuple(beams)
-        self._ways: dict[tuple[Rules, str], GoalDistance] = {}
         self._plan: dict[int, int] = {}
         self._episode: Episode | None = None
         self._expected = (0, 0.0)  # steps and yaw rate if the action is taken
@@ -67,7 +67,7 @@ class Planner:
 
     def search(self, episode: Episode) -> list[int]:
         """Returns the actions of a drive to the ending zone, or of the longest drive found."""
-        search = _Search(episode, self._way(episode))
+        search = _Search(episode)
         actions: list[int] = []
         for beam in self.beams:
             found, is_complete = search.run(beam)
@@ -75,13 +75,6 @@ class Planner:
             if is_complete:
                 return found
         return actions
-
-    def _way(self, episode: Episode) -> "GoalDistance":
-        key = (episode.rules, episode.path.name)
-        if key not in self._ways:
-            free = free_ground(episode.rules.layout, episode.path)
-            self._ways[key] = GoalDistance(free, episode.goal)
-        return self._ways[key]
 
 
 class GoalDistance:
@@ -124,13 +117,20 @@ class GoalDistance:
         return self._way[cell[..., 0], cell[..., 1]]
 
 
+@lru_cache(maxsize=16)  # it takes a second, and planners of one scene share it
+def _ground(layout: Layout, path: Path) -> tuple[BaseGeometry, GoalDistance]:
+    """Returns the free ground of a path's episodes, and the distances on it."""
+    free = free_ground(layout, path)
+    return free, GoalDistance(free, layout.zones[path.end])
+
+
 class _Search:
     """Simulates one episode for many vehicles at once."""
 
-    def __init__(self, episode: Episode, way: GoalDistance) -> None:
-        self.episode, self.way = episode, way
+    def __init__(self, episode: Episode) -> None:
+        self.episode = episode
         self.rules, self.vehicle = episode.rules, episode.rules.layout.scene.vehicle
-        self.free = free_ground(self.rules.layout, episode.path)
+        self.free, self.way = _ground(self.rules.layout, episode.path)
 
     def run(self, beam: int) -> tuple[list[int], bool]:
         """Returns the actions of the best drive found, and whether it arrives."""
@@ -143,7 +143,7 @@ class _Search:
             actions = np.tile(_ACTIONS, state.x_m.size)
             state = VehicleState(*(value[parents] for value in state))
             state, alive, arrived = self.drive(state, actions, ticks)
-            steps, ticks = steps + _HOLD_STEPS, ticks + _HOLD_STEPS * episode.rules.ticks_a_step
+            steps, ticks = steps + _HOLD_STEPS, ticks + _HOLD_STEPS * episode.rules.ticks_per_step
             kept = np.flatnonzero(arrived)[:1] if arrived.any() else self.best(state, alive, beam)
             if not kept.size:
                 break
@@ -162,7 +162,7 @@ class _Search:
         signs = np.array(YAW_SIGN)[actions]
         for _ in range(_HOLD_STEPS):
             state = turn(state, signs, self.rules.dt_s, self.vehicle)
-            for _ in range(self.rules.ticks_a_step):
+            for _ in range(self.rules.ticks_per_step):
                 state = roll(state, self.rules.tick_s, self.episode.vehicle_speed_mps)
                 ticks += 1
                 alive &= arrived | ~self._touches(state, ticks)

@@ -472,7 +472,8 @@ class ViewConfig(Section):
     """The whole config of `flowrep.view`."""
 
     scene: dict[str, Any]
-    policy: BaselineName
+    representations: Stack | None = None
+    policy: Text
     speed: SpeedMode
     frame_rate_hz: FrameRate | None
     path: Text | None

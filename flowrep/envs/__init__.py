@@ -42,7 +42,6 @@ for _id, _scene in SCENE_BY_ID.items():
     )
 
 __all__ = [
-    "SCENE_BY_ID",
     "NumericInfo",
     "Outcome",
     "RepresentationObservation",

@@ -90,7 +90,7 @@ Array = NDArray[Any]
 # Between two checks of the footprint neither the vehicle nor anyone moves more than 0.42 m, as the
 # vehicle does at 10 m/s, nor a shorter vehicle its length: it can't skip anyone or anything.
 _CHECKS_HZ = 24.0
-_CHECKS_A_M = 2.4
+_CHECKS_PER_M = 2.4
 _STEPS_FORESEEN = 16  # people ignore the vehicle, so their positions are computed in batches
 
 
@@ -108,21 +108,21 @@ def ticks_for(
     """Returns how often the footprint is checked in a step, for the speeds of an episode."""
     groups = [group for group in scene.pedestrian_groups if group.standing < group.count]
     fastest_mps = max(((group.speed_mps or speed_mps)[1] for group in groups), default=0.0)
-    driven_hz = vehicle_speed_mps * max(_CHECKS_A_M, 1.0 / scene.vehicle.length_m)
-    checks_hz = max(_CHECKS_HZ, driven_hz, fastest_mps * _CHECKS_A_M)
+    driven_hz = vehicle_speed_mps * max(_CHECKS_PER_M, 1.0 / scene.vehicle.length_m)
+    checks_hz = max(_CHECKS_HZ, driven_hz, fastest_mps * _CHECKS_PER_M)
     return math.ceil(checks_hz / frame_rate_hz - 1e-9)
 
 
 class Rules:
     """The constants of a scene's episodes: ground plan, clock and limits."""
 
-    def __init__(self, layout: Layout, frame_rate_hz: float, ticks_a_step: int) -> None:
+    def __init__(self, layout: Layout, frame_rate_hz: float, ticks_per_step: int) -> None:
         """Prepares the checks for a layout, a frame rate and the number of checks in a step."""
         self.layout, self.frame_rate_hz = layout, frame_rate_hz
         self.dt_s = 1.0 / frame_rate_hz
-        self.ticks_a_step = ticks_a_step
-        self.tick_s = self.dt_s / self.ticks_a_step
-        self.tick_times_s = [(1 + i) * self.tick_s for i in range(self.ticks_a_step)]
+        self.ticks_per_step = ticks_per_step
+        self.tick_s = self.dt_s / self.ticks_per_step
+        self.tick_times_s = [(1 + i) * self.tick_s for i in range(self.ticks_per_step)]
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
 
     def is_out_of_bounds(self, state: VehicleState) -> bool:
@@ -180,7 +180,7 @@ class Episode:
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
             if is_near[i] or not street.is_safe(vehicle.x_m, vehicle.y_m):
-                self._judge(vehicle, poses[i], street)
+                self._end_where_due(vehicle, poses[i], street)
             if self.outcome:
                 break
         self.before, self.now = self.now, Moment(vehicle, self.now.ticks + i + 1)
@@ -191,7 +191,7 @@ class Episode:
 
     def _poses_ahead(self) -> Array:
         """Returns everyone's poses at the checks of the next step, [T, P, 4]."""
-        count, first = self.rules.ticks_a_step, self.now.ticks + 1
+        count, first = self.rules.ticks_per_step, self.now.ticks + 1
         at = first - self._foreseen_from
         if not 0 <= at <= len(self._foreseen) - count:
             ticks = first + np.arange(count * _STEPS_FORESEEN)
@@ -199,7 +199,7 @@ class Episode:
             self._foreseen_from, at = first, 0
         return self._foreseen[at : at + count]
 
-    def _judge(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
+    def _end_where_due(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
         self.hit = street.hit(vehicle, poses, self.path.closures)
         if self.hit:
             self.outcome = Outcome.COLLISION

@@ -1,7 +1,7 @@
 """TorchRL environments of streets, with the transforms that write representations."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
-from flowrep.envs.vector_env import StreetVectorEnv, sensed
+from flowrep.envs.vector_env import StreetVectorEnv, make_sensing
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
 from flowrep.scenes.load import load_scene
 from flowrep.scenes.scene import YAW_SIGN, Range, Scene, SpeedMode
@@ -64,21 +64,26 @@ class VectorWrapper(GymWrapper):
 
     Args:
         env: the environments.
-        check_options: called with the options of each reset.
+        scene: their scene.
+        frame_rate_hz: their frame rate, which no reset may change if flow is in px/s.
+        transforms: those that write the representations.
         kwargs: passed to TorchRL's wrapper.
     """
 
     def __init__(
         self,
         env: VectorEnv,
-        check_options: Callable[[Mapping[str, Any] | None], None],
+        scene: Scene,
+        frame_rate_hz: float,
+        transforms: Iterable[Any],
         **kwargs: Any,
     ) -> None:
         super().__init__(env, **kwargs)
-        self._check_options = check_options
+        self.scene, self.frame_rate_hz = scene, frame_rate_hz
+        self._transforms = [*transforms]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        self._check_options(kwargs.get("options"))
+        check_rate(self._transforms, kwargs.get("options"), self.frame_rate_hz)
         return super()._reset(tensordict, **kwargs)
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -187,7 +192,7 @@ def make_env(
         sensors = [name for name in SENSORS if name in sensors or name not in _SELDOM]
     elif sensors:
         transforms.append(DropSensor())
-    factories = [partial(sensed, street, sensors)] * num_envs
+    factories = [partial(make_sensing, street, sensors)] * num_envs
     vector: VectorEnv
     if num_workers:
         vector = WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)
@@ -195,7 +200,9 @@ def make_env(
         vector = StreetVectorEnv(factories)
     base = VectorWrapper(
         vector,
-        partial(check_rate, [*transforms], frame_rate_hz=probe.frame_rate_hz),
+        loaded,
+        probe.frame_rate_hz,
+        transforms,
         device=torch.device(device),
         categorical_action_encoding=True,
     )

@@ -1,6 +1,7 @@
 """Environments of one scene in one process, stepped one by one and rendered together."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -10,11 +11,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 
-from flowrep.envs.episode import NOTHING_HIT, Outcome, hit_code, reward
+from flowrep.envs.episode import NOTHING_HIT, Episode, Outcome, hit_code, reward
 from flowrep.envs.sensing import observe_together
-from flowrep.envs.workers import Order, copied
-
-_OUTCOME_CODE = {outcome.label: outcome.value for outcome in Outcome}
 
 
 class SensorObservation(gym.Wrapper):
@@ -26,6 +24,8 @@ class SensorObservation(gym.Wrapper):
     | `outcome` | [1] | uint8 | code of `flowrep.envs.Outcome`; 0 while the episode runs |
     | `hit` | [1] | uint8 | class id of what was hit; 255 for nothing |
     | `episode_seed` | [1] | int64 | identifies the episode, see `StreetEnv.reset` |
+    | `path` | [1] | int64 | index of the episode's path in the scene |
+    | `vehicle` | [3] | float32 | x and y in metres and yaw in radians, in the world |
     """
 
     def __init__(self, env: gym.Env) -> None:
@@ -35,6 +35,8 @@ class SensorObservation(gym.Wrapper):
             "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
             "hit": spaces.Box(0, NOTHING_HIT, (1,), np.uint8),
             "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
+            "path": spaces.Box(0, 1 << 31, (1,), np.int64),
+            "vehicle": spaces.Box(-np.inf, np.inf, (3,), np.float32),
         }
         sensor = env.observation_space
         has_sensors = isinstance(sensor, spaces.Dict) and len(sensor.spaces) > 0
@@ -45,35 +47,23 @@ class SensorObservation(gym.Wrapper):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begins an episode."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        return self.arrange(observation, info), {}
+        observation, _ = self.env.reset(seed=seed, options=options)
+        return self._arranged(observation), {}
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drives one step."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return self.arrange(observation, info), float(reward), terminated, truncated, {}
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        return self._arranged(observation), float(reward), terminated, truncated, {}
 
-    def arrange(self, observation: dict[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the observation in this wrapper's layout."""
-        code = _OUTCOME_CODE[info["outcome"]]
-        status = episode_status([code], [info["hit"]], [info["episode_seed"]])
+    def _arranged(self, observation: dict[str, Any]) -> dict[str, Any]:
+        street: Any = self.unwrapped
+        status = _status([street.episode])
         return dict.fromkeys(self._names, observation) | {k: v[0] for k, v in status.items()}
 
 
-def sensed(street: Callable[..., gym.Env], sensors: Sequence[str]) -> SensorObservation:
+def make_sensing(street: Callable[..., gym.Env], sensors: Sequence[str]) -> SensorObservation:
     """Returns a street with sensors; picklable in a partial, and imported without PyTorch."""
     return SensorObservation(street(sensors=sensors))
-
-
-def episode_status(
-    codes: Sequence[int], hits: Sequence[str], seeds: Sequence[int]
-) -> dict[str, Any]:
-    """Returns outcome, hit and episode seed of N episodes, `[N, 1]` each."""
-    return {
-        "outcome": np.array(codes, dtype=np.uint8)[:, None],
-        "hit": np.array([hit_code(hit) for hit in hits], dtype=np.uint8)[:, None],
-        "episode_seed": np.array(seeds, dtype=np.int64)[:, None],
-    }
 
 
 class StreetVectorEnv(SyncVectorEnv):
@@ -89,6 +79,7 @@ class StreetVectorEnv(SyncVectorEnv):
         """Makes the environments."""
         super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
         self._streets: list[Any] = [env.unwrapped for env in self.envs]
+        self._is_idle = [False] * self.num_envs
         self._latest: Any = create_empty_array(
             self.single_observation_space, self.num_envs, np.zeros
         )
@@ -99,67 +90,45 @@ class StreetVectorEnv(SyncVectorEnv):
         seed: int | list[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begins episodes in all environments, or in those marked by `options["reset_mask"]`."""
+        """Begins episodes in all environments, or in those marked by `options["reset_mask"]`.
+
+        Args:
+            seed: of the first environment, with consecutive seeds for the others; or one for each.
+            options: of every episode, see `StreetEnv.reset`. `episodes` holds more for each
+                environment, or None to leave it idle until its next reset: it then ignores actions,
+                gets no reward, and keeps its last observation.
+        """
         options = dict(options or {})
         mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
+        episodes = options.pop("episodes", None) or [{}] * self.num_envs
         seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
         due = np.flatnonzero(mask).tolist()
         for i in due:
-            self._streets[i].begin(seed=None if seeds is None else seeds[i], options=options)
-        return self._observe(due), {}
+            self._is_idle[i] = episodes[i] is None
+            if not self._is_idle[i]:
+                own_seed = None if seeds is None else seeds[i]
+                self._streets[i].begin(seed=own_seed, options=options | episodes[i])
+        return self._observe([i for i in due if not self._is_idle[i]]), {}
 
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[dict[str, Any], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Steps all environments."""
-        for street, action in zip(self._streets, actions.tolist(), strict=True):
-            street.drive(action)
-        outcomes = [street.episode.outcome for street in self._streets]
-        rewards = np.array([reward(outcome) for outcome in outcomes])
-        ended = np.array([outcome != Outcome.RUNNING for outcome in outcomes])
-        everyone = list(range(self.num_envs))
-        return self._observe(everyone), rewards, ended, np.zeros_like(ended), {}
-
-    def advance(
-        self, orders: Sequence[Order], into: Mapping[str, NDArray[Any]]
-    ) -> list[tuple[str, str] | None]:
-        """Executes one order per environment, and renders those whose episode continues.
-
-        Args:
-            orders: one for each environment: an action to take a step, options of `StreetEnv.reset`
-                to begin an episode, or None to do nothing.
-            into: arrays `[num_envs, ...]` by sensor, in which the rendered rows are written.
-
-        Returns:
-            The outcome's name and the category hit for each environment with an order, None for the
-            others.
-        """
-        for street, order in zip(self._streets, orders, strict=True):
-            if isinstance(order, Mapping):
-                street.begin(options=dict(order))
-            elif order is not None:
-                street.drive(order)
-        asked = [None if order is None else s.episode for s, order in zip(self._streets, orders)]
-        rows = [i for i, episode in enumerate(asked) if episode and not episode.outcome]
-        if rows:
-            streets = [self._streets[row] for row in rows]
-            seen = observe_together([s.sensing for s in streets], [s.episode for s in streets])
-            for name, values in seen.items():
-                into[name][rows] = values
-        return [episode and (episode.outcome.label, episode.hit) for episode in asked]
+        """Steps all environments that are not idle."""
+        rewards, ended = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
+        driven = [i for i in range(self.num_envs) if not self._is_idle[i]]
+        for i in driven:
+            outcome = self._streets[i].drive(actions[i].item())
+            rewards[i], ended[i] = reward(outcome), outcome != Outcome.RUNNING
+        return self._observe(driven), rewards, ended, np.zeros_like(ended), {}
 
     def _observe(self, rows: list[int]) -> dict[str, Any]:
         """Renders some environments; the others keep their last observation, at first zeros."""
         if not rows:
-            return copied(self._latest)
+            return deepcopy(self._latest)
         streets = [self._streets[row] for row in rows]
         episodes = [street.episode for street in streets]
         seen = observe_together([street.sensing for street in streets], episodes)
-        status = episode_status(
-            [episode.outcome for episode in episodes],
-            [episode.hit for episode in episodes],
-            [episode.seed for episode in episodes],
-        )
+        status = _status(episodes)
         if len(rows) < self.num_envs:
             # Arrays returned before belong to the caller: copy them instead of writing to them.
             seen = _replaced(self._latest.get("sensor", {}), seen, rows)
@@ -168,8 +137,25 @@ class StreetVectorEnv(SyncVectorEnv):
         return dict(self._latest)
 
 
+def _status(episodes: Sequence[Episode]) -> dict[str, NDArray[Any]]:
+    """Returns what `SensorObservation` says of N episodes, `[N, ...]` each."""
+    numbers = np.array(
+        [
+            (e.outcome, hit_code(e.hit), e.seed, e.rules.layout.scene.paths.index(e.path))
+            for e in episodes
+        ]
+    )
+    return {
+        "outcome": numbers[:, 0:1].astype(np.uint8),
+        "hit": numbers[:, 1:2].astype(np.uint8),
+        "episode_seed": numbers[:, 2:3],
+        "path": numbers[:, 3:4],
+        "vehicle": np.array([e.now.vehicle[:3] for e in episodes], dtype=np.float32),
+    }
+
+
 def _replaced(
-    before: dict[str, NDArray[Any]], new: dict[str, NDArray[Any]], rows: list[int]
+    before: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]], rows: list[int]
 ) -> dict[str, NDArray[Any]]:
     merged = {name: before[name].copy() for name in new}
     for name, values in new.items():

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Sequence
-from functools import partial
 from pkgutil import resolve_name
 from typing import Any
 
@@ -16,13 +14,7 @@ from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.workers import available_cores
-from flowrep.experiment.arena import Agent, Arena
-from flowrep.experiment.arena_team import AnyArena, ArenaTeam, can_travel
-from flowrep.experiment.env_pool import EnvPool
-from flowrep.scenes import load_scene
 from flowrep.simulator.camera import choose_renderer
-
-ENVS_PER_ARENA = 24  # at least, in a process of its own: a step of few costs as much as one of many
 
 
 def device(name: str) -> torch.device:
@@ -137,20 +129,3 @@ def algorithm_class(section: AnyAlgorithm) -> Any:
         if parameter.default is parameter.empty and key not in given:
             raise UsageError(f"algorithm.{key} needs a value: +algorithm.{key}=...")
     return found
-
-
-def arena(config: EnvConfig, agents: Sequence[Agent], num_envs: int) -> AnyArena:
-    """Returns what evaluates agents in the config's scene.
-
-    On a CPU, each of several processes takes whole episodes if it has enough environments;
-    otherwise workers step the environments of one arena.
-    """
-    scene = load_scene(config.scene)
-    workers = min(worker_count(config.num_workers, config.num_envs), num_envs)
-    processes = min(workers, num_envs // ENVS_PER_ARENA)
-    if processes > 1 and can_travel(agents):
-        return ArenaTeam(
-            scene, agents, num_envs=num_envs, num_processes=processes, renderer=config.renderer
-        )
-    pool = partial(EnvPool, num_envs=num_envs, num_workers=workers, renderer=config.renderer)
-    return Arena(scene, agents, pool)

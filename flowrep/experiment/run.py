@@ -30,10 +30,10 @@ from flowrep.tables import append_rows, is_whole, read_rows, write_rows
 Rows = Sequence[Mapping[str, str]]
 
 EVALUATION_COLUMNS = (
-    "scene", "representations", "flow", "seed", "frames", "evaluation",
+    "scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation",
     "policy", "speed", "fps", "episode_seed", "outcome", "hit", "return", "length",
 )  # fmt: skip
-_EPISODE = ("scene", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
+_EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
 """The columns that identify a row's policy and episode."""
 
 _IDENTITY = (
@@ -220,8 +220,7 @@ class RunFolder:
                              while training, at the end of it ("final"), or by flowrep.evaluate
     failures.csv             why episodes failed, by policy and speed
     machine.json             what it was computed with, for each machine
-    scenes/                  the scenes of flowrep.evaluate's rows, except the run's own
-    maps/                    what policies of one's own saw in flowrep.evaluate's rows
+    drives.npz               where the vehicle was in final and later evaluations
     videos/                  what the agent saw and did
     ```
     """
@@ -234,6 +233,7 @@ class RunFolder:
         self.metrics_path = self.path / "metrics.csv"
         self.checkpoint_path = self.path / "checkpoint" / "latest.safetensors"
         self.evaluation_path = self.path / "evaluation.csv"
+        self.drives_path = self.path / "drives.npz"
         self.failures_path = self.path / "failures.csv"
         self.curve_path = self.path / "learning_curve.png"
         self._loggers: list[Any] = []

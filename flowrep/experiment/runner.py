@@ -26,11 +26,15 @@ from flowrep.config.schema import FINAL_POLICIES, TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
 from flowrep.envs.workers import available_cores
 from flowrep.experiment import build
-from flowrep.experiment.arena import Agent
-from flowrep.experiment.arena_team import AnyArena
-from flowrep.experiment.comparison import Comparison, print_table, with_origin
-from flowrep.experiment.evaluation import OUTCOMES
-from flowrep.experiment.failures import print_failures, write_failures
+from flowrep.experiment.evaluation import (
+    OUTCOMES,
+    Comparison,
+    print_failures,
+    print_table,
+    save_drives,
+    scene_id,
+    write_failures,
+)
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch
 
@@ -70,7 +74,6 @@ class Runner:
         self.observation: TensorDictBase | None = None
         self.evaluation_pending = False
         self.metrics, self.recent = Means(), RecentEpisodes()
-        self._arena: AnyArena | None = None
 
     def train(self, stop: StopRequest) -> None:
         """Trains until `total_frames` or until a stop is requested, and saves the last state.
@@ -192,38 +195,44 @@ class Runner:
                 policies=["greedy"],
             )
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
-            comparison.run(self._evaluator(), lambda: bool(stop))
+            num_envs = max(EVALUATION_ENVS, config.num_envs)
+            make_env = partial(build.env, config)
+            comparison.run(make_env, self.agent.policy, num_envs, lambda: bool(stop))
         if not comparison.is_complete:
             return False
-        rows = with_origin(comparison.rows(), config.plain(), self.frames, kind)
+        scene = self.env.base_env.scene
+        rows = comparison.rows(
+            scene=scene.name,
+            scene_id=scene_id(scene),
+            representations="+".join(config.representations),
+            flow=config.flow.source,
+            seed=config.seed,
+            frames=self.frames,
+            evaluation=kind,
+        )
+        if kind == "final":
+            positions = [episode.positions for _, episode in comparison.results()]
+            save_drives(self.folder.drives_path, rows, positions)
         self.folder.log_episodes(rows)
         if kind == "final":
             print_table(rows)
             print_failures(rows)
         return True
 
-    def _evaluator(self) -> AnyArena:
-        """Returns what runs episodes of the agent in training, the same one each time."""
-        if self._arena is None:
-            config = self.config
-            agent = Agent.from_config(self.agent.policy, config, self.agent.device)
-            asked = config.evaluation.episodes, config.evaluation.final_total
-            num_envs = min(max(asked), max(EVALUATION_ENVS, config.num_envs))
-            self._arena = build.arena(config, [agent], num_envs)
-        return self._arena
-
     def film(self) -> None:
         """Writes causes of failure and learning curve, and films an episode unless it is there.
 
-        The processes of the evaluation end first, as filming takes memory as well.
+        The processes of the environments end first, as filming takes memory as well.
         """
         # drawing takes seconds to import
-        from flowrep.viz.curves import draw_learning_curve
-        from flowrep.viz.film import record_episode
+        from flowrep.experiment.film import draw_learning_curve, record_episode
 
         self.close()
-        write_failures(self.folder.failures_path, self.folder.read_episodes())
-        draw_learning_curve(self.folder)
+        metrics, episodes = self.folder.read_metrics(), self.folder.read_episodes()
+        write_failures(self.folder.failures_path, episodes)
+        fps = self.env.base_env.frame_rate_hz
+        path = self.folder.curve_path
+        draw_learning_curve(path, metrics, episodes, speed=self.config.speed, fps=fps)
         path = self.folder.video_path(f"episode_{self.config.speed}")
         if self.config.evaluation.video and not path.exists():
             make_env, seen = partial(build.env, self.config), self.config.representations
@@ -231,10 +240,7 @@ class Runner:
             print(f"video: {path}")
 
     def close(self) -> None:
-        """Ends the processes of environments and evaluation."""
-        if self._arena is not None:
-            self._arena.close()
-            self._arena = None
+        """Ends the processes of environments."""
         if not self.env.is_closed:
             self.env.close()
 

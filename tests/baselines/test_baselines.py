@@ -4,37 +4,25 @@ import numpy as np
 import pytest
 import shapely
 
-from flowrep.baselines import Planner, RandomActions, drives, never_turn
+from flowrep.baselines import Planner
 from flowrep.baselines.planner import GoalDistance
 
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
-def test_the_planner_arrives(make_street, speed):
-    ended = list(drives(make_street(speed=speed, sensors=()), Planner(), 5, seed=0))
-    assert [drive.outcome for drive in ended] == ["success"] * 5
+def test_the_planner_arrives(drive, speed):
+    assert [e.outcome for e in drive("planner", 5, speed=speed)] == ["success"] * 5
 
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
-def test_habit_and_chance_seldom_arrive(make_street, speed):
-    env = make_street(speed=speed, sensors=())
+def test_habit_and_chance_seldom_arrive(drive, speed):
     # With 60 episodes a true share of 12 % gives more than 15 in less than one run in 1,000.
-    straight = [drive.outcome for drive in drives(env, never_turn, 60, seed=0)]
+    straight = [e.outcome for e in drive("never_turn", 60, speed=speed)]
     assert straight.count("success") <= 15
     assert set(straight) <= {"success", "collision"}
-    by_chance = [drive.outcome for drive in drives(env, RandomActions(0), 60, seed=0)]
+    by_chance = [e.outcome for e in drive("random", 60, speed=speed)]
     assert by_chance.count("success") <= 6
-
-
-def test_all_baselines_are_given_the_same_episodes(make_street):
-    env = make_street(sensors=())
-    seeds = [
-        [drive.episode_seed for drive in drives(env, baseline, 4, seed=3)]
-        for baseline in (never_turn, RandomActions(1))
-    ]
-    assert seeds[0] == seeds[1]
-    assert len(set(seeds[0])) == 4
 
 
 def test_the_planner_plans_anew_where_it_is_led_astray(make_street, empty_road):

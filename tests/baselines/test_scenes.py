@@ -11,7 +11,7 @@ import pytest
 import shapely
 from gymnasium.utils.env_checker import check_env
 
-from flowrep.baselines import Planner, RandomActions, drives, never_turn
+from flowrep.baselines import Planner
 from flowrep.envs import SCENE_BY_ID
 from flowrep.envs.episode import Moment
 from flowrep.palette import CATEGORY_ID
@@ -201,14 +201,13 @@ def test_every_category_is_seen_on_a_drive(make_street, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TURNING)
 @pytest.mark.parametrize("speed", ["low", "normal", "high"])
-def test_the_planner_arrives_and_habit_and_chance_do_not(make_street, name, speed):
-    env = make_street(name, speed=speed, sensors=())
-    planned = [drive.outcome for drive in drives(env, Planner(), 3, seed=0)]
+def test_the_planner_arrives_and_habit_and_chance_do_not(drive, name, speed):
+    planned = [e.outcome for e in drive("planner", 3, name, speed=speed)]
     assert planned == ["success"] * 3
     # A bend ahead: straight on leads off the road or into somebody.
-    straight = [drive.outcome for drive in drives(env, never_turn, 20, seed=0)]
+    straight = [e.outcome for e in drive("never_turn", 20, name, speed=speed)]
     assert straight.count("success") == 0
-    by_chance = [drive.outcome for drive in drives(env, RandomActions(0), 20, seed=0)]
+    by_chance = [e.outcome for e in drive("random", 20, name, speed=speed)]
     assert by_chance.count("success") == 0
 
 

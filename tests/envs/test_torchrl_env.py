@@ -20,9 +20,9 @@ from flowrep.envs import (
     set_states,
     street_envs,
 )
+from flowrep.experiment.film import maps_of
 from flowrep.palette import CATEGORY_ID
 from flowrep.transforms import FlowFactorize, RawFlow
-from flowrep.viz.film import maps_of
 
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
 
@@ -241,7 +241,7 @@ def test_a_worker_steps_streets_without_pytorch(make):
     """It takes some 200 MiB and most of the time that a worker needs to start."""
     env = make(representations=["ego", "obj"], num_envs=2, num_workers=1)
     env.rollout(2)
-    (worker,) = env.base_env._env._group.workers
+    (worker,) = env.base_env._env._workers
     loaded = Path(f"/proc/{worker.process.pid}/maps").read_text()
     assert "pybullet" in loaded
     assert "libtorch" not in loaded

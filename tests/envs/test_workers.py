@@ -13,7 +13,6 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from flowrep.envs import WorkerError, WorkerVectorEnv
-from flowrep.envs.workers import worker_context
 
 pytestmark = pytest.mark.slow
 
@@ -188,7 +187,7 @@ def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make)
         raise KeyboardInterrupt
 
     with (
-        patch.object(env._group.workers[1], "receive", interrupted),
+        patch.object(env._workers[1], "receive", interrupted),
         pytest.raises(KeyboardInterrupt),
     ):
         env.step(np.array([1, 2, 3]))
@@ -196,17 +195,11 @@ def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make)
     assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
 
 
-def test_workers_that_run_another_copy_of_the_code_are_refused(make, monkeypatch):
-    monkeypatch.setattr("flowrep.envs.workers.__file__", "/elsewhere/worker_process.py")
-    with pytest.raises(WorkerError, match="another copy of this package"):
-        make(2, 1)
-
-
 def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
     env, other = make(3, 2), in_process(3)
     for each in (env, other):
         each.reset(seed=0)
-    for worker in env._group.workers:
+    for worker in env._workers:
         os.kill(worker.process.pid, signal.SIGINT)
         os.kill(worker.process.pid, signal.SIGTERM)
     assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
@@ -215,25 +208,11 @@ def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks into /proc")
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_such_signals_reach_no_worker_from_its_first_moment_on(make, num_workers):
-    worker = make(2, num_workers)._group.workers[0]
+    worker = make(2, num_workers)._workers[0]
     with open(f"/proc/{worker.process.pid}/status") as file:
         blocked = int(dict(line.split(":") for line in file)["SigBlk"], 16)
     assert all(blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM))
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & {signal.SIGINT, signal.SIGTERM}
-
-
-def parent_of(pid):
-    with open(f"/proc/{pid}/stat") as file:
-        return int(file.read().rsplit(")", 1)[1].split()[1])
-
-
-@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks into /proc")
-def test_several_workers_share_a_server_and_a_single_one_needs_none(make):
-    (alone,) = make(2, 1)._group.workers
-    assert parent_of(alone.process.pid) == os.getpid()
-    parents = {parent_of(worker.process.pid) for worker in make(2, 2)._group.workers}
-    assert len(parents) == 1
-    assert os.getpid() not in parents
 
 
 HOLDER = """
@@ -245,7 +224,7 @@ from flowrep.envs import WorkerVectorEnv
 if __name__ == "__main__":
     env = WorkerVectorEnv([Counter, Counter, Counter], int(sys.argv[1]))
     env.reset(seed=0)
-    print(*(worker.process.pid for worker in env._group.workers), flush=True)
+    print(*(worker.process.pid for worker in env._workers), flush=True)
     if "wait" in sys.argv:
         input()
 """
@@ -285,44 +264,3 @@ def test_no_worker_outlives_its_caller(tmp_path, num_workers, how):
     while any(is_running(pid) for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not any(is_running(pid) for pid in workers)
-    while list(tmp_path.glob("pymp-*")) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert not list(tmp_path.glob("pymp-*"))  # where the socket of the workers' server was
-
-
-GUARD = 'if __name__ == "__main__":'
-
-
-def run_script(tmp_path, text, num_workers):
-    script = tmp_path / "script.py"
-    script.write_text(text)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([".", *sys.path])}
-    return subprocess.run(
-        [sys.executable, str(script), str(num_workers)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env=environment,
-    )
-
-
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_a_script_needs_a_guard_only_for_environments_of_its_own(tmp_path, num_workers):
-    unguarded = HOLDER.replace(GUARD, "if True:")
-    result = run_script(tmp_path, unguarded, num_workers)
-    assert result.returncode == 0, result.stderr
-    assert result.stderr == ""
-    own = "class Own(Counter):\n    pass\n\n"
-    ours = HOLDER.replace("[Counter, ", "[Own, ").replace(GUARD, own + GUARD)
-    result = run_script(tmp_path, ours, num_workers)
-    assert result.returncode == 0, result.stderr
-    result = run_script(tmp_path, ours.replace(GUARD, "if True:"), num_workers)
-    assert result.returncode != 0
-    assert GUARD in result.stderr
-
-
-def test_a_folder_too_long_for_sockets_is_named(monkeypatch):
-    folder = "/tmp/" + 85 * "x"  # 90 bytes, and "/listener-12345678" makes 108
-    monkeypatch.setattr("flowrep.envs.workers.util.get_temp_dir", lambda: folder)
-    with pytest.raises(OSError, match=f"'{folder}' is too long for sockets: shorten TMPDIR"):
-        worker_context("flowrep.envs.workers", 2)

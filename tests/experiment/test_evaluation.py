@@ -1,4 +1,274 @@
-from flowrep.experiment.evaluation import outcome_shares, wilson_interval
+"""One loop drives every policy through the same episodes, and tables say how they ended."""
+
+import csv
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from torch import nn
+
+pytest.importorskip("pybullet", reason="policies drive the simulated street")
+
+from flowrep.agent.networks import DiscreteActions, stochastic_policy
+from flowrep.baselines import BaselinePolicy
+from flowrep.envs import make_env
+from flowrep.experiment.evaluation import (
+    Comparison,
+    evaluate,
+    failure_causes,
+    outcome_shares,
+    print_failures,
+    print_table,
+    save_drives,
+    scene_id,
+    wilson_interval,
+    write_failures,
+)
+from flowrep.experiment.run import EVALUATION_COLUMNS
+
+NO_OP = 0
+NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
+ACTIONS = DiscreteActions(3, "categorical", torch.distributions.Categorical)
+
+
+@pytest.fixture(scope="module")
+def scene(straight_road):
+    return replace(straight_road, camera=replace(straight_road.camera, height_px=12, width_px=20))
+
+
+class Weigher(nn.Module):
+    """Logits from sums over maps, so that an action depends on what is seen."""
+
+    def forward(self, *maps: torch.Tensor) -> torch.Tensor:
+        total = sum(m.float().flatten(1).sum(-1) for m in maps)
+        return torch.stack([0.5 * torch.cos(total + i) for i in range(3)], -1)
+
+
+def weigher(*names):
+    return stochastic_policy(Weigher(), list(names), ACTIONS)
+
+
+def straight_on(tensordict):
+    return tensordict.set("action", torch.full(tensordict.batch_size, NO_OP))
+
+
+def episodes(count, first=5, **options):
+    return [{"episode_seed": first + k, "speed": "low", **options} for k in range(count)]
+
+
+def outcomes(found):
+    """What an episode is known by, in the order of the seeds, whatever ended first."""
+    ended = [(e.seed, e.path, e.outcome, e.hit, round(e.total_reward, 4), e.length) for e in found]
+    return sorted(ended)
+
+
+def test_an_episode_is_that_of_the_gymnasium_env(make_street):
+    env = make_env("three_way_junction", num_envs=2)
+    found = {e.seed: e for e in evaluate(env, straight_on, episodes(3, first=4, path="right"))}
+    env.close()
+    street = make_street("three_way_junction", speed="low", sensors=())
+    for seed, episode in found.items():
+        _, info = street.reset(options={"episode_seed": seed, "path": "right"})
+        positions, total = [street.episode.now.vehicle[:2]], 0.0
+        while info["outcome"] == "running":
+            _, reward, _, _, info = street.step(NO_OP)
+            positions.append(street.episode.now.vehicle[:2])
+            total += reward
+        assert (episode.outcome, episode.hit) == (info["outcome"], info["hit"])
+        assert (episode.path, episode.speed, episode.fps) == ("right", "low", 12.0)
+        assert episode.length == street.episode.steps
+        assert episode.total_reward == pytest.approx(total, abs=1e-5)
+        np.testing.assert_allclose(episode.positions, positions, atol=1e-4)
+    # From the middle of the start zone, at 10 m/s and 12 steps per second, straight along x.
+    np.testing.assert_allclose(
+        found[4].positions[:3], [(7, 0), (7 + 10 / 12, 0), (7 + 20 / 12, 0)], atol=1e-5
+    )
+
+
+def test_the_policy_sees_the_busy_places_and_which_of_them_have_just_begun(scene):
+    env, seen = make_env(scene, ["depth"], num_envs=3), []
+
+    def act(tensordict):
+        seen.append((tensordict["env_id"].tolist(), tensordict["is_init"].flatten().tolist()))
+        assert tensordict["depth"].shape == (len(tensordict), 1, 12, 20)
+        return straight_on(tensordict)
+
+    found = list(evaluate(env, act, episodes(4)))
+    env.close()
+    assert len(found) == 4
+    assert seen[0] == ([0, 1, 2], [True, True, True])
+    assert seen[1] == ([0, 1, 2], [False, False, False])
+    assert len(seen[-1][0]) == 1  # the others are idle by then
+    begun = sum(sum(is_init) for _, is_init in seen)
+    assert begun == 4
+    assert sum(len(ids) for ids, _ in seen) == sum(e.length for e in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("greedy", [True, False])
+@pytest.mark.parametrize("names", [["obj", "seg2"], ["depth2"]])
+def test_an_episode_does_not_depend_on_what_else_is_in_the_batch(scene, names, greedy):
+    made = partial(make_env, scene, names, noise=NOISE)
+    runs = []
+    for num_envs, num_workers in ((1, 0), (3, 0), (5, 2)):
+        env = made(num_envs=num_envs, num_workers=num_workers)
+        runs.append(outcomes(evaluate(env, weigher(*names), episodes(7), greedy=greedy)))
+        env.close()
+    assert runs[0] == runs[1] == runs[2]
+    assert len({(outcome, length) for _, _, outcome, _, _, length in runs[0]}) > 3
+
+
+def test_sampled_actions_differ_from_greedy_ones_and_repeat(scene):
+    env = make_env(scene, ["obj"], num_envs=3)
+    greedy, *sampled = (
+        outcomes(evaluate(env, weigher("obj"), episodes(4), greedy=greedy))
+        for greedy in (True, False, False)
+    )
+    env.close()
+    assert sampled[0] == sampled[1] != greedy
+
+
+def test_a_baseline_and_its_agent_twin_live_through_the_same_episodes(scene):
+    seeing, blind = make_env(scene, ["depth"], num_envs=2), make_env(scene, num_envs=3)
+    agent = outcomes(evaluate(seeing, straight_on, episodes(6)))
+    assert agent == outcomes(evaluate(blind, BaselinePolicy("never_turn", blind), episodes(6)))
+    random = outcomes(evaluate(blind, BaselinePolicy("random", blind), episodes(6)))
+    assert [row[0] for row in random] == [row[0] for row in agent]
+    assert random != agent
+    seeing.close()
+    blind.close()
+
+
+def test_every_frame_is_shown_from_the_reset_to_the_last_step(scene):
+    env, frames = make_env(scene, ["seg"], keep_sensor=True), []
+    (episode,) = evaluate(env, straight_on, episodes(1), on_frame=frames.append)
+    env.close()
+    assert len(frames) == episode.length + 1
+    assert [int(frame["outcome"]) for frame in frames[:-1]] == [0] * episode.length
+    assert int(frames[-1]["outcome"]) != 0
+
+
+ASKED = {"speeds": ["low", "high"], "fps": [12, 6], "episodes": 3, "seed": 5}
+
+
+@pytest.fixture(scope="module")
+def comparison(scene):
+    compared = Comparison(**ASKED, policies=["greedy", "sampled"], baselines=["random"])
+    compared.run(partial(make_env, scene, representations=["obj"]), weigher("obj"), num_envs=4)
+    return compared
+
+
+def test_rows_come_in_the_order_of_what_was_asked(comparison):
+    assert comparison.is_complete
+    rows = comparison.rows()
+    order = [(row["speed"], row["fps"], row["policy"], row["episode_seed"]) for row in rows]
+    names = "greedy", "sampled", "random"
+    assert order == [
+        (s, f, name, k)
+        for s in ("low", "high")
+        for f in (12.0, 6.0)
+        for name in names
+        for k in (5, 6, 7)
+    ]
+    for row in rows:
+        end = 5.0 if row["outcome"] == "success" else -5.0
+        assert row["return"] == pytest.approx(end + 0.01 * row["length"], abs=1e-9)
+
+
+def test_rows_have_the_columns_of_evaluation_csv(comparison, scene):
+    names = ("scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation")
+    assert {*comparison.rows(**dict.fromkeys(names, ""))[0]} == {*EVALUATION_COLUMNS}
+
+
+def test_another_agents_run_keeps_the_baselines_episodes(comparison, scene):
+    before = comparison.rows()
+    made = []
+
+    def make(**changes):
+        made.append(changes)
+        return make_env(scene, **{"representations": ["obj"]} | changes)
+
+    comparison.run(make, straight_on_policy(), num_envs=4)
+    after = comparison.rows()
+    of_random = [row for row in before if row["policy"] == "random"]
+    assert [row for row in after if row["policy"] == "random"] == of_random
+    assert after != before
+    assert len(made) == 2  # an env for each frame rate, none for baselines
+
+
+def straight_on_policy():
+    class Ahead(nn.Module):
+        def forward(self, obj):
+            return torch.tensor([1.0, 0.0, 0.0]).expand(len(obj), 3)
+
+    return stochastic_policy(Ahead(), ["obj"], ACTIONS)
+
+
+def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
+    stopped = Comparison(**ASKED | {"episodes": 6, "speeds": ["low"], "fps": [12]})
+    done = []
+    stopped.run(
+        partial(make_env, scene, representations=["obj"]),
+        weigher("obj"),
+        num_envs=6,
+        should_stop=lambda: done.append(1) or len(done) == 3,
+    )
+    assert not stopped.is_complete
+    (found,) = stopped._found.values()
+    assert len(found) == 3
+    gap = next(k for k in range(6) if 5 + k not in found)
+    assert [row["episode_seed"] for row in stopped.rows()] == [5 + k for k in range(gap)]
+
+
+def test_what_is_complete_is_saved_before_the_rest_is_run(scene):
+    asked = Comparison(**ASKED | {"episodes": 2, "fps": [12]}, baselines=["never_turn"])
+    saved = []
+    asked.run(
+        partial(make_env, scene, representations=["obj"]),
+        weigher("obj"),
+        num_envs=2,
+        save=lambda: saved.append(len(asked.rows())),
+    )
+    assert saved[-1] == 8
+    assert 2 <= saved[0] < 8
+
+
+def test_a_scene_is_known_by_all_that_it_is(scene):
+    assert scene_id(scene) == scene_id(replace(scene))
+    assert scene_id(scene) != scene_id(replace(scene, time_limit_steps=3))
+    assert len(scene_id(scene)) == 8
+
+
+def test_drives_are_kept_by_episode_and_replaced_when_driven_again(tmp_path):
+    path = tmp_path / "drives.npz"
+    same = {"scene_id": "ab", "evaluation": "final", "frames": 9, "policy": "greedy"}
+    same |= {"speed": "low", "fps": 12.0, "outcome": "success"}
+    rows = [same | {"episode_seed": seed} for seed in (1, 2)]
+    first, second, other = (np.full((n, 2), n, np.float32) for n in (3, 4, 5))
+    save_drives(path, rows, [first, second])
+    save_drives(path, rows[:1], [other])
+    with np.load(path, allow_pickle=False) as saved:
+        assert saved["episode_seed"].tolist() == [1, 2]
+        assert saved["policy"].tolist() == ["greedy", "greedy"]
+        starts = saved["starts"]
+        np.testing.assert_array_equal(saved["positions"][starts[0] : starts[1]], other)
+        np.testing.assert_array_equal(saved["positions"][starts[1] : starts[2]], second)
+    assert [file.name for file in tmp_path.iterdir()] == ["drives.npz"]
+
+
+def test_the_table_shows_shares_with_wilson_intervals():
+    rows = [
+        {"speed": "low", "fps": 12.0, "policy": "greedy", "outcome": outcome}
+        for outcome in ["success"] * 8 + ["collision"] * 2
+    ]
+    console = Console(record=True, width=100)
+    print_table(rows, console)
+    text = console.export_text()
+    assert "80 [49–94]" in text  # Wilson's interval of 8 in 10, by hand: 0.490 to 0.943
+    assert "20 [6–51]" in text
 
 
 def test_no_episodes_say_nothing():
@@ -20,3 +290,71 @@ def test_the_share_is_within_its_interval_also_when_all_or_none_succeed():
     for trials in range(1, 400):  # at 192 of 192, for example, the end is rounded to less than 1
         assert wilson_interval(trials, trials)[1] == 1.0
         assert wilson_interval(0, trials)[0] == 0.0
+
+
+ENDS = [
+    ("success", ""),
+    ("success", ""),
+    ("collision", "pedestrian"),
+    ("collision", "pedestrian"),
+    ("collision", "car"),
+    ("collision", "pedestrian"),
+    ("out_of_bounds", ""),
+    ("out_of_bounds", ""),
+    ("timeout", ""),
+    ("timeout", ""),
+]
+
+
+def failed_rows(policy="greedy", ends=ENDS):
+    same = {"scene": "s_turn", "representations": "ego+obj", "speed": "low", "fps": 12.0}
+    return [same | {"policy": policy, "outcome": outcome, "hit": hit} for outcome, hit in ends]
+
+
+def test_shares_are_of_the_failures():
+    (line,) = failure_causes(failed_rows())
+    assert (line["episodes"], line["failures"]) == (10, 8)
+    # Of 8: 2 off the road, 3 into people, 1 into a car, 2 too slow.
+    assert line["out of bounds"] == 25.0
+    assert line["collision: pedestrian"] == 37.5
+    assert line["collision: other"] == 12.5
+    assert line["timeout"] == 25.0
+    assert line["out of bounds to collisions"] == 0.5
+
+
+def test_policies_are_told_apart_and_no_failure_has_no_shares():
+    greedy, planner = failure_causes(failed_rows() + failed_rows("planner", [("success", "")] * 3))
+    assert (greedy["policy"], planner["policy"]) == ("greedy", "planner")
+    assert (planner["failures"], planner["timeout"]) == (0, "")
+
+
+def test_an_agent_is_not_mixed_with_what_it_was_earlier_in_training():
+    early = [row | {"frames": 1000} for row in failed_rows(ends=[("out_of_bounds", "")] * 4)]
+    late = [row | {"frames": 9000} for row in failed_rows(ends=[("collision", "pedestrian")] * 2)]
+    first, last = failure_causes(early + late)
+    assert (first["frames"], first["failures"], first["out of bounds"]) == ("1000", 4, 100.0)
+    assert (last["frames"], last["failures"], last["out of bounds"]) == ("9000", 2, 0.0)
+
+
+def test_the_table_is_printed_and_replaced(tmp_path):
+    console = Console(record=True, width=120)
+    print_failures(failed_rows(), console)
+    text = console.export_text()
+    assert "8 of 10" in text
+    assert "pedestrian" in text
+    path = tmp_path / "failures.csv"
+    write_failures(path, failed_rows() + failed_rows("random"))
+    write_failures(path, failed_rows())
+    with path.open(newline="") as file:
+        (line,) = csv.DictReader(file)
+    assert line["collision: pedestrian"] == "37.5"
+    assert float(line["timeout"]) == pytest.approx(25.0)
+
+
+def test_nothing_of_the_table_is_cut_off_where_little_fits():
+    console = Console(record=True, width=100)
+    print_failures(failed_rows("never_turn") + failed_rows("sampled"), console)
+    text = console.export_text()
+    assert "…" not in text
+    for word in ("never_turn", "bounds", "pedestrian", "timeout", "8 of 10"):
+        assert word in text

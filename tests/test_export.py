@@ -12,8 +12,8 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from flowrep.agent import PPO, DiscreteSAC, DoubleDQN
 from flowrep.agent.networks import PolicyNetwork
-from flowrep.exchange.policies import Task, load_policy
-from flowrep.exchange.programs import ExportError, acting_program, write_agent
+from flowrep.experiment.agents import Task, load_policy
+from flowrep.export import ExportError, acting_program, write_agent
 
 HEIGHT, WIDTH, CLASSES = 40, 52, 5
 SPEC = Composite(

@@ -1,7 +1,9 @@
 """Policies of somebody else's: what they see, and what is said of those that can't be used."""
 
+import json
 import shutil
 import sys
+from dataclasses import replace
 from importlib import import_module
 from zipfile import ZipFile
 
@@ -11,8 +13,14 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Categorical, Composite, Unbounded
 
-from flowrep.exchange import policies
-from flowrep.exchange.policies import ForeignPolicy, PolicyError, Task, load_policy
+from flowrep.experiment import agents
+from flowrep.experiment.agents import (
+    ExternalPolicy,
+    PolicyError,
+    Task,
+    check_card,
+    load_policy,
+)
 
 TASK = Task(
     scene="straight_road",
@@ -29,7 +37,7 @@ def maps(count=2):
         {
             "ego": torch.zeros(count, 2, 4, 6),
             "depth": torch.arange(1.0, count + 1).reshape(-1, 1, 1, 1).expand(-1, 1, 4, 6),
-            "street": torch.arange(count),
+            "env_id": torch.arange(count),
             "is_init": torch.ones(count, 1, dtype=torch.bool),
             "outcome": torch.zeros(count, 1),
         },
@@ -54,7 +62,7 @@ def written(tmp_path, body):
     ids=["list", "tensor", "array", "tensordict"],
 )
 def test_actions_may_come_in_any_form(given):
-    policy = ForeignPolicy("mine", lambda maps: given, TASK)
+    policy = ExternalPolicy("mine", lambda maps: given, TASK)
     action = policy(maps())["action"]
     assert action.dtype == torch.int64
     assert action.tolist() == [2, 0]
@@ -62,24 +70,14 @@ def test_actions_may_come_in_any_form(given):
 
 def test_a_policy_sees_its_maps_and_nothing_of_the_env():
     seen = []
-    ForeignPolicy("mine", lambda maps: seen.append(maps) or [0, 0], TASK)(maps())
-    assert sorted(seen[0].keys()) == ["depth", "ego", "is_init", "street"]
+    ExternalPolicy("mine", lambda maps: seen.append(maps) or [0, 0], TASK)(maps())
+    assert sorted(seen[0].keys()) == ["depth", "ego", "env_id", "is_init"]
     assert seen[0].batch_size == (2,)
 
 
 def test_a_torchrl_module_is_a_policy():
     module = TensorDictModule(lambda depth: depth[:, 0, 0, 0].long(), ["depth"], ["action"])
-    assert ForeignPolicy("mine", module, TASK)(maps())["action"].tolist() == [1, 2]
-
-
-def test_alone_on_a_street_only_its_first_step_is_an_initial_one():
-    begun = []
-    policy = ForeignPolicy("mine", lambda maps: begun.append(maps["is_init"].item()) or [1], TASK)
-    for _ in range(2):  # two episodes
-        act = policy.alone()
-        step = maps(1).exclude("street", "is_init")
-        assert sorted(act(act(step)).keys()) == ["action", "depth", "ego", "outcome"]
-    assert begun == [True, False, True, False]
+    assert ExternalPolicy("mine", module, TASK)(maps())["action"].tolist() == [1, 2]
 
 
 def test_make_is_told_the_task_and_may_import_what_lies_beside_it(tmp_path):
@@ -119,7 +117,7 @@ def test_a_program_that_torch_saved_is_a_policy(tmp_path):
 )
 def test_what_is_no_action_is_named(given, said):
     with pytest.raises(PolicyError) as caught:
-        ForeignPolicy("mine", lambda maps: given, TASK)(maps())
+        ExternalPolicy("mine", lambda maps: given, TASK)(maps())
     assert str(caught.value).startswith(f"policy 'mine' {said}")
 
 
@@ -161,7 +159,7 @@ def installed(tmp_path, monkeypatch):
     """The module under test as a wheel has it, in the folder of libraries, with a policy beside."""
     folder = tmp_path / "site-packages"
     folder.mkdir()
-    shutil.copy(policies.__file__, folder / "installed_policies.py")
+    shutil.copy(agents.__file__, folder / "installed_policies.py")
     (folder / "installed_policy.py").write_text(
         "import torch\n"
         "def make(task):\n"
@@ -205,3 +203,111 @@ def test_what_is_not_there_is_named(reference, said):
     with pytest.raises(PolicyError) as caught:
         load_policy(reference, TASK)
     assert said in str(caught.value)
+
+
+# An exported agent on maps other than its own is refused, with what it takes to put it right.
+
+# 60 degrees up and down 30 rows are 15 / tan(30) = 25.98 pixels of focal length.
+K = [[25.98076, 0.0, 26.5], [0.0, 25.98076, 14.5], [0.0, 0.0, 1.0]]
+OPTIONS = {"ego": {"scale": 1.0, "unit": "px_per_step"}, "seg": {"encoding": "ids"}}
+CARD = {
+    "maps": [
+        {"name": "ego", "shape": [2, 30, 52], "options": OPTIONS["ego"]},
+        {"name": "seg", "shape": [1, 30, 52], "options": OPTIONS["seg"]},
+    ],
+    "intrinsics": K,
+    "num_classes": 5,
+    "scene": "straight_road",
+}
+
+
+def task(names=("ego", "seg"), size=(30, 52), classes=5, **changes):
+    specs = {
+        "ego": Unbounded((2, *size)),
+        "seg": Categorical(classes, (1, *size), dtype=torch.uint8),
+        "depth": Unbounded((1, *size)),
+    }
+    made = Task(
+        scene="straight_road",
+        representations={name: OPTIONS.get(name, {}) for name in names},
+        observation_spec=Composite({name: specs[name] for name in names}),
+        action_spec=Categorical(3),
+        intrinsics=torch.tensor(K),
+        device=torch.device("cpu"),
+    )
+    return replace(made, **changes)
+
+
+@pytest.fixture(params=["agent.pt2", "load_agent.py:make"])
+def agent(request, tmp_path):
+    (tmp_path / "agent.json").write_text(json.dumps(CARD))
+    return f"{tmp_path}/{request.param}"
+
+
+def refusal(agent, task):
+    with pytest.raises(PolicyError) as caught:
+        check_card(agent, task)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(f"policy '{agent}' was trained on other maps than those of ")
+    return message.split(" than those of ")[1]
+
+
+def test_an_agent_passes_on_its_own_maps(agent):
+    check_card(agent, task())
+
+
+SCALED = {**OPTIONS, "ego": {"scale": 0.5, "unit": "px_per_step"}}
+
+
+@pytest.mark.parametrize(
+    ("shown", "here", "give"),
+    [
+        (
+            task(size=(60, 104), intrinsics=2 * torch.tensor(K)),
+            "scene.camera.height_px=60 scene.camera.width_px=104",
+            "scene.camera.height_px=30 scene.camera.width_px=52",
+        ),
+        (  # 15 pixels of focal length see 45 degrees up and 45 down
+            task(intrinsics=torch.tensor([[15.0, 0, 26.5], [0, 15.0, 14.5], [0, 0, 1]])),
+            "scene.camera.fov_deg=90.0",
+            "scene.camera.fov_deg=60.0",
+        ),
+        (task(["ego"]), "representations=[ego]", "representations=[ego,seg]"),
+        (task(["depth"]), "representations=[depth]", "representations=[ego,seg]"),
+        (
+            task(representations=SCALED),
+            "representations.ego.scale=0.5",
+            "representations.ego.scale=1.0",
+        ),
+        (task(classes=6, scene="s_turn"), "scene=s_turn", "scene=straight_road"),
+    ],
+    ids=["size", "view", "one too few", "others", "options", "classes"],
+)
+def test_other_maps_are_refused_with_the_overrides_for_its_own(agent, shown, here, give):
+    assert refusal(agent, shown) == f"{here}; give {give}"
+
+
+def test_the_loader_picks_its_maps_by_name_and_the_program_by_their_order(agent):
+    for names in (["seg", "ego"], ["ego", "depth", "seg"]):
+        if agent.endswith(".pt2"):
+            said = refusal(agent, task(names))
+            assert said == f"representations=[{','.join(names)}]; give representations=[ego,seg]"
+        else:
+            check_card(agent, task(names))
+
+
+def test_policies_that_flowrep_did_not_export_are_left_alone(tmp_path):
+    other = task(size=(9, 9))
+    check_card("package.module:make", other)
+    check_card("/:make", other)
+    check_card(f"{tmp_path}/agent.pt2", other)  # without a card
+    (tmp_path / "agent.json").write_text(json.dumps(CARD))
+    check_card(f"{tmp_path}/mine.py:make", other)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"maps": []}', '{"maps": [{"name": "ego"}]}'])
+def test_a_damaged_card_is_named(text, tmp_path):
+    (tmp_path / "agent.json").write_text(text)
+    with pytest.raises(PolicyError, match=r"agent\.json doesn't describe an exported agent"):
+        check_card(f"{tmp_path}/agent.pt2", task())

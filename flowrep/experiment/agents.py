@@ -1,0 +1,378 @@
+"""Agents to evaluate, film or view: those of runs, and policies of the user's own."""
+
+import json
+import math
+import sys
+import sysconfig
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.export.passes import move_to_device_pass
+from torchrl.data import Categorical, Composite, TensorSpec
+from torchrl.envs import EnvBase
+
+from flowrep.agent import CheckpointError, load_checkpoint
+from flowrep.config.schema import EnvConfig, Noise, validated, validated_run
+from flowrep.envs import street_envs
+from flowrep.experiment import build
+from flowrep.experiment.evaluation import Policy
+from flowrep.experiment.run import RunFolder, check_origin, origin_of
+
+PROGRAM, CARD, LOADER = "agent.pt2", "agent.json", "load_agent.py"
+"""The files of an exported agent: the program that runs it, what describes it, what loads it."""
+
+_STANDARD_LIBRARY = (sysconfig.get_path("stdlib"), "<frozen ")
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A policy and the env in which it acts.
+
+    Args:
+        policy: writes `action`.
+        config: of the env.
+        frames: the frames that the policy was trained for; 0 if unknown.
+        trained_in: the name of the scene in which it was trained, None if unknown.
+    """
+
+    policy: Policy
+    config: EnvConfig
+    frames: int = 0
+    trained_in: str | None = None
+
+    def make_env(self, **changes: Any) -> EnvBase:
+        """Returns an env of its config; `changes` override arguments of `make_env`."""
+        return build.env(self.config, **changes)
+
+
+def load_trained(
+    run: RunFolder, *, scene: Mapping[str, Any] | None = None, **machine: Any
+) -> Agent:
+    """Returns a run's agent.
+
+    Args:
+        run: the run's folder.
+        scene: the scene to act in, seen with the agent's own camera; by default the run's own.
+        machine: `device`, `num_envs` and `num_workers`, in place of the run's.
+
+    Raises:
+        UsageError: its config is damaged.
+        CheckpointError: there is no checkpoint, it is damaged or belongs to another run, or the
+            agent can't see all classes of the scene.
+    """
+    own = validated_run(run.read_config(), f"{run.path}/config.yaml")
+    path = run.checkpoint_path
+    state = load_checkpoint(path, ["origin", "frames", "policy"])
+    check_origin(state["origin"], origin_of(own.plain()), path)
+    if scene is not None:
+        machine["scene"] = {**scene, "camera": own.scene["camera"]}
+    config = own.model_copy(update=machine)
+    env = build.env(config, num_envs=1, num_workers=0)
+    policy = build.policy(config, env)
+    env.close()
+    try:
+        policy.load_state_dict(state["policy"])
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise CheckpointError(
+            f"the agent of {run.path} can't be used in scene '{config.scene['name']}', which has "
+            f"other classes than its own ({reason})"
+        ) from error
+    return Agent(policy, config, state["frames"], own.scene["name"])
+
+
+def load_external(
+    reference: str,
+    *,
+    scene: Mapping[str, Any],
+    representations: Mapping[str, Any],
+    flow: Mapping[str, Any] | None = None,
+    noise: Mapping[str, float] | None = None,
+    **machine: Any,
+) -> Agent:
+    """Returns a policy of the user's own, with the observations that are asked for.
+
+    Args:
+        reference: see `load_policy`.
+        scene: the scene to act in.
+        representations: what the policy sees: a mapping from name to options.
+        flow: the source of raw and obj; exact if None.
+        noise: errors of depth and motion; none if None.
+        machine: `device`, `num_envs` and `num_workers`.
+
+    Raises:
+        PolicyError: as `check_card` and `load_policy`.
+    """
+    config = validated(
+        EnvConfig,
+        {
+            "scene": scene,
+            "representations": representations,
+            "flow": flow or {"source": "exact"},
+            "noise": noise or dict.fromkeys(Noise.key_names(), 0.0),
+            "speed": "normal",
+            "renderer": "auto",
+            "seed": 0,
+        }
+        | machine,
+    )
+    env = build.env(config, num_envs=1, num_workers=0)
+    task = Task(
+        scene=config.scene["name"],
+        representations=config.representations,
+        observation_spec=Composite(
+            {name: env.observation_spec[name][0] for name in config.representations}
+        ),
+        action_spec=env.action_spec[0],
+        intrinsics=torch.from_numpy(street_envs(env)[0].K),
+        device=build.device(config.device),
+    )
+    env.close()
+    check_card(reference, task)
+    return Agent(load_policy(reference, task), config)
+
+
+class PolicyError(Exception):
+    """An external policy is missing, fails or returns no actions; the message names it."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """The task, as described to the function that makes an external policy.
+
+    Args:
+        scene: its name.
+        representations: the maps' names, in the requested order, with their options.
+        observation_spec: of the maps of one environment, `[C, H, W]` each.
+        action_spec: of one environment: 0 goes straight on, 1 turns left, 2 turns right.
+        intrinsics: K `[3, 3]` of the maps, pixels.
+        device: of the maps.
+    """
+
+    scene: str
+    representations: Mapping[str, Any]
+    observation_spec: Composite
+    action_spec: TensorSpec
+    intrinsics: Tensor
+    device: torch.device
+
+
+class ExternalPolicy:
+    """Writes `action` `[N]`, computed by an external function.
+
+    The function takes a TensorDict of batch `[N]` that holds only the task's maps `[N, C, H, W]`,
+    `env_id` int64 `[N]` and `is_init` bool `[N, 1]`, for policies that remember: each row's
+    environment, and whether its episode just began. It returns N integers (a tensor, an array or a
+    list), or the TensorDict with `action`.
+
+    Args:
+        name: of the policy, for error messages.
+        act: the function.
+        task: the policy's task.
+    """
+
+    def __init__(self, name: str, act: Callable[[TensorDictBase], Any], task: Task) -> None:
+        self.name, self._act, self._task = name, act, task
+
+    def __call__(self, maps: TensorDictBase) -> TensorDictBase:
+        """Returns the maps with `action`.
+
+        Raises:
+            PolicyError: if the function fails or returns anything but actions.
+        """
+        seen = maps.select(*self._task.representations, "env_id", "is_init")
+        with _named(self.name):
+            given = self._act(seen)
+        if isinstance(given, TensorDictBase):
+            given = given.get("action")
+        return maps.set("action", self._checked(given, len(maps)))
+
+    def _checked(self, given: Any, count: int) -> Tensor:
+        n = int(self._task.action_spec.space.n)
+        try:
+            actions = torch.as_tensor(given).cpu()
+            what = f"{actions.dtype} of shape {tuple(actions.shape)}"
+        except (TypeError, ValueError, RuntimeError):
+            actions, what = torch.empty(0), f"a {type(given).__name__}"
+        is_whole = not (actions.is_floating_point() or actions.is_complex())
+        if is_whole and actions.shape == (count,):
+            if ((actions >= 0) & (actions < n)).all():
+                return actions.long()
+            what = str(actions.tolist())
+        raise PolicyError(
+            f"policy '{self.name}' returned {what}; expected {count} whole numbers from 0 to "
+            f"{n - 1}, one action per environment"
+        )
+
+
+def load_policy(reference: str, task: Task) -> ExternalPolicy:
+    """Returns an external policy.
+
+    Args:
+        reference: `path.py:make` or `package.module:make`, a function that is called with the task
+            and returns the policy's function; or `path.pt2`, a program saved by `torch.export.save`
+            that takes the maps as arguments, in the task's order, and returns a score per action.
+        task: the policy's task.
+
+    Raises:
+        PolicyError: if the file, module or function doesn't exist or fails.
+    """
+    place, _, name = reference.rpartition(":")
+    with _named(reference):
+        if reference.endswith(".pt2"):
+            return ExternalPolicy(reference, _program(reference, task), task)
+        module = _module(place)
+        make = getattr(module, name, None)
+        if not callable(make):
+            there = [key for key, value in vars(module).items() if _is_own(value, module)]
+            found = ", ".join(there) or "none"
+            raise PolicyError(f"{place} has no function '{name}'; there are: {found}")
+        act = make(task)
+        if not callable(act):
+            raise PolicyError(
+                f"{name}(task) returned a {type(act).__name__}; expected a function of a "
+                "TensorDict of maps"
+            )
+    return ExternalPolicy(reference, act, task)
+
+
+def _module(place: str) -> Any:
+    if not place.endswith(".py"):
+        try:
+            return import_module(place)
+        except ModuleNotFoundError as error:
+            if error.name and place.startswith(error.name):
+                raise PolicyError(
+                    f"there is no module {error.name}; is its folder in PYTHONPATH? A file is "
+                    "named with its ending: path.py:make"
+                ) from None
+            raise
+    path = Path(place)
+    if not path.is_file():
+        raise PolicyError(f"there is no file {place}")
+    sys.path.insert(0, str(path.parent.resolve()))  # as Python does for a script
+    spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[module.__name__] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
+    if not Path(path).is_file():
+        raise PolicyError("there is no such file")
+    # moving the module alone would leave the devices that its graph names
+    program = move_to_device_pass(torch.export.load(path), task.device).module()
+    return lambda maps: program(*(maps[name] for name in task.representations)).argmax(-1)
+
+
+def _is_own(value: Any, module: Any) -> bool:
+    return callable(value) and getattr(value, "__module__", "") == module.__name__
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Turns any exception in external code into a PolicyError of one line, with its location."""
+    try:
+        yield
+    except PolicyError as error:
+        raise PolicyError(f"policy '{name}': {error}") from error.__cause__
+    except Exception as error:
+        text = str(error).strip().splitlines()
+        raise PolicyError(
+            f"policy '{name}' failed: {type(error).__name__}: {text[0] if text else ''}"
+            f"{_place(error.__traceback__)}"
+        ) from error
+
+
+def _place(trace: Any) -> str:
+    """Returns the last line of the author's own code, rather than one deep in a library."""
+    frames = [frame for frame in traceback.extract_tb(trace) if frame.filename != __file__]
+    installed = [frame for frame in frames if "site-packages" in frame.filename]
+    own = [
+        frame
+        for frame in frames
+        if frame not in installed and not frame.filename.startswith(_STANDARD_LIBRARY)
+    ]
+    # a policy may be installed as well; then it is the line that flowrep called
+    for frame in own[-1:] or installed[:1]:
+        return f" ({frame.filename}, line {frame.lineno})"
+    return ""
+
+
+def check_card(reference: str, task: Task) -> None:
+    """Checks that an exported agent gets maps like those that it was trained on.
+
+    A policy that isn't `agent.pt2` or `load_agent.py` with an `agent.json` beside it passes.
+
+    Args:
+        reference: of the policy, see `load_policy`.
+        task: the policy's task.
+
+    Raises:
+        PolicyError: the maps differ in what they are, in size, field of view, options or classes;
+            the message has the overrides that give the right ones. Or agent.json is damaged.
+    """
+    agent = Path(reference.removesuffix(":make"))
+    path = agent.parent / CARD
+    if agent.name not in (PROGRAM, LOADER) or not path.is_file():
+        return
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+        trained, here = _settings(card, task, any_order=agent.name == LOADER)
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise PolicyError(
+            f"policy '{reference}': {path} doesn't describe an exported agent "
+            f"({type(error).__name__}: {error}); export it again"
+        ) from error
+    if wrong := [key for key in trained if trained[key] != here[key]]:
+        raise PolicyError(
+            f"policy '{reference}' was trained on other maps than those of "
+            f"{_overrides(here, wrong)}; give {_overrides(trained, wrong)}"
+        )
+
+
+def _settings(
+    card: Mapping[str, Any], task: Task, *, any_order: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns what the maps depend on, by its key on the command line: in training, and here."""
+    maps = {each["name"]: each for each in card["maps"]}
+    shown = [name for name in maps if name in task.representations]
+    suffices = any_order and shown == list(maps)
+    trained: dict[str, Any] = {"representations": list(maps)}
+    here: dict[str, Any] = {"representations": shown if suffices else list(task.representations)}
+    shape = task.observation_spec[next(iter(task.representations))].shape
+    trained |= _camera(card["maps"][0]["shape"], card["intrinsics"])
+    here |= _camera(shape, task.intrinsics.tolist())
+    for name in shown:
+        for option, value in maps[name]["options"].items():
+            key = f"representations.{name}.{option}"
+            trained[key], here[key] = value, task.representations[name].get(option)
+        spec = task.observation_spec[name]
+        if isinstance(spec, Categorical) and spec.n != card["num_classes"]:
+            trained["scene"], here["scene"] = card["scene"], task.scene
+    return trained, here
+
+
+def _camera(shape: Sequence[int], K: Sequence[Sequence[float]]) -> dict[str, Any]:
+    height, width = shape[-2:]
+    fov_deg = 2 * math.degrees(math.atan(height / 2 / K[1][1]))
+    size = {"scene.camera.height_px": height, "scene.camera.width_px": width}
+    return size | {"scene.camera.fov_deg": round(fov_deg, 3)}
+
+
+def _overrides(settings: Mapping[str, Any], keys: Sequence[str]) -> str:
+    """Returns settings as on the command line, `representations=[ego,obj] scene=s_turn`."""
+    texts = {key: json.dumps(settings[key], separators=(",", ":")) for key in keys}
+    return " ".join(f"{key}={text}" for key, text in texts.items()).replace('"', "")
