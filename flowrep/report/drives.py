@@ -2,8 +2,8 @@
 
 `drives.npz` beside evaluation.csv holds where the vehicle was in each evaluated episode:
 `positions` [sum of T, 2] in world metres, `starts` [N + 1] (episode n is
-`positions[starts[n]:starts[n + 1]]`), and for each episode `policy`, `speed`, `fps`, `frames`,
-`episode_seed` and `outcome` as in evaluation.csv.
+`positions[starts[n]:starts[n + 1]]`), and for each episode `evaluation`, `policy`, `speed`, `fps`,
+`frames`, `episode_seed` and `outcome` as in evaluation.csv.
 """
 
 from collections import Counter
@@ -88,6 +88,7 @@ def tracks_of(run: Run, count: int) -> list[Track]:
         with np.load(path) as saved:
             ours = (saved["policy"] == "greedy") & (saved["speed"] == run.speed)
             ours &= (saved["fps"] == run.fps) & (saved["frames"] >= run.total_frames)
+            ours &= saved["evaluation"] != "training"
             chosen = np.flatnonzero(ours)
             chosen = chosen[np.argsort(saved["episode_seed"][chosen], kind="stable")][:count]
             positions, starts, outcomes = saved["positions"], saved["starts"], saved["outcome"]

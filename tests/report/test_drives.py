@@ -18,6 +18,7 @@ def write_drives(folder, **changes):
     saved = {
         "positions": np.arange(12, dtype=np.float32).reshape(6, 2),
         "starts": np.array([0, 2, 5, 6]),
+        "evaluation": np.array(["final"] * 3),
         "policy": np.array(["greedy"] * 3),
         "speed": np.array(["normal"] * 3),
         "fps": np.full(3, 12.0),
@@ -44,6 +45,7 @@ def test_tracks_are_those_of_the_first_episodes(tmp_path):
 @pytest.mark.parametrize(
     "changes",
     [
+        {"evaluation": np.array(["training"] * 3)},
         {"policy": np.array(["sampled"] * 3)},
         {"speed": np.array(["low"] * 3)},
         {"fps": np.full(3, 6.0)},
