@@ -94,7 +94,12 @@ def run_sweep() -> NoReturn:
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
     sys.argv[1:] = [*typed, given, *(o for o in needed if o.partition("=")[0] not in keys)]
     begun, failure = time.time(), 0
-    with StopRequest(then=lambda: folder.is_dir() and (folder / STOP).touch()) as stop:
+
+    def mark() -> None:
+        if folder.is_dir():
+            (folder / STOP).touch()
+
+    with StopRequest(then=mark) as stop:
         try:
             run_hydra("train", job, TrainConfig)
         except SystemExit as end:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -100,7 +101,7 @@ class Runner:
                     acted = self.act()
                 if steps_meanwhile:
                     begin_step(self.env, acted)
-                self.learn()
+                self.learn(bar)
                 with self.clock("environment"):
                     stepped, self.observation = self.env.step_and_maybe_reset(acted)
                 with self.clock("memory"):
@@ -108,7 +109,7 @@ class Runner:
                 self.frames += stepped.numel()
                 self.recent.add(stepped)
                 if self.frames >= total:
-                    self.learn()  # there is no next step to overlap with
+                    self.learn(bar)  # there is no next step to overlap with
                 bar.update(self.frames - bar.n)
                 if log(self.frames):
                     row = self.log(bar.format_dict["rate"])
@@ -140,9 +141,16 @@ class Runner:
                 f"({cause})"
             ) from error
 
-    def learn(self) -> None:
-        """Takes the updates that are due after the frames so far."""
+    def learn(self, bar: tqdm) -> None:
+        """Takes the updates that are due after the frames so far; the bar shows that it is alive.
+
+        On a CPU, an update of the paper's size takes seconds.
+        """
+        shown = time.monotonic()
         for _ in range(self.agent.updates_due(self.frames)):
+            if time.monotonic() - shown > 1.0:
+                shown = time.monotonic()
+                bar.set_description_str(f"update {self.agent.updates:,}")
             with self.clock("memory"):
                 batch = self.agent.sample()
             with self.clock("update"):
