@@ -184,8 +184,8 @@ class Noise(Section):
 # The algorithms.
 
 
-class AnyAlgorithm(Section):
-    """A user's own class, whose options are those of its signature."""
+class Target(Section):
+    """A class by its name, with options that its signature checks."""
 
     model_config = ConfigDict(extra="allow")
     target: Text = Field(alias="_target_")
@@ -193,6 +193,10 @@ class AnyAlgorithm(Section):
     def options(self) -> dict[str, Any]:
         """Returns the options by name, without the class."""
         return self.model_dump(by_alias=True, exclude={"target"})
+
+
+class AnyAlgorithm(Target):
+    """A user's own algorithm."""
 
     def check_length(self, total_frames: int, num_envs: int) -> None:
         """Checks that something is learnt in a run.
@@ -495,15 +499,10 @@ class ReportConfig(Section):
     videos: CountOrZero
 
 
-class Reader(Section):
-    """A reader of recordings, whose options are those of its class's signature."""
+class Reader(Target):
+    """A reader of recordings."""
 
-    model_config = ConfigDict(extra="allow")
     target: Annotated[str, Field(pattern=r"^flowrep\.sequences\.\w+$")] = Field(alias="_target_")
-
-    def options(self) -> dict[str, Any]:
-        """Returns the options by name, without the class."""
-        return self.model_dump(by_alias=True, exclude={"target"})
 
 
 class FlowScale(Section):

@@ -42,12 +42,6 @@ _IDENTITY = (
 """The parts of a config that determine the weights after some number of frames."""
 
 
-_NEEDED = (
-    "scene", "representations", "flow", "noise", "algorithm", "seed", "total_frames", "num_envs",
-)  # fmt: skip
-"""The keys that every run's config has."""
-
-
 class RunFolderError(ValueError):
     """A folder is not that of a run, or holds a run where none is wanted."""
 
@@ -296,22 +290,19 @@ class RunFolder:
         _replace(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:
-        """Returns the resolved config that the run was started with, as plain data.
+        """Returns the resolved config as plain data, see `flowrep.config.schema.validated_run`.
 
         Raises:
-            RunFolderError: the file is damaged; names what is missing.
+            RunFolderError: the file is damaged.
         """
-        path = self.config_path
+        problem: object = "it holds no config"
         try:
-            config = yaml.safe_load(path.read_text(encoding="utf-8"))
+            config = yaml.safe_load(self.config_path.read_text(encoding="utf-8"))
+            if isinstance(config, dict):
+                return config
         except (yaml.YAMLError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise RunFolderError(f"{path} can't be read: {reason}; restore the file") from error
-        given = config if isinstance(config, dict) else {}
-        missing = [key for key in _NEEDED if given.get(key) is None]
-        if missing:
-            raise RunFolderError(f"{path} has no {missing[0]}: restore the file of the run")
-        return given
+            problem = " ".join(str(error).split())
+        raise RunFolderError(f"{self.config_path} can't be read: {problem}; restore the file")
 
     def note_machine(self, machine: Mapping[str, Any]) -> None:
         """Adds what the run is computed with to machine.json, unless it was there last."""

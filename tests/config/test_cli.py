@@ -121,9 +121,12 @@ def test_a_mistake_ends_in_lines_that_name_it_and_what_exists(run, line, names):
         "evaluate outputs/a outputs/b speed=low fps=6 policy=sampled baselines=[]",
         "view scene=s_turn",
         "report outputs/a",
+        "train hydra/launcher=slurm hydra.launcher.partition=gpu",
     ],
 )
 def test_what_hydra_accepts_passes(run, line):
+    if "slurm" in line:
+        pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     command, *arguments = line.split()
     code, found, said = run(command, *arguments)
     assert (code, said.err) == (0, "")

@@ -249,9 +249,7 @@ def test_config_comes_back_as_written(tmp_path):
     assert (tmp_path / ".hydra" / "overrides.yaml").read_text() == "- seed=3\n"
 
 
-@pytest.mark.parametrize(
-    "text", ["", "- 1\n- 2\n", "seed: [1", "\x00", "seed: 0\nscene: {name: s}\n", "seed:\n"]
-)
+@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "seed: [1", "\x00"])
 def test_a_damaged_config_is_named(tmp_path, text):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(RunFolderError, match=r"config\.yaml"):
