@@ -67,7 +67,8 @@ def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> M
         exact, instance = sensor["depth"], sensor["instance"]
         raw, _ = rigid_flow(exact, instance, intrinsics, sensor["instance_motion"])
     depth = sensor.get("noisy_depth", sensor["depth"])
-    motion = sensor.get("noisy_motion", sensor["prev_from_curr"])
+    told = sensor.get("noisy_motion", sensor["prev_from_curr"])
+    motion = sensor.get("estimated_motion", told)
     ego, obj, _ = factorize(raw, depth, intrinsics, motion)
     return {
         "rgb": sensor["rgb"],

@@ -9,6 +9,7 @@ from flowrep.geometry.camera import (
     unproject,
 )
 from flowrep.geometry.depth import DepthKind, adapt_depth, z_from_ray_length, z_from_z_buffer
+from flowrep.geometry.egomotion import MotionEstimate, camera_motion
 from flowrep.geometry.flow import (
     Channels,
     Direction,
@@ -43,11 +44,13 @@ __all__ = [
     "Flow",
     "FovAxis",
     "Grid",
+    "MotionEstimate",
     "PoseDirection",
     "PoseLayout",
     "adapt_depth",
     "adapt_flow",
     "adapt_pose",
+    "camera_motion",
     "check_intrinsics",
     "check_rigid",
     "ego_flow",

@@ -5,6 +5,7 @@ A matrix is named `<to>_from_<from>`, so that neighbours in a product cancel.
 
 from __future__ import annotations
 
+import math
 from typing import Literal, TypeAlias
 
 import torch
@@ -245,6 +246,24 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
     a_from_b = a_from_b.to(dtype).reshape(*a_from_b.shape[:-2], *[1] * point_dims, 4, 4)
     rotated = (a_from_b[..., :3, :3] @ points_b.to(dtype).unsqueeze(-1)).squeeze(-1)
     return rotated + a_from_b[..., :3, 3]
+
+
+def rotation_from_vector(vector: Tensor) -> Tensor:
+    """Returns the rotation matrix `[*B, 3, 3]` of a rotation vector `[*B, 3]`, rad.
+
+    >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round().int()
+    tensor([[ 0, -1,  0],
+            [ 1,  0,  0],
+            [ 0,  0,  1]], dtype=torch.int32)
+    """
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    # Rodrigues: I + sin(a)/a [r] + (1 - cos(a))/a^2 [r]^2; torch.sinc(t) is sin(pi t)/(pi t).
+    turns = vector.norm(dim=-1)[..., None, None] / math.pi
+    identity = torch.eye(3, dtype=cross.dtype, device=cross.device)
+    rotation = identity + torch.sinc(turns) * cross
+    return rotation + 0.5 * torch.sinc(turns / 2).square() * (cross @ cross)
 
 
 def adapt_pose(

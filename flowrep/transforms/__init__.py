@@ -7,7 +7,7 @@ from flowrep.transforms.flow import FlowFactorize, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.maps import Depth, InstanceIds, Rgb, Segmentation
 from flowrep.transforms.mirror import Mirror
-from flowrep.transforms.motion import CameraMotion, InstanceMotion
+from flowrep.transforms.motion import CameraMotion, EstimateCameraMotion, InstanceMotion
 from flowrep.transforms.noise import SensorNoise
 from flowrep.transforms.stack import (
     REPRESENTATIONS,
@@ -25,6 +25,7 @@ __all__ = [
     "BodyRows",
     "CameraMotion",
     "Depth",
+    "EstimateCameraMotion",
     "EstimatedFlow",
     "FlowFactorize",
     "FrameStack",

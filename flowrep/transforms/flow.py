@@ -371,17 +371,9 @@ class FlowFactorize(FlowTransform):
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Returns the inputs, with nan in raw flow where its mask says that it isn't known."""
         maps = super()._read(tensordict)
-        known = tensordict.get(mask_key(self.in_keys[0]), None) if self.reads[0] == FLOW else None
-        if known is None:
-            return maps
-        raw = maps[0]
-        if known.dtype != torch.bool or known.shape != raw[..., :1, :, :].shape:
-            raise ValueError(
-                f"representation {self.label}: key {mask_key(self.in_keys[0])!r} should be bool "
-                f"{list(raw[..., :1, :, :].shape)}, where {self.in_keys[0]!r} is known; "
-                f"got {known.dtype} {list(known.shape)}"
-            )
-        return [torch.where(known, raw, math.nan), *maps[1:]]
+        if self.reads[0] == FLOW:
+            maps[0] = unknown_as_nan(self, tensordict, maps[0])
+        return maps
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""
@@ -410,6 +402,25 @@ def mask_key(flow: NestedKey) -> NestedKey:
     """Returns the key of the mask beside a raw flow: `"raw_valid"` for `"raw"`."""
     *path, name = (flow,) if isinstance(flow, str) else flow
     return (*path, f"{name}_valid") if path else f"{name}_valid"
+
+
+def unknown_as_nan(transform: MapTransform, tensordict: TensorDictBase, raw: Tensor) -> Tensor:
+    """Returns raw flow, a transform's first input, with nan where the mask beside it is False.
+
+    Raises:
+        ValueError: for a mask of another layout.
+    """
+    key = mask_key(transform.in_keys[0])
+    known = tensordict.get(key, None)
+    if known is None:
+        return raw
+    if known.dtype != torch.bool or known.shape != raw[..., :1, :, :].shape:
+        raise ValueError(
+            f"representation {transform.label}: key {key!r}, where {transform.in_keys[0]!r} is "
+            f"known, should be bool {list(raw[..., :1, :, :].shape)}; "
+            f"got {known.dtype} {list(known.shape)}"
+        )
+    return torch.where(known, raw, math.nan)
 
 
 def checked_outputs(outputs: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:

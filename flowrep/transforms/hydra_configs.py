@@ -83,6 +83,7 @@ AdaptFlowConfig = config_class(transforms.AdaptFlow)
 AdaptPoseConfig = config_class(transforms.AdaptPose)
 CameraMotionConfig = config_class(transforms.CameraMotion)
 DepthConfig = config_class(transforms.Depth)
+EstimateCameraMotionConfig = config_class(transforms.EstimateCameraMotion)
 EstimatedFlowConfig = config_class(transforms.EstimatedFlow)
 FlowFactorizeConfig = config_class(transforms.FlowFactorize)
 FrameStackConfig = config_class(transforms.FrameStack)
@@ -101,6 +102,7 @@ CONFIGS: dict[str, type[TransformConfig]] = {
     "adapt_pose": AdaptPoseConfig,
     "camera_motion": CameraMotionConfig,
     "depth": DepthConfig,
+    "estimate_camera_motion": EstimateCameraMotionConfig,
     "estimated_flow": EstimatedFlowConfig,
     "flow_factorize": FlowFactorizeConfig,
     "frame_stack": FrameStackConfig,

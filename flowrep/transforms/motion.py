@@ -1,4 +1,4 @@
-"""Motions of the camera and of bodies, for flow, computed from their poses at every step."""
+"""Motions of the camera and of bodies, for flow: from their poses, or from flow and depth."""
 
 from __future__ import annotations
 
@@ -10,13 +10,33 @@ from tensordict import TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.transforms.base import MOTION, MOTIONS, Keys, Reads, RecurrentTransform, refuse_n_step
+from flowrep.transforms.base import (
+    DEPTH,
+    FLOW,
+    MOTION,
+    MOTIONS,
+    RGB,
+    Keys,
+    Reads,
+    RecurrentTransform,
+    as_keys,
+    refuse_n_step,
+)
+from flowrep.transforms.flow import CameraTransform, Intrinsics, checked_outputs, unknown_as_nan
 
 _CAMERA: NestedKey = ("sensor", "world_from_cam")
 _BODIES: NestedKey = ("sensor", "world_from_body")
+_DEPTH: NestedKey = ("sensor", "depth")
+# EstimateCameraMotion's outputs, with their keys.
+_ESTIMATES: dict[str, NestedKey] = {
+    "motion": ("sensor", "prev_from_curr"),
+    "inlier_share": ("sensor", "inlier_share"),
+    "covariance": ("sensor", "motion_covariance"),
+    "valid": ("sensor", "motion_valid"),
+}
 
 
 class PoseTransform(RecurrentTransform):
@@ -188,3 +208,109 @@ class InstanceMotion(PoseTransform):
 
 def _but_last(values: Tensor, dim: int) -> Tensor:
     return values.narrow(dim, 0, values.shape[dim] - 1)
+
+
+class EstimateCameraMotion(CameraTransform):
+    """The camera's motion estimated from flow and depth, for envs and robots that give no pose.
+
+    | reads | writes | shape | unit |
+    | --- | --- | --- | --- |
+    | `"raw"`, px/step | `("sensor", "prev_from_curr")` | float32 `[*B, 4, 4]` | m |
+    | `("sensor", "depth")`, m | `("sensor", "inlier_share")` | float32 `[*B, 1]` | |
+    | `picture`, if given | `("sensor", "motion_covariance")` | float32 `[*B, 6, 6]` | rad, m |
+    | `prior`, if given | `("sensor", "motion_valid")` | bool `[*B, 1]` | |
+    | `"raw_valid"`, if there | | | |
+
+    Convention: see `flowrep.geometry.camera_motion`. The result depends on the frame alone, so it
+    is the same in an env, in any batch and on replay samples; no state is kept. Without a prior, a
+    frame that tells no motion (`motion_valid` False) has the identity.
+
+    It takes the camera to move against most of what it sees. Where one body fills more than half
+    of the picture, the motion is relative to that body; `inlier_share` doesn't tell. A prior helps.
+
+    Put it after the transform that writes raw flow and before `FlowFactorize`, whose ego and object
+    flow then need no pose.
+
+    Args:
+        intrinsics: K `[3, 3]` of the maps, pixels, or the env's key for it, `[*B, 3, 3]`.
+        picture: key of the current picture, uint8 `[*B, 3, H, W]`. Give it if raw flow is
+            estimated: flow of plain surfaces is then left out, and along edges.
+        prior: key of the motion expected, `[*B, 4, 4]`, such as odometry's.
+        outputs: which of `"motion"`, `"inlier_share"`, `"covariance"` and `"valid"` to write.
+        in_keys: raw flow (px/step, unscaled) and depth.
+        out_keys: one key per output; the table's by default.
+
+    Raises:
+        ValueError: for a K that can't be one or an unknown output.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from flowrep.geometry import ego_flow
+        >>> K = torch.tensor([[40.0, 0.0, 10.0], [0.0, 50.0, 8.0], [0.0, 0.0, 1.0]])
+        >>> depth = torch.linspace(2.0, 9.0, 320).reshape(1, 16, 20)
+        >>> ahead = torch.eye(4)
+        >>> ahead[2, 3] = 0.5
+        >>> raw = ego_flow(depth, K, ahead).flow
+        >>> td = EstimateCameraMotion(K)(TensorDict({"raw": raw, "sensor": {"depth": depth}}))
+        >>> td["sensor", "prev_from_curr"][2, 3].round(decimals=4), td["sensor", "motion_valid"]
+        (tensor(0.5000), tensor([True]))
+    """
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        *,
+        picture: NestedKey | None = None,
+        prior: NestedKey | None = None,
+        outputs: Sequence[str] = tuple(_ESTIMATES),
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
+    ) -> None:
+        self.outputs = checked_outputs(outputs, tuple(_ESTIMATES))
+        reads, keys = [FLOW, DEPTH], as_keys(["raw", _DEPTH] if in_keys is None else in_keys)
+        for key, layout in ((picture, RGB), (prior, MOTION)):
+            if key is not None:
+                reads.append(layout)
+                keys += as_keys([key])
+        own_keys: Keys = [_ESTIMATES[name] for name in self.outputs]
+        super().__init__(intrinsics, reads, keys, own_keys if out_keys is None else out_keys)
+        if len(self.out_keys) != len(self.outputs):
+            raise ValueError(
+                f"EstimateCameraMotion writes {list(self.outputs)}: out_keys needs as many keys, "
+                f"got {self.out_keys}"
+            )
+        self.has_picture, self.has_prior = picture is not None, prior is not None
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        maps = super()._read(tensordict)
+        maps[0] = unknown_as_nan(self, tensordict, maps[0])
+        return maps
+
+    def compute(self, raw: Tensor, depth: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
+        """Returns the chosen outputs."""
+        rest = list(more)
+        picture = rest.pop(0) if self.has_picture else None
+        prior = rest.pop(0) if self.has_prior else None
+        K = self.K if self.K is not None else rest.pop()
+        motion, share, covariance, valid = geometry.camera_motion(
+            raw, depth, K, picture=picture, prior=prior
+        )
+        made = {
+            "motion": motion.float(),
+            "inlier_share": share.float().unsqueeze(-1),
+            "covariance": covariance.float(),
+            "valid": valid.unsqueeze(-1),
+        }
+        return tuple(made[name] for name in self.outputs)
+
+    def output_specs(self, raw: TensorSpec, *others: TensorSpec) -> tuple[TensorSpec, ...]:
+        """Returns unbounded specs, one bounded to [0, 1] for the share, a boolean one for valid."""
+        batch, device = raw.shape[:-3], raw.device
+        specs = {
+            "motion": Unbounded((*batch, 4, 4), device=device),
+            "inlier_share": Bounded(0.0, 1.0, shape=(*batch, 1), device=device),
+            "covariance": Unbounded((*batch, 6, 6), device=device),
+            "valid": Categorical(2, shape=(*batch, 1), device=device, dtype=torch.bool),
+        }
+        return tuple(specs[name] for name in self.outputs)

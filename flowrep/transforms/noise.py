@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
+from flowrep.geometry.pose import rotation_from_vector
 from flowrep.transforms.base import DEPTH, FLOW, MOTION, Keys, MapTransform, Reads, as_keys
 
 FRAME = Reads(("F",), "integer")
@@ -241,15 +242,7 @@ def drifted_motion(
         drift_rad: standard deviation of the rotation about each axis.
     """
     shift, turn = normal.double().split([3, 3], -1)
-    vector = drift_rad * turn
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    # Rodrigues: I + sin(a)/a [r] + (1 - cos(a))/a^2 [r]^2; torch.sinc(t) is sin(pi t)/(pi t).
-    turns = vector.norm(dim=-1)[..., None, None] / math.pi
-    identity = torch.eye(3, dtype=cross.dtype, device=cross.device)
-    rotation = identity + torch.sinc(turns) * cross
-    rotation = rotation + 0.5 * torch.sinc(turns / 2).square() * (cross @ cross)
+    rotation = rotation_from_vector(drift_rad * turn)
     motion = prev_from_curr.double()
     turned = motion[..., :3, :3] @ rotation
     moved = motion[..., :3, 3:] + motion[..., :3, :3] @ (drift_m * shift).unsqueeze(-1)

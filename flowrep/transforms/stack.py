@@ -15,9 +15,11 @@ from flowrep.transforms.estimated_flow import EstimatedFlow
 from flowrep.transforms.flow import FlowFactorize, Intrinsics, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.maps import Depth, Rgb, Segmentation
+from flowrep.transforms.motion import EstimateCameraMotion
 from flowrep.transforms.noise import SensorNoise
 
 FLOW_SOURCES = ("exact", "estimated")
+MOTION_SOURCES = ("exact", "estimated")
 NOISE_OPTIONS = ("depth_sigma_per_m", "depth_dropout", "drift_m", "drift_rad")
 _ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px")
 _FLOW_OPTIONS = ("scale", "unit")
@@ -54,7 +56,9 @@ _NOISY_KEYS: dict[str, NestedKey] = {
     "depth": ("sensor", "noisy_depth"),
     "motion": ("sensor", "noisy_motion"),
 }
-_KEPT = (_PICTURES_KEY, _ESTIMATED_FLOW_KEY, *_NOISY_KEYS.values())
+_ESTIMATED_MOTION_KEY = ("sensor", "estimated_motion")
+_KEPT = (_PICTURES_KEY, _ESTIMATED_FLOW_KEY, _ESTIMATED_MOTION_KEY, *_NOISY_KEYS.values())
+_PICTURE_KEY = ("sensor", "rgb")
 
 
 class SensorKeys(NamedTuple):
@@ -94,6 +98,7 @@ def representation_stack(
     dt_s: float | None = None,
     compiled: bool = False,
     flow: str | Mapping[str, Any] = "exact",
+    motion: str = "exact",
     noise: Mapping[str, float] | None = None,
 ) -> Compose:
     """Returns the transforms that write the representations at the root of the TensorDict.
@@ -101,7 +106,8 @@ def representation_stack(
     Shared results are computed once: `["ego", "obj"]` factorises once, `["seg", "seg2"]` encodes
     once. Intermediate results are dropped, except the pictures behind estimated flow, which the
     next step needs, and the sensors' measurements: `("sensor", "flow")`, estimated flow in px/step,
-    `("sensor", "noisy_depth")` in metres and `("sensor", "noisy_motion")`.
+    `("sensor", "estimated_motion")`, `("sensor", "noisy_depth")` in metres and
+    `("sensor", "noisy_motion")`.
 
     Args:
         representations: names, or a mapping from name to options (`representation_options`); a
@@ -113,8 +119,11 @@ def representation_stack(
         compiled: whether flow is computed through `torch.compile`, see `RawFlow`.
         flow: source of raw flow, and thus of obj: `"exact"` (`RawFlow`), `"estimated"`
             (`EstimatedFlow`, from `("sensor", "rgb")`), or a mapping with one of them as `source`
-            and further options of `EstimatedFlow`. Ego flow doesn't depend on it, as it is computed
-            from depth and the camera's motion alone.
+            and further options of `EstimatedFlow`. Ego flow, computed from depth and the camera's
+            motion, depends on it only if the motion is estimated.
+        motion: source of the camera's motion for ego and obj: `"exact"`, the env's
+            `("sensor", "prev_from_curr")`, or `"estimated"` (`EstimateCameraMotion`, from raw flow
+            and depth, noisy if depth is; odometry is then not read, and its drift not drawn).
         noise: errors of the depth camera and of odometry: `depth_sigma_per_m`, `depth_dropout`,
             `drift_m` and `drift_rad` of `SensorNoise`, 0 by default. Depth, ego and obj are
             computed from the noisy values; raw flow and classes don't use these sensors. The noise
@@ -136,10 +145,13 @@ def representation_stack(
     flows = {name: chosen[name] for name in FLOWS if name in chosen}
     if intrinsics is None and flows and (estimator is None or set(flows) != {"raw"}):
         raise ValueError(f"representations {', '.join(FLOWS)} need intrinsics=, the camera's K")
-    transforms, keys = _noise_transforms(noise, chosen)
+    if motion not in MOTION_SOURCES:
+        raise ValueError(unknown_name("source of motion", motion, MOTION_SOURCES))
+    estimates_motion = motion == "estimated" and not {"ego", "obj"}.isdisjoint(chosen)
+    transforms, keys = _noise_transforms(noise, chosen, reads_motion=motion == "exact")
     transforms += _map_transforms(chosen, num_classes, keys)
     context = {"dt_s": dt_s, "compiled": compiled}
-    transforms += _flow_transforms(flows, estimator, intrinsics, keys, context)
+    transforms += _flow_transforms(flows, estimator, intrinsics, keys, estimates_motion, context)
     written = [key for transform in transforms for key in transform.out_keys]
     hidden = [key for key in written if key not in (*chosen, *_KEPT)]
     return Compose(*transforms, *([DropKeys(*hidden)] if hidden else []))
@@ -227,13 +239,15 @@ def _flow_transforms(
     estimator: dict[str, Any] | None,
     intrinsics: Intrinsics | None,
     keys: SensorKeys,
+    estimates_motion: bool,
     context: dict[str, Any],
 ) -> list[Transform]:
-    """Returns the source of raw flow, if it is needed, and one FlowFactorize if ego or obj is."""
+    """Returns the sources of raw flow and of motion, if needed, and one FlowFactorize if it is."""
     transforms: list[Transform] = []
     factors = {name: options for name, options in flows.items() if name != "raw"}
     unscaled: NestedKey = _UNSCALED_KEY
-    if estimator is not None and not set(flows) <= {"ego"}:
+    needs_unscaled = "obj" in flows or estimates_motion
+    if estimator is not None and ("raw" in flows or needs_unscaled):
         unscaled = _ESTIMATED_FLOW_KEY
         estimate = EstimatedFlow(
             **estimator,
@@ -243,22 +257,33 @@ def _flow_transforms(
             in_keys=_PICTURES_KEY,
             out_keys=[unscaled, "raw"] if "raw" in flows else [unscaled],
         )
-        pictures = FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=[_PICTURES_KEY])
+        pictures = FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])
         pictures.label = estimate.label = "raw and obj by estimated flow"
         transforms += [pictures, estimate]
-    elif "obj" in flows:
+    elif needs_unscaled:
         factors = flows  # raw too, from the unscaled flow
         transforms.append(RawFlow(intrinsics, out_keys=unscaled, **context))
-        transforms[0].label = "'obj'"
+        transforms[0].label = "'obj'" if "obj" in flows else "'ego' by estimated motion"
     elif "raw" in flows:
         transforms.append(RawFlow(intrinsics, **flows["raw"], **context))
+    if estimates_motion:
+        estimate_motion = EstimateCameraMotion(
+            intrinsics,
+            picture=None if estimator is None else _PICTURE_KEY,
+            outputs=["motion"],
+            in_keys=[unscaled, keys.depth],
+            out_keys=[_ESTIMATED_MOTION_KEY],
+        )
+        estimate_motion.label = "ego and obj by estimated motion"
+        transforms.append(estimate_motion)
+        keys = keys._replace(motion=_ESTIMATED_MOTION_KEY)
     if factors:
         split = FlowFactorize(
             intrinsics,
             outputs=list(factors),
             scale={name: options["scale"] for name, options in factors.items()},
             unit={name: options["unit"] for name, options in factors.items()},
-            in_keys=[unscaled, *keys] if "obj" in factors else [*keys],
+            in_keys=[unscaled, *keys] if {"obj", "raw"} & set(factors) else [*keys],
             **context,
         )
         transforms.append(split)
@@ -266,7 +291,7 @@ def _flow_transforms(
 
 
 def _noise_transforms(
-    noise: Mapping[str, float] | None, representations: Collection[str]
+    noise: Mapping[str, float] | None, representations: Collection[str], *, reads_motion: bool
 ) -> tuple[list[Transform], SensorKeys]:
     """Returns one `SensorNoise`, if a representation reads a noisy sensor, and the keys to read.
 
@@ -283,7 +308,7 @@ def _noise_transforms(
     SensorNoise(**given)  # checks all values, used or not
     readers = {  # raw flow is not measured by a depth camera
         "depth": {"depth", "depth2", "ego", "obj"},
-        "motion": {"ego", "obj"},
+        "motion": {"ego", "obj"} if reads_motion else set(),
     }
     options = {"depth": NOISE_OPTIONS[:2], "motion": NOISE_OPTIONS[2:]}
     noisy = [

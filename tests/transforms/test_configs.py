@@ -27,6 +27,7 @@ K = [[6.0, 0.0, 3.2], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]]
 REQUIRED = {
     "AdaptDepth": {"kind": "z"},
     "AdaptFlow": {"direction": "backward", "grid": "current"},
+    "EstimateCameraMotion": {"intrinsics": K},
     "FlowFactorize": {"intrinsics": K},
     "FrameStack": {"in_keys": ["seg", ["sensor", "depth"]], "out_keys": ["seg2", ["a", "b"]]},
     "InstanceIds": {"body_ids": [17, 3]},

@@ -10,6 +10,7 @@ from flowrep.transforms import (
     AdaptPose,
     CameraMotion,
     Depth,
+    EstimateCameraMotion,
     FlowFactorize,
     FrameStack,
     InstanceIds,
@@ -149,6 +150,19 @@ class TestInstanceMotion(TestCameraMotion):
 
     def make(self):
         return InstanceMotion(out_keys=[("own", "motions")])
+
+
+class TestEstimateCameraMotion(TransformContract):
+    def oracles(self):
+        return {("own", "motion"): functools.partial(oracles.sensor_map, "prev_from_curr")}
+
+    def make(self):
+        return EstimateCameraMotion(
+            INTRINSICS, outputs=["motion"], out_keys=[("own", "motion")], prior=None
+        )
+
+    def before(self):
+        return [RawFlow(INTRINSICS)]
 
 
 class TestSensorNoiseOff(TransformContract):

@@ -9,11 +9,17 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
-from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from flowrep.transforms import CameraMotion, InstanceMotion
-from tests.transforms.fake_env import FakeSensorEnv, SelfResettingEnv
+from flowrep.transforms import (
+    CameraMotion,
+    EstimateCameraMotion,
+    FlowFactorize,
+    InstanceMotion,
+    RawFlow,
+)
+from tests.transforms.fake_env import FakeSensorEnv, SelfResettingEnv, frame_motions
 
 POSE, MOTION = ("sensor", "world_from_cam"), "motion"
 WANT = ("sensor", "prev_from_curr")  # what the env itself says, written down independently
@@ -165,3 +171,57 @@ def test_a_wide_world_costs_no_precision():
     motion = camera_motion()(td)[MOTION]
     assert motion.dtype == torch.float32
     torch.testing.assert_close(motion[1, 0, 3], torch.tensor(0.83), rtol=0, atol=1e-7)
+
+
+def wide_frames(count: int = 3) -> TensorDict:
+    """Returns frames of 16 x 24 with a body in a corner; the camera turns and drives ahead."""
+    depth = 2 + 6 * torch.rand(count, 1, 16, 24, generator=torch.Generator().manual_seed(0))
+    camera = torch.stack([frame_motions(1, env)[0] for env in range(count)])
+    bodies = torch.stack([camera, camera], 1)
+    bodies[:, 1, :2, 3] += 0.4
+    instance = torch.zeros(count, 1, 16, 24, dtype=torch.uint8)
+    instance[..., 10:, :9] = 1
+    sensor = {"depth": depth, "instance": instance, "instance_motion": bodies}
+    return TensorDict({"sensor": sensor, "truth": camera}, [count])
+
+
+WIDE = [[20.0, 0.0, 11.0], [0.0, 22.0, 9.0], [0.0, 0.0, 1.0]]
+
+
+def test_flow_and_depth_tell_ego_and_object_flow_without_a_pose():
+    td = wide_frames()
+    exact = td.clone()
+    exact["sensor", "prev_from_curr"] = exact["truth"]
+    Compose(RawFlow(WIDE), FlowFactorize(WIDE))(exact)
+    estimated = Compose(RawFlow(WIDE), EstimateCameraMotion(WIDE), FlowFactorize(WIDE))(td)
+    for key in (("sensor", "prev_from_curr"), "ego", "obj"):
+        torch.testing.assert_close(estimated[key], exact[key], rtol=0, atol=1e-4)
+    assert estimated["sensor", "motion_valid"].all()
+    share = (td["sensor", "instance"] == 0).float().mean()
+    torch.testing.assert_close(estimated["sensor", "inlier_share"], share.expand(3, 1))
+    assert estimated["sensor", "motion_covariance"].shape == (3, 6, 6)
+
+
+def test_pixels_of_unknown_raw_flow_tell_nothing_of_the_motion():
+    td = RawFlow(WIDE)(wide_frames())
+    td["raw"][..., :14], td["raw_valid"][..., :14] = 0.0, False  # most of the picture
+    motion = EstimateCameraMotion(WIDE, outputs=["motion"])(td)["sensor", "prev_from_curr"]
+    torch.testing.assert_close(motion, td["truth"], rtol=0, atol=1e-4)
+
+
+def test_an_estimate_reads_the_picture_the_prior_and_k_where_it_is_told():
+    td = RawFlow(WIDE)(wide_frames())
+    td["sensor", "rgb"] = torch.full((3, 3, 16, 24), 9, dtype=torch.uint8)
+    td["odometry"], td["K"] = td["truth"].clone(), torch.tensor(WIDE).expand(3, 3, 3)
+    estimate = EstimateCameraMotion("K", picture=("sensor", "rgb"), prior="odometry")
+    assert estimate.in_keys == ["raw", ("sensor", "depth"), ("sensor", "rgb"), "odometry", "K"]
+    td = estimate(td)
+    assert not td["sensor", "motion_valid"].any()  # the picture is plain
+    assert torch.equal(td["sensor", "prev_from_curr"], td["odometry"])
+
+
+def test_options_of_an_estimate_are_checked():
+    with pytest.raises(ValueError, match="outputs"):
+        EstimateCameraMotion(WIDE, outputs=["pose"])
+    with pytest.raises(ValueError, match="out_keys"):
+        EstimateCameraMotion(WIDE, out_keys=["motion"])

@@ -21,6 +21,7 @@ from flowrep.transforms import (
 from flowrep.transforms.base import MissingKey
 from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv
 from tests.transforms.test_base import moments
+from tests.transforms.test_motion import wide_frames
 
 stack = functools.partial(
     representation_stack, intrinsics=INTRINSICS, num_classes=NUM_CLASSES, dt_s=0.5
@@ -251,3 +252,34 @@ def test_options_of_noise_are_checked_whether_or_not_they_are_used(noise, expect
 def test_a_frame_without_a_name_is_asked_for():
     with pytest.raises(MissingKey, match=r"depth2 and obj needs key \('sensor', 'frame'\)"):
         stack(["depth2", "obj"], noise=NOISE)(moments(2))
+
+
+@pytest.mark.parametrize("flow", ["exact", "estimated"])
+def test_estimated_motion_takes_the_place_of_the_env_s(flow):
+    wide = [[20.0, 0.0, 11.0], [0.0, 22.0, 9.0], [0.0, 0.0, 1.0]]
+    build = functools.partial(representation_stack, intrinsics=wide, flow=flow, motion="estimated")
+    td = wide_frames(2)  # without prev_from_curr
+    if flow == "estimated":
+        texture = 255 * torch.rand(2, 3, 16, 24, generator=torch.Generator().manual_seed(1))
+        td["sensor", "rgb"] = texture.to(torch.uint8)
+        td["_rgb2"] = torch.cat([td["sensor", "rgb"]] * 2, 1)  # a picture that stayed the same
+    made = build(["ego"])(td.clone())
+    motion = torch.eye(4).expand(2, 4, 4) if flow == "estimated" else td["truth"]
+    torch.testing.assert_close(made["sensor", "estimated_motion"], motion, rtol=0, atol=1e-4)
+    ego = geometry.ego_flow(td["sensor", "depth"], torch.tensor(wide), motion).flow
+    torch.testing.assert_close(made["ego"], ego, rtol=0, atol=1e-3)
+    together = build(["raw", "ego", "obj"])(td.clone())
+    assert torch.equal(together["ego"], made["ego"])
+    assert torch.equal(together["obj"], together["raw"] - together["ego"])
+    left = {"truth", "sensor", "raw", "ego", "obj"} | ({"_rgb2"} if flow == "estimated" else set())
+    assert set(together.keys()) == left
+
+
+def test_estimated_motion_reads_noisy_depth_and_no_odometry():
+    build = functools.partial(stack, noise=NOISE, motion="estimated")
+    read = {key for transform in build(["ego"]) for key in transform.in_keys}
+    assert ("sensor", "prev_from_curr") not in read
+    assert ("sensor", "noisy_depth") in build(["ego"])[-2].in_keys
+    assert stack(["raw"], motion="estimated")[0].out_keys == ["raw", "raw_valid"]
+    with pytest.raises(ValueError, match=r"'odometry'.*'estimated'"):
+        stack(["ego"], motion="odometry")

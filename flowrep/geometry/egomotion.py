@@ -1,0 +1,461 @@
+"""The camera's motion from flow and depth: the robust inverse of ego flow.
+
+With x the ray of pixel p (z = 1), q the inverse of its depth and `prev_from_curr` = (R, T), the
+point that p shows was seen at the projection of R x + q T. The residual is raw flow's p' minus this
+one, in pixels. Sky has q = 0 and so constrains the rotation alone, without a case of its own.
+
+Moving bodies are outliers. The start is the best of many motions, each from four pixels; then
+Gauss-Newton steps on more pixels with Geman-McClure weights, whose scale follows the residuals.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from flowrep.geometry.camera import centred_pixels
+from flowrep.geometry.checks import broadcast_batch, check_shape
+from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST
+from flowrep.geometry.pose import rotation_from_vector
+
+PIXELS = 1536  # used in a Gauss-Newton step; more gain nothing
+CANDIDATES = 4 * PIXELS  # looked at for known ones
+SCORED_PIXELS = 320
+HYPOTHESES, PIXELS_EACH = 64, 4
+MIN_PIXELS = 32  # fewer known ones tell no motion: four of them fit any
+_HYPOTHESIS_STEPS, _STEPS = 3, 6
+
+# Which of the known pixels a hypothesis is from, as shares of their number. Drawn once, so that the
+# same frame has the same motion in every batch, process and replay.
+_random = random.Random(0)
+_DRAWS = [[_random.random() for _ in range(PIXELS_EACH)] for _ in range(HYPOTHESES)]
+
+_SCORE_SCALES, _LEAST_SCORE_PX = 1.5, 0.02  # where a pixel's cost in a score is half of its bound
+_PRIORS_LEAD = 0.25  # share of the pixels: a body may fill that much more than the static world
+_REFINED, _REFINING_STEPS = 6, 3  # the best hypotheses, each led to its own optimum
+_LEAST_SCALE_PX = 2e-3  # far above float32's rounding of exact flow, far below any measured flow's
+_SCALES = 1.5  # standard deviations at which a pixel's weight is a quarter
+_QUANTILE = 1 / 3  # of all residuals, for their scale: half of the pixels may be outliers
+# That quantile of the length of a vector of two standard normal numbers.
+_RAYLEIGH = math.sqrt(-2 * math.log(1 - _QUANTILE))
+
+_WINDOW = 3  # side of the structure tensor's window, pixels
+_GRADIENT_NOISE = 12.0  # grey levels per pixel, of 255, from which a gradient counts as texture
+_LEAST_TEXTURE = 0.25  # of the structure's trace, 0 to 2, below which a pixel isn't known
+_LEAST_EIGENVALUE = 1e-5  # of the scaled normal matrix: less is a direction that nothing tells
+
+
+class MotionEstimate(NamedTuple):
+    """The camera's motion `[*B, 4, 4]` and how well the flow tells it.
+
+    `inlier_share` `[*B]` is the share of the known pixels that move as the camera's motion says.
+    `covariance` `[*B, 6, 6]` is that of (rotation vector in rad, translation in m), a small motion
+    of the previous camera after the estimate; a variance is inf where nothing tells it. `valid`
+    is bool `[*B]`.
+    """
+
+    prev_from_curr: Tensor
+    inlier_share: Tensor
+    covariance: Tensor
+    valid: Tensor
+
+
+class _Samples(NamedTuple):
+    """Known pixels of each frame: `[B, N]`, the first `number` ones."""
+
+    ray: Tensor  # x, y, 1 and q: [B, 4, N]
+    flow: Tensor  # [B, 2, N]
+    structure: Tensor | None  # xx, xy, yy: [B, 3, N]
+    known: Tensor
+    number: Tensor  # of known ones, [B]
+
+    def part(self, index: Tensor) -> _Samples:
+        """Returns the samples at `index` `[B, M]`."""
+
+        def at(values: Tensor) -> Tensor:
+            return values.gather(-1, index.unsqueeze(1).expand(-1, values.shape[1], -1))
+
+        structure = None if self.structure is None else at(self.structure)
+        known = self.known.gather(-1, index)
+        return _Samples(at(self.ray), at(self.flow), structure, known, self.number)
+
+    def split_pixels(self, size: int) -> _Samples:
+        """Returns every `size` pixels of a frame as a frame, `[B * N / size, size]`."""
+
+        def parts(values: Tensor) -> Tensor:
+            return values.unflatten(-1, (-1, size)).movedim(-2, 1).flatten(0, 1).double()
+
+        structure = None if self.structure is None else parts(self.structure)
+        known = self.known.reshape(-1, size)
+        return _Samples(parts(self.ray), parts(self.flow), structure, known, self.number)
+
+    def repeated(self, times: int) -> _Samples:
+        """Returns each frame `times` times, `[B * times, N]`."""
+        ray, flow, known, number = (
+            part.repeat_interleave(times, 0)
+            for part in (self.ray, self.flow, self.known, self.number)
+        )
+        structure = None
+        if self.structure is not None:
+            structure = self.structure.repeat_interleave(times, 0)
+        return _Samples(ray, flow, structure, known, number)
+
+
+@torch.no_grad()
+def camera_motion(
+    flow: Tensor,
+    depth: Tensor,
+    K: Tensor,
+    *,
+    picture: Tensor | None = None,
+    prior: Tensor | None = None,
+) -> MotionEstimate:
+    """Returns the camera's motion between two frames of a mostly static world.
+
+    Convention: `flow` is p_t - p_t' per step on the current frame's grid, as that of `rigid_flow`
+    or an estimator's, and `prev_from_curr` takes a point from the current camera's frame into the
+    previous camera's, so that `ego_flow(depth, K, prev_from_curr)` is the flow without what moves
+    by itself. The result depends on the frame alone (the draws are fixed) and has no gradient.
+
+    Estimated flow of plain surfaces says nothing, or 0. With `picture` each residual is weighted by
+    the local structure tensor: not at all where there is no texture, only across an edge.
+
+    It fails, without a sign in the result, where more than half of the known pixels move as one
+    body: the motion is then relative to that body. A prior helps there. `valid` is False, and the
+    motion the prior, where fewer than 32 pixels are known or they leave a direction open: nan, no
+    texture, sky alone (which tells the rotation only). The covariance counts the pixels' own
+    errors, as if independent; it is several times too small for errors that neighbours share.
+
+    Args:
+        flow: `[*B, 2, H, W]`, pixels per step, nan where it isn't known.
+        depth: `[*B, 1, H, W]`, metres along the optical axis.
+        K: `[*B, 3, 3]`, pixels.
+        picture: the current picture `[*B, C, H, W]`, 0 to 255; give it if flow is estimated.
+        prior: the motion expected `[*B, 4, 4]`, the last one or odometry's; identity by default.
+
+    Raises:
+        ValueError: a shape does not fit.
+        TypeError: an argument is not a float tensor (`picture` may be uint8).
+
+    >>> from flowrep.geometry import ego_flow
+    >>> K = torch.tensor([[40.0, 0.0, 10.0], [0.0, 50.0, 8.0], [0.0, 0.0, 1.0]])
+    >>> depth = torch.linspace(2.0, 9.0, 320).reshape(1, 16, 20)
+    >>> prev_from_curr = torch.eye(4)
+    >>> prev_from_curr[:3, 3] = torch.tensor([0.1, 0.0, 0.5])  # half a metre ahead
+    >>> flow = ego_flow(depth, K, prev_from_curr).flow
+    >>> flow[:, :6, :8] += 3.0  # something moves by itself
+    >>> motion = camera_motion(flow, depth, K)
+    >>> motion.prev_from_curr[[0, 2], 3], motion.valid
+    (tensor([0.1000, 0.5000]), tensor(True))
+    """
+    check_shape("flow", flow, (2, "H", "W"))
+    check_shape("depth", depth, (1, "H", "W"))
+    check_shape("K", K, (3, 3))
+    batches = {"flow": flow.shape[:-3], "depth": depth.shape[:-3], "K": K.shape[:-2]}
+    if prior is not None:
+        check_shape("prior", prior, (4, 4))
+        batches["prior"] = prior.shape[:-2]
+    if picture is not None:
+        check_shape("picture", picture.float(), ("C", "H", "W"))
+        batches["picture"] = picture.shape[:-3]
+    sizes = {tuple(image.shape[-2:]) for image in (flow, depth, picture) if image is not None}
+    if len(sizes) > 1:
+        raise ValueError(f"flow, depth and picture must have one (height, width), got {sizes}")
+    batch = broadcast_batch(**batches)
+    dtype = torch.promote_types(torch.promote_types(flow.dtype, depth.dtype), torch.float32)
+
+    def flat(tensor: Tensor, dims: int, to: torch.dtype = dtype) -> Tensor:
+        return (
+            tensor.to(to).expand(*batch, *tensor.shape[-dims:]).reshape(-1, *tensor.shape[-dims:])
+        )
+
+    K = flat(K, 2, torch.float64)
+    structure = None if picture is None else structure_tensor(flat(picture, 3))
+    samples = _samples(flat(flow, 3), flat(depth, 3), K.to(dtype), structure)
+    expected = torch.eye(4) if prior is None else prior
+    expected = flat(expected.to(depth.device), 2, torch.float64)
+    motion = _best_hypothesis(samples, K, expected, has_prior=prior is not None)
+    motion = _descended(samples, K, motion, _STEPS)
+    share, covariance, valid = _described(samples, K, motion)
+    motion = torch.where(valid[:, None, None], motion, expected)
+    motion, share, covariance, valid = (
+        part.reshape((*batch, *part.shape[1:])) for part in (motion, share, covariance, valid)
+    )
+    return MotionEstimate(motion.to(dtype), share.to(dtype), covariance.to(dtype), valid)
+
+
+def structure_tensor(picture: Tensor) -> Tensor:
+    """Returns what each pixel's surroundings tell of a shift: xx, xy and yy, `[*B, 3, H, W]`.
+
+    Its eigenvalues are 0 without texture and tend to 1 across a contrast: S (S + n I)^-1, with S
+    the mean of the gradients' products around the pixel and n that of a gradient that is noise.
+
+    Args:
+        picture: `[*B, C, H, W]`, floats from 0 to 255.
+    """
+    grey = picture.mean(-3)
+    dx, dy = torch.zeros_like(grey), torch.zeros_like(grey)
+    dx[..., 1:-1] = (grey[..., 2:] - grey[..., :-2]) / 2
+    dy[..., 1:-1, :] = (grey[..., 2:, :] - grey[..., :-2, :]) / 2
+    products = torch.stack([dx * dx, dx * dy, dy * dy], -3)
+    batch = products.shape[:-3]
+    mean = functional.avg_pool2d(
+        products.reshape(-1, *products.shape[-3:]), _WINDOW, 1, _WINDOW // 2
+    )
+    xx, xy, yy = mean.reshape(*batch, *mean.shape[-3:]).unbind(-3)
+    noise = _GRADIENT_NOISE**2
+    det = (xx + noise) * (yy + noise) - xy * xy
+    own = xx * yy - xy * xy
+    return torch.stack([own + noise * xx, noise * xy, own + noise * yy], -3) / det.unsqueeze(-3)
+
+
+def _samples(flow: Tensor, depth: Tensor, K: Tensor, structure: Tensor | None) -> _Samples:
+    """Returns up to `PIXELS` known pixels of each frame, spread over the picture."""
+    batch, _, height, width = flow.shape
+    size = height * width
+    looked_at = min(size, CANDIDATES)
+    # Steps of the golden ratio spread any number of pixels evenly; coprime steps meet each once.
+    step = next(
+        s for s in range(int(size / 1.618033988749895) + 1, 2 * size + 2) if math.gcd(s, size) == 1
+    )
+    pixel = torch.arange(looked_at, device=flow.device) * step % size
+    maps = [flow.flatten(-2)[..., pixel], depth.flatten(-2)[..., pixel]]
+    if structure is not None:
+        maps.append(structure.flatten(-2)[..., pixel])
+    values = torch.cat(maps, 1)  # [B, 3 or 6, M]
+    u, v, z = values[:, :3].unbind(1)
+    known = u.isfinite() & v.isfinite() & (z >= SMALLEST)  # nan compares False
+    if structure is not None:
+        known &= values[:, 3] + values[:, 5] > _LEAST_TEXTURE
+    # The known ones move to the front.
+    rank = known.long().cumsum(-1) - 1
+    slot = torch.where(known & (rank < PIXELS), rank, PIXELS)
+    order = torch.zeros(batch, PIXELS + 1, dtype=torch.long, device=flow.device)
+    order.scatter_(1, slot, torch.arange(looked_at, device=flow.device).expand(batch, -1))
+    order = order[:, :PIXELS]
+    count = known.sum(-1).clamp(max=PIXELS)
+    is_known = torch.arange(PIXELS, device=flow.device) < count.unsqueeze(-1)
+    values = values.gather(-1, order.unsqueeze(1).expand(-1, values.shape[1], -1))
+    values = torch.where(is_known.unsqueeze(1), values, 1.0)
+    x_px, y_px = centred_pixels(height, width, K)
+    place = pixel[order]
+    x_px = x_px.squeeze(-2).gather(-1, place % width)
+    y_px = y_px.squeeze(-1).gather(-1, place // width)
+    y = y_px / K[:, 1, 1, None]
+    x = (x_px - K[:, 0, 1, None] * y) / K[:, 0, 0, None]
+    ray = torch.stack([x, y, torch.ones_like(x), values[:, 2].reciprocal()], 1)
+    structure = None if structure is None else values[:, 3:]
+    return _Samples(ray, values[:, :2], structure, is_known, count)
+
+
+def _residuals(samples: _Samples, K: Tensor, motion: Tensor) -> tuple[Tensor, ...]:
+    """Returns the residuals `[B, ..., N]` in px and where the projection lies, for Jacobians.
+
+    Args:
+        samples: N of each frame.
+        K: `[B, 3, 3]`.
+        motion: `[B, 4, 4]`, or `[B, M, 4, 4]` for M motions of each frame.
+    """
+    ray = samples.ray
+    # As in `closed_form`, the difference from no motion: exactly 0 for none, and rounded finer.
+    still = torch.eye(3, 4, dtype=motion.dtype, device=motion.device)
+    moved = (motion[..., :3, :] - still).to(ray.dtype)
+    moved = (moved.flatten(1, -2) @ ray).unflatten(1, moved.shape[1:-1])  # [B, (M,) 3, N]
+    dx, dy, dz = moved.unbind(-2)
+    in_front = 1 + dz > MIN_DEPTH_RATIO
+    per_z = torch.where(in_front, 1 + dz, 1.0).reciprocal()
+    per_frame = (slice(None), *[None] * (dx.ndim - 2))
+    x, y = ray[:, 0][per_frame], ray[:, 1][per_frame]
+    dn, dm = (dx - x * dz) * per_z, (dy - y * dz) * per_z
+    u, v = samples.flow[:, 0][per_frame], samples.flow[:, 1][per_frame]
+    k = K.to(ray.dtype)[(..., *[None] * (dx.ndim - 1))]
+    ru = -(k[:, 0, 0] * dn + k[:, 0, 1] * dm) - u
+    rv = -k[:, 1, 1] * dm - v
+    return ru, rv, x + dn, y + dm, per_z, in_front
+
+
+def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
+    """Returns the squared lengths of residuals, as the pixels' structure sees them."""
+    if samples.structure is None:
+        return ru * ru + rv * rv
+    xx, xy, yy = (s if ru.ndim == 2 else s.unsqueeze(1) for s in samples.structure.unbind(1))
+    return (xx * ru * ru + 2 * xy * ru * rv + yy * rv * rv).clamp(min=0.0)
+
+
+def _normal_equations(samples: _Samples, K: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns J^T J `[B, 6, 6]` and J^T r `[B, 6]` of a step after the motion, all pixels alike."""
+    ru, rv, n, m, per_z, in_front = _residuals(samples, K, motion)
+    Ju, Jv = _jacobian(samples, K, n, m, per_z)
+    return _products(samples, Ju, Jv, ru, rv, in_front.to(ru.dtype))
+
+
+def _jacobian(
+    samples: _Samples, K: Tensor, n: Tensor, m: Tensor, per_z: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Returns du and dv `[B, 6, N]` by a rotation vector and a translation after the motion."""
+    q = samples.ray[:, 3] * per_z
+    zero, nm = torch.zeros_like(n), n * m
+    dn = torch.stack([-nm, 1 + n * n, -m, q, zero, -n * q], 1)
+    dm = torch.stack([-1 - m * m, nm, n, zero, q, -m * q], 1)
+    k = K.to(n.dtype)[..., None, None]
+    return k[:, 0, 0] * dn + k[:, 0, 1] * dm, k[:, 1, 1] * dm
+
+
+def _products(
+    samples: _Samples, Ju: Tensor, Jv: Tensor, ru: Tensor, rv: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor]:
+    if samples.structure is None:
+        Wu, Wv = weight.unsqueeze(1) * Ju, weight.unsqueeze(1) * Jv
+    else:
+        xx, xy, yy = (weight.unsqueeze(1) * samples.structure).unsqueeze(2).unbind(1)
+        Wu, Wv = xx * Ju + xy * Jv, xy * Ju + yy * Jv
+    normal = Wu @ Ju.mT + Wv @ Jv.mT
+    right = Wu @ ru.unsqueeze(-1) + Wv @ rv.unsqueeze(-1)
+    return normal.double(), right.squeeze(-1).double()
+
+
+def _after(motion: Tensor, step: Tensor) -> Tensor:
+    """Returns the motion followed by a small one, (rotation vector, translation) `[..., 6]`."""
+    turn, shift = step.split([3, 3], -1)
+    moved = rotation_from_vector(turn) @ motion[..., :3, :]
+    moved = torch.cat([moved[..., :3], moved[..., 3:] + shift.unsqueeze(-1)], -1)
+    return torch.cat([moved, motion[..., 3:, :]], -2)
+
+
+def _best_hypothesis(samples: _Samples, K: Tensor, expected: Tensor, *, has_prior: bool) -> Tensor:
+    """Returns the best of the expected motion and those that four pixels tell, `[B, 4, 4]`."""
+    batch = len(expected)
+    draws = torch.tensor(_DRAWS, dtype=torch.float64, device=K.device)
+    index = (draws * samples.number[:, None, None]).long()  # [B, H, 4]
+    each = samples.part(index.flatten(1)).split_pixels(PIXELS_EACH)
+    K_each = K.repeat_interleave(HYPOTHESES, 0)
+    motion = expected.repeat_interleave(HYPOTHESES, 0)
+    for _ in range(_HYPOTHESIS_STEPS):
+        normal, right = _normal_equations(each, K_each, motion)
+        # Damped, so that four pixels in a row don't throw the motion away.
+        diagonal = normal.diagonal(dim1=-2, dim2=-1)
+        damping = 1e-9 * diagonal + 1e-12 * diagonal.amax(-1, keepdim=True) + 1e-30
+        step = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)[0]
+        step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0).clamp(-10.0, 10.0)
+        motion = _after(motion, step)
+    motions = torch.cat([expected.unsqueeze(1), motion.unflatten(0, (batch, HYPOTHESES))], 1)
+    shares = torch.arange(SCORED_PIXELS, device=K.device) / SCORED_PIXELS
+    scored = samples.part((shares * samples.number.unsqueeze(-1)).long())
+    # What the expected motion is ahead of others: of none but exact ties, unless it is a prior.
+    lead = torch.zeros(1 + HYPOTHESES, device=K.device)
+    lead[0] = _PRIORS_LEAD * SCORED_PIXELS if has_prior else 1e-6
+    if has_prior:
+        motions = torch.cat(
+            [_descended(scored, K, expected, _STEPS).unsqueeze(1), motions[:, 1:]], 1
+        )
+    # Neighbouring hypotheses lead to different optima: the best ones are refined and scored again.
+    first = (_costs(scored, K, motions) - lead).topk(_REFINED, largest=False).indices
+    motions = motions.gather(1, first[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
+    K_refined = K.repeat_interleave(_REFINED, 0)
+    motions = _descended(scored.repeated(_REFINED), K_refined, motions, _REFINING_STEPS)
+    motions = motions.unflatten(0, (batch, _REFINED))
+    best = (_costs(scored, K, motions) - lead[first]).argmin(-1)
+    return motions[torch.arange(batch, device=K.device), best]
+
+
+def _costs(samples: _Samples, K: Tensor, motions: Tensor) -> Tensor:
+    """Returns the truncated costs `[B, M]` of motions `[B, M, 4, 4]` of each frame.
+
+    They are truncated at a few standard deviations of the residuals of the motion that fits best.
+    """
+    ru, rv, *_, in_front = _residuals(samples, K, motions)
+    known = in_front & samples.known.unsqueeze(1)
+    squared = torch.where(known, _squared(samples, ru, rv), torch.inf)
+    number = samples.known.sum(-1, keepdim=True)
+    scale = (_SCORE_SCALES * _scale(squared, number).amin(-1)).clamp(min=_LEAST_SCORE_PX)
+    return -(1 + squared / scale.square()[:, None, None]).reciprocal().sum(-1)
+
+
+def _scale(squared: Tensor, number: Tensor) -> Tensor:
+    """Returns a robust standard deviation of residuals per channel, px, from `[..., N]` squares.
+
+    Unknown ones are inf, so that they come last. Every fourth pixel is enough.
+    """
+    squared = squared[..., ::4]
+    rank = (number * (_QUANTILE / 4)).long().unsqueeze(-1).expand(*squared.shape[:-1], 1)
+    return squared.sort(-1).values.gather(-1, rank).squeeze(-1).sqrt() / _RAYLEIGH
+
+
+class _Weighted(NamedTuple):
+    """A motion's residuals and their weights, for one step or for the covariance."""
+
+    normal: Tensor  # J^T W J, [B, 6, 6]
+    right: Tensor  # J^T W r, [B, 6]
+    squared: Tensor
+    ratio: Tensor  # squared over the scale's square
+    weight: Tensor
+    Ju: Tensor
+    Jv: Tensor
+
+
+def _weighted(samples: _Samples, K: Tensor, motion: Tensor) -> _Weighted:
+    ru, rv, n, m, per_z, in_front = _residuals(samples, K, motion)
+    usable = samples.known & in_front
+    squared = torch.where(usable, _squared(samples, ru, rv), torch.inf)
+    scale = _SCALES * _scale(squared, samples.known.sum(-1))
+    ratio = squared / scale.clamp(min=_LEAST_SCALE_PX, max=1e4).square().unsqueeze(-1)
+    weight = (1 + ratio).square().reciprocal()
+    Ju, Jv = _jacobian(samples, K, n, m, per_z)
+    normal, right = _products(samples, Ju, Jv, ru, rv, weight)
+    return _Weighted(normal, right, squared, ratio, weight, Ju, Jv)
+
+
+def _descended(samples: _Samples, K: Tensor, motion: Tensor, steps: int) -> Tensor:
+    """Returns the motion after Gauss-Newton steps with Geman-McClure weights."""
+    for _ in range(steps):
+        now = _weighted(samples, K, motion)
+        unit, values, vectors, seen = _directions(now)
+        # Only along what the pixels tell.
+        along = (vectors.mT @ (unit * now.right).unsqueeze(-1)).squeeze(-1)
+        along = torch.where(seen, along / values, 0.0)
+        motion = _after(motion, unit * (vectors @ along.unsqueeze(-1)).squeeze(-1))
+    return motion
+
+
+def _described(samples: _Samples, K: Tensor, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns a motion's inlier share, its covariance and whether the pixels tell all of it."""
+    now = _weighted(samples, K, motion)
+    unit, values, vectors, seen = _directions(now)
+    # An M-estimator's covariance is A^-1 B A^-1, A the derivative of its equations: that of
+    # w(r^2) r is w (1 - 2 ratio / (1 + ratio)), averaged over the directions of r.
+    weight, ratio = now.weight, now.ratio
+    slope = torch.where(weight > 0, weight * (1 - 2 * ratio / (1 + ratio)), 0.0).sum(-1)
+    slope = (slope / weight.sum(-1).clamp(min=1e-12)).clamp(min=0.1).double()
+    spread = torch.where(weight > 0, weight.square() * now.squared / 2, 0.0)
+    none = torch.zeros_like(spread)
+    own, _ = _products(samples, now.Ju, now.Jv, none, none, spread)
+    scaled = unit.unsqueeze(-1) * vectors * torch.where(seen, values.rsqrt(), 0.0).unsqueeze(-2)
+    inverse = scaled @ scaled.mT
+    covariance = inverse @ own @ inverse / slope.square()[:, None, None]
+    # A parameter that a direction without information has a part in is not known at all.
+    is_open = (vectors.square() * ~seen.unsqueeze(-2)).sum(-1) > 1e-6  # [B, 6]
+    covariance = torch.where(is_open.unsqueeze(-1) | is_open.unsqueeze(-2), 0.0, covariance)
+    variance = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)  # of exact flow, rounding
+    variance = torch.where(is_open, torch.inf, variance)
+    covariance = torch.where(torch.eye(6, device=K.device) > 0, variance.unsqueeze(-1), covariance)
+    share = (ratio < 1).sum(-1) / samples.number.clamp(min=1)
+    enough = (samples.number >= MIN_PIXELS) & seen.all(-1) & motion.flatten(1).isfinite().all(-1)
+    return share, covariance, enough
+
+
+def _directions(now: _Weighted) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Returns units of the six parameters, and in these the eigenvalues, vectors and which count.
+
+    A parameter's unit moves the pixels by one pixel in all (root of the sum of squares), so that
+    radians and metres compare; 0 for a parameter that moves none. Where the structure hides a
+    motion, its eigenvalue is near 0.
+    """
+    moves = (now.weight.unsqueeze(1) * (now.Ju.square() + now.Jv.square())).sum(-1).double()
+    unit = torch.where(moves > 1e-12, moves, torch.inf).rsqrt()
+    values, vectors = torch.linalg.eigh(unit.unsqueeze(-1) * now.normal * unit.unsqueeze(-2))
+    return unit, values, vectors, values > _LEAST_EIGENVALUE

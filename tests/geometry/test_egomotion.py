@@ -1,0 +1,308 @@
+"""The camera's motion from flow and depth: laws, measured thresholds, and what tells nothing."""
+
+import math
+from itertools import product
+from pathlib import Path
+
+import pytest
+import torch
+
+from flowrep.geometry import camera_motion, ego_flow, factorize, relative_motion, rigid_flow
+from flowrep.geometry.pose import rotation_from_vector
+from tests.geometry.scenes import rigid
+
+SIZE = 84
+CAMERA = torch.tensor([[72.7, 0.0, 40.0], [0.0, 66.1, 45.0], [0.0, 0.0, 1.0]])
+SCENES = ["straight_road", "s_turn", "h_shaped_pathways", "three_way_junction"]
+FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "7scenes"
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def blocks(count: int = 16, seed: int = 0) -> torch.Tensor:
+    """Returns depth of blocks 2 to 10 m away, `[count, 1, 84, 84]`."""
+    coarse = 2 + 8 * torch.rand(count, 1, 6, 6, generator=seeded(seed))
+    return torch.nn.functional.interpolate(coarse, size=(SIZE, SIZE))
+
+
+def motions(count: int = 16, seed: int = 1) -> torch.Tensor:
+    generator = seeded(seed)
+    motion = torch.eye(4).repeat(count, 1, 1)
+    motion[:, :3, :3] = rotation_from_vector(0.02 * torch.randn(count, 3, generator=generator))
+    motion[:, :3, 3] = torch.randn(count, 3, generator=generator) * torch.tensor([0.05, 0.05, 0.2])
+    return motion
+
+
+def errors(got, motion, depth, camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Returns errors of rotation in degrees, translation in metres, ego flow in px (medians)."""
+    turn = got[..., :3, :3].double().mT @ motion[..., :3, :3].double()
+    off = torch.stack(
+        [
+            turn[:, 2, 1] - turn[:, 1, 2],
+            turn[:, 0, 2] - turn[:, 2, 0],
+            turn[:, 1, 0] - turn[:, 0, 1],
+        ],
+        -1,
+    )
+    miss = ego_flow(depth, camera, got).flow - ego_flow(depth, camera, motion).flow
+    return (
+        torch.rad2deg(off.norm(dim=-1) / 2),
+        (got - motion)[..., :3, 3].norm(dim=-1),
+        miss.norm(dim=-3).flatten(1).median(-1).values,
+    )
+
+
+def drive(scene: str, pairs: int, *sensors: str) -> dict[str, torch.Tensor]:
+    """Returns every second frame of a planner's drives, with the picture before as `before`."""
+    envs, planner = pytest.importorskip("flowrep.envs"), pytest.importorskip("flowrep.baselines")
+    names = ("depth", "instance", "instance_motion", "prev_from_curr", *sensors)
+    street, driver = envs.StreetEnv(scene, sensors=names), planner.Planner()
+    frames, episode, over = [], 0, True
+    while len(frames) < 2 * pairs:
+        if over:
+            seen, _ = street.reset(options={"episode_seed": episode})
+            episode += 1
+        before = seen.get("rgb")
+        seen, _, terminated, truncated, _ = street.step(driver(street))
+        over = terminated or truncated
+        frames.append(dict(seen) if before is None else {**seen, "before": before})
+    frames = frames[::2]
+    rows = max(len(frame["instance_motion"]) for frame in frames)
+    made = {}
+    for name in frames[0]:
+        maps = [torch.as_tensor(frame[name]) for frame in frames]
+        if name == "instance_motion":
+            pad = torch.eye(4).repeat(rows, 1, 1)
+            maps = [torch.cat([rows_, pad[len(rows_) :]]) for rows_ in maps]
+        made[name] = torch.stack(maps)
+    return made | {"K": torch.as_tensor(street.K).float()}
+
+
+def exact_flow(seen: dict[str, torch.Tensor]) -> torch.Tensor:
+    flow, valid = rigid_flow(seen["depth"], seen["instance"], seen["K"], seen["instance_motion"])
+    return torch.where(valid, flow, math.nan)
+
+
+def test_the_motion_of_a_flow_is_the_one_that_caused_it():
+    # A turn to the right and 0.5 m ahead; prev_from_curr, so T is where the camera came from. The
+    # rival curr_from_prev would have -0.5 and the opposite turn.
+    motion = rigid((0.01, -0.04, 0.02), (0.1, -0.05, 0.5)).float()
+    depth = blocks(1)[0]
+    estimate = camera_motion(ego_flow(depth, CAMERA, motion).flow, depth, CAMERA)
+    assert estimate.valid
+    assert estimate.inlier_share == 1.0
+    torch.testing.assert_close(estimate.prev_from_curr, motion, rtol=0, atol=1e-5)
+
+
+def test_a_camera_with_skew_and_oblong_pixels_in_float64():
+    camera = torch.tensor([[90.0, 4.0, 30.0], [0.0, 40.0, 51.0], [0.0, 0.0, 1.0]]).double()
+    depth, motion = blocks(3).double(), motions(3).double()
+    estimate = camera_motion(ego_flow(depth, camera, motion).flow, depth, camera)
+    torch.testing.assert_close(estimate.prev_from_curr, motion, rtol=0, atol=1e-6)
+    assert estimate.covariance.dtype == torch.float64
+
+
+def test_no_flow_is_exactly_no_motion():
+    estimate = camera_motion(torch.zeros(2, SIZE, SIZE), blocks(1)[0], CAMERA)
+    assert estimate.valid
+    assert torch.equal(estimate.prev_from_curr, torch.eye(4))
+
+
+@pytest.mark.parametrize("batch", [(3,), (2, 1)])
+def test_a_frame_s_motion_does_not_depend_on_its_batch(batch):
+    count = math.prod(batch)
+    depth, motion = blocks(count), motions(count)
+    flow = ego_flow(depth, CAMERA, motion).flow
+    flow += 0.2 * torch.randn(flow.shape, generator=seeded(3))
+    picture = (255 * torch.rand(count, 3, SIZE, SIZE, generator=seeded(4))).to(torch.uint8)
+    maps = [m.reshape(*batch, *m.shape[1:]) for m in (flow, depth, picture, motion)]
+    together = camera_motion(*maps[:2], CAMERA, picture=maps[2], prior=maps[3])
+    again = camera_motion(*maps[:2], CAMERA, picture=maps[2], prior=maps[3])
+    for part, repeated in zip(together, again):
+        assert part.shape[: len(batch)] == batch
+        assert torch.equal(part, repeated)
+    for at in product(*map(range, batch)):
+        alone = camera_motion(
+            maps[0][at], maps[1][at], CAMERA, picture=maps[2][at], prior=maps[3][at]
+        )
+        torch.testing.assert_close(
+            alone.prev_from_curr, together.prev_from_curr[at], rtol=0, atol=1e-4
+        )
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_exact_flow_of_a_street_gives_the_exact_motion(scene):
+    seen = drive(scene, 24)
+    got = camera_motion(exact_flow(seen), seen["depth"], seen["K"])
+    turn, shift, ego = errors(got.prev_from_curr, seen["prev_from_curr"], seen["depth"], seen["K"])
+    assert got.valid.all()
+    assert (ego < 0.001).float().mean() >= 0.995
+    assert turn.quantile(0.95) < 0.01
+    assert shift.quantile(0.95) < 0.001
+
+
+def test_people_over_a_third_to_half_of_the_picture_are_outliers():
+    crops = []
+    for scene in SCENES[:2]:
+        seen = drive(scene, 60)
+        flow = exact_flow(seen)
+        own = flow - ego_flow(seen["depth"], seen["K"], seen["prev_from_curr"]).flow
+        moves = own.norm(dim=1) > 1e-4
+        for frame, top, left in product(range(len(flow)), range(20, 56, 12), range(0, 60, 12)):
+            if 0.3 <= moves[frame, top : top + 24, left : left + 24].float().mean() < 0.5:
+                camera = seen["K"] - torch.tensor([[0.0, 0, left], [0, 0, top], [0, 0, 0]])
+                window = (frame, slice(None), slice(top, top + 24), slice(left, left + 24))
+                crops.append(
+                    (flow[window], seen["depth"][window], camera, seen["prev_from_curr"][frame])
+                )
+    flow, depth, camera, motion = map(torch.stack, zip(*crops))
+    assert len(flow) >= 10
+    got = camera_motion(flow, depth, camera)
+    assert (errors(got.prev_from_curr, motion, depth, camera)[2] < 0.05).float().mean() >= 0.97
+
+
+def test_noise_of_a_third_of_a_pixel_and_a_covariance_that_says_so():
+    depth, motion = blocks(64), motions(64)
+    flow = ego_flow(depth, CAMERA, motion).flow
+    flow += 0.3 * torch.randn(flow.shape, generator=seeded(5))
+    got = camera_motion(flow, depth, CAMERA)
+    turn, shift, _ = errors(got.prev_from_curr, motion, depth, CAMERA)
+    assert turn.median() < 0.03
+    assert shift.median() < 0.003
+    variance = got.covariance.diagonal(dim1=-2, dim2=-1)
+    said_turn = torch.rad2deg(variance[:, :3].sum(-1).mean().sqrt())
+    said_shift = variance[:, 3:].sum(-1).mean().sqrt()
+    assert 0.7 < said_turn / turn.square().mean().sqrt() < 1.4
+    assert 0.7 < said_shift / shift.square().mean().sqrt() < 1.4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "bad"), [*((scene, 0.25) for scene in SCENES[:3]), (SCENES[3], 0.3)]
+)
+def test_estimated_flow_of_a_street_gives_nearly_the_motion(scene, bad):
+    pytest.importorskip("cv2")
+    from flowrep.transforms import DIS
+
+    seen = drive(scene, 150, "rgb")
+    flow = -DIS()(seen["rgb"], seen["before"])
+    got = camera_motion(flow, seen["depth"], seen["K"], picture=seen["rgb"])
+    turn, shift, ego = errors(got.prev_from_curr, seen["prev_from_curr"], seen["depth"], seen["K"])
+    moved = seen["prev_from_curr"][:, :3, 3].norm(dim=-1)
+    assert ego.median() <= 0.30
+    assert (shift / moved).median() <= 0.13
+    assert turn.median() <= 0.2
+    assert (ego > 0.5).float().mean() <= bad
+
+
+@pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no 7-Scenes frames at {FOLDER}")
+@pytest.mark.parametrize("pair", [(0, 1), (1, 2)])
+def test_recorded_pictures_tell_the_motion_better_than_the_recorded_poses(pair):
+    sequences = pytest.importorskip("flowrep.sequences")
+    from flowrep.sequences.sevenscenes import SevenScenes
+    from flowrep.transforms import DIS
+
+    recording = SevenScenes(FOLDER)
+    before, now = (recording[i] for i in pair)
+    flow = torch.as_tensor(sequences.EstimatedFlowSource(DIS("fast"))(before, now))
+    depth, camera = torch.as_tensor(now.depth)[None], torch.as_tensor(now.K).float()
+    picture = torch.as_tensor(now.rgb).permute(2, 0, 1)
+    got = camera_motion(flow, depth, camera, picture=picture)
+    recorded = relative_motion(*(torch.as_tensor(f.world_from_cam) for f in (before, now)))
+
+    def unexplained(motion) -> float:
+        _, obj, valid = factorize(flow, depth, camera, motion)
+        return float(obj.norm(dim=0)[valid[0]].median() / flow.norm(dim=0)[valid[0]].median())
+
+    assert unexplained(got.prev_from_curr) <= 0.12
+    assert unexplained(got.prev_from_curr) < unexplained(recorded)
+
+
+def few_pixels() -> torch.Tensor:
+    depth = torch.full((1, SIZE, SIZE), math.nan)
+    depth[0, 40:44, 40:44] = 5.0
+    return depth
+
+
+def edges() -> torch.Tensor:
+    """Returns a picture of vertical edges alone, which tell nothing of a shift along them."""
+    return (255.0 * (torch.arange(SIZE) % 12 < 2)).expand(3, SIZE, SIZE)
+
+
+FLAT, SKY = torch.full((1, SIZE, SIZE), 5.0), torch.full((1, SIZE, SIZE), math.inf)
+TURN, RISE = rigid((0.01, 0.02, -0.01), (0, 0, 0)).float(), rigid((0, 0, 0), (0, 0.1, 0.3)).float()
+TELLS_NOTHING = {
+    "unknown flow": (torch.full((2, SIZE, SIZE), math.nan), FLAT, {}),
+    "unknown depth": (torch.zeros(2, SIZE, SIZE), FLAT * math.nan, {}),
+    "16 pixels": (torch.randn(2, SIZE, SIZE, generator=seeded()), few_pixels(), {}),
+    "no texture": (
+        torch.randn(2, SIZE, SIZE, generator=seeded()),
+        FLAT,
+        {"picture": torch.full((3, SIZE, SIZE), 90, dtype=torch.uint8)},
+    ),
+    "sky alone": (ego_flow(SKY, CAMERA, TURN).flow, SKY, {}),
+    "one direction of edges": (ego_flow(FLAT, CAMERA, RISE).flow, FLAT, {"picture": edges()}),
+}
+OPEN = {"sky alone": [3, 4, 5], "one direction of edges": [4], "16 pixels": None}
+
+
+@pytest.mark.parametrize("case", TELLS_NOTHING)
+def test_what_tells_no_motion_gives_the_identity_and_says_so(case):
+    flow, depth, options = TELLS_NOTHING[case]
+    got = camera_motion(flow, depth, CAMERA, **options)
+    assert not got.valid
+    assert torch.equal(got.prev_from_curr, torch.eye(4))
+    assert 0 <= got.inlier_share <= 1
+    assert not got.covariance.isnan().any()
+    variance = got.covariance.diagonal()
+    if OPEN.get(case, range(6)) is not None:
+        assert variance.isinf().nonzero().flatten().tolist() == list(OPEN.get(case, range(6)))
+    off_diagonal = got.covariance - torch.diag(torch.nan_to_num(variance, posinf=0.0))
+    assert off_diagonal[~torch.eye(6).bool()].isfinite().all()
+    prior = rigid((0.1, 0.0, 0.0), (0.0, 0.0, 0.4)).float()
+    assert torch.equal(
+        camera_motion(flow, depth, CAMERA, prior=prior, **options).prev_from_curr, prior
+    )
+
+
+def test_a_prior_decides_for_the_world_against_a_body_that_fills_more():
+    depth, motion = blocks(8), motions(8)
+    flow = ego_flow(depth, CAMERA, motion).flow
+    body = motion @ rigid((0.02, 0.0, 0.01), (0.15, 0.1, 0.0)).float()
+    flow[..., 36:] = ego_flow(depth, CAMERA, body).flow[..., 36:]  # 57 % of the picture
+    flow += 0.05 * torch.randn(flow.shape, generator=seeded(6))
+    follows_the_body = camera_motion(flow, depth, CAMERA)
+    guided = camera_motion(
+        flow, depth, CAMERA, prior=motion @ rigid((0, 0.002, 0), (0, 0, 0.01)).float()
+    )
+    assert errors(follows_the_body.prev_from_curr, motion, depth, CAMERA)[2].median() > 0.5
+    assert (errors(guided.prev_from_curr, motion, depth, CAMERA)[2] < 0.05).all()
+
+
+@pytest.mark.slow
+def test_it_compiles_to_one_graph_and_has_no_gradient():
+    depth, motion = blocks(2), motions(2)
+    flow = ego_flow(depth, CAMERA, motion).flow.requires_grad_()
+    eager = camera_motion(flow, depth, CAMERA)
+    assert not eager.prev_from_curr.requires_grad
+    compiled = torch.compile(camera_motion, fullgraph=True, backend="eager")(flow, depth, CAMERA)
+    torch.testing.assert_close(compiled.prev_from_curr, eager.prev_from_curr)
+
+
+@pytest.mark.parametrize(
+    ("changed", "error"),
+    [
+        ({"flow": torch.zeros(1, 5, 7)}, ValueError),
+        ({"depth": torch.ones(1, 7, 5)}, ValueError),
+        ({"picture": torch.zeros(3, 7, 5)}, ValueError),
+        ({"prior": torch.eye(3)}, ValueError),
+        ({"depth": torch.ones(1, 5, 7).int()}, TypeError),
+        ({"K": CAMERA.expand(2, 3, 3), "prior": torch.eye(4).expand(3, 4, 4)}, ValueError),
+    ],
+)
+def test_mistakes_are_named(changed, error):
+    given = {"flow": torch.zeros(2, 5, 7), "depth": torch.ones(1, 5, 7), "K": CAMERA, **changed}
+    with pytest.raises(error, match=next(iter(changed))):
+        camera_motion(given.pop("flow"), given.pop("depth"), given.pop("K"), **given)
