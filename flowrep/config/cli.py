@@ -195,6 +195,8 @@ def explained(error: Exception, schema: type[Section]) -> str:
     value = re.match(r"(?:Missing mandatory value: |Interpolation key ')([\w.]+)", text)
     if value:
         return f"{value[1]} needs a value: {value[1]}=..."
+    if not isinstance(error, HydraException | OmegaConfBaseException):
+        return text
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     place = ("full_key:", "object_type=", "See http", "provider=")
     return " ".join(x for x in lines if not x.startswith(place)).partition(" Config search path")[0]
@@ -213,19 +215,14 @@ def _unreadable(typed: str) -> str:
 
 
 def _unknown_key(key: str, schema: type[Section]) -> str:
-    """Returns that there is no such key, and where its last part is one, or all keys."""
-    name, places = key.rpartition(".")[2], set()
-    for group in config_groups():
-        for path in CONF_DIR.glob(f"{group}/**/*.yaml"):
-            keys = OmegaConf.load(path)
-            if group in schema.key_names() and isinstance(keys, DictConfig) and name in keys:
-                own = f"{path.stem}." if group == "representations" else ""
-                places.add(f"{group}.{own}{name}")
-    there = ", ".join(sorted(places)) if places and key == name else ""
-    if there:
-        return f"unknown key '{key}': do you mean {there}?"
+    """Returns that there is no such key, and the sections that have one, or all keys."""
     if "." in key:
         return f"unknown key '{key}': --cfg job shows the keys that there are"
+    groups = [group for group in config_groups() if group in schema.key_names()]
+    files = [(group, path) for group in groups for path in CONF_DIR.glob(f"{group}/**/*.yaml")]
+    places = sorted({f"{group}.{key}" for group, path in files if key in OmegaConf.load(path)})
+    if places:
+        return f"unknown key '{key}': do you mean {' or '.join(places)}?"
     return f"unknown key '{key}'; there are: {', '.join([*schema.key_names(), 'preset', 'debug'])}"
 
 

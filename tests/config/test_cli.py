@@ -133,6 +133,11 @@ def test_what_hydra_accepts_passes(run, line):
     assert isinstance(found[0], SCHEMAS[command])
 
 
+def test_each_mistake_has_its_line(run):
+    _, _, said = run("train", "algorithm.gamma=2", "seed=x")
+    assert len(said.err.splitlines()) == 2
+
+
 def test_a_key_of_ones_own_is_kept(run):
     _, (config,), _ = run("train", "+note=pilot")
     assert config.plain()["note"] == "pilot"
