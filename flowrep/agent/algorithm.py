@@ -320,7 +320,8 @@ def options_of(makers: Iterable[Any]) -> dict[str, inspect.Parameter]:
     found: dict[str, inspect.Parameter] = {}
     for maker in filter(None, makers):
         parameters = dict(inspect.signature(maker.__init__).parameters)
-        rest = [n for n, p in parameters.items() if p.kind is inspect.Parameter.VAR_KEYWORD]
+        variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        rest = [n for n, p in parameters.items() if p.kind in variadic]
         given = (*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS, *rest)
         found = {n: p for n, p in parameters.items() if n not in given} | found
         if not rest:

@@ -18,7 +18,6 @@ from flowrep.agent.networks import (
     DiscreteActions,
     MapNetwork,
     PolicyNetwork,
-    acting_network,
 )
 from flowrep.agent.off_policy import OffPolicy
 
@@ -85,9 +84,7 @@ class DoubleDQN(OffPolicy):
     the policy takes the action of the largest value.
 
     Args:
-        observation_spec: see `OffPolicy`, as for the next three arguments.
-        action_spec: `Categorical` or `OneHot`.
-        keys: the observation maps to read, in order.
+        run: positional arguments of `OffPolicy`.
         total_frames: environment frames over the whole training.
         initial_epsilon: ε at the start, from which it falls linearly.
         final_epsilon: ε after `exploration_share` of the frames.
@@ -104,10 +101,7 @@ class DoubleDQN(OffPolicy):
 
     def __init__(
         self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        keys: Sequence[NestedKey],
-        *,
+        *run: Any,
         total_frames: int,
         initial_epsilon: float = 1.0,
         final_epsilon: float = 0.05,
@@ -120,14 +114,7 @@ class DoubleDQN(OffPolicy):
             "exploration_share": exploration_share,
             "total_frames": total_frames,
         }
-        super().__init__(
-            observation_spec,
-            action_spec,
-            keys,
-            total_frames=total_frames,
-            policy_options=policy_options,
-            **options,
-        )
+        super().__init__(*run, total_frames=total_frames, policy_options=policy_options, **options)
 
     @property
     def exploration(self) -> EGreedyModule:
@@ -149,15 +136,8 @@ class DoubleDQN(OffPolicy):
         **options: Any,
     ) -> EpsilonGreedyPolicy:
         """Returns an untrained policy, see `Algorithm.make_policy`; its state includes ε."""
-        device = torch.device(device)
-        network = acting_network(
-            observation_spec,
-            action_spec,
-            keys,
-            device=device,
-            precision=options["precision"],
-            hidden_size=options["hidden_size"],
-            layer_norm=options.get("layer_norm", False),
+        stochastic = super().make_policy(
+            observation_spec, action_spec, keys, device=device, **options
         )
         exploration = EGreedyModule(
             action_spec,
@@ -166,9 +146,8 @@ class DoubleDQN(OffPolicy):
             max(1, int(options["exploration_share"] * options["total_frames"])),
             device=device,
         )
-        return EpsilonGreedyPolicy(
-            network, list(keys), DiscreteActions.from_spec(action_spec), exploration
-        )
+        actions = DiscreteActions.from_spec(action_spec)
+        return EpsilonGreedyPolicy(stochastic[0].module, list(keys), actions, exploration)
 
     def remember(self, steps: TensorDictBase) -> None:
         """Stores steps and lowers ε for each of them."""

@@ -9,7 +9,6 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
 from torchrl.objectives import DiscreteSACLoss, LossModule, ValueEstimators
 
 from flowrep.agent.networks import (
@@ -185,11 +184,9 @@ class DiscreteSAC(OffPolicy):
     without the entropy bonus of the steps between.
 
     Args:
-        observation_spec: see `OffPolicy`, as for the next two arguments.
-        action_spec: `Categorical` or `OneHot`.
-        keys: the observation maps to read, in order.
         alpha_rate_factor: learning rate of log α relative to that of the weights.
-        options: further arguments of `OffPolicy` and `DiscreteSACMapLoss`.
+        run: positional arguments of `OffPolicy`.
+        options: its other arguments, and those of `DiscreteSACMapLoss`.
     """
 
     LOSS: ClassVar[Callable[..., LossModule]] = DiscreteSACMapLoss
@@ -203,14 +200,5 @@ class DiscreteSAC(OffPolicy):
         "td_error": "td_error",
     }
 
-    def __init__(
-        self,
-        observation_spec: Composite,
-        action_spec: TensorSpec,
-        keys: Sequence[NestedKey],
-        *,
-        alpha_rate_factor: float = 1.0,
-        **options: Any,
-    ) -> None:
-        rate_factors = {"log_alpha": alpha_rate_factor}
-        super().__init__(observation_spec, action_spec, keys, rate_factors=rate_factors, **options)
+    def __init__(self, *run: Any, alpha_rate_factor: float = 1.0, **options: Any) -> None:
+        super().__init__(*run, rate_factors={"log_alpha": alpha_rate_factor}, **options)
