@@ -106,7 +106,8 @@ def test_without_poses_the_motion_is_estimated():
     depth = np.linspace(2.0, 6.0, 40, dtype=np.float32)[:, None].repeat(60, 1)
     raw = np.stack([-30.0 * 0.4 / depth, 0 * depth])
     raw[:, :20, :30] += np.float32([[[4.0]], [[-3.0]]])
-    before, now = frame("a", world_from_cam=None), frame("b", world_from_cam=None, depth=depth)
+    before = frame("a", world_from_cam=None)
+    now = frame("b", world_from_cam=None, depth=depth, rgb=None)
     with pytest.raises(SequenceError, match="poses=estimated"):
         factorize_pair(before, now, raw)
     made = factorize_pair(before, now, raw, estimated_motion(before, now, raw))
