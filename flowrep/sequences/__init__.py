@@ -2,7 +2,7 @@
 
 from flowrep.extras import require
 
-require("flowrep.sequences", "factorize", "cv2")
+require("flowrep.sequences", "factorize", "cv2", "pydantic")
 
 from flowrep.sequences.calibration import Registration
 from flowrep.sequences.doctor import Diagnosis, Doctor, diagnose

@@ -3,32 +3,101 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    field_validator,
+)
 
 from flowrep.geometry import CameraAxes, PoseDirection, PoseLayout, adapt_pose
-from flowrep.sequences.files import read_json, read_table
+from flowrep.sequences.files import read_bytes, read_table
 from flowrep.sequences.recording import Pose, SequenceError
 
 
-@dataclass(frozen=True)
-class Camera:
-    """K `[3, 3]` in flowrep's convention, and the size of the pictures it belongs to."""
+class Camera(BaseModel):
+    """A camera in `intrinsics.json`."""
 
-    K: NDArray[np.float64]
-    height: int
-    width: int
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    width: PositiveInt
+    height: PositiveInt
+    fx: PositiveFloat
+    fy: float
+    cx: float
+    cy: float
+    first_pixel_centre: float
+
+    @field_validator("first_pixel_centre")
+    @classmethod
+    def _is_corner_or_centre(cls, place: float) -> float:
+        if place not in (0.0, 0.5):
+            raise ValueError(f"is 0 (as OpenCV calibrates) or 0.5, not {place}")
+        return place
+
+    @field_validator("fy")
+    @classmethod
+    def _is_right_handed(cls, fy: float) -> float:
+        if fy > 0:
+            return fy
+        raise ValueError(
+            "should be positive. Where it is negative (ICL-NUIM) the camera is left-handed, with y "
+            "up and z ahead: mirror the poses, F @ pose @ F with F = diag(1, -1, 1, 1)"
+        )
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """K `[3, 3]` in flowrep's convention."""
+        shift = 0.5 - self.first_pixel_centre
+        return intrinsics(self.fx, self.fy, self.cx + shift, self.cy + shift)
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width."""
         return self.height, self.width
+
+
+Row = tuple[float, float, float, float]
+
+
+class ColourCamera(Camera):
+    """A second camera, to whose pixels depth is registered."""
+
+    colour_from_depth: tuple[Row, Row, Row, Row]
+
+
+class Cameras(Camera):
+    """The content of `intrinsics.json`: depth's camera, and colour's if it is another."""
+
+    colour: ColourCamera | None = None
+
+
+def read_cameras(path: Path) -> Cameras:
+    """Returns the content of a folder's `intrinsics.json`, see docs/factorize.md.
+
+    Raises:
+        SequenceError: a key is missing, or its value is invalid.
+    """
+    remedy = (
+        'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
+        '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5}'
+    )
+    try:
+        return Cameras.model_validate_json(read_bytes(path, remedy))
+    except ValidationError as error:
+        lines = [
+            f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip()
+            for e in error.errors(include_url=False, include_input=False)
+        ]
+        raise SequenceError(path, f"{', '.join(lines)}; {remedy}") from None
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> NDArray:
@@ -52,67 +121,6 @@ def four_intrinsics(name: str, numbers: Sequence[float]) -> tuple[float, float, 
     if len(values) != 4 or not np.isfinite(values).all() or min(values[:2]) <= 0:
         raise SequenceError(name, f"should be [fx, fy, cx, cy] in pixels, not {list(numbers)}")
     return values[0], values[1], values[2], values[3]
-
-
-INTRINSICS_REMEDY = (
-    'write {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
-    '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5} to it'
-)
-_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "first_pixel_centre")
-
-
-def read_cameras(path: Path) -> tuple[Camera, Camera | None, NDArray[np.float64] | None]:
-    """Returns the depth camera, the colour camera if it is different, and `colour_from_depth`.
-
-    The file is the `intrinsics.json` of `frames` and `zed` folders, see docs/factorize.md.
-
-    Raises:
-        SequenceError: a key is missing, or its value is invalid.
-    """
-    content = read_json(path, INTRINSICS_REMEDY)
-    camera = _camera(path, content)
-    if "colour" not in content:
-        return camera, None, None
-    colour = content["colour"]
-    if not isinstance(colour, Mapping):
-        raise SequenceError(path, "colour should be an object")
-    try:
-        extrinsics = np.array(colour.get("colour_from_depth"), dtype=np.float64)
-    except (TypeError, ValueError):
-        extrinsics = np.empty(0)
-    if extrinsics.shape != (4, 4):
-        raise SequenceError(path, "colour.colour_from_depth should be four rows of four numbers")
-    return camera, _camera(path, colour, "colour."), as_pose(extrinsics, path)
-
-
-def _camera(path: Path, content: Mapping[str, Any], prefix: str = "") -> Camera:
-    missing = [prefix + key for key in _KEYS if key not in content]
-    if missing:
-        raise SequenceError(path, f"lacks {', '.join(missing)}; {INTRINSICS_REMEDY}")
-    value = {key: content[key] for key in _KEYS}
-    for key, number in value.items():
-        is_number = isinstance(number, int | float) and not isinstance(number, bool)
-        if not is_number or not math.isfinite(number):
-            raise SequenceError(path, f"{prefix}{key} should be a number, not {str(number)[:40]!r}")
-    if value["first_pixel_centre"] not in (0, 0.5):
-        raise SequenceError(
-            path, f"{prefix}first_pixel_centre is 0 (as OpenCV calibrates) or 0.5, "
-            f"not {value['first_pixel_centre']}",
-        )  # fmt: skip
-    for key in ("width", "height"):
-        if value[key] < 1 or value[key] != int(value[key]):
-            raise SequenceError(path, f"{prefix}{key} should be a whole number, not {value[key]}")
-    if value["fx"] > 0 > value["fy"]:
-        raise SequenceError(
-            path,
-            f"{prefix}fy is negative: the camera is left-handed, with y up and z ahead (ICL-NUIM). "
-            "Write fy positive and mirror the poses: F @ pose @ F with F = diag(1, -1, 1, 1)",
-        )
-    if not (value["fx"] > 0 and value["fy"] > 0):
-        raise SequenceError(path, f"{prefix}fx and {prefix}fy should be positive")
-    shift = 0.5 - value["first_pixel_centre"]
-    K = intrinsics(value["fx"], value["fy"], value["cx"] + shift, value["cy"] + shift)
-    return Camera(K, int(value["height"]), int(value["width"]))
 
 
 def as_pose(

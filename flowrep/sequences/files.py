@@ -6,7 +6,6 @@ to name the file, to refuse pictures that were cut off, and to say which shape a
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 from collections.abc import Iterable
@@ -134,17 +133,6 @@ def read_table(
     if not rows:
         raise SequenceError(path, "holds no numbers")
     return np.array(rows, dtype=np.float64)
-
-
-def read_json(path: Path, remedy: str = "") -> dict[str, Any]:
-    """Returns the object that a JSON file holds."""
-    try:
-        value = json.loads(read_bytes(path, remedy))
-    except ValueError as error:
-        raise SequenceError(path, f"is not JSON ({error})") from None
-    if not isinstance(value, dict):
-        raise SequenceError(path, f"should be a JSON object, not {type(value).__name__}")
-    return value
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:

@@ -133,13 +133,12 @@ class Frames(Recording):
             self._times = read_table(times_path, [1])[:, 0]
             check_count(times_path, len(self._times), len(self), "times")
             check_ascending(times_path, self._times)
-        self._camera, colour, colour_from_depth = read_cameras(self.folder / "intrinsics.json")
+        path = self.folder / "intrinsics.json"
+        self._camera = read_cameras(path)
         self._registration, self.K = None, self._camera.K
-        if colour is not None and colour_from_depth is not None:
-            self._registration = Registration(
-                self._camera.K, colour.K, colour_from_depth, colour.size
-            )
-            self.K = colour.K
+        if colour := self._camera.colour:
+            extrinsics, self.K = as_pose(np.array(colour.colour_from_depth), path), colour.K
+            self._registration = Registration(self._camera.K, self.K, extrinsics, colour.size)
 
     def _check_names(self) -> None:
         """Raises SequenceError if a frame lacks a file that the others have."""

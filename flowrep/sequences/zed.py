@@ -42,13 +42,13 @@ class Zed(Recording):
         if self.has_poses:
             self._poses = read_pose_lines(self._poses_path, "xyz_xyzw")
             check_count(self._poses_path, len(self._poses), len(self), "poses")
-        camera, other, _ = read_cameras(self.folder / "intrinsics.json")
-        if other is not None:
+        self._camera = read_cameras(self.folder / "intrinsics.json")
+        self.K = self._camera.K
+        if self._camera.colour is not None:
             raise SequenceError(
                 self.folder / "intrinsics.json",
                 "names a colour camera; a ZED's depth belongs to the left picture already",
             )
-        self._camera, self.K = camera, camera.K
 
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]

@@ -248,7 +248,7 @@ def test_poses_that_are_none_are_refused(line, says, tmp_path):
     ("change", "says"),
     [
         ({"fx": None}, "fx"),
-        ({"fx": -31.0}, "positive"),
+        ({"fx": -31.0}, "fx"),
         ({"fy": -27.0}, "left-handed"),  # ICL-NUIM's: no camera axes turn it
         ({"width": 40.9}, "width"),
         ({"height": float("nan")}, "height"),
@@ -267,7 +267,7 @@ def test_intrinsics_that_are_none_are_refused(name, change, says, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "says"), [("{", "JSON"), ("[]", "JSON object"), ("{}", "width"), (None, "width")]
+    ("content", "says"), [("{", "JSON"), ("[]", "object"), ("{}", "width"), (None, "width")]
 )
 def test_an_intrinsics_file_says_what_it_lacks(content, says, tmp_path):
     synthetic.write_frames(tmp_path)
