@@ -245,18 +245,18 @@ def test_without_poses_the_cameras_motion_is_estimated(moments, tmp_path, capsys
     assert "estimated" in capsys.readouterr().out
     expected = np.linalg.inv(synthetic.pose(0)) @ synthetic.pose(1)
     estimated = np.load(out / "flow/0001.npz")["prev_from_curr"]
-    np.testing.assert_allclose(estimated, expected, atol=1e-2)
+    np.testing.assert_allclose(estimated, expected, atol=1e-3)
     for row in table(out):
         assert float(row["inlier_share"]) > 0.7
         assert row["rotation_off_deg"] == row["recorded_obj_median_px"] == ""
-        assert float(row["obj_median_px"]) < 0.1
+        assert float(row["obj_median_px"]) < 0.01
 
 
 def test_an_estimated_motion_stands_beside_the_recorded_one(moments, tmp_path):
     _, out = factorize(tmp_path, "flow=exact", "poses=estimated", "video=false")
     for row in table(out):
-        assert float(row["rotation_off_deg"]) < 0.3
-        assert float(row["translation_off_m"]) < 0.01
+        assert float(row["rotation_off_deg"]) < 0.02
+        assert float(row["translation_off_m"]) < 0.001
         assert float(row["recorded_obj_median_px"]) < 1e-3
 
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flowrep.geometry import factorize, relative_motion
+from flowrep.geometry import camera_motion, factorize, relative_motion
 from flowrep.sequences.files import Flow
 from flowrep.sequences.recording import Frame, Pose, SequenceError
 
@@ -207,45 +207,14 @@ def picture_of(frame: Frame) -> Tensor | None:
     return None if frame.rgb is None else torch.from_numpy(frame.rgb).permute(2, 0, 1)
 
 
-_LEAST_PIXELS, _MOST_PIXELS = 50, 1500
-
-
 def estimate_motion(
     raw: Tensor, depth: Tensor, K: Tensor, *, picture: Tensor | None = None
 ) -> Motion:
-    """Returns the camera's motion from flow and depth.
-
-    Args:
-        raw: `[2, H, W]`, pixels; nan unknown.
-        depth: `[1, H, W]`, metres.
-        K: `[3, 3]`, pixels.
-        picture: uint8 `[3, H, W]`.
-    """
-    flow, z, camera = raw.numpy(), depth[0].numpy(), K.double().numpy()
-    usable = np.isfinite(flow).all(0) & np.isfinite(z) & (z > 0)
-    if picture is not None and usable.any():
-        rows, columns = np.gradient(picture.float().mean(0).numpy())
-        texture = cv2.blur(np.square(rows) + np.square(columns), (7, 7))
-        usable &= texture >= np.median(texture[usable])
-    v, u = np.nonzero(usable)
-    if len(u) < _LEAST_PIXELS:
+    """Returns the camera's motion by `flowrep.geometry.camera_motion`, see there."""
+    found = camera_motion(raw, depth, K.float(), picture=picture)
+    if not found.valid:
         return Motion(known=False, inlier_share=0.0)
-    chosen = np.random.default_rng(0).permutation(len(u))[:_MOST_PIXELS]
-    u, v = u[chosen], v[chosen]
-    pixels = np.stack([u + 0.5, v + 0.5, np.ones(len(u))])
-    unit = float(np.median(z[v, u]))
-    points = (np.linalg.inv(camera) @ pixels * (z[v, u] / unit)).T.copy()
-    seen = (pixels[:2] - flow[:, v, u]).T.copy()
-    found, turn, shift, inliers = cv2.solvePnPRansac(
-        points, seen, camera, None, reprojectionError=1.0, iterationsCount=300
-    )
-    if not found:
-        return Motion(known=False, inlier_share=0.0)
-    kept = inliers[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points[kept], seen[kept], camera, None, turn, shift)
-    prev_from_curr = np.eye(4)
-    prev_from_curr[:3, :3], prev_from_curr[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0] * unit
-    return Motion(prev_from_curr, inlier_share=len(kept) / len(u))
+    return Motion(found.prev_from_curr.double().numpy(), inlier_share=float(found.inlier_share))
 
 
 def factorize_frames(
