@@ -62,14 +62,15 @@ def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> M
     Flow is in px/step, whatever the unit and scale of the agent's own representations. If the agent
     uses estimated flow or noisy depth, so do these maps.
     """
-    raw = sensor.get("flow", None)
+    raw = measured = sensor.get("flow", None)
     if raw is None:
         exact, instance = sensor["depth"], sensor["instance"]
-        raw, _ = rigid_flow(exact, instance, intrinsics, sensor["instance_motion"])
+        measured = rigid_flow(exact, instance, intrinsics, sensor["instance_motion"])
+        raw = measured.flow
     depth = sensor.get("noisy_depth", sensor["depth"])
     told = sensor.get("noisy_motion", sensor["prev_from_curr"])
     motion = sensor.get("estimated_motion", told)
-    ego, obj, _ = factorize(raw, depth, intrinsics, motion)
+    ego, obj, _ = factorize(measured, depth, intrinsics, motion)
     return {
         "rgb": sensor["rgb"],
         "semantic": sensor["semantic"],

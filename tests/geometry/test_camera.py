@@ -1,11 +1,20 @@
-"""Projection and its inverse, worked by hand on an off-centre camera with fx != fy and skew."""
+"""The pinhole camera: pixels and points, and K from what others give."""
 
+from __future__ import annotations
+
+import math
 from itertools import product
 
 import pytest
 import torch
 
-from flowrep.geometry import project, unproject
+from flowrep.geometry import (
+    check_intrinsics,
+    intrinsics_from_fov,
+    intrinsics_from_opencv,
+    project,
+    unproject,
+)
 from tests.geometry.scenes import HEIGHT, WIDTH, K, depth_map
 
 
@@ -130,3 +139,60 @@ def test_gradients():
 def test_mistakes_are_named(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+# 1 x 3 pixels whose rays lead through (-0.75, 0.5), (0, 0.5) and (0.75, 0.5) at z = 1.
+CAMERA = torch.tensor([[4.0, 0.0, 3.5], [0.0, 8.0, -3.5], [0.0, 0.0, 1.0]])
+
+
+def test_field_of_view_across_the_width_or_the_height():
+    # tan(45 deg) = 1: half of the picture, 3 or 2 px, lies as far out as the focal length.
+    across_width = intrinsics_from_fov(90.0, axis="horizontal", height=4, width=6)
+    across_height = intrinsics_from_fov(90.0, axis="vertical", height=4, width=6)
+    assert across_width.tolist() == [[3.0, 0.0, 3.0], [0.0, 3.0, 2.0], [0.0, 0.0, 1.0]]
+    assert across_height.tolist() == [[2.0, 0.0, 3.0], [0.0, 2.0, 2.0], [0.0, 0.0, 1.0]]
+    # What lies on the field's rim is seen at the picture's: 30 degrees to the right of the axis.
+    rim = torch.tensor([math.tan(math.radians(30.0)), 0.0, 1.0])
+    K_60 = intrinsics_from_fov(60.0, axis="horizontal", height=4, width=6)
+    torch.testing.assert_close(project(rim, K_60), torch.tensor([6.0, 2.0]))
+
+
+def test_pixels_that_are_not_square():
+    wide = intrinsics_from_fov(90.0, axis="horizontal", height=240, width=320, pixel_aspect=1.2)
+    assert [wide[0, 0].item(), wide[1, 1].item()] == pytest.approx([160.0, 192.0])
+    tall = intrinsics_from_fov(90.0, axis="vertical", height=240, width=320, pixel_aspect=1.2)
+    assert [tall[0, 0].item(), tall[1, 1].item()] == pytest.approx([100.0, 120.0])
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"axis": "diagonal"}, r"axis must be one of \['horizontal', 'vertical'\], got 'diagonal'"),
+        ({"fov_deg": 180.0}, "between 0 and 180 degrees, got 180"),
+        ({"height": 0}, "at least 1 pixel, got 0 and 6"),
+    ],
+)
+def test_field_of_view_is_checked(changed, expected):
+    options = {"fov_deg": 90.0, "axis": "vertical", "height": 4, "width": 6, **changed}
+    with pytest.raises(ValueError, match=expected):
+        intrinsics_from_fov(**options)
+
+
+def test_a_picture_may_be_one_pixel_wide():
+    # One pixel across 90 degrees: the focal length is half of it, and its centre lies at 0.5.
+    K = intrinsics_from_fov(90.0, axis="horizontal", height=1, width=1)
+    assert (K[0, 0], K[0, 2], K[1, 2]) == (pytest.approx(0.5), 0.5, 0.5)
+
+
+def test_opencv_calibration_moves_by_half_a_pixel_and_no_more():
+    moved = intrinsics_from_opencv(CAMERA.expand(2, 3, 3)) - CAMERA
+    half = [[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]
+    assert moved.tolist() == [half, half]
+
+
+def test_intrinsics_that_are_none_are_refused_by_name_and_place():
+    cameras = CAMERA.repeat(2, 3, 1, 1)
+    check_intrinsics("K", cameras)
+    cameras[1, 2, 2, 0] = 3.5  # and so (3.5, 0, 1) as the last row
+    with pytest.raises(ValueError, match=r"^K\[1, 2\] should .*got \[\[4.0, 0.0, 3.5\], .*, \[3.5"):
+        check_intrinsics("K", cameras)

@@ -1,5 +1,8 @@
-"""torch.compile: one graph without breaks, and the same numbers."""
+"""torch.compile, torch.export and CUDA give what eager PyTorch gives on a CPU."""
 
+from __future__ import annotations
+
+import io
 import math
 import shutil
 
@@ -118,3 +121,58 @@ def test_compiled_gradients_are_eager_s():
 
     for got, expected in zip(gradients(compiled), gradients(ego_flow)):
         torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-3)
+
+
+class Function(torch.nn.Module):
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def forward(self, *given):
+        return tuple(self.function(*given))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dynamic", [False, True])
+@pytest.mark.parametrize("function", [ego_flow, factorize])
+def test_a_saved_program_gives_the_same_flow(function, dynamic):
+    depth, motions = depth_map(3).float(), MOTION.float().repeat(3, 1, 1)
+    depth[0, 0, 0, :3] = torch.tensor([torch.inf, torch.nan, 0.0])
+    given = (depth, K.float().repeat(3, 1, 1), motions)
+    if function is factorize:
+        given = (torch.ones(3, 2, HEIGHT, WIDTH), *given)
+    batch = torch.export.Dim("batch") if dynamic else None
+    shapes = (({0: batch},) * len(given),) if dynamic else None
+    program = torch.export.export(Function(function), given, dynamic_shapes=shapes)
+    file = io.BytesIO()
+    torch.export.save(program, file)
+    file.seek(0)
+    loaded = torch.export.load(file).module()
+    for count in (3, 2) if dynamic else (3,):
+        part = tuple(tensor[:count] for tensor in given)
+        for got, want in zip(loaded(*part), function(*part)):
+            assert torch.equal(got, want)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_equals_cpu(dtype, compiled):
+    instance = (torch.arange(HEIGHT * WIDTH) % 3).reshape(1, HEIGHT, WIDTH)
+    motions = torch.stack([MOTION, OTHER_MOTION, MOTION]).to(dtype)
+
+    def everything(depth, instance, K, motions):
+        raw, valid = rigid_flow(depth, instance, K, motions)
+        factors = factorize(raw, depth, K, motions[0])
+        points = unproject(depth, K)
+        return raw, valid, *factors, points, project(points, K), ego_flow(depth, K, motions[0]).flow
+
+    given = [depth_map().to(dtype), instance, K.to(dtype), motions]
+    on_gpu = torch.compile(everything, fullgraph=True) if compiled else everything
+    got = on_gpu(*(tensor.cuda() for tensor in given))
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-12
+    for part, expected in zip(got, everything(*given)):
+        assert part.is_cuda
+        torch.testing.assert_close(part.cpu(), expected, rtol=tolerance, atol=tolerance)
+    static = (instance != 1).expand_as(got[3])
+    assert got[3].cpu()[static].abs().max() == 0  # object flow of what stands still

@@ -6,6 +6,7 @@ import math
 import pickle
 import re
 import shutil
+import subprocess
 import sys
 
 import pytest
@@ -13,11 +14,31 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Compose
 
-from flowrep.transforms import Depth, FlowFactorize, FrameStack, RawFlow, Rgb, Segmentation, base
-from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv, frame
+from flowrep.transforms import (
+    CameraMotion,
+    Depth,
+    EstimatedFlow,
+    FlowFactorize,
+    FrameStack,
+    RawFlow,
+    Rgb,
+    Segmentation,
+    base,
+)
+from flowrep.transforms.stack import DropKeys
+from tests.transforms.contract import same_bits
+from tests.transforms.fake_env import (
+    INTRINSICS,
+    NUM_CLASSES,
+    FakeSensorEnv,
+    SelfResettingEnv,
+    frame,
+)
 
 COMPILE = torch.compile
+
 
 TRANSFORMS = {
     "seg": lambda: Segmentation(NUM_CLASSES),
@@ -29,6 +50,8 @@ TRANSFORMS = {
     "ego, obj": lambda: FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
     "stack": lambda: FrameStack(k=3, in_keys=[("sensor", "rgb")], out_keys=["rgb3"]),
 }
+
+
 each_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=list(TRANSFORMS))
 
 
@@ -240,3 +263,49 @@ def test_wrong_number_of_keys_is_refused():
         RawFlow(INTRINSICS, in_keys=["depth"])
     with pytest.raises(ValueError, match=r"\['ego', 'obj'\]: out_keys needs as many"):
         FlowFactorize(INTRINSICS, out_keys=["ego"])
+
+
+DEPTH, RGB = ("sensor", "depth"), ("sensor", "rgb")
+
+
+def one_pixel(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """An estimator whose flow is 1 px everywhere."""
+    return torch.ones_like(first[:, :2], dtype=torch.float32)
+
+
+def opening() -> Compose:
+    return Compose(
+        CameraMotion(out_keys="motion"),
+        FlowFactorize(INTRINSICS, outputs=["ego"], in_keys=[DEPTH, "motion"]),
+        FrameStack(k=2, in_keys=[RGB], out_keys=["rgb2"]),
+        EstimatedFlow(one_pixel),
+        DropKeys("motion"),
+    )
+
+
+def test_all_that_is_computed_from_a_first_frame_is_what_a_reset_would_give():
+    own = TransformedEnv(SelfResettingEnv((2,)), opening()).rollout(9, break_when_any_done=False)
+    reset = TransformedEnv(FakeSensorEnv((2,)), opening()).rollout(9, break_when_any_done=False)
+    for key in (DEPTH, "ego", "rgb2", "raw"):
+        assert same_bits(own[key], reset[key]), key
+    for flow in ("ego", "raw"):  # of an episode's first frame, and of no other, is 0
+        still = (own[flow] == 0).flatten(2).all(-1)
+        assert still.nonzero().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0], [1, 4], [1, 8]]
+
+
+PROGRAM = """
+import sys
+import torch, tensordict.nn, torchrl.data, torchrl.envs.transforms
+before = {name.partition(".")[0] for name in sys.modules}
+import flowrep.transforms
+after = {name.partition(".")[0] for name in sys.modules}
+print(*sorted(after - before - sys.stdlib_module_names))
+"""
+
+
+@pytest.mark.slow
+def test_importing_the_transforms_imports_nothing_else():
+    result = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.split() == ["flowrep"]

@@ -1,15 +1,29 @@
-"""Where flow is valid it is finite, whatever goes in; where it isn't, it is 0 and sends back 0."""
+"""What the closed form promises: finite flow, finite gradients, float32 near float64."""
+
+from __future__ import annotations
 
 import itertools
 import math
 
 import pytest
 import torch
+from torch.autograd import gradcheck
 
 from flowrep.geometry import ego_flow, factorize, rigid_flow
-from tests.geometry.scenes import HEIGHT, MOTION, OTHER_MOTION, WIDTH, K, depth_map
+from tests.geometry.scenes import (
+    HEIGHT,
+    MOTION,
+    OTHER_MOTION,
+    WIDTH,
+    K,
+    depth_map,
+    flow_by_points,
+    rigid,
+)
 
 NAN, INF = math.nan, math.inf
+
+
 ENTRIES = [
     *(("K", entry) for entry in itertools.product(range(3), range(3))),
     *(("motion", entry) for entry in itertools.product(range(4), range(4))),
@@ -183,3 +197,140 @@ def test_factors_have_one_type_the_widest(raw, others, expected):
     assert valid.all()
     if torch.promote_types(raw, others) == raw:  # widened raw flow rounds as ego flow does
         assert obj.abs().max() == 0
+
+
+def depth_with_every_mask() -> torch.Tensor:
+    depth = depth_map()
+    depth[0, 0, :5] = torch.tensor([math.inf, math.nan, 0.0, -2.0, -math.inf])
+    depth[0, 0, 5] = 1.5  # behind the previous camera of BACKED_OFF
+    return depth.requires_grad_()
+
+
+BACKED_OFF = MOTION.clone()
+
+
+BACKED_OFF[2, 3] = -2.0
+
+
+def leaves(*tensors: torch.Tensor) -> list[torch.Tensor]:
+    return [tensor.clone().requires_grad_() for tensor in tensors]
+
+
+def test_gradients_of_ego_flow():
+    K_leaf, motion = leaves(K, BACKED_OFF)
+    depth = depth_with_every_mask()
+    assert ego_flow(depth, K, BACKED_OFF).valid[0, 0].tolist() == [True] + 5 * [False] + [True]
+    assert gradcheck(lambda *given: ego_flow(*given, dt=0.5).flow, (depth, K_leaf, motion))
+
+
+def test_gradients_of_rigid_flow():
+    instance = torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) % 2
+    K_leaf, motions = leaves(K, torch.stack([BACKED_OFF, OTHER_MOTION]))
+    depth = depth_with_every_mask()
+    assert gradcheck(
+        lambda depth, K, motions: rigid_flow(depth, instance, K, motions).flow,
+        (depth, K_leaf, motions),
+    )
+
+
+def test_gradients_of_factors():
+    raw = torch.ones(2, HEIGHT, WIDTH, dtype=torch.float64)
+    raw[0, 2, 2] = math.nan
+    raw_leaf, K_leaf, motion = leaves(raw, K, BACKED_OFF)
+    depth = depth_with_every_mask()
+    assert gradcheck(lambda *given: factorize(*given)[:2], (raw_leaf, depth, K_leaf, motion))
+
+
+def test_masked_pixels_send_back_zero_not_nan():
+    # With an epsilon instead of two masks the gradient at depth 0 is about 1/eps^2, and
+    # 0 * inf = nan spreads from it to K and motion.
+    depth = depth_with_every_mask()
+    K_leaf, motion = leaves(K, MOTION)
+    ego_flow(depth, K_leaf, motion).flow.square().sum().backward()
+    assert depth.grad[0, 0, :5].tolist() == [0.0] * 5
+    assert depth.grad[0, 1:].abs().min() > 0
+    assert K_leaf.grad.isfinite().all()
+    assert motion.grad.isfinite().all()
+    assert motion.grad[:3].abs().min() > 0
+
+
+def test_a_point_level_with_the_previous_camera_sends_back_zero_not_nan():
+    # 2 m ahead after backing off by 2 m: its previous depth is exactly 0, flow there 0/0.
+    level = torch.eye(4, dtype=torch.float64)
+    level[2, 3] = -2.0
+    depth = torch.tensor([[[2.0, 5.0]]], dtype=torch.float64, requires_grad=True)
+    K_leaf, motion = leaves(K, level)
+    ego_flow(depth, K_leaf, motion).flow.sum().backward()
+    assert depth.grad[0, 0, 0].item() == 0.0
+    assert depth.grad[0, 0, 1].item() != 0.0
+    assert K_leaf.grad.isfinite().all()
+    assert motion.grad.isfinite().all()
+
+
+def test_gradient_by_hand():
+    # u = -fx * t / Z with fx = 4, t = 0.5, Z = 4: du/dZ = fx t / Z^2, du/dfx = -t/Z, du/dt = -fx/Z.
+    camera, motion = leaves(torch.tensor([[4.0, 0.0, 0.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]),
+                            torch.eye(4))  # fmt: skip
+    with torch.no_grad():
+        motion[0, 3] = 0.5
+    depth = torch.full((1, 1, 1), 4.0, requires_grad=True)
+    ego_flow(depth, camera, motion).flow[0].sum().backward()
+    assert depth.grad.item() == 0.125
+    assert camera.grad[0, 0].item() == -0.125
+    assert motion.grad[0, 3].item() == -1.0
+
+
+SIZE = 84
+
+
+def street(yaw_deg: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Returns depth, K and motion of a camera at 10 m/s and 12 frames/s, float32."""
+    generator = torch.Generator().manual_seed(8)
+    depth = 2 + 60 * torch.rand((1, SIZE, SIZE), generator=generator)
+    camera = torch.tensor([[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]])
+    return depth, camera, rigid((0.0, math.radians(yaw_deg), 0.01), (0.02, 0.01, 0.83)).float()
+
+
+def flow_by_homography(depth, camera, motion) -> torch.Tensor:
+    """Returns p - p' by the homography K R K^-1 plus epipole over depth, uncentred."""
+    homography = camera @ motion[:3, :3] @ torch.linalg.inv(camera)
+    axis = torch.arange(SIZE, dtype=depth.dtype) + 0.5
+    v, u = torch.meshgrid(axis, axis, indexing="ij")
+    pixels = torch.stack([u, v, torch.ones_like(u)], -1)
+    previous = pixels @ homography.T + (camera @ motion[:3, 3]) / depth[0, ..., None]
+    return (pixels[..., :2] - previous[..., :2] / previous[..., 2:]).permute(2, 0, 1)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 1.0, 3.0, 6.0])
+def test_float32_error_is_an_order_of_magnitude_below_the_homography_s(yaw_deg):
+    inputs = street(yaw_deg)
+    exact = flow_by_points(*(tensor.double() for tensor in inputs))
+    error = (ego_flow(*inputs).flow - exact).abs().max()
+    homography_error = (flow_by_homography(*inputs) - exact).abs().max()
+    assert error < 4e-6  # px; flow itself reaches 16 px
+    assert homography_error > 5 * error
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_narrow_types_are_computed_in_float32_and_rounded_once(dtype):
+    inputs = [tensor.to(dtype) for tensor in street(2.0)]
+    wide = [tensor.float() for tensor in inputs]
+    assert torch.equal(ego_flow(*inputs).flow, ego_flow(*wide).flow.to(dtype))
+    depth, camera, motion = inputs
+    instance = (torch.arange(SIZE**2) % 2).reshape(1, SIZE, SIZE)
+    motions = torch.stack([motion, rigid((0.0, 0.0, 0.1), (0.5, 0.0, 0.0)).to(dtype)])
+    flow = rigid_flow(depth, instance, camera, motions).flow
+    wide_flow = rigid_flow(depth.float(), instance, camera.float(), motions.float()).flow
+    assert torch.equal(flow, wide_flow.to(dtype))
+
+
+def test_result_has_the_widest_type():
+    depth, camera, motion = street(1.0)
+    instance = torch.zeros_like(depth, dtype=torch.int32)
+    raw = torch.zeros(2, SIZE, SIZE)
+    assert ego_flow(depth.half(), camera, motion.bfloat16()).flow.dtype == torch.float32
+    assert ego_flow(depth, camera, motion.double()).flow.dtype == torch.float64
+    assert rigid_flow(depth, instance, camera.double(), motion[None]).flow.dtype == torch.float64
+    assert factorize(raw, depth, camera, motion.double()).obj.dtype == torch.float64
+    narrow = factorize(raw.half(), depth.half(), camera.half(), motion.half())
+    assert narrow.ego.dtype == narrow.obj.dtype == torch.float16

@@ -7,22 +7,32 @@ import inspect
 
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
 from torchrl.envs.transforms import Transform
 
 from flowrep import transforms
+from flowrep.config import CONF_DIR, group_choices
+from flowrep.transforms import REPRESENTATIONS, representation_options, representation_stack
 
 hydra = pytest.importorskip("hydra")
+
+
 configs = pytest.importorskip("flowrep.transforms.hydra_configs", exc_type=ImportError)
+
+
 omegaconf = pytest.importorskip("omegaconf")
 
-from hydra.core.config_store import ConfigStore  # noqa: E402
 
 CLASSES = {
     name: value
     for name, value in vars(transforms).items()
     if inspect.isclass(value) and issubclass(value, Transform)
 }
+
+
 K = [[6.0, 0.0, 3.2], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]]
+
+
 # What each transform can't be made without.
 REQUIRED = {
     "AdaptDepth": {"kind": "z"},
@@ -108,3 +118,35 @@ def test_composed_by_a_project_s_own_config_beside_torchrl_s(tmp_path):
     raw, split = hydra.utils.instantiate(config.stack)
     assert (raw.outputs, raw.factors) == (("raw", "valid"), {"raw": 0.5})
     assert (split.outputs, split.in_keys[-1]) == (("obj",), ("sensor", "K"))
+
+
+yaml = pytest.importorskip("yaml")
+
+
+CAMERA = [[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]]
+
+
+def read(name: str) -> dict:
+    return yaml.safe_load((CONF_DIR / "representations" / f"{name}.yaml").read_text())
+
+
+def test_there_is_a_file_for_each_representation():
+    assert sorted(REPRESENTATIONS) == group_choices("representations")
+
+
+@pytest.mark.parametrize("name", REPRESENTATIONS)
+def test_file_names_the_representation_and_spells_its_options(name):
+    config = read(name)
+    assert list(config) == [name]
+    assert list(config[name]) == list(representation_options(name))
+
+
+@pytest.mark.parametrize("name", REPRESENTATIONS)
+def test_an_experiment_changes_nothing_of_a_representation(name):
+    # the flows' scale among it: one factor for all, so that scale decides no comparison
+    assert read(name)[name] == representation_options(name)
+
+
+def test_all_files_together_make_a_stack():
+    chosen = {name: read(name)[name] for name in REPRESENTATIONS}
+    assert representation_stack(chosen, intrinsics=CAMERA, num_classes=5)

@@ -1,0 +1,487 @@
+"""Ego flow, flow of bodies and their difference: values by hand, masks, laws, mistakes."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from itertools import product
+
+import pytest
+import torch
+
+from flowrep.geometry import (
+    adapt_depth,
+    adapt_flow,
+    adapt_pose,
+    ego_flow,
+    factorize,
+    rigid_flow,
+)
+from flowrep.geometry.depth import z_from_z_buffer
+from tests.geometry.scenes import (
+    HEIGHT,
+    MOTION,
+    OTHER_MOTION,
+    WIDTH,
+    K,
+    depth_map,
+    flow_by_points,
+    rigid,
+)
+
+NAN, INF = math.nan, math.inf
+
+
+def camera(fx=4.0, skew=0.0, cx=1.0, fy=8.0, cy=0.25) -> torch.Tensor:
+    return torch.tensor([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def moved(x=0.0, y=0.0, z=0.0) -> torch.Tensor:
+    prev_from_curr = torch.eye(4)
+    prev_from_curr[:3, 3] = torch.tensor([x, y, z])
+    return prev_from_curr
+
+
+def test_sideways_by_hand():
+    # The camera went 0.5 m right and 0.25 m down. At 4 m: u = -4 * 0.5/4, v = -8 * 0.25/4. With fx
+    # and fy swapped (-1, -0.25); with curr_from_prev, or previous minus current, (0.5, 0.5).
+    flow, valid = ego_flow(torch.full((1, 1, 1), 4.0), camera(), moved(x=0.5, y=0.25))
+    assert flow.flatten().tolist() == [-0.5, -0.5]
+    assert valid.all()
+
+
+def test_forwards_by_hand():
+    # The camera went 1 m forward, so what stands at 4 m stood at 5 m. Pixel (1, 0) lies (0.5, 0.25)
+    # from the principal point and lay at 4/5 of that: flow is a fifth of it, outwards. On the
+    # previous frame's grid it would be a third (4 m -> 3 m); unnegated, (-0.1, -0.05). With pixel
+    # corners for centres, x would be 0 and flow (0, -0.05).
+    flow, _ = ego_flow(torch.full((1, 1, 2), 4.0), camera(), moved(z=1.0))
+    torch.testing.assert_close(flow[:, 0, 1].tolist(), [0.1, 0.05])
+
+
+def test_skew_by_hand():
+    # Moving 0.25 m down with skew 2 shifts u as well: -2 * 0.25/4, where ignored skew gives 0.
+    flow, _ = ego_flow(torch.full((1, 1, 1), 4.0), camera(skew=2.0), moved(y=0.25))
+    assert flow.flatten().tolist() == [-0.125, -0.5]
+
+
+def test_quarter_turn_about_the_axis_by_hand():
+    # prev_from_curr turns x to y: pixel (1, 0) at (0.5, 0.25) px has ray (1/8, 1/32), which was
+    # (-1/32, 1/8), at (-1/8, 1) px. Flow (0.5 + 0.125, 0.25 - 1); the inverse turn gives
+    # (0.375, 1.25); square pixels (f = 4) would give (0.75, -0.25).
+    roll = rigid((0.0, 0.0, math.pi / 2), (0.0, 0.0, 0.0)).float()
+    flow, _ = ego_flow(torch.full((1, 1, 2), 7.0), camera(), roll)
+    torch.testing.assert_close(flow[:, 0, 1].tolist(), [0.625, -0.75])
+
+
+@pytest.mark.parametrize("motion", [MOTION, rigid((0.4, -0.3, 0.9), (-1.0, 0.5, 1.5))])
+def test_agrees_with_the_point_cloud(motion):
+    depth = depth_map()
+    flow, valid = ego_flow(depth, K, motion)
+    assert valid.all()
+    torch.testing.assert_close(flow, flow_by_points(depth, K, motion), rtol=0, atol=1e-12)
+
+
+def test_at_infinity_only_rotation_moves_a_pixel():
+    endless = torch.full((1, HEIGHT, WIDTH), INF, dtype=torch.float64)
+    rotation_only = MOTION.clone()
+    rotation_only[:3, 3] = 0
+    flow, valid = ego_flow(endless, K, MOTION)
+    assert valid.all()
+    assert torch.equal(flow, ego_flow(depth_map(), K, rotation_only).flow)
+    assert flow.abs().min() > 0
+    assert torch.equal(ego_flow(endless, K, moved(1.0, 2.0, 3.0)).flow, torch.zeros_like(flow))
+
+
+@pytest.mark.parametrize("depth_m", [NAN, 0.0, -3.0, -INF])
+def test_depth_that_is_no_depth_is_invalid(depth_m):
+    # -3 m would otherwise give a mirrored flow, 0 m inf.
+    flow, valid = ego_flow(torch.tensor([[[depth_m, 3.0]]]), camera(), moved(0.1, 0.2, 0.3))
+    assert valid.tolist() == [[[False, True]]]
+    assert flow[:, 0, 0].tolist() == [0.0, 0.0]
+    assert flow[:, 0, 1].abs().min() > 0
+
+
+def test_points_that_were_behind_the_previous_camera_are_invalid():
+    # The camera backed off by 2 m: what is now 1 m or 2 m ahead was behind it or level with it.
+    flow, valid = ego_flow(torch.tensor([[[1.0, 2.0, 3.0]]]), camera(), moved(z=-2.0))
+    assert valid.tolist() == [[[False, False, True]]]
+    assert flow[..., :2].abs().max() == 0  # unmasked, the first would be mirrored, the second inf
+
+
+def test_rotation_turns_a_far_pixel_out_of_the_previous_view():
+    about_face = rigid((0.0, math.pi, 0.0), (0.0, 0.0, 0.0)).float()
+    assert not ego_flow(torch.tensor([[[INF, 5.0]]]), camera(), about_face).valid.any()
+
+
+def test_unknown_motion_gives_no_nan():
+    motion = torch.eye(4)
+    motion[:3] = NAN
+    flow, valid = ego_flow(torch.full((1, 2, 3), 4.0), camera(), motion)
+    assert not valid.any()
+    assert flow.abs().max() == 0
+
+
+def test_still_camera_sees_exactly_no_flow():
+    depth = depth_map().float()
+    depth[..., 0, 0] = INF
+    flow, valid = ego_flow(depth, K.float(), torch.eye(4))
+    assert valid.all()
+    assert flow.abs().max() == 0
+
+
+def test_flow_is_per_step_unless_told_seconds():
+    depth = depth_map()
+    per_step = ego_flow(depth, K, MOTION).flow
+    per_second = ego_flow(depth, K, MOTION, dt=0.125).flow
+    torch.testing.assert_close(per_second, 8 * per_step, rtol=1e-14, atol=0)
+
+
+def test_each_frame_may_have_its_own_dt():
+    depth = depth_map(2)
+    flow, _ = ego_flow(depth, K, MOTION, dt=torch.tensor([0.5, 4.0]))
+    torch.testing.assert_close(flow[0], 2 * ego_flow(depth[0], K, MOTION).flow)
+    torch.testing.assert_close(flow[1], ego_flow(depth[1], K, MOTION).flow / 4)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
+def test_ego_flow_of_any_batch_equals_a_loop(batch):
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.rand((*batch, 4, 4), generator=generator, dtype=torch.float64)
+    Ks, motions, depth = K + noise[..., :3, :3], MOTION + 0.1 * noise, depth_map(*batch)
+    flow, valid = ego_flow(depth, Ks, motions)
+    assert flow.shape == (*batch, 2, HEIGHT, WIDTH)
+    assert valid.shape == (*batch, 1, HEIGHT, WIDTH)
+    assert valid.dtype == torch.bool
+    for at in product(*map(range, batch)):
+        assert torch.equal(flow[at], ego_flow(depth[at], Ks[at], motions[at]).flow)
+    unbatched_K = ego_flow(depth, K, motions).flow
+    assert torch.equal(unbatched_K, ego_flow(depth, K.expand(*batch, 3, 3), motions).flow)
+
+
+def test_one_depth_under_many_motions():
+    motions = torch.stack([MOTION, torch.eye(4, dtype=torch.float64)])
+    flow, valid = ego_flow(depth_map(), K, motions)
+    assert flow.shape == (2, 2, HEIGHT, WIDTH)
+    assert valid.shape == (2, 1, HEIGHT, WIDTH)
+    assert torch.equal(flow[0], ego_flow(depth_map(), K, MOTION).flow)
+
+
+def test_layout_in_memory_does_not_matter():
+    depth = depth_map(3)
+    transposed = depth.mT.contiguous().mT
+    assert torch.equal(ego_flow(transposed, K, MOTION).flow, ego_flow(depth, K, MOTION).flow)
+
+
+def test_inputs_stay_as_they_were():
+    given = [depth_map(), K.clone(), MOTION.clone()]
+    given[0][..., 0, 0] = NAN
+    before = [tensor.clone() for tensor in given]
+    ego_flow(*given)
+    for tensor, copy in zip(given, before):
+        torch.testing.assert_close(tensor, copy, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda d, m: ego_flow(d[0], K, m), ValueError, r"depth must be \[\*B, 1, H, W\]"),
+        (lambda d, m: ego_flow(d.expand(2, -1, -1), K, m), ValueError, r"depth .* got \[2, 5, 7\]"),
+        (lambda d, m: ego_flow(d, K[:2], m), ValueError, r"K must be \[\*B, 3, 3\], got \[2, 3\]"),
+        (lambda d, m: ego_flow(d, K, m[:3]), ValueError, r"prev_from_curr must be \[\*B, 4, 4\]"),
+        (lambda d, m: ego_flow(d, K, m.numpy()), TypeError, "prev_from_curr must be a torch.Tens"),
+        (lambda d, m: ego_flow(d.int(), K, m), TypeError, "depth must be floating point"),
+        (
+            lambda d, m: ego_flow(d.expand(2, 1, 5, 7), K, m.expand(3, 4, 4)),
+            ValueError,
+            r"do not broadcast: depth \[2\], K \[\], prev_from_curr \[3\]",
+        ),
+        (lambda d, m: ego_flow(d, K, m, dt=0), ValueError, "dt must be positive .* got 0"),
+        (lambda d, m: ego_flow(d, K, m, dt=-1.0), ValueError, r"dt must be positive .* got -1\.0"),
+    ],
+)
+def test_mistakes_with_ego_flow_are_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call(depth_map(), MOTION)
+
+
+def instance_map(*batch: int, count: int = 3, dtype=torch.uint8) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(4)
+    return torch.randint(count, (*batch, 1, HEIGHT, WIDTH), generator=generator).to(dtype)
+
+
+MOTIONS = torch.stack([MOTION, OTHER_MOTION, rigid((0.1, 0.0, 0.2), (1.0, 2.0, 0.5))])
+
+
+def test_body_by_hand():
+    # Two pixels at 4 m, a still camera. Body 1 stood 1 m higher (y down: -1) and 0.5 m further
+    # left: it came down and to the right, (4 * 0.5/4, 8 * 1/4). With the ids swapped the first
+    # pixel would move; with world y up, v would be -2.
+    camera = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 0.25], [0.0, 0.0, 1.0]])
+    motions = torch.eye(4).repeat(2, 1, 1)
+    motions[1, :2, 3] = torch.tensor([-0.5, -1.0])
+    flow, _ = rigid_flow(torch.full((1, 1, 2), 4.0), torch.tensor([[[0, 1]]]), camera, motions)
+    assert flow[:, 0].T.tolist() == [[0.0, 0.0], [0.5, 2.0]]
+
+
+def test_every_pixel_has_the_flow_of_its_own_body():
+    depth, instance = depth_map(), instance_map()
+    flow, valid = rigid_flow(depth, instance, K, MOTIONS)
+    assert valid.all()
+    for number, motion in enumerate(MOTIONS):
+        riding = (instance == number).expand_as(flow)
+        assert riding.any()
+        assert torch.equal(flow[riding], ego_flow(depth, K, motion).flow[riding])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bits_are_those_of_ego_flow_where_a_row_is_the_camera_s(dtype):
+    depth, camera = depth_map(4).to(dtype), K.to(dtype)
+    depth[0, 0, 0, :3] = torch.tensor([math.inf, math.nan, 1e-3])
+    rows = torch.stack([MOTION, OTHER_MOTION, MOTION]).to(dtype).expand(4, 3, 4, 4)
+    instance = instance_map(4)
+    riding_with_camera = (instance != 1).expand(4, 2, HEIGHT, WIDTH)
+    raw, valid = rigid_flow(depth, instance, camera, rows)
+    ego, ego_valid = ego_flow(depth, camera, MOTION.to(dtype))
+    bits = torch.int32 if dtype == torch.float32 else torch.int64
+    assert torch.equal(raw.view(bits)[riding_with_camera], ego.view(bits)[riding_with_camera])
+    assert torch.equal(valid[instance != 1], ego_valid[instance != 1])
+    assert not torch.equal(raw, ego)
+
+
+def test_a_body_that_came_from_behind_is_invalid_alone():
+    motions = torch.eye(4).repeat(2, 1, 1)
+    motions[1, 2, 3] = -9.0  # body 1 was 9 m further back: behind the camera
+    depth, instance = torch.full((1, 1, 2), 4.0), torch.tensor([[[1, 0]]])
+    flow, valid = rigid_flow(depth, instance, K.float(), motions)
+    assert valid.tolist() == [[[False, True]]]
+    assert flow.abs().max() == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
+def test_ids_of_any_integer_type(dtype):
+    expected = rigid_flow(depth_map(), instance_map(), K, MOTIONS).flow
+    got = rigid_flow(depth_map(), instance_map(dtype=dtype), K, MOTIONS).flow
+    assert torch.equal(got, expected)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
+def test_rigid_flow_of_any_batch_equals_a_loop(batch):
+    generator = torch.Generator().manual_seed(5)
+    noise = torch.rand((*batch, 3, 4, 4), generator=generator, dtype=torch.float64)
+    Ks, motions = K + noise[..., 0, :3, :3], MOTIONS + 0.1 * noise
+    depth, instance = depth_map(*batch), instance_map(*batch)
+    flow, valid = rigid_flow(depth, instance, Ks, motions, dt=0.5)
+    assert flow.shape == (*batch, 2, HEIGHT, WIDTH)
+    assert valid.shape == (*batch, 1, HEIGHT, WIDTH)
+    for at in product(*map(range, batch)):
+        alone = rigid_flow(depth[at], instance[at], Ks[at], motions[at], dt=0.5)
+        assert torch.equal(flow[at], alone.flow)
+    unbatched_K = rigid_flow(depth, instance, K, motions).flow
+    assert torch.equal(unbatched_K, rigid_flow(depth, instance, K.expand_as(Ks), motions).flow)
+
+
+@pytest.mark.parametrize(("id_", "held"), [(-1, "-1 to 2"), (3, "0 to 3")])
+def test_an_id_without_a_row_is_refused(id_, held):
+    instance = instance_map(2, dtype=torch.int32)
+    instance[1, 0, 2, 3] = id_
+    with pytest.raises(RuntimeError, match=f"instance holds ids {held}.* 0 to 2; .*InstanceIds"):
+        rigid_flow(depth_map(2), instance, K, MOTIONS)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda d, i: rigid_flow(d, i.float(), K, MOTIONS), TypeError, "instance must hold integ"),
+        (lambda d, i: rigid_flow(d, i == 0, K, MOTIONS), TypeError, "integer ids, got torch.bool"),
+        (lambda d, i: rigid_flow(d, i[0], K, MOTIONS), ValueError, r"instance must be \[\*B, 1, H"),
+        (
+            lambda d, i: rigid_flow(d, i.mT, K, MOTIONS),
+            ValueError,
+            r"instance and depth must have one \(height, width\), got \[7, 5\] and \[5, 7\]",
+        ),
+        (
+            lambda d, i: rigid_flow(d, i, K, MOTION),
+            ValueError,
+            r"prev_from_curr_by_instance must be \[\*B, N, 4, 4\], got \[4, 4\]",
+        ),
+        (
+            lambda d, i: rigid_flow(d, i.expand(2, -1, -1, -1), K, MOTIONS.expand(3, -1, -1, -1)),
+            ValueError,
+            "leading batch dims do not broadcast",
+        ),
+    ],
+)
+def test_mistakes_with_rigid_flow_are_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call(depth_map(), instance_map())
+
+
+STILL = torch.eye(4, dtype=torch.float64)
+
+
+def raw_flow(*batch: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(6)
+    return 5 * torch.randn((*batch, 2, HEIGHT, WIDTH), generator=generator, dtype=torch.float64)
+
+
+def test_factors_by_hand():
+    # 0.5 m to the right at 4 m: ego (-0.5, 0). Raw (-0.5, 3): the object moved 3 px down by itself.
+    # Added instead of subtracted, obj would be (-1, 3).
+    camera = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
+    slide = torch.eye(4)
+    slide[0, 3] = 0.5
+    raw = torch.tensor([-0.5, 3.0]).reshape(2, 1, 1)
+    ego, obj, valid = factorize(raw, torch.full((1, 1, 1), 4.0), camera, slide)
+    assert ego.flatten().tolist() == [-0.5, 0.0]
+    assert obj.flatten().tolist() == [0.0, 3.0]
+    assert valid.all()
+
+
+def test_ego_is_ego_flow_and_the_parts_add_up():
+    raw, depth = raw_flow(), depth_map()
+    ego, obj, valid = factorize(raw, depth, K, MOTION, dt=0.5)
+    assert valid.all()
+    assert torch.equal(ego, ego_flow(depth, K, MOTION, dt=0.5).flow)
+    assert torch.equal(obj, raw - ego)
+
+
+def test_still_camera_leaves_everything_to_the_objects():
+    raw = raw_flow()
+    ego, obj, _ = factorize(raw, depth_map(), K, STILL)
+    assert ego.abs().max() == 0
+    assert torch.equal(obj, raw)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_does_not_move_by_itself_has_exactly_no_object_flow(dtype):
+    depth, camera = depth_map(2).to(dtype), K.to(dtype)
+    depth[0, 0, 0, :2] = torch.tensor([INF, NAN])
+    instance = torch.zeros_like(depth, dtype=torch.uint8)
+    instance[..., 2:4, 3:6] = 1
+    motions = torch.stack([MOTION, OTHER_MOTION]).to(dtype).expand(2, 2, 4, 4)
+    raw, _ = rigid_flow(depth, instance, camera, motions)
+    _, obj, _ = factorize(raw, depth, camera, motions[:, 0])
+    static = (instance == 0).expand_as(obj)
+    assert obj[static].abs().max() == 0
+    assert obj[~static].abs().min() > 0
+
+
+def test_unknown_pixels_have_no_object_flow_and_say_so():
+    raw, depth = raw_flow(), depth_map()
+    depth[0, 0, 0] = NAN
+    raw[0, 1, 1] = NAN
+    raw[1, 2, 2] = INF
+    raw[:, 3, 3] = torch.tensor([INF, -INF])
+    ego, obj, valid = factorize(raw, depth, K, MOTION)
+    unknown = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    unknown[[0, 1, 2, 3], [0, 1, 2, 3]] = True
+    assert torch.equal(~valid[0], unknown)
+    assert obj[:, unknown].abs().max() == 0
+    assert torch.equal(obj[:, ~unknown], (raw - ego)[:, ~unknown])
+    # The camera's share needs no raw flow: only the pixel without depth lacks it.
+    assert ego[:, 0, 0].abs().max() == 0
+    assert ego[:, [1, 2, 3], [1, 2, 3]].abs().min() > 0
+
+
+def test_unknown_flow_of_a_body_is_no_object_flow():
+    # The camera slid 0.5 m right before 4 m: ego -0.5 px. What was behind it has no raw flow; its 0
+    # taken as measured would make obj +0.5.
+    camera = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
+    motions = torch.eye(4).repeat(2, 1, 1)
+    motions[:, 0, 3] = 0.5
+    motions[1, 2, 3] = -5.0
+    depth, instance = torch.full((1, 1, 2), 4.0), torch.tensor([[[0, 1]]])
+    raw = rigid_flow(depth, instance, camera, motions)
+    ego, obj, valid = factorize(raw, depth, camera, motions[0])
+    assert raw.flow[0].tolist() == [[-0.5, 0.0]]
+    assert ego[0].tolist() == [[-0.5, -0.5]]
+    assert (obj == 0).all()
+    assert valid.tolist() == [[[True, False]]]
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
+def test_factors_of_any_batch_equal_a_loop(batch):
+    generator = torch.Generator().manual_seed(7)
+    noise = torch.rand((*batch, 4, 4), generator=generator, dtype=torch.float64)
+    Ks, motions = K + noise[..., :3, :3], MOTION + 0.1 * noise
+    raw, depth = raw_flow(*batch), depth_map(*batch)
+    got = factorize(raw, depth, Ks, motions)
+    assert [part.shape[-3] for part in got] == [2, 2, 1]
+    for at in product(*map(range, batch)):
+        for part, alone in zip(got, factorize(raw[at], depth[at], Ks[at], motions[at])):
+            assert torch.equal(part[at], alone)
+    unbatched_K = factorize(raw, depth, K, motions)
+    for part, other in zip(unbatched_K, factorize(raw, depth, K.expand_as(Ks), motions)):
+        assert torch.equal(part, other)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda r, d: factorize(r[:1], d, K, MOTION), ValueError, r"raw must be \[\*B, 2, H, W\]"),
+        (lambda r, d: factorize(r.int(), d, K, MOTION), TypeError, "raw must be floating point"),
+        (
+            lambda r, d: factorize(r, d[..., :-1], K, MOTION),
+            ValueError,
+            r"raw and depth must have one \(height, width\), got \[5, 7\] and \[5, 6\]",
+        ),
+        (
+            lambda r, d: factorize(r.expand(2, -1, -1, -1), d.expand(3, -1, -1, -1), K, MOTION),
+            ValueError,
+            r"do not broadcast: others \[3\], raw \[2\]",
+        ),
+    ],
+)
+def test_mistakes_with_factors_are_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call(raw_flow(), depth_map())
+
+
+@pytest.mark.parametrize(
+    ("adapt", "expected"),
+    [
+        (partial(adapt_depth, kind="z"), r"^depth must be .*1, H, W\], got \[5, 7\]"),
+        (partial(z_from_z_buffer, near_m=0.1, far_m=9.0), r"^z_buffer must be .*1, H, W\]"),
+        (adapt_pose, r"^pose must be .*4, 4\], got \[5, 7\]"),
+        (
+            partial(adapt_flow, direction="forward", grid="current"),
+            r"^flow must be .*2, H, W\], got \[5, 7\]",
+        ),
+    ],
+    ids=["depth", "z-buffer", "pose", "flow"],
+)
+def test_a_tensor_of_another_shape_is_refused_by_name_and_with_the_right_one(adapt, expected):
+    with pytest.raises(ValueError, match=expected):
+        adapt(torch.ones(5, 7))
+
+
+def test_flow_that_needs_no_change_and_flow_that_points_back():
+    # The point at column 7, row 2 came from column 4, row 3: p_t - p_t' = (3, -1).
+    want = torch.tensor([3.0, -1.0]).reshape(2, 1, 1)
+    grid = {"grid": "current"}
+    assert torch.equal(adapt_flow(want, direction="forward", **grid), want)
+    assert torch.equal(adapt_flow(-want, direction="backward", **grid), want)
+    rows_first = torch.tensor([1.0, -3.0]).reshape(1, 2, 1, 1)
+    back = adapt_flow(rows_first, direction="backward", channels="row_column", **grid)
+    assert torch.equal(back[0], want)
+
+
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+def test_flow_on_the_previous_grid_is_refused_with_a_way_out(direction):
+    with pytest.raises(ValueError, match=rf"{direction} flow on the previous.*swap the two"):
+        adapt_flow(torch.zeros(2, 3, 4), direction=direction, grid="previous")
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"direction": "back"}, r"\['forward', 'backward'\], got 'back'"),
+        ({"grid": "next"}, r"\['current', 'previous'\], got 'next'"),
+        ({"channels": "vu"}, r"\['uv', 'row_column'\], got 'vu'"),
+    ],
+)
+def test_flow_options_are_checked(changed, expected):
+    options = {"direction": "forward", "grid": "current", **changed}
+    with pytest.raises(ValueError, match=expected):
+        adapt_flow(torch.zeros(2, 3, 4), **options)

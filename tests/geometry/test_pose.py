@@ -1,0 +1,349 @@
+"""Poses of any convention, the motions between them, and ids of any simulator as rows."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import pytest
+import torch
+
+from flowrep.geometry import (
+    adapt_pose,
+    check_rigid,
+    instance_motion,
+    instance_rows,
+    invert_rigid,
+    pose_from_quaternion,
+    relative_motion,
+    transform_points,
+)
+from tests.geometry.scenes import MOTION, OTHER_MOTION, rigid
+
+QUARTER_TURN = torch.pi / 2
+
+
+def test_transform_points_by_hand():
+    # About z by a quarter turn, x goes to y: (1, 0, 0) -> (0, 1, 0), then + (10, 20, 30).
+    a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
+    points_a = transform_points(a_from_b, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    # The inverse rotation would give (10, 19, 30).
+    torch.testing.assert_close(points_a[0].tolist(), [10.0, 21.0, 30.0])
+
+
+@pytest.mark.parametrize("points", [torch.float16, torch.float32, torch.float64])
+@pytest.mark.parametrize("transform", [torch.float32, torch.float64])
+def test_float_types_may_differ(transform, points):
+    # Seen along z at 3 m by a camera 10.25 m along x that looks along world x.
+    world_from_cam = torch.tensor([[0, 0, 1, 10.25], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    points_cam = torch.tensor([[0.5, 2.0, 3.0]], dtype=points)
+    points_world = transform_points(world_from_cam.to(transform), points_cam)
+    assert points_world.dtype == torch.promote_types(transform, points)
+    assert points_world.tolist() == [[13.25, -0.5, -2.0]]
+
+
+def test_invert_rigid_by_hand():
+    a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
+    # b's x axis is a's y axis: a's origin lies at -(20, -10, 30) in b. -t alone: (-10, -20, -30).
+    torch.testing.assert_close(invert_rigid(a_from_b)[:3, 3].tolist(), [-20.0, 10.0, -30.0])
+
+
+def test_inverse_undoes():
+    undone = invert_rigid(MOTION) @ MOTION
+    torch.testing.assert_close(undone, torch.eye(4, dtype=torch.float64))
+
+
+def test_relative_motion_by_hand():
+    # Both cameras look along world y (their z); the current one stands 2 m further on.
+    world_from_prev = rigid((-QUARTER_TURN, 0.0, 0.0), (5.0, 1.0, 0.0))
+    world_from_curr = rigid((-QUARTER_TURN, 0.0, 0.0), (5.0, 3.0, 0.0))
+    prev_from_curr = relative_motion(world_from_prev, world_from_curr)
+    # What the current camera sees 0 m ahead was 2 m ahead. curr_from_prev would have -2.
+    torch.testing.assert_close(prev_from_curr[:3, 3].tolist(), [0.0, 0.0, 2.0])
+    torch.testing.assert_close(prev_from_curr[:3, :3], torch.eye(3))
+
+
+def test_relative_motion_is_the_product_of_poses():
+    expected = torch.linalg.inv(MOTION) @ OTHER_MOTION
+    got = relative_motion(MOTION, OTHER_MOTION, dtype=torch.float64)
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
+def test_any_batch_equals_a_loop(batch):
+    generator = torch.Generator().manual_seed(2)
+    noise = torch.rand((*batch, 4, 4), generator=generator, dtype=torch.float64)
+    poses = MOTION.expand(*batch, 4, 4).clone()
+    poses[..., :3, 3] += noise[..., :3, 3]
+    points = torch.rand((*batch, 2, 5, 3), generator=generator, dtype=torch.float64)
+    relative = relative_motion(poses, OTHER_MOTION)
+    assert relative.shape == (*batch, 4, 4)
+    for at in product(*map(range, batch)):
+        torch.testing.assert_close(relative[at], relative_motion(poses[at], OTHER_MOTION))
+        torch.testing.assert_close(invert_rigid(poses)[at], invert_rigid(poses[at]))
+        moved = transform_points(poses, points)[at]
+        torch.testing.assert_close(moved, transform_points(poses[at], points[at]))
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: invert_rigid(torch.eye(3)), ValueError, r"a_from_b must be \[\*B, 4, 4\]"),
+        (
+            lambda: relative_motion(torch.eye(4), torch.eye(4, dtype=torch.int64)),
+            TypeError,
+            "world_from_curr must be floating point",
+        ),
+        (
+            lambda: relative_motion(torch.eye(4).expand(2, 4, 4), torch.eye(4).expand(3, 4, 4)),
+            ValueError,
+            r"world_from_prev \[2\], world_from_curr \[3\]",
+        ),
+        (
+            lambda: transform_points(torch.eye(4).expand(2, 4, 4), torch.ones(3)),
+            ValueError,
+            "a_from_b has batch.*points_b",
+        ),
+    ],
+)
+def test_mistakes_with_poses_are_named(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+PREV, CURR = rigid((0.1, 0.2, 0.3), (400.0, -300.0, 1.2)), rigid((0.1, 0.25, 0.3), (400.8, -300, 1))
+
+
+BODY_BEFORE = torch.stack([MOTION, OTHER_MOTION])
+
+
+BODY_NOW = torch.stack([MOTION, rigid((0.4, 0.0, -0.1), (2.0, 3.0, 4.0))])
+
+
+def test_a_body_s_motion_by_hand():
+    # The camera stands at the origin and looks along z. The body went 2 m to the right and turned
+    # by a quarter about y (forward to right): its nose, 1 m ahead of it, is at (2 + 1, 0, 5) now
+    # and was at (0, 0, 5 + 1).
+    still, before = torch.eye(4), torch.eye(4)
+    before[2, 3] = 5.0
+    now = torch.tensor([[0.0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 5], [0, 0, 0, 1]])
+    motions = instance_motion(still, still, before[None], now[None])
+    assert torch.equal(motions[0], torch.eye(4))
+    assert transform_points(motions[1], torch.tensor([3.0, 0.0, 5.0])).tolist() == [0.0, 0.0, 6.0]
+
+
+def test_a_point_on_a_body_goes_where_it_was():
+    motions = instance_motion(PREV, CURR, BODY_BEFORE, BODY_NOW, dtype=torch.float64)
+    point_body = torch.tensor([0.3, -0.2, 0.7], dtype=torch.float64)
+    curr_from_body = invert_rigid(CURR) @ BODY_NOW[1]
+    prev_from_body = invert_rigid(PREV) @ BODY_BEFORE[1]
+    was = transform_points(motions[2], transform_points(curr_from_body, point_body))
+    torch.testing.assert_close(was, transform_points(prev_from_body, point_body))
+
+
+def test_a_body_that_stands_still_has_the_camera_s_motion_to_the_last_bit():
+    far = BODY_NOW.clone()
+    far[:, :3, 3] += 1000.0 / 3.0
+    motions = instance_motion(PREV, CURR, far, far)
+    assert motions.dtype == torch.float32
+    assert torch.equal(motions, relative_motion(PREV, CURR).expand(3, 4, 4))
+    # In float64 no rounding hides that the bodies' rows went another way.
+    exact = instance_motion(PREV, CURR, far, far, dtype=torch.float64)
+    camera = relative_motion(PREV, CURR, dtype=torch.float64)
+    assert torch.equal(exact, camera.expand(3, 4, 4))
+
+
+def test_a_batch_equals_a_loop():
+    prev, curr = PREV.repeat(2, 1, 1, 1), torch.stack([CURR, PREV]).unsqueeze(1)
+    together = instance_motion(prev, curr, BODY_BEFORE, BODY_NOW)
+    assert together.shape == (2, 1, 3, 4, 4)
+    for i in range(2):
+        alone = instance_motion(prev[i, 0], curr[i, 0], BODY_BEFORE, BODY_NOW)
+        torch.testing.assert_close(together[i, 0], alone)
+
+
+def test_no_bodies_leave_the_static_world():
+    motions = instance_motion(PREV, CURR, BODY_NOW[:0], BODY_NOW[:0])
+    assert torch.equal(motions, relative_motion(PREV, CURR)[None])
+
+
+def test_another_number_of_bodies_is_refused():
+    with pytest.raises(ValueError, match="the same bodies are needed before and now, got 2 and 1"):
+        instance_motion(PREV, CURR, BODY_BEFORE, BODY_NOW[:1])
+
+
+def test_equal_poses_are_exactly_no_motion():
+    # R R^T of this rotation is not the identity in floats.
+    assert torch.equal(relative_motion(PREV, PREV), torch.eye(4))
+    both = relative_motion(torch.stack([PREV, PREV]), torch.stack([PREV, CURR]))
+    assert torch.equal(both[0], torch.eye(4))
+    assert not torch.equal(both[1], torch.eye(4))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_rigid_transform_passes(dtype):
+    check_rigid("pose", PREV.to(dtype))
+
+
+def test_the_offender_is_shown():
+    poses = torch.stack([PREV, PREV])
+    poses[1, 0, 0] = math.inf
+    with pytest.raises(ValueError, match=r"pose\[1\] holds nan or inf; got \[\[inf"):
+        check_rigid("pose", poses)
+
+
+# A camera at (5, 6, 7) that looks along the world's x, with z up: right is -y, down is -z.
+LOOKING_ALONG_X = torch.tensor(
+    [[0.0, 0.0, 1.0, 5.0], [-1.0, 0.0, 0.0, 6.0], [0.0, -1.0, 0.0, 7.0], [0.0, 0.0, 0.0, 1.0]]
+).double()
+
+
+# The same camera's axes in the other conventions, a column each, written down by hand.
+AXES = {
+    "opencv": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],  # right, down, forward
+    "opengl": [[0, 0, -1], [-1, 0, 0], [0, 1, 0]],  # right, up, backward
+    "ned": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],  # forward, right, down
+    "x_forward_z_up": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # forward, left, up
+}
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_axes_of_one_and_the_same_camera(axes):
+    pose = LOOKING_ALONG_X.clone()
+    pose[:3, :3] = torch.tensor(AXES[axes]).double()
+    assert torch.equal(adapt_pose(pose, axes=axes), LOOKING_ALONG_X)
+    # and of world-to-camera matrices, which are given in those axes too
+    extrinsics = invert_rigid(pose)
+    assert torch.equal(
+        adapt_pose(extrinsics, direction="world_to_camera", axes=axes), LOOKING_ALONG_X
+    )
+
+
+def test_world_to_camera_is_inverted():
+    world_from_cam = rigid((0.3, -0.2, 0.9), (5.0, 6.0, 7.0))
+    got = adapt_pose(invert_rigid(world_from_cam).float(), direction="world_to_camera")
+    assert got.dtype == torch.float64
+    torch.testing.assert_close(got, world_from_cam, atol=1e-5, rtol=0)
+
+
+def test_a_pose_without_its_last_row():
+    whole = torch.tensor([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1.0]])
+    assert adapt_pose(whole[:3], layout="matrix_3x4").equal(whole.double())
+    inverted = adapt_pose(whole[:3], layout="matrix_3x4", direction="world_to_camera")
+    torch.testing.assert_close(inverted @ whole.double(), torch.eye(4).double())
+
+
+def test_angles_turn_left_and_look_up():
+    pose = torch.tensor([5.0, 6.0, 7.0, math.pi / 2, math.pi / 6], dtype=torch.float64)
+    camera = adapt_pose(pose, layout="xyz_yaw_pitch", axes="x_forward_z_up")
+    ahead = camera @ torch.tensor([0.0, 0.0, 2.0, 1.0], dtype=torch.float64)
+    # a quarter turn to the left of x is y; 30 degrees up: 2 sin 30 = 1, not -1
+    expected = torch.tensor([5.0, 6 + math.sqrt(3), 8.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(ahead, expected)
+    right = camera @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(right[:3], torch.tensor([6.0, 6.0, 7.0], dtype=torch.float64))
+    level = adapt_pose(pose[:4], layout="xyz_yaw", axes="x_forward_z_up")
+    torch.testing.assert_close(level[:3, 2], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    with pytest.raises(ValueError, match="x_forward_z_up"):
+        adapt_pose(pose[:4], layout="xyz_yaw")
+
+
+def test_a_quaternion_s_real_part_is_first_or_last():
+    # A quarter turn about z takes x to y: w = z = sqrt(1/2).
+    half = math.sqrt(0.5)
+    expected = [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]]
+    last = torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, half, half])
+    first = torch.tensor([1.0, 2.0, 3.0, half, 0.0, 0.0, half])
+    for pose, layout in ((last, "xyz_xyzw"), (first, "xyz_wxyz")):
+        matrix = adapt_pose(pose, layout=layout)
+        torch.testing.assert_close(matrix[:3], torch.tensor(expected).double(), atol=1e-6, rtol=0)
+        assert matrix[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+    # Read the other way round, `last` would be a quarter turn about y and then some.
+    assert not torch.allclose(
+        adapt_pose(last, layout="xyz_wxyz")[:3], torch.tensor(expected).double()
+    )
+
+
+@pytest.mark.parametrize(("axis", "moves", "to"), [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
+def test_a_quarter_turn_about_each_axis(axis, moves, to):
+    quaternion = torch.zeros(2, 7).double()
+    quaternion[:, 3 + axis] = quaternion[:, 6] = math.sqrt(0.5)
+    turned = (
+        pose_from_quaternion(quaternion, "xyz_xyzw")[..., :3, :3] @ torch.eye(3).double()[moves]
+    )
+    torch.testing.assert_close(turned, torch.eye(3).double()[to].expand(2, 3))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"layout": "xyzw"}, r"layout.*'matrix_3x4'.*xyzw"),
+        ({"direction": "cam2world"}, r"\['camera_to_world', 'world_to_camera'\], got 'cam2world'"),
+        (
+            {"axes": "blender"},
+            r"axes must be one of \['opencv', 'opengl', 'ned', 'x_forward_z_up'\]",
+        ),
+        ({"layout": "xyz_xyzw"}, r"pose must be \[\*B, 7\], got \[4, 4\]"),
+    ],
+)
+def test_pose_options_are_checked(options, expected):
+    with pytest.raises(ValueError, match=expected):
+        adapt_pose(torch.eye(4), **options)
+
+
+def ill_formed(what: str) -> torch.Tensor:
+    pose = rigid((0.3, -0.2, 0.9), (5.0, 6.0, 7.0))
+    if what == "nan":
+        pose[0, 3] = math.nan
+    elif what == "transposed":
+        pose = pose.mT
+    elif what == "scaled":
+        pose[:3, :3] *= 1.01
+    else:
+        pose[:3, 1] *= -1.0
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("what", "expected"),
+    [
+        ("nan", "holds nan or inf"),
+        ("transposed", r"has a last row other than \(0, 0, 0, 1\): is it transposed"),
+        ("scaled", "is not rigid"),
+        ("mirrored", "is left-handed"),
+    ],
+)
+def test_an_ill_formed_pose_is_refused_by_name_and_place(what, expected):
+    poses = torch.eye(4).double().repeat(2, 3, 1, 1)
+    poses[1, 2] = ill_formed(what)
+    with pytest.raises(ValueError, match=rf"^pose\[1, 2\] {expected}"):
+        adapt_pose(poses)
+    assert adapt_pose(poses, check=False).shape == (2, 3, 4, 4)
+
+
+def test_a_quaternion_that_is_not_of_unit_length_is_refused():
+    pose = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0])
+    with pytest.raises(ValueError, match=r"a quaternion must have length 1, got \[2.0\]"):
+        adapt_pose(pose, layout="xyz_xyzw")
+    normalised = adapt_pose(pose, layout="xyz_xyzw", check=False)
+    assert torch.equal(normalised, torch.eye(4).double())
+
+
+def test_ids_of_any_simulator_become_rows():
+    ids = torch.tensor([[[17, 0, 3], [-1, 4, 16_777_215]]])
+    rows = instance_rows(ids, torch.tensor([17, 3, 16_777_215]))
+    # A static world of id 0, a background of -1 and the unknown body 4 are row 0.
+    assert rows.tolist() == [[[1, 0, 2], [0, 0, 3]]]
+    assert rows.dtype == torch.uint8
+    assert instance_rows(ids, torch.arange(400)).dtype == torch.int32
+    assert instance_rows(ids, torch.arange(0)).tolist() == [[[0, 0, 0], [0, 0, 0]]]
+    assert instance_rows(ids.short()[..., :1].mT, torch.tensor([17])).tolist() == [[[1, 0]]]
+
+
+def test_ids_are_checked():
+    with pytest.raises(TypeError, match=r"ids must hold integer ids, got torch\.float32"):
+        instance_rows(torch.zeros(1, 2, 3), torch.tensor([1]))
+    with pytest.raises(TypeError, match=r"body_ids must hold integer ids, got torch\.bool"):
+        instance_rows(torch.zeros(1, 2, 3).int(), torch.tensor([True]))
+    with pytest.raises(ValueError, match=r"body_ids must be \[N\], got \[1, 1\]"):
+        instance_rows(torch.zeros(1, 2, 3).int(), torch.tensor([[1]]))
