@@ -6,7 +6,8 @@ a test holds them equal to `flowrep.geometry`.
 Convention: `<to>_from_<from>`; a planar pose is (x, y, yaw), metres and radians, z up.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -97,7 +98,12 @@ class Sensing:
     """The camera of one environment and the requested sensors."""
 
     def __init__(
-        self, scene: Scene, street: Street, sensors: Sequence[str], renderer: str = "auto"
+        self,
+        scene: Scene,
+        street: Street,
+        sensors: Sequence[str],
+        renderer: str = "auto",
+        picture_scale: int = 1,
     ) -> None:
         """Precomputes the constants of all pictures."""
         unknown = [name for name in sensors if name not in SENSORS]
@@ -112,12 +118,12 @@ class Sensing:
         self._vehicle_from_cam = vehicle_from_camera(camera)
         self._class_of_body = street.simulator.class_lookup()
         self._instance_of_body = street.simulator.instance_lookup()
+        self._asked, self._scale = renderer, picture_scale
         self._rasterise: Callable[..., Any] | None = None
-        if not _MAPS.isdisjoint(sensors) and choose_renderer(renderer) == "rasteriser":
-            from flowrep.simulator.rasteriser import Rasteriser
-
-            range_m = camera.near_m, camera.far_m
-            self._rasterise = Rasteriser(street.triangles, self.K, size, range_m)
+        if not {"rgb", *_MAPS}.isdisjoint(sensors):
+            self._rasterise = self._rasteriser(1)
+            if picture_scale != 1 and self._rasterise is None:
+                raise ValueError(f"picture_scale={picture_scale} needs renderer 'rasteriser'")
         self._picture: Picture | None = None
 
     def observe(self, episode: Episode) -> dict[str, Any]:
@@ -126,6 +132,10 @@ class Sensing:
 
     def rgb(self, episode: Episode) -> NDArray[np.uint8]:
         """Returns the colour picture [H, W, 3] of an episode's last observed step."""
+        if self._rasterise is None:
+            self._rasterise = self._rasteriser(1)
+        if self._rasterise is not None:
+            return self._drawn([episode], {"rgb"})["rgb"][0].transpose(1, 2, 0)
         picture = self._seen(episode)
         rgb = picture.rgba[..., :3].copy()
         rgb[picture.body < 0] = CLASS_COLOURS["sky"]
@@ -149,10 +159,41 @@ class Sensing:
             "instance": spaces.Box(0, max(parts, 1), (1, *size), np.uint8),
             "prev_from_curr": spaces.Box(-np.inf, np.inf, (4, 4), np.float32),
             "instance_motion": spaces.Box(-np.inf, np.inf, (1 + parts, 4, 4), np.float32),
-            "rgb": spaces.Box(0, 255, (3, *size), np.uint8),
+            "rgb": spaces.Box(0, 255, (3, *(self._scale * side for side in size)), np.uint8),
             "frame": spaces.Box(0, (1 << 31) - 1, (2,), np.int64),
         }
         return spaces.Dict({name: every[name] for name in self.names})
+
+    @cache  # noqa: B019 - a sensing lives as long as its environment
+    def _rasteriser(self, scale: int) -> Callable[..., Any] | None:
+        """Returns a rasteriser of pictures so many times the maps' size; None for PyBullet."""
+        if choose_renderer(self._asked) == "pybullet":
+            return None
+        from flowrep.simulator.rasteriser import Rasteriser
+
+        camera = self._camera
+        size = scale * camera.height_px, scale * camera.width_px
+        K = np.diag([scale, scale, 1.0]) @ self.K
+        return Rasteriser(self._street.triangles, K, size, (camera.near_m, camera.far_m))
+
+    def _drawn(self, episodes: Sequence[Episode], names: Set[str]) -> Arrays:
+        """Returns the maps and the colours that are named, [N, ...], by the rasteriser."""
+        views = (
+            self._camera_poses([episode.now for episode in episodes]).cam_from_world,
+            _parts([episode.poses for episode in episodes]),
+            np.stack([self._street.solids(each.path.closures).is_shown for each in episodes]),
+        )
+        arrays: Arrays = {}
+        at_once = "rgb" in names and self._scale == 1
+        if at_once or not names.isdisjoint(_MAPS):
+            assert self._rasterise is not None
+            drawn = self._rasterise(*views, rgb=at_once)
+            arrays = {name: getattr(drawn, name)[:, None] for name in _MAPS} | {"rgb": drawn.rgb}
+        if "rgb" in names and not at_once:
+            photograph = self._rasteriser(self._scale)
+            assert photograph is not None
+            arrays["rgb"] = photograph(*views, rgb=True).rgb
+        return arrays
 
     def _seen(self, episode: Episode) -> Picture:
         if self._picture is None:
@@ -191,30 +232,23 @@ def observe_together(sensings: Sequence[Sensing], episodes: Sequence[Episode]) -
     first = sensings[0]
     observation: Arrays = {}
     names = frozenset(first.names)
-    now = first._camera_poses([episode.now for episode in episodes])
-    parts = _parts([episode.poses for episode in episodes])
-    if not names.isdisjoint(_MAPS):
-        if first._rasterise is None:
-            pictured = [s._pictured(episode) for s, episode in zip(sensings, episodes)]
-            observation |= {
-                name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]
-            }
-        else:
-            street = first._street
-            closed = [street.solids(episode.path.closures).is_shown for episode in episodes]
-            is_shown = np.stack(closed)
-            drawn = first._rasterise(now.cam_from_world, parts, is_shown)
-            observation |= {name: maps[:, None] for name, maps in drawn._asdict().items()}
+    if first._rasterise is not None:
+        observation = first._drawn(episodes, names)
+    elif not names.isdisjoint(_MAPS):
+        pictured = [s._pictured(episode) for s, episode in zip(sensings, episodes)]
+        observation = {name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]}
     if not names.isdisjoint(_MOTIONS):
+        now = first._camera_poses([episode.now for episode in episodes])
         before = first._camera_poses([episode.before for episode in episodes])
         if "instance_motion" in names:
             parts_before = _parts([episode.poses_before for episode in episodes])
+            parts = _parts([episode.poses for episode in episodes])
             rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
             observation["instance_motion"] = rows
             observation["prev_from_curr"] = rows[:, 0].copy()
         else:
             observation["prev_from_curr"] = relative_camera(before, now).astype(np.float32)
-    if "rgb" in names:
+    if "rgb" in names and first._rasterise is None:
         colours = [s.rgb(episode) for s, episode in zip(sensings, episodes)]
         observation["rgb"] = np.ascontiguousarray(np.stack(colours).transpose(0, 3, 1, 2))
     if "frame" in names:

@@ -40,7 +40,7 @@ class StreetEnv(gym.Env):
     | `instance` | [1, H, W] | uint8 | 0: static world; 1, 2, 3: first person's body and legs, ... |
     | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
     | `instance_motion` | [1 + 3·P, 4, 4] | float32 | the same by instance; row 0: static world |
-    | `rgb` | [3, H, W] | uint8 | |
+    | `rgb` | [3, k·H, k·W] | uint8 | colours, k = `picture_scale` |
     | `frame` | [2] | int64 | its identifier: the episode's seed, and the steps since its start |
 
     At reset the previous pose is the current one. `info` holds `outcome`, `hit` (the category hit,
@@ -52,8 +52,10 @@ class StreetEnv(gym.Env):
         frame_rate_hz: steps a second; the scene's own if None. The time limit keeps its seconds.
         sensors: the keys of the observation; nothing is rendered if empty.
         render_mode: "rgb_array" or None.
-        renderer: of depth, classes and ids: "rasteriser", "pybullet", or "auto", which is the
-            rasteriser if numba is installed. Colours always come from PyBullet.
+        renderer: "rasteriser", whose colours are textured, "pybullet", or "auto", which is the
+            rasteriser if numba is installed.
+        picture_scale: size of `rgb` and of rendered pictures in sizes of the maps. Flow estimated
+            from larger pictures and averaged down is more accurate.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - gymnasium declares it so
@@ -69,6 +71,7 @@ class StreetEnv(gym.Env):
         sensors: Sequence[str] = SENSORS[:5],
         render_mode: str | None = None,
         renderer: str = "auto",
+        picture_scale: int = 1,
     ) -> None:
         """Builds the street; the first `reset` begins an episode."""
         self.scene = load_scene(scene)
@@ -80,7 +83,7 @@ class StreetEnv(gym.Env):
         self._street = Street.shared(self.scene)
         self._is_open = True
         self._rules: dict[tuple[float, int], Rules] = {}  # by frame rate and ticks a step
-        self.sensing = Sensing(self.scene, self._street, sensors, renderer)
+        self.sensing = Sensing(self.scene, self._street, sensors, renderer, picture_scale)
         self.K = self.sensing.K
         self._episode: Episode | None = None
         self.action_space = spaces.Discrete(3)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from flowrep.palette import CATEGORY_ID
 from flowrep.simulator.meshes import Mesh
+from flowrep.simulator.paint import AMBIENT, DIFFUSE, LIGHT
 
 
 @contextlib.contextmanager
@@ -36,10 +37,10 @@ with _without_greeting():
     import pybullet
 
 _LIGHT = {
-    "lightDirection": [-4.0, 3.0, 9.0],
+    "lightDirection": list(LIGHT),
     "lightColor": [1.0, 1.0, 1.0],
-    "lightAmbientCoeff": 0.62,
-    "lightDiffuseCoeff": 0.46,
+    "lightAmbientCoeff": AMBIENT,
+    "lightDiffuseCoeff": DIFFUSE,
     "lightSpecularCoeff": 0.0,
     "shadow": 0,
     "renderer": pybullet.ER_TINY_RENDERER,

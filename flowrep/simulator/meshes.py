@@ -14,103 +14,17 @@ from shapely.geometry.base import BaseGeometry
 from flowrep.scenes.layout import Box
 from flowrep.scenes.pedestrians import HIP_M, PARTS
 from flowrep.scenes.scene import Kind
+from flowrep.simulator.paint import (
+    SHIRTS,
+    Painted,
+    Patch,
+    front,
+    painted,
+    swatch,
+    upper_storeys,
+)
 
 Array = NDArray[np.float64]
-SIZE_PX = 256
-_SWATCH_PX = 8
-_FRONT_PX = (60, 64)  # height, width of one house front in the texture
-_FLOORS = (2, 3, 4, 5)
-
-PAINTS: dict[str, tuple[int, int, int]] = {
-    "asphalt": (84, 84, 90),
-    "lane_mark": (226, 222, 206),
-    "paving": (178, 168, 156),
-    "skin": (224, 176, 144),
-    "trousers": (44, 52, 84),
-    "shirt_red": (196, 52, 52),
-    "shirt_green": (58, 140, 84),
-    "shirt_yellow": (222, 178, 60),
-    "shirt_blue": (60, 104, 190),
-    "roof": (92, 66, 58),
-    "grass": (110, 150, 74),
-    "leaf": (48, 112, 56),
-    "wood": (128, 92, 60),
-    "metal": (90, 94, 100),
-    "car_body": (52, 84, 168),
-    "glass": (60, 76, 92),
-    "hair": (66, 48, 36),
-    "shoe": (34, 30, 30),
-    "tyre": (30, 30, 34),
-    "car_red": (170, 44, 44),
-    "car_white": (222, 222, 218),
-    "car_grey": (120, 124, 130),
-    "leaf_light": (92, 146, 62),
-    "lamp_white": (250, 244, 214),
-    "lamp_red": (230, 48, 40),
-    "lamp_green": (60, 200, 96),
-    "lamp_off": (52, 46, 44),
-    "kerb": (214, 210, 202),
-}
-SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
-_WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))
-NUM_FRONTS = len(_WALLS) * len(_FLOORS)
-
-# (u0, v0, u1, v1): a rectangle of the texture, v downwards.
-Patch = tuple[float, float, float, float]
-
-
-def swatch(name: str) -> Patch:
-    """Returns the middle of a plain colour, as a patch of zero size."""
-    u = (list(PAINTS).index(name) + 0.5) * _SWATCH_PX / SIZE_PX
-    v = 0.5 * _SWATCH_PX / SIZE_PX
-    return (u, v, u, v)
-
-
-def front(variant: int) -> Patch:
-    """Returns the patch of house front `variant`, modulo the number of fronts."""
-    row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
-    top = _SWATCH_PX + row * _FRONT_PX[0]
-    left = column * _FRONT_PX[1]
-    pixels = np.array([left + 0.5, top + 0.5, left + _FRONT_PX[1] - 0.5, top + _FRONT_PX[0] - 0.5])
-    u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
-    return (u0, v0, u1, v1)
-
-
-def upper_storeys(variant: int) -> Patch:
-    """Returns a house front above its ground floor, for walls without a door."""
-    u0, v0, u1, v1 = front(variant)
-    floors = _FLOORS[variant % NUM_FRONTS // len(_WALLS)]
-    return (u0, v0, u1, v1 - (v1 - v0) / floors)
-
-
-def texture() -> NDArray[np.uint8]:
-    """Returns the texture [SIZE_PX, SIZE_PX, 3]."""
-    image = np.zeros((SIZE_PX, SIZE_PX, 3), dtype=np.uint8)
-    for i, rgb in enumerate(PAINTS.values()):
-        image[:_SWATCH_PX, i * _SWATCH_PX : (i + 1) * _SWATCH_PX] = rgb
-    height, width = _FRONT_PX
-    for row, floors in enumerate(_FLOORS):
-        for column, rgb in enumerate(_WALLS):
-            top, left = _SWATCH_PX + row * height, column * width
-            image[top : top + height, left : left + width] = _house_front(floors, rgb)
-    return image
-
-
-def _house_front(floors: int, rgb: tuple[int, int, int]) -> NDArray[np.uint8]:
-    height, width = _FRONT_PX
-    image = np.full((height, width, 3), rgb, dtype=np.uint8)
-    storey, bay = height // floors, width // 4
-    for floor in range(floors):
-        top = floor * storey + storey // 4
-        image[floor * storey] = np.array(rgb) * 0.8
-        for column in range(4):
-            left = column * bay + bay // 4
-            image[top : top + storey // 2, left : left + bay // 2] = PAINTS["glass"]
-    # A door in the second bay of the ground floor, down to the street.
-    image[height - storey * 2 // 3 :, bay + bay // 4 : 2 * bay - bay // 4] = PAINTS["wood"]
-    return image
-
-
 _CHUNK_TRIANGLES = 24
 
 
@@ -124,6 +38,7 @@ class Body:
         semantic: its id in the semantic map.
         instance: its id in the instance map.
         moves: whether it has a pose of its own; if not, its frame is the world's.
+        uvs: [V, 2], places in the texture; without them it is plain asphalt.
     """
 
     vertices: NDArray[np.float64]
@@ -131,6 +46,7 @@ class Body:
     semantic: int
     instance: int
     moves: bool = False
+    uvs: NDArray[np.float64] | None = None
 
 
 class Triangles(NamedTuple):
@@ -146,6 +62,7 @@ class Triangles(NamedTuple):
     poses: NDArray[np.int32]  # [C], index among the moving bodies; -1 for the static world
     semantic: NDArray[np.uint8]  # [B], by body
     instance: NDArray[np.uint8]  # [B]
+    look: Painted  # of the T triangles
 
 
 def gather(bodies: Sequence[Body]) -> Triangles:
@@ -154,11 +71,16 @@ def gather(bodies: Sequence[Body]) -> Triangles:
     corners: list[NDArray[np.int32]] = [np.empty((0, 3), dtype=np.int32)]
     owners: list[int] = []
     poses: list[int] = []
+    looks: list[Painted] = []
     movers = iter(range(len(bodies)))
     for number, body in enumerate(bodies):
         pose = next(movers) if body.moves else -1
-        for chunk in _chunks(body.vertices[body.triangles]):
-            own, inverse = np.unique(chunk.reshape(-1, 3), axis=0, return_inverse=True)
+        triangles = body.vertices[body.triangles]
+        uvs = np.zeros((len(body.vertices), 2)) if body.uvs is None else body.uvs
+        look = painted(triangles, uvs[body.triangles], body.semantic, body.instance)
+        for chunk in _chunks(triangles.mean(axis=1), np.arange(len(triangles))):
+            own, inverse = np.unique(triangles[chunk].reshape(-1, 3), axis=0, return_inverse=True)
+            looks.append(look.of(chunk))
             points.append(own)
             corners.append(inverse.reshape(-1, 3).astype(np.int32))
             owners.append(number)
@@ -175,20 +97,20 @@ def gather(bodies: Sequence[Body]) -> Triangles:
         poses=np.array(poses, dtype=np.int32),
         semantic=np.array([body.semantic for body in bodies], dtype=np.uint8),
         instance=np.array([body.instance for body in bodies], dtype=np.uint8),
+        look=Painted.joined(looks),
     )
 
 
-def _chunks(triangles: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Returns triangles [T, 3, 3] in groups of neighbours."""
+def _chunks(middles: NDArray[np.float64], triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Returns triangles in groups of neighbours; `middles` are those of all triangles."""
     if len(triangles) == 0:
         return []
     if len(triangles) <= _CHUNK_TRIANGLES:
         return [triangles]
-    middles = triangles.mean(axis=1)
-    longest = int(np.ptp(middles, axis=0).argmax())
-    order = np.argsort(middles[:, longest], kind="stable")
+    own = middles[triangles]
+    order = np.argsort(own[:, int(np.ptp(own, axis=0).argmax())], kind="stable")
     half = len(order) // 2
-    return [*_chunks(triangles[order[:half]]), *_chunks(triangles[order[half:]])]
+    return [*_chunks(middles, triangles[order[:half]]), *_chunks(middles, triangles[order[half:]])]
 
 
 def _sphere(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

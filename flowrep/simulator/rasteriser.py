@@ -16,19 +16,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.jit import compiled
+from flowrep.palette import CLASS_COLOURS
 from flowrep.simulator.meshes import Triangles
+from flowrep.simulator.paint import (
+    AMBIENT,
+    DIFFUSE,
+    FRONT_SIZE,
+    GRAIN_SIZE,
+    LIGHT,
+    front_levels,
+    grain,
+)
 
 _LEAST_AREA_PX = 0.01  # twice the area below which PyBullet's renderer omits triangles
+_SKY = CLASS_COLOURS["sky"]
+_GRAIN_LEVELS = GRAIN_SIZE.bit_length() - 1
+_FRONT_LEVELS = FRONT_SIZE.bit_length()
+# Where levels of halved sizes begin, one after another, and how large their texels are.
+_GRAIN_STARTS = np.cumsum([0, *((GRAIN_SIZE >> i) ** 2 for i in range(_GRAIN_LEVELS))])
+_FRONT_STARTS = np.cumsum([0, *((FRONT_SIZE >> i) ** 2 for i in range(_FRONT_LEVELS))])
+_SCALES = 0.5 ** np.arange(_GRAIN_LEVELS)
+
 
 _compiled = compiled()
+_shading = compiled(error_model="numpy", fastmath=True)
+_inlined = compiled(error_model="numpy", fastmath=True, inline="always")
 
 
 class Maps(NamedTuple):
-    """Maps of N views, all [N, H, W]: inf, class 0 and instance 0 for pixels without a surface."""
+    """Maps of N views [N, H, W]: inf, class 0 and instance 0 for pixels without a surface."""
 
     depth: NDArray[np.float32]  # metres along z
     semantic: NDArray[np.uint8]
     instance: NDArray[np.uint8]
+    rgb: NDArray[np.uint8]  # [N, 3, H, W], or [0, 3, H, W] where none was asked for
 
 
 class Rasteriser:
@@ -51,7 +72,13 @@ class Rasteriser:
         """Compiles the drawing functions unless they are in the cache."""
         # Column i is sampled at u = i + 0.5.
         K_of_index = K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-        self._world = (*triangles, K_of_index, *map(float, range_m))
+        shape = triangles[: triangles._fields.index("bodies") + 1]
+        # The renderer numbers triangles, so classes and instances are looked up by triangle.
+        owners = np.repeat(triangles.bodies, np.diff(triangles.corner_bounds))
+        ids = triangles.semantic[owners], triangles.instance[owners]
+        self._world = (*shape, triangles.poses, *ids, K_of_index, *map(float, range_m))
+        poses = np.repeat(triangles.poses, np.diff(triangles.corner_bounds))
+        self._look = poses, *triangles.look, grain(), front_levels()
         self._size = size
         moving = int(triangles.poses.max(initial=-1)) + 1
         nothing = np.empty((0, 4, 4)), np.empty((0, moving, 4, 4))
@@ -62,6 +89,8 @@ class Rasteriser:
         cam_from_world: NDArray[np.float64],
         world_from_body: NDArray[np.float64],
         is_shown: NDArray[np.bool_],
+        *,
+        rgb: bool = False,
     ) -> Maps:
         """Returns N views of the same bodies at poses of their own.
 
@@ -69,28 +98,36 @@ class Rasteriser:
             cam_from_world: [N, 4, 4], with OpenCV camera axes.
             world_from_body: poses [N, M, 4, 4] of the M moving bodies.
             is_shown: which bodies are present, [N, B].
+            rgb: whether to draw colours too.
         """
-        shape = (len(cam_from_world), *self._size)
-        maps = Maps(*(np.empty(shape, kind) for kind in (np.float32, np.uint8, np.uint8)))
-        _draw(*self._world, cam_from_world, world_from_body, is_shown, *maps)
+        views = len(cam_from_world)
+        shape = (views, *self._size)
+        maps = Maps(
+            np.empty(shape, np.float32),
+            np.empty(shape, np.uint8),
+            np.empty(shape, np.uint8),
+            np.empty((views if rgb else 0, 3, *self._size), np.uint8),
+        )
+        _draw(*self._world, self._look, cam_from_world, world_from_body, is_shown, *maps)
         return maps
 
 
 @_compiled
 def _draw(
     points, corners, point_bounds, corner_bounds, centres, radii, bodies, poses, classes, instances,
-    K, near_m, far_m, cam_from_world, world_from_body, is_shown, depth, semantic, instance,
+    K, near_m, far_m, look, cam_from_world, world_from_body, is_shown,
+    depth, semantic, instance, rgb,
 ):  # fmt: skip
     views, height, width = depth.shape
     planes = _side_planes(K, height, width)
     most = (point_bounds[1:] - point_bounds[:-1]).max() if len(bodies) else 0
     q = np.empty((most, 3))
     inverse = np.empty((height, width))
-    body = np.empty((height, width), dtype=np.int32)
+    number = np.empty((height, width), dtype=np.int32)
     into = np.empty((3, 4))
     for n in range(views):
         inverse[:] = 1.0 / far_m
-        body[:] = -1
+        number[:] = -1
         for c in range(len(bodies)):
             if not is_shown[n, bodies[c]]:
                 continue
@@ -102,8 +139,10 @@ def _draw(
                 _project(K, into, points[i], q[i - first])
             for t in range(corner_bounds[c], corner_bounds[c + 1]):
                 a, b, d = corners[t, 0], corners[t, 1], corners[t, 2]
-                _fill(q[a], q[b], q[d], near_m, far_m, bodies[c], inverse, body)
-        _look_up(inverse, body, classes, instances, depth[n], semantic[n], instance[n])
+                _fill(q[a], q[b], q[d], near_m, far_m, t, inverse, number)
+        _look_up(inverse, number, classes, instances, depth[n], semantic[n], instance[n])
+        if len(rgb):
+            _shade(inverse, number, K, cam_from_world[n], world_from_body[n], look, rgb[n])
 
 
 @_compiled
@@ -165,7 +204,7 @@ def _cross(p, q):
 
 
 @_compiled
-def _fill(p, q, r, near_m, far_m, number, inverse, body):
+def _fill(p, q, r, near_m, far_m, triangle, inverse, number):
     """Draws the triangle with corners p, q, r, clockwise in an image whose y points down."""
     e, f, g = _cross(r, q), _cross(p, r), _cross(q, p)
     det = p[0] * e[0] + p[1] * e[1] + p[2] * e[2]
@@ -206,17 +245,139 @@ def _fill(p, q, r, near_m, far_m, number, inverse, body):
             w = row + dx * x
             if inverse[y, x] < w <= most:
                 inverse[y, x] = w
-                body[y, x] = number
+                number[y, x] = triangle
 
 
 @_compiled
-def _look_up(inverse, body, classes, instances, depth, semantic, instance):
-    height, width = body.shape
+def _look_up(inverse, number, classes, instances, depth, semantic, instance):
+    height, width = number.shape
     for y in range(height):
         for x in range(width):
-            number = body[y, x]
-            if number < 0:
+            t = number[y, x]
+            if t < 0:
                 depth[y, x], semantic[y, x], instance[y, x] = np.inf, 0, 0
             else:
                 depth[y, x] = 1.0 / inverse[y, x]
-                semantic[y, x], instance[y, x] = classes[number], instances[number]
+                semantic[y, x], instance[y, x] = classes[t], instances[t]
+
+
+@_shading
+def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
+    """Colours the visible triangles: paint times grain times light, filtered to a pixel's size."""
+    poses, normals, colours, contrast, grain_axes, front_of, front_axes, grain, fronts = look
+    height, width = number.shape
+    m, g, f = np.empty((3, 4)), np.empty((2, 4)), np.empty((2, 4))
+    last, front = -1, -1
+    nx = ny = per_d = shade = rough = red = green = blue = 0.0
+    du, dv = 1.0 / K[0, 0], 1.0 / K[1, 1]
+    for y in range(height):
+        b = (y - K[1, 2]) * dv
+        for x in range(width):
+            t = number[y, x]
+            if t < 0:
+                rgb[0, y, x], rgb[1, y, x], rgb[2, y, x] = _SKY
+                continue
+            a = (x - K[0, 2]) * du
+            w = inverse[y, x]
+            if t != last:
+                last = t
+                _compose(cam_from_world, world_from_body, poses[t], m)
+                nx, ny, nz = _turned(m, normals[t, 0], normals[t, 1], normals[t, 2])
+                # The plane n · p = d has inverse depth w = n · r / d on the ray r.
+                per_d = w / (nx * a + ny * b + nz)
+                lx, ly, lz = _turned(cam_from_world, LIGHT[0], LIGHT[1], LIGHT[2])
+                shade = AMBIENT + DIFFUSE * max(0.0, nx * lx + ny * ly + nz * lz)
+                red, green, blue = colours[t, 0], colours[t, 1], colours[t, 2]
+                rough, front = contrast[t], front_of[t]
+                _seen_from_cam(grain_axes, t, m, g)
+                if front >= 0:
+                    _seen_from_cam(front_axes, t, m, f)
+            z = 1.0 / w
+            tilt_u, tilt_v = nx * per_d * z * du, ny * per_d * z * dv
+            if front >= 0:
+                u, v, level = _texel(f, a, b, z, tilt_u, tilt_v, du, dv)
+                light = shade
+                red, green, blue = _front(fronts, front, u, v, level)
+            else:
+                u, v, level = _texel(g, a, b, z, tilt_u, tilt_v, du, dv)
+                light = shade * (1.0 + rough * _grain(grain, u, v, level))
+            rgb[0, y, x] = np.uint8(min(255.0, max(0.0, red * light)))
+            rgb[1, y, x] = np.uint8(min(255.0, max(0.0, green * light)))
+            rgb[2, y, x] = np.uint8(min(255.0, max(0.0, blue * light)))
+
+
+@_shading
+def _turned(m, x, y, z):
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+    )
+
+
+@_shading
+def _seen_from_cam(axes, n, cam_from_body, into):
+    # axes · (R, t)⁻¹, for a rotation R
+    for i in range(2):
+        into[i, 3] = axes[n, i, 3]
+        for j in range(3):
+            into[i, j] = 0.0
+            for k in range(3):
+                into[i, j] += axes[n, i, k] * cam_from_body[j, k]
+            into[i, 3] -= into[i, j] * cam_from_body[j, 3]
+
+
+@_inlined
+def _texel(axes, a, b, z, tilt_u, tilt_v, du, dv):
+    """Returns the texel on the ray r = (a, b, 1) and the level whose texels have a pixel's size."""
+    s = axes[0, 0] * a + axes[0, 1] * b + axes[0, 2]
+    t = axes[1, 0] * a + axes[1, 1] * b + axes[1, 2]
+    # d(z r)/du = z (e_x / fx - r · n_x / (fx n · r)), and so for v.
+    su, tu = axes[0, 0] * du - s * tilt_u, axes[1, 0] * du - t * tilt_u
+    sv, tv = axes[0, 1] * dv - s * tilt_v, axes[1, 1] * dv - t * tilt_v
+    square = np.float32(z * z * max(su * su + tu * tu, sv * sv + tv * tv))
+    # Half of log2 of the square; the bits of a float are its log2, linear between powers of two.
+    level = square.view(np.int32) * (0.5 / (1 << 23)) - 63.5
+    return z * s + axes[0, 3], z * t + axes[1, 3], level
+
+
+@_inlined
+def _grain(texels, u, v, level):
+    if level >= _GRAIN_LEVELS - 1:
+        return 0.0
+    level = max(level, 0.0)
+    n = int(level)
+    p, q, r, s, du, dv = _around(u, v, GRAIN_SIZE >> n, _SCALES[n], _GRAIN_STARTS[n])
+    fine = _mixed(texels, p, q, r, s, du, dv, 0)
+    return fine + (level - n) * (_mixed(texels, p, q, r, s, du, dv, 1) - fine)
+
+
+@_inlined
+def _front(texels, front, u, v, level):
+    n = int(min(max(level + 0.5, 0.0), _FRONT_LEVELS - 1.0))
+    half = 0.5 / _SCALES[n]  # of a texel: here the centre of texel 0 is at 0.5
+    start = front * _FRONT_STARTS[-1] + _FRONT_STARTS[n]
+    p, q, r, s, du, dv = _around(u - half, v - half, FRONT_SIZE >> n, _SCALES[n], start)
+    return (
+        _mixed(texels, p, q, r, s, du, dv, 0),
+        _mixed(texels, p, q, r, s, du, dv, 1),
+        _mixed(texels, p, q, r, s, du, dv, 2),
+    )
+
+
+@_inlined
+def _around(u, v, size, scale, start):
+    """Returns the indices of the four texels around a place, and where it is between them."""
+    u, v = u * scale, v * scale
+    i, j = math.floor(u), math.floor(v)
+    left, up = int(i) & (size - 1), int(j) & (size - 1)
+    right, down = (left + 1) & (size - 1), (up + 1) & (size - 1)
+    up, down = start + up * size, start + down * size
+    return up + left, up + right, down + left, down + right, u - i, v - j
+
+
+@_inlined
+def _mixed(texels, p, q, r, s, du, dv, channel):
+    top = texels[p, channel] + du * (texels[q, channel] - texels[p, channel])
+    bottom = texels[r, channel] + du * (texels[s, channel] - texels[r, channel])
+    return top + dv * (bottom - top)

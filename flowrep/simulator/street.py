@@ -19,6 +19,7 @@ from flowrep.scenes.scene import Scene, VehicleState
 from flowrep.simulator import meshes
 from flowrep.simulator.bullet import Simulator
 from flowrep.simulator.meshes import Body, gather, person_meshes
+from flowrep.simulator.paint import texture
 
 Array = NDArray[Any]
 _BEHIND_M = 2.0  # people further behind the camera are out of view: none reach that far
@@ -88,7 +89,7 @@ class Street:
         self.is_safe = SafeGround(layout)
         self.lock = threading.RLock()  # held from placing bodies to rendering them
         self.users = 0
-        self.simulator = Simulator(meshes.texture())
+        self.simulator = Simulator(texture())
         self.bodies: list[Body] = []
         vehicle = layout.scene.vehicle
         self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
@@ -278,7 +279,8 @@ class Street:
         vertices = np.array(mesh.vertices, dtype=np.float64)
         triangles = np.array(mesh.indices).reshape(-1, 3)
         seen_as = CATEGORY_ID[category], instance
-        self.bodies.append(Body(vertices, triangles, *seen_as, moves=instance > 0))
+        uvs = np.array(mesh.uvs).reshape(-1, 2)
+        self.bodies.append(Body(vertices, triangles, *seen_as, moves=instance > 0, uvs=uvs))
         return self.simulator.add_body(mesh, category, instance=instance, **options)
 
 

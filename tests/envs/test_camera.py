@@ -14,7 +14,8 @@ from flowrep.simulator.camera import (
     sampled_intrinsics,
     vehicle_from_camera,
 )
-from flowrep.simulator.meshes import Mesh, swatch, texture
+from flowrep.simulator.meshes import Mesh
+from flowrep.simulator.paint import swatch, texture
 
 NEAR_M, FAR_M = 0.2, 300.0
 # Columns: height, width, fx, fy. Nothing is square, so that no two numbers can be swapped.

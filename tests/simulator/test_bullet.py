@@ -15,7 +15,8 @@ import pytest
 from flowrep.envs import StreetEnv
 from flowrep.simulator import street
 from flowrep.simulator.bullet import Simulator
-from flowrep.simulator.meshes import Mesh, texture
+from flowrep.simulator.meshes import Mesh
+from flowrep.simulator.paint import texture
 
 
 @pytest.fixture

@@ -52,7 +52,7 @@ def test_numba_is_imported_where_something_is_drawn_and_not_before(monkeypatch):
 
     # None is what Python finds where a module can't be imported.
     monkeypatch.setitem(sys.modules, "flowrep.simulator.rasteriser", None)
-    StreetEnv(sensors=("prev_from_curr", "rgb")).close()
+    StreetEnv(sensors=("prev_from_curr", "frame")).close()
     StreetEnv(renderer="pybullet").close()
     with pytest.raises(ImportError):
         StreetEnv()

@@ -1,0 +1,249 @@
+"""Paint: plain colours and house fronts in one small texture, and the grain on every surface.
+
+PyBullet's picture shows the texture alone. The rasteriser's multiplies it by a grain, so that roads
+and clothes have something to follow: without it, the flow estimated from two pictures of plain
+asphalt is 0.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.palette import CATEGORY_ID, CLASS_COLOURS
+
+SIZE_PX = 256
+AMBIENT, DIFFUSE = 0.62, 0.46
+LIGHT = tuple((np.array([-4.0, 3.0, 9.0]) / np.linalg.norm([-4.0, 3.0, 9.0])).tolist())
+"""Shares of light from everywhere and from the sun, and the direction to it, in the world."""
+
+GRAIN_SIZE, FRONT_SIZE = 1024, 64  # texels a side; of a house front as the rasteriser has it
+_TEXELS_A_M, _PEOPLE_TEXELS_A_M = 50.0, 400.0  # so the grain of roads repeats every 20 m
+_SLOPE = 1.2  # of the grain's spectrum; at 1 every octave has the same contrast
+_COARSEST_WAVES = 5  # over the grain's size: 4 m on roads
+# With these, DIS follows roads and people (see docs/scenes.md) and they still look like asphalt and
+# clothes; at 0.2 the flow of the road is missed twice as often.
+_CONTRAST_OF = {"road": 0.3, "crosswalk": 0.3, "sidewalk": 0.2, "terrain": 0.3, "tree": 0.3}
+_CONTRAST_OF |= {"pedestrian": 0.3, "building": 0.12, "fence": 0.2}
+_CONTRAST = [_CONTRAST_OF.get(name, 0.1) for name in CLASS_COLOURS]  # by class
+_SWATCH_PX = 8
+_FRONT_PX = (60, 64)  # height, width of one house front in the texture
+_FLOORS = (2, 3, 4, 5)
+
+PAINTS: dict[str, tuple[int, int, int]] = {
+    "asphalt": (84, 84, 90),
+    "lane_mark": (226, 222, 206),
+    "paving": (178, 168, 156),
+    "skin": (224, 176, 144),
+    "trousers": (44, 52, 84),
+    "shirt_red": (196, 52, 52),
+    "shirt_green": (58, 140, 84),
+    "shirt_yellow": (222, 178, 60),
+    "shirt_blue": (60, 104, 190),
+    "roof": (92, 66, 58),
+    "grass": (110, 150, 74),
+    "leaf": (48, 112, 56),
+    "wood": (128, 92, 60),
+    "metal": (90, 94, 100),
+    "car_body": (52, 84, 168),
+    "glass": (60, 76, 92),
+    "hair": (66, 48, 36),
+    "shoe": (34, 30, 30),
+    "tyre": (30, 30, 34),
+    "car_red": (170, 44, 44),
+    "car_white": (222, 222, 218),
+    "car_grey": (120, 124, 130),
+    "leaf_light": (92, 146, 62),
+    "lamp_white": (250, 244, 214),
+    "lamp_red": (230, 48, 40),
+    "lamp_green": (60, 200, 96),
+    "lamp_off": (52, 46, 44),
+    "kerb": (214, 210, 202),
+}
+SHIRTS = tuple(name for name in PAINTS if name.startswith("shirt"))
+_WALLS = ((178, 108, 80), (206, 186, 150), (150, 152, 158), (190, 146, 108))
+NUM_FRONTS = len(_WALLS) * len(_FLOORS)
+
+# (u0, v0, u1, v1): a rectangle of the texture, v downwards.
+Patch = tuple[float, float, float, float]
+
+
+def swatch(name: str) -> Patch:
+    """Returns the middle of a plain colour, as a patch of zero size."""
+    u = (list(PAINTS).index(name) + 0.5) * _SWATCH_PX / SIZE_PX
+    v = 0.5 * _SWATCH_PX / SIZE_PX
+    return (u, v, u, v)
+
+
+def front(variant: int) -> Patch:
+    """Returns the patch of house front `variant`, modulo the number of fronts."""
+    row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
+    top = _SWATCH_PX + row * _FRONT_PX[0]
+    left = column * _FRONT_PX[1]
+    pixels = np.array([left + 0.5, top + 0.5, left + _FRONT_PX[1] - 0.5, top + _FRONT_PX[0] - 0.5])
+    u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
+    return (u0, v0, u1, v1)
+
+
+def upper_storeys(variant: int) -> Patch:
+    """Returns a house front above its ground floor, for walls without a door."""
+    u0, v0, u1, v1 = front(variant)
+    floors = _FLOORS[variant % NUM_FRONTS // len(_WALLS)]
+    return (u0, v0, u1, v1 - (v1 - v0) / floors)
+
+
+def texture() -> NDArray[np.uint8]:
+    """Returns the texture [SIZE_PX, SIZE_PX, 3]."""
+    image = np.zeros((SIZE_PX, SIZE_PX, 3), dtype=np.uint8)
+    for i, rgb in enumerate(PAINTS.values()):
+        image[:_SWATCH_PX, i * _SWATCH_PX : (i + 1) * _SWATCH_PX] = rgb
+    height, width = _FRONT_PX
+    for row, floors in enumerate(_FLOORS):
+        for column, rgb in enumerate(_WALLS):
+            top, left = _SWATCH_PX + row * height, column * width
+            image[top : top + height, left : left + width] = _house_front(floors, rgb)
+    return image
+
+
+def _house_front(floors: int, rgb: tuple[int, int, int]) -> NDArray[np.uint8]:
+    height, width = _FRONT_PX
+    image = np.full((height, width, 3), rgb, dtype=np.uint8)
+    storey, bay = height // floors, width // 4
+    for floor in range(floors):
+        top = floor * storey + storey // 4
+        image[floor * storey] = np.array(rgb) * 0.8
+        for column in range(4):
+            left = column * bay + bay // 4
+            image[top : top + storey // 2, left : left + bay // 2] = PAINTS["glass"]
+    # A door in the second bay of the ground floor, down to the street.
+    image[height - storey * 2 // 3 :, bay + bay // 4 : 2 * bay - bay // 4] = PAINTS["wood"]
+    return image
+
+
+class Painted(NamedTuple):
+    """How T triangles look, in the frames of their bodies; the rasteriser shades with it."""
+
+    normals: NDArray[np.float32]  # [T, 3]
+    colours: NDArray[np.float32]  # [T, 3], 0 to 255
+    contrast: NDArray[np.float32]  # [T], standard deviation of the grain
+    grain_from_point: NDArray[np.float32]  # [T, 2, 4], texels of the grain from (x, y, z, 1)
+    fronts: NDArray[np.int32]  # [T], the house front; -1 for a plain colour
+    front_from_point: NDArray[np.float32]  # [T, 2, 4], texels of the house front
+
+    def of(self, triangles: NDArray[np.int64]) -> "Painted":
+        """Returns the look of some of the triangles."""
+        return Painted._make(array[triangles] for array in self)
+
+    @classmethod
+    def joined(cls, looks: Sequence["Painted"]) -> "Painted":
+        """Returns the look of the triangles of all, in order."""
+        nothing = painted(np.empty((0, 3, 3)), np.empty((0, 3, 2)), 0, 0)
+        return cls._make(np.concatenate(arrays) for arrays in zip(nothing, *looks))
+
+
+def painted(
+    corners: NDArray[np.float64], uvs: NDArray[np.float64], semantic: int, instance: int
+) -> Painted:
+    """Returns the look of a body's triangles.
+
+    The grain lies on level ground as a map does, so it runs on over its triangles. On other faces
+    its axes are the level direction along the face and the one across.
+
+    Args:
+        corners: [T, 3, 3], metres, counter-clockwise seen from outside.
+        uvs: [T, 3, 2], the corners' places in the texture.
+        semantic: their id in the semantic map.
+        instance: 0 for the static world.
+    """
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normals = np.cross(a, b)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    is_level = np.abs(normals[:, 2]) > 0.9
+    along = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(a))], axis=1)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    along[is_level] = 1.0, 0.0, 0.0
+    across = np.cross(normals, along)
+    across[is_level] = 0.0, 1.0, 0.0
+    per_m = _PEOPLE_TEXELS_A_M if instance else _TEXELS_A_M
+    # Any numbers do: they give parallel faces, and people, grains of their own.
+    plane_m = np.where(is_level, 0.0, (normals * corners[:, 0]).sum(axis=1))
+    grain_axes = np.zeros((len(a), 2, 4))
+    grain_axes[:, 0, :3], grain_axes[:, 1, :3] = per_m * along, per_m * across
+    grain_axes[:, 0, 3] = 37.7 * per_m * plane_m + 97.0 * instance
+    grain_axes[:, 1, 3] = 17.3 * per_m * plane_m + 61.0 * instance
+    # A plain colour is one place of the texture; only a house front covers an area of it.
+    column, row = np.clip(uvs.mean(axis=1) * SIZE_PX, 0, SIZE_PX - 1).astype(int).T
+    is_front = np.ptp(uvs, axis=1).max(axis=1, initial=0.0) > 0.0
+    column_of_front, row_of_front = column // _FRONT_PX[1], (row - _SWATCH_PX) // _FRONT_PX[0]
+    fronts = np.where(is_front, row_of_front * len(_WALLS) + column_of_front, -1)
+    # The affine map of a triangle's plane that takes corners to texels: [a b n] to [du dv 0].
+    front_axes = np.zeros((len(a), 2, 4))
+    for i in np.flatnonzero(is_front):
+        left, top = column_of_front[i] * _FRONT_PX[1], _SWATCH_PX + row_of_front[i] * _FRONT_PX[0]
+        texels = (uvs[i] * SIZE_PX - [left, top]) * FRONT_SIZE / np.array(_FRONT_PX[::-1])
+        steps = np.column_stack([texels[1] - texels[0], texels[2] - texels[0], np.zeros(2)])
+        front_axes[i, :, :3] = steps @ np.linalg.inv(np.column_stack([a[i], b[i], normals[i]]))
+        front_axes[i, :, 3] = texels[0] - front_axes[i, :, :3] @ corners[i, 0]
+    return Painted(
+        normals.astype(np.float32),
+        texture()[row, column].astype(np.float32),
+        np.full(len(a), _CONTRAST[semantic], dtype=np.float32),
+        grain_axes.astype(np.float32),
+        fronts.astype(np.int32),
+        front_axes.astype(np.float32),
+    )
+
+
+@cache
+def grain() -> NDArray[np.float32]:
+    """Returns a periodic random pattern of mean 0 and deviation 1, and its coarser levels.
+
+    Level l, of `GRAIN_SIZE / 2^l` texels a side, is the pattern behind a Gaussian of half its own
+    texel, which no more aliases at that size: [texels of all levels, 2]. Beside each texel stands
+    the next level's value at the same place, so that one look-up blends the two.
+    """
+    frequency = np.fft.fftfreq(GRAIN_SIZE)  # cycles a texel
+    radius = np.hypot(frequency[:, None], frequency)
+    noise = np.random.default_rng(0).standard_normal((GRAIN_SIZE, GRAIN_SIZE))
+    spectrum = np.fft.fft2(noise) / np.maximum(radius, 1 / GRAIN_SIZE) ** _SLOPE
+    spectrum[radius < _COARSEST_WAVES / GRAIN_SIZE] = 0.0
+    spectrum /= np.fft.ifft2(spectrum).real.std()
+    levels = []
+    size = GRAIN_SIZE
+    while size >= 2:
+        kept = np.ix_(*[np.r_[0 : size // 2, GRAIN_SIZE - size // 2 : GRAIN_SIZE]] * 2)
+        texel = GRAIN_SIZE / size
+        pair = [
+            np.fft.ifft2(spectrum[kept] * np.exp(-2 * (np.pi * sigma * radius[kept]) ** 2)).real
+            for sigma in (texel / 2, texel)
+        ]
+        levels.append(np.stack(pair, axis=-1).reshape(-1, 2) / texel**2)
+        size //= 2
+    return np.concatenate(levels).astype(np.float32)
+
+
+@cache
+def front_levels() -> NDArray[np.float32]:
+    """Returns the house fronts, each with its coarser levels: [texels of all, 3], grain included.
+
+    Level l has `FRONT_SIZE / 2^l` texels a side.
+    """
+    image, levels = texture().astype(np.float32), []
+    pattern = grain()[: GRAIN_SIZE**2, 0].reshape(GRAIN_SIZE, GRAIN_SIZE)
+    height, width = _FRONT_PX
+    rows = ((np.arange(FRONT_SIZE) + 0.5) * height / FRONT_SIZE).astype(int)
+    for number in range(NUM_FRONTS):
+        row, column = divmod(number, len(_WALLS))
+        level = image[_SWATCH_PX + row * height + rows, column * width : (column + 1) * width]
+        # Every eighth texel of the grain, so that its waves are 1 to 8 m long on a house too.
+        own = pattern[row * 16 :: 8, column * 16 :: 8][:FRONT_SIZE, :FRONT_SIZE, None]
+        level = level * (1.0 + _CONTRAST[CATEGORY_ID["building"]] * own)
+        while True:
+            levels.append(level.reshape(-1, 3))
+            half = len(level) // 2
+            if not half:
+                break
+            level = level.reshape(half, 2, half, 2, 3).mean(axis=(1, 3))
+    return np.concatenate(levels).astype(np.float32)
