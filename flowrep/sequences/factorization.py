@@ -111,7 +111,9 @@ class EstimatedFlowSource:
         If the picture repeats the previous one although the camera moved, all flow is unknown.
         """
         if previous.rgb is None or current.rgb is None:
-            raise SequenceError(current.source, "has no picture to estimate flow from")
+            raise SequenceError(
+                current.source, "has no picture to estimate flow from: use flow=exact"
+            )
         if np.array_equal(previous.rgb, current.rgb):
             unknown = repeats(previous, current)
             return np.full((2, *current.size), np.nan if unknown else 0.0, dtype=np.float32)
