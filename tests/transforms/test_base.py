@@ -81,14 +81,11 @@ def test_any_batch_equals_a_loop_over_frames(make, batch):
         assert torch.equal(output.reshape(want.shape), want)
 
 
-@pytest.mark.slow_after_first
 @each_transform
-def test_compute_is_pure_and_compiles_to_one_graph(make):
+def test_compute_leaves_its_inputs_alone(make):
     transform, td = make(), moments(2)
     before = td.clone()
-    want = transform.compute(*inputs(transform, td))
-    got = torch.compile(transform.compute, fullgraph=True, backend="eager")(*inputs(transform, td))
-    assert all(torch.equal(a, b) for a, b in zip(got, want))
+    transform.compute(*inputs(transform, td))
     for key in transform.in_keys:
         assert torch.equal(td[key].nan_to_num(), before[key].nan_to_num())
 

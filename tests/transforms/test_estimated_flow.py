@@ -375,7 +375,10 @@ def test_what_is_no_weights_is_refused_by_name(weights, tmp_path):
     torch.save({"bias": torch.zeros(1)}, other)
     with pytest.raises(ValueError, match=r"other\.pth does not hold the weights of raft_small"):
         RAFT(other)
-    with pytest.raises(ValueError, match=r"\['raft_small', 'raft_large'\], got 'raft_tiny'"):
+    torch.save([torch.ones(2)], other)
+    with pytest.raises(ValueError, match=r"other\.pth"):
+        RAFT(other)
+    with pytest.raises(ValueError, match="raft_tiny"):
         RAFT(weights, "raft_tiny")
     with pytest.raises(ValueError, match="at least 128"):
         RAFT(weights, min_side_px=96)
@@ -418,9 +421,3 @@ def test_weights_that_are_garbage_are_named_without_advice_to_trust_them(tmp_pat
         RAFT(path)
     assert "weights_only" not in str(caught.value)
     assert caught.value.__cause__ is None
-
-
-def test_weights_that_are_no_state_dict_are_named(tmp_path):
-    torch.save([torch.ones(2)], tmp_path / "w.pth")
-    with pytest.raises(ValueError, match="holds no state dict"):
-        RAFT(tmp_path / "w.pth")

@@ -96,21 +96,6 @@ def test_whatever_the_float_types_raw_and_ego_round_alike(precision, other):
         assert obj.dtype == torch.promote_types(precision, torch.float32)
 
 
-def test_still_camera_leaves_everything_to_the_objects():
-    td = scene()
-    td["sensor", "prev_from_curr"] = torch.eye(4)
-    td["sensor", "instance_motion"][0] = torch.eye(4)
-    td = factors(td)
-    assert (td["ego"] == 0).all()
-    assert torch.equal(td["obj"], td["raw"])
-
-
-def test_nothing_flows_at_a_reset():
-    td = FakeSensorEnv((2,)).reset()
-    td = FlowFactorize(INTRINSICS)(RawFlow(INTRINSICS)(td))
-    assert not any(td[key].any() for key in ("raw", "ego", "obj"))
-
-
 def test_holes_and_unknown_raw_flow_are_0_and_marked():
     td = RawFlow(K, invalid=math.nan)(scene())
     td["sensor", "depth"][0, 1, 0] = math.nan
@@ -124,16 +109,6 @@ def test_holes_and_unknown_raw_flow_are_0_and_marked():
     assert (td["ego"][:, 1, 0] == 0).all()
     assert td["ego"][0, 0, 1] == -2.0  # the camera's share is known without raw flow
     assert td["raw_out"][1, 0, 1] == 0.0
-
-
-def test_a_body_that_came_from_behind_the_camera_has_no_flow():
-    td = scene()
-    td["sensor", "instance_motion"][1, 2, 3] = -9.0  # it was at z = 8 - 9 < 0
-    transform = RawFlow(K, outputs=["raw", "valid"])
-    td = transform(td)
-    assert not td["valid"][0, 0, 1]
-    assert (td["raw"][:, 0, 1] == 0).all()
-    assert RawFlow(K, invalid=math.nan)(td)["raw"][:, 0, 1].isnan().all()
 
 
 def overtaken() -> TensorDict:
