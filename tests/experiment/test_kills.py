@@ -21,7 +21,7 @@ from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow
 
-KILLS = 13  # of each of four algorithms
+KILLS = 7  # of each of four algorithms
 STAGES = ("write", "half", "flush", "rename", "renamed")
 SMALL = [
     "debug=smoke", "num_envs=1", "algorithm.precision=fp32", "algorithm.hidden_size=16",
