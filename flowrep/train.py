@@ -114,16 +114,12 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
         print(f"run folder: {folder.path}")
         try:
             is_evaluated = complete(runner, stop)
-        except (CheckpointError, DivergenceError) as error:
-            exit_with(f"after {runner.frames} frames: {error}")
-        except (WorkerError, OSError) as error:
-            remedy = (
-                ""
-                if isinstance(error, WorkerError)
-                else ". Free some space or make the folder writable"
-            )
+        except (CheckpointError, DivergenceError, WorkerError, OSError) as error:
+            free = ". Free some space or make the folder writable" * isinstance(error, OSError)
+            may_go_on = isinstance(error, OSError | WorkerError)
             exit_with(
-                f"after {runner.frames} frames: {error}{remedy}", f"Continue with: {how_to_go_on}"
+                f"after {runner.frames} frames: {error}{free}",
+                f"Continue with: {how_to_go_on}" if may_go_on else "",
             )
         finally:
             runner.close()

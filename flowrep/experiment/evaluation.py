@@ -9,7 +9,7 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
-from itertools import product
+from itertools import count, product
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -302,10 +302,18 @@ class Comparison:
             if key[-1] in self.policies:
                 del self._found[key]
         done = sum(map(len, self._found.values()))
+        steps = count(1)
+
+        def show_step(_: TensorDictBase) -> None:
+            """Shows that the bar is alive: the first episodes end after seconds, many at once."""
+            bar.set_postfix_str(f"step {next(steps)}", refresh=False)
+            bar.update(0)
+
         with tqdm(
-            total=self.total, initial=done, unit="episode", desc="evaluating", leave=False
-        ) as bar:
-            for name, episode in self._episodes(make_env, policy, num_envs):
+            total=self.total, initial=done, unit="episode", desc="evaluating", leave=False,
+            miniters=0, mininterval=0.5,
+        ) as bar:  # fmt: skip
+            for name, episode in self._episodes(make_env, policy, num_envs, show_step):
                 found = self._found[episode.speed, episode.fps, name]
                 found[episode.seed] = episode
                 bar.update()
@@ -315,7 +323,11 @@ class Comparison:
                     return
 
     def _episodes(
-        self, make_env: Callable[..., EnvBase], policy: Policy, num_envs: int
+        self,
+        make_env: Callable[..., EnvBase],
+        policy: Policy,
+        num_envs: int,
+        on_frame: Callable[[TensorDictBase], None],
     ) -> Iterator[tuple[str, Episode]]:
         for rate in self.fps:
             for names, changes in ((self.policies, {}), (self.baselines, _WITHOUT_OBSERVATIONS)):
@@ -326,8 +338,9 @@ class Comparison:
                 size = {"num_envs": min(num_envs, most)}
                 with closing(make_env(frame_rate_hz=rate, **size, **changes)) as env:
                     for name, episodes in missing.items():
+                        how: dict[str, Any] = {"greedy": name != "sampled", "on_frame": on_frame}
                         driver = BaselinePolicy(name, env) if changes else policy
-                        for episode in evaluate(env, driver, episodes, greedy=name != "sampled"):
+                        for episode in evaluate(env, driver, episodes, **how):
                             yield name, episode
 
     def _missing(self, rate: float, name: str) -> list[dict[str, Any]]:

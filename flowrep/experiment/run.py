@@ -128,14 +128,14 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             "install that version, or start a new run"
         )
     known = {key: value for key, value in saved.items() if key in expected}
-    for place, there, here in differences(known, expected):
+    for place, there, here in _differences(known, expected):
         raise CheckpointError(
             f"{path} belongs to a run with {place}={there}, the config.yaml of its folder says "
             f"{place}={here}: restore the file that was there, or start a new run"
         )
 
 
-def differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+def _differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Yields the dotted key of each difference with the two values."""
     if not (isinstance(saved, Mapping) and isinstance(expected, Mapping)):
         if saved != expected:
@@ -143,7 +143,7 @@ def differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[st
         return
     for key in dict.fromkeys([*saved, *expected]):
         there, here = saved.get(key, "absent"), expected.get(key, "absent")
-        yield from differences(there, here, f"{place}.{key}" if place else key)
+        yield from _differences(there, here, f"{place}.{key}" if place else key)
 
 
 def machine_of(precision: torch.dtype) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -95,7 +94,7 @@ class Runner:
         if self.evaluation_pending:
             self.evaluation_pending = not self.evaluate("training", stop)
         progress = {"total": total, "initial": self.frames, "unit": "frame", "unit_scale": True}
-        with tqdm(**progress, mininterval=0.5, dynamic_ncols=True) as bar:
+        with tqdm(**progress, miniters=0, mininterval=0.5, dynamic_ncols=True) as bar:
             while self.frames < total and not stop:
                 with self.clock("policy"):
                     acted = self.act()
@@ -142,15 +141,9 @@ class Runner:
             ) from error
 
     def learn(self, bar: tqdm) -> None:
-        """Takes the updates that are due after the frames so far; the bar shows that it is alive.
-
-        On a CPU, an update of the paper's size takes seconds.
-        """
-        shown = time.monotonic()
+        """Takes the updates that are due after the frames so far."""
         for _ in range(self.agent.updates_due(self.frames)):
-            if time.monotonic() - shown > 1.0:
-                shown = time.monotonic()
-                bar.set_description_str(f"update {self.agent.updates:,}")
+            bar.update(0)  # its clock goes on: an update of the paper's size takes a second
             with self.clock("memory"):
                 batch = self.agent.sample()
             with self.clock("update"):
