@@ -179,14 +179,12 @@ def test_noise_of_a_third_of_a_pixel_and_a_covariance_that_says_so():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scene", "bad"), [*((scene, 0.25) for scene in SCENES[:3]), (SCENES[3], 0.3)]
-)
-def test_estimated_flow_of_a_street_gives_nearly_the_motion(scene, bad):
+@pytest.mark.parametrize("scene", SCENES)
+def test_estimated_flow_of_a_street_gives_nearly_the_motion(scene):
     pytest.importorskip("cv2")
     from flowrep.transforms import DIS
 
-    seen = drive(scene, 150, "rgb")
+    seen = drive(scene, 60, "rgb")
     flow = -DIS()(seen["rgb"], seen["before"])
     got = camera_motion(flow, seen["depth"], seen["K"], picture=seen["rgb"])
     turn, shift, ego = errors(got.prev_from_curr, seen["prev_from_curr"], seen["depth"], seen["K"])
@@ -194,7 +192,7 @@ def test_estimated_flow_of_a_street_gives_nearly_the_motion(scene, bad):
     assert ego.median() <= 0.30
     assert (shift / moved).median() <= 0.13
     assert turn.median() <= 0.2
-    assert (ego > 0.5).float().mean() <= bad
+    assert (ego > 0.5).float().mean() <= 0.25
 
 
 @pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no 7-Scenes frames at {FOLDER}")
