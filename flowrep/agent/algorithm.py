@@ -5,9 +5,9 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -20,28 +20,17 @@ from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_p
 
 Step = Callable[[TensorDictBase], TensorDictBase]
 WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
-GIVEN_BY_THE_RUN = (
+GIVEN_BY_THE_RUN = [
     "observation_spec",
     "action_spec",
     "keys",
     "total_frames",
     "device",
     "mirror_image",
-)
-GIVEN_BY_THE_CLASS = ("self", "rate_factors", "policy_options", "network", "actor", "actions")
-
-
-class Memory(Protocol):
-    """The frames that an algorithm has stored to learn from."""
-
-    def extend(self, frames: TensorDictBase) -> object:
-        """Stores steps of N environments."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the complete contents."""
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`."""
+]
+GIVEN_BY_THE_CLASS = ["self", "rate_factors", "policy_options", "network", "actor", "actions"]
+NOT_OPTIONS = {*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS}
+VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 class Algorithm(ABC):
@@ -83,7 +72,8 @@ class Algorithm(ABC):
     """Whether `policy` writes `action_log_prob` beside `action`."""
 
     policy: Any
-    memory: Memory
+    memory: Any
+    """What it learns from, with `extend`, `state_dict` and `load_state_dict`."""
     threads: AbstractContextManager[Any]
     """Entered for each update; `FasterThreads` on a CPU whose cores are free."""
 
@@ -98,8 +88,16 @@ class Algorithm(ABC):
         rate_factors: Mapping[str, float] | None = None,
     ) -> None:
         self.loss = loss
-        self.target_updater = None if tau is None else FastSoftUpdate(loss, tau=tau)
+        if tau is not None:
+            SoftUpdate(loss, tau=tau)  # tells TorchRL that something moves the targets
+        self.tau = tau
         self.weights = weights_of(loss) | dict(self.other_weights())
+        self._targets = [w for n, w in self.weights.items() if n.startswith("target_")]
+        self._followed = [
+            self.weights[n.removeprefix("target_")].data
+            for n in self.weights
+            if n.startswith("target_")
+        ]
         self.trained = {n: w for n, w in self.weights.items() if w.requires_grad}
         self.learning_rate, self.total_updates = learning_rate, max(1, total_updates)
         self.max_grad_norm = max_grad_norm
@@ -121,9 +119,6 @@ class Algorithm(ABC):
 
     def _parameter_groups(self, rate_factors: Mapping[str, float]) -> list[dict[str, Any]]:
         """Returns Adam's parameter groups, one for each learning rate."""
-        unknown = rate_factors.keys() - self.trained.keys()
-        if unknown:
-            raise ValueError(f"rate_factors names {sorted(unknown)}, which training doesn't change")
         groups: dict[float, list[Tensor]] = {}
         for name, weight in self.trained.items():
             groups.setdefault(rate_factors.get(name, 1.0), []).append(weight)
@@ -177,9 +172,21 @@ class Algorithm(ABC):
 
         These are the parameters of the class and, if it takes arbitrary keywords, those of its
         bases and its loss.
+
+        >>> from flowrep.agent import DoubleDQN
+        >>> DoubleDQN.options()["final_epsilon"].default, DoubleDQN.options()["tau"].default
+        (0.05, 0.005)
         """
-        owners = [owner for owner in cls.__mro__ if "__init__" in vars(owner)]
-        return options_of([*owners[: owners.index(Algorithm)], getattr(cls, "LOSS", None)])
+        owners: list[Any] = [owner for owner in cls.__mro__ if "__init__" in vars(owner)]
+        owners[owners.index(Algorithm) :] = [cls.LOSS] if hasattr(cls, "LOSS") else []
+        found: dict[str, inspect.Parameter] = {}
+        for owner in owners:
+            parameters = inspect.signature(owner.__init__).parameters
+            named = {n: p for n, p in parameters.items() if p.kind not in VARIADIC}
+            found = {n: p for n, p in named.items() if n not in NOT_OPTIONS} | found
+            if len(named) == len(parameters):
+                break
+        return found
 
     def step_eagerly(self) -> None:
         """Runs all further updates eagerly instead of as a CUDA graph.
@@ -221,8 +228,9 @@ class Algorithm(ABC):
 
     def after_update(self) -> None:
         """Moves the targets by `tau` towards the weights; called after each optimizer step."""
-        if self.target_updater is not None:
-            self.target_updater.step()
+        if self.tau is not None:
+            with torch.no_grad():
+                torch._foreach_lerp_(self._targets, self._followed, self.tau)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Takes one gradient step on a batch from `sample()` and returns detached metrics.
@@ -246,7 +254,7 @@ class Algorithm(ABC):
         torch.stack(minimised).sum().backward()
         metrics = {name: value.detach() for name, value in losses.items()}
         metrics["grad_norm"] = self._gradient_norm()
-        self.divergence.look(metrics)
+        self.divergence.record(metrics)
         self.optimizer.step()
         self.after_update()
         return TensorDict(metrics, [])
@@ -276,18 +284,14 @@ class Algorithm(ABC):
             ValueError: if it was saved by another algorithm, or for other maps or sizes.
         """
         saved = state["weights"]
-        shapes = {name: tuple(weight.shape) for name, weight in self.weights.items()}
-        differing = [
-            f"{name}: {shapes.get(name, 'absent')} here, "
-            f"{tuple(saved[name].shape) if name in saved else 'absent'} there"
-            for name in sorted(shapes.keys() | saved.keys())
-            if name not in saved or shapes.get(name) != tuple(saved[name].shape)
-        ]
+        here, there = ({n: tuple(w.shape) for n, w in x.items()} for x in (self.weights, saved))
+        differing = [n for n in sorted(here | there) if here.get(n) != there.get(n)]
         if differing:
+            first = differing[0]
             raise ValueError(
                 f"the saved agent does not fit this one in {len(differing)} weights, first "
-                f"{differing[0]}; use the algorithm, representations, image size and encoder it "
-                "was made with"
+                f"{first}: {here.get(first, 'absent')} here, {there.get(first, 'absent')} there; use the "
+                "algorithm, representations, image size and encoder it was made with"
             )
         for name, weight in self.weights.items():
             weight.copy_(saved[name])
@@ -310,46 +314,6 @@ def weights_of(loss: LossModule) -> dict[str, Tensor]:
     return {name: weights[name] for name in (*encoders, *weights)}
 
 
-def options_of(makers: Iterable[Any]) -> dict[str, inspect.Parameter]:
-    """Returns the classes' parameters by name, up to the first class without `**kwargs`.
-
-    >>> from flowrep.agent import DoubleDQN
-    >>> DoubleDQN.options()["final_epsilon"].default, DoubleDQN.options()["tau"].default
-    (0.05, 0.005)
-    """
-    found: dict[str, inspect.Parameter] = {}
-    for maker in filter(None, makers):
-        parameters = dict(inspect.signature(maker.__init__).parameters)
-        variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-        rest = [n for n, p in parameters.items() if p.kind in variadic]
-        given = (*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS, *rest)
-        found = {n: p for n, p in parameters.items() if n not in given} | found
-        if not rest:
-            break
-    return found
-
-
-class FastSoftUpdate(SoftUpdate):
-    """TorchRL's `SoftUpdate`, which lists the weights once instead of at every step.
-
-    Args:
-        loss: has target parameters.
-        tau: share of the weights in each move of the targets.
-    """
-
-    def __init__(self, loss: LossModule, *, tau: float) -> None:
-        super().__init__(loss, tau=tau)
-        targets = dict(self._targets.flatten_keys(".").items())
-        weights = self._sources.flatten_keys(".")
-        self._moved = [*targets.values()]
-        self._followed = [weights[name.removeprefix("target_")] for name in targets]
-
-    @torch.no_grad()
-    def step(self) -> None:
-        """Moves each target towards its weight."""
-        torch._foreach_lerp_(self._moved, self._followed, 1 - self.eps)
-
-
 class DivergenceError(ArithmeticError):
     """A loss or another watched metric became nan or infinite; the message names it."""
 
@@ -364,7 +328,7 @@ class DivergenceWatch:
 
     >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
     >>> for q_loss in (0.5, float("nan"), 0.25):
-    ...     watch.look({"q_loss": torch.tensor(q_loss), "entropy": torch.tensor(1.0)})
+    ...     watch.record({"q_loss": torch.tensor(q_loss), "entropy": torch.tensor(1.0)})
     >>> watch.check()
     Traceback (most recent call last):
     flowrep.agent.algorithm.DivergenceError: q_loss became nan in update 2 (q_loss=nan, entropy=1)
@@ -392,7 +356,7 @@ class DivergenceWatch:
         self._good_updates.fill_(good_updates)
         self.is_bad.zero_()
 
-    def look(self, metrics: Mapping[str, Tensor]) -> None:
+    def record(self, metrics: Mapping[str, Tensor]) -> None:
         """Records an update's metrics, changing its own tensors in place."""
         values = torch.stack([metrics[name].float() for name in self.names])
         self._values.copy_(torch.where(self.is_bad.bool(), self._values, values))

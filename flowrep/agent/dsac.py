@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -23,6 +23,15 @@ from flowrep.agent.observation import MapCodec, decode_maps
 from flowrep.agent.off_policy import OffPolicy
 
 ENCODERS = ("shared", "separate")
+METRICS = {
+    "q_loss": "loss_qvalue",
+    "actor_loss": "loss_actor",
+    "alpha_loss": "loss_alpha",
+    "alpha": "alpha",
+    "entropy": "entropy",
+    "q_mean": "q_mean",
+    "td_error": "td_error",
+}
 
 
 class DiscreteSACMapLoss(DiscreteSACLoss):
@@ -54,15 +63,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     actor_encoder: Encoder
     actor_encoder_params: TensorDictParams
     target_actor_encoder_params: TensorDictParams
-    out_keys: ClassVar[list[str]] = [
-        "loss_qvalue",
-        "loss_actor",
-        "loss_alpha",
-        "alpha",
-        "entropy",
-        "q_mean",
-        "td_error",
-    ]
+    out_keys: ClassVar[list[str]] = [*METRICS.values()]
 
     def __init__(
         self,
@@ -190,15 +191,7 @@ class DiscreteSAC(OffPolicy):
     """
 
     LOSS: ClassVar[Callable[..., LossModule]] = DiscreteSACMapLoss
-    METRICS: ClassVar[Mapping[str, str]] = {
-        "q_loss": "loss_qvalue",
-        "actor_loss": "loss_actor",
-        "alpha_loss": "loss_alpha",
-        "alpha": "alpha",
-        "entropy": "entropy",
-        "q_mean": "q_mean",
-        "td_error": "td_error",
-    }
+    METRICS = METRICS
 
     def __init__(self, *run: Any, alpha_rate_factor: float = 1.0, **options: Any) -> None:
         super().__init__(*run, rate_factors={"log_alpha": alpha_rate_factor}, **options)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -15,6 +14,17 @@ from torchrl.objectives import LossModule
 from flowrep.agent.dsac import DiscreteSAC, transition_keys
 from flowrep.agent.networks import DiscreteActions, MapNetwork
 from flowrep.agent.observation import decode_maps
+
+METRICS = {
+    "q_loss": "loss_qvalue",
+    "value_loss": "loss_value",
+    "actor_loss": "loss_actor",
+    "alpha_loss": "loss_alpha",
+    "alpha": "alpha",
+    "entropy": "entropy",
+    "q_mean": "q_mean",
+    "value_mean": "value_mean",
+}
 
 
 class DiscreteSACValueLoss(LossModule):
@@ -44,16 +54,7 @@ class DiscreteSACValueLoss(LossModule):
     value: MapNetwork
     value_params: TensorDictParams
     target_value_params: TensorDictParams
-    out_keys: ClassVar[list[str]] = [
-        "loss_qvalue",
-        "loss_value",
-        "loss_actor",
-        "loss_alpha",
-        "alpha",
-        "entropy",
-        "q_mean",
-        "value_mean",
-    ]
+    out_keys: ClassVar[list[str]] = [*METRICS.values()]
 
     def __init__(
         self,
@@ -138,13 +139,4 @@ class DiscreteSACWithValue(DiscreteSAC):
     """
 
     LOSS = DiscreteSACValueLoss
-    METRICS: ClassVar[Mapping[str, str]] = {
-        "q_loss": "loss_qvalue",
-        "value_loss": "loss_value",
-        "actor_loss": "loss_actor",
-        "alpha_loss": "loss_alpha",
-        "alpha": "alpha",
-        "entropy": "entropy",
-        "q_mean": "q_mean",
-        "value_mean": "value_mean",
-    }
+    METRICS = METRICS

@@ -264,12 +264,12 @@ def metrics(**values):
 
 def test_the_first_bad_update_is_told_with_its_statistics():
     watch = DivergenceWatch(["q_loss", "actor_loss"], ["entropy"])
-    watch.look(metrics(q_loss=1.0, actor_loss=2.0, entropy=0.5))
+    watch.record(metrics(q_loss=1.0, actor_loss=2.0, entropy=0.5))
     assert watch.is_bad == 0
     watch.check()
-    watch.look(metrics(q_loss=3.0, actor_loss=-math.inf, entropy=0.25))
+    watch.record(metrics(q_loss=3.0, actor_loss=-math.inf, entropy=0.25))
     assert watch.is_bad == 1
-    watch.look(metrics(q_loss=math.nan, actor_loss=math.nan, entropy=9.0))
+    watch.record(metrics(q_loss=math.nan, actor_loss=math.nan, entropy=9.0))
     assert watch.is_bad == 1
     message = r"^actor_loss became -inf in update 2 \(q_loss=3, actor_loss=-inf, entropy=0.25\)$"
     with pytest.raises(DivergenceError, match=message):
@@ -279,12 +279,12 @@ def test_the_first_bad_update_is_told_with_its_statistics():
 def test_after_a_reset_updates_are_counted_from_the_given_number():
     watch = DivergenceWatch(["q_loss"])
     is_bad = watch.is_bad  # which the optimizer holds
-    watch.look(metrics(q_loss=math.nan))
+    watch.record(metrics(q_loss=math.nan))
     watch.reset(40)
     assert is_bad == 0
     watch.check()
-    watch.look(metrics(q_loss=1.0))
-    watch.look(metrics(q_loss=math.inf))
+    watch.record(metrics(q_loss=1.0))
+    watch.record(metrics(q_loss=math.inf))
     assert is_bad == 1
     with pytest.raises(DivergenceError, match=r"^q_loss became inf in update 42 \(q_loss=inf\)$"):
         watch.check()
@@ -292,7 +292,7 @@ def test_after_a_reset_updates_are_counted_from_the_given_number():
 
 def test_what_is_logged_beside_the_losses_may_be_undefined():
     watch = DivergenceWatch(["q_loss"], ["explained_variance"])
-    watch.look(metrics(q_loss=1.0, explained_variance=math.nan))
+    watch.record(metrics(q_loss=1.0, explained_variance=math.nan))
     assert watch.is_bad == 0
     watch.check()
 
@@ -308,7 +308,7 @@ def test_looking_reads_nothing_back_from_the_device(monkeypatch):
     with monkeypatch.context() as patched:
         for name in ("item", "tolist", "__bool__", "__float__", "__int__", "numpy"):
             patched.setattr(torch.Tensor, name, forbidden)
-        watch.look(values)
+        watch.record(values)
         with pytest.raises(AssertionError, match="have to wait"):
             watch.check()
 
