@@ -27,7 +27,7 @@ def require(what: str, extra: str, *packages: str, module: str = "") -> None:
     """
     for package in packages:
         if not is_installed(package):
-            message = f"{what} needs {package}; run: pip install 'flowrep[{extra}]'"
+            message = f"{what} needs {package}; run: pip install 'flowrep-rl[{extra}]'"
             if module == "__main__" or Path(sys.argv[0]).name.startswith("flowrep-"):
                 sys.exit(f"error: {message}")
             raise ImportError(message)

@@ -13,14 +13,14 @@ from flowrep.config import CONF_DIR, config_groups
 
 PACKAGE = Path(flowrep.__file__).parent
 MODULES = {
-    "train.py": "training needs hydra; run: pip install 'flowrep[train]'",
-    "evaluate.py": "evaluation needs hydra; run: pip install 'flowrep[train]'",
-    "export.py": "an export needs hydra; run: pip install 'flowrep[train]'",
-    "view.py": "viewing needs hydra; run: pip install 'flowrep[train]'",
-    "factorize.py": "factorising needs cv2; run: pip install 'flowrep[factorize]'",
-    "agent/__init__.py": "flowrep.agent needs safetensors; run: pip install 'flowrep[train]'",
-    "torchrl_configs.py": "flowrep.torchrl_configs needs hydra; run: pip install 'flowrep[train]'",
-    "transforms/hydra_configs.py": "needs hydra; run: pip install 'flowrep[train]'",
+    "train.py": "training needs hydra; run: pip install 'flowrep-rl[train]'",
+    "evaluate.py": "evaluation needs hydra; run: pip install 'flowrep-rl[train]'",
+    "export.py": "an export needs hydra; run: pip install 'flowrep-rl[train]'",
+    "view.py": "viewing needs hydra; run: pip install 'flowrep-rl[train]'",
+    "factorize.py": "factorising needs cv2; run: pip install 'flowrep-rl[factorize]'",
+    "agent/__init__.py": "flowrep.agent needs safetensors; run: pip install 'flowrep-rl[train]'",
+    "torchrl_configs.py": "needs hydra; run: pip install 'flowrep-rl[train]'",
+    "transforms/hydra_configs.py": "needs hydra; run: pip install 'flowrep-rl[train]'",
 }
 
 
@@ -41,7 +41,7 @@ def test_a_command_ends_in_one_line(monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(SystemExit) as caught:
         load("__main__", "train.py")
-    assert caught.value.code == "error: training needs hydra; run: pip install 'flowrep[train]'"
+    assert caught.value.code == "error: training needs hydra; run: pip install 'flowrep-rl[train]'"
 
 
 @pytest.mark.parametrize("package", ["matplotlib", "imageio"])

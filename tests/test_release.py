@@ -48,8 +48,10 @@ def test_pip_install_lines_name_extras_that_exist_and_read_alike():
     code = [*ROOT.glob("tests/**/*.py"), *ROOT.glob("flowrep/**/*.py")]
     for path in (path for path in (*pages, *code) if path.suffix in (".md", ".py", ".ipynb")):
         text = path.read_text("utf-8")
-        for quoted in re.findall(r"pip install '(?:\.|flowrep(?:-rl)?)\[([\w,]+)\]'", text):
-            assert set(quoted.split(",")) <= extras, path
+        for quoted in re.findall(r"pip install '(?:\.|flowrep-rl)\[([\w,{}]+)\]'", text):
+            assert set(quoted.split(",")) <= extras | {"{extra}"}, path
+        # `flowrep` is another project's distribution
+        assert not re.search(r"pip install ['\"]?flowrep(?!-rl)", text), path
         # a clone is what there is: pages and examples install `.`, with quotes for every shell
         if path in pages:
             assert not re.search(r"pip install (\.\[|\"|-e|'?flowrep)", text), path

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
-pytest.importorskip("cv2", reason="flow is estimated by OpenCV: pip install 'flowrep[flow]'")
+pytest.importorskip("cv2", reason="flow is estimated by OpenCV: pip install 'flowrep-rl[flow]'")
 
 pytestmark = pytest.mark.slow
 

@@ -81,7 +81,7 @@ def depth_from_zbuffer(
 
 
 RENDERERS = ("auto", "rasteriser", "pybullet")
-_REMEDY = "run: pip install 'flowrep[sim]'"
+_REMEDY = "run: pip install 'flowrep-rl[sim]'"
 
 
 def choose_renderer(name: str) -> str:

@@ -118,7 +118,7 @@ def _opencv() -> Any:
         import cv2
     except ImportError as error:
         raise ImportError(
-            "flow estimated by DIS needs OpenCV: pip install 'flowrep[flow]'"
+            "flow estimated by DIS needs OpenCV: pip install 'flowrep-rl[flow]'"
         ) from error
     return cv2
 
@@ -241,7 +241,7 @@ def _optical_flow() -> Any:
     except (ImportError, RuntimeError) as error:  # RuntimeError: built for another torch
         raise ImportError(
             "flow estimated by RAFT needs the torchvision that belongs to your torch: "
-            f"pip install 'flowrep[raft]' ({error})"
+            f"pip install 'flowrep-rl[raft]' ({error})"
         ) from error
     return optical_flow
 

@@ -18,7 +18,9 @@ from flowrep.geometry import invert_rigid, transform_points, unproject
 
 pytest.importorskip("gymnasium", reason="the example wraps a gymnasium env")
 if importlib.util.find_spec("mujoco") is None:
-    pytest.skip("MuJoCo is not installed: pip install 'flowrep[examples]'", allow_module_level=True)
+    pytest.skip(
+        "MuJoCo is not installed: pip install 'flowrep-rl[examples]'", allow_module_level=True
+    )
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 120

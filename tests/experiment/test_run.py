@@ -129,7 +129,7 @@ def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_path):
-    wandb = pytest.importorskip("wandb", reason="needs the extra: pip install 'flowrep[wandb]'")
+    wandb = pytest.importorskip("wandb", reason="needs the extra: pip install 'flowrep-rl[wandb]'")
     names = []
     for frames in (10, 20):
         run = RunFolder(tmp_path)

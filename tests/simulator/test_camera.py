@@ -38,7 +38,7 @@ def test_without_numba_who_asks_for_pybullet_hears_nothing(monkeypatch):
 
 def test_without_numba_the_rasteriser_is_refused(monkeypatch):
     without_numba(monkeypatch)
-    with pytest.raises(ImportError, match=r"needs numba; run: pip install 'flowrep\[sim\]'"):
+    with pytest.raises(ImportError, match=r"needs numba; run: pip install 'flowrep-rl\[sim\]'"):
         choose_renderer("rasteriser")
 
 

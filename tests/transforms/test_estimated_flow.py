@@ -70,7 +70,7 @@ class TestEstimatedFlow(TransformContract):
         return [FrameStack(k=2, **PICTURES)]
 
 
-pytest.importorskip("cv2", reason="DIS is OpenCV's: pip install 'flowrep[flow]'")
+pytest.importorskip("cv2", reason="DIS is OpenCV's: pip install 'flowrep-rl[flow]'")
 
 
 @pytest.mark.parametrize(("height", "width"), [(48, 64), (84, 60), (180, 200)])
@@ -231,7 +231,7 @@ def test_object_flow_is_the_estimate_less_ego_flow():
 
 def test_without_opencv_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(ImportError, match=r"needs OpenCV: pip install 'flowrep\[flow\]'"):
+    with pytest.raises(ImportError, match=r"needs OpenCV: pip install 'flowrep-rl\[flow\]'"):
         EstimatedFlow()
 
 
