@@ -20,16 +20,9 @@ from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_p
 
 Step = Callable[[TensorDictBase], TensorDictBase]
 WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
-GIVEN_BY_THE_RUN = [
-    "observation_spec",
-    "action_spec",
-    "keys",
-    "total_frames",
-    "device",
-    "mirror_image",
-]
+GIVEN_BY_THE_RUN = ["observation_spec", "action_spec", "keys", "total_frames", "device"]
 GIVEN_BY_THE_CLASS = ["self", "rate_factors", "policy_options", "network", "actor", "actions"]
-NOT_OPTIONS = {*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS}
+NOT_OPTIONS = {*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS, "mirror_image"}
 VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
@@ -290,8 +283,8 @@ class Algorithm(ABC):
             first = differing[0]
             raise ValueError(
                 f"the saved agent does not fit this one in {len(differing)} weights, first "
-                f"{first}: {here.get(first, 'absent')} here, {there.get(first, 'absent')} there; use the "
-                "algorithm, representations, image size and encoder it was made with"
+                f"{first}: {here.get(first, 'absent')} here, {there.get(first, 'absent')} there; "
+                "use the algorithm, representations, image size and encoder it was made with"
             )
         for name, weight in self.weights.items():
             weight.copy_(saved[name])
