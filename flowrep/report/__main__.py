@@ -1,6 +1,85 @@
-"""`python -m flowrep.report outputs/<sweep>`."""
+"""Reports on runs: `python -m flowrep.report outputs/<sweep>`."""
 
-from flowrep.report.command import main
+from pathlib import Path
+from typing import Any
+
+from flowrep.extras import require
+
+require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja2", module=__name__)
+
+import rich.box
+import rich.table
+from rich.console import Console
+from rich.text import Text
+
+from flowrep.config import UsageError
+from flowrep.config.cli import run_command
+from flowrep.config.schema import ReportConfig
+from flowrep.report.page import drives_of, render_page, summary
+from flowrep.report.sections import Settings, assemble, write_files
+from flowrep.report.statistics import Bootstrap
+from flowrep.report.storage import is_archive, read_runs, without_repeats
+from flowrep.report.tables import Table
+
+
+def report(config: ReportConfig) -> Path:
+    """Writes figures, tables and a page of runs; returns the page's path.
+
+    Raises:
+        UsageError: nothing in the folders can be read.
+        RunFolderError: a folder holds no run.
+    """
+    folders = list(map(Path, config.run))
+    is_of_runs = folders[0].is_dir() and not is_archive(folders[0])
+    output = Path(config.output or (folders[0] if is_of_runs else Path("outputs")) / "report")
+    found, unreadable = read_runs(folders)
+    runs, repeats = without_repeats(found)
+    warnings = [*unreadable, *repeats]
+    for warning in warnings:
+        print(f"left out: {warning}")
+    if not runs:
+        raise UsageError("none of the runs can be read, see above")
+    print(summary(runs))
+    assembled = assemble(runs, warnings, Settings(config.policy, Bootstrap(config.resamples)))
+    for warning in assembled.warnings[len(warnings) :]:
+        print(f"in part: {warning}")
+    for label, sections in assembled.chapters:
+        for section in sections:
+            for table in section.tables:
+                if not table.name.endswith("_differences"):  # too long for a screen
+                    show(table, f"{section.title} {label}".strip())
+    output.mkdir(parents=True, exist_ok=True)
+    for folder in write_files(assembled, output):
+        print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    drives = drives_of(runs, trajectories=config.trajectories, videos=config.videos)
+    for warning in drives.warnings:
+        print(f"drives: {warning}")
+    page = output / "index.html"
+    page.write_text(render_page(assembled, drives), encoding="utf-8")
+    print(f"page: {page}")
+    return page
+
+
+def show(table: Table, title: str) -> None:
+    """Prints a table."""
+    heading = Text(title, style="table.title")  # in a str, brackets would be markup
+    shown = rich.table.Table(title=heading, box=rich.box.SIMPLE, pad_edge=False)
+    for place, name in enumerate(table.header):
+        justify: Any = "left" if table.is_text(place) else "right"
+        shown.add_column(Text(name), justify=justify, no_wrap=True)
+    for block, rows in table.blocks:
+        if block:
+            shown.add_row(Text(block, style="italic"))
+        for row in rows:
+            shown.add_row(*map(Text, row))
+        shown.add_section()
+    Console(width=max(160, Console().width)).print(shown)
+
+
+def main() -> None:
+    """Entry point; a mistake on the command line ends in one line that names the remedy."""
+    run_command("report", report, ReportConfig)
+
 
 if __name__ == "__main__":
     main()

@@ -4,14 +4,12 @@ One colour per stack in every figure, safe for colour-blind readers; the same da
 files, byte for byte.
 """
 
-import base64
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -19,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flowrep.report.outcomes import Curve, Grid, Score, mean_curve
+from flowrep.report.runs import Curve, Grid, Score, mean_curve
 
 # Okabe and Ito's colours for single maps and for the two flows. A map added to the flows has its
 # own hue, darker, and a hatch or a dashed line.
@@ -55,8 +53,7 @@ _WIDEST_BAR = 0.3  # of a group
 _DPI = 300
 
 
-@dataclass(frozen=True)
-class Look:
+class Look(NamedTuple):
     """How a series is drawn: its colour, its bars' hatch, its line's marker; hatched is dashed."""
 
     colour: str
@@ -149,18 +146,6 @@ def _reproducible() -> Any:
     return mpl.rc_context(
         {"svg.hashsalt": "flowrep", "pdf.fonttype": 42, "hatch.linewidth": 0.7}  # text as text
     )
-
-
-def data_uri(kind: str, data: bytes) -> str:
-    """Returns a file's content for embedding in a page."""
-    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
-
-
-def png_uri(figure: Figure, dpi: int) -> str:
-    """Returns a figure as a data URI of a PNG."""
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=dpi)
-    return data_uri("image/png", data.getvalue())
 
 
 def canvas(panels: int, *, for_page: bool) -> tuple[Figure, list[Axes]]:

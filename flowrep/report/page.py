@@ -1,43 +1,110 @@
-"""One self-contained HTML page, and the files of a report's figures and tables."""
+"""One self-contained HTML page of a report, with drives and films that evaluations left.
 
+`drives.npz` beside evaluation.csv holds where the vehicle was in each evaluated episode:
+`positions` [sum of T, 2] in world metres, `starts` [N + 1] (episode n is
+`positions[starts[n]:starts[n + 1]]`), and for each episode `evaluation`, `policy`, `speed`, `fps`,
+`frames`, `episode_seed` and `outcome` as in evaluation.csv.
+"""
+
+import base64
+import io
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from flowrep.report.drives import Drives
-from flowrep.report.figures import data_uri, save, svg, words
-from flowrep.report.runs import Run, scenes_of
+from flowrep.report.figures import svg, words
+from flowrep.report.runs import Run, groups_of, scenes_of
 from flowrep.report.sections import Report, Section
 from flowrep.report.tables import listed
+from flowrep.scenes import load_scene
+from flowrep.scenes.layout import Layout
+from flowrep.viz.plan import Track, draw_plan
 
-PAGE = "index.html"
+DRIVES = "drives.npz"
 
 
-def write_files(report: Report, folder: Path) -> list[Path]:
-    """Writes each section's figures and tables as PNG, PDF, LaTeX and CSV; returns their folders.
+class Picture(NamedTuple):
+    """A plan or a film of one agent: its name, what it shows, a data URI."""
 
-    The same report gives the same files, byte for byte.
+    title: str
+    caption: str
+    data: str
+
+
+class Drives(NamedTuple):
+    """Plans by the scene's title, films by the episode's name, and a line for each run without."""
+
+    plans: dict[str, list[Picture]]
+    films: dict[str, list[Picture]]
+    warnings: list[str]
+
+
+def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
+    """Returns plans and films of one finished agent of each scene, stack and group.
+
+    Args:
+        runs: the runs of a report.
+        trajectories: the number of episodes in a plan, none without plans.
+        videos: the number of films of each agent, none without films.
     """
-    sections = [section for chapter in report.chapters for section in chapter.sections]
-    for section in sections:
-        place = folder / section.name
-        place.mkdir(parents=True, exist_ok=True)
-        for drawing in section.drawings:
-            save(drawing.draw(drawing.panels), place / drawing.name)
-            (place / f"{drawing.name}.tex").write_text(drawing.to_latex(), encoding="utf-8")
-        for table in section.tables:
-            (place / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
-            (place / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
-    return [folder / section.name for section in sections]
+    drives = Drives({}, {}, [])
+    finished: dict[Any, Run] = {}  # the one of the lowest seed
+    for number, group in enumerate(groups_of(runs)):
+        for run in sorted(group.runs, key=lambda run: run.seed):
+            if run.is_finished:
+                finished.setdefault((number, run.scene, run.stack), run)
+    for run in finished.values():
+        title = f"{run.stack}, seed {run.seed} ({run.folder.name})" if run.folder else run.name
+        if trajectories and (tracks := tracks_of(run, trajectories)):
+            counts = Counter(track.outcome.replace("_", " ") for track in tracks)
+            ended = ", ".join(f"{number} {outcome}" for outcome, number in counts.items())
+            png = io.BytesIO()
+            draw_plan(Layout(load_scene(run.config["scene"])), tracks).savefig(png, dpi=100)
+            plan = Picture(
+                title, f"{len(tracks)} drives: {ended}", data_uri("image/png", png.getvalue())
+            )
+            drives.plans.setdefault(words(run.scene), []).append(plan)
+        elif trajectories:
+            drives.warnings.append(f"{run.name} has no {DRIVES} with greedy drives: no plan")
+        films = sorted(run.folder.glob("videos/*.mp4"))[:videos] if run.folder else []
+        for film in films:
+            shown = drives.films.setdefault(f"{words(run.scene)}, {words(film.stem)}", [])
+            shown.append(Picture(title, film.name, data_uri("video/mp4", film.read_bytes())))
+        if videos and not films:
+            drives.warnings.append(
+                f"{run.name} has no films: python -m flowrep.evaluate run={run.name} video=true"
+            )
+    return drives
 
 
-def write_page(text: str, folder: Path) -> Path:
-    """Writes the page into the report's folder; returns its path."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / PAGE).write_text(text, encoding="utf-8")
-    return folder / PAGE
+def tracks_of(run: Run, count: int) -> list[Track]:
+    """Returns a run's first greedy drives at its training speed and frame rate, none without."""
+    if run.folder is None:
+        return []
+    try:
+        with np.load(run.folder / DRIVES) as saved:
+            ours = (saved["policy"] == "greedy") & (saved["speed"] == run.speed)
+            ours &= (saved["fps"] == run.fps) & (saved["frames"] >= run.total_frames)
+            ours &= saved["evaluation"] != "training"
+            chosen = np.flatnonzero(ours)
+            chosen = chosen[np.argsort(saved["episode_seed"][chosen], kind="stable")][:count]
+            positions, starts, outcomes = saved["positions"], saved["starts"], saved["outcome"]
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return []
+    return [
+        Track(positions[starts[n] : starts[n + 1]].astype(float), str(outcomes[n]))
+        for n in chosen.tolist()
+    ]
+
+
+def data_uri(kind: str, data: bytes) -> str:
+    """Returns a file's content for embedding in a page."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def template(name: str, *, autoescape: bool) -> Any:
@@ -50,12 +117,8 @@ def template(name: str, *, autoescape: bool) -> Any:
 
 
 def render_page(report: Report, drives: Drives) -> str:
-    """Returns the page of a report.
-
-    Args:
-        report: the report on the runs.
-        drives: plans and films of some of their episodes, possibly none.
-    """
+    """Returns the page of a report, with plans and films of some of its episodes, if any."""
+    runs = report.runs
     chapters = [
         {
             "label": chapter.label,
@@ -63,21 +126,37 @@ def render_page(report: Report, drives: Drives) -> str:
         }
         for n, chapter in enumerate(report.chapters)
     ]
+    stacks = sorted({run.stack for run in runs})
+    what = listed(stacks) if len(stacks) < 4 else f"{len(stacks)} stacks"
+    scenes = listed([words(scene) for scene in scenes_of(runs)])
     return template("page.html.jinja", autoescape=True).render(
-        title=title(report.runs),
-        summary=summary(report.runs),
+        title=f"{what} in {scenes}" if runs else "No runs",
+        summary=summary(runs),
         warnings=report.warnings,
         chapters=chapters,
         drives=drives,
-        runs=[_row(run) for run in report.runs],
+        runs=[
+            (
+                run.name,
+                run.config.get("experiment") or "",
+                words(run.scene),
+                run.stack,
+                str(run.seed),
+                f"{run.frames:,} of {run.total_frames:,}",
+                f"{int(run.tested.sum()):,}",
+            )
+            for run in runs
+        ],
     )
 
 
-def title(runs: Sequence[Run]) -> str:
-    """Returns what runs are about: their stacks if they are few, and their scenes."""
-    stacks = sorted({run.stack for run in runs})
-    what = listed(stacks) if len(stacks) < 4 else f"{len(stacks)} stacks"
-    return f"{what} in {listed([words(scene) for scene in scenes_of(runs)])}" if runs else "No runs"
+def _section(anchor: str, section: Section) -> dict[str, Any]:
+    kind = "image/svg+xml"
+    drawings = [
+        {"caption": d.caption, "panels": [data_uri(kind, svg(f)) for f in d.parts()]}
+        for d in section.drawings
+    ]
+    return {"anchor": anchor, "section": section, "drawings": drawings}
 
 
 def summary(runs: Sequence[Run]) -> str:
@@ -95,23 +174,3 @@ def summary(runs: Sequence[Run]) -> str:
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")
-
-
-def _section(anchor: str, section: Section) -> dict[str, Any]:
-    drawings = [
-        {"caption": d.caption, "panels": [data_uri("image/svg+xml", svg(f)) for f in d.parts()]}
-        for d in section.drawings
-    ]
-    return {"anchor": anchor, "section": section, "drawings": drawings}
-
-
-def _row(run: Run) -> tuple[str, ...]:
-    return (
-        run.name,
-        run.config.get("experiment") or "",
-        words(run.scene),
-        run.stack,
-        str(run.seed),
-        f"{run.frames:,} of {run.total_frames:,}",
-        f"{int(run.tested.sum()):,}",
-    )

@@ -19,10 +19,20 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from flowrep.report.figures import styled, svg, words
-from flowrep.report.outcomes import baseline_share, out_of_bounds_of_both, outcomes_of, success
 from flowrep.report.page import template
-from flowrep.report.runs import SPEEDS, Columns, Condition, Run, in_order
-from flowrep.report.sections import STACKS, pooled
+from flowrep.report.runs import (
+    SPEEDS,
+    Columns,
+    Condition,
+    Run,
+    baseline_share,
+    in_order,
+    out_of_bounds_of_both,
+    outcomes_of,
+    pooled,
+    success,
+)
+from flowrep.report.sections import STACKS
 from flowrep.report.statistics import Array, Bootstrap, Effect, effect, holm, rates
 from flowrep.report.storage import read_archive
 from flowrep.report.tables import markdown, p_text, percent, points, signed

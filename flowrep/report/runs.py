@@ -1,8 +1,8 @@
-"""Runs as a report sees them: config, columns of episodes and of metrics, and groups of runs."""
+"""Runs as a report sees them: their columns, which may be compared, and what episodes came to."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.experiment.run import origin_of
+from flowrep.report.statistics import Array, Bootstrap, Estimate, rates
 
 Columns = dict[str, NDArray[Any]]
+Metric = Callable[[NDArray[Any]], Array]
 SPEEDS = ("low", "normal", "high")
 """Pedestrians' speed modes, in the order of figures."""
 SCENES = ("straight_road", "s_turn", "h_shaped_pathways", "three_way_junction")
 """The paper's scenes in its order."""
+BASELINES = ("never_turn", "random", "planner")
 _ORDER = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _OF_EVERY_SCENE = ("camera", "frame_rate_hz")
 
@@ -62,8 +65,6 @@ class Run:
         self.fps = float(scene["frame_rate_hz"])
         self.total_frames = int(config["total_frames"])
         self.paths = max(len(scene.get("paths") or ()), 1)
-        if not (isinstance(self.scene, str) and isinstance(self.speed, str)):
-            raise TypeError("a name is none")
         columns = (metrics.get("frames", np.zeros(0)), episodes["frames"])
         self.frames = max((int(c.max()) for c in columns if len(c)), default=0)
         self.is_finished = self.frames >= self.total_frames
@@ -110,10 +111,23 @@ def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in found.items() if v != {}}  # a representation without options
 
 
+def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        for key, inner in value.items():
+            yield from _flat(inner, f"{place}.{key}" if place else str(key))
+    else:
+        yield place, _plain(value)
+
+
+def _plain(value: Any) -> Any:
+    """Returns a value that is spelt in one way: 4.0 in a file is 4 on a command line."""
+    if isinstance(value, list):
+        return [_plain(part) for part in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
 def drawn_paths(episode_seeds: NDArray[Any], paths: int) -> NDArray[Any]:
     """Returns the path of each episode: the first draw of its generator, as an episode makes it."""
-    if paths < 2:
-        return np.zeros(len(episode_seeds), int)
     seeds, places = np.unique(episode_seeds, return_inverse=True)
     drawn = [int(np.random.default_rng(int(seed)).integers(paths)) for seed in seeds]
     return np.array(drawn, int)[places]
@@ -125,9 +139,7 @@ def stack_of(representations: Iterable[str]) -> str:
     >>> stack_of(["seg2", "obj", "ego"]), stack_of(["raw"])
     ('ego+obj+seg2', 'raw')
     """
-    names = list(representations)
-    known = [name for name in _ORDER if name in names]
-    return "+".join([*known, *sorted(set(names) - set(known))])
+    return "+".join(in_order(representations, _ORDER))
 
 
 def in_order(found: Iterable[str], known: Sequence[str]) -> list[str]:
@@ -141,14 +153,13 @@ def scenes_of(runs: Sequence[Run]) -> list[str]:
     return in_order([run.scene for run in runs], SCENES)
 
 
-@dataclass(frozen=True)
-class Group:
-    """Runs that may be compared: they differ in scene, representations and seed alone.
+def by_stack(runs: Sequence[Run], stacks: Sequence[str]) -> dict[str, list[Run]]:
+    """Returns the runs of each of these stacks."""
+    return {stack: [run for run in runs if run.stack == stack] for stack in stacks}
 
-    Args:
-        runs: the group's runs.
-        differences: the keys in which groups differ, with this one's values.
-    """
+
+class Group(NamedTuple):
+    """Runs that may be compared, and the keys in which groups differ with this one's values."""
 
     runs: tuple[Run, ...]
     differences: dict[str, Any]
@@ -158,12 +169,14 @@ class Group:
         """What distinguishes it from other groups; empty if it is the only one."""
         shown = [f"{key}={value}" for key, value in self.differences.items()]
         shown = [text if len(text) < 60 else f"{text[:56]} ..." for text in shown]
-        more = [f"{len(shown) - 3} more keys"] if len(shown) > 4 else []
-        return ", ".join(shown[:3] + more if more else shown)
+        return ", ".join(shown if len(shown) <= 4 else [*shown[:3], f"{len(shown) - 3} more keys"])
 
 
 def groups_of(runs: Sequence[Run]) -> list[Group]:
-    """Returns runs grouped by the settings in which they differ, the largest group first."""
+    """Returns runs grouped by the settings in which they differ, the largest group first.
+
+    Runs of a group differ in scene, representations and seed alone.
+    """
     values: dict[str, dict[str, Any]] = {}
     for key in dict.fromkeys(key for run in runs for key in run.settings):
         of_runs = [run.settings.get(key, "absent") for run in runs if _can_have(run, key)]
@@ -185,16 +198,200 @@ def _can_have(run: Run, key: str) -> bool:
     return place != "scene" or part in (*_OF_EVERY_SCENE, run.scene)
 
 
-def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping) and value:
-        for key, inner in value.items():
-            yield from _flat(inner, f"{place}.{key}" if place else str(key))
-    else:
-        yield place, _plain(value)
+# What episodes came to.
 
 
-def _plain(value: Any) -> Any:
-    """Returns a value that is spelt in one way: 4.0 in a file is 4 on a command line."""
-    if isinstance(value, list):
-        return [_plain(part) for part in value]
-    return int(value) if isinstance(value, float) and value.is_integer() else value
+def success(outcomes: NDArray[Any]) -> Array:
+    """Returns 1 for each success, else 0."""
+    return (outcomes == "success").astype(float)
+
+
+def out_of_bounds_of_both(outcomes: NDArray[Any]) -> Array:
+    """Returns 1 out of bounds, 0 for a collision, else nan: the paper's Table III."""
+    failed = np.where(outcomes == "collision", 0.0, np.nan)
+    return np.where(outcomes == "out_of_bounds", 1.0, failed)
+
+
+class OutcomeMatrix(NamedTuple):
+    """The outcomes of the runs of one stack in one scene and condition.
+
+    Args:
+        seeds: the runs' seeds, in the order of rows.
+        episodes: the episodes' seeds, in the order of columns.
+        outcomes: `[R, E]`, the metric of each episode, nan where it was not driven.
+    """
+
+    seeds: tuple[int, ...]
+    episodes: Array
+    outcomes: Array
+
+    @property
+    def counts(self) -> str:
+        """The numbers of seeds and episodes, as text: `3 × 192`."""
+        of_each = (~np.isnan(self.outcomes)).sum(axis=1)
+        low, high = of_each.min(), of_each.max()
+        return f"{len(self.seeds)} × {low}" + (f"–{high}" if high > low else "")
+
+    def on(self, episodes: Array) -> Array:
+        """Returns the outcomes in these episodes, which it must have."""
+        return self.outcomes[:, np.searchsorted(self.episodes, episodes)]
+
+
+def outcomes_of(
+    runs: Iterable[Run], condition: Condition, metric: Metric = success
+) -> OutcomeMatrix | None:
+    """Returns the outcomes of runs of one stack and scene; None if the condition has none.
+
+    An episode has one column, whichever runs drove it.
+    """
+    found = []
+    for run in sorted(runs, key=lambda run: run.seed):
+        driven = run.under(condition)
+        if len(driven["outcome"]):
+            found.append((run.seed, driven["episode_seed"], metric(driven["outcome"])))
+    if not found:
+        return None
+    episodes = np.unique(np.concatenate([seeds for _, seeds, _ in found]))
+    outcomes = np.full((len(found), len(episodes)), np.nan)
+    for row, (_, seeds, values) in enumerate(found):
+        outcomes[row, np.searchsorted(episodes, seeds)] = values
+    return OutcomeMatrix(tuple(seed for seed, _, _ in found), episodes, outcomes)
+
+
+def pooled(runs: Sequence[Run], conditions: Sequence[Condition], metric: Metric) -> Array | None:
+    """Returns `[R, E]` of the runs that drove under all conditions; None if none did."""
+    ours = [run for run in runs if run.conditions.issuperset(conditions)]
+    found = [outcomes_of(ours, condition, metric) for condition in conditions]
+    parts = [matrix.outcomes for matrix in found if matrix is not None]
+    return np.hstack(parts) if parts else None
+
+
+def side_by_side(first: OutcomeMatrix, second: OutcomeMatrix) -> tuple[Array, Array]:
+    """Returns the outcomes of two matrices in the episodes that every run of both drove."""
+    every = [m.episodes[~np.isnan(m.outcomes).any(axis=0)] for m in (first, second)]
+    shared = np.intersect1d(*every)
+    return first.on(shared), second.on(shared)
+
+
+def change(before: OutcomeMatrix | None, after: OutcomeMatrix | None) -> Array | None:
+    """Returns `[R, E]`, the change for each run and episode of both; None if they share none.
+
+    A run that drove no episode under both conditions is no part of it.
+    """
+    if before is None or after is None:
+        return None
+    seeds = [seed for seed in before.seeds if seed in after.seeds]
+    episodes = np.intersect1d(before.episodes, after.episodes)
+    ours, theirs = (m.on(episodes)[[m.seeds.index(s) for s in seeds]] for m in (before, after))
+    changes = theirs - ours
+    driven = ~np.isnan(changes).all(axis=1)
+    return changes[driven] if driven.any() else None
+
+
+def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:
+    """Returns the success rate of a baseline, the condition's policy; None if it did not drive.
+
+    Its drive of an episode doesn't depend on the agent beside it, so each episode counts once.
+    """
+    driven = outcomes_of(runs, condition)
+    return None if driven is None else float(np.nanmax(driven.outcomes, axis=0).mean())
+
+
+class Score(NamedTuple):
+    """An estimate of success, each seed's success, and the numbers of seeds and episodes."""
+
+    estimate: Estimate
+    of_seeds: tuple[float, ...]
+    counts: str
+
+
+class Grid(NamedTuple):
+    """Success in one scene: a score for each series and condition, None where it is missing.
+
+    Args:
+        scene: the scene's name.
+        series: the compared stacks, or stacks of groups, in the figure's order.
+        conditions: groups of bars, or points of a line.
+        matrices: the outcomes behind the scores.
+        scores: by series and condition.
+        baselines: success by the baseline's name and condition.
+    """
+
+    scene: str
+    series: tuple[str, ...]
+    conditions: tuple[Condition, ...]
+    matrices: Mapping[tuple[str, Condition], OutcomeMatrix | None]
+    scores: Mapping[tuple[str, Condition], Score | None]
+    baselines: Mapping[tuple[str, Condition], float]
+
+
+def grid_of(
+    scene: str,
+    runs: Mapping[str, Sequence[Run]],
+    conditions: Sequence[Condition],
+    bootstrap: Bootstrap,
+    baselines: Sequence[str] = BASELINES,
+) -> Grid:
+    """Returns the success of several series of runs in a scene.
+
+    Args:
+        scene: the scene's name; runs of other scenes are left out.
+        runs: the runs of each series, possibly none.
+        conditions: the conditions in which they are compared.
+        bootstrap: computes the intervals.
+        baselines: names of baselines; none where the runs' configs differ, since a baseline's
+            drives may differ too.
+    """
+    here = {name: [run for run in members if run.scene == scene] for name, members in runs.items()}
+    found = {(name, c): outcomes_of(here[name], c) for name, c in product(runs, conditions)}
+    scores = {
+        place: m
+        and Score(bootstrap.success([m.outcomes]), tuple(rates(m.outcomes).tolist()), m.counts)
+        for place, m in found.items()
+    }
+    everybody = [run for members in here.values() for run in members]
+    shares = {
+        (name, c): share
+        for name, c in product(baselines, conditions)
+        if (share := baseline_share(everybody, c._replace(policy=name))) is not None
+    }
+    return Grid(scene, tuple(runs), tuple(conditions), found, scores, shares)
+
+
+class Curve(NamedTuple):
+    """One run's (frames, share of success) in evaluations and in training episodes."""
+
+    evaluated: list[tuple[int, float]]
+    training: list[tuple[int, float]]
+
+
+def curve_of(run: Run) -> Curve:
+    """Returns greedy evaluations at the run's own speed and frame rate, and training episodes.
+
+    At the frames of the final evaluation, that one alone counts: its episodes are others.
+    """
+    e = run.episodes
+    own = (e["scene"] == run.scene) & (e["speed"] == run.speed) & (e["fps"] == run.fps)
+    own &= e["policy"] == "greedy"
+    evaluated: dict[int, float] = {}
+    for kind in ("training", "final"):
+        chosen = own & (e["evaluation"] == kind)
+        frames, outcomes = e["frames"][chosen], success(e["outcome"][chosen])
+        at = np.unique(frames).tolist()
+        evaluated |= {f: float(outcomes[frames == f].mean()) for f in at}
+    logged = zip(run.metrics.get("frames", ()), run.metrics.get("success", ()))
+    training = [(int(frames), float(share)) for frames, share in logged if not np.isnan(share)]
+    return Curve(sorted(evaluated.items()), training)
+
+
+def mean_curve(curves: Sequence[Sequence[tuple[int, float]]]) -> list[tuple[int, float]]:
+    """Returns the mean over curves, at the frames that most of them have.
+
+    >>> mean_curve([[(10, 0.0), (20, 0.5)], [(10, 1.0), (20, 1.0)], [(10, 0.5)]])
+    [(10, 0.5), (20, 0.75)]
+    """
+    at: dict[int, list[float]] = {}
+    for frames, share in (point for curve in curves for point in curve):
+        at.setdefault(frames, []).append(share)
+    most = [(frames, found) for frames, found in sorted(at.items()) if 2 * len(found) > len(curves)]
+    return [(frames, float(np.mean(found))) for frames, found in most]

@@ -1,31 +1,35 @@
-"""The sections of a report on runs: headings, figures and tables, independent of the medium."""
+"""The sections of a report on runs: headings, figures and tables, and their files."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import combinations, product
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from flowrep.config.cli import folder_name
-from flowrep.report.figures import draw_bars, draw_curves, draw_rates, words
-from flowrep.report.outcomes import (
+from flowrep.report.figures import draw_bars, draw_curves, draw_rates, save, words
+from flowrep.report.runs import (
     BASELINES,
+    SCENES,
+    SPEEDS,
+    Condition,
     Grid,
-    Metric,
+    Group,
+    Run,
     by_stack,
     change,
     curve_of,
     grid_of,
+    groups_of,
+    in_order,
     out_of_bounds_of_both,
-    outcomes_of,
-    rates_tested,
+    pooled,
+    scenes_of,
     side_by_side,
-    speeds_tested,
 )
-from flowrep.report.runs import SCENES, Condition, Group, Run, groups_of, in_order, scenes_of
-from flowrep.report.statistics import FEWEST_RUNS, Array, Bootstrap, Comparison, Estimate, holm
+from flowrep.report.statistics import FEWEST_RUNS, Bootstrap, Comparison, Estimate, holm
 from flowrep.report.tables import MISSING, Table, latex_text, listed, p_text, percent, points
 
 INTERVALS = (
@@ -104,16 +108,8 @@ class Settings(NamedTuple):
     bootstrap: Bootstrap
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """A figure that can be drawn whole for a paper, or panel by panel for a page.
-
-    Args:
-        name: the name of its files.
-        caption: describes the figure and its intervals.
-        panels: the data of each panel.
-        draw: draws panels side by side.
-    """
+class Drawing(NamedTuple):
+    """A figure of panels, drawn side by side for a paper or one by one for a page."""
 
     name: str
     caption: str
@@ -127,21 +123,16 @@ class Drawing:
     def to_latex(self) -> str:
         """Returns a figure environment around the PDF, which lies beside it."""
         star, width = ("*", r"\textwidth") if len(self.panels) > 1 else ("", r"\columnwidth")
-        return "\n".join(
-            [
-                rf"\begin{{figure{star}}}[t]",
-                r"  \centering",
-                rf"  \includegraphics[width={width}]{{{self.name}.pdf}}",
-                rf"  \caption{{{latex_text(self.caption)}}}",
-                rf"  \label{{fig:{self.name}}}",
-                rf"\end{{figure{star}}}",
-                "",
-            ]
-        )
+        return rf"""\begin{{figure{star}}}[t]
+  \centering
+  \includegraphics[width={width}]{{{self.name}.pdf}}
+  \caption{{{latex_text(self.caption)}}}
+  \label{{fig:{self.name}}}
+\end{{figure{star}}}
+"""
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """One part of a report: the name of its folder, heading, notes, figures and tables."""
 
     name: str
@@ -174,22 +165,40 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], settings: Settings) -
     for number, group in enumerate(groups):
         sections = _group_sections(group, settings)
         if len(groups) > 1:
-            sections = [replace(s, name=f"{number + 1}_{s.name}") for s in sections]
+            sections = [s._replace(name=f"{number + 1}_{s.name}") for s in sections]
         chapters.append(Chapter(group.label, tuple(sections)))
     if len(groups) > 1:
         chapters.append(Chapter("", tuple(_across(groups, settings))))
     return Report(tuple(runs), tuple(wrong), tuple(c for c in chapters if c.sections))
 
 
+def write_files(report: Report, folder: Path) -> list[Path]:
+    """Writes each section's figures and tables as PNG, PDF, LaTeX and CSV; returns their folders.
+
+    The same report gives the same files, byte for byte.
+    """
+    sections = [section for chapter in report.chapters for section in chapter.sections]
+    for section in sections:
+        place = folder / section.name
+        place.mkdir(exist_ok=True)
+        for drawing in section.drawings:
+            save(drawing.draw(drawing.panels), place / drawing.name)
+            (place / f"{drawing.name}.tex").write_text(drawing.to_latex(), encoding="utf-8")
+        for table in section.tables:
+            (place / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
+            (place / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
+    return [folder / section.name for section in sections]
+
+
 def _unusable(run: Run, settings: Settings) -> str | None:
     """Returns why a run fills no cell, None if it does."""
-    policy = settings.policy
     if not run.is_finished:
         return (
             f"{run.name} is not finished, at {run.frames:,} of {run.total_frames:,} frames: only "
             "its learning curve is used"
         )
-    if not any(condition.policy == policy for condition in run.conditions):
+    policy = settings.policy
+    if policy not in {condition.policy for condition in run.conditions}:
         return (
             f"{run.name} has no {policy} evaluation at its end: only its learning curve is used; "
             f"python -m flowrep.evaluate run={run.name} policy={policy} adds one"
@@ -206,7 +215,13 @@ def _group_sections(group: Group, settings: Settings) -> list[Section]:
         found = set(stacks) & set(experiment.stacks)
         named = any(run.config.get("experiment") == experiment.name for run in group.runs)
         if len(found) > 1 or (found and named):
-            sections.append(_experiment_section(experiment, runs, settings))
+            ours = [run for run in runs if run.stack in experiment.stacks]
+            name, title, order, pairs = experiment
+            section = success_section(name, title, by_stack(ours, order), pairs, settings)
+            if absent := [words(scene) for scene in SCENES if scene not in scenes_of(ours)]:
+                notes = (*section.notes, f"No runs in {listed(absent)}.")
+                section = section._replace(notes=notes)
+            sections.append(section)
             shown |= found
     if runs:
         if set(stacks) - shown:
@@ -214,18 +229,21 @@ def _group_sections(group: Group, settings: Settings) -> list[Section]:
                 success_section("success", "Success", by_stack(runs, stacks), None, settings)
             )
         sections.append(_failure_section(runs, settings))
-        if len(rates_tested(runs, settings.policy, runs[0].speed)) > 1:
+        if len(_rates(runs, settings.policy)) > 1:
             sections.append(_rate_section(runs, settings))
     return [*sections, *_curves(group.runs)]
 
 
-def _experiment_section(experiment: Experiment, runs: Sequence[Run], settings: Settings) -> Section:
-    ours = [run for run in runs if run.stack in experiment.stacks]
-    series = by_stack(ours, experiment.stacks)
-    section = success_section(experiment.name, experiment.title, series, experiment.pairs, settings)
-    absent = [words(scene) for scene in SCENES if scene not in scenes_of(ours)]
-    note = (f"No runs in {listed(absent)}.",) if absent else ()
-    return replace(section, notes=(*section.notes, *note))
+def _speeds(runs: Sequence[Run], policy: str) -> list[str]:
+    """Returns the speed modes in which runs were evaluated at their frame rate."""
+    asked = (policy, runs[0].fps)
+    return in_order([c.speed for run in runs for c in run.conditions if c[::2] == asked], SPEEDS)
+
+
+def _rates(runs: Sequence[Run], policy: str) -> list[float]:
+    """Returns the frame rates at which runs were evaluated at their speed, the lowest first."""
+    asked = (policy, runs[0].speed)
+    return sorted({c.fps for run in runs for c in run.conditions if c[:2] == asked})
 
 
 def success_section(
@@ -248,23 +266,24 @@ def success_section(
     """
     runs = [run for members in series.values() for run in members]
     policy, bootstrap, fps = settings.policy, settings.bootstrap, runs[0].fps
-    conditions = [Condition(policy, s, fps) for s in speeds_tested(runs, policy, fps)]
+    conditions = [Condition(policy, speed, fps) for speed in _speeds(runs, policy)]
     grids = [grid_of(s, series, conditions, bootstrap, baselines) for s in scenes_of(runs)]
     trained = listed(sorted({run.speed for run in runs}))
     caption = (
         f"Success of agents trained at {trained} speed, {policy} actions, {fps:g} frames per "
         f"second: {INTERVALS}; dots are the seeds."
     )
-    tables = [_success_table(name, grids, caption, bootstrap)]
-    differences = _difference_table(name, grids, pairs, bootstrap)
+    tables = [
+        _success_table(name, grids, caption, bootstrap),
+        *_difference_table(name, grids, pairs, bootstrap),
+    ]
     drawing = Drawing(name, caption, tuple(grids), draw_bars)
-    return Section(
-        name,
-        title,
-        _what_is_missing(grids),
-        (drawing,),
-        (*tables, *([differences] if differences else [])),
-    )
+    return Section(name, title, _what_is_missing(grids), (drawing,), tuple(tables))
+
+
+def _shares(grid: Grid, series: str) -> list[str]:
+    scores = [grid.scores[series, c] for c in grid.conditions]
+    return [percent(score.estimate) if score else MISSING for score in scores]
 
 
 def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bootstrap) -> Table:
@@ -275,9 +294,8 @@ def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bo
         rows = []
         for series in grid.series:
             scores = [grid.scores[series, c] for c in conditions]
-            cells = [percent(score.estimate) if score else MISSING for score in scores]
             counts = dict.fromkeys(score.counts for score in scores if score)
-            rows.append((series, *cells, ", ".join(counts) or "0"))
+            rows.append((series, *_shares(grid, series), ", ".join(counts) or "0"))
         for baseline in dict.fromkeys(baseline for baseline, _ in grid.baselines):
             shares = [grid.baselines.get((baseline, c)) for c in conditions]
             cells = [MISSING if share is None else f"{100 * share:.0f}" for share in shares]
@@ -302,8 +320,8 @@ def _difference_table(
     grids: Sequence[Grid],
     pairs: Sequence[tuple[str, str]] | None,
     bootstrap: Bootstrap,
-) -> Table | None:
-    """Returns the difference of each pair with its verdict; None if there is no pair to compare."""
+) -> Iterator[Table]:
+    """Yields the difference of each pair with its verdict, if there is a pair to compare."""
     every = list(combinations(reversed(grids[0].series), 2)) if pairs is None else pairs
     chosen = every[:_MOST_PAIRS] if pairs is None else pairs
     places = [(words(grid.scene), [grid]) for grid in grids]
@@ -317,14 +335,18 @@ def _difference_table(
             if (compared := _compared(members, first, second, c, bootstrap)) is not None
         ]
         corrected = holm([c.p_value if c else np.nan for _, _, c, _ in found])
-        rows = [
-            (pair, speed, *_difference_cells(comparison, p), str(shared))
-            for (pair, speed, comparison, shared), p in zip(found, corrected)
-        ]
+        rows = []
+        for (pair, speed, c, shared), p in zip(found, corrected):
+            cells = ("", "no shared episodes", "", "", "")
+            if c is not None:
+                better = percent(c.improvement)
+                told = (points(c.difference), c.verdict(p), better)
+                cells = (*told, p_text(c.p_value), p_text(p))
+            rows.append((pair, speed, *cells, str(shared)))
         if rows:
             blocks.append((heading, tuple(rows)))
     if not blocks:
-        return None
+        return
     caption = (
         "First minus second in percentage points, on the episodes that all runs of both drove, "
         "with 95 % bootstrap intervals over seeds and episodes; the probability that a run of the "
@@ -335,17 +357,9 @@ def _difference_table(
     )
     if len(chosen) < len(every):
         caption += f" The first {len(chosen)} of {len(every)} pairs."
-    header = (
-        "first − second",
-        "speed",
-        "points",
-        "verdict",
-        "P(first better) (%)",
-        "p",
-        "p (Holm)",
-    )
-    columns = (*header, "shared")
-    return Table(f"{name}_differences", caption, columns, tuple(blocks), words=(1, 3))
+    told = ("points", "verdict", "P(first better) (%)", "p", "p (Holm)")
+    header = ("first − second", "speed", *told, "shared")
+    yield Table(f"{name}_differences", caption, header, tuple(blocks), words=(1, 3))
 
 
 def _compared(
@@ -360,18 +374,6 @@ def _compared(
         sides.append(side_by_side(a, b))
     shared = [ours.shape[1] for ours, _ in sides]
     return (bootstrap.compare(sides), sum(shared)) if all(shared) else (None, 0)
-
-
-def _difference_cells(comparison: Comparison | None, corrected: float) -> tuple[str, ...]:
-    if comparison is None:
-        return ("", "no shared episodes", "", "", "")
-    return (
-        points(comparison.difference),
-        comparison.verdict(corrected),
-        percent(comparison.improvement),
-        p_text(comparison.p_value),
-        p_text(corrected),
-    )
 
 
 def _what_is_missing(grids: Sequence[Grid]) -> tuple[str, ...]:
@@ -399,8 +401,9 @@ def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
     they were not both driven; time-outs are left out, as in the paper.
     """
     fps = runs[0].fps
-    driven = speeds_tested(runs, settings.policy, fps)
-    speeds = ["low", "high"] if {"low", "high"} <= {*driven} else [runs[0].speed]
+    speeds = ["low", "high"]
+    if not {*speeds} <= {*_speeds(runs, settings.policy)}:
+        speeds = [runs[0].speed]
     conditions = [Condition(settings.policy, speed, fps) for speed in speeds]
     stacks = in_order([run.stack for run in runs], _TABLE_III)
     blocks, missing = [], []
@@ -438,14 +441,6 @@ def _failure_row(
     return (stack, percent(share, 1), percent(collisions, 1), ratio(share), *counted)
 
 
-def pooled(runs: Sequence[Run], conditions: Sequence[Condition], metric: Metric) -> Array | None:
-    """Returns `[R, E]` of the runs that drove under all conditions; None if none did."""
-    ours = [run for run in runs if run.conditions.issuperset(conditions)]
-    found = [outcomes_of(ours, condition, metric) for condition in conditions]
-    parts = [matrix.outcomes for matrix in found if matrix is not None]
-    return np.hstack(parts) if parts else None
-
-
 def ratio(share: Estimate) -> str:
     """Returns share : rest with its interval, as text.
 
@@ -459,8 +454,8 @@ def ratio(share: Estimate) -> str:
 def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
     """Returns success at the training speed over all frame rates that were evaluated."""
     policy, speed, trained = settings.policy, runs[0].speed, runs[0].fps
-    ours = [run for run in runs if len(rates_tested([run], policy, speed)) > 1]
-    conditions = [Condition(policy, speed, rate) for rate in rates_tested(ours, policy, speed)]
+    ours = [run for run in runs if len(_rates([run], policy)) > 1]
+    conditions = [Condition(policy, speed, rate) for rate in _rates(ours, policy)]
     series = by_stack(ours, in_order([run.stack for run in ours], STACKS))
     grids = [grid_of(scene, series, conditions, settings.bootstrap) for scene in scenes_of(ours)]
     caption = (
@@ -481,11 +476,9 @@ def _rate_table(grids: Sequence[Grid], caption: str, settings: Settings) -> Tabl
     for grid in grids:
         rows = []
         for series in grid.series:
-            scores = [grid.scores[series, c] for c in conditions]
-            cells = [percent(score.estimate) if score else MISSING for score in scores]
             changes = change(grid.matrices[series, high], grid.matrices[series, low])
             lost = MISSING if changes is None else points(settings.bootstrap.mean([changes]))
-            rows.append((series, *cells, lost))
+            rows.append((series, *_shares(grid, series), lost))
         blocks.append((words(grid.scene), tuple(rows)))
     heads = (*(f"{c.fps:g} Hz (%)" for c in conditions), f"{high.fps:g} → {low.fps:g} Hz (points)")
     extra = "The last column is the change of the same agents on the same episodes."
@@ -515,7 +508,10 @@ def _across(groups: Sequence[Group], settings: Settings) -> Iterator[Section]:
     """Yields the results of stacks in groups whose configs differ, side by side, not pooled."""
     keys = list(dict.fromkeys(key for group in groups for key in group.differences))
     numbers = [f"config {number}" for number in range(1, len(groups) + 1)]
-    rows = tuple((key, *(_value(g.differences.get(key, ""), 24) for g in groups)) for key in keys)
+    cells = {key: [str(group.differences.get(key, "")) for group in groups] for key in keys}
+    rows = tuple(
+        (key, *(c if len(c) <= 24 else f"{c[:20]} ..." for c in of)) for key, of in cells.items()
+    )
     caption = "Keys of the configs in which the runs differ. No number is of runs of two columns."
     columns = tuple(range(1, len(groups) + 1))
     table = Table("configs", caption, ("key", *numbers), (("", rows),), words=columns)
@@ -544,16 +540,9 @@ def _across(groups: Sequence[Group], settings: Settings) -> Iterator[Section]:
         else:
             series = {v: of for v, of in series.items() if of}
             pairs, notes = None, ()
-            name, title = (
-                folder_name(f"across_{stacks[0]}"),
-                f"{stacks[0]} under configs that differ",
-            )
+            name = folder_name(f"across_{stacks[0]}")
+            title = f"{stacks[0]} under configs that differ"
         places = [scene for of in series.values() for scene in {run.scene for run in of}]
         if len(set(places)) < len(places):  # some scene has more than one of them
             section = success_section(name, title, series, pairs, settings, baselines=())
-            yield replace(section, notes=(*notes, *section.notes))
-
-
-def _value(value: Any, most: int) -> str:
-    text = str(value)
-    return text if len(text) <= most else f"{text[: most - 4]} ..."
+            yield section._replace(notes=(*notes, *section.notes))

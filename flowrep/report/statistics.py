@@ -159,13 +159,15 @@ class Bootstrap:
             np.mean([a.mean(axis=-1) - b.mean(axis=-1) for a, b in pairs], axis=0)
             for pairs in (own, drawn)
         )
+        fewest = min(len(side) for pair in own for side in pair)  # of a side in a scene
+        runs = fewest if fewest < 2 else min(sum(map(len, side)) for side in zip(*own))
         improvement = float(np.mean([_improvement(*pair) for pair in own]))
         improvements = np.mean([_improvement(*pair) for pair in drawn], axis=0)
         return Comparison(
             self._estimate(float(difference), differences),
             self._estimate(improvement, improvements),
             effect(own).p_value,
-            _runs_a_side(own),
+            runs,
         )
 
     def _draw(self, scene: int, outcomes: Array, sides: Sequence[int]) -> list[Array]:
@@ -211,12 +213,6 @@ def _improvement(ours: Array, theirs: Array) -> Any:
     return ((a > b) + 0.5 * (a == b)).mean(axis=(-2, -1))
 
 
-def _runs_a_side(scenes: Sequence[tuple[Array, Array]]) -> int:
-    """The runs per side over all scenes if each scene has several; else the fewest of a scene."""
-    fewest = min(len(side) for pair in scenes for side in pair)
-    return fewest if fewest < 2 else min(sum(len(pair[side]) for pair in scenes) for side in (0, 1))
-
-
 class Effect(NamedTuple):
     """A difference in the mean over scenes, by the t distribution over runs.
 
@@ -237,11 +233,11 @@ class Effect(NamedTuple):
             return 1.0 if self.value == 0 else 0.0
         return float(2 * stats.t.sf(abs(self.value) / self.error, self.freedom))
 
-    def interval(self, confidence: float = 0.95) -> Estimate:
-        """Returns the difference with its interval, which leaves out 0 exactly if p is small."""
+    def interval(self) -> Estimate:
+        """Returns the difference with its 95 % interval, which leaves out 0 exactly if p < 0.05."""
         if self.error == 0:
             return Estimate(self.value, self.value, self.value)
-        half = self.error * float(stats.t.ppf(0.5 + confidence / 2, self.freedom))
+        half = self.error * float(stats.t.ppf(0.975, self.freedom))
         return Estimate(self.value, self.value - half, self.value + half)
 
 

@@ -26,8 +26,6 @@ from flowrep.tables import TableError
 
 RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
 _MACHINE = ("commit", "precision", "cpu")
-
-
 _NUMBERS = {"frames": int, "fps": float, "episode_seed": int, "length": int}
 EPISODE_COLUMNS = (
     "scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed",
@@ -56,7 +54,11 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
                 raise RunFolderError(f"'{folder}': no packed run in it has such a name")
             runs |= {run.name: run for run in found}
             continue
-        configs = sorted(path for path in folder.rglob("config.yaml") if _is_of_a_run(path, folder))
+        configs = sorted(
+            path
+            for path in folder.rglob("config.yaml")
+            if {".hydra", "wandb"}.isdisjoint(path.relative_to(folder).parts)
+        )
         if not configs:
             what = "holds no run" if folder.exists() else "does not exist"
             raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
@@ -70,54 +72,43 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     return list(runs.values()), warnings
 
 
-def _is_of_a_run(config: Path, folder: Path) -> bool:
-    below = config.relative_to(folder).parts  # the folder itself may be called anything
-    return ".hydra" not in below and "wandb" not in below
-
-
 def read_run(path: Path) -> Run:
     """Returns the run in a folder.
 
     Raises:
-        RunFolderError: its config is not what a run leaves.
-        TableError: one of its tables is damaged.
+        RunFolderError: its config or a cell of a table is not what a run leaves.
+        TableError: one of its tables lacks columns.
     """
     folder = RunFolder.existing(path)
     config, tables = folder.read_config(), (folder.read_episodes(), folder.read_metrics())
-    (header, rows), (logged, metrics) = (
+    episodes, metrics = (
         (list(table[0]) if table else [], [list(row.values()) for row in table]) for table in tables
     )
     try:
-        episodes, curves = _episodes(header, rows), _metrics(logged, metrics)
-        machine = _machine(path / "machine.json")
-    except ValueError as error:
-        raise TableError(f"{path}: a cell of its tables is damaged ({error})") from None
-    try:
-        return Run(str(path), config, episodes, curves, path, machine)
+        columns = _episodes(*episodes), _metrics(*metrics)
+        return Run(str(path), config, *columns, path, _machine(path / "machine.json"))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RunFolderError(
-            f"{path}/config.yaml is not what a run leaves ({error!r}); restore the file that the "
-            "run was started with"
+            f"{path}: config.yaml or a table is not what a run leaves ({error!r}); restore the "
+            "file that the run wrote"
         ) from None
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     """Returns one run per config and seed, and a line for each other: it would be another seed."""
-    warnings: list[str] = []
-    kept: dict[Any, Run] = {}
+    same: dict[Any, list[Run]] = {}
     for run in runs:
         key = (run.stack, run.seed, repr(sorted(run.settings.items(), key=lambda item: item[0])))
-        other = kept.setdefault(key, run)
-        if other is run:
-            continue
-        best = max(other, run, key=lambda r: (int(r.tested.sum()), r.frames))
-        left = run if best is other else other
-        warnings.append(
-            f"{left.name} is the same run as {best.name}, config and seed: left out, it would "
-            "count as another seed"
-        )
-        kept[key] = best
-    return list(kept.values()), warnings
+        same.setdefault(key, []).append(run)
+    kept = [max(of, key=lambda r: (int(r.tested.sum()), r.frames)) for of in same.values()]
+    warnings = [
+        f"{run.name} is the same run as {best.name}, config and seed: left out, it would count as "
+        "another seed"
+        for best, of in zip(kept, same.values())
+        for run in of
+        if run is not best
+    ]
+    return kept, warnings
 
 
 def _episodes(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Columns:
@@ -181,13 +172,12 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
     logged = list(dict.fromkeys(name for _, run in kept for name in run.metrics))
     _write(folder / EPISODES, ("run", *EPISODE_COLUMNS), _rows(kept, "episodes", EPISODE_COLUMNS))
     _write(folder / TRAINING, ("run", *logged), _rows(kept, "metrics", logged))
-    lines = (json.dumps(_entry(name, run), ensure_ascii=False) for name, run in kept)
-    (folder / RUNS).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
-
-
-def _entry(name: str, run: Run) -> dict[str, Any]:
-    machine = {key: run.machine.get(key, "unknown") for key in _MACHINE}
-    return {"run": name, **machine, "config": run.config}
+    lines = []
+    for name, run in kept:
+        machine = {key: run.machine.get(key, "unknown") for key in _MACHINE}
+        entry = {"run": name, **machine, "config": run.config}
+        lines.append(json.dumps(entry, ensure_ascii=False) + "\n")
+    (folder / RUNS).write_text("".join(lines), encoding="utf-8")
 
 
 def _rows(

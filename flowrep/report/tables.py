@@ -3,37 +3,21 @@
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from flowrep.report.statistics import Estimate
 
 MISSING = "missing"
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "–": "--",
-    "−": "$-$",
-    "×": r"$\times$",
-    "→": r"$\to$",
-    "∞": r"$\infty$",
-    "≥": r"$\ge$",
-    "<": r"$<$",
-    ">": r"$>$",
-}
+_LATEX: dict[str, str] = {character: rf"\{character}" for character in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "–": "--", "−": "$-$", "×": r"$\times$", "→": r"$\to$", "∞": r"$\infty$", "≥": r"$\ge$",
+    "<": "$<$", ">": "$>$",
+}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Text in rows.
 
     Args:
@@ -57,23 +41,25 @@ class Table:
     def to_latex(self) -> str:
         """Returns a table environment for booktabs."""
         columns = "".join("l" if self.is_text(i) else "r" for i in range(len(self.header)))
-        lines = [
-            r"\begin{table}[t]",
-            r"  \centering",
-            rf"  \caption{{{latex_text(self.caption)}}}",
-            rf"  \label{{tab:{self.name}}}",
-            rf"  \begin{{tabular}}{{{columns}}}",
-            r"    \toprule",
-            f"    {_latex_row(self.header)}",
-        ]
+        lines = [_latex_row(self.header)]
         for heading, rows in self.blocks:
-            lines.append(r"    \midrule")
+            lines.append(r"\midrule")
             if heading:
                 span = rf"\multicolumn{{{len(self.header)}}}{{l}}"
-                lines.append(rf"    {span}{{\textit{{{latex_text(heading)}}}}} \\")
-            lines += [f"    {_latex_row(row)}" for row in rows]
-        lines += [r"    \bottomrule", r"  \end{tabular}", r"\end{table}"]
-        return "\n".join(lines) + "\n"
+                lines.append(rf"{span}{{\textit{{{latex_text(heading)}}}}} \\")
+            lines += map(_latex_row, rows)
+        body = "\n    ".join(lines)
+        return rf"""\begin{{table}}[t]
+  \centering
+  \caption{{{latex_text(self.caption)}}}
+  \label{{tab:{self.name}}}
+  \begin{{tabular}}{{{columns}}}
+    \toprule
+    {body}
+    \bottomrule
+  \end{{tabular}}
+\end{{table}}
+"""
 
     def to_csv(self) -> str:
         """Returns a CSV table; a block's heading is its rows' first cell."""

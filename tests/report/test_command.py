@@ -7,8 +7,7 @@ import pytest
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("pybullet", reason="the schema reads the simulator's names")
 
-from flowrep.report import command
-from flowrep.report.command import main, show
+from flowrep.report.__main__ import main, show
 from flowrep.report.tables import Table
 from tests.report.folders import config_of, rows_of, write_run
 
@@ -39,7 +38,7 @@ def test_folders_that_are_all_damaged_are_lines(tmp_path, monkeypatch, capsys):
 
 def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatch, capsys):
     run = write_run(tmp_path / "run", config_of(), rows_of(config_of(), "soccc"))
-    monkeypatch.setattr(command, "write_files", lambda *_: [])
+    monkeypatch.setattr("flowrep.report.__main__.write_files", lambda *_: [])
     monkeypatch.setattr(sys, "argv", ["flowrep-report", str(run), f"output={tmp_path / 'out'}"])
     main()
     said = capsys.readouterr().out
@@ -56,7 +55,7 @@ def test_a_tables_title_may_hold_brackets(capsys):
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, capsys):
     run = write_run(tmp_path / "run", config_of(), rows_of(config_of(), "s"))
     (tmp_path / "taken").write_text("")
-    monkeypatch.setattr(command, "write_page", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr("flowrep.report.__main__.render_page", lambda *_: pytest.fail("too late"))
     code, said = ended(monkeypatch, capsys, run, "resamples=5", f"output={tmp_path / 'taken'}")
     assert code == 2
     assert said.err.count("\n") == 1

@@ -8,7 +8,7 @@ pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("shapely", reason="plans are of scenes")
 
 from flowrep.config import CONF_DIR
-from flowrep.report.drives import DRIVES, drives_of, tracks_of
+from flowrep.report.page import DRIVES, drives_of, tracks_of
 from flowrep.report.storage import read_run, read_runs
 from tests.report.folders import config_of, rows_of, write_run
 

@@ -11,12 +11,10 @@ pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.config.schema import ReportConfig
-from flowrep.report.command import report
-from flowrep.report.drives import Drives, Picture
+from flowrep.report.__main__ import report
 from flowrep.report.figures import draw_bars, save, svg
-from flowrep.report.outcomes import grid_of
-from flowrep.report.page import render_page
-from flowrep.report.runs import Condition
+from flowrep.report.page import Drives, Picture, render_page
+from flowrep.report.runs import Condition, grid_of
 from flowrep.report.sections import COMPLEMENTARY, Report
 from flowrep.report.statistics import Bootstrap
 from flowrep.report.storage import read_run, write_archive

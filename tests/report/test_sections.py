@@ -7,8 +7,7 @@ import pytest
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.report.outcomes import change, curve_of, outcomes_of, side_by_side
-from flowrep.report.runs import Condition
+from flowrep.report.runs import Condition, change, curve_of, outcomes_of, side_by_side
 from flowrep.report.sections import Settings, assemble
 from flowrep.report.statistics import Bootstrap
 from flowrep.report.storage import read_runs

@@ -57,6 +57,7 @@ def test_a_folder_of_runs_may_lie_anywhere(tmp_path, name):
         ("config.yaml", "seed: [", "config.yaml"),
         ("config.yaml", "", "config.yaml"),
         ("config.yaml", "seed: 1\n", "scene"),
+        ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
         ("metrics.csv", "frames,success\n9,high\n", "'high'"),
@@ -81,18 +82,6 @@ def test_a_cell_that_no_episode_can_have_is_one_line(tmp_path, column, value):
     runs, (warning,) = read_runs([tmp_path])
     assert names(runs) == ["good"]
     assert "/bad" in warning
-
-
-@pytest.mark.parametrize("key", ["speed", "scene__name", "scene__frame_rate_hz", "total_frames"])
-@pytest.mark.parametrize("value", [[1], None])
-def test_a_config_that_is_not_a_runs_is_one_line(tmp_path, key, value):
-    config = config_of(**{key: value})
-    path = write_run(tmp_path / "bad", config, rows_of(config_of(), "s"))
-    (path / "config.yaml").write_text(yaml.safe_dump(config))
-    runs, warnings = read_runs([tmp_path])
-    assert runs == []
-    assert len(warnings) == 1
-    assert "bad/config.yaml" in warnings[0]
 
 
 @pytest.mark.parametrize(("name", "said"), [("none", "does not exist"), ("empty", "holds no run")])
