@@ -1,7 +1,7 @@
 """Shows a scene and how a policy drives in it: `python -m flowrep.view scene=s_turn`."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import cycle, pairwise
 from pathlib import Path
@@ -54,22 +54,19 @@ def run(config: ViewConfig) -> None:
     job = HydraConfig.get()
     is_scene_given = any(text.startswith("scene") for text in job.overrides.task)
     driver = driver_of(config, is_scene_given)
-    with_every_sensor = make_filmed(driver.make_env, driver.representations)
-    scene = with_every_sensor.base_env.scene
-    check_path(config, scene)
+    env = make_filmed(driver.make_env, driver.representations)
+    options = episodes_of(config, env.base_env.scene)
     if config.interactive:
-        drive_by_hand(config, driver, with_every_sensor)
+        drive_by_hand(driver, Path(config.policy).name, env, options[0])
     else:
-        view(config, driver, with_every_sensor, Path(job.runtime.output_dir))
-    with_every_sensor.close()
+        view(config, driver, env, options, Path(job.runtime.output_dir))
+    env.close()
 
 
 def driver_of(config: ViewConfig, is_scene_given: bool) -> Driver:
     """Returns the baseline, run or policy of the user's own that drives.
 
-    Args:
-        config: names it with `policy`.
-        is_scene_given: whether the scene was typed; if not, a run's agent drives in its own.
+    A run's agent drives in its own scene unless one was given.
     """
     rates: dict[str, Any] = {"speed": config.speed, "frame_rate_hz": config.frame_rate_hz}
     name = config.policy
@@ -95,44 +92,32 @@ def driver_of(config: ViewConfig, is_scene_given: bool) -> Driver:
     )
 
 
-def check_path(config: ViewConfig, scene: Scene) -> None:
-    """Checks that the scene has the path.
+def episodes_of(config: ViewConfig, scene: Scene) -> list[dict[str, Any]]:
+    """Returns the options of the episodes to view.
 
     Raises:
-        UsageError: it has no such path.
+        UsageError: the scene has no such path.
     """
     paths = [path.name for path in scene.paths]
     if config.path not in (*paths, None):
         raise UsageError(f"path should be {', '.join(paths)} or null, not '{config.path}'")
-
-
-def episodes_of(config: ViewConfig) -> list[dict[str, Any]]:
-    """Returns the options of the episodes to view."""
     path = {} if config.path is None else {"path": config.path}
     seeds = evaluation_seeds(config.seed, config.episodes)
     return [{"episode_seed": seed, "speed": config.speed} | path for seed in seeds]
 
 
-def view(config: ViewConfig, driver: Driver, env: EnvBase, folder: Path) -> None:
-    """Drives the episodes and writes their pictures, plan, video and tables.
+def view(
+    config: ViewConfig, driver: Driver, env: EnvBase, options: list[dict[str, Any]], folder: Path
+) -> None:
+    """Drives episodes and writes their pictures, plan, video and tables into a folder.
 
-    Args:
-        config: of the command.
-        driver: what drives.
-        env: keeps every sensor, for the first episode.
-        folder: where the files are written.
+    The first is driven in `env`, which keeps every sensor.
     """
     scene, fps = env.base_env.scene, env.base_env.frame_rate_hz
-    first, *others = episodes_of(config)
-    counts = CategoryCount(scene.categories)
     with tqdm(desc="driving", unit="frame") as bar:
-
-        def look(sensor: TensorDictBase) -> None:
-            counts.add(sensor["semantic"].numpy())
-            bar.update()
-
-        frames, episode = film_episode(env, driver.policy_in(env), first, look)
-    episodes = [episode, *drive_on(driver, others)]
+        policy = driver.policy_in(env)
+        frames, episode = film_episode(env, policy, options[0], lambda _: bar.update())
+    episodes = [episode, *drive_on(driver, options[1:])]
     strips = [representation_strip(maps) for maps in tqdm(frames, desc="drawing", unit="frame")]
     chosen = moments([moving_pixels(maps) for maps in frames], config.sheet_rows)
     folder.mkdir(parents=True, exist_ok=True)
@@ -146,12 +131,18 @@ def view(config: ViewConfig, driver: Driver, env: EnvBase, folder: Path) -> None
     path = paths.pop() if len(paths) == 1 else None
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
     draw_plan(Layout(scene), tracks, path=path).savefig(folder / "plan.png", dpi=110)
-    for name, rows in (
-        ("episodes.csv", [row_of(each) for each in episodes]),
-        ("categories.csv", counts.rows()),
-    ):
-        write_rows(folder / name, rows)
-        print_rows(name.removesuffix(".csv"), rows)
+    tables = {
+        "episodes": [row_of(each) for each in episodes],
+        "categories": category_rows(scene.categories, (maps["semantic"] for maps in frames)),
+    }
+    for name, rows in tables.items():
+        write_rows(folder / f"{name}.csv", rows)
+        table = Table(title=name, box=box.SIMPLE, pad_edge=False)
+        for column in rows[0]:
+            table.add_column(column.replace("_", " "), no_wrap=True)
+        for row in rows:
+            table.add_row(*map(str, row.values()))
+        Console().print(table)
     print(f"{folder}: {', '.join(written)}")
 
 
@@ -181,37 +172,19 @@ def row_of(episode: Episode) -> dict[str, Any]:
     }
 
 
-class CategoryCount:
-    """Counts the pixels of each category and the pictures that show it."""
-
-    def __init__(self, categories: tuple[str, ...]) -> None:
-        """Starts at 0 for the categories of a scene."""
-        self.categories = categories
-        self._pixels = np.zeros(256, dtype=np.int64)
-        self._pictures = np.zeros(256, dtype=np.int64)
-        self._seen = 0
-
-    def add(self, semantic: Any) -> None:
-        """Adds a semantic map."""
-        pixels = np.bincount(np.asarray(semantic).ravel(), minlength=256)
-        self._pixels += pixels
-        self._pictures += pixels > 0
-        self._seen += 1
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Returns each category's share of the pixels and of the pictures, in %."""
-        total = max(1, int(self._pixels.sum()))
-        return [
-            {
-                "category": name,
-                "pixels": int(self._pixels[CATEGORY_ID[name]]),
-                "pixels_percent": round(100 * self._pixels[CATEGORY_ID[name]] / total, 3),
-                "pictures_percent": round(
-                    100 * self._pictures[CATEGORY_ID[name]] / max(1, self._seen), 1
-                ),
-            }
-            for name in self.categories
-        ]
+def category_rows(categories: Iterable[str], semantic: Iterable[Any]) -> list[dict[str, Any]]:
+    """Returns each category's share of the pixels of semantic maps and of the maps, in %."""
+    counts = np.stack([np.bincount(np.ravel(ids), minlength=256) for ids in semantic])
+    pixels, pictures = counts.sum(axis=0), (counts > 0).mean(axis=0)
+    return [
+        {
+            "category": name,
+            "pixels": int(pixels[CATEGORY_ID[name]]),
+            "pixels_percent": round(100 * pixels[CATEGORY_ID[name]] / pixels.sum(), 3),
+            "pictures_percent": round(100 * pictures[CATEGORY_ID[name]], 1),
+        }
+        for name in categories
+    ]
 
 
 def moving_pixels(maps: Maps) -> int:
@@ -229,21 +202,7 @@ def moments(motion: list[int], count: int) -> list[int]:
     return [max(range(a, b), key=lambda i: motion[i]) for a, b in pairwise(ends) if b > a]
 
 
-def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
-    """Prints rows as a table."""
-    table = Table(title=title, box=box.SIMPLE, pad_edge=False)
-    for name in rows[0]:
-        table.add_column(name.replace("_", " "), no_wrap=True)
-    for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
-    Console().print(table)
-
-
 # The interactive window.
-
-
-class NoScreenError(UsageError):
-    """A window can't be opened."""
 
 
 class NewEpisode(Exception):
@@ -251,13 +210,9 @@ class NewEpisode(Exception):
 
 
 class Keyboard:
-    """A policy that takes the action of the held keys, or lets another policy drive.
+    """A policy that takes the action of the held keys, or lets another, of this name, drive.
 
     A key acts while it is held; both together cancel out. A key press switches between the drivers.
-
-    Args:
-        other: drives after a switch.
-        name: its name.
     """
 
     ACTIONS = {"left": TURN_LEFT, "right": TURN_RIGHT}  # noqa: RUF012 - never changed
@@ -270,7 +225,7 @@ class Keyboard:
         self.driver = "you"
 
     def press(self, key: str | None) -> None:
-        """Handles a key press."""
+        """Handles a key press; other keys than letters may have no name."""
         key = (key or "").lower()
         if key in self.ACTIONS:
             self._held.add(key)
@@ -294,33 +249,28 @@ class Keyboard:
         return tensordict.set("action", torch.full(tensordict.shape, action))
 
 
-def drive_by_hand(config: ViewConfig, driver: Driver, env: EnvBase) -> None:
+def drive_by_hand(driver: Driver, name: str, env: EnvBase, options: dict[str, Any]) -> None:
     """Opens a window and drives one episode after the other until it is closed.
 
     A finished episode stays in view until R begins the next.
 
-    Args:
-        config: of the command.
-        driver: drives after a switch.
-        env: keeps every sensor.
-
     Raises:
-        NoScreenError: there is no screen, or no GUI toolkit.
+        UsageError: there is no screen, or no GUI toolkit.
     """
     import matplotlib.pyplot as plt
 
-    keyboard = Keyboard(driver.policy_in(env), Path(config.policy).name)
+    keyboard = Keyboard(driver.policy_in(env), name)
     # Disable Matplotlib's own shortcuts for the driver's keys (left: back, r: home, q: quit).
     shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
     with plt.rc_context(shortcuts):
         figure = plt.figure(figsize=(15, 3.2))
         if type(figure.canvas).required_interactive_framework is None:
             plt.close(figure)
-            raise NoScreenError(
+            raise UsageError(
                 "interactive=true needs a screen, and tkinter or PyQt to open a window on it "
                 f"(matplotlib found only the backend {plt.get_backend()!r})"
             )
-        drive_in_window(figure, keyboard, env, episodes_of(config)[0], plt.pause)
+        drive_in_window(figure, keyboard, env, options, plt.pause)
         plt.close(figure)
 
 
@@ -343,10 +293,10 @@ def drive_in_window(
     axes = figure.add_axes((0, 0, 1, 0.92))
     axes.set_axis_off()
     title = figure.suptitle("", fontfamily="monospace", fontsize=10)
-    canvas = figure.canvas
-    canvas.mpl_connect("key_press_event", lambda event: keyboard.press(event.key))
-    canvas.mpl_connect("key_release_event", lambda event: keyboard.release(event.key))
-    canvas.mpl_connect("close_event", lambda event: keyboard.press("q"))
+    listen = figure.canvas.mpl_connect
+    listen("key_press_event", lambda event: keyboard.press(event.key))
+    listen("key_release_event", lambda event: keyboard.release(event.key))
+    listen("close_event", lambda event: keyboard.press("q"))
     intrinsics = torch.from_numpy(street_envs(env)[0].K)
     image, drawn_at = None, time.monotonic()
 

@@ -5,7 +5,7 @@ files, byte for byte.
 """
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -54,7 +54,7 @@ _DPI = 300
 
 
 class Look(NamedTuple):
-    """How a series is drawn: its colour, its bars' hatch, its line's marker; hatched is dashed."""
+    """How a series is drawn: its colour, its bars' hatch, its line's marker."""
 
     colour: str
     hatch: str
@@ -62,7 +62,7 @@ class Look(NamedTuple):
 
     @property
     def line(self) -> dict[str, Any]:
-        """The style of its line."""
+        """The style of its line: dashed where bars are hatched."""
         dashes = "--" if self.hatch else "-"
         return {"color": self.colour, "marker": self.marker, "linestyle": dashes, "markersize": 3.5}
 
@@ -106,14 +106,9 @@ def styled(font_pt: float) -> Iterator[None]:
         "font.size": font_pt,
         "axes.titlesize": font_pt + 0.5,
         "axes.labelsize": font_pt,
-        "xtick.labelsize": font_pt - 0.5,
-        "ytick.labelsize": font_pt - 0.5,
-        "legend.fontsize": font_pt - 0.5,
-        "text.color": _TEXT,
-        "axes.labelcolor": _TEXT,
+        **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), font_pt - 0.5),
+        **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), _TEXT),
         "axes.edgecolor": _FAINT,
-        "xtick.color": _TEXT,
-        "ytick.color": _TEXT,
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.linewidth": 0.7,
@@ -148,42 +143,74 @@ def _reproducible() -> Any:
     )
 
 
-def canvas(panels: int, *, for_page: bool) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with panels in rows, sized for a paper or for a web page."""
-    columns = min(panels, _MOST_IN_A_ROW)
-    rows = -(-panels // columns)
-    width, height = (5.6, 3.7) if for_page else (_PAGE_IN, 2.1)
-    if panels == 1 and not for_page:
-        width, height = _COLUMN_IN, 2.3
-    figure = Figure(figsize=(width, height * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel().tolist()
-    for spare in axes[panels:]:
-        spare.set_visible(False)
-    return figure, axes[:panels]
-
-
 def draw_bars(grids: Sequence[Grid], *, for_page: bool = False) -> Figure:
     """Returns grouped bars: a panel per scene, a group per speed mode, a bar per stack.
 
     Whiskers are the intervals, small dots the seeds, dotted lines the baselines.
     """
+    handles: list[Any] = [
+        Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="white", lw=0, label=name)
+        for name, look in looks(grids[0].series).items()
+    ]
+    shown = {name for grid in grids for name, _ in grid.baselines}
+    handles += [
+        Line2D([], [], linestyle=line, color=_TEXT, linewidth=1.0, label=words(name).lower())
+        for name, line in _BASELINE_LINES.items()
+        if name in shown
+    ]
+    return _panels([(grid.scene, grid) for grid in grids], _bars, handles, for_page)
+
+
+def draw_rates(grids: Sequence[Grid], *, for_page: bool = False) -> Figure:
+    """Returns success over frame rates: a panel per scene, a line per stack."""
+    panels = [(grid.scene, grid) for grid in grids]
+    return _panels(panels, _rate_lines, _line_handles(looks(grids[0].series)), for_page)
+
+
+def draw_curves(
+    panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]], *, for_page: bool = False
+) -> Figure:
+    """Returns a panel per scene: bold, the seeds' mean of evaluations; thin, their training."""
+    style = looks(list(dict.fromkeys(name for _, curves in panels for name in curves)))
+
+    def draw(axes: Axes, curves: Mapping[str, Sequence[Curve]]) -> None:
+        for name, of_runs in curves.items():
+            for curve in of_runs:
+                thin: Any = {"color": style[name].colour, "linewidth": 0.6, "alpha": 0.6}
+                axes.plot(*_in_thousands(curve.training), **thin)
+            mean = mean_curve([curve.evaluated for curve in of_runs])
+            axes.plot(*_in_thousands(mean), linewidth=1.5, **style[name].line)
+        axes.set_xlabel("frames (thousands)")
+
+    return _panels(panels, draw, _line_handles(style), for_page)
+
+
+def _panels(
+    panels: Sequence[tuple[str, Any]],
+    draw: Callable[[Axes, Any], None],
+    handles: Sequence[Any],
+    for_page: bool,
+) -> Figure:
+    """Returns a figure with a panel of success per scene, in rows, for a paper or a web page."""
+    columns = min(len(panels), _MOST_IN_A_ROW)
+    rows = -(-len(panels) // columns)
+    width, height = (5.6, 3.7) if for_page else (_PAGE_IN, 2.1)
+    if len(panels) == 1 and not for_page:
+        width, height = _COLUMN_IN, 2.3
     with styled(_PAGE_PT if for_page else _PAPER_PT):
-        figure, panels = canvas(len(grids), for_page=for_page)
-        for axes, grid in zip(panels, grids):
-            _bars(axes, grid)
-            axes.set_title(words(grid.scene))
-        percent_axis(panels)
-        handles: list[Any] = [
-            Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="white", lw=0, label=name)
-            for name, look in looks(grids[0].series).items()
-        ]
-        shown = {name for grid in grids for name, _ in grid.baselines}
-        handles += [
-            Line2D([], [], linestyle=line, color=_TEXT, linewidth=1.0, label=words(name).lower())
-            for name, line in _BASELINE_LINES.items()
-            if name in shown
-        ]
-        legend(figure, handles)
+        figure = Figure(figsize=(width, height * rows), layout="constrained")
+        all_axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel().tolist()
+        for spare in all_axes[len(panels) :]:
+            spare.set_visible(False)
+        for axes, (scene, data) in zip(all_axes, panels):
+            draw(axes, data)
+            axes.set_title(words(scene))
+            axes.set_ylim(0, 100)
+            axes.set_yticks(range(0, 101, 25))
+            axes.grid(axis="y")
+            axes.set_axisbelow(True)
+        all_axes[0].set_ylabel("success (% of episodes)")
+        _legend(figure, handles)
     return figure
 
 
@@ -226,18 +253,6 @@ def _whisker(axes: Axes, at: float, width: float, score: Score) -> None:
         axes.scatter([at + 0.24 * width] * len(dots), dots, s=5, zorder=4, clip_on=False, **ring)
 
 
-def draw_rates(grids: Sequence[Grid], *, for_page: bool = False) -> Figure:
-    """Returns success over frame rates: a panel per scene, a line per stack."""
-    with styled(_PAGE_PT if for_page else _PAPER_PT):
-        figure, panels = canvas(len(grids), for_page=for_page)
-        for axes, grid in zip(panels, grids):
-            _rate_lines(axes, grid)
-            axes.set_title(words(grid.scene))
-        percent_axis(panels)
-        legend(figure, _line_handles(grids[0].series))
-    return figure
-
-
 def _rate_lines(axes: Axes, grid: Grid) -> None:
     at = [condition.fps for condition in grid.conditions]
     step = min((b - a for a, b in pairwise(at)), default=1.0)
@@ -256,50 +271,15 @@ def _rate_lines(axes: Axes, grid: Grid) -> None:
     axes.set_xlabel("frames per second (Hz)")
 
 
-def draw_curves(
-    panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]], *, for_page: bool = False
-) -> Figure:
-    """Returns a panel per scene: bold, the seeds' mean of evaluations; thin, their training."""
-    with styled(_PAGE_PT if for_page else _PAPER_PT):
-        figure, all_axes = canvas(len(panels), for_page=for_page)
-        names = list(dict.fromkeys(name for _, curves in panels for name in curves))
-        style = looks(names)
-        for axes, (scene, curves) in zip(all_axes, panels):
-            for name, of_runs in curves.items():
-                for curve in of_runs:
-                    xs, ys = _in_thousands(curve.training)
-                    axes.plot(xs, ys, color=style[name].colour, linewidth=0.6, alpha=0.6)
-                xs, ys = _in_thousands(mean_curve([curve.evaluated for curve in of_runs]))
-                axes.plot(xs, ys, linewidth=1.5, **style[name].line)
-            axes.set_title(words(scene))
-            axes.set_xlabel("frames (thousands)")
-        percent_axis(all_axes)
-        legend(figure, _line_handles(names))
-    return figure
-
-
 def _in_thousands(points: Sequence[tuple[int, float]]) -> tuple[list[float], list[float]]:
     return [frames / 1000 for frames, _ in points], [100 * share for _, share in points]
 
 
-def _line_handles(series: Sequence[str]) -> list[Any]:
-    return [
-        Line2D([], [], linewidth=1.3, label=name, **look.line)
-        for name, look in looks(series).items()
-    ]
+def _line_handles(style: Mapping[str, Look]) -> list[Any]:
+    return [Line2D([], [], linewidth=1.3, label=name, **look.line) for name, look in style.items()]
 
 
-def percent_axis(panels: Sequence[Axes]) -> None:
-    """Gives panels one axis of success in percent."""
-    for axes in panels:
-        axes.set_ylim(0, 100)
-        axes.set_yticks(range(0, 101, 25))
-        axes.grid(axis="y")
-        axes.set_axisbelow(True)
-    panels[0].set_ylabel("success (% of episodes)")
-
-
-def legend(figure: Figure, handles: Sequence[Any]) -> None:
+def _legend(figure: Figure, handles: Sequence[Any]) -> None:
     """Puts a legend above the panels, in reading order."""
     em_in = mpl.rcParams["font.size"] / 72
     longest = max(len(handle.get_label()) for handle in handles)

@@ -6,7 +6,7 @@ that all compared runs drove.
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatch
 from functools import reduce
 from itertools import product
@@ -152,13 +152,9 @@ def _contrast(
 def _p_value(found: Effect, asked: Mapping[str, Any]) -> float:
     if asked["expect"] != "equal":
         return found.p_value
-    # two one-sided tests against the margin, each the half of a two-sided one
-    halves = [found._replace(value=found.value - sign * asked["margin"]) for sign in (1, -1)]
-    one_sided = [
-        half.p_value / 2 if half.value * sign < 0 else 1 - half.p_value / 2
-        for half, sign in zip(halves, (1, -1))
-    ]
-    return max(one_sided)
+    # of two one-sided tests, that against the nearer end of the margin has the larger p
+    nearer = found._replace(value=abs(found.value) - asked["margin"])
+    return nearer.p_value / 2 if nearer.value < 0 else 1 - nearer.p_value / 2
 
 
 def of_study(declared: Mapping[str, Any], study: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -178,8 +174,7 @@ def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Arr
         asked: names the measure and its conditions, see claims.yaml.
     """
     kind = next(name for name in _MEASURES if name in asked)
-    names = list(asked[kind])
-    driven = [[_under(run, names) for run in side] for side in sides]
+    driven = [[_under(run, asked[kind]) for run in side] for side in sides]
     driven = [[found for found in side if all(len(c["outcome"]) for c in found)] for side in driven]
     if not all(driven):
         return None
@@ -187,35 +182,24 @@ def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Arr
     shared = reduce(np.intersect1d, seeds)
     if not len(shared):
         return None
-    metric = out_of_bounds_of_both if kind == "out_of_bounds" else success
-    scored = []
-    for side in driven:
-        of_runs = []
-        for found in side:
-            values = [metric(c["outcome"][np.isin(c["episode_seed"], shared)]) for c in found]
-            of_runs.append(_score(kind, values, asked[kind]))
-        scored.append(np.array(of_runs))
-    return scored
+
+    def score(found: Sequence[Columns]) -> float:
+        ends = [c["outcome"][np.isin(c["episode_seed"], shared)] for c in found]
+        if kind == "out_of_bounds":
+            failed = out_of_bounds_of_both(np.concatenate(ends))
+            return float("nan") if np.isnan(failed).all() else float(np.nanmean(failed))
+        means = [float(success(e).mean()) for e in ends]
+        return (
+            means[0] / means[1] if kind == "kept" else float(np.dot(means, [*asked[kind].values()]))
+        )
+
+    return [np.array([score(found) for found in side]) for side in driven]
 
 
-def _under(run: Run, names: Sequence[str | int]) -> list[Columns]:
-    conditions = [
-        Condition("greedy", n, run.fps)
-        if isinstance(n, str)
-        else Condition("greedy", run.speed, float(n))
-        for n in names
-    ]
-    return [run.under(condition) for condition in conditions]
-
-
-def _score(kind: str, values: Sequence[Array], asked: Any) -> float:
-    if kind == "out_of_bounds":
-        share = np.concatenate(values)
-        return float(np.nanmean(share)) if not np.isnan(share).all() else float("nan")
-    means = [float(v.mean()) for v in values]
-    if kind == "kept":
-        return means[0] / means[1]
-    return float(np.dot(means, list(asked.values())))
+def _under(run: Run, names: Iterable[str | int]) -> list[Columns]:
+    """Returns a run's greedy episodes at each speed mode, or frame rate at its own speed."""
+    of = [(n, run.fps) if isinstance(n, str) else (run.speed, float(n)) for n in names]
+    return [run.under(Condition("greedy", *condition)) for condition in of]
 
 
 def claims_table(claims: Sequence[Claim], p_name: str) -> str:
@@ -225,7 +209,10 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     rows = []
     for claim in claims:
         effects = "; ".join(map(_effect_text, claim.contrasts))
-        by_scene = "; ".join(map(_scenes_text, claim.contrasts))
+        by_scene = "; ".join(
+            " / ".join(f"{SHORT[scene]} {signed(e.value)}" for scene, e in c.by_scene.items())
+            for c in claim.contrasts
+        )
         row = f"[row {claim.number}](#the-claims-in-one-figure)"
         rows.append((claim.text, f"**{claim.verdict}**", effects, by_scene, row, claim.limits))
     return markdown(header, rows)
@@ -239,12 +226,6 @@ def _effect_text(contrast: Contrast) -> str:
     p = p_text(contrast.p_value)
     p = f"p {p}" if p.startswith("<") else f"p = {p}"
     return f"{points(contrast.effect.interval())}, {p}"
-
-
-def _scenes_text(contrast: Contrast) -> str:
-    return " / ".join(
-        f"{SHORT[scene]} {signed(found.value)}" for scene, found in contrast.by_scene.items()
-    )
 
 
 def draw_claims(claims: Sequence[Claim]) -> Figure:
@@ -436,17 +417,15 @@ def repeats(main: Sequence[Run], runs: Sequence[Run]) -> list[float]:
     found = []
     thirds = {"success": dict.fromkeys(SPEEDS, 1 / 3)}
     for run, other in product(main, runs):
-        if (run.scene, run.stack, run.seed) != (other.scene, other.stack, other.seed):
+        if any(
+            getattr(run, x) != getattr(other, x) for x in ("scene", "stack", "seed", "settings")
+        ):
             continue
         sides = scores([[other], [run]], thirds)
-        if run.settings == other.settings and sides is not None and not _are_equal(run, other):
+        first, second = (_under(r, ["low"])[0]["outcome"].tolist() for r in (run, other))
+        if sides is not None and first != second:
             found.append(100 * float(sides[0][0] - sides[1][0]))
     return found
-
-
-def _are_equal(first: Run, second: Run) -> bool:
-    ends = [r.under(Condition("greedy", "low", r.fps))["outcome"].tolist() for r in (first, second)]
-    return ends[0] == ends[1]
 
 
 def collapses(runs: Sequence[Run]) -> dict[bool, list[float]]:
@@ -468,8 +447,8 @@ def sampled_minus_greedy(runs: Sequence[Run]) -> list[float]:
     """Returns how much better each run is with sampled actions, in points, at each speed."""
     found = []
     for run, speed in product(runs, SPEEDS):
-        of_both = (run.under(Condition(p, speed, run.fps)) for p in ("sampled", "greedy"))
-        sampled, greedy = (success(driven["outcome"]) for driven in of_both)
+        conditions = (Condition(policy, speed, run.fps) for policy in ("sampled", "greedy"))
+        sampled, greedy = (success(run.under(c)["outcome"]) for c in conditions)
         if len(sampled) and len(greedy):
             found.append(100 * float(sampled.mean() - greedy.mean()))
     return found

@@ -82,6 +82,16 @@ def write_run(path, config, rows, metrics=()):
     return path
 
 
+def run_in(folder, name, outcomes=4, *, scene="straight_road", stack="ego+obj", seed=0, **changes):
+    """A run whose episodes end as the letters say, by speed or at normal speed, or so many well."""
+    config = config_of(scene, stack, seed, **changes)
+    if isinstance(outcomes, int):
+        outcomes = letters(outcomes)
+    of = outcomes if isinstance(outcomes, dict) else {"normal": outcomes}
+    rows = [row for speed, ends in of.items() for row in rows_of(config, ends, speed=speed)]
+    return write_run(folder / name, config, rows)
+
+
 def letters(successes, episodes=EPISODES, rest="c"):
     """Outcomes of which the first are successes and the others `rest`."""
     return "s" * successes + rest * (episodes - successes)

@@ -1,26 +1,29 @@
-"""A whole report, from folders to a page in a browser."""
+"""A whole report: the command, its page in a browser, and the drives and films that it shows."""
 
 import json
 import re
 import shutil
 import subprocess
+import sys
 
+import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
+from flowrep.config import CONF_DIR
 from flowrep.config.schema import ReportConfig
-from flowrep.report.__main__ import report
+from flowrep.report.__main__ import main, report, show
 from flowrep.report.figures import draw_bars, save, svg
-from flowrep.report.page import Drives, Picture, render_page
+from flowrep.report.page import DRIVES, Drives, Picture, drives_of, render_page, tracks_of
 from flowrep.report.runs import Condition, grid_of
 from flowrep.report.sections import COMPLEMENTARY, Report
 from flowrep.report.statistics import Bootstrap
-from flowrep.report.storage import read_run, write_archive
-from tests.report.folders import config_of, letters, rows_of, write_run
-
-pytestmark = pytest.mark.slow
+from flowrep.report.storage import read_run, read_runs, write_archive
+from flowrep.report.tables import Table
+from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
 
 def report_on(folder, output=None):
@@ -60,6 +63,7 @@ def page(sweep):
     return report_on(sweep)
 
 
+@pytest.mark.slow
 def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
     files = (path for path in page.parent.rglob("*") if path.is_file())
     found = {path.relative_to(page.parent).as_posix() for path in files}
@@ -71,6 +75,7 @@ def test_each_experiment_has_its_figure_and_tables_in_every_form(page):
     assert found == drawn | written | {"index.html"}
 
 
+@pytest.mark.slow
 def test_names_are_drawn_as_they_are_and_nothing_is_written_elsewhere(tmp_path):
     for tau in (0.02, "[/red]"):
         config = config_of(r"$\foo$", "/../../evil+$x^$", algorithm__tau=tau)
@@ -85,6 +90,7 @@ def test_names_are_drawn_as_they_are_and_nothing_is_written_elsewhere(tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["x"]
 
 
+@pytest.mark.slow
 def test_packed_runs_have_the_same_tables(sweep, page, tmp_path):
     runs = [read_run(path.parent) for path in sorted(sweep.glob("*_*/config.yaml"))]
     write_archive(runs, tmp_path / "packed")
@@ -96,6 +102,7 @@ def test_packed_runs_have_the_same_tables(sweep, page, tmp_path):
         assert other.read_text() == table.read_text()
 
 
+@pytest.mark.slow
 def test_the_page_says_what_is_missing_and_what_is_wrong(page):
     text = page.read_text(encoding="utf-8")
     assert "Missing in S-Turn: raw." in text
@@ -114,8 +121,7 @@ def test_the_page_names_agents_without_drives(plans):
 
 
 def test_a_figure_saved_again_is_the_same_byte_for_byte(tmp_path):
-    config = config_of()
-    run = write_run(tmp_path / "run", config, rows_of(config, letters(3)))
+    run = run_in(tmp_path, "run", 3)
     conditions = [Condition("greedy", "normal", 12.0)]
     series = {"ego+obj": [read_run(run)], "ego+obj+seg2": []}
     grid = grid_of("straight_road", series, conditions, Bootstrap(50))
@@ -128,6 +134,7 @@ def test_a_figure_saved_again_is_the_same_byte_for_byte(tmp_path):
     assert saved("first") == saved("second")
 
 
+@pytest.mark.slow
 def test_the_page_asks_for_nothing(page):
     text = page.read_text(encoding="utf-8")
     assert set(re.findall(r'(?:src|srcset|href)="(data:[a-z+/0-9]+|#|[^"]*)', text)) == {
@@ -167,6 +174,7 @@ look(1400).then(() => look(400)).then(() => { document.title = JSON.stringify(fo
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed to open the page in")
+@pytest.mark.slow
 def test_a_browser_shows_the_page_on_wide_and_narrow_screens(page, tmp_path):
     text = page.read_text(encoding="utf-8")
     probe = tmp_path / "probe.html"
@@ -189,3 +197,130 @@ def test_a_browser_shows_the_page_on_wide_and_narrow_screens(page, tmp_path):
     assert found["1400"]["in_a_row"] == 2
     assert found["400"]["in_a_row"] == 1
     assert found["400"]["narrowest"] > 300
+
+
+# The command.
+
+
+def ended(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["flowrep-report", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        main()
+    return caught.value.code, capsys.readouterr()
+
+
+def test_a_folder_without_runs_is_one_line_and_no_traceback(tmp_path, monkeypatch, capsys):
+    code, said = ended(monkeypatch, capsys, tmp_path)
+    assert code == 2
+    assert said.err.startswith("error: ")
+    assert str(tmp_path) in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_folders_that_are_all_damaged_are_lines(tmp_path, monkeypatch, capsys):
+    run = run_in(tmp_path, "run")
+    (run / "config.yaml").write_text("[")
+    code, said = ended(monkeypatch, capsys, tmp_path)
+    assert code == 2
+    assert said.out.startswith(f"left out: {run}/config.yaml")
+    assert said.err.startswith("error: ")
+    assert said.err.count("\n") == 1
+
+
+def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatch, capsys):
+    run = run_in(tmp_path, "run", "soccc")
+    monkeypatch.setattr("flowrep.report.__main__.write_files", lambda *_: [])
+    monkeypatch.setattr(sys, "argv", ["flowrep-report", str(run), f"output={tmp_path / 'out'}"])
+    main()
+    said = capsys.readouterr().out
+    assert "1 run, 1 of them finished, of 1 stack (ego+obj) in Straight Road" in said
+    assert "0.333 [0.048–2.326]" in said  # 1 out of bounds to 3 collisions; Wilson's of 1 of 4
+    assert said.endswith(f"page: {tmp_path / 'out' / 'index.html'}\n")
+
+
+def test_a_tables_title_may_hold_brackets(capsys):
+    show(Table("t", "", ("a column as wide as the title",), ()), "tau=[/red], scale=[1]")
+    assert capsys.readouterr().out.split("\n")[0].strip() == "tau=[/red], scale=[1]"
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, monkeypatch, capsys):
+    run = run_in(tmp_path, "run")
+    (tmp_path / "taken").write_text("")
+    monkeypatch.setattr("flowrep.report.__main__.render_page", lambda *_: pytest.fail("too late"))
+    code, said = ended(monkeypatch, capsys, run, "resamples=5", f"output={tmp_path / 'taken'}")
+    assert code == 2
+    assert said.err.count("\n") == 1
+    assert "taken" in said.err
+
+
+# Drives and films.
+
+
+def write_drives(folder, **changes):
+    """Three episodes of 2, 3 and 1 positions: the last is the first by its seed."""
+    saved = {
+        "positions": np.arange(12, dtype=np.float32).reshape(6, 2),
+        "starts": np.array([0, 2, 5, 6]),
+        "evaluation": np.array(["final"] * 3),
+        "policy": np.array(["greedy"] * 3),
+        "speed": np.array(["normal"] * 3),
+        "fps": np.full(3, 12.0),
+        "frames": np.full(3, 1000),
+        "episode_seed": np.array([101, 102, 100]),
+        "outcome": np.array(["success", "collision", "out_of_bounds"]),
+    }
+    np.savez(folder / DRIVES, **saved | changes)
+
+
+def test_tracks_are_those_of_the_first_episodes(tmp_path):
+    write_drives(run_in(tmp_path, "run", "sco"))
+    first, second = tracks_of(read_run(tmp_path / "run"), 2)
+    assert (first.outcome, second.outcome) == ("out_of_bounds", "success")
+    np.testing.assert_array_equal(first.points_m, [[10, 11]])
+    np.testing.assert_array_equal(second.points_m, [[0, 1], [2, 3]])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"evaluation": np.array(["training"] * 3)},
+        {"policy": np.array(["sampled"] * 3)},
+        {"speed": np.array(["low"] * 3)},
+        {"fps": np.full(3, 6.0)},
+        {"frames": np.full(3, 500)},
+    ],
+    ids=str,
+)
+def test_only_greedy_drives_of_the_finished_agent_as_it_was_trained_are_drawn(tmp_path, changes):
+    write_drives(run_in(tmp_path, "run", "sco"), **changes)
+    assert tracks_of(read_run(tmp_path / "run"), 2) == []
+
+
+@pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04 damaged"])
+def test_a_run_without_drives_or_films_is_a_line(tmp_path, content):
+    run_in(tmp_path, "run", "sco")
+    if content is not None:
+        (tmp_path / "run" / DRIVES).write_bytes(content)
+    drives = drives_of([read_run(tmp_path / "run")], trajectories=2, videos=1)
+    assert (drives.plans, drives.films) == ({}, {})
+    assert ["plan" in line for line in drives.warnings] == [True, False]
+
+
+def test_a_plan_and_films_of_one_agent_of_each_stack(tmp_path):
+    scene = yaml.safe_load((CONF_DIR / "scene" / "straight_road.yaml").read_text())
+    for seed in (1, 0):
+        config = config_of(seed=seed) | {"scene": scene}
+        folder = write_run(tmp_path / f"run{seed}", config, rows_of(config, "sco"))
+        write_drives(folder)
+        (folder / "videos").mkdir()
+        for name in ("a", "b"):
+            (folder / "videos" / f"{name}.mp4").write_bytes(b"film")
+    runs, _ = read_runs([tmp_path])
+    drives = drives_of(runs, trajectories=3, videos=1)
+    ((place, (plan,)),) = drives.plans.items()
+    assert (place, plan.title) == ("Straight Road", "ego+obj, seed 0 (run0)")
+    assert plan.caption == "3 drives: 1 out of bounds, 1 success, 1 collision"
+    assert plan.data.startswith("data:image/png;base64,")
+    ((episode, (film,)),) = drives.films.items()
+    assert (episode, film.data) == ("Straight Road, A", "data:video/mp4;base64,ZmlsbQ==")
+    assert drives.warnings == []

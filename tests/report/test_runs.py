@@ -6,8 +6,7 @@ pytest.importorskip("scipy", reason="reports are an extra")
 
 from flowrep.report.runs import groups_of
 from flowrep.report.storage import read_run, read_runs
-from tests.report.folders import config_of, rows_of, write_run
-from tests.report.test_storage import run_in
+from tests.report.folders import config_of, rows_of, run_in, write_run
 
 
 def labels(folder):
@@ -49,7 +48,6 @@ def test_runs_of_one_config_are_one_group_over_scenes_stacks_and_seeds(tmp_path)
     [
         ("algorithm__tau", 0.005, "algorithm.tau"),
         ("total_frames", 2000, "total_frames"),
-        ("flow__source", "estimated", "flow.source"),
         ("scene__camera__width_px", 84, "scene.camera.width_px"),
         ("scene__time_limit_steps", 90, "scene.straight_road.time_limit_steps"),
         ("representations__obj__scale", 2.5, "representations.obj.scale"),
@@ -76,7 +74,6 @@ def test_a_whole_number_is_the_same_with_and_without_a_point(tmp_path):
     ("key", "value", "label"),
     [
         ("scene__obstacles", ["car"], "scene.straight_road.obstacles"),
-        ("algorithm__beta", 2, "algorithm.beta"),
         ("scene__camera__roll_deg", 3, "scene.camera.roll_deg"),
     ],
 )

@@ -1,6 +1,7 @@
 """Sections of runs whose every number is worked by hand."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from flowrep.report.sections import Settings, assemble
 from flowrep.report.statistics import Bootstrap
 from flowrep.report.storage import read_runs
 from flowrep.report.tables import Table
-from tests.report.folders import config_of, rows_of, write_run
+from tests.report.folders import config_of, rows_of, run_in, write_run
 
 ASK = Settings("greedy", Bootstrap(100))
 NORMAL = Condition("greedy", "normal", 12.0)
@@ -25,12 +26,7 @@ def sections_of(folder):
     return found, report
 
 
-def run_in(folder, name, outcomes, *, stack="ego+obj", scene="s_turn", seed=0, **changes):
-    """A run whose episodes end as the letters say, by speed or at normal speed."""
-    config = config_of(scene, stack, seed, **changes)
-    of = outcomes if isinstance(outcomes, dict) else {"normal": outcomes}
-    rows = [row for speed, ends in of.items() for row in rows_of(config, ends, speed=speed)]
-    return write_run(folder / name, config, rows)
+run_in = partial(run_in, scene="s_turn")
 
 
 def rows_in(table):

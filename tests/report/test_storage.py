@@ -19,12 +19,7 @@ from flowrep.report.storage import (
     without_repeats,
     write_archive,
 )
-from tests.report.folders import config_of, letters, rows_of, write_run
-
-
-def run_in(folder, name, successes=4, *, scene="straight_road", stack="ego+obj", seed=0, **changes):
-    config = config_of(scene, stack, seed, **changes)
-    return write_run(folder / name, config, rows_of(config, letters(successes)))
+from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
 
 def names(runs):
@@ -60,7 +55,7 @@ def test_a_folder_of_runs_may_lie_anywhere(tmp_path, name):
         ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
-        ("metrics.csv", "frames,success\n9,high\n", "'high'"),
+        ("evaluation.csv", "frames,fps\n9,often\n", "'often'"),
     ],
 )
 def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, text, expected):
@@ -73,21 +68,10 @@ def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, te
     assert "\n" not in warning
 
 
-@pytest.mark.parametrize(("column", "value"), [("fps", "often"), ("length", "")])
-def test_a_cell_that_no_episode_can_have_is_one_line(tmp_path, column, value):
-    run_in(tmp_path, "good")
-    config = config_of(seed=1)
-    first, *rows = rows_of(config, "ssss")
-    write_run(tmp_path / "bad", config, [*rows, first | {column: value}])
-    runs, (warning,) = read_runs([tmp_path])
-    assert names(runs) == ["good"]
-    assert "/bad" in warning
-
-
-@pytest.mark.parametrize(("name", "said"), [("none", "does not exist"), ("empty", "holds no run")])
-def test_a_folder_without_runs_is_named(tmp_path, name, said):
+@pytest.mark.parametrize("name", ["none", "empty"])
+def test_a_folder_without_runs_is_named(tmp_path, name):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(RunFolderError, match=f"{name}' {said}"):
+    with pytest.raises(RunFolderError, match=name):
         read_runs([tmp_path / name])
 
 
@@ -101,14 +85,6 @@ def test_a_run_that_is_there_twice_counts_as_one_seed(tmp_path):
     assert "first is the same run as" in warning
 
 
-def same(first, second):
-    assert first.config == second.config
-    for ours, theirs in ((first.episodes, second.episodes), (first.metrics, second.metrics)):
-        assert ours.keys() == theirs.keys()
-        for name, column in ours.items():
-            np.testing.assert_array_equal(column, theirs[name])
-
-
 def test_packed_runs_are_the_runs_of_the_folders(tmp_path):
     config = config_of("s_turn", "raw")
     metrics = [{"frames": 123456, "success": ""}, {"frames": 200000, "success": 0.25}]
@@ -118,8 +94,10 @@ def test_packed_runs_are_the_runs_of_the_folders(tmp_path):
     write_archive(folders, tmp_path / "packed")
     packed, warnings = read_runs([tmp_path / "packed"])
     assert ([run.name for run in packed], warnings) == (["a", "b"], [])
-    same(folders[0], packed[0])
-    same(folders[1], packed[1])
+    for first, second in zip(folders, packed):
+        assert first.config == second.config
+        np.testing.assert_equal(first.episodes, second.episodes)
+        np.testing.assert_equal(first.metrics, second.metrics)
     assert set(packed[0].machine.values()) == {"unknown"}
 
 
