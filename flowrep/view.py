@@ -283,12 +283,8 @@ def drive_in_window(
 ) -> None:
     """Draws each step into a figure at the env's frame rate, and listens to its keys.
 
-    Args:
-        figure: of matplotlib.
-        keyboard: chooses the actions, and tells when to go on and to end.
-        env: keeps every sensor.
-        options: of the first episode; later ones have the seeds after it.
-        pause: draws, and handles key presses for some seconds.
+    `options` are of the first episode; later ones have the seeds after it. `pause` draws, and
+    handles key presses for some seconds.
     """
     axes = figure.add_axes((0, 0, 1, 0.92))
     axes.set_axis_off()

@@ -1,6 +1,5 @@
 """An exported agent gives what the agent gives, with torch alone."""
 
-import json
 import subprocess
 import sys
 
@@ -167,12 +166,5 @@ def test_a_policy_in_training_is_exported_and_left_as_it_is():
 
 
 def test_a_policy_of_another_making_is_refused_by_name():
-    with pytest.raises(ExportError, match="of which Sequential has 0; build it with acting_net"):
+    with pytest.raises(ExportError, match="Sequential"):
         acting_program(torch.nn.Sequential(torch.nn.Linear(2, 3)), SPEC)
-
-
-def test_the_card_says_what_is_read(exported):
-    _, folder = exported
-    assert [
-        each["name"] for each in json.loads((folder / "agent.json").read_text())["maps"]
-    ] == KEYS

@@ -32,7 +32,7 @@ from flowrep.report.runs import (
     pooled,
     success,
 )
-from flowrep.report.sections import STACKS
+from flowrep.report.sections import STACKS, in_stacks
 from flowrep.report.statistics import Array, Bootstrap, Effect, effect, holm, rates
 from flowrep.report.storage import read_archive
 from flowrep.report.tables import markdown, p_text, percent, points, signed
@@ -291,8 +291,7 @@ def scene_tables(declared: Mapping[str, Any], runs: Sequence[Run]) -> list[dict[
         header = ["", "low", "normal (training)", "high", "each run, normal"]
         header += [f"find all {here[0].paths} ways"] if is_fork else []
         rows = []
-        for stack in in_order([run.stack for run in here], STACKS):
-            members = [run for run in here if run.stack == stack]
+        for stack, members in in_stacks(here).items():
             each = outcomes_of(members, Condition("greedy", members[0].speed, members[0].fps))
             of_runs = [] if each is None else [f"{100 * r:.0f}" for r in rates(each.outcomes)]
             cells = [_success(members, speed) for speed in SPEEDS]
@@ -358,8 +357,7 @@ def rate_table(runs: Sequence[Run]) -> str:
     """Returns success by frame rate on the episodes driven at all of them, and what is kept."""
     frame_rates = sorted({c.fps for run in runs for c in run.conditions})
     rows = []
-    for stack in in_order([run.stack for run in runs], STACKS):
-        members = [run for run in runs if run.stack == stack]
+    for stack, members in in_stacks(runs).items():
         means = []
         for rate in frame_rates:
             weights = {int(r): float(r == rate) for r in frame_rates}
@@ -378,8 +376,7 @@ def variation_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
     rows = []
     for study, title in declared["variations"].items():
         for members in of_study(declared, study, runs).values():
-            for stack in in_order([run.stack for run in members], STACKS):
-                ours = [run for run in members if run.stack == stack]
+            for stack, ours in in_stacks(members).items():
                 cells = [_success(ours, speed) for speed in SPEEDS]
                 rows.append((title, _stack(stack), *cells, str(len(ours))))
     return markdown(("", "", "low", "normal", "high", "runs"), rows)

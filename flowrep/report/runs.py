@@ -268,8 +268,8 @@ def pooled(runs: Sequence[Run], conditions: Sequence[Condition], metric: Metric)
 
 def side_by_side(first: OutcomeMatrix, second: OutcomeMatrix) -> tuple[Array, Array]:
     """Returns the outcomes of two matrices in the episodes that every run of both drove."""
-    every = [m.episodes[~np.isnan(m.outcomes).any(axis=0)] for m in (first, second)]
-    shared = np.intersect1d(*every)
+    ours, theirs = (m.episodes[~np.isnan(m.outcomes).any(axis=0)] for m in (first, second))
+    shared = np.intersect1d(ours, theirs)
     return first.on(shared), second.on(shared)
 
 

@@ -234,6 +234,11 @@ def _group_sections(group: Group, settings: Settings) -> list[Section]:
     return [*sections, *_curves(group.runs)]
 
 
+def in_stacks(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Returns the runs of each of their stacks, in the order of the paper's figures."""
+    return by_stack(runs, in_order([run.stack for run in runs], STACKS))
+
+
 def _speeds(runs: Sequence[Run], policy: str) -> list[str]:
     """Returns the speed modes in which runs were evaluated at their frame rate."""
     asked = (policy, runs[0].fps)
@@ -258,7 +263,7 @@ def success_section(
 
     Args:
         name: the section's name.
-        title: the section's heading.
+        title: its heading.
         series: the runs of each series.
         pairs: series whose differences are listed; None for all, up to 15.
         settings: policy and intervals.
@@ -340,8 +345,8 @@ def _difference_table(
             cells = ("", "no shared episodes", "", "", "")
             if c is not None:
                 better = percent(c.improvement)
-                told = (points(c.difference), c.verdict(p), better)
-                cells = (*told, p_text(c.p_value), p_text(p))
+                ps = p_text(c.p_value), p_text(p)
+                cells = (points(c.difference), c.verdict(p), better, *ps)
             rows.append((pair, speed, *cells, str(shared)))
         if rows:
             blocks.append((heading, tuple(rows)))
@@ -456,7 +461,7 @@ def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
     policy, speed, trained = settings.policy, runs[0].speed, runs[0].fps
     ours = [run for run in runs if len(_rates([run], policy)) > 1]
     conditions = [Condition(policy, speed, rate) for rate in _rates(ours, policy)]
-    series = by_stack(ours, in_order([run.stack for run in ours], STACKS))
+    series = in_stacks(ours)
     grids = [grid_of(scene, series, conditions, settings.bootstrap) for scene in scenes_of(ours)]
     caption = (
         f"Success over the frame rate of the evaluation, trained at {trained:g} frames per second, "
@@ -490,8 +495,7 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
     panels = []
     for scene in scenes_of(runs):
         here = [run for run in runs if run.scene == scene]
-        stacks = by_stack(here, in_order([run.stack for run in here], STACKS))
-        curves = {name: [curve_of(run) for run in members] for name, members in stacks.items()}
+        curves = {stack: [curve_of(run) for run in of] for stack, of in in_stacks(here).items()}
         if any(curve.evaluated or curve.training for of in curves.values() for curve in of):
             panels.append((scene, curves))
     if not panels:

@@ -21,7 +21,7 @@ from flowrep.report.page import DRIVES, Drives, Picture, drives_of, render_page,
 from flowrep.report.runs import Condition, grid_of
 from flowrep.report.sections import COMPLEMENTARY, Report
 from flowrep.report.statistics import Bootstrap
-from flowrep.report.storage import read_run, read_runs, write_archive
+from flowrep.report.storage import read_run, read_runs
 from flowrep.report.tables import Table
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
@@ -88,18 +88,6 @@ def test_names_are_drawn_as_they_are_and_nothing_is_written_elsewhere(tmp_path):
     assert "[/red]" in text
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "runs"]
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["x"]
-
-
-@pytest.mark.slow
-def test_packed_runs_have_the_same_tables(sweep, page, tmp_path):
-    runs = [read_run(path.parent) for path in sorted(sweep.glob("*_*/config.yaml"))]
-    write_archive(runs, tmp_path / "packed")
-    again = report_on(tmp_path / "packed", str(tmp_path / "out"))
-    tables = sorted(page.parent.rglob("*.csv"))
-    assert len(tables) == 6
-    for table in tables:
-        other = again.parent / table.relative_to(page.parent)
-        assert other.read_text() == table.read_text()
 
 
 @pytest.mark.slow

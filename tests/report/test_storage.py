@@ -55,7 +55,6 @@ def test_a_folder_of_runs_may_lie_anywhere(tmp_path, name):
         ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
-        ("evaluation.csv", "frames,fps\n9,often\n", "'often'"),
     ],
 )
 def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, text, expected):
@@ -66,6 +65,15 @@ def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, te
     assert "/bad" in warning
     assert expected in warning
     assert "\n" not in warning
+
+
+def test_a_cell_that_no_episode_can_have_is_one_line(tmp_path):
+    config = config_of()
+    first, *rows = rows_of(config, "ssss")
+    write_run(tmp_path / "bad", config, [*rows, first | {"fps": "often"}])
+    runs, (warning,) = read_runs([tmp_path])
+    assert runs == []
+    assert "'often'" in warning
 
 
 @pytest.mark.parametrize("name", ["none", "empty"])
