@@ -20,7 +20,7 @@ from flowrep.sequences.calibration import opencv_intrinsics
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output, OutputOptions
 from flowrep.sequences.recording import check_frame
-from flowrep.sequences.zed import measured
+from flowrep.sequences.frames import measured
 from flowrep.transforms import DIS
 
 

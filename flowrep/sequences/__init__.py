@@ -16,22 +16,14 @@ from flowrep.sequences.factorization import (
     recorded_flow,
     recorded_motion,
 )
-from flowrep.sequences.files import (
-    read_flo,
-    read_kitti_flow,
-    write_flo,
-    write_kitti_flow,
-)
-from flowrep.sequences.frames import Frames
+from flowrep.sequences.files import read_flo, read_kitti_flow, write_flo, write_kitti_flow
+from flowrep.sequences.frames import Frames, Zed
 from flowrep.sequences.kitti import Kitti
 from flowrep.sequences.recording import Frame, Recording, SequenceError, Stream
+from flowrep.sequences.rendered import Sintel, TartanAir, VKitti2
 from flowrep.sequences.sevenscenes import SevenScenes
-from flowrep.sequences.sintel import Sintel
-from flowrep.sequences.tartanair import TartanAir
 from flowrep.sequences.tum import Tum
 from flowrep.sequences.video import StillVideo
-from flowrep.sequences.vkitti2 import VKitti2
-from flowrep.sequences.zed import Zed
 
 __all__ = [
     "RECORDINGS",
@@ -67,14 +59,9 @@ __all__ = [
     "write_kitti_flow",
 ]
 
+# By the names of conf/format/.
 RECORDINGS: dict[str, type[Recording]] = {
-    "frames": Frames,
-    "kitti": Kitti,
-    "sevenscenes": SevenScenes,
-    "sintel": Sintel,
-    "tartanair": TartanAir,
-    "tum": Tum,
-    "vkitti2": VKitti2,
-    "zed": Zed,
+    reader.__name__.lower(): reader
+    for reader in (Frames, Kitti, SevenScenes, Sintel, TartanAir, Tum, VKitti2, Zed)
 }
 STREAMS = {"video": StillVideo}

@@ -17,11 +17,6 @@ from flowrep.geometry import check_intrinsics, check_rigid
 
 Pose = NDArray[np.float64]  # world_from_cam [4, 4]
 
-PLAY_BACKWARDS = (
-    "its flow leads to the next frame: format.backwards=true plays it from the last frame to the "
-    "first, where that is the previous one"
-)
-
 
 class SequenceError(Exception):
     """A recording that can't be read, in one line that names the file and the cause."""

@@ -1,0 +1,226 @@
+"""Rendered data sets, exact in depth, poses and flow: MPI Sintel, TartanAir, Virtual KITTI 2."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrep.sequences.calibration import (
+    as_pose,
+    check_count,
+    intrinsics,
+    opencv_intrinsics,
+    read_pose_lines,
+)
+from flowrep.sequences.files import (
+    FLO_TAG,
+    Flow,
+    depth_from_integers,
+    list_files,
+    read_bytes,
+    read_flo,
+    read_npy,
+    read_png,
+    read_rgb,
+    read_table,
+    read_tagged_floats,
+)
+from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
+
+PLAY_BACKWARDS = (
+    "its flow leads to the next frame: format.backwards=true plays it from the last frame to the "
+    "first, where that is the previous one"
+)
+
+
+class Sintel(Recording):
+    """One scene of MPI Sintel's `training` folder, with depth and camera data unpacked into it.
+
+    Its flow leads from each frame to the next, on the frame's own grid. Read from the last frame
+    to the first (`backwards`), the next frame comes before, and flow is exact; forwards it would
+    be on the wrong grid and is not used.
+
+    Args:
+        folder: `training`, with `final/`, `depth/`, `camdata_left/` and `flow/`.
+        scene: e.g. `alley_1`.
+        render: the pass of the pictures, `"final"` or `"clean"`.
+        backwards: whether time runs backwards.
+    """
+
+    def __init__(
+        self, folder: str | Path, *, scene: str, render: str = "final", backwards: bool = False
+    ) -> None:
+        self.folder, self.scene = Path(folder), scene
+        pictures = list_files(self.folder / render / scene, (".png",), "frame_")
+        self._pictures = pictures[::-1] if backwards else pictures
+        self.count = len(pictures)
+        flow = self.folder / "flow" / scene
+        self.has_flow = backwards and flow.is_dir()
+        self.no_flow = f"no such folder: {flow}" if backwards else PLAY_BACKWARDS
+
+    def _read(self, index: int) -> Frame:
+        picture = self._pictures[index]
+        K, pose = _read_cam(self._file("camdata_left", picture, ".cam"))
+        raw = since = None
+        if self.has_flow and index > 0:
+            number = picture.stem.removeprefix("frame_")
+            if not number.isdecimal():
+                raise SequenceError(picture, "is not named frame_<number>")
+            since = f"frame_{int(number) + 1:0{len(number)}d}"
+            raw = -read_flo(self._file("flow", picture, ".flo"))
+            invalid = self._file("invalid", picture, ".png")
+            if invalid.is_file():
+                _mask(raw, read_png(invalid, np.uint8), invalid)
+        return Frame(
+            name=picture.stem,
+            source=picture,
+            world_from_cam=pose,
+            K=K,
+            depth=read_tagged_floats(self._file("depth", picture, ".dpt"), channels=1)[..., 0],
+            rgb=read_rgb(picture),
+            raw=raw,
+            raw_since=since,
+        )
+
+    def _file(self, kind: str, picture: Path, suffix: str) -> Path:
+        return self.folder / kind / self.scene / f"{picture.stem}{suffix}"
+
+
+def _read_cam(path: Path) -> tuple[NDArray[np.float64], Pose]:
+    """Returns K in flowrep's convention and `world_from_cam` of a .cam file."""
+    data = read_bytes(path)
+    if len(data) != 4 + 8 * (9 + 12) or struct.unpack_from("<f", data)[0] != FLO_TAG:
+        raise SequenceError(path, f"is no .cam file: {FLO_TAG}, 9 and 12 doubles")
+    K = np.frombuffer(data, "<f8", 9, offset=4).reshape(3, 3).copy()
+    K[:2, 2] += 0.5
+    extrinsics = np.frombuffer(data, "<f8", 12, offset=4 + 8 * 9)
+    return K, as_pose(extrinsics, path, direction="world_to_camera")
+
+
+class TartanAir(Recording):
+    """A trajectory's folder of TartanAir (version 1), e.g. `abandonedfactory/Easy/P000`.
+
+    Its flow leads from each frame to the next and contains only the camera's motion, even where
+    objects moved. As in `Sintel`, it is used `backwards` alone.
+
+    Args:
+        folder: the folder of `image_left/`, `depth_left/`, `pose_left.txt` and, for flow, `flow/`.
+        backwards: whether time runs backwards.
+    """
+
+    def __init__(self, folder: str | Path, *, backwards: bool = False) -> None:
+        self.folder, order = Path(folder), slice(None, None, -1 if backwards else 1)
+        self._pictures = list_files(self.folder / "image_left", (".png",))[order]
+        self.count = len(self._pictures)
+        self._poses_path = self.folder / "pose_left.txt"
+        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw")[order]
+        check_count(self._poses_path, len(self._poses), len(self), "poses")
+        flow = self.folder / "flow"
+        self.has_flow = backwards and flow.is_dir()
+        self.no_flow = f"no such folder: {flow}" if backwards else PLAY_BACKWARDS
+
+    def _read(self, index: int) -> Frame:
+        number, raw, since = self._number(index), None, None
+        depth = read_npy(self.folder / "depth_left" / f"{number}_left_depth.npy")
+        height, width = depth.shape
+        if self.has_flow and index > 0:
+            since = self._number(index - 1)
+            flow = self.folder / "flow" / f"{number}_{since}_flow.npy"
+            raw = -read_npy(flow, channels=2).transpose(2, 0, 1)
+            hidden = flow.with_name(f"{number}_{since}_mask.npy")
+            if hidden.is_file():
+                _mask(raw, read_npy(hidden, kind="u"), hidden)
+        return Frame(
+            name=number,
+            source=self._pictures[index],
+            world_from_cam=as_pose(
+                self._poses[index], self._poses_path, layout="xyz_xyzw", axes="ned"
+            ),
+            # 90 degrees of horizontal view, a centred axis: 320, 320, 320, 240 at 640 x 480.
+            K=intrinsics(width / 2, width / 2, width / 2, height / 2),
+            depth=depth,
+            rgb=read_rgb(self._pictures[index]),
+            raw=raw,
+            raw_since=since,
+        )
+
+    def _number(self, index: int) -> str:
+        return self._pictures[index].stem.removesuffix("_left")
+
+
+class VKitti2(Recording):
+    """The folder of one variation of one scene of Virtual KITTI 2, e.g. `Scene01/clone`.
+
+    Its `backwardFlow` leads from each frame to the previous one, on the frame's own grid; raw flow
+    is its negative.
+
+    Args:
+        folder: the folder of `extrinsic.txt`, `intrinsic.txt` and `frames/`.
+        camera: 0 for the left camera, 1 for the right one.
+    """
+
+    def __init__(self, folder: str | Path, *, camera: int = 0) -> None:
+        self.folder, self.camera = Path(folder), camera
+        self._poses_path = self.folder / "extrinsic.txt"
+        self._poses = self._of_camera(self._poses_path, 18)
+        self._intrinsics = self._of_camera(self.folder / "intrinsic.txt", 6)
+        self._pictures = list_files(self._maps("rgb"), (".jpg", ".png"))
+        self.count = len(self._pictures)
+        self.has_flow = self._maps("backwardFlow").is_dir()
+        self.no_flow = f"no such folder: {self._maps('backwardFlow')}"
+
+    def _read(self, index: int) -> Frame:
+        picture = self._pictures[index]
+        found = re.fullmatch(r"rgb_(\d+)", picture.stem)
+        if not found:
+            raise SequenceError(picture, "is not named rgb_<number>")
+        name, number = found[1], int(found[1])
+        if number not in self._poses or number not in self._intrinsics:
+            raise SequenceError(self._poses_path, f"has no pose or intrinsics of frame {number}")
+        depth = read_png(self._maps("depth") / f"depth_{name}.png", np.uint16)
+        flow = self._maps("backwardFlow") / f"backwardFlow_{name}.png"
+        has_flow = self.has_flow and index > 0
+        return Frame(
+            name=name,
+            source=picture,
+            world_from_cam=as_pose(
+                self._poses[number], self._poses_path, direction="world_to_camera"
+            ),
+            K=opencv_intrinsics(self._intrinsics[number].tolist()),
+            depth=depth_from_integers(depth, 0.01, no_surface=65535),
+            rgb=read_rgb(picture),
+            raw=-_read_vkitti_flow(flow) if has_flow else None,
+            raw_since=f"{number - 1:0{len(name)}d}" if has_flow else None,
+        )
+
+    def _maps(self, kind: str) -> Path:
+        return self.folder / "frames" / kind / f"Camera_{self.camera}"
+
+    def _of_camera(self, path: Path, columns: int) -> dict[int, NDArray[np.float64]]:
+        table = read_table(path, [columns], header=True)
+        rows = table[table[:, 1] == self.camera]
+        if not len(rows):
+            raise SequenceError(path, f"says nothing of camera {self.camera}")
+        return {int(row[0]): row[2:] for row in rows}
+
+
+def _read_vkitti_flow(path: Path) -> Flow:
+    """Returns flow `[2, H, W]`, 2 I / 65535 - 1 of the picture's size; nan where blue is 0."""
+    red, green, blue = read_png(path, np.uint16, 3).transpose(2, 0, 1)
+    height, width = red.shape
+    share = np.stack([red, green]).astype(np.float32) * np.float32(2 / 65535) - 1
+    flow = share * np.array([width - 1, height - 1], np.float32)[:, None, None]
+    flow[:, blue == 0] = np.nan
+    return flow
+
+
+def _mask(flow: Flow, mask: NDArray[Any], path: Path) -> None:
+    """Marks flow as unknown where the data set's mask is not 0."""
+    if mask.shape != flow.shape[1:]:
+        raise SequenceError(path, "differs in size from its flow")
+    flow[:, mask != 0] = np.nan
