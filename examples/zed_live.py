@@ -17,10 +17,10 @@ import numpy as np
 
 from flowrep.sequences import EstimatedFlowSource, Frame, SequenceError, recorded_motion
 from flowrep.sequences.calibration import opencv_intrinsics
+from flowrep.sequences.frames import measured
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output, OutputOptions
 from flowrep.sequences.recording import check_frame
-from flowrep.sequences.frames import measured
 from flowrep.transforms import DIS
 
 

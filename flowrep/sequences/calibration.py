@@ -81,11 +81,7 @@ class Cameras(Camera):
 
 
 def read_cameras(path: Path) -> Cameras:
-    """Returns the content of a folder's `intrinsics.json`, see docs/factorize.md.
-
-    Raises:
-        SequenceError: a key is missing, or its value is invalid.
-    """
+    """Returns the content of a folder's `intrinsics.json`, see docs/factorize.md."""
     remedy = (
         'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
         '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5}'
@@ -100,9 +96,9 @@ def read_cameras(path: Path) -> Cameras:
         raise SequenceError(path, f"{', '.join(lines)}; {remedy}") from None
 
 
-def intrinsics(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> NDArray:
-    """Returns K `[3, 3]`, float64."""
-    return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    """Returns K `[3, 3]`."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def opencv_intrinsics(numbers: Sequence[float]) -> NDArray[np.float64]:
@@ -117,10 +113,10 @@ def opencv_intrinsics(numbers: Sequence[float]) -> NDArray[np.float64]:
 
 def four_intrinsics(name: str, numbers: Sequence[float]) -> tuple[float, float, float, float]:
     """Returns fx, fy, cx, cy of an option; the error for anything else names the option."""
-    values = [float(number) for number in numbers]
-    if len(values) != 4 or not np.isfinite(values).all() or min(values[:2]) <= 0:
+    if len(numbers) != 4 or not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:
         raise SequenceError(name, f"should be [fx, fy, cx, cy] in pixels, not {list(numbers)}")
-    return values[0], values[1], values[2], values[3]
+    fx, fy, cx, cy = numbers
+    return fx, fy, cx, cy
 
 
 def as_pose(
@@ -131,15 +127,11 @@ def as_pose(
     direction: PoseDirection = "camera_to_world",
     axes: CameraAxes = "opencv",
 ) -> Pose:
-    """Returns `world_from_cam` from the 7, 12 or 16 numbers of one pose.
-
-    Raises:
-        SequenceError: the pose has nan, an invalid quaternion, or a matrix that is not rigid.
-    """
+    """Returns `world_from_cam` from the 7, 12 or 16 numbers of one pose."""
     values = torch.from_numpy(np.array(numbers, dtype=np.float64).reshape(-1))
     if layout == "matrix":
         last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-        values = (torch.cat([values, last_row]) if len(values) == 12 else values).reshape(4, 4)
+        values = torch.cat([values, last_row])[:16].reshape(4, 4)
     try:
         pose = adapt_pose(values, layout=layout, direction=direction, axes=axes)
     except ValueError as error:
@@ -148,11 +140,7 @@ def as_pose(
 
 
 def read_pose_lines(path: Path, layout: PoseLayout) -> NDArray[np.float64]:
-    """Returns the numbers of one pose per line, `[N, 7]`, `[N, 12]` or `[N, 16]`.
-
-    Raises:
-        SequenceError: a line has another number of columns.
-    """
+    """Returns the numbers of one pose per line, `[N, 7]`, `[N, 12]` or `[N, 16]`."""
     if layout == "matrix":
         quaternions = "a position and a quaternion are format.pose_layout=xyz_xyzw (or xyz_wxyz)"
         return read_table(path, [12, 16], remedies={7: quaternions})
@@ -208,13 +196,16 @@ class Registration:
         colour_from_depth: NDArray[np.float64],
         size: tuple[int, int],
     ) -> None:
-        self.K_colour, self.size = K_colour, size
+        self.size = size
         self.depth_from_colour = np.linalg.inv(colour_from_depth)
-        self._depth_focal = float(min(K_depth[0, 0], K_depth[1, 1]))
+        # The largest focal length of the colour camera over the smallest of the depth camera.
+        self._finer = np.float32(
+            max(K_colour[0, 0], K_colour[1, 1]) / min(K_depth[0, 0], K_depth[1, 1])
+        )
         # p_colour ~ z (to_colour @ pixel) + shift, so only one product per pixel is left to do.
         self._to_colour = K_colour @ colour_from_depth[:3, :3] @ np.linalg.inv(K_depth)
-        self._shift = K_colour @ colour_from_depth[:3, 3]
-        self._rays: NDArray[np.float32] | None = None  # [3, H, W] of the last size seen
+        self._shift = (K_colour @ colour_from_depth[:3, 3]).astype(np.float32)
+        self._rays = np.empty((3, 0, 0), np.float32)  # to_colour @ pixel, of the last size seen
 
     def __call__(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns the colour camera's depth, `[height, width]`, metres, nan where missing.
@@ -222,49 +213,26 @@ class Registration:
         Args:
             depth: `[H, W]` of the depth camera, metres; nan and inf are no surface.
         """
-        rays = self._rays_of(depth.shape)
-        surface = np.isfinite(depth) & (depth > 0)
-        x, y, z = (ray * depth + shift for ray, shift in zip(rays, self._shift.astype(np.float32)))
-        surface &= z > 0
-        u, v, z_colour, z_depth = x[surface], y[surface], z[surface], depth[surface]
-        u, v = u / z_colour, v / z_colour
-        footprint = (z_depth / z_colour) * np.float32(self._colour_focal / self._depth_focal)
-        return self._nearest(u, v, z_colour, np.maximum(footprint, 1.0))
-
-    def _nearest(
-        self,
-        u: NDArray[np.float32],
-        v: NDArray[np.float32],
-        z: NDArray[np.float32],
-        footprint: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """Returns the depth of the nearest square around (u, v) in each pixel."""
+        if self._rays.shape[1:] != depth.shape:
+            row, column = np.indices(depth.shape) + 0.5
+            pixels = np.stack([column, row, np.ones(depth.shape)]).reshape(3, -1)
+            self._rays = (self._to_colour @ pixels).reshape(3, *depth.shape).astype(np.float32)
+        x, y, z = (ray * depth + shift for ray, shift in zip(self._rays, self._shift))
+        surface = np.isfinite(depth) & (depth > 0) & (z > 0)
+        u, v, z, z_depth = x[surface], y[surface], z[surface], depth[surface]
+        u, v = u / z, v / z
+        side = np.maximum((z_depth / z) * self._finer, 1.0)
+        # The nearest square around (u, v) covers the pixels whose centres lie in
+        # [u - side / 2, u + side / 2).
         height, width = self.size
         seen = np.full(height * width + 1, np.inf, dtype=np.float32)  # the last: outside
-        # The pixels whose centres lie in [u - side / 2, u + side / 2).
-        first_u = np.ceil(u - (footprint + 1) / 2).astype(np.int64)
-        first_v = np.ceil(v - (footprint + 1) / 2).astype(np.int64)
-        widest = float(footprint.max()) if len(footprint) else 0.0
-        reach = min(math.ceil(widest), _LARGEST_FOOTPRINT_PX)
-        for right in range(reach):
-            for down in range(reach):
-                column, row = first_u + right, first_v + down
-                inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-                if right or down:
-                    inside &= column + 0.5 < u + footprint / 2
-                    inside &= row + 0.5 < v + footprint / 2
-                place = np.where(inside, row * width + column, height * width)
-                np.minimum.at(seen, place, z)
+        first_u, first_v = (np.ceil(a - (side + 1) / 2).astype(np.int64) for a in (u, v))
+        reach = min(math.ceil(side.max(initial=0.0)), _LARGEST_FOOTPRINT_PX)
+        for right, down in np.ndindex(reach, reach):
+            column, row = first_u + right, first_v + down
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            if right or down:
+                inside &= (column + 0.5 < u + side / 2) & (row + 0.5 < v + side / 2)
+            np.minimum.at(seen, np.where(inside, row * width + column, height * width), z)
         seen[np.isinf(seen)] = np.nan
         return seen[:-1].reshape(height, width)
-
-    def _rays_of(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        if self._rays is None or self._rays.shape[1:] != shape:
-            row, column = np.indices(shape) + 0.5
-            pixels = np.stack([column, row, np.ones(shape)]).reshape(3, -1)
-            self._rays = (self._to_colour @ pixels).reshape(3, *shape).astype(np.float32)
-        return self._rays
-
-    @property
-    def _colour_focal(self) -> float:
-        return float(max(self.K_colour[0, 0], self.K_colour[1, 1]))

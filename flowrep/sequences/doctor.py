@@ -12,7 +12,7 @@ told of the poses.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, get_args
 
@@ -57,15 +57,7 @@ _ASSUMED = {
 
 @dataclass(frozen=True)
 class Mistake:
-    """What the data may be instead, and how to compute with that.
-
-    Attributes:
-        says: completes "if ...".
-        poses: returns the correct poses of a pair from the given ones, or None.
-        depth: returns the correct depth from depth and K, or None.
-        flow: returns the correct raw flow from the given flow, or None.
-        K: returns the correct K from the given one, or None.
-    """
+    """What the data may be instead, completing "if ...", and what makes correct data of them."""
 
     says: str
     poses: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
@@ -75,41 +67,36 @@ class Mistake:
 
 
 def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict[str, Mistake]:
-    """Returns the usual mistakes by what would correct them: options, or a few words.
-
-    Args:
-        given: the options in force, as in `Recording.conventions`.
-        flow_is_recorded: whether raw flow is the recording's, so that its options may be wrong.
-    """
+    """Returns the usual mistakes by what would correct them, see `Doctor` for the arguments."""
     given = {**_ASSUMED, **given}
     found: dict[str, Mistake] = {}
 
-    def suppose(says: Mapping[str, str], options: Mapping[str, str], **corrections: Any) -> None:
-        changed = {key: value for key, value in options.items() if value != given[key]}
+    def suppose(options: Mapping[str, tuple[str, str]], **corrections: Any) -> None:
+        """Adds what changes of the options, each a value and what it says, would correct."""
+        changed = {key: it for key, it in options.items() if it[0] != given[key]}
         if changed:
-            name = " ".join(f"{key}={value}" for key, value in changed.items())
-            found[name] = Mistake(" and ".join(says[key] for key in changed), **corrections)
+            name = " ".join(f"{key}={value}" for key, (value, _) in changed.items())
+            found[name] = Mistake(" and ".join(says for _, says in changed.values()), **corrections)
 
     for direction in get_args(PoseDirection):
         for axes in get_args(CameraAxes):
-            options = {"pose_direction": direction, "pose_axes": axes}
-            says = {
-                "pose_direction": f"the poses are {direction.replace('_', '-')}",
-                "pose_axes": f"the camera's axes are {axes}",
+            options = {
+                "pose_direction": (direction, f"the poses are {direction.replace('_', '-')}"),
+                "pose_axes": (axes, f"the camera's axes are {axes}"),
             }
-            suppose(says, options, poses=_each(_readapted(given, direction, axes)))
+            suppose(options, poses=_each(_readapted(given, direction, axes)))
     if given["depth_kind"] != "z_buffer":
-        says = {"depth_kind": "depth is the length of the ray, not z"}
-        suppose(says, {"depth_kind": "ray_length"}, depth=z_from_ray_length)
-        says = {"depth_kind": "depth is z, not the length of the ray"}
-        suppose(says, {"depth_kind": "z"}, depth=_ray_from_z)
+        says = "depth is the length of the ray, not z"
+        suppose({"depth_kind": ("ray_length", says)}, depth=z_from_ray_length)
+        says = "depth is z, not the length of the ray"
+        suppose({"depth_kind": ("z", says)}, depth=_ray_from_z)
     if flow_is_recorded:
         for direction, points in (("backward", "back to"), ("forward", "away from")):
-            says = {"flow_direction": f"the flow points {points} the previous frame"}
-            suppose(says, {"flow_direction": direction}, flow=lambda raw: -raw)
+            says = f"the flow points {points} the previous frame"
+            suppose({"flow_direction": (direction, says)}, flow=lambda raw: -raw)
         for channels in ("row_column", "uv"):
-            says = {"flow_channels": f"the flow's channels are {channels}"}
-            suppose(says, {"flow_channels": channels}, flow=lambda raw: raw.flip(0))
+            says = f"the flow's channels are {channels}"
+            suppose({"flow_channels": (channels, says)}, flow=lambda raw: raw.flip(0))
     else:
         found["frames in reverse order"] = Mistake(
             "the poses are in the reverse order of the pictures", lambda prev, curr: (curr, prev)
@@ -120,7 +107,7 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
     for factor, size in ((2.0, "twice"), (0.5, "half")):
         found[f"intrinsics times {factor:g}"] = Mistake(
             f"the pictures are {size} as large as those that the intrinsics belong to",
-            K=_scaled(factor),
+            K=lambda K, s=factor: K * torch.tensor([[s], [s], [1.0]], dtype=K.dtype),
         )
     return found
 
@@ -151,10 +138,6 @@ def _transposed(pose: Tensor) -> Tensor:
 def _ray_from_z(depth: Tensor, K: Tensor) -> Tensor:
     ray = depth.square() / z_from_ray_length(depth, K)
     return torch.where(depth.isinf(), depth, ray)  # the sky stays at infinity
-
-
-def _scaled(factor: float) -> Callable[[Tensor], Tensor]:
-    return lambda K: K * torch.tensor([[factor], [factor], [1.0]], dtype=K.dtype)
 
 
 def _times(*factors: float) -> Callable[[Tensor, Tensor], Tensor]:
@@ -276,17 +259,19 @@ class Doctor:
                 correction = f"depth_unit_m={best * float(self.conventions['depth_unit_m']):g}"
             says = f"depth in metres is {best:g} times as large"
             rivals[correction] = Mistake(says, depth=_times(best))
-        estimated = [
-            _residual_px(p, motion=p.estimated) for p in self._pairs if p.estimated is not None
-        ]
+        kept = self._pairs
         found = Diagnosis(
             pairs=self.pairs,
-            raw_px=_mean([_median_px(pair.raw, pair) for pair in self._pairs]),
-            residual_px=_mean([_residual_px(pair) for pair in self._pairs]),
-            estimated_px=_mean(estimated),
+            raw_px=_mean(_median_px(pair.raw, pair) for pair in kept),
+            residual_px=_mean(_residual_px(pair) for pair in kept),
+            estimated_px=_mean(
+                _residual_px(pair, motion=pair.estimated)
+                for pair in kept
+                if pair.estimated is not None
+            ),
             depth_factors=(least, most),
             rivals_px={
-                name: _mean([_residual_px(pair, mistake) for pair in self._pairs])
+                name: _mean(_residual_px(pair, mistake) for pair in kept)
                 for name, mistake in rivals.items()
             },
         )
@@ -298,9 +283,8 @@ class Doctor:
 
         def left_px(powers: NDArray[np.float64]) -> NDArray[np.float64]:
             factors = Mistake("", depth=_times(*(10**powers).tolist()))
-            return (
-                torch.stack([_residual_px(pair, factors) for pair in self._pairs]).mean(0).numpy()
-            )
+            left = torch.stack([_residual_px(pair, factors) for pair in self._pairs])
+            return left.mean(0).numpy()
 
         coarse = left_px(_POWERS)
         finer = _POWERS[coarse.argmin()] + np.arange(-4, 5) / 40
@@ -351,8 +335,9 @@ def _median_px(flow: Tensor, pair: _Pair) -> Tensor:
     return pair.step * lengths.nan_to_num(nan=torch.inf).median(-1).values
 
 
-def _mean(values: list[Tensor]) -> float:
-    return float(np.mean([float(value) for value in values])) if values else math.nan
+def _mean(values: Iterable[Tensor]) -> float:
+    numbers = [float(value) for value in values]
+    return float(np.mean(numbers)) if numbers else math.nan
 
 
 def _sampled(raw: Tensor, depth: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
@@ -445,10 +430,8 @@ def _words(found: Diagnosis, rivals: Mapping[str, Mistake], conventions: Mapping
     if found.residual_px > _SHRINKS * found.raw_px:
         why = "no motion of the camera explains this flow: is there texture, and is most static?"
         if found.estimated_px <= _SHRINKS * found.raw_px:
-            why = (
-                f"another motion of the camera would leave {found.estimated_px:.2f} px: are poses,"
-            )
-            why += " pictures and depth of one recording and one clock?"
+            left = f"another motion of the camera would leave {found.estimated_px:.2f} px"
+            why = f"{left}: are poses, pictures and depth of one recording and one clock?"
         return f"can't tell whether the conventions are right: {medians}; {why}"
     least, most = found.depth_factors
     unit = "; the unit of depth can't be told, for the camera hardly moves from its place"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -69,10 +69,8 @@ class FactorizedFrame:
     motion: Motion
 
 
-# From the previous and the current frame to raw flow on the current grid, nan where unknown.
-FlowSource = Callable[[Frame, Frame], Flow]
-# From the two frames and that flow to the camera's motion.
-MotionSource = Callable[[Frame, Frame, Flow], Motion]
+FlowSource = Callable[[Frame, Frame], Flow]  # from t' and t to raw flow, nan where unknown
+MotionSource = Callable[[Frame, Frame, Flow], Motion]  # from these and raw flow
 
 
 def recorded_flow(previous: Frame, current: Frame) -> Flow:
@@ -117,13 +115,9 @@ class EstimatedFlowSource:
         if np.array_equal(previous.rgb, current.rgb):
             unknown = repeats(previous, current)
             return np.full((2, *current.size), np.nan if unknown else 0.0, dtype=np.float32)
-        ways = [(current.rgb, previous.rgb), (previous.rgb, current.rgb)]
-        ways = ways if self.check_consistency else ways[:1]
-        first, second = (
-            torch.stack([torch.from_numpy(way[side]) for way in ways]).permute(0, 3, 1, 2)
-            for side in (0, 1)
-        )
-        back, *forth = self.estimator(first, second).float().cpu().numpy()
+        both = torch.from_numpy(np.stack([current.rgb, previous.rgb])).permute(0, 3, 1, 2)
+        ways = 2 if self.check_consistency else 1
+        back, *forth = self.estimator(both[:ways], both.flip(0)[:ways]).float().cpu().numpy()
         raw = -back
         if forth:
             raw[:, ~consistent(back, forth[0])] = np.nan
@@ -141,12 +135,8 @@ def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
     row, column = np.indices((height, width), dtype=np.float32)
     x, y = column + back[0], row + back[1]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    found = np.stack(
-        [
-            cv2.remap(plane, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for plane in forth
-        ]
-    )
+    options: Any = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
+    found = np.stack([cv2.remap(plane, x, y, **options) for plane in forth])
     missed = np.square(found + back).sum(0)
     length = np.square(found).sum(0) + np.square(back).sum(0)
     return inside & (missed < _CONSISTENT_SHARE * length + _CONSISTENT_PX2)
@@ -193,12 +183,9 @@ def recorded_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
 
 def estimated_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
     """Returns the camera's motion that most of the picture's flow and depth agree on."""
-    return estimate_motion(
-        torch.from_numpy(raw),
-        torch.from_numpy(current.depth)[None],
-        torch.from_numpy(current.K),
-        picture=None if raw is current.raw else picture_of(current),
-    )
+    depth, K = torch.from_numpy(current.depth)[None], torch.from_numpy(current.K)
+    picture = None if raw is current.raw else picture_of(current)
+    return estimate_motion(torch.from_numpy(raw), depth, K, picture=picture)
 
 
 def picture_of(frame: Frame) -> Tensor | None:

@@ -1,15 +1,13 @@
-"""Files of recordings: text, pictures, arrays, depth maps and flow; every error names its file.
-
-NumPy and OpenCV refuse most files that are damaged or of another kind; what is left to do here is
-to name the file, to refuse pictures that were cut off, and to say which shape and type is expected.
-"""
+"""Files of recordings: text, pictures, arrays, depth maps and flow; every error names its file."""
 
 from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -21,8 +19,7 @@ from flowrep.sequences.recording import SequenceError
 PICTURES = (".png", ".jpg", ".jpeg")
 DEPTH_FILES = (".png", ".npy")
 FLO_TAG = 202021.25
-FLO_UNKNOWN = 1e10
-_FLO_LARGEST = 1e9  # larger values mean unknown in this format
+_FLO_UNKNOWN, _FLO_LARGEST = 1e10, 1e9  # what is written for unknown flow, and what is not read
 
 Flow = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
@@ -41,29 +38,24 @@ def list_files(folder: Path, suffixes: Iterable[str], prefix: str = "") -> list[
             if path.suffix.lower() in suffixes and path.name.startswith(prefix)
         ]
     except OSError as error:
-        raise SequenceError(folder, _reason(error, "folder")) from None
+        raise SequenceError(folder, (error.strerror or str(error)).lower()) from None
     if not found:
         raise SequenceError(folder, f"holds no {prefix}*{' or '.join(suffixes)} file")
-    found.sort(key=_natural)
     by_stem: dict[str, Path] = {}
-    for path in found:
+    for path in sorted(found, key=_natural):
         if (first := by_stem.setdefault(path.stem, path)) is not path:
             raise SequenceError(path, f"belongs to the same frame as {first.name}; remove one")
-    return found
+    return list(by_stem.values())
 
 
 def _natural(path: Path) -> tuple[list[tuple[int, int | str]], str]:
     """Returns the key by which frame_9 comes before frame_10."""
-    pieces = re.split(r"(\d+)", path.name)
-    return [(0, int(p)) if p.isdecimal() and p.isascii() else (1, p) for p in pieces], path.name
+    pieces = re.split(r"([0-9]+)", path.name)
+    return [(1, p) if i % 2 == 0 else (0, int(p)) for i, p in enumerate(pieces)], path.name
 
 
 def read_bytes(path: Path, remedy: str = "") -> bytes:
-    """Returns a file's content.
-
-    Args:
-        path: the file.
-        remedy: what to do if there is no such file.
+    """Returns a file's content; `remedy` says what to do if there is no such file.
 
     Raises:
         SequenceError: there is no such file, or it is empty.
@@ -73,15 +65,10 @@ def read_bytes(path: Path, remedy: str = "") -> bytes:
     except FileNotFoundError:
         raise SequenceError(path, f"no such file{remedy and f'; {remedy}'}") from None
     except OSError as error:
-        raise SequenceError(path, _reason(error)) from None
+        raise SequenceError(path, (error.strerror or str(error)).lower()) from None
     if not data:
         raise SequenceError(path, "is empty")
     return data
-
-
-def _reason(error: OSError, what: str = "file") -> str:
-    known = {FileNotFoundError: f"no such {what}", NotADirectoryError: "is not a folder"}
-    return known.get(type(error), (error.strerror or str(error)).lower())
 
 
 def read_lines(path: Path, remedy: str = "") -> list[tuple[int, str]]:
@@ -96,10 +83,10 @@ def read_lines(path: Path, remedy: str = "") -> list[tuple[int, str]]:
 
 def read_table(
     path: Path,
-    columns: Iterable[int],
+    columns: Sequence[int],
     *,
     header: bool = False,
-    remedies: dict[int, str] | None = None,
+    remedies: Mapping[int, str] = MappingProxyType({}),
 ) -> NDArray[np.float64]:
     """Returns the numbers of a text file, one row per line, `[N, columns]`.
 
@@ -112,27 +99,22 @@ def read_table(
     Raises:
         SequenceError: there are no numbers, or a line has another number of columns.
     """
-    allowed = tuple(columns)
     rows: list[list[float]] = []
-    for number, line in read_lines(path)[1 if header else 0 :]:
-        words = re.split(r"[\s,]+", line.strip(","))
+    for number, line in read_lines(path)[int(header) :]:
         try:
-            row = [float(word) for word in words]
+            row = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:
             raise SequenceError(path, f"line {number}: {line[:40]!r} are not numbers") from None
-        wanted = (len(rows[0]),) if rows else allowed
+        wanted = [len(rows[0])] if rows else columns
         if len(row) not in wanted:
             expected = " or ".join(map(str, wanted))
-            remedy = (remedies or {}).get(len(row), "")
-            raise SequenceError(
-                path,
-                f"line {number} has {len(row)} numbers, expected {expected}"
-                + (f"; {remedy}" if remedy else ""),
-            )
+            remedy = f"; {remedies[len(row)]}" if len(row) in remedies else ""
+            cause = f"line {number} has {len(row)} numbers, expected {expected}{remedy}"
+            raise SequenceError(path, cause)
         rows.append(row)
     if not rows:
         raise SequenceError(path, "holds no numbers")
-    return np.array(rows, dtype=np.float64)
+    return np.array(rows)
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
@@ -144,10 +126,8 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     picture = _decode(path)
     if picture.dtype != np.uint8:
         raise SequenceError(path, f"has {8 * picture.itemsize} bits per channel, colour has 8")
-    if picture.ndim == 2:
-        return cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB).astype(np.uint8, copy=False)
-    order = cv2.COLOR_BGRA2RGB if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB
-    return cv2.cvtColor(picture, order).astype(np.uint8, copy=False)
+    blue_green_red = picture[..., :3] if picture.ndim == 3 else np.stack(3 * [picture], -1)
+    return np.ascontiguousarray(blue_green_red[..., ::-1])
 
 
 def read_png(path: Path, dtype: type, channels: int = 1) -> NDArray[Any]:
@@ -179,8 +159,8 @@ def _decode(path: Path) -> NDArray[Any]:
         raise SequenceError(path, "is a picture that was cut off")
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise SequenceError(path, f"can't be decoded ({error.err or error})") from None
+    except cv2.error:  # a header that claims more than OpenCV decodes
+        picture = None
     if picture is None:
         raise SequenceError(path, "can't be decoded: its data are corrupt")
     return picture
@@ -191,18 +171,16 @@ def read_npy(path: Path, *, kind: str = "f", channels: int | None = None) -> NDA
 
     Args:
         path: the .npy file.
-        kind: the kind of its numbers, `"f"` for floats, `"u"` for bytes.
+        kind: the kind of its numbers, `"f"` for floats, which become float32, `"u"` for bytes.
         channels: the size of its last dimension.
 
     Raises:
         SequenceError: the file is no .npy file, is cut off, or holds another shape or kind.
     """
-    read_bytes(path)
     try:
-        array = np.load(path, allow_pickle=False)
+        array = np.load(BytesIO(read_bytes(path)), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        cause = (str(error).splitlines() or [""])[0][:120]
-        raise SequenceError(path, f"is no whole .npy file ({cause})") from None
+        raise SequenceError(path, f"is no whole .npy file ({str(error)[:120]})") from None
     expected = "[H, W]" if channels is None else f"[H, W, {channels}]"
     if array.ndim != expected.count(",") + 1 or (channels and array.shape[2] != channels):
         raise SequenceError(path, f"holds an array {list(array.shape)}, expected {expected}")
@@ -219,21 +197,14 @@ def depth_from_integers(
     missing: Iterable[int] = (),
     no_surface: int | None = None,
 ) -> NDArray[np.float32]:
-    """Returns depth in metres.
-
-    Args:
-        values: `[H, W]`, as stored.
-        unit_m: the length of a stored 1, metres.
-        missing: values that mean "not measured", which become nan.
-        no_surface: the value that means "no surface", which becomes inf.
+    """Returns depth in metres: nan for the values that mean "missing", inf for "no surface".
 
     >>> stored = np.array([[0, 1500, 65535]], np.uint16)
     >>> depth_from_integers(stored, 0.001, missing=(0, 65535))
     array([[nan, 1.5, nan]], dtype=float32)
     """
     depth = (values * np.float64(unit_m)).astype(np.float32)
-    for value in missing:
-        depth[values == value] = np.nan
+    depth[np.isin(values, list(missing))] = np.nan
     if no_surface is not None:
         depth[values == no_surface] = np.inf
     return depth
@@ -295,13 +266,9 @@ def read_tagged_floats(path: Path, channels: int) -> NDArray[np.float32]:
 def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
     """Writes flow `[2, H, W]`; invalid pixels get the format's mark for unknown."""
     _, height, width = flow.shape
-    pairs = np.empty((height, width, 2), dtype="<f4")
-    known = _known(flow, valid)
-    for channel in range(2):
-        pairs[..., channel] = np.where(known, flow[channel], np.float32(FLO_UNKNOWN))
-    with path.open("wb") as file:
-        file.write(struct.pack("<fii", FLO_TAG, width, height))
-        file.write(pairs.data)
+    marked = np.where(_known(flow, valid), flow, np.float32(_FLO_UNKNOWN)).transpose(1, 2, 0)
+    header = struct.pack("<fii", FLO_TAG, width, height)
+    path.write_bytes(header + marked.astype("<f4").tobytes())
 
 
 def read_kitti_flow(path: Path) -> Flow:

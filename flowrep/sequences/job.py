@@ -43,15 +43,7 @@ class Selection:
 
 
 class Job:
-    """The factorisation of one recording.
-
-    Args:
-        stream: the source of frames.
-        flow_source: the source of raw flow.
-        motion_source: the source of the camera's motion.
-        output: the output folder.
-        selection: the frames that are used.
-    """
+    """The factorisation of one recording, or of a camera's frames, into a folder."""
 
     def __init__(
         self,
@@ -89,9 +81,8 @@ class Job:
         if repeats(previous, current):
             return False
         before = doctor.pairs
-        raw = torch.from_numpy(self.flow_source(previous, current))
         doctor.look(
-            raw,
+            torch.from_numpy(self.flow_source(previous, current)),
             torch.from_numpy(current.depth)[None],
             torch.from_numpy(current.K),
             torch.from_numpy(previous.world_from_cam),

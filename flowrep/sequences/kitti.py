@@ -58,7 +58,13 @@ class Kitti(Recording):
             return
         if mapping is None:
             raise SequenceError(raw_data, "is of no use without format.mapping=train_mapping.txt")
-        self._oxts = _read_mapping(Path(mapping), Path(raw_data))
+        self._oxts = {}  # the folder of GPS and IMU packets and the frame number, by pair
+        for number, line in read_lines(Path(mapping)):
+            words = line.split()
+            if len(words) != 3 or not words[2].isdecimal():
+                raise SequenceError(mapping, f"line {number} is not a date, recording and frame")
+            packets = Path(raw_data) / words[0] / words[1] / "oxts" / "data"
+            self._oxts[number - 1] = packets, int(words[2])
         posed = [name for name in self._pairs if int(name) in self._oxts]
         if not posed:
             raise SequenceError(mapping, f"names no raw recording of the pictures in {folder}")
@@ -81,13 +87,17 @@ class Kitti(Recording):
         depth = np.full(rgb.shape[:2], np.nan, dtype=np.float32)
         if is_current:
             disparity = read_png(self.folder / "disp_occ_0" / f"{name}.png", np.uint16)
-            depth = depth_from_disparity(disparity, focal_baseline)
+            depth = _depth_from_disparity(disparity, focal_baseline)
         world_from_cam = None
         if self.has_poses:
             cam0_from_velo = self._rigid("calib_velo_to_cam", pair)
             cam_from_imu = cam_from_cam0 @ cam0_from_velo @ self._rigid("calib_imu_to_velo", pair)
-            later = 0 if is_current else 1
-            world_from_cam = self._world_from_imu(int(pair), later) @ np.linalg.inv(cam_from_imu)
+            packets, first = self._oxts[int(pair)]
+            before, path = (packets / f"{first + later:010d}.txt" for later in (0, not is_current))
+            latitude_deg = read_table(before, [_OXTS_NUMBERS])[0, 0]
+            packet = read_table(path, [_OXTS_NUMBERS])[0]
+            world_from_imu = _pose_from_oxts(packet, latitude_deg, path)
+            world_from_cam = world_from_imu @ np.linalg.inv(cam_from_imu)
         flow = self.folder / "flow_occ" / f"{name}.png"
         return Frame(
             name=name,
@@ -101,17 +111,10 @@ class Kitti(Recording):
             starts_clip=self.starts_clip(index),
         )
 
-    def _world_from_imu(self, pair: int, frames_later: int) -> Pose:
-        """Returns the pose of the IMU, in a world whose axes are east, north and up."""
-        folder, first = self._oxts[pair]
-        path = folder / f"{first + frames_later:010d}.txt"
-        before = read_table(folder / f"{first:010d}.txt", [_OXTS_NUMBERS])[0]
-        return pose_from_oxts(read_table(path, [_OXTS_NUMBERS])[0], before[0], path)
-
     def _camera(self, pair: str) -> tuple[NDArray[np.float64], float, Pose]:
         """Returns K, baseline times fx (px m), and `cam_from_cam0` of the left colour camera."""
         path = self.folder / "calib_cam_to_cam" / f"{pair}.txt"
-        entries = read_calibration(path)
+        entries = _read_calibration(path)
         left, right = (_matrix(path, entries, f"P_rect_{i}", (3, 4)) for i in ("02", "03"))
         fx, fy, cx, cy = left[0, 0], left[1, 1], left[0, 2], left[1, 2]
         if min(fx, fy) <= 0 or not np.array_equal(left[:, :3], intrinsics(fx, fy, cx, cy)):
@@ -129,52 +132,36 @@ class Kitti(Recording):
 
     def _rigid(self, kind: str, pair: str) -> Pose:
         path = self.folder / kind / f"{pair}.txt"
-        entries = read_calibration(path)
+        entries = _read_calibration(path)
         parts = [_matrix(path, entries, "R", (3, 3)), _matrix(path, entries, "T", (3, 1))]
         return as_pose(np.hstack(parts), path)
 
 
-def _read_mapping(mapping: Path, raw_data: Path) -> dict[int, tuple[Path, int]]:
-    """Returns the folder of GPS and IMU packets and the frame number by pair."""
-    found = {}
-    for number, line in read_lines(mapping):
-        words = line.split()
-        if len(words) != 3 or not words[2].isdecimal():
-            raise SequenceError(mapping, f"line {number} is not a date, recording and frame")
-        found[number - 1] = raw_data / words[0] / words[1] / "oxts" / "data", int(words[2])
-    return found
-
-
-def depth_from_disparity(stored: NDArray[np.uint16], focal_baseline: float) -> NDArray[np.float32]:
+def _depth_from_disparity(stored: NDArray[np.uint16], focal_baseline: float) -> NDArray[np.float32]:
     """Returns depth in metres, nan where the disparity (in 1/256 px) is 0.
 
-    >>> depth_from_disparity(np.array([[0, 2560]], np.uint16), 400.0)  # 400 / 10 px
+    >>> _depth_from_disparity(np.array([[0, 2560]], np.uint16), 400.0)  # 400 / 10 px
     array([[nan, 40.]], dtype=float32)
     """
     disparity = np.where(stored == 0, np.nan, stored / 256)
     return (focal_baseline / disparity).astype(np.float32)
 
 
-def pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float, source: Path) -> Pose:
+def _pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float, source: Path) -> Pose:
     """Returns the pose of an IMU with x forward, y left, z up; the world is a Mercator map.
 
     Args:
         packet: latitude, longitude (degrees), altitude (m), roll, pitch, yaw (rad), and more.
         latitude_deg: the latitude at which the map is true to scale.
         source: the file, for the message.
-
-    Raises:
-        SequenceError: a number is not finite, or a latitude is out of range.
     """
-    if not np.isfinite(packet[:6]).all() or abs(packet[0]) >= 90 or not abs(latitude_deg) < 90:
+    latitude, longitude, altitude, *angles = packet[:6]
+    if not np.isfinite(packet[:6]).all() or abs(latitude) >= 90 or not abs(latitude_deg) < 90:
         raise SequenceError(source, f"holds no position and attitude: {packet[:6].tolist()}")
-    latitude, longitude, altitude, roll, pitch, yaw = packet[:6]
     scale = math.cos(math.radians(latitude_deg)) * EARTH_RADIUS_M
     pose = np.eye(4)
-    about_x, about_y, about_z = (
-        cv2.Rodrigues(angle * axis)[0] for angle, axis in zip((roll, pitch, yaw), np.eye(3))
-    )
-    pose[:3, :3] = about_z @ about_y @ about_x
+    roll, pitch, yaw = (cv2.Rodrigues(a * axis)[0] for a, axis in zip(angles, np.eye(3)))
+    pose[:3, :3] = yaw @ pitch @ roll
     pose[:3, 3] = (
         scale * math.radians(longitude),
         scale * math.log(math.tan(math.radians(90 + latitude) / 2)),
@@ -183,7 +170,7 @@ def pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float, source: Pat
     return pose
 
 
-def read_calibration(path: Path) -> dict[str, list[float]]:
+def _read_calibration(path: Path) -> dict[str, list[float]]:
     """Returns the numbers of a KITTI calibration file by name."""
     entries: dict[str, list[float]] = {}
     for _, line in read_lines(path):

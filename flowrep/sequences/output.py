@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flowrep.extras import require
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
 from flowrep.sequences.files import Flow, write_flo, write_kitti_flow, write_picture
-from flowrep.sequences.recording import SequenceError
+from flowrep.sequences.recording import Pose, SequenceError
 from flowrep.viz import (
     Image,
     Video,
@@ -32,21 +32,6 @@ from flowrep.viz import (
 FLOW_FORMATS = ("flo", "kitti", "npz")
 FLOW_NAMES = ("raw", "ego", "obj")
 TABLE, JOB, SUMMARY, VIDEO = "frames.csv", "job.json", "summary.json", "strip.mp4"
-COLUMNS = (
-    "index",
-    "name",
-    "timestamp_s",
-    "raw_median_px",
-    "ego_median_px",
-    "obj_median_px",
-    "valid_share",
-    "moving_share",
-    "epe_px",
-    "inlier_share",
-    "recorded_obj_median_px",
-    "rotation_off_deg",
-    "translation_off_m",
-)
 _MOVING_SPREAD = 3.0
 _JPEG_QUALITY = 80
 _TILE_PX = 480  # the most of a tile of the video, so that two rows of three fit a screen
@@ -101,7 +86,7 @@ class Output:
             )
         self._rerun = RerunExport(self.path.name, options.scale_px) if options.rerun else None
         self.partial.mkdir(parents=True)
-        write_json(self.partial / JOB, settings)
+        _write_json(self.partial / JOB, settings)
         self.rows: list[dict[str, Any]] = []
         self._video: Video | None = None
         if options.video_fps is not None:
@@ -118,7 +103,7 @@ class Output:
             self._rerun.append(index, made)
         self.rows.append(score(index, made, moving_px=self.options.moving_px))
         with (self.partial / TABLE).open("a", newline="", encoding="utf-8") as file:
-            table = csv.DictWriter(file, COLUMNS)
+            table = csv.DictWriter(file, self.rows[-1].keys())
             if len(self.rows) == 1:
                 table.writeheader()
             table.writerow(self.rows[-1])
@@ -134,20 +119,21 @@ class Output:
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Writes the summary and gives the folder its final name."""
-        write_json(self.partial / SUMMARY, summary)
+        _write_json(self.partial / SUMMARY, summary)
         self.partial.replace(self.path)
 
     def medians(self) -> dict[str, float | None]:
         """Returns the median over the frames of each column of measurements."""
-        medians: dict[str, float | None] = {}
-        for name in COLUMNS[3:]:
-            values = [float(row[name]) for row in self.rows if row[name] != ""]
-            medians[name] = float(np.median(values)) if values else None
-        return medians
+        known = {
+            name: [float(row[name]) for row in self.rows if row[name] != ""]
+            for name in list(self.rows[0])[3:]
+        }
+        return {
+            name: float(np.median(values)) if values else None for name, values in known.items()
+        }
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes a JSON file."""
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
@@ -160,9 +146,9 @@ def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, A
     Args:
         index: the frame's index in the recording.
         made: its flow.
-        moving_px: the least object flow from which a pixel counts as moving by itself, pixels.
+        moving_px: see `OutputOptions`.
     """
-    frame = made.frame
+    frame, truth = made.frame, made.frame.raw
     raw_px, ego_px, obj_px = (
         np.hypot(*flow)[made.valid] for flow in (made.raw, made.ego, made.obj)
     )
@@ -177,23 +163,20 @@ def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, A
         "obj_median_px": obj_median_px,
         "valid_share": float(made.valid.mean()),
         "moving_share": float(moves.mean()) if len(moves) else math.nan,
-        "epe_px": _error_px(made),
+        "epe_px": math.nan,
         "inlier_share": made.motion.inlier_share,
         **_beside_the_recorded_motion(made),
     }
-    return {name: _cell(row[name]) for name in COLUMNS}
+    if truth is not None and frame.raw_since == made.previous.name:
+        row["epe_px"] = end_point_error(made.raw, truth)
+    for name, value in row.items():
+        if isinstance(value, float):  # six digits; nothing for what is unknown
+            row[name] = f"{value:.6g}" if math.isfinite(value) else ""
+    return row
 
 
 def _median(values: NDArray[np.float32]) -> float:
     return float(np.median(values)) if len(values) else math.nan
-
-
-def _error_px(made: FactorizedFrame) -> float:
-    """Returns the error against the recording's own flow, nan if it has none for this pair."""
-    truth, since = made.frame.raw, made.frame.raw_since
-    if truth is None or since != made.previous.name:
-        return math.nan
-    return end_point_error(made.raw, truth)
 
 
 def end_point_error(flow: Flow, truth: Flow) -> float:
@@ -205,26 +188,19 @@ def end_point_error(flow: Flow, truth: Flow) -> float:
 
 def _beside_the_recorded_motion(made: FactorizedFrame) -> dict[str, float]:
     """Returns how an estimated motion compares with the recorded one, nan without either."""
-    names = ("recorded_obj_median_px", "rotation_off_deg", "translation_off_m")
     has_poses = not any(f.world_from_cam is None for f in (made.previous, made.frame))
-    if math.isnan(made.motion.inlier_share) or not made.motion.known or not has_poses:
-        return dict.fromkeys(names, math.nan)
-    recorded = factorize_pair(made.previous, made.frame, made.raw)
-    off = np.linalg.inv(recorded.motion.prev_from_curr) @ made.motion.prev_from_curr
-    turn_rad = float(np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]))
-    numbers = (
-        _median(np.hypot(*recorded.obj)[recorded.valid]),
-        math.degrees(turn_rad),
-        float(np.linalg.norm(off[:3, 3])),
-    )
-    return dict(zip(names, numbers))
-
-
-def _cell(value: Any) -> Any:
-    """Returns a table cell: empty for an unknown value, six digits for a number."""
-    if not isinstance(value, float):
-        return value
-    return f"{value:.6g}" if math.isfinite(value) else ""
+    obj_px = turn_rad = shift_m = math.nan
+    if has_poses and made.motion.known and not math.isnan(made.motion.inlier_share):
+        recorded = factorize_pair(made.previous, made.frame, made.raw)
+        off = np.linalg.inv(recorded.motion.prev_from_curr) @ made.motion.prev_from_curr
+        obj_px = _median(np.hypot(*recorded.obj)[recorded.valid])
+        turn_rad = float(np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]))
+        shift_m = float(np.linalg.norm(off[:3, 3]))
+    return {
+        "recorded_obj_median_px": obj_px,
+        "rotation_off_deg": math.degrees(turn_rad),
+        "translation_off_m": shift_m,
+    }
 
 
 def write_frame(folder: Path, index: int, made: FactorizedFrame, options: OutputOptions) -> None:
@@ -244,7 +220,9 @@ def write_frame(folder: Path, index: int, made: FactorizedFrame, options: Output
         if "kitti" in options.flow_files:
             write_kitti_flow(_place(folder, f"flow/{kind}", f"{name}.png"), flow, valid)
         if options.pictures_every and index % options.pictures_every == 0:
-            picture = flow_picture(kind, made, options.scale_px[kind])
+            label, scale_px = f"{kind} flow", options.scale_px[kind]
+            colours = {label: flow_to_rgb(shown(kind, made), scale_px)}
+            picture = strip(colours, wheel_for=[label], notes={label: flow_note(scale_px)})
             write_picture(_place(folder, f"pictures/{kind}", f"{name}.png"), picture)
     if "npz" in options.flow_files:
         contents: Any = {key: getattr(made, key) for key in (*FLOW_NAMES, "valid", "ego_valid")}
@@ -271,13 +249,6 @@ def shown(kind: str, made: FactorizedFrame, places: Any = ...) -> Flow:
     return np.stack([u, v])
 
 
-def flow_picture(kind: str, made: FactorizedFrame, scale_px: float) -> Image:
-    """Returns a flow's colours under a label with the scale and the wheel; unknown is grey."""
-    label = f"{kind} flow"
-    colours = flow_to_rgb(shown(kind, made), scale_px)
-    return strip({label: colours}, wheel_for=[label], notes={label: flow_note(scale_px)})
-
-
 def video_frame(made: FactorizedFrame, options: OutputOptions) -> Image:
     """Returns RGB and depth above raw, ego and obj, each sampled to at most 480 pixels."""
     frame = made.frame
@@ -297,15 +268,7 @@ def video_frame(made: FactorizedFrame, options: OutputOptions) -> Image:
 
 
 class RerunExport:
-    """Writes the camera, picture, depth and flow of each frame, to scrub through in 3-D.
-
-    Args:
-        recording: its name.
-        scale_px: the flow of full colour by name, pixels.
-
-    Raises:
-        ImportError: rerun is not installed.
-    """
+    """Writes the camera, picture, depth and flow of each frame, to scrub through in 3-D."""
 
     def __init__(self, recording: str, scale_px: Mapping[str, float]) -> None:
         require("rerun=true", "rerun", "rerun")
@@ -314,7 +277,7 @@ class RerunExport:
         self._rerun: Any = rerun
         self._stream = rerun.RecordingStream("flowrep", recording_id=recording)
         self._scale_px = scale_px
-        self._poses: dict[str, NDArray[np.float64]] = {}
+        self._poses: dict[str, Pose] = {}
 
     def save(self, path: Path) -> None:
         """Chooses the .rrd file; before the first frame."""
@@ -322,42 +285,28 @@ class RerunExport:
 
     def append(self, index: int, made: FactorizedFrame) -> None:
         """Logs one frame."""
-        rr, frame = self._rerun, made.frame
+        rr, frame, log = self._rerun, made.frame, self._stream.log
         self._stream.set_time("frame", sequence=index)
         if frame.timestamp_s is not None:
             self._stream.set_time("time", duration=frame.timestamp_s)
-        pose = self._pose(made)
-        self._log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-        height, width = frame.size
-        self._log(
-            "world/camera/image",
-            rr.Pinhole(
-                image_from_camera=frame.K,
-                resolution=[width, height],
-                camera_xyz=rr.ViewCoordinates.RDF,
-            ),
-        )
+        pose = frame.world_from_cam
+        if pose is None:  # the estimated motions so far, one after the other
+            before = self._poses.get(made.previous.name, np.eye(4))
+            pose = self._poses[frame.name] = before @ made.motion.prev_from_curr
+        log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+        size, axes = frame.size[::-1], rr.ViewCoordinates.RDF
+        camera = rr.Pinhole(image_from_camera=frame.K, resolution=size, camera_xyz=axes)
+        log("world/camera/image", camera)
         if frame.rgb is not None:
             picture = rr.Image(frame.rgb).compress(jpeg_quality=_JPEG_QUALITY)
-            self._log("world/camera/image/rgb", picture)
+            log("world/camera/image/rgb", picture)
         depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
-        self._log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
+        log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
         for name, scale_px in self._scale_px.items():
             colours = flow_to_rgb(shown(name, made), scale_px)
-            self._log(f"flow/{name}", rr.Image(colours).compress(jpeg_quality=_JPEG_QUALITY))
+            log(f"flow/{name}", rr.Image(colours).compress(jpeg_quality=_JPEG_QUALITY))
 
     def close(self) -> None:
         """Writes what is left."""
         self._stream.flush()
         self._stream.disconnect()
-
-    def _pose(self, made: FactorizedFrame) -> NDArray[np.float64]:
-        """Returns the recorded pose, or the estimated motions so far, one after the other."""
-        if made.frame.world_from_cam is not None:
-            return made.frame.world_from_cam
-        before = self._poses.get(made.previous.name, np.eye(4))
-        self._poses[made.frame.name] = before @ made.motion.prev_from_curr
-        return self._poses[made.frame.name]
-
-    def _log(self, place: str, what: Any) -> None:
-        self._stream.log(place, what)

@@ -132,13 +132,10 @@ class Recording(ABC):
             raise IndexError(f"frame {index} of {len(self)}")
         frame = self._read(index)
         check_frame(frame)
-        if self._size is None:
-            self._size = frame.size
-        if self.one_size and frame.size != self._size:
-            raise SequenceError(
-                frame.source,
-                f"is {_size_text(frame.size)}, other frames are {_size_text(self._size)}",
-            )
+        first, own = (_size_text(size) for size in (self._size or frame.size, frame.size))
+        if self.one_size and own != first:
+            raise SequenceError(frame.source, f"is {own}, other frames are {first}")
+        self._size = self._size or frame.size
         return frame
 
     def __iter__(self) -> Iterator[Frame]:
@@ -152,11 +149,11 @@ def check_frame(frame: Frame) -> None:
     Raises:
         SequenceError: if sizes differ, the pose is not rigid, or K is not a camera matrix.
     """
-    sizes = {"depth": frame.size}
+    sizes: dict[str, tuple[int, ...]] = {"depth": frame.size}
     if frame.rgb is not None:
-        sizes["colour"] = (frame.rgb.shape[0], frame.rgb.shape[1])
+        sizes["colour"] = frame.rgb.shape[:2]
     if frame.raw is not None:
-        sizes["flow"] = (frame.raw.shape[1], frame.raw.shape[2])
+        sizes["flow"] = frame.raw.shape[1:]
     if len(set(sizes.values())) > 1:
         listing = ", ".join(f"{name} {_size_text(size)}" for name, size in sizes.items())
         raise SequenceError(frame.source, f"pictures of one frame differ in size: {listing}")
@@ -168,5 +165,5 @@ def check_frame(frame: Frame) -> None:
         raise SequenceError(frame.source, str(error)) from None
 
 
-def _size_text(size: tuple[int, int]) -> str:
+def _size_text(size: tuple[int, ...]) -> str:
     return f"{size[1]} x {size[0]}"

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrep.sequences.calibration import Registration, as_pose, four_intrinsics, intrinsics
 from flowrep.sequences.files import (
@@ -18,7 +17,6 @@ from flowrep.sequences.files import (
 )
 from flowrep.sequences.recording import Frame, Recording, SequenceError
 
-DEPTH_UNIT_M = 0.001
 _COLOUR = (".color.png", ".color.jpg")
 
 
@@ -71,29 +69,23 @@ class SevenScenes(Recording):
         name = colour.name.split(".")[0]
         rgb = read_rgb(colour)
         stored = read_png(self.folder / f"{name}.depth.png", np.uint16)
-        register = self._registered_to((rgb.shape[0], rgb.shape[1]))
+        size = (rgb.shape[0], rgb.shape[1])
+        register = self._registration
+        if register is None or register.size != size:
+            register = Registration(self._K_depth, self.K, self._colour_from_depth, size)
+            self._registration = register
         world_from_cam = None
         if self.has_poses:
             path = self.folder / f"{name}.pose.txt"
-            world_from_cam = as_pose(_matrix(path), path) @ register.depth_from_colour
+            table = read_table(path, [4])
+            if len(table) != 4:
+                raise SequenceError(path, f"has {len(table)} lines, expected 4")
+            world_from_cam = as_pose(table, path) @ register.depth_from_colour
         return Frame(
             name=name,
             source=colour,
             world_from_cam=world_from_cam,
             K=self.K,
-            depth=register(depth_from_integers(stored, DEPTH_UNIT_M, missing=(0, 65535))),
+            depth=register(depth_from_integers(stored, 0.001, missing=(0, 65535))),
             rgb=rgb,
         )
-
-    def _registered_to(self, size: tuple[int, int]) -> Registration:
-        if self._registration is None or self._registration.size != size:
-            self._registration = Registration(self._K_depth, self.K, self._colour_from_depth, size)
-        return self._registration
-
-
-def _matrix(path: Path) -> NDArray[np.float64]:
-    """Returns the pose's numbers, four in each of four lines."""
-    table = read_table(path, [4])
-    if len(table) != 4:
-        raise SequenceError(path, f"has {len(table)} lines, expected 4")
-    return table

@@ -24,8 +24,6 @@ from flowrep.sequences.files import (
 )
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
-DEPTH_UNIT_M = 1 / 5000
-
 
 class Tum(Recording):
     """A folder with `rgb.txt`, `depth.txt` and, for poses, `groundtruth.txt`.
@@ -51,7 +49,7 @@ class Tum(Recording):
     ) -> None:
         self.folder = Path(folder)
         self.K = opencv_intrinsics(four_intrinsics("intrinsics", intrinsics))
-        self.tolerance_s, self.interpolate = float(tolerance_s), bool(interpolate)
+        self.tolerance_s, self.interpolate = tolerance_s, interpolate
         rgb_times, rgb_paths = self._index("rgb.txt")
         depth_times, depth_paths = self._index("depth.txt")
         depth_of = nearest(depth_times, rgb_times, tolerance_s)
@@ -90,7 +88,7 @@ class Tum(Recording):
             source=rgb,
             world_from_cam=self._pose(place) if self.has_poses else None,
             K=self.K,
-            depth=depth_from_integers(stored, DEPTH_UNIT_M, missing=(0,)),
+            depth=depth_from_integers(stored, 1 / 5000, missing=(0,)),
             rgb=read_rgb(rgb),
             timestamp_s=float(self._times[place]),
         )

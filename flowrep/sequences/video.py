@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flowrep.sequences.recording import Frame, SequenceError, check_frame
+from flowrep.sequences.recording import Frame, SequenceError
 
 
 class StillVideo:
@@ -44,21 +44,15 @@ class StillVideo:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields frames until the file ends, or endlessly from a camera."""
-        capture: Any = cv2.VideoCapture(
-            int(str(self.source)) if self._is_camera else str(self.source)
-        )
+        name = str(self.source)
+        capture: Any = cv2.VideoCapture(int(name) if self._is_camera else name)
         try:
-            if not capture.isOpened():
-                raise SequenceError(self.source, "OpenCV can't open it as a video")
             number = 0
-            while True:
-                found, picture = capture.read()
-                if not found:
-                    break
+            while (picture := capture.read()[1]) is not None:
                 yield self._frame(number, picture)
                 number += 1
             if number == 0:
-                raise SequenceError(self.source, "gives no picture")
+                raise SequenceError(self.source, "OpenCV reads no picture of it as a video")
         finally:
             capture.release()
 
@@ -66,13 +60,11 @@ class StillVideo:
         height, width = picture.shape[:2]
         # A camera that stands still has no ego flow with any depth and any K.
         K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float64)
-        frame = Frame(
+        return Frame(
             name=f"{number:06d}",
             source=self.source,
             world_from_cam=np.eye(4),
             K=K,
             depth=np.full((height, width), np.inf, dtype=np.float32),
-            rgb=cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False),
+            rgb=np.ascontiguousarray(picture[..., ::-1]),
         )
-        check_frame(frame)
-        return frame
