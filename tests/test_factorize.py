@@ -37,7 +37,7 @@ from flowrep.sequences.job import Job, Selection
 from flowrep.sequences.output import Output, OutputOptions
 from tests.config.composing import plain
 from tests.sequences import synthetic
-from tests.sequences.real_frames import FOLDER, needs_7scenes
+from tests.sequences.synthetic import SEVEN_SCENES, needs_7scenes
 
 
 def settings(*overrides) -> FactorizeConfig:
@@ -359,7 +359,7 @@ def test_a_still_camera_needs_neither_poses_nor_depth(tmp_path):
 def test_a_real_static_room_has_little_object_flow(stride, pair, tmp_path):
     options = [f"stride={stride}", f"stop={stride + 1}", "video=false", "poses=estimated"]
     out = tmp_path / "out"
-    given = [f"input={FOLDER}", "format=sevenscenes", f"output={out}"]
+    given = [f"input={SEVEN_SCENES}", "format=sevenscenes", f"output={out}"]
     factorize_recording(settings(*given, *options))
     (row,) = table(out)
     assert row["name"] == pair

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple, get_args
 
 import cv2
@@ -107,7 +108,7 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
     for factor, size in ((2.0, "twice"), (0.5, "half")):
         found[f"intrinsics times {factor:g}"] = Mistake(
             f"the pictures are {size} as large as those that the intrinsics belong to",
-            K=lambda K, s=factor: K * torch.tensor([[s], [s], [1.0]], dtype=K.dtype),
+            K=partial(_scaled, factor),
         )
     return found
 
@@ -138,6 +139,10 @@ def _transposed(pose: Tensor) -> Tensor:
 def _ray_from_z(depth: Tensor, K: Tensor) -> Tensor:
     ray = depth.square() / z_from_ray_length(depth, K)
     return torch.where(depth.isinf(), depth, ray)  # the sky stays at infinity
+
+
+def _scaled(factor: float, K: Tensor) -> Tensor:
+    return K * torch.tensor([[factor], [factor], [1.0]], dtype=K.dtype)
 
 
 def _times(*factors: float) -> Callable[[Tensor, Tensor], Tensor]:

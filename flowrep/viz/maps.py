@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
@@ -85,9 +86,8 @@ def flow_wheel(size_px: int, background: tuple[int, int, int] = (255, 255, 255))
     axis = np.linspace(-1, 1, size_px, dtype=np.float32)
     u, v = np.meshgrid(axis, axis)
     disc = flow_to_rgb(np.stack([u, v]), scale_px=1.0)
-    return np.where((np.hypot(u, v) <= 1 + 1 / size_px)[..., None], disc, background).astype(
-        np.uint8
-    )
+    disc[np.hypot(u, v) > 1 + 1 / size_px] = background
+    return disc
 
 
 def classes_to_rgb(semantic: Any) -> Image:
@@ -130,27 +130,26 @@ def representation_strip(
     Raises:
         ValueError: a map has the wrong shape, or none of the names is present.
     """
-    tiles: list[tuple[str, Callable[[Any], Image]]] = [
-        ("rgb", lambda rgb: np.moveaxis(_channels("rgb", rgb, 3), 0, -1).astype(np.uint8)),
-        ("semantic", classes_to_rgb),
-        ("depth", lambda depth: depth_to_rgb(depth, depth_range_m)),
-        *(
-            (name, lambda flow, scale_px=scale_px: flow_to_rgb(flow, scale_px))
-            for name, scale_px in flow_scale_px.items()
+    tiles: dict[str, tuple[str, Callable[[Any], Image], Note]] = {
+        "rgb": ("RGB", lambda rgb: np.moveaxis(_channels("rgb", rgb, 3), 0, -1).astype("u1"), ""),
+        "semantic": ("segmentation", classes_to_rgb, ""),
+        "depth": (
+            "depth, logarithmic",
+            partial(depth_to_rgb, range_m=depth_range_m),
+            partial(depth_bar, depth_range_m),
         ),
-    ]
-    labels = {"rgb": "RGB", "semantic": "segmentation", "depth": "depth, logarithmic"}
-    labels |= {name: f"{name} flow" for name in flow_scale_px}
+    }
+    for name, scale_px in flow_scale_px.items():
+        draw = partial(flow_to_rgb, scale_px=scale_px)
+        tiles[name] = f"{name} flow", draw, flow_note(scale_px)
     names = set(maps.keys())
-    images = {labels[name]: draw(maps[name]) for name, draw in tiles if name in names}
+    images = {label: draw(maps[name]) for name, (label, draw, _) in tiles.items() if name in names}
     if not images:
         raise ValueError(
-            f"nothing to draw: maps has {sorted(map(str, names))}, "
-            f"expected some of {[name for name, _ in tiles]}"
+            f"nothing to draw: maps has {sorted(map(str, names))}, expected some of {list(tiles)}"
         )
-    notes: dict[str, Note] = {labels["depth"]: partial(depth_bar, depth_range_m)}
-    notes |= {labels[name]: flow_note(scale) for name, scale in flow_scale_px.items()}
-    return strip(images, wheel_for=[labels[name] for name in flow_scale_px], notes=notes)
+    notes = {label: note for label, _, note in tiles.values() if note}
+    return strip(images, wheel_for=[f"{name} flow" for name in flow_scale_px], notes=notes)
 
 
 def flow_note(scale_px: float) -> str:
@@ -242,10 +241,20 @@ class Video:
 
     def append(self, image: Image) -> None:
         """Adds a frame `[H, W, 3]`."""
-        image = _sampled_for_codec(image)
+        # Every n-th row and column, with the least n for which H.264 takes the image.
+        step = math.ceil(max(image.shape[:2]) / _MOST_CODEC_PX)
+        image = image[::step, ::step]
         if self._writer is None:
+            import imageio.v2 as imageio
+
             self._size = (image.shape[0] + 1) // 2 * 2, (image.shape[1] + 1) // 2 * 2
-            self._writer = self._open()
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            options: dict[str, Any] = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
+            # Half the time of x264's default at the same error, and no larger.
+            options["output_params"] = ["-preset", "veryfast"]
+            self._writer = imageio.get_writer(
+                self.path, fps=self.fps, macro_block_size=1, **options
+            )
         height, width = self._size
         image = image[:height, :width]
         fill = ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0))
@@ -256,30 +265,12 @@ class Video:
         if self._writer is not None:
             self._writer.close()
 
-    def _open(self) -> Any:
-        import imageio.v2 as imageio
-
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        options: dict[str, Any] = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
-        # Half the time of x264's default at the same error, and no larger.
-        options["output_params"] = ["-preset", "veryfast"]
-        return imageio.get_writer(self.path, fps=self.fps, macro_block_size=1, **options)
-
 
 def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
     """Writes frames `[H, W, 3]` as an mp4, see `Video`."""
-    video = Video(path, fps=fps)
-    try:
+    with closing(Video(path, fps=fps)) as video:
         for frame in frames:
             video.append(frame)
-    finally:
-        video.close()
-
-
-def _sampled_for_codec(image: Image) -> Image:
-    """Returns every n-th row and column, with the least n for which H.264 takes the image."""
-    step = math.ceil(max(image.shape[:2]) / _MOST_CODEC_PX)
-    return image[::step, ::step]
 
 
 @lru_cache(maxsize=64)

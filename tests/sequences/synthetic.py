@@ -1,4 +1,7 @@
-"""Recordings whose flow is known exactly, written in each format as its data set writes it."""
+"""Recordings whose flow is known exactly, written in each format as its data set writes it.
+
+And four frames of 7-Scenes that lie beside the checkout; tests that use them skip without.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import torch
 
 from flowrep.geometry import ego_flow, relative_motion, rigid_flow
 from tests.geometry.scenes import rigid
+
+PLACES = [parent / "shared/data/7scenes" for parent in Path(__file__).resolve().parents]
+SEVEN_SCENES = next((place for place in PLACES if place.is_dir()), None)
+needs_7scenes = pytest.mark.skipif(
+    SEVEN_SCENES is None, reason="no frames of 7-Scenes in shared/data/7scenes beside the checkout"
+)
 
 HEIGHT, WIDTH, FRAMES = 24, 40, 3
 K = np.array([[31.0, 0.0, 18.5], [0.0, 27.0, 13.0], [0.0, 0.0, 1.0]])
@@ -94,9 +104,7 @@ def quaternion_line(world_from_cam: np.ndarray) -> str:
 
 def write_flo(path: Path, flow: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    pairs = np.ascontiguousarray(flow.transpose(1, 2, 0), dtype="<f4")
-    size = struct.pack("<fii", 202021.25, flow.shape[2], flow.shape[1])
-    path.write_bytes(size + pairs.tobytes())
+    assert cv2.writeOpticalFlow(str(path), np.ascontiguousarray(flow.transpose(1, 2, 0)))
 
 
 def camera_json(K=K, size=(HEIGHT, WIDTH)) -> dict:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -17,13 +18,20 @@ from flowrep.geometry import (
     invert_rigid,
     relative_motion,
     rigid_flow,
-    z_from_ray_length,
 )
-from flowrep.sequences import Doctor, EstimatedFlowSource, diagnose
+from flowrep.sequences import (
+    Doctor,
+    EstimatedFlowSource,
+    Frames,
+    SevenScenes,
+    diagnose,
+    recorded_flow,
+)
 from flowrep.sequences.doctor import mistakes
+from flowrep.sequences.factorization import picture_of
 from flowrep.transforms import DIS
 from tests.geometry.scenes import rigid
-from tests.sequences.real_frames import needs_7scenes, seven_scenes
+from tests.sequences.synthetic import SEVEN_SCENES, needs_7scenes
 
 HEIGHT, WIDTH = 45, 64
 K = torch.tensor([[40.0, 0.0, 30.5], [0.0, 37.0, 24.0], [0.0, 0.0, 1.0]])
@@ -131,36 +139,12 @@ def test_a_wrong_convention_is_named_by_what_corrects_it(correction, right):
         assert f"format.{option}" in found.words or "=" not in option
 
 
-# The data are as frames' defaults, but an option says otherwise: taking it out is the remedy.
-UNDONE = {
-    "pose_direction=camera_to_world": ({"pose_direction": "world_to_camera"}, invert_rigid),
-    "pose_axes=opencv": (
-        {"pose_axes": "ned"}, lambda pose: adapt_pose(pose, axes="ned")
-    ),
-    "pose_axes=x_forward_z_up": (  # the data's; "opengl" was given
-        {"pose_axes": "opengl"},
-        lambda pose: adapt_pose(turned("x_forward_z_up")(pose), axes="opengl"),
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("correction", UNDONE)
-def test_the_correction_is_relative_to_the_options_in_force(correction, right):
-    conventions, adapt = UNDONE[correction]
-    found = poses(right, adapt).diagnosis(conventions)
-    assert found.suspects[0] == correction
-    assert f"format.{correction}" in found.words
-
-
-def test_options_of_flow_and_depth_are_undone_too(right):
-    backwards = WRONG["flow_direction=backward"](right)
-    found = backwards.diagnosis({"flow_direction": "backward"})
-    assert found.suspects[0] == "flow_direction=forward"
-    swapped = WRONG["flow_channels=row_column"](right)
-    found = swapped.diagnosis({"flow_channels": "row_column"})
-    assert found.suspects[0] == "flow_channels=uv"
-    as_z = depth(right, lambda z: z_from_ray_length(z, K))
-    assert as_z.diagnosis({"depth_kind": "ray_length"}).suspects[0] == "depth_kind=z"
+def test_the_correction_is_relative_to_the_options_in_force(right):
+    # The data's axes are x_forward_z_up, and opengl was given.
+    case = poses(right, lambda p: adapt_pose(turned("x_forward_z_up")(p), axes="opengl"))
+    found = case.diagnosis({"pose_axes": "opengl"})
+    assert found.suspects[0] == "pose_axes=x_forward_z_up"
+    assert "format.pose_axes=x_forward_z_up" in found.words
     millimetres = depth(right, lambda z: 5 * z).diagnosis({"depth_unit_m": "0.001"})
     assert millimetres.suspects[0] == "depth_unit_m=0.0002"
 
@@ -238,19 +222,15 @@ def test_unknown_flow_and_missing_depth_are_left_out(right):
     assert dataclasses.replace(right, raw=raw, depth=z).diagnosis().suspects == ()
 
 
-def test_it_cannot_tell_of_flow_that_no_motion_explains(right):
+def test_flow_that_no_motion_explains_and_poses_of_another_recording_are_no_convention(right):
     raw = 5 * torch.randn(right.raw.shape, generator=torch.Generator().manual_seed(2))
-    found = dataclasses.replace(right, raw=raw).diagnosis()
-    assert found.suspects == ()
-    assert found.words.startswith("can't tell")
-
-
-def test_poses_of_another_recording_are_no_convention(right):
+    noise = dataclasses.replace(right, raw=raw).diagnosis()
     other = dataclasses.replace(right, now=BEFORE @ rigid((0.1, 0.08, -0.2), (0.3, 0.5, -0.1)))
-    found = other.diagnosis()
-    assert found.suspects == ()
-    assert found.words.startswith("can't tell")
-    assert found.estimated_px < 0.05 < found.residual_px
+    others = other.diagnosis()
+    for found in (noise, others):
+        assert found.suspects == ()
+        assert found.words.startswith("can't tell")
+    assert others.estimated_px < 0.05 < others.residual_px
 
 
 def test_a_camera_that_only_turns_leaves_the_unit_of_depth_open():
@@ -290,6 +270,60 @@ def test_large_pictures_are_sampled_without_a_shift():
     assert found.residual_px < 1e-3
 
 
+def show(doctor, previous, current, source, change=lambda pose: pose, factor=1.0, **options):
+    """Shows the doctor a pair of frames, with poses and depth of another convention."""
+    doctor.look(
+        torch.from_numpy(source(previous, current)),
+        torch.from_numpy(np.float32(factor) * current.depth)[None],
+        torch.from_numpy(current.K),
+        *(change(torch.from_numpy(frame.world_from_cam)) for frame in (previous, current)),
+        **options,
+    )
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Six frames of a drive through a turn."""
+    pytest.importorskip("pybullet", reason="the streets are PyBullet's")
+    from examples.make_recording import make_recording
+
+    folder = tmp_path_factory.mktemp("made") / "turn"
+    make_recording(folder, scene="s_turn", frames=6, size=(120, 160), skipped=60)
+    return folder
+
+
+# Options that say what the recording is not, and what corrects them.
+GIVEN = {
+    "right": ({}, None),
+    "direction": ({"pose_direction": "world_to_camera"}, "pose_direction=camera_to_world"),
+    "axes": ({"pose_axes": "opengl"}, "pose_axes=opencv"),
+    "ned": ({"pose_axes": "ned"}, "pose_axes=opencv"),
+    "flow": ({"flow_direction": "backward"}, "flow_direction=forward"),
+    "channels": ({"flow_channels": "row_column"}, "flow_channels=uv"),
+    "unit": ({"depth_unit_m": 0.001}, "depth_unit_m=1"),
+    "1.5": ({"depth_unit_m": 1.5}, "depth_unit_m="),
+    "ray": ({"depth_kind": "ray_length"}, "depth_kind=z"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "flow"),
+    [(name, "exact") for name in GIVEN]
+    + [(name, "estimated") for name in ("right", "axes", "unit")],
+)
+def test_the_doctor_corrects_the_options_of_a_recorded_street(name, flow, recording):
+    options, correction = GIVEN[name]
+    read, exact = Frames(recording, **options), flow == "exact"
+    source = recorded_flow if exact else EstimatedFlowSource(DIS("medium"))
+    doctor = Doctor(read.conventions, flow_is_recorded=exact)
+    for pair in pairwise(read):
+        show(doctor, *pair, source, picture=None if exact else picture_of(pair[1]))
+    found = doctor.diagnosis()
+    assert bool(found.suspects) == bool(correction), found.words
+    if correction is not None:
+        assert any(suspect.startswith(correction) for suspect in found.suspects), found.words
+
+
 OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 REAL = {
     "": (1.0, lambda pose: pose),
@@ -309,17 +343,10 @@ REAL = {
 @pytest.mark.parametrize("correction", REAL)
 def test_mistakes_about_a_real_recording_are_named(correction):
     factor, change = REAL[correction]
-    recording = seven_scenes()
+    recording = SevenScenes(SEVEN_SCENES)
     source = EstimatedFlowSource(DIS("fast"))
     doctor = Doctor(flow_is_recorded=False)
     for before, now in ((0, 1), (1, 2), (0, 2)):
-        previous, current = recording[before], recording[now]
-        doctor.look(
-            torch.from_numpy(source(previous, current)),
-            torch.from_numpy(np.float32(factor) * current.depth)[None],
-            torch.from_numpy(current.K),
-            change(torch.from_numpy(previous.world_from_cam)),
-            change(torch.from_numpy(current.world_from_cam)),
-            picture=torch.from_numpy(current.rgb).permute(2, 0, 1),
-        )
+        pair = recording[before], recording[now]
+        show(doctor, *pair, source, change, factor, picture=picture_of(pair[1]))
     assert doctor.diagnosis().suspects[:1] == ((correction,) if correction else ())

@@ -16,6 +16,7 @@ import cv2
 from flowrep.sequences import (
     EstimatedFlowSource,
     Frame,
+    Frames,
     SequenceError,
     estimated_motion,
     factorize_frames,
@@ -212,3 +213,20 @@ def test_the_error_against_flow_of_another_pair_is_not_counted():
         pytest.approx(2**0.5, rel=1e-5)
     )
     assert np.isnan(end_point_error(zero, np.full_like(zero, np.nan)))
+
+
+def test_people_move_and_the_street_stands_still(tmp_path):
+    pytest.importorskip("pybullet", reason="the streets are PyBullet's")
+    from examples.make_recording import make_recording
+
+    make_recording(tmp_path / "street", frames=4, size=(60, 80), skipped=20, seed=3)
+    first, *others = factorize_frames(Frames(tmp_path / "street"), recorded_flow)
+    assert first is None
+    assert len(others) == 3
+    for made in others:
+        obj_px = np.hypot(*made.obj)[made.valid]
+        assert made.valid.mean() > 0.95
+        # Depth, poses and flow are rounded to float32 alone.
+        assert np.quantile(obj_px, 0.9) < 1e-3
+        assert (obj_px > 0.3).sum() >= 10
+        assert np.median(np.hypot(*made.ego)[made.valid]) > 1

@@ -45,16 +45,12 @@ def test_flo_by_hand(tmp_path):
     assert np.frombuffer(data, "<f4", offset=12).tolist() == [1.5, -2.0, 3.0, 4.0]
 
 
-def test_opencv_reads_the_flo_that_is_written(flow, tmp_path):
-    write_flo(tmp_path / "a.flo", flow)
-    np.testing.assert_array_equal(
-        cv2.readOpticalFlow(str(tmp_path / "a.flo")).transpose(2, 0, 1), flow
-    )
-
-
-def test_the_flo_that_opencv_writes_is_read(flow, tmp_path):
-    cv2.writeOpticalFlow(str(tmp_path / "a.flo"), np.ascontiguousarray(flow.transpose(1, 2, 0)))
-    np.testing.assert_array_equal(read_flo(tmp_path / "a.flo"), flow)
+def test_flo_is_opencvs(flow, tmp_path):
+    path = tmp_path / "a.flo"
+    write_flo(path, flow)
+    np.testing.assert_array_equal(cv2.readOpticalFlow(str(path)).transpose(2, 0, 1), flow)
+    cv2.writeOpticalFlow(str(path), np.ascontiguousarray(2 * flow.transpose(1, 2, 0)))
+    np.testing.assert_array_equal(read_flo(path), 2 * flow)
 
 
 def test_unknown_flow_is_marked_as_the_format_says_and_comes_back_as_nan(flow, tmp_path):
@@ -97,7 +93,7 @@ def refusal(read, names) -> str:
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
-@pytest.mark.parametrize("kept", [0.0, 0.2, 0.99])
+@pytest.mark.parametrize("kept", [0.2, 0.99])
 def test_a_picture_that_was_cut_off_is_refused(suffix, kept, tmp_path):
     # OpenCV decodes it, with a grey rest.
     synthetic.write_frames(tmp_path)

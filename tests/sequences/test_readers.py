@@ -7,9 +7,12 @@ import pytest
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
+import cv2
+
 from flowrep.sequences import (
     Frames,
     Kitti,
+    SequenceError,
     SevenScenes,
     Sintel,
     TartanAir,
@@ -19,6 +22,7 @@ from flowrep.sequences import (
     factorize_frames,
     recorded_flow,
 )
+from flowrep.sequences.tum import interpolated_pose
 from tests.sequences import synthetic
 from tests.sequences.synthetic import HEIGHT, TUM_INTRINSICS, WIDTH
 
@@ -140,22 +144,17 @@ def test_virtual_kittis_second_camera_and_sky(tmp_path):
     np.testing.assert_allclose(frame.world_from_cam[:3, 3], right, atol=1e-9)
 
 
-def test_what_tartanair_masks_is_unknown(tmp_path):
-    synthetic.write_tartanair(tmp_path)
+@pytest.mark.parametrize("name", ["sintel", "tartanair"])
+def test_what_the_data_set_masks_is_unknown(name, tmp_path):
+    write, open_it, *_ = FORMATS[name]
+    write(tmp_path)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[4, 5] = 100  # out of the picture
-    np.save(tmp_path / "flow/000000_000001_mask.npy", mask)
-    raw = TartanAir(tmp_path, backwards=True)[2].raw
-    assert np.isnan(raw[:, 4, 5]).all()
-    assert np.isnan(raw).sum() == 2
-
-
-def test_what_sintel_calls_invalid_is_unknown(tmp_path):
-    synthetic.write_sintel(tmp_path)
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[4, 5] = 255
-    synthetic.png(tmp_path / "invalid/cave/frame_0001.png", mask)
-    raw = Sintel(tmp_path, scene="cave", backwards=True)[2].raw
+    mask[4, 5] = 100
+    if name == "sintel":
+        synthetic.png(tmp_path / "invalid/cave/frame_0001.png", mask)
+    else:
+        np.save(tmp_path / "flow/000000_000001_mask.npy", mask)
+    raw = open_it(tmp_path)[2].raw
     assert np.isnan(raw[:, 4, 5]).all()
     assert np.isnan(raw).sum() == 2
 
@@ -194,3 +193,84 @@ def test_zed_poses_in_other_coordinate_systems(axes, given_from_opencv, tmp_path
     synthetic.text(tmp_path / "poses.txt", map(synthetic.quaternion_line, poses))
     for frame, moment in zip(Zed(tmp_path, pose_axes=axes), moments):
         np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-7)
+
+
+# TUM's three clocks: what belongs together, and poses between those that were measured.
+
+
+def write_times(folder, rgb_s, depth_s, poses):
+    """Writes pictures at these times; the grey of one and the metres of the other count them."""
+    for i, time in enumerate(rgb_s):
+        synthetic.png(folder / f"rgb/{time:.3f}.png", np.full((4, 6, 3), i, np.uint8))
+    for i, time in enumerate(depth_s):
+        synthetic.png(folder / f"depth/{time:.3f}.png", np.full((4, 6), 5000 * (i + 1), np.uint16))
+    synthetic.text(folder / "rgb.txt", [f"{time} rgb/{time:.3f}.png" for time in rgb_s])
+    synthetic.text(folder / "depth.txt", [f"{time} depth/{time:.3f}.png" for time in depth_s])
+    synthetic.text(folder / "groundtruth.txt", [f"{time} {pose}" for time, pose in poses])
+
+
+def at(x):
+    return f"{x} 0 0 0 0 0 1"
+
+
+def matches(recording):
+    return [
+        (int(f.rgb[0, 0, 0]), float(f.depth[0, 0]), round(float(f.world_from_cam[0, 3]), 9))
+        for f in recording
+    ]
+
+
+def test_each_picture_has_the_nearest_depth_and_pose_within_the_tolerance(tmp_path):
+    poses = [(0.995, at(1)), (1.1, at(2)), (1.198, at(3)), (1.203, at(4))]
+    write_times(tmp_path, [1.0, 1.1, 1.2], [1.01, 1.13, 1.19, 1.215], poses)
+    recording = Tum(tmp_path, tolerance_s=0.02)
+    # 1.1 has no depth within 0.02 s (1.13); of 1.19 and 1.215 the first is nearer to 1.2.
+    assert matches(recording) == [(0, 1.0, 1.0), (2, 3.0, 3.0)]
+    assert [frame.timestamp_s for frame in recording] == [1.0, 1.2]
+    (note,) = recording.notes
+    assert note.startswith("1 of 3 pictures have no depth map or pose within 0.02 s")
+
+
+def test_a_depth_map_belongs_to_one_picture_alone(tmp_path):
+    write_times(tmp_path, [1.0, 1.012], [1.01], [(1.0, at(1)), (1.012, at(2))])
+    assert matches(Tum(tmp_path)) == [(1, 1.0, 2.0)]  # 1.01 is 2 ms from one and 10 from the other
+
+
+def test_a_pose_at_the_pictures_own_time_lies_between_its_neighbours(tmp_path):
+    # A quarter of the way from x = 1 to x = 3, and of a right angle about y.
+    turned = "3 0 0 0 0.7071067811865476 0 0.7071067811865476"
+    write_times(tmp_path, [1.0025], [1.0], [(1.0, at(1)), (1.01, turned)])
+    (frame,) = Tum(tmp_path, interpolate=True)
+    np.testing.assert_allclose(frame.world_from_cam[:3, 3], [1.5, 0, 0], atol=1e-9)
+    expected = cv2.Rodrigues(np.array([0.0, np.pi / 8, 0.0]))[0]
+    np.testing.assert_allclose(frame.world_from_cam[:3, :3], expected, atol=1e-9)
+    (nearest,) = Tum(tmp_path)
+    np.testing.assert_allclose(nearest.world_from_cam, np.array(
+        [[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))  # fmt: skip
+
+
+def test_poses_are_not_interpolated_across_a_gap_nor_beyond_the_ends(tmp_path):
+    poses = [(1.0, at(1)), (1.5, at(2)), (1.51, at(3))]
+    write_times(tmp_path, [0.99, 1.2, 1.505], [0.99, 1.2, 1.505], poses)
+    assert matches(Tum(tmp_path, interpolate=True)) == [(2, 3.0, 2.5)]
+
+
+def test_a_pose_that_was_measured_is_not_changed(tmp_path):
+    write_times(tmp_path, [1.0, 1.5], [1.0, 1.5], [(1.0, at(1)), (1.5, at(2))])
+    assert matches(Tum(tmp_path, interpolate=True)) == [(0, 1.0, 1.0), (1, 2.0, 2.0)]
+
+
+def test_clocks_that_never_meet(tmp_path):
+    write_times(tmp_path, [1.0], [2.0], [(1.0, at(1))])
+    with pytest.raises(SequenceError, match=r"within 0\.02 s: raise tolerance_s, or check"):
+        Tum(tmp_path)
+
+
+def test_a_half_turn_is_halved():
+    # Near pi the axis is read from the diagonal: a sign lost there would turn the wrong way.
+    after = np.eye(4)
+    after[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.0, np.pi - 1e-3]))[0]
+    half = interpolated_pose(np.eye(4), after, 0.5)[:3, :3]
+    np.testing.assert_allclose(
+        half, cv2.Rodrigues(np.array([0, 0, np.pi / 2 - 5e-4]))[0], atol=1e-6
+    )
