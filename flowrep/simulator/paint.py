@@ -19,8 +19,8 @@ AMBIENT, DIFFUSE = 0.62, 0.46
 LIGHT = tuple((np.array([-4.0, 3.0, 9.0]) / np.linalg.norm([-4.0, 3.0, 9.0])).tolist())
 """Shares of light from everywhere and from the sun, and the direction to it, in the world."""
 
-GRAIN_SIZE, FRONT_SIZE = 1024, 64  # texels a side; of a house front as the rasteriser has it
-_TEXELS_A_M, _PEOPLE_TEXELS_A_M = 50.0, 400.0  # so the grain of roads repeats every 20 m
+GRAIN_SIZE, FRONT_SIZE = 512, 64  # texels a side; of a house front as the rasteriser has it
+_TEXELS_A_M, _PEOPLE_TEXELS_A_M = 25.0, 200.0  # so the grain of roads repeats every 20 m
 _SLOPE = 1.2  # of the grain's spectrum; at 1 every octave has the same contrast
 _COARSEST_WAVES = 5  # over the grain's size: 4 m on roads
 # With these, DIS follows roads and people (see docs/scenes.md) and they still look like asphalt and
@@ -237,8 +237,8 @@ def front_levels() -> NDArray[np.float32]:
     for number in range(NUM_FRONTS):
         row, column = divmod(number, len(_WALLS))
         level = image[_SWATCH_PX + row * height + rows, column * width : (column + 1) * width]
-        # Every eighth texel of the grain, so that its waves are 1 to 8 m long on a house too.
-        own = pattern[row * 16 :: 8, column * 16 :: 8][:FRONT_SIZE, :FRONT_SIZE, None]
+        # Every fourth texel of the grain, so that its waves are as long as on the ground.
+        own = pattern[row * 16 :: 4, column * 16 :: 4][:FRONT_SIZE, :FRONT_SIZE, None]
         level = level * (1.0 + _CONTRAST[CATEGORY_ID["building"]] * own)
         while True:
             levels.append(level.reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""A fast rasteriser for depth, class and instance maps, in place of PyBullet's renderer.
+"""A fast rasteriser for depth, class and instance maps and colours, instead of PyBullet's renderer.
 
 Numba compiles it at the first call and caches the machine code. The module is imported only when
 something is drawn.
@@ -7,6 +7,8 @@ A vertex becomes q = z · (u, v, 1): pixel coordinates times depth. In this fram
 triangle are planes through the camera, e_a = q_b × q_c, and pixel r = (u, v, 1) lies inside if
 e_a · r ≥ 0 for all three. With d = q_a · e_a the inverse depth is (e_a + e_b + e_c) · r / d, affine
 in u and v. This also holds for corners behind the camera, so nothing needs to be clipped.
+
+Colours are computed after all triangles are drawn, once for each pixel (`_shade`).
 """
 
 import math
@@ -53,7 +55,7 @@ class Maps(NamedTuple):
 
 
 class Rasteriser:
-    """A camera for depth and ids; triangles are visible only from outside.
+    """A camera for depth, ids and colours; triangles are visible only from outside.
 
     Args:
         triangles: the bodies.
@@ -78,7 +80,14 @@ class Rasteriser:
         ids = triangles.semantic[owners], triangles.instance[owners]
         self._world = (*shape, triangles.poses, *ids, K_of_index, *map(float, range_m))
         poses = np.repeat(triangles.poses, np.diff(triangles.corner_bounds))
-        self._look = poses, *triangles.look, grain(), front_levels()
+        # Tables of 4 MB are made when colours are first drawn.
+        self._look = (
+            poses,
+            *triangles.look,
+            np.empty((0, 2), np.float32),
+            np.empty((0, 3), np.float32),
+        )
+        self._is_painted = False
         self._size = size
         moving = int(triangles.poses.max(initial=-1)) + 1
         nothing = np.empty((0, 4, 4)), np.empty((0, moving, 4, 4))
@@ -100,6 +109,9 @@ class Rasteriser:
             is_shown: which bodies are present, [N, B].
             rgb: whether to draw colours too.
         """
+        if rgb and not self._is_painted:
+            self._look = *self._look[:-2], grain(), front_levels()
+            self._is_painted = True
         views = len(cam_from_world)
         shape = (views, *self._size)
         maps = Maps(
