@@ -275,7 +275,11 @@ def _look_up(inverse, number, classes, instances, depth, semantic, instance):
 
 @_shading
 def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
-    """Colours the visible triangles: paint times grain times light, filtered to a pixel's size."""
+    """Colours the visible triangles: paint times grain times light, filtered to a pixel's size.
+
+    No array is handed to a function within the loop: numba would count its references at every
+    pixel, which takes a third of the time.
+    """
     poses, normals, colours, contrast, grain_axes, front_of, front_axes, grain, fronts = look
     height, width = number.shape
     m, g, f = np.empty((3, 4)), np.empty((2, 4)), np.empty((2, 4))
@@ -308,11 +312,26 @@ def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
             tilt_u, tilt_v = nx * per_d * z * du, ny * per_d * z * dv
             if front >= 0:
                 u, v, level = _texel(f, a, b, z, tilt_u, tilt_v, du, dv)
+                n = int(min(max(level + 0.5, 0.0), _FRONT_LEVELS - 1.0))
+                half = 0.5 / _SCALES[n]  # of a texel: here the centre of texel 0 is at 0.5
+                start = front * _FRONT_STARTS[-1] + _FRONT_STARTS[n]
+                p, q, r, s, right, down = _around(
+                    u - half, v - half, FRONT_SIZE >> n, _SCALES[n], start
+                )
                 light = shade
-                red, green, blue = _front(fronts, front, u, v, level)
+                red = _mixed(fronts[p, 0], fronts[q, 0], fronts[r, 0], fronts[s, 0], right, down)
+                green = _mixed(fronts[p, 1], fronts[q, 1], fronts[r, 1], fronts[s, 1], right, down)
+                blue = _mixed(fronts[p, 2], fronts[q, 2], fronts[r, 2], fronts[s, 2], right, down)
             else:
                 u, v, level = _texel(g, a, b, z, tilt_u, tilt_v, du, dv)
-                light = shade * (1.0 + rough * _grain(grain, u, v, level))
+                level = min(max(level, 0.0), _GRAIN_LEVELS - 1.001)
+                n = int(level)
+                p, q, r, s, right, down = _around(
+                    u, v, GRAIN_SIZE >> n, _SCALES[n], _GRAIN_STARTS[n]
+                )
+                fine = _mixed(grain[p, 0], grain[q, 0], grain[r, 0], grain[s, 0], right, down)
+                coarse = _mixed(grain[p, 1], grain[q, 1], grain[r, 1], grain[s, 1], right, down)
+                light = shade * (1.0 + rough * (fine + (level - n) * (coarse - fine)))
             rgb[0, y, x] = np.uint8(min(255.0, max(0.0, red * light)))
             rgb[1, y, x] = np.uint8(min(255.0, max(0.0, green * light)))
             rgb[2, y, x] = np.uint8(min(255.0, max(0.0, blue * light)))
@@ -354,30 +373,6 @@ def _texel(axes, a, b, z, tilt_u, tilt_v, du, dv):
 
 
 @_inlined
-def _grain(texels, u, v, level):
-    if level >= _GRAIN_LEVELS - 1:
-        return 0.0
-    level = max(level, 0.0)
-    n = int(level)
-    p, q, r, s, du, dv = _around(u, v, GRAIN_SIZE >> n, _SCALES[n], _GRAIN_STARTS[n])
-    fine = _mixed(texels, p, q, r, s, du, dv, 0)
-    return fine + (level - n) * (_mixed(texels, p, q, r, s, du, dv, 1) - fine)
-
-
-@_inlined
-def _front(texels, front, u, v, level):
-    n = int(min(max(level + 0.5, 0.0), _FRONT_LEVELS - 1.0))
-    half = 0.5 / _SCALES[n]  # of a texel: here the centre of texel 0 is at 0.5
-    start = front * _FRONT_STARTS[-1] + _FRONT_STARTS[n]
-    p, q, r, s, du, dv = _around(u - half, v - half, FRONT_SIZE >> n, _SCALES[n], start)
-    return (
-        _mixed(texels, p, q, r, s, du, dv, 0),
-        _mixed(texels, p, q, r, s, du, dv, 1),
-        _mixed(texels, p, q, r, s, du, dv, 2),
-    )
-
-
-@_inlined
 def _around(u, v, size, scale, start):
     """Returns the indices of the four texels around a place, and where it is between them."""
     u, v = u * scale, v * scale
@@ -385,11 +380,10 @@ def _around(u, v, size, scale, start):
     left, up = int(i) & (size - 1), int(j) & (size - 1)
     right, down = (left + 1) & (size - 1), (up + 1) & (size - 1)
     up, down = start + up * size, start + down * size
-    return up + left, up + right, down + left, down + right, u - i, v - j
+    return up + left, up + right, down + left, down + right, np.float32(u - i), np.float32(v - j)
 
 
 @_inlined
-def _mixed(texels, p, q, r, s, du, dv, channel):
-    top = texels[p, channel] + du * (texels[q, channel] - texels[p, channel])
-    bottom = texels[r, channel] + du * (texels[s, channel] - texels[r, channel])
-    return top + dv * (bottom - top)
+def _mixed(a, b, c, d, right, down):
+    top, bottom = a + right * (b - a), c + right * (d - c)
+    return top + down * (bottom - top)
