@@ -107,6 +107,7 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
             scene=config.scene or {},
             representations=config.representations or {},
             flow=None if config.flow is None else config.flow.plain(),
+            motion=config.motion,
             noise=None if config.noise is None else config.noise.plain(),
             **machine,
         )

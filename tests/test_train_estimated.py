@@ -28,9 +28,15 @@ def command(*arguments, cwd):
 
 def test_a_run_on_estimated_flow_is_trained_and_evaluated(tmp_path):
     run = tmp_path / "run"
-    smoke = ["debug=smoke", "flow=estimated", "flow.preset=ultrafast", f"hydra.run.dir={run}"]
+    smoke = [
+        "debug=smoke",
+        "flow=estimated",
+        "flow.preset=ultrafast",
+        "motion=estimated",
+        f"hydra.run.dir={run}",
+    ]
     command("flowrep.train", *smoke, *QUICK, cwd=tmp_path)
-    assert "source: estimated" in (run / "config.yaml").read_text()
+    assert "motion: estimated" in (run / "config.yaml").read_text()
     asked = ["speed=high", "episodes=1", "num_envs=1", "baselines=[]", "video=1"]
     command("flowrep.evaluate", f"run={run}", *asked, cwd=tmp_path)
     with (run / "evaluation.csv").open(newline="") as file:

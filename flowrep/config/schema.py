@@ -44,6 +44,7 @@ SpeedMode = Literal["low", "normal", "high"]
 FrameRate = Annotated[float, Field(ge=0.5, le=1000)]
 BaselineName = Literal["planner", "never_turn", "random"]
 Renderer = Literal["auto", "rasteriser", "pybullet"]
+MotionSource = Literal["exact", "estimated"]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 Workers = CountOrZero | Literal["auto"]
 
@@ -352,6 +353,7 @@ class EnvConfig(Section):
     renderer: Renderer
     representations: Stack
     flow: Flow
+    motion: MotionSource = "exact"  # not in runs before it
     noise: Noise
     scene: dict[str, Any]  # flowrep.scenes.load_scene checks it
 
@@ -421,6 +423,7 @@ class EvaluateConfig(Section):
     scene: dict[str, Any] | None = None
     representations: Stack | None = None
     flow: Flow | None = None
+    motion: MotionSource | None = None
     noise: Noise | None = None
     speed: Annotated[list[SpeedMode], Field(min_length=1), Distinct, OneOrMore]
     fps: Annotated[list[FrameRate], Field(min_length=1), Distinct, OneOrMore]
@@ -459,7 +462,7 @@ class EvaluateConfig(Section):
         for key in needed:
             if getattr(self, key) is None:
                 raise ValueError(f"{key} needs a value for policy={own[0]}")
-        for key in () if own else ("representations", "flow", "noise", "output"):
+        for key in () if own else ("representations", "flow", "motion", "noise", "output"):
             if getattr(self, key) is not None:
                 raise ValueError(f"{key}= is for a policy of your own; a run's is in its config")
         return self

@@ -118,6 +118,7 @@ def make_env(
     seed: int | None = None,
     keep_sensor: bool = False,
     flow: str | Mapping[str, Any] = "exact",
+    motion: str = "exact",
     noise: Mapping[str, float] | None = None,
     compiled: bool = False,
     renderer: str = "auto",
@@ -143,6 +144,8 @@ def make_env(
             representation needs them.
         flow: "exact" or "estimated", the source of raw and obj; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
+        motion: "exact" or "estimated" from flow and depth, the source of the camera's motion behind
+            ego and obj.
         noise: errors of the depth camera and of odometry, see `representation_stack`. They are
             drawn by frame, so that a repeated episode looks the same.
         compiled: whether flow is computed through `torch.compile`: up to two and a half times as
@@ -184,6 +187,7 @@ def make_env(
             dt_s=1.0 / probe.frame_rate_hz,
             compiled=compiled,
             flow=flow,
+            motion=motion,
             noise=noise,
         )
     probe.close()

@@ -96,6 +96,7 @@ def load_external(
     scene: Mapping[str, Any],
     representations: Mapping[str, Any],
     flow: Mapping[str, Any] | None = None,
+    motion: str | None = None,
     noise: Mapping[str, float] | None = None,
     **machine: Any,
 ) -> Agent:
@@ -106,6 +107,7 @@ def load_external(
         scene: the scene to act in.
         representations: what the policy sees: a mapping from name to options.
         flow: the source of raw and obj; exact if None.
+        motion: the source of the camera's motion; exact if None.
         noise: errors of depth and motion; none if None.
         machine: `device`, `num_envs` and `num_workers`.
 
@@ -118,6 +120,7 @@ def load_external(
             "scene": scene,
             "representations": representations,
             "flow": flow or {"source": "exact"},
+            "motion": motion or "exact",
             "noise": noise or dict.fromkeys(Noise.key_names(), 0.0),
             "speed": "normal",
             "renderer": "auto",

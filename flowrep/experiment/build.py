@@ -45,6 +45,7 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
         "scene": config.scene,
         "representations": config.representations,
         "flow": config.flow.plain(),
+        "motion": config.motion,
         "noise": config.noise.plain(),
         "num_envs": config.num_envs,
         "device": device(config.device),
