@@ -170,7 +170,7 @@ def test_an_evaluation_takes_one_value_or_a_list():
 
 @pytest.mark.parametrize(
     "line",
-    ["policy=pilot", "speed=fast", "episodes=0", "sheet_rows=true", "seed=-1", "frame_rate_hz=0"],
+    ["speed=fast", "episodes=0", "sheet_rows=true", "seed=-1", "frame_rate_hz=0"],
 )
 def test_a_look_that_can_not_be_is_refused(line):
     assert line.partition("=")[0] in refusal("view", ViewConfig, line)
@@ -198,7 +198,7 @@ def test_names_in_the_schema_are_those_of_the_code():
     from flowrep.baselines import BASELINES
     from flowrep.scenes import scene
     from flowrep.simulator.camera import RENDERERS
-    from flowrep.transforms.stack import NOISE_OPTIONS
+    from flowrep.transforms.stack import MOTION_SOURCES, NOISE_OPTIONS
 
     def literal(model, field):
         return set(get_args(model.model_fields[field].annotation))
@@ -206,6 +206,7 @@ def test_names_in_the_schema_are_those_of_the_code():
     assert set(get_args(schema.SpeedMode)) == set(get_args(scene.SpeedMode))
     assert set(get_args(schema.BaselineName)) == set(BASELINES)
     assert set(get_args(schema.Renderer)) == set(RENDERERS)
+    assert set(get_args(schema.MotionSource)) == set(MOTION_SOURCES)
     assert literal(schema.DiscreteSAC, "encoder") == set(dsac.ENCODERS)
     assert literal(schema.PPO, "precision") == set(observation.PRECISIONS)
     assert schema.Noise.key_names() == list(NOISE_OPTIONS)
@@ -219,7 +220,7 @@ def test_names_in_the_schema_are_those_of_the_code():
             "policy=a.py:make", "scene=s_turn", "flow=exact", "noise=none", "representations=[ego]",
         ]),
         ("export", ExportConfig, ["run=x"]),
-        ("view", ViewConfig, []),
+        ("view", ViewConfig, ["representations=[ego]"]),
         ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
         ("report", ReportConfig, ["run=x"]),
     ],
