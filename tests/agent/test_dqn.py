@@ -27,14 +27,6 @@ def test_epsilon_falls_linearly_over_its_share_of_the_frames(make_dqn, random_st
         assert agent.exploration.eps.item() == pytest.approx(expected)
 
 
-def test_a_policy_alone_has_no_layer_norm_unless_it_is_given(observation_spec):
-    policy = DoubleDQN.make_policy(
-        observation_spec, Categorical(3), ["seg"], device="cpu", precision="fp32", hidden_size=8,
-        initial_epsilon=1.0, final_epsilon=0.1, exploration_share=0.2, total_frames=100,
-    )  # fmt: skip
-    assert not policy[0].module.network.encoder.layer_norm
-
-
 def values(agent, maps, target=False):
     """Q(s, ·) of raw maps."""
     prefix = "target_value_network_params" if target else "value_network_params"

@@ -96,20 +96,6 @@ def test_writes_the_action_and_nothing_else(make_agent, random_maps):
     assert set(agent.policy(maps.clone()).keys()) - set(maps.keys()) == {"action"}
 
 
-def test_acts_with_the_weights_that_an_update_left(make_agent, random_steps, as_batch):
-    agent, steps = make_agent(learning_rate=0.01), random_steps(8)
-    before = probabilities(agent, steps)
-    agent.update(as_batch(agent, steps))
-    assert not torch.equal(probabilities(agent, steps), before)
-
-
-def test_maps_of_another_size_are_refused(make_agent, random_maps):
-    agent, maps = make_agent(), random_maps(2)
-    maps["flow"] = maps["flow"][..., :-1]
-    with pytest.raises(ValueError, match=r"'flow': .* maps \(2, 38, 45\), got \(2, 38, 44\)"):
-        agent.policy(maps)
-
-
 class Clock(EnvBase):
     """Three environments whose one map shows the time; environment i ends at time 2 + i."""
 
