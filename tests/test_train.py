@@ -42,7 +42,7 @@ def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
     assert {path.name for path in run.iterdir() if not path.name.startswith(".")} == {
         "config.yaml", "metrics.csv", "tensorboard", "learning_curve.png", "checkpoint",
-        "evaluation.csv", "failures.csv", "machine.json", "videos",
+        "drives.npz", "evaluation.csv", "failures.csv", "machine.json", "videos",
     }  # fmt: skip
 
 

@@ -176,7 +176,8 @@ def test_evaluations_go_to_tensorboard_as_shares_and_means(tmp_path):
     """Two of four succeed; returns 1, 2, 3 and 10, lengths 10, 20, 30 and 60."""
     run = RunFolder(tmp_path)
     same = {
-        "scene": "s_turn", "representations": "ego", "flow": "exact", "seed": 3, "frames": 500,
+        "scene": "s_turn", "scene_id": "0a", "representations": "ego", "flow": "exact", "seed": 3,
+        "frames": 500,
         "evaluation": "training", "policy": "greedy", "speed": "normal", "fps": 12.0, "hit": "",
     }  # fmt: skip
     ends = [
