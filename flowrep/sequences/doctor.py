@@ -1,12 +1,11 @@
 """The convention doctor: detects poses, depth or flow in another convention than assumed.
 
-A wrong convention raises no error and gives wrong flow. In most recordings, most of the picture is
-static, and there raw flow is ego flow, so that the median of |raw - ego| is small. If it is not,
-the doctor computes ego flow again under each of the usual mistakes, with depth times any factor,
-and with the camera's axes that fit the motion that flow and depth give by themselves
-(`flowrep.geometry.camera_motion`). It names the corrections that explain the flow, as options
-relative to those in force. If that other motion does not explain the flow either, nothing can be
-told of the poses.
+In most recordings, most of the picture is static, and there raw flow is ego flow, so that the
+median of |raw - ego| is small. If it is not, the doctor computes ego flow again under each of the
+usual mistakes, with depth times any factor, and with the camera's axes that fit the motion that
+flow and depth give by themselves (`flowrep.geometry.camera_motion`). It names the corrections that
+explain the flow, as options relative to those in force. If that other motion does not explain the
+flow either, nothing can be told of the poses.
 """
 
 from __future__ import annotations
@@ -61,7 +60,8 @@ class Mistake:
     """What the data may be instead, completing "if ...", and what makes correct data of them."""
 
     says: str
-    poses: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
+    pose: Callable[[Tensor], Tensor] | None = None
+    reverses: bool = False  # the poses of a pair belong to each other's frames
     depth: Callable[[Tensor, Tensor], Tensor] | None = None
     flow: Callable[[Tensor], Tensor] | None = None
     K: Callable[[Tensor], Tensor] | None = None
@@ -85,7 +85,7 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
                 "pose_direction": (direction, f"the poses are {direction.replace('_', '-')}"),
                 "pose_axes": (axes, f"the camera's axes are {axes}"),
             }
-            suppose(options, poses=_each(_readapted(given, direction, axes)))
+            suppose(options, pose=_readapted(given, direction, axes))
     if given["depth_kind"] != "z_buffer":
         says = "depth is the length of the ray, not z"
         suppose({"depth_kind": ("ray_length", says)}, depth=z_from_ray_length)
@@ -100,10 +100,10 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
             suppose({"flow_channels": (channels, says)}, flow=lambda raw: raw.flip(0))
     else:
         found["frames in reverse order"] = Mistake(
-            "the poses are in the reverse order of the pictures", lambda prev, curr: (curr, prev)
+            "the poses are in the reverse order of the pictures", reverses=True
         )
     found["rotations transposed"] = Mistake(
-        "the rotations are stored column by column, or inverted", _each(_transposed)
+        "the rotations are stored column by column, or inverted", _transposed
     )
     for factor, size in ((2.0, "twice"), (0.5, "half")):
         found[f"intrinsics times {factor:g}"] = Mistake(
@@ -111,10 +111,6 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
             K=partial(_scaled, factor),
         )
     return found
-
-
-def _each(change: Callable[[Tensor], Tensor]) -> Callable[..., Any]:
-    return lambda prev, curr: (change(prev), change(curr))
 
 
 def _readapted(given: Mapping[str, str], direction: str, axes: Any) -> Callable[[Tensor], Tensor]:
@@ -322,7 +318,8 @@ def _residual_px(
     """Returns the median of |raw - ego|, `[*B]` for depths `[*B, 1, H, W]`."""
     poses, depth, flow, K = pair.poses, pair.depth, pair.raw, pair.K
     if mistake is not None:
-        poses = mistake.poses(*poses) if mistake.poses else poses
+        poses = poses[::-1] if mistake.reverses else poses
+        poses = (mistake.pose(poses[0]), mistake.pose(poses[1])) if mistake.pose else poses
         K = mistake.K(K) if mistake.K else K
         depth = mistake.depth(depth, K) if mistake.depth else depth
         flow = mistake.flow(flow) if mistake.flow else flow
@@ -392,7 +389,7 @@ def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
             return {}  # one of the usual ones
     columns = given_from_opencv[:3, :3].round(decimals=1).tolist()
     says = f"the camera's right, down and ahead are the columns of {columns} in the poses' axes"
-    return {"other axes": Mistake(says, _each(lambda pose: pose @ given_from_opencv))}
+    return {"other axes": Mistake(says, lambda pose: pose @ given_from_opencv)}
 
 
 def _vectors(motion: Tensor) -> NDArray[np.float64]:

@@ -211,7 +211,7 @@ def depth_from_integers(
 
 
 def read_depth(
-    path: Path, size: tuple[int, int], *, unit_m: float | None = None
+    path: Path, size: tuple[int, int], unit_m: float | None = None
 ) -> NDArray[np.float32]:
     """Returns a depth map in metres: 16 bits (0 and 65535 missing) or floats, times a unit.
 

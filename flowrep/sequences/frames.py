@@ -143,10 +143,9 @@ class Frames(Recording):
     def _check_names(self) -> None:
         """Raises SequenceError if a frame lacks a file that the others have."""
         names = [path.stem for path in self._depths]
-        for kind, found in (("rgb", self._rgbs), ("flow", self._flows)):
-            # The first frame has no flow since the frame before.
-            expected = names[1:] if kind == "flow" else names
-            for name in expected if found else ():
+        # The first frame has no flow since the frame before.
+        for kind, found, first in (("rgb", self._rgbs, 0), ("flow", self._flows, 1)):
+            for name in names[first:] if found else ():
                 if name not in found:
                     raise SequenceError(self.folder / kind, f"lacks a file for frame {name}")
             for name, path in found.items():
@@ -159,12 +158,19 @@ class Frames(Recording):
         world_from_cam = None
         if self.has_poses:
             world_from_cam = as_pose(self._poses[index], self._poses_path, **self._pose_options)
-        depth = self._depth(depth_path)
+        stored = torch.from_numpy(read_depth(depth_path, self._camera.size, self.depth_unit_m))
+        is_ray = self._depth_options["kind"] == "ray_length"
+        K = torch.from_numpy(self._camera.K).float() if is_ray else None
+        depth = adapt_depth(stored[None], K=K, **self._depth_options)[0].numpy()
         if self._registration is not None:
             depth = self._registration(depth)
             if world_from_cam is not None:
                 world_from_cam = world_from_cam @ self._registration.depth_from_colour
-        rgb, has_flow = self._rgbs.get(name), self.has_flow and index > 0
+        rgb, raw = self._rgbs.get(name), None
+        if self.has_flow and index > 0:
+            path = self._flows[name]
+            flow = read_kitti_flow(path) if path.suffix.lower() == ".png" else read_flo(path)
+            raw = adapt_flow(torch.from_numpy(flow), **self._flow_options).numpy()
         return Frame(
             name=name,
             source=depth_path if rgb is None else rgb,
@@ -173,25 +179,13 @@ class Frames(Recording):
             depth=depth,
             rgb=None if rgb is None else read_rgb(rgb),
             timestamp_s=None if self._times is None else float(self._times[index]),
-            raw=self._flow(self._flows[name]) if has_flow else None,
-            raw_since=self._depths[index - 1].stem if has_flow else None,
+            raw=raw,
+            raw_since=None if raw is None else self._depths[index - 1].stem,
         )
-
-    def _depth(self, path: Path) -> NDArray[np.float32]:
-        stored = read_depth(path, self._camera.size, unit_m=self.depth_unit_m)
-        is_ray = self._depth_options["kind"] == "ray_length"
-        K = torch.from_numpy(self._camera.K).float() if is_ray else None
-        return adapt_depth(torch.from_numpy(stored)[None], K=K, **self._depth_options)[0].numpy()
-
-    def _flow(self, path: Path) -> NDArray[np.float32]:
-        flow = read_kitti_flow(path) if path.suffix.lower() == ".png" else read_flo(path)
-        return adapt_flow(torch.from_numpy(flow), **self._flow_options).numpy()
 
     def _by_stem(self, kind: str, suffixes: tuple[str, ...]) -> dict[str, Path]:
         folder = self.folder / kind
-        if not folder.is_dir():
-            return {}
-        return {path.stem: path for path in list_files(folder, suffixes)}
+        return {p.stem: p for p in list_files(folder, suffixes)} if folder.is_dir() else {}
 
 
 class Zed(Recording):

@@ -99,7 +99,14 @@ class Job:
         with StopRequest() as interrupted, tqdm(total=self._total(), unit="frame") as bar:
             for index, previous, current in self._pairs():
                 if previous is not None:
-                    self._take(index, previous, current)
+                    with self.clock("raw flow"):
+                        raw = self.flow_source(previous, current)
+                    with self.clock("motion"):
+                        motion = self.motion_source(previous, current, raw)
+                    with self.clock("factorising"):
+                        made = factorize_pair(previous, current, raw, motion)
+                    with self.clock("writing"):
+                        self.output.append(index, made)
                 bar.update()
                 if interrupted:
                     break
@@ -117,16 +124,6 @@ class Job:
             "notes": list(self.stream.notes),
             "seconds": {name: round(spent, 3) for name, spent in self.clock.seconds.items()},
         }
-
-    def _take(self, index: int, previous: Frame, current: Frame) -> None:
-        with self.clock("raw flow"):
-            raw = self.flow_source(previous, current)
-        with self.clock("motion"):
-            motion = self.motion_source(previous, current, raw)
-        with self.clock("factorising"):
-            made = factorize_pair(previous, current, raw, motion)
-        with self.clock("writing"):
-            self.output.append(index, made)
 
     def _total(self) -> int | None:
         """Returns the number of frames to read, None for a camera."""

@@ -124,13 +124,11 @@ class Output:
 
     def medians(self) -> dict[str, float | None]:
         """Returns the median over the frames of each column of measurements."""
-        known = {
-            name: [float(row[name]) for row in self.rows if row[name] != ""]
-            for name in list(self.rows[0])[3:]
-        }
-        return {
-            name: float(np.median(values)) if values else None for name, values in known.items()
-        }
+        medians: dict[str, float | None] = {}
+        for name in list(self.rows[0])[3:]:
+            values = [float(row[name]) for row in self.rows if row[name] != ""]
+            medians[name] = float(np.median(values)) if values else None
+        return medians
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:

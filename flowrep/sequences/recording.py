@@ -65,19 +65,11 @@ class Frame:
 
 
 class Stream(Protocol):
-    """Frames as they come, from a camera or from a `Recording`, which can also be indexed."""
+    """Frames as they come, from a camera or from a `Recording`; see there for the attributes."""
 
-    @property
-    def has_flow(self) -> bool:
-        """Whether frames may bring flow of their own."""
-
-    @property
-    def has_poses(self) -> bool:
-        """Whether frames bring the camera's pose."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes for the user, a sentence each."""
+    has_flow: bool
+    has_poses: bool
+    notes: tuple[str, ...]
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields the frames in order."""

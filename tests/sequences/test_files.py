@@ -36,15 +36,6 @@ def flow():
     return np.random.default_rng(0).normal(0, 30, (2, 5, 7)).astype(np.float32)
 
 
-def test_flo_by_hand(tmp_path):
-    # One row of two pixels, (u, v) interleaved: 202021.25, 2, 1, then 1.5 -2 and 3 4.
-    write_flo(tmp_path / "a.flo", np.array([[[1.5, 3.0]], [[-2.0, 4.0]]], np.float32))
-    data = (tmp_path / "a.flo").read_bytes()
-    assert data[:4] == b"PIEH"
-    assert np.frombuffer(data, "<i4", 2, 4).tolist() == [2, 1]
-    assert np.frombuffer(data, "<f4", offset=12).tolist() == [1.5, -2.0, 3.0, 4.0]
-
-
 def test_flo_is_opencvs(flow, tmp_path):
     path = tmp_path / "a.flo"
     write_flo(path, flow)
