@@ -34,7 +34,7 @@ class DIS:
 
     Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels,
     because the preset "medium" matches patches of 8 px at half size, too coarse for a picture of
-    48 px (`benchmarks/estimated_flow.py` measures the effect). The faster presets choose their
+    48 px (docs/transforms/estimated_flow.md has the effect). The faster presets choose their
     scale by the picture's width and gain less, or nothing.
 
     The pictures of a batch are split among as many threads as torch uses
