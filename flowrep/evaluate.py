@@ -17,6 +17,7 @@ from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, print_error, run_command
 from flowrep.config.schema import EvaluateConfig
 from flowrep.envs import WorkerError
+from flowrep.experiment import build
 from flowrep.experiment.agents import Agent, PolicyError, load_external, load_trained
 from flowrep.experiment.evaluation import (
     Comparison,
@@ -134,6 +135,8 @@ def evaluate_one(
         ),
     )
     table = folder.read_episodes()
+    num_envs = min(agent.config.num_envs, comparison.total)
+    pool = build.evaluation_pool(agent.config, agent.policy, num_envs)
 
     def save() -> list[dict[str, Any]]:
         rows = comparison.rows(
@@ -154,9 +157,11 @@ def evaluate_one(
 
     try:
         comparison.run(
-            agent.make_env, agent.policy, agent.config.num_envs, lambda: bool(stop), try_to_save
+            agent.make_env, agent.policy, num_envs, lambda: bool(stop), try_to_save, pool
         )
     finally:
+        if pool is not None:
+            pool.close()
         if results := comparison.results():
             try:
                 rows = save()

@@ -87,7 +87,7 @@ class WorkerVectorEnv(VectorEnv):
         self._end = util.Finalize(self, _end, args=(self._workers,), exitpriority=10)
         context: Any = get_context("forkserver")
         context.set_forkserver_preload([_PRELOADED])
-        with _sheltered():
+        with sheltered():
             forkserver.ensure_running()
             memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
             for rows in self._rows:
@@ -274,7 +274,7 @@ def _work(pipe: Connection, make: Callable[[], Any]) -> None:
 
 
 @contextmanager
-def _sheltered() -> Iterator[None]:
+def sheltered() -> Iterator[None]:
     """Starts processes that signals don't reach and that do not run the main module again.
 
     A process inherits the mask of blocked signals, so there is no moment at which Ctrl-C could

@@ -8,6 +8,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -49,9 +50,10 @@ class Agent:
     frames: int = 0
     trained_in: str | None = None
 
-    def make_env(self, **changes: Any) -> EnvBase:
-        """Returns an env of its config; `changes` override arguments of `make_env`."""
-        return build.env(self.config, **changes)
+    @property
+    def make_env(self) -> Callable[..., EnvBase]:
+        """Makes envs of its config; arguments override those of `make_env`."""
+        return partial(build.env, self.config)
 
 
 def load_trained(

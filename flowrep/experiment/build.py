@@ -14,7 +14,10 @@ from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.workers import available_cores
+from flowrep.experiment.evaluation_pool import EvaluationPool, can_travel
 from flowrep.simulator.camera import choose_renderer
+
+ENVS_PER_PROCESS = 24  # of an evaluation
 
 
 def device(name: str) -> torch.device:
@@ -81,6 +84,17 @@ def _workers_help(config: EnvConfig) -> bool:
     if available_cores() > 2 or device(config.device).type != "cpu":
         return True
     return config.flow.source != "exact" or choose_renderer(config.renderer) == "pybullet"
+
+
+def evaluation_pool(config: EnvConfig, policy: Any, num_envs: int) -> EvaluationPool | None:
+    """Returns processes that evaluate a policy; None if this one alone does, with its workers.
+
+    A process needs some environments to be worth it: a step of few costs as much as one of many.
+    """
+    if device(config.device).type != "cpu" or not can_travel(policy):
+        return None
+    count = min(worker_count(config.num_workers, config.num_envs), num_envs // ENVS_PER_PROCESS)
+    return EvaluationPool(count) if count > 1 else None
 
 
 def agent(config: TrainConfig, env: EnvBase) -> Algorithm:

@@ -9,10 +9,11 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from itertools import count, product
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,6 +31,9 @@ from flowrep.envs import Outcome
 from flowrep.envs.episode import hit_name
 from flowrep.scenes import Scene
 from flowrep.tables import write_rows
+
+if TYPE_CHECKING:
+    from flowrep.experiment.evaluation_pool import EvaluationPool
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Row = dict[str, Any]
@@ -286,6 +290,7 @@ class Comparison:
         num_envs: int,
         should_stop: Callable[[], bool] = lambda: False,
         save: Callable[[], None] = lambda: None,
+        pool: "EvaluationPool | None" = None,
     ) -> None:
         """Runs the episodes; finished ones are kept even if it is interrupted.
 
@@ -297,6 +302,7 @@ class Comparison:
             num_envs: the number of environments side by side, at most.
             should_stop: called after each episode.
             save: called when all episodes of a policy at one speed and frame rate have been run.
+            pool: the processes that run the episodes; this one if None.
         """
         for key in list(self._found):
             if key[-1] in self.policies:
@@ -313,7 +319,8 @@ class Comparison:
             total=self.total, initial=done, unit="episode", desc="evaluating", leave=False,
             miniters=0, mininterval=0.5,
         ) as bar:  # fmt: skip
-            for name, episode in self._episodes(make_env, policy, num_envs, show_step):
+            driven = self._episodes(make_env, policy, num_envs, show_step, should_stop, pool)
+            for name, episode in driven:
                 found = self._found[episode.speed, episode.fps, name]
                 found[episode.seed] = episode
                 bar.update()
@@ -328,18 +335,33 @@ class Comparison:
         policy: Policy,
         num_envs: int,
         on_frame: Callable[[TensorDictBase], None],
+        should_stop: Callable[[], bool],
+        pool: "EvaluationPool | None",
     ) -> Iterator[tuple[str, Episode]]:
         for rate in self.fps:
+            if should_stop():
+                return
             for names, changes in ((self.policies, {}), (self.baselines, _WITHOUT_OBSERVATIONS)):
                 missing = {name: self._missing(rate, name) for name in names}
                 most = max(map(len, missing.values()), default=0)
                 if not most:
                     continue
-                size = {"num_envs": min(num_envs, most)}
-                with closing(make_env(frame_rate_hz=rate, **size, **changes)) as env:
+                changes = {"frame_rate_hz": rate, "num_envs": min(num_envs, most), **changes}
+                if pool is not None:
+                    changes["num_envs"] = -(-changes["num_envs"] // pool.num_processes)
+                    make = partial(make_env, **changes | {"num_workers": 0})
+                    for name, episodes in missing.items():
+                        driver = name if name in self.baselines else policy
+                        greedy = name != "sampled"
+                        found = pool.evaluate(
+                            make, driver, episodes, greedy=greedy, should_stop=should_stop
+                        )
+                        yield from ((name, episode) for episode in found)
+                    continue
+                with closing(make_env(**changes)) as env:
                     for name, episodes in missing.items():
                         how: dict[str, Any] = {"greedy": name != "sampled", "on_frame": on_frame}
-                        driver = BaselinePolicy(name, env) if changes else policy
+                        driver = BaselinePolicy(name, env) if name in self.baselines else policy
                         for episode in evaluate(env, driver, episodes, **how):
                             yield name, episode
 

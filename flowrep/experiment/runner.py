@@ -35,6 +35,7 @@ from flowrep.experiment.evaluation import (
     scene_id,
     write_failures,
 )
+from flowrep.experiment.evaluation_pool import EvaluationPool
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch
 
@@ -74,6 +75,7 @@ class Runner:
         self.observation: TensorDictBase | None = None
         self.evaluation_pending = False
         self.metrics, self.recent = Means(), RecentEpisodes()
+        self._pool: EvaluationPool | None = None
 
     def train(self, stop: StopRequest) -> None:
         """Trains until `total_frames` or until a stop is requested, and saves the last state.
@@ -196,9 +198,12 @@ class Runner:
                 policies=["greedy"],
             )
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
-            num_envs = max(EVALUATION_ENVS, config.num_envs)
+            num_envs, policy = max(EVALUATION_ENVS, config.num_envs), self.agent.policy
+            if self._pool is None:
+                most = min(num_envs, max(asked.episodes, asked.final_total))
+                self._pool = build.evaluation_pool(config, policy, most)
             make_env = partial(build.env, config)
-            comparison.run(make_env, self.agent.policy, num_envs, lambda: bool(stop))
+            comparison.run(make_env, policy, num_envs, lambda: bool(stop), pool=self._pool)
         if not comparison.is_complete:
             return False
         scene = self.env.base_env.scene
@@ -223,7 +228,7 @@ class Runner:
     def film(self) -> None:
         """Writes causes of failure and learning curve, and films an episode unless it is there.
 
-        The processes of the environments end first, as filming takes memory as well.
+        The processes of environments and evaluation end first, as filming takes memory as well.
         """
         # drawing takes seconds to import
         from flowrep.experiment.film import draw_learning_curve, record_episode
@@ -241,7 +246,10 @@ class Runner:
             print(f"video: {path}")
 
     def close(self) -> None:
-        """Ends the processes of environments."""
+        """Ends the processes of environments and evaluation."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
         if not self.env.is_closed:
             self.env.close()
 

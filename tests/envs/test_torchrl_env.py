@@ -120,7 +120,8 @@ def test_the_tensordict_has_the_representations_and_no_sensor(make):
     env = make(representations=["obj", "seg"], num_envs=2, seed=0)
     reset = env.reset()
     assert set(reset.keys(True, True)) == {
-        "obj", "seg", "outcome", "hit", "episode_seed", "done", "terminated", "truncated"
+        "obj", "seg", "outcome", "hit", "episode_seed", "path", "vehicle",
+        "done", "terminated", "truncated",
     }  # fmt: skip
     assert reset["obj"].shape == (2, 2, 84, 84)
     assert (reset["outcome"].dtype, reset["outcome"].shape) == (torch.uint8, (2, 1))

@@ -42,8 +42,12 @@ def scene(straight_road):
 class Weigher(nn.Module):
     """Logits from sums over maps, so that an action depends on what is seen."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.tensor(1.0))
+
     def forward(self, *maps: torch.Tensor) -> torch.Tensor:
-        total = sum(m.float().flatten(1).sum(-1) for m in maps)
+        total = self.factor * sum(m.float().flatten(1).sum(-1) for m in maps)
         return torch.stack([0.5 * torch.cos(total + i) for i in range(3)], -1)
 
 

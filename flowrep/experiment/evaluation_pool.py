@@ -1,0 +1,138 @@
+"""Processes that evaluate shares of episodes, each with an env of its own, on a CPU's cores."""
+
+import os
+import pickle
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache
+from multiprocessing import get_context, parent_process
+from typing import Any
+
+import torch
+from torchrl.envs import EnvBase
+
+from flowrep.agent import keep_freed_memory
+from flowrep.baselines import BaselinePolicy
+from flowrep.envs import WorkerError
+from flowrep.envs.workers import sheltered
+from flowrep.experiment.evaluation import Episode, Policy, evaluate
+
+_stop: Any = None  # an event that ends the shares under way; set by `_begin`
+
+
+class EvaluationPool:
+    """Evaluates in several processes, which start with the first share and are kept.
+
+    An episode is the same wherever it is driven. Ctrl-C does not reach the processes, and they end
+    with the caller.
+
+    Args:
+        num_processes: their number.
+    """
+
+    def __init__(self, num_processes: int) -> None:
+        context = get_context("spawn")
+        self.num_processes = num_processes
+        self._stop = context.Event()
+        self._executor = ProcessPoolExecutor(num_processes, context, _begin, (self._stop,))
+
+    def evaluate(
+        self,
+        make_env: Callable[..., EnvBase],
+        policy: Policy | str,
+        episodes: Sequence[Mapping[str, Any]],
+        *,
+        greedy: bool = True,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> Iterator[Episode]:
+        """Yields episodes share by share; closing the iterator ends those under way.
+
+        Args:
+            make_env: picklable; makes the env of a process, without workers.
+            policy: picklable, or the name of a baseline.
+            episodes: see `flowrep.experiment.evaluation.evaluate`.
+            greedy: see there.
+            should_stop: ends the shares under way.
+
+        Raises:
+            WorkerError: a process has died.
+        """
+        # Sent as they are, tensors would be moved to shared memory, the caller's weights included.
+        env, given = pickle.dumps(make_env), pickle.dumps(policy)
+        count = 2 * self.num_processes  # so that none waits for long for the others
+        shares = [episodes[first::count] for first in range(count)]
+        waiting: set[Future[list[Episode]]] = set()
+        try:
+            with sheltered():
+                for share in filter(None, shares):
+                    waiting.add(self._executor.submit(_evaluate_share, env, given, share, greedy))
+            while waiting and not should_stop():
+                done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield from future.result()
+        except BrokenProcessPool as error:
+            if should_stop():  # a scheduler's SIGTERM ended all of them
+                return
+            raise WorkerError(
+                "a process of the evaluation is gone: perhaps the system killed it for want of "
+                "memory; num_workers=0 needs less"
+            ) from error
+        finally:
+            self._stop.set()
+            for future in waiting:
+                future.cancel()
+            wait(waiting)
+            self._stop.clear()
+
+    def close(self) -> None:
+        """Ends the processes."""
+        self._executor.shutdown()
+
+
+def can_travel(policy: Any) -> bool:
+    """Returns whether a policy can be sent to another process."""
+    try:
+        pickle.dumps(policy)
+    except (pickle.PicklingError, AttributeError, TypeError, RuntimeError):
+        return False
+    return True
+
+
+def _begin(stop: Any) -> None:
+    """Prepares a process."""
+    global _stop
+    _stop = stop
+    # by which the executor ends the others if one has died
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM,))
+    keep_freed_memory()
+    torch.set_num_threads(1)
+    # A killed caller leaves processes that wait for work: they hold the queue's other end as well.
+    threading.Thread(target=_end_with_caller, daemon=True).start()
+
+
+def _end_with_caller() -> None:
+    caller = parent_process()
+    assert caller is not None
+    caller.join()
+    os._exit(1)
+
+
+@lru_cache(maxsize=2)  # one that sees, and one without observations
+def _made(env: bytes) -> EnvBase:
+    return pickle.loads(env)()
+
+
+def _evaluate_share(
+    env: bytes, policy: bytes, episodes: Sequence[Mapping[str, Any]], greedy: bool
+) -> list[Episode]:
+    made, given = _made(env), pickle.loads(policy)
+    driver = BaselinePolicy(given, made) if isinstance(given, str) else given
+    found = []
+    for episode in evaluate(made, driver, episodes, greedy=greedy):
+        found.append(episode)
+        if _stop.is_set():
+            break
+    return found
