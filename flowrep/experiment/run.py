@@ -389,7 +389,9 @@ class RunFolder:
 
     def read_episodes(self) -> list[dict[str, str]]:
         """Returns the rows of evaluation.csv, none if there is no such file."""
-        return read_rows(self.evaluation_path, EVALUATION_COLUMNS)
+        # runs of earlier versions have no scene_id
+        needed = [name for name in EVALUATION_COLUMNS if name != "scene_id"]
+        return [{"scene_id": ""} | row for row in read_rows(self.evaluation_path, needed)]
 
     def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Saves evaluated episodes and plots them, see `save_episodes` and `plot_episodes`."""
