@@ -123,7 +123,7 @@ def test_another_version_is_refused(config):
 def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     RunFolder(tmp_path).log_to_wandb("off", {})
-    with pytest.raises(ImportError, match=r"wandb=offline needs .*flowrep\[train,wandb\]"):
+    with pytest.raises(ImportError, match=r"wandb=offline needs .*\[train,wandb\]"):
         RunFolder(tmp_path).log_to_wandb("offline", {})
 
 
