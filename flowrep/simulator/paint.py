@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 
 from flowrep.palette import CATEGORY_ID, CLASS_COLOURS
 
-SIZE_PX = 256
+SIZE_PX = 256  # a side of the texture
+_SWATCH_PX = 8
+_FRONT_PX = (60, 64)  # height, width of one house front in the texture
+_FLOORS = (2, 3, 4, 5)
 AMBIENT, DIFFUSE = 0.62, 0.46
 LIGHT = tuple((np.array([-4.0, 3.0, 9.0]) / np.linalg.norm([-4.0, 3.0, 9.0])).tolist())
 """Shares of light from everywhere and from the sun, and the direction to it, in the world."""
@@ -23,14 +26,11 @@ GRAIN_SIZE, FRONT_SIZE = 512, 64  # texels a side; of a house front as the raste
 _TEXELS_A_M, _PEOPLE_TEXELS_A_M = 25.0, 200.0  # so the grain of roads repeats every 20 m
 _SLOPE = 1.2  # of the grain's spectrum; at 1 every octave has the same contrast
 _COARSEST_WAVES = 5  # over the grain's size: 4 m on roads
-# With these, DIS follows roads and people (see docs/scenes.md) and they still look like asphalt and
-# clothes; at 0.2 the flow of the road is missed twice as often.
+# Enough for DIS to follow roads and people (docs/scenes.md), and they still look like asphalt and
+# clothes. A slope of 0.8 doubles the road's error, contrasts of 1 raise that of people.
 _CONTRAST_OF = {"road": 0.3, "crosswalk": 0.3, "sidewalk": 0.2, "terrain": 0.3, "tree": 0.3}
 _CONTRAST_OF |= {"pedestrian": 0.3, "building": 0.12, "fence": 0.2}
 _CONTRAST = [_CONTRAST_OF.get(name, 0.1) for name in CLASS_COLOURS]  # by class
-_SWATCH_PX = 8
-_FRONT_PX = (60, 64)  # height, width of one house front in the texture
-_FLOORS = (2, 3, 4, 5)
 
 PAINTS: dict[str, tuple[int, int, int]] = {
     "asphalt": (84, 84, 90),

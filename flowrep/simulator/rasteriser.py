@@ -377,9 +377,10 @@ def _around(u, v, size, scale, start):
     """Returns the indices of the four texels around a place, and where it is between them."""
     u, v = u * scale, v * scale
     i, j = math.floor(u), math.floor(v)
-    left, up = int(i) & (size - 1), int(j) & (size - 1)
-    right, down = (left + 1) & (size - 1), (up + 1) & (size - 1)
-    up, down = start + up * size, start + down * size
+    last = np.uint32(size - 1)
+    left, up = np.uint32(i) & last, np.uint32(j) & last
+    right, down = (left + np.uint32(1)) & last, (up + np.uint32(1)) & last
+    up, down = np.uint32(start) + up * np.uint32(size), np.uint32(start) + down * np.uint32(size)
     return up + left, up + right, down + left, down + right, np.float32(u - i), np.float32(v - j)
 
 
