@@ -213,12 +213,11 @@ def straight_on_policy():
 
 def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
     stopped = Comparison(**ASKED | {"episodes": 6, "speeds": ["low"], "fps": [12]})
-    done = []
     stopped.run(
         partial(make_env, scene, representations=["obj"]),
         weigher("obj"),
         num_envs=6,
-        should_stop=lambda: done.append(1) or len(done) == 3,
+        should_stop=lambda: sum(map(len, stopped._found.values())) == 3,
     )
     assert not stopped.is_complete
     (found,) = stopped._found.values()

@@ -179,7 +179,6 @@ def test_evaluations_go_to_tensorboard_as_shares_and_means(tmp_path):
         "scene": "s_turn", "scene_id": "0a", "representations": "ego", "flow": "exact", "seed": 3,
         "frames": 500,
         "evaluation": "training", "policy": "greedy", "speed": "normal", "fps": 12.0, "hit": "",
-        "scene_id": "",
     }  # fmt: skip
     ends = [
         ("success", 1.0, 10),
