@@ -13,7 +13,7 @@ from functools import partial
 from itertools import count, product
 from pathlib import Path
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,9 +31,6 @@ from flowrep.envs import Outcome
 from flowrep.envs.episode import hit_name
 from flowrep.scenes import Scene
 from flowrep.tables import write_rows
-
-if TYPE_CHECKING:
-    from flowrep.experiment.evaluation_pool import EvaluationPool
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Row = dict[str, Any]
@@ -290,7 +287,7 @@ class Comparison:
         num_envs: int,
         should_stop: Callable[[], bool] = lambda: False,
         save: Callable[[], None] = lambda: None,
-        pool: "EvaluationPool | None" = None,
+        pool: Any = None,
     ) -> None:
         """Runs the episodes; finished ones are kept even if it is interrupted.
 
@@ -302,7 +299,7 @@ class Comparison:
             num_envs: the number of environments side by side, at most.
             should_stop: called after each episode.
             save: called when all episodes of a policy at one speed and frame rate have been run.
-            pool: the processes that run the episodes; this one if None.
+            pool: an `EvaluationPool`, whose processes run the episodes; this one does if None.
         """
         for key in list(self._found):
             if key[-1] in self.policies:
@@ -336,7 +333,7 @@ class Comparison:
         num_envs: int,
         on_frame: Callable[[TensorDictBase], None],
         should_stop: Callable[[], bool],
-        pool: "EvaluationPool | None",
+        pool: Any,
     ) -> Iterator[tuple[str, Episode]]:
         for rate in self.fps:
             if should_stop():
