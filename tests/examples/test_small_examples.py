@@ -75,7 +75,7 @@ def test_the_policy_of_ones_own_keeps_clear_of_a_person_and_comes_back(side):
             obj[..., 15, column] = torch.tensor([-0.1 * side, 0.0])
             depth[..., 15, column] = 0.1
         maps = {"obj": obj, "depth": depth}
-        maps |= {"street": torch.tensor([3]), "is_init": torch.tensor([[step == 0]])}
+        maps |= {"env_id": torch.tensor([3]), "is_init": torch.tensor([[step == 0]])}
         (action,) = act(maps).tolist()
         state = roll(turn(state, YAW_SIGN[action], 1 / 12, vehicle), 1 / 12, vehicle.speed_mps)
         way.append(side * state.y_m)
