@@ -118,8 +118,8 @@ def test_no_config_of_torchrl_s_is_replaced():
         "groups = ['env', 'loss', 'sampler', 'storage', 'replay_buffer', 'transform']\n"
         "before = {(group, name) for group in groups for name in listed(group)}\n"
         "from flowrep import torchrl_configs\n"
-        "from flowrep.transforms import hydra_configs\n"
-        "ours = {*torchrl_configs.CONFIGS, *(('transform', name) for name in hydra_configs.CONFIGS)}\n"
+        "from flowrep.transforms.hydra_configs import CONFIGS\n"
+        "ours = {*torchrl_configs.CONFIGS, *(('transform', name) for name in CONFIGS)}\n"
         "print(sorted(before & {(group, name + '.yaml') for group, name in ours}))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
