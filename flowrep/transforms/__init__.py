@@ -1,7 +1,6 @@
 """TorchRL transforms that turn sensor maps into mid-level representations."""
 
-from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose
-from flowrep.transforms.body_rows import BodyRows
+from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose, BodyRows
 from flowrep.transforms.estimated_flow import DIS, RAFT, EstimatedFlow
 from flowrep.transforms.flow import FlowFactorize, RawFlow
 from flowrep.transforms.frame_stack import FrameStack

@@ -15,6 +15,7 @@ from flowrep.transforms import (
     AdaptDepth,
     AdaptFlow,
     AdaptPose,
+    BodyRows,
     CameraMotion,
     FlowFactorize,
     InstanceIds,
@@ -201,3 +202,42 @@ def test_isaac_labs_buffers_become_flow():
     pose = AdaptPose(layout="xyz_wxyz")  # ROS's axes are OpenCV's
     camera = pose(TensorDict(pose=torch.cat([position, quaternion], -1), batch_size=[1]))
     assert camera["sensor", "world_from_cam"][0, :3, 2:].tolist() == [[0, 5], [0, 6], [1, 7]]
+
+
+def body_at(x):
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[0, 3] = x
+    return matrix
+
+
+def test_a_body_keeps_its_row_while_others_leave():
+    rows = BodyRows(3)
+    rows({"a": body_at(1), "b": body_at(2)})
+    assert rows({"b": body_at(3)})[:, 0, 3].tolist()[1] == 3
+    assert rows({"c": body_at(7), "b": body_at(4)})[:, 0, 3].tolist()[:2] == [7, 4]
+
+
+def test_a_row_is_empty_for_a_step_before_another_body_takes_it():
+    rows = BodyRows(2)
+    first = rows({"a": body_at(1)})
+    second = rows({"b": body_at(9)})
+    # in one row, motion from 1 m to 9 m would be a jump that nobody made
+    both_known = first.isfinite() & second.isfinite()
+    assert not both_known.any()
+
+
+def test_labels_follow_their_bodies_from_frame_to_frame():
+    rows = BodyRows(2)
+    rows({"a": body_at(1), "b": body_at(2)})
+    picture = torch.tensor([[[0, 200, 7]]], dtype=torch.uint8)
+    assert rows.instance(picture, {200: "b", 7: "a"}).tolist() == [[[0, 2, 1]]]
+    assert rows.instance(picture, {200: "a", 7: "b"}).tolist() == [[[0, 1, 2]]]
+    assert rows.instance(picture, {200: "gone"}).tolist() == [[[0, 0, 0]]]
+
+
+def test_too_many_bodies_say_how_many_rows_they_need():
+    rows = BodyRows(1)
+    with pytest.raises(ValueError, match=r"BodyRows\(2\)"):
+        rows({"a": body_at(1), "b": body_at(2)})
+    rows.clear()
+    rows({"a": body_at(1)})
