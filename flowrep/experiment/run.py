@@ -5,6 +5,7 @@ import fcntl
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -149,7 +150,7 @@ def _differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[s
 def machine_of(precision: torch.dtype) -> dict[str, Any]:
     """Returns what a run is computed with: versions, commit, processor and number format."""
     home, found = Path(__file__).parents[2], ""
-    if (home / ".git").exists():
+    if (home / ".git").exists() and shutil.which("git"):
         ask = ["git", "-C", str(home), "describe", "--always", "--dirty", "--abbrev=40"]
         found = subprocess.run([*ask, "--exclude=*"], capture_output=True, text=True).stdout.strip()
     is_gpu = torch.cuda.is_available()

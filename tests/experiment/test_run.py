@@ -268,6 +268,11 @@ def test_what_a_run_is_computed_with_is_noted_once_for_each_machine(tmp_path):
     assert noted == [here, here | {"cpu": "another"}, here]
 
 
+def test_a_clone_on_a_machine_without_git_has_no_commit(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert machine_of(torch.float32)["commit"] is None
+
+
 def test_a_folder_without_a_run_is_named(tmp_path):
     with pytest.raises(RunFolderError, match="holds no run"):
         RunFolder.existing(tmp_path / "nothing")
