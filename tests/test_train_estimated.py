@@ -44,6 +44,18 @@ def test_a_run_on_estimated_flow_is_trained_and_evaluated(tmp_path):
     assert (run / "videos" / "high_12fps_2000000.mp4").stat().st_size > 1e4
 
 
+@pytest.mark.parametrize("motion", ["exact", "estimated"])
+def test_a_config_says_where_the_cameras_motion_is_from(motion):
+    from flowrep.experiment import build
+    from flowrep.transforms import EstimateCameraMotion
+    from tests.config.composing import composed
+
+    env = build.env(composed("debug=smoke", f"motion={motion}", "num_workers=0", "device=cpu"))
+    estimators = [each for each in env.transform if isinstance(each, EstimateCameraMotion)]
+    env.close()
+    assert len(estimators) == (motion == "estimated")
+
+
 def test_the_agent_and_the_film_see_one_estimate():
     import torch
 
