@@ -242,6 +242,13 @@ def test_angles_turn_left_and_look_up():
     torch.testing.assert_close(ahead, expected)
     right = camera @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     torch.testing.assert_close(right[:3], torch.tensor([6.0, 6.0, 7.0], dtype=torch.float64))
+    aslant = torch.tensor([5.0, 6.0, 7.0, math.pi / 3, math.pi / 6], dtype=torch.float64)
+    down = adapt_pose(aslant, layout="xyz_yaw_pitch", axes="x_forward_z_up")[:3, 1]
+    # looking up by 30 degrees, the picture's down leans ahead: it is the up of
+    # (-cos 60 sin 30, -sin 60 sin 30, cos 30), turned over
+    half = math.sqrt(3) / 2
+    expected = torch.tensor([0.25, half / 2, -half], dtype=torch.float64)
+    torch.testing.assert_close(down, expected)
     level = adapt_pose(pose[:4], layout="xyz_yaw", axes="x_forward_z_up")
     torch.testing.assert_close(level[:3, 2], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
     with pytest.raises(ValueError, match="x_forward_z_up"):
