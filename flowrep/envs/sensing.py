@@ -118,7 +118,7 @@ class Sensing:
         self._vehicle_from_cam = vehicle_from_camera(camera)
         self._class_of_body = street.simulator.class_lookup()
         self._instance_of_body = street.simulator.instance_lookup()
-        self._asked, self._scale = renderer, picture_scale
+        self.renderer, self._scale = choose_renderer(renderer), picture_scale
         self._rasterise: Callable[..., Any] | None = None
         if not {"rgb", *_MAPS}.isdisjoint(sensors):
             self._rasterise = self._rasteriser(1)
@@ -167,7 +167,7 @@ class Sensing:
     @cache  # noqa: B019 - a sensing lives as long as its environment
     def _rasteriser(self, scale: int) -> Callable[..., Any] | None:
         """Returns a rasteriser of pictures so many times the maps' size; None for PyBullet."""
-        if choose_renderer(self._asked) == "pybullet":
+        if self.renderer == "pybullet":
             return None
         from flowrep.simulator.rasteriser import Rasteriser
 

@@ -122,6 +122,7 @@ def make_env(
     noise: Mapping[str, float] | None = None,
     compiled: bool = False,
     renderer: str = "auto",
+    picture_scale: int = 1,
 ) -> TransformedEnv:
     """Returns a batched TorchRL env, always of batch size [num_envs].
 
@@ -151,6 +152,7 @@ def make_env(
         compiled: whether flow is computed through `torch.compile`: up to two and a half times as
             fast on a CPU and equal up to rounding, after up to a minute of compilation.
         renderer: what renders depth, classes and ids, see `StreetEnv`.
+        picture_scale: size of `rgb` in sizes of the maps, with the rasteriser.
 
     Raises:
         SceneError: if the scene is invalid.
@@ -175,6 +177,7 @@ def make_env(
         speed=speed,
         frame_rate_hz=frame_rate_hz,
         renderer=choose_renderer(renderer),
+        picture_scale=picture_scale,
     )
     # An environment without sensors gives the transforms K, classes and frame rate.
     probe = street(sensors=())

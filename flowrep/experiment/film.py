@@ -15,6 +15,7 @@ from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Episode, Policy, evaluate, outcome_shares
 from flowrep.geometry import factorize, rigid_flow
 from flowrep.viz import representation_strip, write_video
+from flowrep.viz.maps import tile_zoom
 
 Maps = dict[str, Tensor]
 
@@ -22,12 +23,25 @@ Maps = dict[str, Tensor]
 def make_filmed(make_env: Callable[..., EnvBase], representations: Mapping[str, Any]) -> EnvBase:
     """Returns an env of one street for `film_episode`: it keeps every sensor, rgb included.
 
+    Unless the agent or an estimator sees it too, rgb is as large as the tiles of a film.
+
     Args:
         make_env: takes changes of `make_env`'s arguments.
         representations: the policy's inputs, a mapping from name to options.
     """
     seen = {**representations, "rgb": {}}
-    return make_env(representations=seen, keep_sensor=True, num_envs=1, num_workers=0)
+    make = partial(make_env, representations=seen, keep_sensor=True, num_envs=1, num_workers=0)
+    env = make()
+    is_for_us = (
+        "rgb" not in representations
+        and sum(("sensor", "rgb") in transform.in_keys for transform in env.transform) == 1
+    )
+    (street,) = street_envs(env)
+    if not is_for_us or street.sensing.renderer == "pybullet":
+        return env
+    size = env.observation_spec["sensor", "rgb"].shape[-2:]
+    env.close()
+    return make(picture_scale=tile_zoom(*size))
 
 
 def film_episode(

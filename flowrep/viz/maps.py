@@ -175,9 +175,10 @@ def strip(
     wheel_for: Iterable[str] = (),
     notes: Mapping[str, Note] = MappingProxyType({}),
 ) -> Image:
-    """Returns images of the same size side by side, each under its label.
+    """Returns images side by side, each under its label.
 
-    Small images are enlarged by a whole factor without interpolation.
+    Small images are enlarged by a whole factor without interpolation. An image may be larger than
+    the others, by `tile_zoom` of their size.
 
     Args:
         images: label to image `[H, W, 3]`.
@@ -185,23 +186,34 @@ def strip(
         notes: by label, the note below it: a text, or a function that draws a legend of a width.
 
     Raises:
-        ValueError: the images differ in size.
+        ValueError: the images differ in size otherwise.
     """
-    sizes = {image.shape for image in images.values()}
-    if len(sizes) != 1:
-        raise ValueError(f"a strip needs images of one size, got {sorted(sizes)}")
-    height, width, _ = sizes.pop()
-    zoom = max(1, round(_TILE_PX / max(height, width)))
+    height, width, _ = size = min(image.shape for image in images.values())
+    zoom = tile_zoom(height, width)
+    large = (zoom * height, zoom * width, 3)
+    if others := {image.shape for image in images.values()} - {size, large}:
+        raise ValueError(f"a strip needs images of {size} or {large}, got {sorted(others)}")
     with_wheel = frozenset(wheel_for)
     columns: list[Image] = []
     for label, image in images.items():
         bars = [_label_bar(label, width * zoom, label in with_wheel)]
         if notes.keys() & images.keys():
             bars.append(_note_bar(notes.get(label, ""), width * zoom))
-        tile = image.repeat(zoom, axis=0).repeat(zoom, axis=1)
+        tile = image
+        if image.shape == size:
+            tile = image.repeat(zoom, axis=0).repeat(zoom, axis=1)
         column = np.concatenate([*bars, tile])
         columns += [column, np.full((len(column), _GAP_PX, 3), _GAP_GREY, np.uint8)]
     return np.concatenate(columns[:-1], axis=1)
+
+
+def tile_zoom(height: int, width: int) -> int:
+    """Returns by which factor a strip enlarges images of a size.
+
+    >>> tile_zoom(48, 48), tile_zoom(480, 640)
+    (5, 1)
+    """
+    return max(1, round(_TILE_PX / max(height, width)))
 
 
 def contact_sheet(rows: Iterable[Image]) -> Image:

@@ -36,6 +36,21 @@ def test_a_film_is_of_the_episode_that_names_it():
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("representation", "flow", "rgb"),
+    [
+        ("seg", "exact", (3, 252, 252)),  # three times the maps, as large as a film's tiles
+        ("rgb", "exact", (3, 84, 84)),  # the agent sees it
+        ("obj", "estimated", (3, 84, 84)),  # flow is estimated from it
+    ],
+)
+def test_the_picture_is_large_unless_something_else_reads_it(representation, flow, rgb):
+    make = partial(make_env, "straight_road", flow=flow)
+    env = make_filmed(make, {representation: {}})
+    assert env.observation_spec["sensor", "rgb"].shape == (1, *rgb)
+    env.close()
+
+
 @pytest.mark.slow
 def test_a_recorded_episode_is_a_whole_film(tmp_path):
     imageio = pytest.importorskip("imageio.v3")

@@ -162,7 +162,7 @@ def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
         (lambda: representation_strip({"eggo": np.zeros(1)}), "eggo.*expected some of.*'ego'"),
         (
             lambda: strip({"a": np.zeros((2, 3, 3), np.uint8), "b": np.zeros((3, 2, 3), np.uint8)}),
-            "images of one size",
+            "strip needs images",
         ),
     ],
 )
