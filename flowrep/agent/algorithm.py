@@ -30,7 +30,7 @@ class Algorithm(ABC):
     """Acts with `policy`, stores frames in `memory` and takes gradient steps on samples from it.
 
     ```
-    acted = algorithm.policy(observation)                   # writes `action`
+    acted = algorithm.act(observation)                      # writes `action`
     for _ in range(algorithm.updates_due(frames)):
         metrics = algorithm.update(algorithm.sample())
     algorithm.remember(steps)                               # with reward and next observation
@@ -197,6 +197,10 @@ class Algorithm(ABC):
     def metric_names(cls) -> tuple[str, ...]:
         """Returns the keys of the metrics that `update` returns."""
         return (*cls.METRICS, "grad_norm", "learning_rate")
+
+    def act(self, observation: TensorDictBase) -> TensorDictBase:
+        """Returns an observation of N environments with the actions that collect experience."""
+        return self.policy(observation)
 
     def remember(self, steps: TensorDictBase) -> None:
         """Stores steps of N environments: observations, actions and their outcomes."""

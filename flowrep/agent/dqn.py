@@ -122,8 +122,8 @@ class DoubleDQN(OffPolicy):
         return self.policy[2]
 
     def other_weights(self) -> Mapping[str, Tensor]:
-        """Returns ε."""
-        return {"epsilon": self.exploration.eps}
+        """Returns ε, beside those of `OffPolicy`."""
+        return {**super().other_weights(), "epsilon": self.exploration.eps}
 
     @classmethod
     def make_policy(

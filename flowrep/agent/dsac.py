@@ -54,6 +54,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
             `"separate"`, each has its own, and π(·|s') in y reads the policy's.
         initial_alpha: α before the first update.
         target_entropy_weight: target entropy as a share of the largest, log n.
+        entropy_in_target: with False, y lacks the bonus α H(π(·|s')): Q values reward alone.
         gamma: discount per frame.
     """
 
@@ -73,6 +74,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         encoder: str = "shared",
         initial_alpha: float = 0.5,
         target_entropy_weight: float = 0.2,
+        entropy_in_target: bool = True,
         gamma: float = 0.99,
     ) -> None:
         if encoder not in ENCODERS:
@@ -93,6 +95,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.codecs, self.encoder_is_shared = actor.codecs, shared
+        self.entropy_in_target = entropy_in_target
         self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
         if not shared:
             self.convert_to_functional(actor.encoder, "actor_encoder")
@@ -147,7 +150,9 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
         log_policy = self._log_policy(seen)
         q = heads_together(embedding, self.target_qvalue_network_params["module"]).amin(0)
-        value = (log_policy.exp() * (q - alpha * log_policy)).sum(-1, keepdim=True)
+        if self.entropy_in_target:
+            q = q - alpha * log_policy
+        value = (log_policy.exp() * q).sum(-1, keepdim=True)
         # masked instead of multiplied: the value after an end may even be nan
         value = value.masked_fill(outcome["terminated"], 0.0)
         discount = self.gamma ** batch["steps_to_next_obs"]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
@@ -14,6 +17,60 @@ from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.networks import DiscreteActions
 from flowrep.agent.observation import compute_dtype, map_codecs
 from flowrep.agent.replay import ReplayMemory
+
+
+class PersistentExploration:
+    """Temporally extended ε-greedy exploration, "εz-greedy" (Dabney et al. 2020, arXiv:2006.01782).
+
+    With probability ε an environment begins to repeat an action that is drawn uniformly, for n
+    steps, P(n) ∝ n⁻², at most 24 (two seconds of driving). Single random actions cancel each other;
+    repeated ones take a turn that the policy avoids. ε falls linearly to 0.
+
+    Args:
+        epsilon: ε at the first frame.
+        total_frames: frames of all environments over which ε falls.
+        num_envs: environments.
+        actions: the action space.
+        device: of the actions.
+    """
+
+    LONGEST = 24
+
+    def __init__(
+        self,
+        epsilon: float,
+        total_frames: int,
+        num_envs: int,
+        actions: DiscreteActions,
+        device: torch.device,
+    ) -> None:
+        self.epsilon, self.total_frames, self.actions = epsilon, total_frames, actions
+        self._length_weights = torch.arange(1.0, self.LONGEST + 1, device=device) ** -2
+        # the longest stands for all that would be longer
+        self._length_weights[-1] = math.pi**2 / 6 - self._length_weights[:-1].sum()
+        number = torch.zeros(num_envs, dtype=torch.long, device=device)
+        self.state = {
+            "steps_left": number,
+            "repeated_action": number.clone(),
+            "frames_acted": torch.zeros((), dtype=torch.long, device=device),
+        }
+
+    def __call__(self, acted: TensorDictBase) -> TensorDictBase:
+        """Replaces actions of environments `[N]`, whose episodes begin where `is_init`."""
+        steps_left, repeated, frames = self.state.values()
+        epsilon = self.epsilon * (1 - frames / self.total_frames)
+        frames += len(steps_left)
+        steps_left.masked_fill_(acted["is_init"].flatten(), 0)
+        begins = (steps_left == 0) & (torch.rand_like(steps_left, dtype=torch.float) < epsilon)
+        lengths = 1 + torch.multinomial(self._length_weights, len(begins), replacement=True)
+        steps_left.copy_(torch.where(begins, lengths, steps_left))
+        drawn = torch.randint_like(repeated, self.actions.count)
+        repeated.copy_(torch.where(begins, drawn, repeated))
+        own, other, repeats = acted["action"], repeated, steps_left > 0
+        if self.actions.space == "one-hot":
+            other, repeats = F.one_hot(other, self.actions.count), repeats.unsqueeze(-1)
+        steps_left.sub_(1).clamp_(min=0)
+        return acted.set("action", torch.where(repeats, other.to(own.dtype), own))
 
 
 class OffPolicy(Algorithm):
@@ -41,6 +98,8 @@ class OffPolicy(Algorithm):
         mirror: replace half of each batch by its left-right images, with `mirror_image`.
         mirror_image: TorchRL transform that does so with a batch, maps in their stored form; for
             what it has to know of maps, camera and actions, it comes from where they are known.
+        persistent_exploration: ε of `PersistentExploration` at the start, from which it falls
+            linearly to 0 over `total_frames`.
         rate_factors: see `Algorithm`.
         policy_options: further arguments of `make_policy`.
         loss_options: arguments of `LOSS` besides `gamma`.
@@ -72,6 +131,7 @@ class OffPolicy(Algorithm):
         layer_norm: bool = False,
         mirror: bool = False,
         mirror_image: Transform | None = None,
+        persistent_exploration: float = 0.0,
         rate_factors: Mapping[str, float] | None = None,
         policy_options: Mapping[str, Any] | None = None,
         **loss_options: Any,
@@ -89,6 +149,12 @@ class OffPolicy(Algorithm):
             **(policy_options or {}),
         )
         network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
+        self.persistence: PersistentExploration | None = None
+        if persistent_exploration > 0:
+            num_envs = observation_spec.shape.numel()
+            self.persistence = PersistentExploration(
+                persistent_exploration, total_frames, num_envs, actions, device
+            )
         loss = self.LOSS(network, actions, gamma=gamma, **loss_options)
         self.frames_per_update = frames_per_update
         self.learning_starts = batch_size if learning_starts is None else learning_starts
@@ -111,6 +177,15 @@ class OffPolicy(Algorithm):
             if mirror_image is None:
                 raise ValueError("mirror=True needs mirror_image, a transform of sampled batches")
             self.memory.append_transform(mirror_image)
+
+    def act(self, observation: TensorDictBase) -> TensorDictBase:
+        """Returns an observation of N environments with the actions that collect experience."""
+        acted = super().act(observation)
+        return acted if self.persistence is None else self.persistence(acted)
+
+    def other_weights(self) -> Mapping[str, Tensor]:
+        """Returns the state of the persistent exploration, if there is any."""
+        return {} if self.persistence is None else self.persistence.state
 
     def updates_due(self, frames: int) -> int:
         """Returns how many updates `frames` frames allow, less those already taken."""

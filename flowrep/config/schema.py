@@ -228,6 +228,7 @@ class _OffPolicy(_Learner):
     n_steps: Count
     layer_norm: bool
     mirror: bool = False  # not in runs before it
+    persistent_exploration: Share = 0.0  # nor this one
 
     def check_length(self, total_frames: int, num_envs: int) -> None:
         """Checks that the memory holds a batch and the run is long enough for an update."""
@@ -258,6 +259,7 @@ class DiscreteSAC(_OffPolicy):
     encoder: Literal["shared", "separate"]
     initial_alpha: Positive
     target_entropy_weight: Share
+    entropy_in_target: bool = True  # not in runs before it
     alpha_rate_factor: NotNegative
 
 

@@ -24,6 +24,7 @@ from torchrl.record.loggers import TensorboardLogger
 
 from flowrep import __version__
 from flowrep.agent import CheckpointError
+from flowrep.config.schema import ALGORITHMS
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.extras import require
 from flowrep.tables import append_rows, is_whole, read_rows, write_rows
@@ -108,8 +109,19 @@ def _holder(lock: str) -> str:
 
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the identity of a run: flowrep's version, and the config keys that define it."""
-    parts = {key: config[key] for key in _IDENTITY}
-    return {"flowrep": __version__} | json.loads(json.dumps(parts))
+    parts = json.loads(json.dumps({key: config[key] for key in _IDENTITY}))
+    parts["algorithm"] = _without_defaults(parts["algorithm"])
+    return {"flowrep": __version__} | parts
+
+
+def _without_defaults(algorithm: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns an algorithm's options without those at the schema's default.
+
+    Only options that earlier runs did not have yet have a default there.
+    """
+    section = ALGORITHMS.get(algorithm["_target_"])
+    fields = section.model_fields if section else {}
+    return {k: v for k, v in algorithm.items() if k not in fields or fields[k].default != v}
 
 
 def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
@@ -129,6 +141,7 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             "install that version, or start a new run"
         )
     known = {key: value for key, value in saved.items() if key in expected}
+    known["algorithm"] = _without_defaults(known["algorithm"])
     for place, there, here in _differences(known, expected):
         raise CheckpointError(
             f"{path} belongs to a run with {place}={there}, the config.yaml of its folder says "

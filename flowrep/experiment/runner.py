@@ -130,7 +130,7 @@ class Runner:
         assert self.observation is not None
         try:
             with torch.no_grad():
-                return self.agent.policy(self.observation)
+                return self.agent.act(self.observation)
         except RuntimeError as error:
             self.check()  # an update may have seen it first, and its error says more
             if "probability tensor" not in str(error):

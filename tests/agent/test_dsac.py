@@ -124,6 +124,19 @@ def test_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch, encoder):
     torch.testing.assert_close(q[:, 2], torch.tensor([0.125, 0.25, 0.5, 1.0]), atol=0.1, rtol=0)
 
 
+def test_without_entropy_in_the_target_it_is_that_of_a_vanishing_alpha(
+    make_agent, random_steps, as_batch
+):
+    steps = random_steps(16)
+    with_bonus, without, small = (
+        make_agent(**options)
+        for options in ({}, {"entropy_in_target": False}, {"initial_alpha": 1e-9})
+    )
+    losses = [a.losses(as_batch(a, steps))["q_loss"] for a in (with_bonus, without, small)]
+    torch.testing.assert_close(losses[1], losses[2])
+    assert abs(losses[0] - losses[1]) > 1e-3 * losses[0]
+
+
 LR, ALPHA, GAMMA, TAU, TARGET_ENTROPY = 3e-4, 0.5, 0.99, 0.005, 0.2 * math.log(3)
 
 

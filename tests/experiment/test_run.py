@@ -114,6 +114,18 @@ def test_an_edited_config_is_refused_by_the_name_of_the_key(config, place, value
         check_origin(origin_of(config), origin_of(edited), PATH)
 
 
+def test_a_run_from_before_an_option_existed_is_the_same_as_with_its_default(config):
+    older = copy.deepcopy(config)
+    del older["algorithm"]["persistent_exploration"]
+    saved = origin_of(config) | {"algorithm": config["algorithm"]}  # which has the default
+    check_origin(saved, origin_of(older), PATH)
+    check_origin(origin_of(older), origin_of(config), PATH)
+    config = copy.deepcopy(config)
+    config["algorithm"]["persistent_exploration"] = 0.1
+    with pytest.raises(CheckpointError, match="persistent_exploration"):
+        check_origin(origin_of(older), origin_of(config), PATH)
+
+
 def test_another_version_is_refused(config):
     saved = origin_of(config) | {"flowrep": "0.0.9"}
     with pytest.raises(CheckpointError, match=r"by flowrep 0\.0\.9, this is .*: install that"):
