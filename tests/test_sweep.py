@@ -227,28 +227,14 @@ def runs_of(monkeypatch, tmp_path, capsys):
     return runs_of
 
 
-SCENES = ["straight_road", "s_turn", "h_shaped_pathways", "three_way_junction"]
-STACKS = [
-    "[seg2]", "[depth2]", "[ego,obj]", "[ego,obj,seg2]", "[ego,obj,depth2]",
-    "[ego,obj,seg2,depth2]",
-]  # fmt: skip
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "scenes", "stacks"),
-    [
-        ("flow_composition", SCENES[1:2], ["[ego]", "[raw]", "[obj]", "[ego,obj]"]),
-        ("failure_causes", ["s_turn"], STACKS),
-        ("frame_rate", ["straight_road"], STACKS),
-    ],
-)
-def test_an_experiment_has_each_stack_with_three_seeds(runs_of, name, scenes, stacks):
-    scene = ["scene=s_turn"] if name == "flow_composition" else []  # typed, it replaces the four
-    runs = runs_of(f"experiment={name}", "preset=laptop", *scene)
+def test_an_experiment_has_each_stack_with_three_seeds(runs_of):
+    # typed, a scene replaces the four of the experiment
+    runs = runs_of("experiment=flow_composition", "preset=laptop", "scene=s_turn")
+    stacks = ["[ego]", "[raw]", "[obj]", "[ego,obj]"]
     cells = [(run["scene"], run["representations"], run["seed"]) for run in runs]
-    assert sorted(cells) == sorted((s, r, k) for s in scenes for r in stacks for k in "012")
-    assert {(run["experiment"], run["preset"]) for run in runs} == {(name, "laptop")}
+    assert sorted(cells) == sorted(("s_turn", r, k) for r in stacks for k in "012")
+    assert {(run["experiment"], run["preset"]) for run in runs} == {("flow_composition", "laptop")}
 
 
 @pytest.mark.slow_after_first
@@ -317,16 +303,13 @@ def saved(folder):
 
 @pytest.mark.slow
 def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path):
-    """Ctrl-C stops it after its first checkpoint, SIGKILL after one more; the third start ends."""
+    """Ctrl-C stops it after its first checkpoint; the second start ends it."""
     pytest.importorskip("pybullet", reason="training drives the simulated street")
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="it runs two at a time")
-    before = []
-    for end, code in ((ctrl_c, 130), (subprocess.Popen.kill, -signal.SIGKILL)):
-        process = started(tmp_path)
-        wait_for(lambda before=before: saved(tmp_path) not in ([], before))
-        end(process)
-        assert process.wait(timeout=180) == code
-        before = saved(tmp_path)
+    process = started(tmp_path)
+    wait_for(lambda: saved(tmp_path))
+    ctrl_c(process)
+    assert process.wait(timeout=180) == 130
     assert started(tmp_path).wait(timeout=300) == 1
     printed = (tmp_path / "printed").read_text()
     assert "1 of 2 runs finished, 1 failed" in printed
@@ -337,17 +320,4 @@ def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path):
     (whole,) = tmp_path.glob("*learning_rate-0.0003*")
     with (whole / "metrics.csv").open(newline="") as file:
         assert [int(row["frames"]) for row in csv.DictReader(file)] == list(range(20, 241, 20))
-    assert (whole / "job.log").read_text().count("run folder: ") == 3  # begun, and resumed twice
-
-
-@pytest.mark.slow
-def test_what_is_finished_is_not_run_again(tmp_path):
-    pytest.importorskip("pybullet", reason="training drives the simulated street")
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="it runs two at a time")
-    line = [*LINE, "total_frames=40", "seed=0,1", f"hydra.sweep.dir={tmp_path}"]
-    for _ in range(2):
-        done = subprocess.run(line, capture_output=True, text=True, env=ENVIRONMENT)
-        assert done.returncode == 0, done.stderr
-        assert "2 of 2 runs finished" in done.stdout
-    logs = [log.read_text() for log in tmp_path.glob("*/job.log")]
-    assert [log.count("run folder: ") for log in logs] == [1, 1]
+    assert (whole / "job.log").read_text().count("run folder: ") == 2  # begun, and resumed

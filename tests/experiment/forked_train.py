@@ -2,15 +2,12 @@
 
 Reads one JSON object a line and answers with one. A request is
 
-    {"run": folder, "kill_after_s": 0.3, "kill_at": ["rename", 2], "largest_file": 100000,
-     "read_only": true}
+    {"run": folder, "kill_after_s": 0.3, "kill_at": ["rename", 2], "largest_file": 100000}
 
 of which all but the first may be missing; the answer holds the exit code (minus the signal's number
 for a command that was killed) and what was printed.
 """
 
-import errno
-import io
 import json
 import os
 import resource
@@ -57,22 +54,6 @@ def killed_at(stage: str, save: int) -> None:
     setattr(checkpoint, name, counted)
 
 
-def read_only(folder: str) -> None:
-    """Makes every attempt to write below a folder fail as on a disk that is mounted read-only."""
-
-    def refusing(whole, writes):
-        def call(path, *arguments, **options):
-            is_inside = isinstance(path, str | os.PathLike) and str(path).startswith(folder)
-            if is_inside and writes(arguments):
-                raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
-            return whole(path, *arguments, **options)
-
-        return call
-
-    io.open = refusing(io.open, lambda modes: set("wa") & set("".join(modes[:1])))
-    os.mkdir = refusing(os.mkdir, lambda _: True)
-
-
 def child(request: dict, output) -> None:
     """Runs the command and ends the process as it would."""
     code = 0
@@ -81,8 +62,6 @@ def child(request: dict, output) -> None:
     try:
         if "kill_at" in request:
             killed_at(*request["kill_at"])
-        if "read_only" in request:
-            read_only(request["run"])
         if "largest_file" in request:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (request["largest_file"],) * 2)

@@ -14,14 +14,13 @@ import pytest
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.agent import load_checkpoint
-from flowrep.config import group_choices
 from flowrep.experiment.run import RunFolder
 from tests.experiment.test_runner import differing
 from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow
 
-KILLS = 7  # of each of four algorithms
+KILLS = 5  # of each of two algorithms, one with a replay memory and one without
 STAGES = ("write", "half", "flush", "rename", "renamed")
 SMALL = [
     "debug=smoke", "num_envs=1", "algorithm.precision=fp32", "algorithm.hidden_size=16",
@@ -70,7 +69,7 @@ def without_clock(rows):
     ]
 
 
-@pytest.mark.parametrize("algorithm", group_choices("algorithm"))
+@pytest.mark.parametrize("algorithm", ["dsac", "ppo"])
 def test_a_run_killed_again_and_again_ends_bit_for_bit_as_one_that_was_not(
     tmp_path, carry_on, algorithm
 ):
@@ -103,23 +102,15 @@ def test_a_run_killed_again_and_again_ends_bit_for_bit_as_one_that_was_not(
         assert rows_of(run.evaluation_path) == rows_of(whole.evaluation_path)
 
 
-@pytest.mark.parametrize(
-    ("how", "reason"),
-    [({"largest_file": 200_000}, "File too large"), ({"read_only": True}, "Read-only file system")],
-    ids=["disk full", "read-only"],
-)
-def test_what_cannot_be_written_ends_in_one_line_and_leaves_the_last_checkpoint(
-    tmp_path, carry_on, how, reason
-):
+def test_a_full_disk_ends_in_one_line_and_leaves_the_last_checkpoint(tmp_path, carry_on):
     run = new_run(tmp_path)
     assert carry_on(run, kill_at=["flush", 4])["code"] == -signal.SIGKILL
     before = load_checkpoint(run.checkpoint_path)
-    reply = carry_on(run, **how)
+    reply = carry_on(run, largest_file=200_000)
     assert reply["code"] == 2
     (line,) = [line for line in reply["printed"].splitlines() if "error" in line.lower()]
     assert line.startswith("error: after ")
-    assert reason in line
-    assert "Free some space or make the folder writable" in line
+    assert "File too large" in line
     assert "Traceback" not in reply["printed"]
     assert differing(before, load_checkpoint(run.checkpoint_path)) == []
     assert carry_on(run)["code"] == 0
