@@ -13,16 +13,15 @@ tests/examples/test_miniworld_flow.py:
 - there are no ids, so a body is where depth changes when the room is drawn without it.
 """
 
+import os
 import sys
 from itertools import cycle
 from typing import Any
 
+os.environ.setdefault("PYGLET_HEADLESS", "1")  # read when pyglet is imported
+
 import gymnasium as gym
 import numpy as np
-import pyglet
-
-pyglet.options["headless"] = True  # before MiniWorld opens its window
-
 import torch
 from gymnasium import spaces
 from miniworld.envs import OneRoom
@@ -66,7 +65,7 @@ class Room(gym.Wrapper):
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
         _, reward, ended, cut, info = self.env.step(action)
-        self.env.box.pos = self.env.box.pos + (0.0, 0.0, self.slide_m)
+        self.env.box.pos = np.add(self.env.box.pos, (0.0, 0.0, self.slide_m))
         if not 1.0 < self.env.box.pos[2] < 7.0:
             self.slide_m = -self.slide_m
         return self.observe(), reward, ended, cut, info

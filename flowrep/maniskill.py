@@ -83,7 +83,7 @@ class ManiSkillEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         options = {}
-        if tensordict is not None and "_reset" in tensordict.keys():
+        if tensordict is not None and "_reset" in tensordict:
             options["env_idx"] = tensordict["_reset"].flatten().nonzero().flatten()
         observation, _ = self.env.reset(options=options)
         return self._tensordict(sensor=self._sensor(observation))
