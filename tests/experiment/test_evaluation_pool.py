@@ -17,8 +17,9 @@ pytestmark = pytest.mark.slow
 __all__ = ["scene"]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def pool():
+    """Its processes take seconds to start."""
     made = EvaluationPool(2)
     yield made
     made.close()
@@ -61,7 +62,13 @@ def test_a_stop_ends_the_shares_under_way(scene, pool):
     assert not asked.is_complete
 
 
+def test_policies_that_hold_functions_stay_in_this_process():
+    assert can_travel(weigher("obj"))
+    assert not can_travel(lambda tensordict: tensordict)
+
+
 def test_a_process_that_was_killed_is_told_and_ctrl_c_is_not_heard(scene, pool):
+    """The last test of these processes."""
     make = partial(make_env, scene, representations=["obj"], num_envs=2)
     list(pool.evaluate(make, "never_turn", episodes(4)))
     processes = list(pool._executor._processes)
@@ -71,8 +78,3 @@ def test_a_process_that_was_killed_is_told_and_ctrl_c_is_not_heard(scene, pool):
     os.kill(processes[0], signal.SIGKILL)
     with pytest.raises(WorkerError, match="memory"):
         list(pool.evaluate(make, weigher("obj"), episodes(4)))
-
-
-def test_policies_that_hold_functions_stay_in_this_process():
-    assert can_travel(weigher("obj"))
-    assert not can_travel(lambda tensordict: tensordict)
