@@ -89,6 +89,7 @@ def test_only_its_own_final_evaluation_finishes_a_run(tmp_path):
     assert not sweep.is_finished(tmp_path, more)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize(
     ("code", "expected"),
     [

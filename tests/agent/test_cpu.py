@@ -22,6 +22,7 @@ print(faults())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator")
 def test_a_freed_block_is_reused_without_page_faults():
     faults = {}

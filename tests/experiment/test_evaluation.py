@@ -125,6 +125,7 @@ def test_an_episode_does_not_depend_on_what_else_is_in_the_batch(scene, names, g
     assert len({(outcome, length) for _, _, outcome, _, _, length in runs[0]}) > 3
 
 
+@pytest.mark.slow
 def test_sampled_actions_differ_from_greedy_ones_and_repeat(scene):
     env = make_env(scene, ["obj"], num_envs=3)
     greedy, *sampled = (
@@ -165,6 +166,7 @@ def comparison(scene):
     return compared
 
 
+@pytest.mark.slow
 def test_rows_come_in_the_order_of_what_was_asked(comparison):
     assert comparison.is_complete
     rows = comparison.rows()
@@ -187,6 +189,7 @@ def test_rows_have_the_columns_of_evaluation_csv(comparison, scene):
     assert {*comparison.rows(**dict.fromkeys(names, ""))[0]} == {*EVALUATION_COLUMNS}
 
 
+@pytest.mark.slow
 def test_another_agents_run_keeps_the_baselines_episodes(comparison, scene):
     before = comparison.rows()
     made = []

@@ -38,6 +38,7 @@ with folder_lock(Path(sys.argv[1]), "training"):
 """
 
 
+@pytest.mark.slow
 def test_who_holds_a_folder_is_named_and_one_that_was_killed_holds_it_no_more(tmp_path):
     with subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE) as other:
         try:
