@@ -7,7 +7,7 @@ files, byte for byte.
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
+from itertools import cycle, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flowrep.report.runs import Curve, Grid, Score, mean_curve
+from flowrep.report.runs import Curve, Grid, mean_curve
+from flowrep.report.statistics import Estimate, rates
 
 # Okabe and Ito's colours for single maps and for the two flows. A map added to the flows has its
 # own hue, darker, and a hatch or a dashed line.
@@ -34,7 +35,6 @@ _COLOURS = {
 }
 _ADDED = {"ego+obj+seg2": "////", "ego+obj+depth2": "\\\\\\\\", "ego+obj+seg2+depth2": "xxxx"}
 _OTHERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-_HATCHES = ("", "////", "xxxx", "....")
 _OF_VARIANTS = ("", "......", "++++", "||||")  # no stack uses them
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
 _TEXT, _FAINT = "#1b1f24", "#6b7480"
@@ -47,10 +47,11 @@ _TITLES = {
 }
 _BASELINE_LINES: dict[str, Any] = {"never_turn": ":", "random": "-.", "planner": "--"}
 _COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page
-_PAPER_PT, _PAGE_PT = 7.5, 10.0
+_FONT_PT = 7.5
 _MOST_IN_A_ROW = 4  # panels
 _WIDEST_BAR = 0.3  # of a group
 _DPI = 300
+_CAPS: dict[str, Any] = {"capsize": 1.8, "capthick": 0.9, "clip_on": False}  # of whiskers
 
 
 class Look(NamedTuple):
@@ -68,24 +69,23 @@ class Look(NamedTuple):
 
 
 def looks(names: Sequence[str]) -> dict[str, Look]:
-    """Returns how each series of a figure is drawn.
+    """Returns how each series of a figure is drawn: a stack, or one of its configs ("ego, noisy").
 
-    The paper's stacks look the same in all figures, and keep their colour under several configs
-    ("ego, noisy"). If other names are among them, colours are assigned in turn.
+    The paper's stacks look the same in all figures. With another among them, all have colours in
+    turn, so that no two look alike.
     """
-    parts = {name: name.partition(", ")[::2] for name in names}
-    variants = list(dict.fromkeys(variant for _, variant in parts.values()))
-    places = list(_COLOURS)
+    parts = [name.partition(", ")[::2] for name in names]
+    stacks, variants = ([*dict.fromkeys(part)] for part in zip(*parts))
+    colours = _COLOURS
+    if not {*stacks} <= {*_COLOURS}:
+        colours = dict(zip(stacks, cycle(_OTHERS)))
     found = {}
-    for turn, (name, (stack, variant)) in enumerate(parts.items()):
-        if all(of in _COLOURS for of, _ in parts.values()):
-            hatch = _OF_VARIANTS[variants.index(variant) % len(_OF_VARIANTS)]
-            marker = _MARKERS[places.index(stack)]
-            found[name] = Look(_COLOURS[stack], hatch or _ADDED.get(stack, ""), marker)
-        else:
-            hatch = _HATCHES[turn // len(_OTHERS) % len(_HATCHES)]
-            marker = _MARKERS[turn % len(_MARKERS)]
-            found[name] = Look(_OTHERS[turn % len(_OTHERS)], hatch, marker)
+    for name, (stack, variant) in zip(names, parts):
+        turn = [*colours].index(stack)
+        again = 0 if colours is _COLOURS else turn // len(_OTHERS)
+        hatch = _OF_VARIANTS[(variants.index(variant) + again) % len(_OF_VARIANTS)]
+        hatch = hatch or _ADDED.get(stack, "")
+        found[name] = Look(colours[stack], hatch, _MARKERS[turn % len(_MARKERS)])
     return found
 
 
@@ -124,26 +124,20 @@ def styled(font_pt: float) -> Iterator[None]:
 
 def save(figure: Figure, path: Path) -> None:
     """Writes a figure as PNG and PDF; the endings are added to the path."""
-    with _reproducible():
+    with mpl.rc_context({"pdf.fonttype": 42, "hatch.linewidth": 0.7}):  # text as text
         figure.savefig(path.with_name(f"{path.name}.png"), dpi=_DPI)
         figure.savefig(path.with_name(f"{path.name}.pdf"), metadata={"CreationDate": None})
 
 
 def svg(figure: Figure) -> bytes:
-    """Returns a figure as an SVG."""
+    """Returns a figure as an SVG, the same one whenever it is drawn."""
     data = io.BytesIO()
-    with _reproducible():
+    with mpl.rc_context({"svg.hashsalt": "flowrep", "hatch.linewidth": 0.7}):
         figure.savefig(data, format="svg", metadata={"Date": None})
     return data.getvalue()
 
 
-def _reproducible() -> Any:
-    return mpl.rc_context(
-        {"svg.hashsalt": "flowrep", "pdf.fonttype": 42, "hatch.linewidth": 0.7}  # text as text
-    )
-
-
-def draw_bars(grids: Sequence[Grid], *, for_page: bool = False) -> Figure:
+def draw_bars(grids: Sequence[Grid]) -> Figure:
     """Returns grouped bars: a panel per scene, a group per speed mode, a bar per stack.
 
     Whiskers are the intervals, small dots the seeds, dotted lines the baselines.
@@ -158,18 +152,16 @@ def draw_bars(grids: Sequence[Grid], *, for_page: bool = False) -> Figure:
         for name, line in _BASELINE_LINES.items()
         if name in shown
     ]
-    return _panels([(grid.scene, grid) for grid in grids], _bars, handles, for_page)
+    return _panels([(grid.scene, grid) for grid in grids], _bars, handles)
 
 
-def draw_rates(grids: Sequence[Grid], *, for_page: bool = False) -> Figure:
+def draw_rates(grids: Sequence[Grid]) -> Figure:
     """Returns success over frame rates: a panel per scene, a line per stack."""
     panels = [(grid.scene, grid) for grid in grids]
-    return _panels(panels, _rate_lines, _line_handles(looks(grids[0].series)), for_page)
+    return _panels(panels, _rate_lines, _line_handles(looks(grids[0].series)))
 
 
-def draw_curves(
-    panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]], *, for_page: bool = False
-) -> Figure:
+def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> Figure:
     """Returns a panel per scene: bold, the seeds' mean of evaluations; thin, their training."""
     style = looks(list(dict.fromkeys(name for _, curves in panels for name in curves)))
 
@@ -182,23 +174,18 @@ def draw_curves(
             axes.plot(*_in_thousands(mean), linewidth=1.5, **style[name].line)
         axes.set_xlabel("frames (thousands)")
 
-    return _panels(panels, draw, _line_handles(style), for_page)
+    return _panels(panels, draw, _line_handles(style))
 
 
 def _panels(
-    panels: Sequence[tuple[str, Any]],
-    draw: Callable[[Axes, Any], None],
-    handles: Sequence[Any],
-    for_page: bool,
+    panels: Sequence[tuple[str, Any]], draw: Callable[[Axes, Any], None], handles: Sequence[Any]
 ) -> Figure:
-    """Returns a figure with a panel of success per scene, in rows, for a paper or a web page."""
+    """Returns a figure with a panel of success per scene, as wide as a paper's column or page."""
     columns = min(len(panels), _MOST_IN_A_ROW)
     rows = -(-len(panels) // columns)
-    width, height = (5.6, 3.7) if for_page else (_PAGE_IN, 2.1)
-    if len(panels) == 1 and not for_page:
-        width, height = _COLUMN_IN, 2.3
-    with styled(_PAGE_PT if for_page else _PAPER_PT):
-        figure = Figure(figsize=(width, height * rows), layout="constrained")
+    width = _COLUMN_IN if len(panels) == 1 else _PAGE_IN
+    with styled(_FONT_PT):
+        figure = Figure(figsize=(width, 2.2 * rows), layout="constrained")
         all_axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel().tolist()
         for spare in all_axes[len(panels) :]:
             spare.set_visible(False)
@@ -219,17 +206,23 @@ def _bars(axes: Axes, grid: Grid) -> None:
     for group, condition in enumerate(grid.conditions):
         for place, (name, look) in enumerate(looks(grid.series).items()):
             at = group + (place - (len(grid.series) - 1) / 2) * width
-            score = grid.scores[name, condition]
-            if score is None:
+            score, matrix = grid.scores[name, condition], grid.matrices[name, condition]
+            if score is None or matrix is None:
                 style: Any = {"rotation": 90, "ha": "center", "va": "bottom", "color": _FAINT}
                 axes.text(at, 1.5, "missing", fontsize="x-small", **style)
                 continue
             edge = "white" if look.hatch else _TEXT
             axes.bar(
-                at, 100 * score.estimate.value, 0.92 * width,
+                at, 100 * score.value, 0.92 * width,
                 facecolor=look.colour, hatch=look.hatch, edgecolor=edge, linewidth=0,
             )  # fmt: skip
-            _whisker(axes, at, width, score)
+            lengths = _whiskers([score])
+            axes.errorbar(at, 100 * score.value, lengths, color=_TEXT, linewidth=0.9, **_CAPS)
+            if len(matrix.seeds) > 1:
+                dots = (100 * rates(matrix.outcomes)).tolist()
+                ring: Any = {"facecolor": "white", "edgecolor": _TEXT, "linewidth": 0.5}
+                beside = [at + 0.24 * width] * len(dots)
+                axes.scatter(beside, dots, s=5, zorder=4, clip_on=False, **ring)
         for name, line in _BASELINE_LINES.items():
             share = grid.baselines.get((name, condition))
             if share is not None:
@@ -241,16 +234,9 @@ def _bars(axes: Axes, grid: Grid) -> None:
     axes.tick_params(axis="x", length=0)
 
 
-def _whisker(axes: Axes, at: float, width: float, score: Score) -> None:
-    value, low, high = (100 * number for number in score.estimate)
-    axes.errorbar(
-        at, value, [[max(value - low, 0)], [max(high - value, 0)]], color=_TEXT,
-        linewidth=0.9, capsize=1.8, capthick=0.9, clip_on=False,
-    )  # fmt: skip
-    if len(score.of_seeds) > 1:
-        dots = [100 * share for share in score.of_seeds]
-        ring: Any = {"facecolor": "white", "edgecolor": _TEXT, "linewidth": 0.5}
-        axes.scatter([at + 0.24 * width] * len(dots), dots, s=5, zorder=4, clip_on=False, **ring)
+def _whiskers(scores: Sequence[Estimate]) -> list[list[float]]:
+    below = [max(100 * (score.value - score.low), 0) for score in scores]
+    return [below, [max(100 * (score.high - score.value), 0) for score in scores]]
 
 
 def _rate_lines(axes: Axes, grid: Grid) -> None:
@@ -260,13 +246,12 @@ def _rate_lines(axes: Axes, grid: Grid) -> None:
         # side by side, so that whiskers of equal scores are all visible
         aside = (place - (len(grid.series) - 1) / 2) * 0.08 * step
         found = [(c.fps + aside, grid.scores[name, c]) for c in grid.conditions]
-        points = [(x, score.estimate) for x, score in found if score is not None]
+        points = [(x, score) for x, score in found if score is not None]
         if points:
-            xs, values = [x for x, _ in points], [100 * e.value for _, e in points]
-            below = [max(100 * (e.value - e.low), 0) for _, e in points]
-            above = [max(100 * (e.high - e.value), 0) for _, e in points]
-            bars: Any = {"elinewidth": 0.9, "capsize": 1.8, "clip_on": False}
-            axes.errorbar(xs, values, [below, above], linewidth=1.3, **look.line, **bars)
+            scores = [score for _, score in points]
+            xs, values = [x for x, _ in points], [100 * score.value for score in scores]
+            lines: Any = {"linewidth": 1.3, "elinewidth": 0.9, **look.line, **_CAPS}
+            axes.errorbar(xs, values, _whiskers(scores), **lines)
     axes.set_xticks(at, [f"{rate:g}" for rate in at])
     axes.set_xlabel("frames per second (Hz)")
 

@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from flowrep.report.figures import svg, words
 from flowrep.report.runs import Run, groups_of, scenes_of
-from flowrep.report.sections import Report, Section
+from flowrep.report.sections import Report
 from flowrep.report.tables import listed
 from flowrep.scenes import load_scene
 from flowrep.scenes.layout import Layout
@@ -59,15 +59,13 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
             if run.is_finished:
                 finished.setdefault((number, run.scene, run.stack), run)
     for run in finished.values():
-        title = f"{run.stack}, seed {run.seed} ({run.folder.name})" if run.folder else run.name
+        title = f"{run.stack}, seed {run.seed} ({Path(run.name).name})"
         if trajectories and (tracks := tracks_of(run, trajectories)):
-            counts = Counter(track.outcome.replace("_", " ") for track in tracks)
-            ended = ", ".join(f"{number} {outcome}" for outcome, number in counts.items())
+            ends = Counter(track.outcome.replace("_", " ") for track in tracks)
+            ended = ", ".join(f"{number} {outcome}" for outcome, number in ends.items())
             png = io.BytesIO()
             draw_plan(Layout(load_scene(run.config["scene"])), tracks).savefig(png, dpi=100)
-            plan = Picture(
-                title, f"{len(tracks)} drives: {ended}", data_uri("image/png", png.getvalue())
-            )
+            plan = Picture(title, f"drives: {ended}", data_uri("image/png", png.getvalue()))
             drives.plans.setdefault(words(run.scene), []).append(plan)
         elif trajectories:
             drives.warnings.append(f"{run.name} has no {DRIVES} with greedy drives: no plan")
@@ -119,21 +117,13 @@ def template(name: str, *, autoescape: bool) -> Any:
 def render_page(report: Report, drives: Drives) -> str:
     """Returns the page of a report, with plans and films of some of its episodes, if any."""
     runs = report.runs
-    chapters = [
-        {
-            "label": chapter.label,
-            "sections": [_section(f"{n}-{s.name}", s) for s in chapter.sections],
-        }
-        for n, chapter in enumerate(report.chapters)
-    ]
     stacks = sorted({run.stack for run in runs})
     what = listed(stacks) if len(stacks) < 4 else f"{len(stacks)} stacks"
-    scenes = listed([words(scene) for scene in scenes_of(runs)])
     return template("page.html.jinja", autoescape=True).render(
-        title=f"{what} in {scenes}" if runs else "No runs",
+        title=f"{what} in {listed([words(scene) for scene in scenes_of(runs)])}",
         summary=summary(runs),
-        warnings=report.warnings,
-        chapters=chapters,
+        report=report,
+        figure=lambda drawing: data_uri("image/svg+xml", svg(drawing.draw())),
         drives=drives,
         runs=[
             (
@@ -150,15 +140,6 @@ def render_page(report: Report, drives: Drives) -> str:
     )
 
 
-def _section(anchor: str, section: Section) -> dict[str, Any]:
-    kind = "image/svg+xml"
-    drawings = [
-        {"caption": d.caption, "panels": [data_uri(kind, svg(f)) for f in d.parts()]}
-        for d in section.drawings
-    ]
-    return {"anchor": anchor, "section": section, "drawings": drawings}
-
-
 def summary(runs: Sequence[Run]) -> str:
     """Returns a sentence on the runs that were read."""
     finished = sum(run.is_finished for run in runs)
@@ -166,11 +147,6 @@ def summary(runs: Sequence[Run]) -> str:
     scenes = [words(scene) for scene in scenes_of(runs)]
     episodes = sum(int(run.tested.sum()) for run in runs)
     return (
-        f"{_count(len(runs), 'run')}, {finished} of them finished, of "
-        f"{_count(len(stacks), 'stack')} ({listed(stacks)}) in {listed(scenes)}; {episodes:,} "
-        "evaluated episodes, those of baselines included."
+        f"Runs: {len(runs)}, {finished} of them finished; stacks: {listed(stacks)}, in "
+        f"{listed(scenes)}; evaluated episodes: {episodes:,}, those of baselines included."
     )
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatch
 from functools import reduce
-from itertools import product
+from itertools import count, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,7 +47,6 @@ SHORT = {
     "h_shaped_pathways": "H",
     "three_way_junction": "T",
 }
-_MEASURES = ("success", "out_of_bounds", "kept")
 _SCENE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")
 _WIDEST = 80  # points of the figure's axis
 _LEVEL, _POWER = 0.05, 0.8
@@ -55,14 +54,10 @@ _FOUND, _NEVER = 0.5, 0.05  # a run finds a way if it succeeds in this share of 
 
 
 class Contrast(NamedTuple):
-    """One comparison and its outcome.
+    """One comparison, as claims.yaml asks for it, and its outcome.
 
-    Args:
-        asked: its keys in claims.yaml.
-        effect: the difference in the mean over its scenes; None without runs on both sides.
-        by_scene: the difference in each scene of its study.
-        fewest: the fewest runs of a side in a scene.
-        p_value: of its test, corrected if the claim is primary.
+    `effect` is the difference in the mean over its scenes, None without runs on both sides;
+    `fewest` the fewest runs of a side in a scene; `p_value` is corrected if the claim is primary.
     """
 
     asked: Mapping[str, Any]
@@ -109,16 +104,20 @@ def claims_of(
     declared: Mapping[str, Any], runs: Sequence[Run], study: str = "main"
 ) -> dict[str, list[Claim]]:
     """Returns the primary and secondary claims with their contrasts, of one protocol's runs."""
-    found: dict[str, list[Claim]] = {}
-    number = 0
-    for family in ("primary", "secondary"):
-        found[family] = []
-        for entry in declared[family]:
-            number += 1
-            contrasts = tuple(_contrast(declared, x, runs, study) for x in entry["contrasts"])
-            found[family].append(Claim(number, entry["claim"], entry["limits"], contrasts))
-    every = [contrast for claim in found["primary"] for contrast in claim.contrasts]
-    corrected = iter(holm([contrast.p_value for contrast in every]))
+    numbers = count(1)
+    found = {
+        family: [
+            Claim(
+                next(numbers),
+                entry["claim"],
+                entry["limits"],
+                tuple(_contrast(declared, asked, runs, study) for asked in entry["contrasts"]),
+            )
+            for entry in declared[family]
+        ]
+        for family in ("primary", "secondary")
+    }
+    corrected = iter(holm([x.p_value for claim in found["primary"] for x in claim.contrasts]))
     found["primary"] = [
         c._replace(contrasts=tuple(x._replace(p_value=next(corrected)) for x in c.contrasts))
         for c in found["primary"]
@@ -129,7 +128,7 @@ def claims_of(
 def _contrast(
     declared: Mapping[str, Any], asked: Mapping[str, Any], runs: Sequence[Run], study: str
 ) -> Contrast:
-    firsts = asked["first"] if isinstance(asked["first"], list) else [asked["first"]]
+    firsts = [asked["first"]] if isinstance(asked["first"], str) else asked["first"]
     strata: dict[str, list[list[Array]]] = {}
     for scene, here in of_study(declared, asked.get("study", study), runs).items():
         found = []
@@ -167,21 +166,18 @@ def of_study(declared: Mapping[str, Any], study: str, runs: Sequence[Run]) -> di
 
 
 def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Array] | None:
-    """Returns the score of each run of each side; None if a side has no run.
+    """Returns the score of each run of each side, of one scene; None if a side has no run.
 
-    Args:
-        sides: runs of one scene and study.
-        asked: names the measure and its conditions, see claims.yaml.
+    `asked` names the measure and its conditions as in claims.yaml. A run's episodes are those that
+    all runs of all sides drove.
     """
-    kind = next(name for name in _MEASURES if name in asked)
+    kind = _measure(asked)
     driven = [[_under(run, asked[kind]) for run in side] for side in sides]
     driven = [[found for found in side if all(len(c["outcome"]) for c in found)] for side in driven]
     if not all(driven):
         return None
     seeds = [c["episode_seed"] for side in driven for found in side for c in found]
     shared = reduce(np.intersect1d, seeds)
-    if not len(shared):
-        return None
 
     def score(found: Sequence[Columns]) -> float:
         ends = [c["outcome"][np.isin(c["episode_seed"], shared)] for c in found]
@@ -189,11 +185,15 @@ def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Arr
             failed = out_of_bounds_of_both(np.concatenate(ends))
             return float("nan") if np.isnan(failed).all() else float(np.nanmean(failed))
         means = [float(success(e).mean()) for e in ends]
-        return (
-            means[0] / means[1] if kind == "kept" else float(np.dot(means, [*asked[kind].values()]))
-        )
+        if kind == "kept":
+            return means[0] / means[1]
+        return float(np.dot(means, [*asked[kind].values()]))
 
-    return [np.array([score(found) for found in side]) for side in driven]
+    return [np.array([score(found) for found in side]) for side in driven] if len(shared) else None
+
+
+def _measure(asked: Mapping[str, Any]) -> str:
+    return next(name for name in ("success", "out_of_bounds", "kept") if name in asked)
 
 
 def _under(run: Run, names: Iterable[str | int]) -> list[Columns]:
@@ -204,8 +204,6 @@ def _under(run: Run, names: Iterable[str | int]) -> list[Columns]:
 
 def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     """Returns the table of claims in Markdown."""
-    effect_name = f"effect over scenes [95 %], {p_name}"
-    header = ("claim", "verdict", effect_name, "by scene", "figure", "what limits it")
     rows = []
     for claim in claims:
         effects = "; ".join(map(_effect_text, claim.contrasts))
@@ -215,6 +213,8 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
         )
         row = f"[row {claim.number}](#the-claims-in-one-figure)"
         rows.append((claim.text, f"**{claim.verdict}**", effects, by_scene, row, claim.limits))
+    effect_name = f"effect over scenes [95 %], {p_name}"
+    header = ("claim", "verdict", effect_name, "by scene", "figure", "what limits it")
     return markdown(header, rows)
 
 
@@ -224,8 +224,8 @@ def _effect_text(contrast: Contrast) -> str:
     if np.isnan(contrast.p_value):
         return f"{signed(contrast.effect.value)}, one run a side"
     p = p_text(contrast.p_value)
-    p = f"p {p}" if p.startswith("<") else f"p = {p}"
-    return f"{points(contrast.effect.interval())}, {p}"
+    sign = "" if p.startswith("<") else "= "
+    return f"{points(contrast.effect.interval())}, p {sign}{p}"
 
 
 def draw_claims(claims: Sequence[Claim]) -> Figure:
@@ -247,26 +247,23 @@ def draw_claims(claims: Sequence[Claim]) -> Figure:
         axes.set_xlim(-_WIDEST, _WIDEST)
         axes.grid(axis="x")
         axes.set_xlabel("points (95 % intervals; an arrow where one goes on)")
-        names = [*(words(scene) for scene in SHORT), "over scenes"]
-        colours = (*_SCENE_COLOURS, "#1b1f24")
-        for name, colour in zip(names, colours):
-            axes.plot([], [], color=colour, marker="D" if name == names[-1] else "o", label=name)
+        for scene, colour in zip(SHORT, _SCENE_COLOURS):
+            axes.plot([], [], color=colour, marker="o", label=words(scene))
+        axes.plot([], [], color="#1b1f24", marker="D", label="over scenes")
         figure.legend(loc="outside upper center", ncols=5)
     return figure
 
 
 def _label(claim: Claim, contrast: Contrast) -> str:
-    asked = contrast.asked
+    asked, kind = contrast.asked, _measure(contrast.asked)
     sides = [asked[side] for side in ("first", "second") if side in asked]
     names = ["all stacks" if isinstance(x, list) else _stack(x).strip("`") for x in sides]
-    kind = next(name for name in _MEASURES if name in asked)
     what = {"out_of_bounds": "out of bounds", "kept": "share kept"}.get(kind, "")
     if not what:
         units = [f"{n} Hz" if isinstance(n, int) else n for n in asked[kind]]
-        weights = list(asked[kind].values())
-        what = " − ".join(units) if min(weights) < 0 else " and ".join(units)
-    study = asked.get("study", "")
-    return f"{claim.number}  {' − '.join(names)}, {what}{', 84 px' * (study == 'resolution')}"
+        what = (" − " if min(asked[kind].values()) < 0 else " and ").join(units)
+    size = ", 84 px" if asked.get("study") == "resolution" else ""
+    return f"{claim.number}  {' − '.join(names)}, {what}{size}"
 
 
 def _draw_effect(
@@ -276,9 +273,9 @@ def _draw_effect(
     axes.plot(value, at, marker, color=colour, markersize=size)
     if np.isnan(low):
         return
-    left, right = -_WIDEST, _WIDEST
-    axes.plot([max(low, left), min(high, right)], [at, at], color=colour, linewidth=1.2)
-    for end, is_cut, sign in ((left, low < left, "<"), (right, high > right, ">")):
+    ends = [max(low, -_WIDEST), min(high, _WIDEST)]
+    axes.plot(ends, [at, at], color=colour, linewidth=1.2)
+    for end, is_cut, sign in ((-_WIDEST, low < -_WIDEST, "<"), (_WIDEST, high > _WIDEST, ">")):
         if is_cut:
             axes.plot(end, at, sign, color=colour, markersize=3.0, clip_on=False)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.experiment.run import origin_of
-from flowrep.report.statistics import Array, Bootstrap, Estimate, rates
+from flowrep.report.statistics import Array, Bootstrap, Estimate
 
 Columns = dict[str, NDArray[Any]]
 Metric = Callable[[NDArray[Any]], Array]
@@ -96,7 +96,7 @@ class Run:
         return {name: column[chosen] for name, column in e.items()}
 
 
-def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
+def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     """Returns what determines a run's weights, by dotted key, without the seed.
 
     Keys of one scene alone are under the scene's name, and options of a representation under its
@@ -107,8 +107,8 @@ def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
     scene = parts.pop("scene")
     own = {key: value for key, value in scene.items() if key not in _OF_EVERY_SCENE}
     shared = {f"scene.{key}": scene[key] for key in _OF_EVERY_SCENE if key in scene}
-    found = dict([*_flat(parts | shared), *_flat(own, f"scene.{scene['name']}")])
-    return {k: v for k, v in found.items() if v != {}}  # a representation without options
+    found = [*_flat(parts | shared), *_flat(own, f"scene.{scene['name']}")]
+    return {key: str(value) for key, value in found if value != {}}
 
 
 def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
@@ -162,14 +162,14 @@ class Group(NamedTuple):
     """Runs that may be compared, and the keys in which groups differ with this one's values."""
 
     runs: tuple[Run, ...]
-    differences: dict[str, Any]
+    differences: dict[str, str]
 
     @property
     def label(self) -> str:
         """What distinguishes it from other groups; empty if it is the only one."""
-        shown = [f"{key}={value}" for key, value in self.differences.items()]
-        shown = [text if len(text) < 60 else f"{text[:56]} ..." for text in shown]
-        return ", ".join(shown if len(shown) <= 4 else [*shown[:3], f"{len(shown) - 3} more keys"])
+        shown = [f"{key}={value}"[:60] for key, value in self.differences.items()]
+        more = [f"{len(shown) - 3} more keys"] if len(shown) > 4 else shown[3:]
+        return ", ".join(shown[:3] + more)
 
 
 def groups_of(runs: Sequence[Run]) -> list[Group]:
@@ -177,16 +177,13 @@ def groups_of(runs: Sequence[Run]) -> list[Group]:
 
     Runs of a group differ in scene, representations and seed alone.
     """
-    values: dict[str, dict[str, Any]] = {}
-    for key in dict.fromkeys(key for run in runs for key in run.settings):
-        of_runs = [run.settings.get(key, "absent") for run in runs if _can_have(run, key)]
-        values[key] = {repr(value): value for value in of_runs}
-    differing = [key for key, found in values.items() if len(found) > 1]
+    keys = dict.fromkeys(key for run in runs for key in run.settings)
+    own = [{k: run.settings.get(k, "absent") for k in keys if _can_have(run, k)} for run in runs]
+    differing = [key for key in keys if len({of[key] for of in own if key in of}) > 1]
     groups: dict[tuple[tuple[str, str], ...], list[Run]] = {}
-    for run in runs:
-        own = {k: run.settings.get(k, "absent") for k in differing if _can_have(run, k)}
-        groups.setdefault(tuple((k, repr(v)) for k, v in own.items()), []).append(run)
-    found = [Group(tuple(g), {k: values[k][v] for k, v in key}) for key, g in groups.items()]
+    for run, of in zip(runs, own):
+        groups.setdefault(tuple((k, of[k]) for k in differing if k in of), []).append(run)
+    found = [Group(tuple(members), dict(values)) for values, members in groups.items()]
     return sorted(found, key=lambda group: -len(group.runs))
 
 
@@ -213,12 +210,9 @@ def out_of_bounds_of_both(outcomes: NDArray[Any]) -> Array:
 
 
 class OutcomeMatrix(NamedTuple):
-    """The outcomes of the runs of one stack in one scene and condition.
+    """The metric of each run (by its seed) and episode `[R, E]`, nan where it was not driven.
 
-    Args:
-        seeds: the runs' seeds, in the order of rows.
-        episodes: the episodes' seeds, in the order of columns.
-        outcomes: `[R, E]`, the metric of each episode, nan where it was not driven.
+    All runs are of one stack, scene and condition.
     """
 
     seeds: tuple[int, ...]
@@ -297,31 +291,18 @@ def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:
     return None if driven is None else float(np.nanmax(driven.outcomes, axis=0).mean())
 
 
-class Score(NamedTuple):
-    """An estimate of success, each seed's success, and the numbers of seeds and episodes."""
-
-    estimate: Estimate
-    of_seeds: tuple[float, ...]
-    counts: str
-
-
 class Grid(NamedTuple):
-    """Success in one scene: a score for each series and condition, None where it is missing.
+    """Success in one scene: outcomes and scores by series and condition, None where it is missing.
 
-    Args:
-        scene: the scene's name.
-        series: the compared stacks, or stacks of groups, in the figure's order.
-        conditions: groups of bars, or points of a line.
-        matrices: the outcomes behind the scores.
-        scores: by series and condition.
-        baselines: success by the baseline's name and condition.
+    `series` are the compared stacks in the figure's order, or stacks of groups; `conditions` are
+    groups of bars, or points of a line; baselines go by their name and condition.
     """
 
     scene: str
     series: tuple[str, ...]
     conditions: tuple[Condition, ...]
     matrices: Mapping[tuple[str, Condition], OutcomeMatrix | None]
-    scores: Mapping[tuple[str, Condition], Score | None]
+    scores: Mapping[tuple[str, Condition], Estimate | None]
     baselines: Mapping[tuple[str, Condition], float]
 
 
@@ -332,23 +313,13 @@ def grid_of(
     bootstrap: Bootstrap,
     baselines: Sequence[str] = BASELINES,
 ) -> Grid:
-    """Returns the success of several series of runs in a scene.
+    """Returns the success of several series of runs in a scene; those of others are left out.
 
-    Args:
-        scene: the scene's name; runs of other scenes are left out.
-        runs: the runs of each series, possibly none.
-        conditions: the conditions in which they are compared.
-        bootstrap: computes the intervals.
-        baselines: names of baselines; none where the runs' configs differ, since a baseline's
-            drives may differ too.
+    Without `baselines` where the runs' configs differ, since a baseline's drives may differ too.
     """
     here = {name: [run for run in members if run.scene == scene] for name, members in runs.items()}
     found = {(name, c): outcomes_of(here[name], c) for name, c in product(runs, conditions)}
-    scores = {
-        place: m
-        and Score(bootstrap.success([m.outcomes]), tuple(rates(m.outcomes).tolist()), m.counts)
-        for place, m in found.items()
-    }
+    scores = {place: m and bootstrap.success([m.outcomes]) for place, m in found.items()}
     everybody = [run for members in here.values() for run in members]
     shares = {
         (name, c): share

@@ -1,18 +1,18 @@
 """The sections of a report on runs: headings, figures and tables, and their files."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from flowrep.config.cli import folder_name
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, save, words
 from flowrep.report.runs import (
     BASELINES,
-    SCENES,
     SPEEDS,
     Condition,
     Grid,
@@ -30,13 +30,14 @@ from flowrep.report.runs import (
     side_by_side,
 )
 from flowrep.report.statistics import FEWEST_RUNS, Bootstrap, Comparison, Estimate, holm
-from flowrep.report.tables import MISSING, Table, latex_text, listed, p_text, percent, points
+from flowrep.report.tables import MISSING, Table, listed, p_text, percent, points
 
 INTERVALS = (
     "the mean over seeds with 95 % intervals, by a bootstrap over seeds and episodes; of a single "
-    "seed, or where all episodes end alike, Wilson's over the episodes"
+    "seed, or where all resamples agree, Wilson's over the episodes"
 )
-_MOST_PAIRS = 15
+_MOST_PAIRS = 15  # in a table
+_LONGEST_LABEL = 30  # of a config, in a legend
 _ALL = "ego+obj+seg2+depth2"
 
 
@@ -74,33 +75,6 @@ STACKS = tuple(dict.fromkeys((*FLOW_COMPOSITION.stacks, *COMPLEMENTARY.stacks)))
 """All of the paper's, in the order of its figures."""
 
 
-class Variation(NamedTuple):
-    """Configs that differ in the keys with one prefix alone, and what a run's variant is called."""
-
-    prefix: str
-    name: str
-    title: str
-    stacks: tuple[str, ...]
-    variant_of: Callable[[Run], str]
-
-
-_VARIATIONS = (
-    Variation(
-        "flow.", "estimated_flow", "Flow estimated from pictures", ("raw", "ego+obj"),
-        lambda run: run.config["flow"]["source"],
-    ),
-    Variation(
-        "noise.", "sensor_noise", "Noise of depth and odometry", ("ego+obj", "raw", "depth2"),
-        lambda run: "noisy" if any(run.config["noise"].values()) else "exact",
-    ),
-    Variation(
-        "scene.camera.", "resolution", "Resolution of the maps", ("ego+obj", "seg2", "depth2"),
-        lambda run: f"{run.config['scene']['camera']['height_px']} px",
-    ),
-)  # fmt: skip
-_FIRST = ("exact", "48 px")  # variants that the others are compared with
-
-
 class Settings(NamedTuple):
     """A report's choice of evaluations, "greedy" or "sampled", and of intervals."""
 
@@ -109,36 +83,19 @@ class Settings(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """A figure of panels, drawn side by side for a paper or one by one for a page."""
+    """A figure: the name of its files, its caption, and what draws it."""
 
     name: str
     caption: str
-    panels: tuple[Any, ...]
-    draw: Callable[..., Figure]
-
-    def parts(self) -> list[Figure]:
-        """Returns one figure per panel, for a page."""
-        return [self.draw([panel], for_page=True) for panel in self.panels]
-
-    def to_latex(self) -> str:
-        """Returns a figure environment around the PDF, which lies beside it."""
-        star, width = ("*", r"\textwidth") if len(self.panels) > 1 else ("", r"\columnwidth")
-        return rf"""\begin{{figure{star}}}[t]
-  \centering
-  \includegraphics[width={width}]{{{self.name}.pdf}}
-  \caption{{{latex_text(self.caption)}}}
-  \label{{fig:{self.name}}}
-\end{{figure{star}}}
-"""
+    draw: Callable[[], Figure]
 
 
 class Section(NamedTuple):
-    """One part of a report: the name of its folder, heading, notes, figures and tables."""
+    """One part of a report: the name of its folder, its heading, its figure and its tables."""
 
     name: str
     title: str
-    notes: tuple[str, ...] = ()
-    drawings: tuple[Drawing, ...] = ()
+    drawing: Drawing | None
     tables: tuple[Table, ...] = ()
 
 
@@ -168,12 +125,12 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], settings: Settings) -
             sections = [s._replace(name=f"{number + 1}_{s.name}") for s in sections]
         chapters.append(Chapter(group.label, tuple(sections)))
     if len(groups) > 1:
-        chapters.append(Chapter("", tuple(_across(groups, settings))))
+        chapters.append(Chapter("", (_configs_section(groups, settings),)))
     return Report(tuple(runs), tuple(wrong), tuple(c for c in chapters if c.sections))
 
 
 def write_files(report: Report, folder: Path) -> list[Path]:
-    """Writes each section's figures and tables as PNG, PDF, LaTeX and CSV; returns their folders.
+    """Writes figures as PNG and PDF, tables as LaTeX and CSV, and returns the sections' folders.
 
     The same report gives the same files, byte for byte.
     """
@@ -181,9 +138,8 @@ def write_files(report: Report, folder: Path) -> list[Path]:
     for section in sections:
         place = folder / section.name
         place.mkdir(exist_ok=True)
-        for drawing in section.drawings:
-            save(drawing.draw(drawing.panels), place / drawing.name)
-            (place / f"{drawing.name}.tex").write_text(drawing.to_latex(), encoding="utf-8")
+        if section.drawing:
+            save(section.drawing.draw(), place / section.drawing.name)
         for table in section.tables:
             (place / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
             (place / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
@@ -208,29 +164,23 @@ def _unusable(run: Run, settings: Settings) -> str | None:
 
 def _group_sections(group: Group, settings: Settings) -> list[Section]:
     runs = [run for run in group.runs if _unusable(run, settings) is None]
+    if not runs:
+        return _curves(group.runs)
+    stacks = in_order([run.stack for run in runs], STACKS)
     sections = []
     shown: set[str] = set()
-    stacks = in_order([run.stack for run in runs], STACKS)
-    for experiment in (FLOW_COMPOSITION, COMPLEMENTARY):
-        found = set(stacks) & set(experiment.stacks)
-        named = any(run.config.get("experiment") == experiment.name for run in group.runs)
-        if len(found) > 1 or (found and named):
-            ours = [run for run in runs if run.stack in experiment.stacks]
-            name, title, order, pairs = experiment
-            section = success_section(name, title, by_stack(ours, order), pairs, settings)
-            if absent := [words(scene) for scene in SCENES if scene not in scenes_of(ours)]:
-                notes = (*section.notes, f"No runs in {listed(absent)}.")
-                section = section._replace(notes=notes)
-            sections.append(section)
-            shown |= found
-    if runs:
-        if set(stacks) - shown:
-            sections.append(
-                success_section("success", "Success", by_stack(runs, stacks), None, settings)
-            )
-        sections.append(_failure_section(runs, settings))
-        if len(_rates(runs, settings.policy)) > 1:
-            sections.append(_rate_section(runs, settings))
+    for name, title, order, pairs in (FLOW_COMPOSITION, COMPLEMENTARY):
+        if len({*stacks} & {*order}) > 1:
+            ours = [run for run in runs if run.stack in order]
+            sections.append(success_section(name, title, by_stack(ours, order), pairs, settings))
+            shown |= {*order}
+    if {*stacks} - shown:
+        every = list(combinations(reversed(stacks), 2))
+        series = by_stack(runs, stacks)
+        sections.append(success_section("success", "Success", series, every, settings))
+    sections.append(_failure_section(runs, settings))
+    if len(_rates(runs, settings.policy)) > 1:
+        sections.append(_rate_section(runs, settings))
     return [*sections, *_curves(group.runs)]
 
 
@@ -255,20 +205,11 @@ def success_section(
     name: str,
     title: str,
     series: Mapping[str, Sequence[Run]],
-    pairs: Sequence[tuple[str, str]] | None,
+    pairs: Sequence[tuple[str, str]],
     settings: Settings,
     baselines: Sequence[str] = BASELINES,
 ) -> Section:
-    """Returns bars, a table of success and one of differences for series of runs.
-
-    Args:
-        name: the section's name.
-        title: its heading.
-        series: the runs of each series.
-        pairs: series whose differences are listed; None for all, up to 15.
-        settings: policy and intervals.
-        baselines: see `grid_of`.
-    """
+    """Returns bars, a table of success and one of the pairs' differences, for series of runs."""
     runs = [run for members in series.values() for run in members]
     policy, bootstrap, fps = settings.policy, settings.bootstrap, runs[0].fps
     conditions = [Condition(policy, speed, fps) for speed in _speeds(runs, policy)]
@@ -278,17 +219,16 @@ def success_section(
         f"Success of agents trained at {trained} speed, {policy} actions, {fps:g} frames per "
         f"second: {INTERVALS}; dots are the seeds."
     )
-    tables = [
+    tables = (
         _success_table(name, grids, caption, bootstrap),
-        *_difference_table(name, grids, pairs, bootstrap),
-    ]
-    drawing = Drawing(name, caption, tuple(grids), draw_bars)
-    return Section(name, title, _what_is_missing(grids), (drawing,), tuple(tables))
+        *_difference_tables(name, grids, pairs, bootstrap),
+    )
+    return Section(name, title, Drawing(name, caption, partial(draw_bars, grids)), tables)
 
 
 def _shares(grid: Grid, series: str) -> list[str]:
     scores = [grid.scores[series, c] for c in grid.conditions]
-    return [percent(score.estimate) if score else MISSING for score in scores]
+    return [percent(score) if score else MISSING for score in scores]
 
 
 def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bootstrap) -> Table:
@@ -298,8 +238,8 @@ def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bo
     for grid in grids:
         rows = []
         for series in grid.series:
-            scores = [grid.scores[series, c] for c in conditions]
-            counts = dict.fromkeys(score.counts for score in scores if score)
+            found = [grid.matrices[series, c] for c in conditions]
+            counts = dict.fromkeys(matrix.counts for matrix in found if matrix)
             rows.append((series, *_shares(grid, series), ", ".join(counts) or "0"))
         for baseline in dict.fromkeys(baseline for baseline, _ in grid.baselines):
             shares = [grid.baselines.get((baseline, c)) for c in conditions]
@@ -309,8 +249,8 @@ def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bo
     if len(grids) > 1:
         rows = []
         for series in grids[0].series:
-            found = [[grid.matrices[series, c] for grid in grids] for c in conditions]
-            here = [[m.outcomes for m in of if m is not None] for of in found]
+            each = [[grid.matrices[series, c] for grid in grids] for c in conditions]
+            here = [[m.outcomes for m in of if m is not None] for of in each]
             cells = [
                 percent(bootstrap.success(o)) if len(o) == len(grids) else MISSING for o in here
             ]
@@ -320,15 +260,11 @@ def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bo
     return Table(f"{name}_success", f"In %. {caption}", header, tuple(blocks))
 
 
-def _difference_table(
-    name: str,
-    grids: Sequence[Grid],
-    pairs: Sequence[tuple[str, str]] | None,
-    bootstrap: Bootstrap,
-) -> Iterator[Table]:
-    """Yields the difference of each pair with its verdict, if there is a pair to compare."""
-    every = list(combinations(reversed(grids[0].series), 2)) if pairs is None else pairs
-    chosen = every[:_MOST_PAIRS] if pairs is None else pairs
+def _difference_tables(
+    name: str, grids: Sequence[Grid], pairs: Sequence[tuple[str, str]], bootstrap: Bootstrap
+) -> list[Table]:
+    """Returns the difference of each pair with its verdict, if there is a pair to compare."""
+    chosen = pairs[:_MOST_PAIRS]
     places = [(words(grid.scene), [grid]) for grid in grids]
     if len(grids) > 1:
         places.append((f"All {len(grids)} scenes", list(grids)))
@@ -350,8 +286,6 @@ def _difference_table(
             rows.append((pair, speed, *cells, str(shared)))
         if rows:
             blocks.append((heading, tuple(rows)))
-    if not blocks:
-        return
     caption = (
         "First minus second in percentage points, on the episodes that all runs of both drove, "
         "with 95 % bootstrap intervals over seeds and episodes; the probability that a run of the "
@@ -360,11 +294,11 @@ def _difference_table(
         "its interval leaves out 0 and the corrected p < 0.05; of fewer than "
         f"{FEWEST_RUNS} seeds a side it is one of these agents."
     )
-    if len(chosen) < len(every):
-        caption += f" The first {len(chosen)} of {len(every)} pairs."
-    told = ("points", "verdict", "P(first better) (%)", "p", "p (Holm)")
-    header = ("first − second", "speed", *told, "shared")
-    yield Table(f"{name}_differences", caption, header, tuple(blocks), words=(1, 3))
+    if len(chosen) < len(pairs):
+        caption += f" The first {len(chosen)} of {len(pairs)} pairs."
+    columns = ("speed", "points", "verdict", "P(first better) (%)", "p", "p (Holm)", "shared")
+    header = ("first − second", *columns)
+    return [Table(f"{name}_differences", caption, header, tuple(blocks), (1, 3))] if blocks else []
 
 
 def _compared(
@@ -381,24 +315,6 @@ def _compared(
     return (bootstrap.compare(sides), sum(shared)) if all(shared) else (None, 0)
 
 
-def _what_is_missing(grids: Sequence[Grid]) -> tuple[str, ...]:
-    """Returns a sentence per scene on the cells that no finished run fills."""
-    notes = []
-    for grid in grids:
-        parts = []
-        for name in grid.series:
-            lacking = [c for c in grid.conditions if grid.scores[name, c] is None]
-            if len(lacking) == len(grid.conditions):
-                parts.append(name)
-            elif lacking:
-                of_rates = len({c.fps for c in grid.conditions}) > 1
-                which = [f"{c.fps:g} Hz" if of_rates else c.speed for c in lacking]
-                parts.append(f"{name} ({listed(which)})")
-        if parts:
-            notes.append(f"Missing in {words(grid.scene)}: {listed(parts)}.")
-    return tuple(notes)
-
-
 def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
     """Returns Table III for the scenes of the runs, the paper's scene first.
 
@@ -411,11 +327,10 @@ def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
         speeds = [runs[0].speed]
     conditions = [Condition(settings.policy, speed, fps) for speed in speeds]
     stacks = in_order([run.stack for run in runs], _TABLE_III)
-    blocks, missing = [], []
+    blocks = []
     for scene in in_order(scenes_of(runs), ("s_turn",)):
         here = by_stack([run for run in runs if run.scene == scene], stacks)
         rows = [_failure_row(stack, here[stack], conditions, settings) for stack in stacks]
-        missing += [f"{row[0]} in {words(scene)}" for row in rows if MISSING in row]
         blocks.append((words(scene), tuple(rows)))
     caption = (
         "Causes of failure in % of collisions and departures from the road together, of all seeds; "
@@ -425,9 +340,8 @@ def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
     )
     header = ("representations", "out of bounds (%)", "collision (%)", "out of bounds to collision")
     counts = ("failures", "time-outs", "episodes")
-    notes = (f"Missing: {listed(missing)}.",) if missing else ()
     table = Table("failure_causes", caption, (*header, *counts), tuple(blocks))
-    return Section("failure_causes", "Causes of failure", notes, tables=(table,))
+    return Section("failure_causes", "Causes of failure", None, (table,))
 
 
 def _failure_row(
@@ -467,28 +381,21 @@ def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
         f"Success over the frame rate of the evaluation, trained at {trained:g} frames per second, "
         f"{speed} speed, {policy} actions: {INTERVALS}. Points of one rate stand side by side."
     )
-    drawing = Drawing("frame_rate", caption, tuple(grids), draw_rates)
-    table = _rate_table(grids, caption, settings)
-    title = "Sensitivity to the frame rate"
-    return Section("frame_rate", title, _what_is_missing(grids), (drawing,), (table,))
-
-
-def _rate_table(grids: Sequence[Grid], caption: str, settings: Settings) -> Table:
-    """Returns success in % by frame rate, and the change from the highest to the lowest."""
-    conditions = grids[0].conditions
+    drawing = Drawing("frame_rate", caption, partial(draw_rates, grids))
     low, high = conditions[0], conditions[-1]
     blocks = []
     for grid in grids:
         rows = []
-        for series in grid.series:
-            changes = change(grid.matrices[series, high], grid.matrices[series, low])
+        for name in grid.series:
+            changes = change(grid.matrices[name, high], grid.matrices[name, low])
             lost = MISSING if changes is None else points(settings.bootstrap.mean([changes]))
-            rows.append((series, *_shares(grid, series), lost))
+            rows.append((name, *_shares(grid, name), lost))
         blocks.append((words(grid.scene), tuple(rows)))
     heads = (*(f"{c.fps:g} Hz (%)" for c in conditions), f"{high.fps:g} → {low.fps:g} Hz (points)")
     extra = "The last column is the change of the same agents on the same episodes."
     header = ("representations", *heads)
-    return Table("frame_rate_success", f"In %. {caption} {extra}", header, tuple(blocks))
+    table = Table("frame_rate_success", f"In %. {caption} {extra}", header, tuple(blocks))
+    return Section("frame_rate", "Sensitivity to the frame rate", drawing, (table,))
 
 
 def _curves(runs: Sequence[Run]) -> list[Section]:
@@ -504,49 +411,35 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
         "Learning curves. Bold, with markers: greedy evaluations at the training speed, the mean "
         "over seeds. Thin: each seed's training episodes, sampled actions."
     )
-    drawing = Drawing("learning_curves", caption, tuple(panels), draw_curves)
-    return [Section("learning_curves", "Learning curves", drawings=(drawing,))]
+    drawing = Drawing("learning_curves", caption, partial(draw_curves, panels))
+    return [Section("learning_curves", "Learning curves", drawing)]
 
 
-def _across(groups: Sequence[Group], settings: Settings) -> Iterator[Section]:
-    """Yields the results of stacks in groups whose configs differ, side by side, not pooled."""
-    keys = list(dict.fromkeys(key for group in groups for key in group.differences))
-    numbers = [f"config {number}" for number in range(1, len(groups) + 1)]
-    cells = {key: [str(group.differences.get(key, "")) for group in groups] for key in keys}
-    rows = tuple(
-        (key, *(c if len(c) <= 24 else f"{c[:20]} ..." for c in of)) for key, of in cells.items()
-    )
+def _configs_section(groups: Sequence[Group], settings: Settings) -> Section:
+    """Returns the stacks that have runs of several configs, side by side and never pooled."""
+    keys = dict.fromkeys(key for group in groups for key in group.differences)
+    labels = [group.label for group in groups]
+    are_short = all(0 < len(label) <= _LONGEST_LABEL for label in labels)
+    configs = labels if are_short else [f"config {n}" for n in range(1, len(groups) + 1)]
+    rows = [(key, *(group.differences.get(key, "")[:60] for group in groups)) for key in keys]
     caption = "Keys of the configs in which the runs differ. No number is of runs of two columns."
     columns = tuple(range(1, len(groups) + 1))
-    table = Table("configs", caption, ("key", *numbers), (("", rows),), words=columns)
-    variation = next((v for v in _VARIATIONS if all(k.startswith(v.prefix) for k in keys)), None)
-    usable = [[r for r in g.runs if _unusable(r, settings) is None] for g in groups]
-    variants = [variation.variant_of(g.runs[0]) for g in groups] if variation else numbers
-    if len(set(variants)) < len(variants):  # two kinds of noise have no names
-        variation, variants = None, numbers
-    by_variant = dict(zip(variants, usable))
-    order = in_order(variants, _FIRST) if variation else variants
-    first, *others = order
-    found = in_order(
-        [r.stack for of in usable for r in of], variation.stacks if variation else STACKS
-    )
-    yield Section("configs", "Configs that differ", tables=(table,))
-    for stacks in [found] if variation else [[stack] for stack in found]:
-        series = {
-            f"{stack}, {v}" if variation else v: [r for r in by_variant[v] if r.stack == stack]
-            for stack, v in product(stacks, order)
-        }
-        if variation:
-            pairs = [(f"{stack}, {v}", f"{stack}, {first}") for stack in stacks for v in others]
-            pairs += [(f"{stacks[0]}, {v}", f"{s}, {v}") for v in order for s in stacks[1:]]
-            notes = tuple(f"{v}: {g.label}." for v, g in zip(variants, groups))
-            name, title = variation.name, variation.title
-        else:
-            series = {v: of for v, of in series.items() if of}
-            pairs, notes = None, ()
-            name = folder_name(f"across_{stacks[0]}")
-            title = f"{stacks[0]} under configs that differ"
-        places = [scene for of in series.values() for scene in {run.scene for run in of}]
-        if len(set(places)) < len(places):  # some scene has more than one of them
-            section = success_section(name, title, series, pairs, settings, baselines=())
-            yield section._replace(notes=(*notes, *section.notes))
+    table = Table("configs", caption, ("key", *configs), (("", tuple(rows)),), columns)
+
+    usable = [[run for run in g.runs if _unusable(run, settings) is None] for g in groups]
+    places = Counter(place for runs in usable for place in {(r.scene, r.stack) for r in runs})
+    shared = [place for place, configs_there in places.items() if configs_there > 1]
+    series = {
+        (stack, config): [
+            run for run in runs if (run.scene, stack) in shared and run.stack == stack
+        ]
+        for stack in in_order([stack for _, stack in shared], STACKS)
+        for config, runs in zip(configs, usable)
+    }
+    names = {place: ", ".join(place) for place, runs in series.items() if runs}
+    if not names:
+        return Section("configs", "Configs that differ", None, (table,))
+    pairs = [(names[b], names[a]) for a, b in combinations(names, 2) if a[0] == b[0]]
+    told = {name: series[place] for place, name in names.items()}
+    section = success_section("configs", "Configs that differ", told, pairs, settings, baselines=())
+    return section._replace(tables=(table, *section.tables))

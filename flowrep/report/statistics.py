@@ -107,21 +107,18 @@ class Bootstrap:
         """Returns the mean over a scene's runs, in the mean over scenes.
 
         Args:
-            scenes: for each scene [R, E], see `rates`. One run alone gives Wilson's interval, as
-                do runs that succeed always or never: every draw of them is the same.
+            scenes: for each scene [R, E], see `rates`. One run alone gives Wilson's interval.
         """
         if sum(map(len, scenes)) == 1:
             return self._wilson(scenes[0])
-        outcomes = np.concatenate([part[~np.isnan(part)] for part in scenes])
-        if outcomes.size and outcomes.min() == outcomes.max():  # the episodes are shared by runs
-            return self._wilson(np.full(sum(part.shape[1] for part in scenes), outcomes[0]))
-        return self.mean(scenes)
+        return self.mean(scenes, least=0.0)
 
-    def mean(self, scenes: Sequence[Array]) -> Estimate:
-        """Returns the same of outcomes of any kind, such as changes between two conditions."""
+    def mean(self, scenes: Sequence[Array], least: float = -1.0) -> Estimate:
+        """Returns the same of outcomes from `least` to 1, such as changes between conditions."""
         value = np.mean([rates(outcomes).mean() for outcomes in scenes])
         drawn = [self._draw(k, outcomes, [len(outcomes)])[0] for k, outcomes in enumerate(scenes)]
-        return self._estimate(float(value), np.mean([d.mean(axis=-1) for d in drawn], axis=0))
+        means = np.mean([d.mean(axis=-1) for d in drawn], axis=0)
+        return self._estimate(float(value), means, sum(s.shape[1] for s in scenes), least)
 
     def pooled_share(self, outcomes: Array) -> Estimate:
         """Returns the share over the pooled episodes of all runs; nan without episodes.
@@ -141,7 +138,7 @@ class Bootstrap:
         counts = np.take_along_axis(weights @ there.T, chosen, axis=1).sum(axis=1)
         sums = np.take_along_axis(weights @ found.T, chosen, axis=1).sum(axis=1)
         drawn = sums[counts > 0] / counts[counts > 0]
-        return self._estimate(float(found.sum() / there.sum()), drawn)
+        return self._estimate(float(found.sum() / there.sum()), drawn, int(there.sum()))
 
     def compare(self, scenes: Sequence[tuple[Array, Array]]) -> Comparison:
         """Returns how much better the first of each pair does than the second.
@@ -163,9 +160,10 @@ class Bootstrap:
         runs = fewest if fewest < 2 else min(sum(map(len, side)) for side in zip(*own))
         improvement = float(np.mean([_improvement(*pair) for pair in own]))
         improvements = np.mean([_improvement(*pair) for pair in drawn], axis=0)
+        episodes = sum(ours.shape[1] for ours, _ in scenes)  # shared by the runs
         return Comparison(
-            self._estimate(float(difference), differences),
-            self._estimate(improvement, improvements),
+            self._estimate(float(difference), differences, episodes, least=-1.0),
+            self._estimate(improvement, improvements, episodes),
             effect(own).p_value,
             runs,
         )
@@ -193,9 +191,17 @@ class Bootstrap:
         found, trials = int(outcomes[there].sum()), int(there.sum())
         return Estimate(found / max(trials, 1), *wilson_interval(found, trials, self.confidence))
 
-    def _estimate(self, value: float, drawn: Array) -> Estimate:
+    def _estimate(self, value: float, drawn: Array, episodes: int, least: float = 0.0) -> Estimate:
+        """Returns a value from `least` to 1 with the interval of its resamples.
+
+        Where they all agree they say nothing of what other episodes would have shown, and the
+        interval is as wide as Wilson's of a share that is 0 in so many episodes.
+        """
         tail = (1 - self.confidence) / 2
         low, high = np.quantile(drawn, [tail, 1 - tail])
+        if np.ptp(drawn) < 1e-9:
+            unseen = wilson_interval(0, episodes, self.confidence)[1]
+            low, high = max(value - unseen, least), min(value + unseen, 1.0)
         return Estimate(value, float(low), float(high))
 
 

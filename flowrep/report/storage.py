@@ -12,7 +12,7 @@ import gzip
 import io
 import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from itertools import groupby
 from pathlib import Path
@@ -31,7 +31,6 @@ EPISODE_COLUMNS = (
     "scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed",
     "outcome", "hit", "length",
 )  # fmt: skip
-"""The columns of evaluation.csv that are packed; `scene_id` is empty in tables without it."""
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
@@ -46,29 +45,26 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     runs: dict[str, Run] = {}
     warnings: list[str] = []
     for folder in folders:
-        if is_archive(folder) or (not folder.exists() and is_archive(folder.parent)):
-            pattern = "*" if folder.exists() else folder.name
-            packed = read_archive(folder if folder.exists() else folder.parent)
-            found = [run for run in packed if fnmatch(run.name, pattern)]
+        place, pattern = (folder, "*") if folder.exists() else (folder.parent, folder.name)
+        if is_archive(place):
+            found = {run.name: run for run in read_archive(place) if fnmatch(run.name, pattern)}
             if not found:
                 raise RunFolderError(f"'{folder}': no packed run in it has such a name")
-            runs |= {run.name: run for run in found}
+            runs |= found
             continue
-        configs = sorted(
-            path
-            for path in folder.rglob("config.yaml")
-            if {".hydra", "wandb"}.isdisjoint(path.relative_to(folder).parts)
-        )
+        configs = [
+            config
+            for config in sorted(folder.rglob("config.yaml"))
+            if {".hydra", "wandb"}.isdisjoint(config.relative_to(folder).parts)
+        ]
         if not configs:
             what = "holds no run" if folder.exists() else "does not exist"
             raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
-        for config in configs:
-            key = str(config.parent.resolve())
-            if key not in runs:
-                try:
-                    runs[key] = read_run(config.parent)
-                except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
-                    warnings.append(" ".join(str(error).split()))
+        for path in (config.parent for config in configs):
+            try:
+                runs.setdefault(str(path.resolve()), read_run(path))
+            except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
+                warnings.append(" ".join(str(error).split()))
     return list(runs.values()), warnings
 
 
@@ -96,19 +92,16 @@ def read_run(path: Path) -> Run:
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     """Returns one run per config and seed, and a line for each other: it would be another seed."""
-    same: dict[Any, list[Run]] = {}
-    for run in runs:
-        key = (run.stack, run.seed, repr(sorted(run.settings.items(), key=lambda item: item[0])))
-        same.setdefault(key, []).append(run)
-    kept = [max(of, key=lambda r: (int(r.tested.sum()), r.frames)) for of in same.values()]
-    warnings = [
-        f"{run.name} is the same run as {best.name}, config and seed: left out, it would count as "
-        "another seed"
-        for best, of in zip(kept, same.values())
-        for run in of
-        if run is not best
-    ]
-    return kept, warnings
+    kept: dict[Any, Run] = {}
+    warnings = []
+    for run in sorted(runs, key=lambda run: (-int(run.tested.sum()), -run.frames)):
+        best = kept.setdefault((run.stack, run.seed, *sorted(run.settings.items())), run)
+        if run is not best:
+            warnings.append(
+                f"{run.name} is the same run as {best.name}, config and seed: left out, it would "
+                "count as another seed"
+            )
+    return [run for run in runs if run in kept.values()], warnings
 
 
 def _episodes(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Columns:
@@ -167,11 +160,10 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     before = read_archive(folder) if is_archive(folder) else []
-    by_name = {Path(run.name).name: run for run in (*before, *runs)}
-    kept = sorted(by_name.items())
+    kept = sorted({Path(run.name).name: run for run in (*before, *runs)}.items())
     logged = list(dict.fromkeys(name for _, run in kept for name in run.metrics))
-    _write(folder / EPISODES, ("run", *EPISODE_COLUMNS), _rows(kept, "episodes", EPISODE_COLUMNS))
-    _write(folder / TRAINING, ("run", *logged), _rows(kept, "metrics", logged))
+    _write(folder / EPISODES, EPISODE_COLUMNS, [(name, run.episodes) for name, run in kept])
+    _write(folder / TRAINING, logged, [(name, run.metrics) for name, run in kept])
     lines = []
     for name, run in kept:
         machine = {key: run.machine.get(key, "unknown") for key in _MACHINE}
@@ -180,31 +172,23 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
     (folder / RUNS).write_text("".join(lines), encoding="utf-8")
 
 
-def _rows(
-    runs: Iterable[tuple[str, Run]], table: str, names: Iterable[str]
-) -> Iterator[tuple[Any, ...]]:
-    for name, run in runs:
-        columns: Columns = getattr(run, table)
-        size = max(map(len, columns.values()), default=0)
-        absent = np.full(size, np.nan)
-        cells = [columns.get(column, absent).tolist() for column in names]
-        yield from ((name, *map(_text, row)) for row in zip(*cells))
+def _write(path: Path, names: Sequence[str], tables: Iterable[tuple[str, Columns]]) -> None:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("run", *names))
+    for run, columns in tables:
+        absent = np.full(max(map(len, columns.values()), default=0), np.nan)
+        cells = [map(_text, columns.get(name, absent).tolist()) for name in names]
+        writer.writerows((run, *row) for row in zip(*cells))
+    whole = path.with_suffix(".tmp")
+    whole.write_bytes(gzip.compress(text.getvalue().encode("utf-8"), mtime=0))
+    whole.replace(path)
 
 
 def _text(value: Any) -> str:
     if isinstance(value, float):  # five digits of a loss are enough
         return "" if value != value else f"{value:.5g}" if abs(value) < 1e5 else f"{value:.0f}"
     return str(value)
-
-
-def _write(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    whole = path.with_suffix(".tmp")
-    whole.write_bytes(gzip.compress(text.getvalue().encode("utf-8"), mtime=0))
-    whole.replace(path)
 
 
 def main() -> None:
