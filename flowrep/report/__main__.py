@@ -43,11 +43,10 @@ def report(config: ReportConfig) -> Path:
     assembled = assemble(runs, warnings, Settings(config.policy, Bootstrap(config.resamples)))
     for warning in assembled.warnings[len(warnings) :]:
         print(f"in part: {warning}")
-    for label, sections in assembled.chapters:
-        for section in sections:
-            for table in section.tables:
-                if not table.name.endswith("_differences"):  # too long for a screen
-                    show(table, f"{section.title} {label}".strip())
+    for section in assembled.sections:
+        for table in section.tables:
+            if not table.name.endswith("_differences"):  # too long for a screen
+                show(table, f"{section.title} {section.label}".strip())
     output.mkdir(parents=True, exist_ok=True)
     for folder in write_files(assembled, output):
         print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")

@@ -91,19 +91,16 @@ class Drawing(NamedTuple):
 
 
 class Section(NamedTuple):
-    """One part of a report: the name of its folder, its heading, its figure and its tables."""
+    """One part of a report: the name of its folder, its heading, its figure and its tables.
+
+    `label` says what distinguishes the config of its runs from that of other sections' runs.
+    """
 
     name: str
     title: str
     drawing: Drawing | None
     tables: tuple[Table, ...] = ()
-
-
-class Chapter(NamedTuple):
-    """The sections of comparable runs; `label` says what distinguishes them from other runs."""
-
-    label: str
-    sections: tuple[Section, ...]
+    label: str = ""
 
 
 class Report(NamedTuple):
@@ -111,22 +108,21 @@ class Report(NamedTuple):
 
     runs: tuple[Run, ...]
     warnings: tuple[str, ...]
-    chapters: tuple[Chapter, ...]
+    sections: tuple[Section, ...]
 
 
 def assemble(runs: Sequence[Run], warnings: Sequence[str], settings: Settings) -> Report:
     """Returns the sections for runs, group by group, and the problems found in runs."""
     groups = groups_of(runs)
     wrong = [*warnings, *(w for w in (_unusable(run, settings) for run in runs) if w)]
-    chapters = []
-    for number, group in enumerate(groups):
-        sections = _group_sections(group, settings)
-        if len(groups) > 1:
-            sections = [s._replace(name=f"{number + 1}_{s.name}") for s in sections]
-        chapters.append(Chapter(group.label, tuple(sections)))
+    sections = []
+    for number, group in enumerate(groups, start=1):
+        prefix = f"{number}_" if len(groups) > 1 else ""
+        for section in _group_sections(group, settings):
+            sections.append(section._replace(name=prefix + section.name, label=group.label))
     if len(groups) > 1:
-        chapters.append(Chapter("", (_configs_section(groups, settings),)))
-    return Report(tuple(runs), tuple(wrong), tuple(c for c in chapters if c.sections))
+        sections.append(_configs_section(groups, settings))
+    return Report(tuple(runs), tuple(wrong), tuple(sections))
 
 
 def write_files(report: Report, folder: Path) -> list[Path]:
@@ -134,8 +130,7 @@ def write_files(report: Report, folder: Path) -> list[Path]:
 
     The same report gives the same files, byte for byte.
     """
-    sections = [section for chapter in report.chapters for section in chapter.sections]
-    for section in sections:
+    for section in report.sections:
         place = folder / section.name
         place.mkdir(exist_ok=True)
         if section.drawing:
@@ -143,7 +138,7 @@ def write_files(report: Report, folder: Path) -> list[Path]:
         for table in section.tables:
             (place / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
             (place / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
-    return [folder / section.name for section in sections]
+    return [folder / section.name for section in report.sections]
 
 
 def _unusable(run: Run, settings: Settings) -> str | None:
@@ -275,15 +270,11 @@ def _difference_tables(
             for (first, second), c in product(chosen, grids[0].conditions)
             if (compared := _compared(members, first, second, c, bootstrap)) is not None
         ]
-        corrected = holm([c.p_value if c else np.nan for _, _, c, _ in found])
+        corrected = holm([c.p_value for _, _, c, _ in found])
         rows = []
         for (pair, speed, c, shared), p in zip(found, corrected):
-            cells = ("", "no shared episodes", "", "", "")
-            if c is not None:
-                better = percent(c.improvement)
-                ps = p_text(c.p_value), p_text(p)
-                cells = (points(c.difference), c.verdict(p), better, *ps)
-            rows.append((pair, speed, *cells, str(shared)))
+            cells = (points(c.difference), c.verdict(p), percent(c.improvement))
+            rows.append((pair, speed, *cells, p_text(c.p_value), p_text(p), str(shared)))
         if rows:
             blocks.append((heading, tuple(rows)))
     caption = (
@@ -303,8 +294,8 @@ def _difference_tables(
 
 def _compared(
     grids: Sequence[Grid], first: str, second: str, condition: Condition, bootstrap: Bootstrap
-) -> tuple[Comparison | None, int] | None:
-    """Returns a comparison over scenes and its shared episodes; None where a side is missing."""
+) -> tuple[Comparison, int] | None:
+    """Returns a comparison over scenes and the number of its episodes; None where one has none."""
     sides = []
     for grid in grids:
         a, b = grid.matrices.get((first, condition)), grid.matrices.get((second, condition))
@@ -312,7 +303,7 @@ def _compared(
             return None
         sides.append(side_by_side(a, b))
     shared = [ours.shape[1] for ours, _ in sides]
-    return (bootstrap.compare(sides), sum(shared)) if all(shared) else (None, 0)
+    return (bootstrap.compare(sides), sum(shared)) if all(shared) else None
 
 
 def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:

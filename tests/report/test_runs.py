@@ -51,6 +51,8 @@ def test_runs_of_one_config_are_one_group_over_scenes_stacks_and_seeds(tmp_path)
         ("scene__camera__width_px", 84, "scene.camera.width_px"),
         ("scene__time_limit_steps", 90, "scene.straight_road.time_limit_steps"),
         ("representations__obj__scale", 2.5, "representations.obj.scale"),
+        ("scene__obstacles", ["car"], "scene.straight_road.obstacles"),  # absent from the others
+        ("scene__camera__roll_deg", 3, "scene.camera.roll_deg"),
     ],
 )
 def test_runs_whose_configs_differ_are_apart_and_the_key_is_named(tmp_path, key, value, label):
@@ -68,20 +70,6 @@ def test_a_whole_number_is_the_same_with_and_without_a_point(tmp_path):
     ranges = {"scene__pedestrian_speed_mps": {"normal": [1.0, 2.5]}}
     run_in(tmp_path, "b", seed=1, algorithm__tau=1.0, **ranges)
     assert labels(tmp_path) == {"": ["a", "b"]}
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "label"),
-    [
-        ("scene__obstacles", ["car"], "scene.straight_road.obstacles"),
-        ("scene__camera__roll_deg", 3, "scene.camera.roll_deg"),
-    ],
-)
-def test_an_option_that_only_some_runs_have_keeps_them_apart(tmp_path, key, value, label):
-    run_in(tmp_path, "a")
-    run_in(tmp_path, "b", **{key: value})
-    run_in(tmp_path, "c", seed=1)
-    assert labels(tmp_path) == {f"{label}=absent": ["a", "c"], f"{label}={value}": ["b"]}
 
 
 def test_many_keys_that_differ_make_a_short_label(tmp_path):

@@ -22,7 +22,7 @@ NORMAL = Condition("greedy", "normal", 12.0)
 def sections_of(folder):
     runs, warnings = read_runs([folder])
     report = assemble(runs, warnings, ASK)
-    found = {section.name: section for chapter in report.chapters for section in chapter.sections}
+    found = {section.name: section for section in report.sections}
     return found, report
 
 
@@ -33,22 +33,11 @@ def rows_in(table):
     return [row for _, rows in table.blocks for row in rows]
 
 
-def test_an_episode_has_one_column_whichever_runs_drove_it(tmp_path):
-    config, other = config_of(seed=0), config_of(seed=1)
-    late = [row | {"episode_seed": row["episode_seed"] + 1} for row in rows_of(other, "sc")]
-    write_run(tmp_path / "a", config, rows_of(config, "cs"))
-    write_run(tmp_path / "b", other, late)
-    found = outcomes_of(read_runs([tmp_path])[0], NORMAL)
-    assert (found.seeds, found.counts) == ((0, 1), "2 × 2")
-    assert found.episodes.tolist() == [100, 101, 102]
-    np.testing.assert_array_equal(found.outcomes, [[0, 1, math.nan], [math.nan, 1, 0]])
-
-
 def later(rows, episodes):
     return [row | {"episode_seed": row["episode_seed"] + episodes} for row in rows]
 
 
-def test_two_cells_stand_side_by_side_in_the_episodes_that_all_their_runs_drove(tmp_path):
+def test_an_episode_has_one_column_and_two_cells_share_those_that_all_their_runs_drove(tmp_path):
     # Episodes 100 to 103, 102 to 105, and 101 to 103 of the other side: 102 and 103 are of all.
     first, second, other = config_of(), config_of(seed=1), config_of(stack="seg2")
     write_run(tmp_path / "a", first, rows_of(first, "cssc"))
@@ -58,6 +47,10 @@ def test_two_cells_stand_side_by_side_in_the_episodes_that_all_their_runs_drove(
     flows, seg = (
         outcomes_of([r for r in runs if r.stack == s], NORMAL) for s in ("ego+obj", "seg2")
     )
+    assert (flows.seeds, flows.counts) == ((0, 1), "2 × 4")
+    assert flows.episodes.tolist() == [100, 101, 102, 103, 104, 105]
+    nan = math.nan
+    np.testing.assert_array_equal(flows.outcomes, [[0, 1, 1, 0, nan, nan], [nan, nan, 0, 0, 1, 1]])
     ours, theirs = side_by_side(flows, seg)
     np.testing.assert_array_equal(ours, [[1, 0], [0, 0]])
     np.testing.assert_array_equal(theirs, [[1, 0]])
@@ -71,18 +64,6 @@ def test_a_difference_is_of_shared_episodes_alone(tmp_path):
     differences = found["flow_composition"].tables[1]
     ((_, _, told, _, _, _, _, shared),) = rows_in(differences)
     assert (told, shared) == ("0 [−49, +49]", "4")  # no draw differs: Wilson's of 0 of 4
-
-
-def test_a_pair_without_shared_episodes_has_no_difference(tmp_path):
-    run_in(tmp_path, "a", {"low": "sc", "normal": "sc", "high": "sc"}, stack="ego")
-    config = config_of("s_turn", "raw")
-    rows = [row for s in ("low", "high") for row in rows_of(config, "ss", speed=s)]
-    write_run(tmp_path / "b", config, rows + later(rows_of(config, "ss"), 2))
-    found, _ = sections_of(tmp_path)
-    differences = found["flow_composition"].tables[1]
-    low, normal, high = rows_in(differences)
-    assert normal == ("raw − ego", "normal", "", "no shared episodes", "", "", "", "0")
-    assert low[-1] == high[-1] == "2"
 
 
 def test_p_is_corrected_for_the_comparisons_of_its_block(tmp_path):
@@ -172,7 +153,7 @@ def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):
     run_in(tmp_path, "c", "sscc", algorithm__tau=0.005, stack="raw")
     found, report = sections_of(tmp_path)
     configs = ("algorithm.tau=0.005", "algorithm.tau=0.02")
-    assert [chapter.label for chapter in report.chapters] == [*configs, ""]
+    assert list(dict.fromkeys(s.label for s in report.sections)) == [*configs, ""]
     differing, success, differences = found["configs"].tables
     assert differing.header == ("key", *configs)
     assert rows_in(differing) == [("algorithm.tau", "0.005", "0.02")]
