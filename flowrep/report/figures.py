@@ -8,7 +8,6 @@ import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle, pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -50,7 +49,6 @@ _COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page
 _FONT_PT = 7.5
 _MOST_IN_A_ROW = 4  # panels
 _WIDEST_BAR = 0.3  # of a group
-_DPI = 300
 _CAPS: dict[str, Any] = {"capsize": 1.8, "capthick": 0.9, "clip_on": False}  # of whiskers
 
 
@@ -76,16 +74,14 @@ def looks(names: Sequence[str]) -> dict[str, Look]:
     """
     parts = [name.partition(", ")[::2] for name in names]
     stacks, variants = ([*dict.fromkeys(part)] for part in zip(*parts))
-    colours = _COLOURS
-    if not {*stacks} <= {*_COLOURS}:
-        colours = dict(zip(stacks, cycle(_OTHERS)))
+    are_known = {*stacks} <= {*_COLOURS}
+    colours = _COLOURS if are_known else dict(zip(stacks, cycle(_OTHERS)))
     found = {}
     for name, (stack, variant) in zip(names, parts):
         turn = [*colours].index(stack)
-        again = 0 if colours is _COLOURS else turn // len(_OTHERS)
-        hatch = _OF_VARIANTS[(variants.index(variant) + again) % len(_OF_VARIANTS)]
-        hatch = hatch or _ADDED.get(stack, "")
-        found[name] = Look(colours[stack], hatch, _MARKERS[turn % len(_MARKERS)])
+        hatch = variants.index(variant) + (0 if are_known else turn // len(_OTHERS))
+        hatches = _OF_VARIANTS[hatch % len(_OF_VARIANTS)] or _ADDED.get(stack, "")
+        found[name] = Look(colours[stack], hatches, _MARKERS[turn % len(_MARKERS)])
     return found
 
 
@@ -122,18 +118,13 @@ def styled(font_pt: float) -> Iterator[None]:
         yield
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Writes a figure as PNG and PDF; the endings are added to the path."""
-    with mpl.rc_context({"pdf.fonttype": 42, "hatch.linewidth": 0.7}):  # text as text
-        figure.savefig(path.with_name(f"{path.name}.png"), dpi=_DPI)
-        figure.savefig(path.with_name(f"{path.name}.pdf"), metadata={"CreationDate": None})
-
-
-def svg(figure: Figure) -> bytes:
-    """Returns a figure as an SVG, the same one whenever it is drawn."""
+def encoded(figure: Figure, kind: str, dpi: int = 300) -> bytes:
+    """Returns a figure as "png", "pdf" or "svg", the same bytes whenever it is drawn."""
     data = io.BytesIO()
-    with mpl.rc_context({"svg.hashsalt": "flowrep", "hatch.linewidth": 0.7}):
-        figure.savefig(data, format="svg", metadata={"Date": None})
+    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
+    settings: Any = {"pdf.fonttype": 42, "svg.hashsalt": "flowrep", "hatch.linewidth": 0.7}
+    with mpl.rc_context(settings):  # fonts of type 42: text stays text
+        figure.savefig(data, format=kind, dpi=dpi, metadata=undated)
     return data.getvalue()
 
 
@@ -206,20 +197,20 @@ def _bars(axes: Axes, grid: Grid) -> None:
     for group, condition in enumerate(grid.conditions):
         for place, (name, look) in enumerate(looks(grid.series).items()):
             at = group + (place - (len(grid.series) - 1) / 2) * width
-            score, matrix = grid.scores[name, condition], grid.matrices[name, condition]
-            if score is None or matrix is None:
+            cell = grid.cells.get((name, condition))
+            if cell is None:
                 style: Any = {"rotation": 90, "ha": "center", "va": "bottom", "color": _FAINT}
                 axes.text(at, 1.5, "missing", fontsize="x-small", **style)
                 continue
             edge = "white" if look.hatch else _TEXT
+            height, lengths = 100 * cell.score.value, _whiskers([cell.score])
             axes.bar(
-                at, 100 * score.value, 0.92 * width,
+                at, height, 0.92 * width,
                 facecolor=look.colour, hatch=look.hatch, edgecolor=edge, linewidth=0,
             )  # fmt: skip
-            lengths = _whiskers([score])
-            axes.errorbar(at, 100 * score.value, lengths, color=_TEXT, linewidth=0.9, **_CAPS)
-            if len(matrix.seeds) > 1:
-                dots = (100 * rates(matrix.outcomes)).tolist()
+            axes.errorbar(at, height, lengths, color=_TEXT, linewidth=0.9, **_CAPS)
+            if len(cell.matrix.outcomes) > 1:
+                dots = (100 * rates(cell.matrix.outcomes)).tolist()
                 ring: Any = {"facecolor": "white", "edgecolor": _TEXT, "linewidth": 0.5}
                 beside = [at + 0.24 * width] * len(dots)
                 axes.scatter(beside, dots, s=5, zorder=4, clip_on=False, **ring)
@@ -245,11 +236,10 @@ def _rate_lines(axes: Axes, grid: Grid) -> None:
     for place, (name, look) in enumerate(looks(grid.series).items()):
         # side by side, so that whiskers of equal scores are all visible
         aside = (place - (len(grid.series) - 1) / 2) * 0.08 * step
-        found = [(c.fps + aside, grid.scores[name, c]) for c in grid.conditions]
-        points = [(x, score) for x, score in found if score is not None]
-        if points:
-            scores = [score for _, score in points]
-            xs, values = [x for x, _ in points], [100 * score.value for score in scores]
+        driven = [c for c in grid.conditions if (name, c) in grid.cells]
+        if driven:
+            scores = [grid.cells[name, c].score for c in driven]
+            xs, values = [c.fps + aside for c in driven], [100 * score.value for score in scores]
             lines: Any = {"linewidth": 1.3, "elinewidth": 0.9, **look.line, **_CAPS}
             axes.errorbar(xs, values, _whiskers(scores), **lines)
     axes.set_xticks(at, [f"{rate:g}" for rate in at])

@@ -7,7 +7,6 @@
 """
 
 import base64
-import io
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from flowrep.report.figures import svg, words
+from flowrep.report.figures import encoded, words
 from flowrep.report.runs import Run, groups_of, scenes_of
 from flowrep.report.sections import Report
 from flowrep.report.tables import listed
@@ -26,6 +25,14 @@ from flowrep.scenes.layout import Layout
 from flowrep.viz.plan import Track, draw_plan
 
 DRIVES = "drives.npz"
+TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent),
+    autoescape=lambda name: name == "page.html.jinja",
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
 
 
 class Picture(NamedTuple):
@@ -37,7 +44,7 @@ class Picture(NamedTuple):
 
 
 class Drives(NamedTuple):
-    """Plans by the scene's title, films by the episode's name, and a line for each run without."""
+    """Plans by the scene's title, films by the episode's, and a line for each run without."""
 
     plans: dict[str, list[Picture]]
     films: dict[str, list[Picture]]
@@ -59,20 +66,20 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
             if run.is_finished:
                 finished.setdefault((number, run.scene, run.stack), run)
     for run in finished.values():
-        title = f"{run.stack}, seed {run.seed} ({Path(run.name).name})"
-        if trajectories and (tracks := tracks_of(run, trajectories)):
+        scene, title = words(run.scene), f"{run.stack}, seed {run.seed} ({Path(run.name).name})"
+        tracks = tracks_of(run, trajectories)
+        if tracks:
             ends = Counter(track.outcome.replace("_", " ") for track in tracks)
             ended = ", ".join(f"{number} {outcome}" for outcome, number in ends.items())
-            png = io.BytesIO()
-            draw_plan(Layout(load_scene(run.config["scene"])), tracks).savefig(png, dpi=100)
-            plan = Picture(title, f"drives: {ended}", data_uri("image/png", png.getvalue()))
-            drives.plans.setdefault(words(run.scene), []).append(plan)
+            png = encoded(draw_plan(Layout(load_scene(run.config["scene"])), tracks), "png", 100)
+            plan = Picture(title, f"drives: {ended}", data_uri("image/png", png))
+            drives.plans.setdefault(scene, []).append(plan)
         elif trajectories:
             drives.warnings.append(f"{run.name} has no {DRIVES} with greedy drives: no plan")
         films = sorted(run.folder.glob("videos/*.mp4"))[:videos] if run.folder else []
         for film in films:
-            shown = drives.films.setdefault(f"{words(run.scene)}, {words(film.stem)}", [])
-            shown.append(Picture(title, film.name, data_uri("video/mp4", film.read_bytes())))
+            picture = Picture(title, film.name, data_uri("video/mp4", film.read_bytes()))
+            drives.films.setdefault(f"{scene}, {words(film.stem)}", []).append(picture)
         if videos and not films:
             drives.warnings.append(
                 f"{run.name} has no films: python -m flowrep.evaluate run={run.name} video=true"
@@ -82,7 +89,7 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
 
 def tracks_of(run: Run, count: int) -> list[Track]:
     """Returns a run's first greedy drives at its training speed and frame rate, none without."""
-    if run.folder is None:
+    if run.folder is None or not count:
         return []
     try:
         with np.load(run.folder / DRIVES) as saved:
@@ -105,25 +112,16 @@ def data_uri(kind: str, data: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def template(name: str, *, autoescape: bool) -> Any:
-    """Returns a template of this folder."""
-    loader = FileSystemLoader(Path(__file__).parent)
-    return Environment(
-        loader=loader, autoescape=autoescape, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    ).get_template(name)  # fmt: skip
-
-
 def render_page(report: Report, drives: Drives) -> str:
     """Returns the page of a report, with plans and films of some of its episodes, if any."""
     runs = report.runs
     stacks = sorted({run.stack for run in runs})
     what = listed(stacks) if len(stacks) < 4 else f"{len(stacks)} stacks"
-    return template("page.html.jinja", autoescape=True).render(
+    return TEMPLATES.get_template("page.html.jinja").render(
         title=f"{what} in {listed([words(scene) for scene in scenes_of(runs)])}",
         summary=summary(runs),
         report=report,
-        figure=lambda drawing: data_uri("image/svg+xml", svg(drawing.draw())),
+        drawn=lambda figure: data_uri("image/svg+xml", encoded(figure, "svg")),
         drives=drives,
         runs=[
             (

@@ -7,9 +7,11 @@ that all compared runs drove.
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import reduce
 from itertools import count, product
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,22 +20,24 @@ import yaml
 from matplotlib.figure import Figure
 from scipy import stats
 
-from flowrep.report.figures import styled, svg, words
-from flowrep.report.page import template
+from flowrep.report.figures import encoded, styled, words
+from flowrep.report.page import TEMPLATES
 from flowrep.report.runs import (
+    SCENES,
     SPEEDS,
+    STACKS,
     Columns,
     Condition,
     Run,
     baseline_share,
     in_order,
+    in_stacks,
     out_of_bounds_of_both,
     outcomes_of,
     pooled,
     success,
 )
-from flowrep.report.sections import STACKS, in_stacks
-from flowrep.report.statistics import Array, Bootstrap, Effect, effect, holm, rates
+from flowrep.report.statistics import LEVEL, Array, Bootstrap, Effect, effect, holm, rates
 from flowrep.report.storage import read_archive
 from flowrep.report.tables import markdown, p_text, percent, points, signed
 
@@ -41,19 +45,29 @@ ROOT = Path(__file__).parents[2]
 DATA, PAGE = ROOT / "outputs" / "reference", ROOT / "docs" / "results.md"
 FIGURE = "images/results_claims.svg"
 CLAIMS = Path(__file__).with_name("claims.yaml")
-SHORT = {
-    "straight_road": "SR",
-    "s_turn": "ST",
-    "h_shaped_pathways": "H",
-    "three_way_junction": "T",
-}
-_SCENE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")
+_SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
+_COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
 _WIDEST = 80  # points of the figure's axis
-_LEVEL, _POWER = 0.05, 0.8
+_POWER = 0.8
 _FOUND, _NEVER = 0.5, 0.05  # a run finds a way if it succeeds in this share of its episodes
 
+Studies = Mapping[str, Mapping[str, Sequence[Run]]]
 
-class Contrast(NamedTuple):
+
+def studies_of(declared: Mapping[str, Any], runs: Sequence[Run]) -> Studies:
+    """Returns the finished runs of each study and scene, where there are any."""
+    found = {
+        study: {
+            scene: [r for r in runs if fnmatch(r.name, pattern) and r.is_finished]
+            for scene, pattern in patterns.items()
+        }
+        for study, patterns in declared["studies"].items()
+    }
+    return {name: {s: of for s, of in study.items() if of} for name, study in found.items()}
+
+
+@dataclass
+class Contrast:
     """One comparison, as claims.yaml asks for it, and its outcome.
 
     `effect` is the difference in the mean over its scenes, None without runs on both sides;
@@ -75,8 +89,8 @@ class Contrast(NamedTuple):
         if expect == "equal":
             _, low, high = self.effect.interval()
             is_apart = low > self.asked["margin"] or high < -self.asked["margin"]
-            return "contradicted" if is_apart else "holds" if self.p_value < _LEVEL else "not seen"
-        if self.p_value >= _LEVEL:
+            return "contradicted" if is_apart else "holds" if self.p_value < LEVEL else "not seen"
+        if self.p_value >= LEVEL:
             return "not seen"
         return "holds" if (value > 0) == (expect == "more") else "contradicted"
 
@@ -87,7 +101,7 @@ class Claim(NamedTuple):
     number: int
     text: str
     limits: str
-    contrasts: tuple[Contrast, ...]
+    contrasts: Sequence[Contrast]
 
     @property
     def verdict(self) -> str:
@@ -101,36 +115,31 @@ class Claim(NamedTuple):
 
 
 def claims_of(
-    declared: Mapping[str, Any], runs: Sequence[Run], study: str = "main"
-) -> dict[str, list[Claim]]:
+    declared: Mapping[str, Any], studies: Studies, study: str = "main"
+) -> tuple[list[Claim], list[Claim]]:
     """Returns the primary and secondary claims with their contrasts, of one protocol's runs."""
     numbers = count(1)
-    found = {
-        family: [
-            Claim(
-                next(numbers),
-                entry["claim"],
-                entry["limits"],
-                tuple(_contrast(declared, asked, runs, study) for asked in entry["contrasts"]),
-            )
-            for entry in declared[family]
+
+    def claim(entry: Mapping[str, Any]) -> Claim:
+        contrasts = [
+            _contrast(asked, studies[asked.get("study", study)], declared["scenes"])
+            for asked in entry["contrasts"]
         ]
-        for family in ("primary", "secondary")
-    }
-    corrected = iter(holm([x.p_value for claim in found["primary"] for x in claim.contrasts]))
-    found["primary"] = [
-        c._replace(contrasts=tuple(x._replace(p_value=next(corrected)) for x in c.contrasts))
-        for c in found["primary"]
-    ]
-    return found
+        return Claim(next(numbers), entry["claim"], entry["limits"], contrasts)
+
+    primary, secondary = (list(map(claim, declared[of])) for of in ("primary", "secondary"))
+    together = [contrast for claim in primary for contrast in claim.contrasts]
+    for contrast, p_value in zip(together, holm([contrast.p_value for contrast in together])):
+        contrast.p_value = p_value
+    return primary, secondary
 
 
 def _contrast(
-    declared: Mapping[str, Any], asked: Mapping[str, Any], runs: Sequence[Run], study: str
+    asked: Mapping[str, Any], study: Mapping[str, Sequence[Run]], scenes: Sequence[str]
 ) -> Contrast:
     firsts = [asked["first"]] if isinstance(asked["first"], str) else asked["first"]
     strata: dict[str, list[list[Array]]] = {}
-    for scene, here in of_study(declared, asked.get("study", study), runs).items():
+    for scene, here in study.items():
         found = []
         for first in firsts:
             stacks = [first, *([asked["second"]] if "second" in asked else [])]
@@ -139,7 +148,7 @@ def _contrast(
                 found.append(sides)
         if len(found) == len(firsts):
             strata[scene] = found
-    chosen = asked.get("scenes", declared["scenes"])
+    chosen = asked.get("scenes", scenes)
     has_all = {*chosen} <= {*strata}
     together = effect([sides for s in chosen for sides in strata[s]]) if has_all else None
     p_value = float("nan") if together is None else _p_value(together, asked)
@@ -154,15 +163,6 @@ def _p_value(found: Effect, asked: Mapping[str, Any]) -> float:
     # of two one-sided tests, that against the nearer end of the margin has the larger p
     nearer = found._replace(value=abs(found.value) - asked["margin"])
     return nearer.p_value / 2 if nearer.value < 0 else 1 - nearer.p_value / 2
-
-
-def of_study(declared: Mapping[str, Any], study: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Returns the finished runs of a study by scene, where there are any."""
-    patterns = declared["studies"][study].items()
-    found = {
-        scene: [r for r in runs if fnmatch(r.name, of) and r.is_finished] for scene, of in patterns
-    }
-    return {scene: members for scene, members in found.items() if members}
 
 
 def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Array] | None:
@@ -208,7 +208,7 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     for claim in claims:
         effects = "; ".join(map(_effect_text, claim.contrasts))
         by_scene = "; ".join(
-            " / ".join(f"{SHORT[scene]} {signed(e.value)}" for scene, e in c.by_scene.items())
+            " / ".join(f"{_SHORT[scene]} {signed(e.value)}" for scene, e in c.by_scene.items())
             for c in claim.contrasts
         )
         row = f"[row {claim.number}](#the-claims-in-one-figure)"
@@ -236,7 +236,7 @@ def draw_claims(claims: Sequence[Claim]) -> Figure:
         axes = figure.add_subplot()
         axes.axvline(0, color="#6b7480", linewidth=0.8)
         for row, (_, contrast) in enumerate(rows):
-            for place, (scene, colour) in enumerate(zip(SHORT, _SCENE_COLOURS)):
+            for place, (scene, colour) in enumerate(_COLOURS.items()):
                 if scene in contrast.by_scene:
                     at = row + 0.1 + 0.15 * place
                     _draw_effect(axes, contrast.by_scene[scene], at, colour, "o", 3.5)
@@ -247,7 +247,7 @@ def draw_claims(claims: Sequence[Claim]) -> Figure:
         axes.set_xlim(-_WIDEST, _WIDEST)
         axes.grid(axis="x")
         axes.set_xlabel("points (95 % intervals; an arrow where one goes on)")
-        for scene, colour in zip(SHORT, _SCENE_COLOURS):
+        for scene, colour in _COLOURS.items():
             axes.plot([], [], color=colour, marker="o", label=words(scene))
         axes.plot([], [], color="#1b1f24", marker="D", label="over scenes")
         figure.legend(loc="outside upper center", ncols=5)
@@ -280,74 +280,73 @@ def _draw_effect(
             axes.plot(end, at, sign, color=colour, markersize=3.0, clip_on=False)
 
 
-def scene_tables(declared: Mapping[str, Any], runs: Sequence[Run]) -> list[dict[str, str]]:
-    """Returns a block per scene: success by stack and speed, and how many runs find all ways."""
-    blocks = []
-    for scene, here in of_study(declared, "main", runs).items():
-        is_fork = scene in declared["forks"]
-        header = ["", "low", "normal (training)", "high", "each run, normal"]
-        header += [f"find all {here[0].paths} ways"] if is_fork else []
-        rows = []
-        for stack, members in in_stacks(here).items():
-            each = outcomes_of(members, Condition("greedy", members[0].speed, members[0].fps))
-            of_runs = [] if each is None else [f"{100 * r:.0f}" for r in rates(each.outcomes)]
-            cells = [_success(members, speed) for speed in SPEEDS]
-            rows.append([_stack(stack), *cells, ", ".join(of_runs)])
-            if is_fork:
-                found = sum(min(_by_way(run)) >= _FOUND for run in members)
-                rows[-1].append(f"{found} of {len(members)}")
-        of_speeds = [Condition("never_turn", speed, here[0].fps) for speed in SPEEDS]
-        shares = [baseline_share(here, condition) for condition in of_speeds]
-        never = ["" if share is None else f"{100 * share:.0f}" for share in shares]
-        rows.append(["never turning", *never, *[""] * (len(header) - 4)])
-        blocks.append({"title": words(scene), "table": markdown(header, rows)})
-    return blocks
+def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
+    """Returns success by stack and speed in one scene, and how many runs find all ways."""
+    header = ["", "low", "normal (training)", "high", "each run, normal"]
+    header += [f"find all {_paths(runs[0])} ways"] if is_fork else []
+    rows = []
+    for stack, members in in_stacks(runs).items():
+        each = outcomes_of(members, Condition("greedy", members[0].speed, members[0].fps))
+        of_runs = [] if each is None else [f"{100 * r:.0f}" for r in rates(each.outcomes)]
+        rows.append([_stack(stack), *_successes(members), ", ".join(of_runs)])
+        if is_fork:
+            found = sum(min(_by_way(run)) >= _FOUND for run in members)
+            rows[-1].append(f"{found} of {len(members)}")
+    of_speeds = [Condition("never_turn", speed, runs[0].fps) for speed in SPEEDS]
+    shares = [baseline_share(runs, condition) for condition in of_speeds]
+    never = ["" if share is None else f"{100 * share:.0f}" for share in shares]
+    rows.append(["never turning", *never, *[""] * (len(header) - 4)])
+    return markdown(header, rows)
 
 
-def one_way(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[int, int]:
-    """Returns how many runs don't find all ways where roads fork, and how many never drive one.
+def one_way(runs: Iterable[Run]) -> tuple[int, int]:
+    """Returns how many runs don't find all ways of their scene, and how many never drive one.
 
     Those that arrive nowhere are not counted.
     """
-    missed = [
-        ways
-        for scene in declared["forks"]
-        for run in of_study(declared, "main", runs).get(scene, ())
-        if max(ways := _by_way(run)) > _NEVER and min(ways) < _FOUND
-    ]
+    of_runs = map(_by_way, runs)
+    missed = [ways for ways in of_runs if max(ways) > _NEVER and min(ways) < _FOUND]
     return len(missed), sum(max(ways) >= _FOUND and min(ways) <= _NEVER for ways in missed)
+
+
+def drawn_paths(episode_seeds: Iterable[int], paths: int) -> Array:
+    """Returns the path of each episode: the first draw of its generator, as an episode makes it."""
+    return np.array([np.random.default_rng(seed).integers(paths) for seed in episode_seeds])
+
+
+def _paths(run: Run) -> int:
+    return len(run.config["scene"]["paths"])
 
 
 def _by_way(run: Run) -> list[float]:
     """Returns a run's greedy success on each path at its training speed."""
     driven = run.under(Condition("greedy", run.speed, run.fps))
-    on_path = [driven["outcome"][driven["path"] == place] for place in range(run.paths)]
+    drawn = drawn_paths(driven["episode_seed"], _paths(run))
+    on_path = [driven["outcome"][drawn == path] for path in range(_paths(run))]
     return [float(success(ends).mean()) if len(ends) else 0.0 for ends in on_path]
 
 
-def _success(runs: Sequence[Run], speed: str) -> str:
-    matrix = outcomes_of(runs, Condition("greedy", speed, runs[0].fps))
-    return "" if matrix is None else percent(Bootstrap().success([matrix.outcomes]))
+def _successes(runs: Sequence[Run]) -> list[str]:
+    conditions = [Condition("greedy", speed, runs[0].fps) for speed in SPEEDS]
+    found = [outcomes_of(runs, condition) for condition in conditions]
+    return [percent(Bootstrap().success([m.outcomes])) if m else "" for m in found]
 
 
 def _stack(stack: str) -> str:
     return f"`[{stack.replace('+', ',')}]`"
 
 
-def failure_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
+def failure_table(papers: Mapping[str, float], runs: Sequence[Run]) -> str:
     """Returns Table III beside the paper's, at low and high speed together and in training."""
-    rows = []
-    for stack, papers in declared["table_iii"].items():
-        members, shares = [run for run in runs if run.stack == stack], []
-        if not members:
-            continue
+    rows, here = [], in_stacks(runs)
+    for stack in (stack for stack in papers if stack in here):
+        members, shares = here[stack], []
         for speeds in (("low", "high"), ("normal",)):
             conditions = [Condition("greedy", speed, members[0].fps) for speed in speeds]
             outcomes = pooled(members, conditions, out_of_bounds_of_both)
             shares.append("" if outcomes is None else percent(Bootstrap().pooled_share(outcomes)))
-        rows.append((_stack(stack), f"{papers:.1f}", *shares, str(len(members))))
-    header = ("", "the paper", "low and high", "training", "runs")
-    return markdown(header, rows)
+        rows.append((_stack(stack), f"{papers[stack]:.1f}", *shares, str(len(members))))
+    return markdown(("", "the paper", "low and high", "training", "runs"), rows)
 
 
 def rate_table(runs: Sequence[Run]) -> str:
@@ -368,23 +367,23 @@ def rate_table(runs: Sequence[Run]) -> str:
     return markdown(header, rows)
 
 
-def variation_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
+def variation_table(titles: Mapping[str, str], studies: Studies) -> str:
     """Returns success of the stacks of each further study."""
-    rows = []
-    for study, title in declared["variations"].items():
-        for members in of_study(declared, study, runs).values():
-            for stack, ours in in_stacks(members).items():
-                cells = [_success(ours, speed) for speed in SPEEDS]
-                rows.append((title, _stack(stack), *cells, str(len(ours))))
+    rows = [
+        (title, _stack(stack), *_successes(runs), str(len(runs)))
+        for study, title in titles.items()
+        for members in studies[study].values()
+        for stack, runs in in_stacks(members).items()
+    ]
     return markdown(("", "", "low", "normal", "high", "runs"), rows)
 
 
-def runs_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
+def runs_table(studies: Studies) -> str:
     """Returns the number of runs of each stack in each study and scene."""
     places = {
-        f"{'' if study == 'main' else study.replace('_', ' ')} {SHORT[scene]}".strip(): members
-        for study in declared["studies"]
-        for scene, members in of_study(declared, study, runs).items()
+        f"{'' if study == 'main' else study.replace('_', ' ')} {_SHORT[scene]}".strip(): members
+        for study, scenes in studies.items()
+        for scene, members in scenes.items()
     }
     stacks = in_order([run.stack for members in places.values() for run in members], STACKS)
     counts = [[sum(r.stack == stack for r in of) for of in places.values()] for stack in stacks]
@@ -392,32 +391,23 @@ def runs_table(declared: Mapping[str, Any], runs: Sequence[Run]) -> str:
     return markdown(("", *places), rows)
 
 
-def smallest_differences(claims: Sequence[Claim]) -> tuple[float, float]:
-    """Returns the range of the differences that primary contrasts see with 80 % power."""
-    found = []
-    for contrast in (contrast for claim in claims for contrast in claim.contrasts):
-        if contrast.effect is not None and not np.isnan(contrast.effect.error):
-            freedom = contrast.effect.freedom
-            factor = stats.t.ppf(1 - _LEVEL / 2, freedom) + stats.t.ppf(_POWER, freedom)
-            found.append(100 * factor * contrast.effect.error)
-    return (min(found), max(found)) if found else (float("nan"), float("nan"))
+def smallest_differences(claims: Sequence[Claim]) -> list[float]:
+    """Returns the difference that each contrast sees with 80 % power, in points."""
+    found = [x.effect for claim in claims for x in claim.contrasts if x.effect]
+    errors = [(x.error, stats.t(x.freedom)) for x in found if not np.isnan(x.error)]
+    return [100 * error * float(t.ppf(1 - LEVEL / 2) + t.ppf(_POWER)) for error, t in errors]
 
 
 def repeats(main: Sequence[Run], runs: Sequence[Run]) -> list[float]:
-    """Returns how much better runs are that repeat one of the main study, in points.
-
-    Those that drive every episode as the main study's run does are the same run.
-    """
+    """Returns how much better runs are that repeat one of the main study, in points."""
     found = []
-    thirds = {"success": dict.fromkeys(SPEEDS, 1 / 3)}
+    what_it_is = attrgetter("scene", "stack", "seed", "settings")
     for run, other in product(main, runs):
-        if any(
-            getattr(run, x) != getattr(other, x) for x in ("scene", "stack", "seed", "settings")
-        ):
+        if what_it_is(run) != what_it_is(other):
             continue
-        sides = scores([[other], [run]], thirds)
+        sides = scores([[other], [run]], {"success": dict.fromkeys(SPEEDS, 1 / 3)})
         first, second = (_under(r, ["low"])[0]["outcome"].tolist() for r in (run, other))
-        if sides is not None and first != second:
+        if sides is not None and first != second:  # else it is the same run under another name
             found.append(100 * float(sides[0][0] - sides[1][0]))
     return found
 
@@ -450,25 +440,23 @@ def sampled_minus_greedy(runs: Sequence[Run]) -> list[float]:
 
 def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figure]:
     """Returns the page and its figure."""
-    claims = claims_of(declared, runs)
-    wide = claims_of(declared, runs, "wide_speeds")["primary"]
-    main = of_study(declared, "main", runs)
+    studies = studies_of(declared, runs)
+    primary, secondary = claims_of(declared, studies)
+    wide, _ = claims_of(declared, studies, "wide_speeds")
+    main, forks = studies["main"], declared["forks"]
     every = [run for of in main.values() for run in of]
-    low, high = smallest_differences(claims["primary"])
-    text = template("results.md.jinja", autoescape=False).render(
-        primary=claims_table(claims["primary"], "p (Holm)"),
-        secondary=claims_table(claims["secondary"], "p"),
+    smallest = smallest_differences(primary) or [float("nan")]
+    text = TEMPLATES.get_template("results.md.jinja").render(
+        primary=claims_table(primary, "p (Holm)"),
+        secondary=claims_table(secondary, "p"),
         wide=claims_table(wide, "p (Holm)") if all(c.contrasts[0].effect for c in wide) else "",
         figure=FIGURE,
-        scenes=scene_tables(declared, runs),
-        one_way=one_way(declared, runs),
-        failures=failure_table(declared, main.get("s_turn", [])),
-        frame_rates={
-            words(scene): rate_table(members)
-            for scene, members in of_study(declared, "frame_rate", runs).items()
-        },
-        variations=variation_table(declared, runs),
-        runs=runs_table(declared, runs),
+        scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
+        one_way=one_way(run for run in every if run.scene in forks),
+        failures=failure_table(declared["table_iii"], main.get("s_turn", [])),
+        frame_rates={words(scene): rate_table(of) for scene, of in studies["frame_rate"].items()},
+        variations=variation_table(declared["variations"], studies),
+        runs=runs_table(studies),
         commands=declared["commands"],
         number=len(runs),
         pixels=sorted(
@@ -476,15 +464,15 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         ),
         frames=sorted({run.total_frames for run in every}),
         episodes=sum(len(run.episodes["outcome"]) for run in runs),
-        fewest=min(c.fewest for claim in claims["primary"] for c in claim.contrasts),
-        smallest=f"{low:.0f} to {high:.0f}",
+        fewest=min(c.fewest for claim in primary for c in claim.contrasts),
+        smallest=f"{min(smallest):.0f} to {max(smallest):.0f}",
         repeats=repeats(every, [run for run in runs if run not in every]),
         sampled=sampled_minus_greedy(every),
         collapsed=collapses(main.get("straight_road", [])),
         unknown=sum(run.machine.get("precision") == "unknown" for run in runs),
         np=np,
     )
-    return text, draw_claims([*claims["primary"], *claims["secondary"]])
+    return text, draw_claims([*primary, *secondary])
 
 
 def main(data: Path = DATA, page: Path = PAGE) -> None:
@@ -492,7 +480,7 @@ def main(data: Path = DATA, page: Path = PAGE) -> None:
     declared = yaml.safe_load(CLAIMS.read_text(encoding="utf-8"))
     text, figure = render(declared, read_archive(data))
     page.write_text(text, encoding="utf-8")
-    (page.parent / FIGURE).write_bytes(svg(figure))
+    (page.parent / FIGURE).write_bytes(encoded(figure, "svg"))
     print(f"{page}: {len(text.split()):,} words")
 
 

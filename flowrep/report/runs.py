@@ -18,8 +18,14 @@ SPEEDS = ("low", "normal", "high")
 """Pedestrians' speed modes, in the order of figures."""
 SCENES = ("straight_road", "s_turn", "h_shaped_pathways", "three_way_junction")
 """The paper's scenes in its order."""
+FLOW_STACKS = ("ego", "raw", "obj", "ego+obj")
+COMPLEMENTARY_STACKS = (
+    "seg2", "depth2", "ego+obj", "ego+obj+seg2", "ego+obj+depth2", "ego+obj+seg2+depth2",
+)  # fmt: skip
+STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
+"""The paper's stacks, in the order of its figures."""
 BASELINES = ("never_turn", "random", "planner")
-_ORDER = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
+_REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _OF_EVERY_SCENE = ("camera", "frame_rate_hz")
 
 
@@ -37,7 +43,7 @@ class Run:
     Args:
         name: its folder, or its name in packed tables.
         config: the resolved config that it was started with.
-        episodes: the columns of evaluation.csv; `path` counts the scene's paths.
+        episodes: the columns of evaluation.csv.
         metrics: the columns of metrics.csv, nan where a cell is empty.
         folder: where films and drives may lie; None for a run of packed tables.
         machine: the commit, precision and CPU that trained it, "unknown" where not recorded.
@@ -56,7 +62,7 @@ class Run:
         machine: Mapping[str, str] | None = None,
     ) -> None:
         self.name, self.config, self.folder = name, config, folder
-        self.metrics, self.machine = metrics, machine or {}
+        self.episodes, self.metrics, self.machine = episodes, metrics, machine or {}
         scene = config["scene"]
         self.scene: str = scene["name"]
         self.stack = stack_of(config["representations"])
@@ -64,13 +70,10 @@ class Run:
         self.speed: str = config["speed"]  # of the pedestrians in training
         self.fps = float(scene["frame_rate_hz"])
         self.total_frames = int(config["total_frames"])
-        self.paths = max(len(scene.get("paths") or ()), 1)
         columns = (metrics.get("frames", np.zeros(0)), episodes["frames"])
         self.frames = max((int(c.max()) for c in columns if len(c)), default=0)
         self.is_finished = self.frames >= self.total_frames
         self.settings = _settings(config)
-        drawn = drawn_paths(episodes["episode_seed"], self.paths)
-        self.episodes = episodes | {"path": drawn}
 
     @cached_property
     def tested(self) -> NDArray[np.bool_]:
@@ -105,10 +108,9 @@ def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     parts = origin_of(config) | {"total_frames": config["total_frames"]}
     del parts["flowrep"], parts["seed"]
     scene = parts.pop("scene")
-    own = {key: value for key, value in scene.items() if key not in _OF_EVERY_SCENE}
-    shared = {f"scene.{key}": scene[key] for key in _OF_EVERY_SCENE if key in scene}
-    found = [*_flat(parts | shared), *_flat(own, f"scene.{scene['name']}")]
-    return {key: str(value) for key, value in found if value != {}}
+    shared = {key: scene.pop(key) for key in _OF_EVERY_SCENE if key in scene}
+    parts["scene"] = shared | {scene["name"]: scene}
+    return {key: str(value) for key, value in _flat(parts) if value != {}}
 
 
 def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
@@ -120,26 +122,10 @@ def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _plain(value: Any) -> Any:
-    """Returns a value that is spelt in one way: 4.0 in a file is 4 on a command line."""
+    # 4.0 in a file is 4 on a command line
     if isinstance(value, list):
         return [_plain(part) for part in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def drawn_paths(episode_seeds: NDArray[Any], paths: int) -> NDArray[Any]:
-    """Returns the path of each episode: the first draw of its generator, as an episode makes it."""
-    seeds, places = np.unique(episode_seeds, return_inverse=True)
-    drawn = [int(np.random.default_rng(int(seed)).integers(paths)) for seed in seeds]
-    return np.array(drawn, int)[places]
-
-
-def stack_of(representations: Iterable[str]) -> str:
-    """Returns the name of a set of representations, in any order.
-
-    >>> stack_of(["seg2", "obj", "ego"]), stack_of(["raw"])
-    ('ego+obj+seg2', 'raw')
-    """
-    return "+".join(in_order(representations, _ORDER))
 
 
 def in_order(found: Iterable[str], known: Sequence[str]) -> list[str]:
@@ -148,13 +134,23 @@ def in_order(found: Iterable[str], known: Sequence[str]) -> list[str]:
     return [name for name in known if name in names] + sorted(names - set(known))
 
 
+def stack_of(representations: Iterable[str]) -> str:
+    """Returns the name of a set of representations, in any order.
+
+    >>> stack_of(["seg2", "obj", "ego"]), stack_of(["raw"])
+    ('ego+obj+seg2', 'raw')
+    """
+    return "+".join(in_order(representations, _REPRESENTATIONS))
+
+
 def scenes_of(runs: Sequence[Run]) -> list[str]:
     """Returns the scenes that runs were trained in, the paper's first."""
     return in_order([run.scene for run in runs], SCENES)
 
 
-def by_stack(runs: Sequence[Run], stacks: Sequence[str]) -> dict[str, list[Run]]:
-    """Returns the runs of each of these stacks."""
+def in_stacks(runs: Sequence[Run], order: Sequence[str] = STACKS) -> dict[str, list[Run]]:
+    """Returns the runs of each of their stacks, those in `order` first."""
+    stacks = in_order([run.stack for run in runs], order)
     return {stack: [run for run in runs if run.stack == stack] for stack in stacks}
 
 
@@ -168,8 +164,7 @@ class Group(NamedTuple):
     def label(self) -> str:
         """What distinguishes it from other groups; empty if it is the only one."""
         shown = [f"{key}={value}"[:60] for key, value in self.differences.items()]
-        more = [f"{len(shown) - 3} more keys"] if len(shown) > 4 else shown[3:]
-        return ", ".join(shown[:3] + more)
+        return ", ".join(shown if len(shown) < 5 else [*shown[:3], f"{len(shown) - 3} more keys"])
 
 
 def groups_of(runs: Sequence[Run]) -> list[Group]:
@@ -210,12 +205,11 @@ def out_of_bounds_of_both(outcomes: NDArray[Any]) -> Array:
 
 
 class OutcomeMatrix(NamedTuple):
-    """The metric of each run (by its seed) and episode `[R, E]`, nan where it was not driven.
+    """The metric of each run and episode `[R, E]`, nan where it was not driven.
 
     All runs are of one stack, scene and condition.
     """
 
-    seeds: tuple[int, ...]
     episodes: Array
     outcomes: Array
 
@@ -224,7 +218,7 @@ class OutcomeMatrix(NamedTuple):
         """The numbers of seeds and episodes, as text: `3 × 192`."""
         of_each = (~np.isnan(self.outcomes)).sum(axis=1)
         low, high = of_each.min(), of_each.max()
-        return f"{len(self.seeds)} × {low}" + (f"–{high}" if high > low else "")
+        return f"{len(self.outcomes)} × {low}" + (f"–{high}" if high > low else "")
 
     def on(self, episodes: Array) -> Array:
         """Returns the outcomes in these episodes, which it must have."""
@@ -234,22 +228,21 @@ class OutcomeMatrix(NamedTuple):
 def outcomes_of(
     runs: Iterable[Run], condition: Condition, metric: Metric = success
 ) -> OutcomeMatrix | None:
-    """Returns the outcomes of runs of one stack and scene; None if the condition has none.
+    """Returns the outcomes of runs of one stack and scene; None if the condition has none."""
+    driven = [run.under(condition) for run in sorted(runs, key=lambda run: run.seed)]
+    return _matrix([(e["episode_seed"], metric(e["outcome"])) for e in driven])
 
-    An episode has one column, whichever runs drove it.
-    """
-    found = []
-    for run in sorted(runs, key=lambda run: run.seed):
-        driven = run.under(condition)
-        if len(driven["outcome"]):
-            found.append((run.seed, driven["episode_seed"], metric(driven["outcome"])))
+
+def _matrix(of_runs: Iterable[tuple[Array, Array]]) -> OutcomeMatrix | None:
+    # an episode has one column, whichever runs drove it
+    found = [(seeds, values) for seeds, values in of_runs if len(seeds)]
     if not found:
         return None
-    episodes = np.unique(np.concatenate([seeds for _, seeds, _ in found]))
+    episodes = np.unique(np.concatenate([seeds for seeds, _ in found]))
     outcomes = np.full((len(found), len(episodes)), np.nan)
-    for row, (_, seeds, values) in enumerate(found):
-        outcomes[row, np.searchsorted(episodes, seeds)] = values
-    return OutcomeMatrix(tuple(seed for seed, _, _ in found), episodes, outcomes)
+    for row, (seeds, values) in zip(outcomes, found):
+        row[np.searchsorted(episodes, seeds)] = values
+    return OutcomeMatrix(episodes, outcomes)
 
 
 def pooled(runs: Sequence[Run], conditions: Sequence[Condition], metric: Metric) -> Array | None:
@@ -267,19 +260,16 @@ def side_by_side(first: OutcomeMatrix, second: OutcomeMatrix) -> tuple[Array, Ar
     return first.on(shared), second.on(shared)
 
 
-def change(before: OutcomeMatrix | None, after: OutcomeMatrix | None) -> Array | None:
-    """Returns `[R, E]`, the change for each run and episode of both; None if they share none.
-
-    A run that drove no episode under both conditions is no part of it.
-    """
-    if before is None or after is None:
-        return None
-    seeds = [seed for seed in before.seeds if seed in after.seeds]
-    episodes = np.intersect1d(before.episodes, after.episodes)
-    ours, theirs = (m.on(episodes)[[m.seeds.index(s) for s in seeds]] for m in (before, after))
-    changes = theirs - ours
-    driven = ~np.isnan(changes).all(axis=1)
-    return changes[driven] if driven.any() else None
+def change(runs: Iterable[Run], before: Condition, after: Condition) -> Array | None:
+    """Returns `[R, E]`, the change of success in the episodes that a run drove under both."""
+    found = []
+    for run in runs:
+        first, second = outcomes_of([run], before), outcomes_of([run], after)
+        if first and second:
+            episodes = np.intersect1d(first.episodes, second.episodes)
+            found.append((episodes, (second.on(episodes) - first.on(episodes))[0]))
+    changes = _matrix(found)
+    return changes and changes.outcomes
 
 
 def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:
@@ -291,8 +281,15 @@ def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:
     return None if driven is None else float(np.nanmax(driven.outcomes, axis=0).mean())
 
 
+class Cell(NamedTuple):
+    """The outcomes of one series in one scene and condition, and their mean success."""
+
+    matrix: OutcomeMatrix
+    score: Estimate
+
+
 class Grid(NamedTuple):
-    """Success in one scene: outcomes and scores by series and condition, None where it is missing.
+    """Success in one scene by (series, condition); a place without runs has no cell.
 
     `series` are the compared stacks in the figure's order, or stacks of groups; `conditions` are
     groups of bars, or points of a line; baselines go by their name and condition.
@@ -301,14 +298,13 @@ class Grid(NamedTuple):
     scene: str
     series: tuple[str, ...]
     conditions: tuple[Condition, ...]
-    matrices: Mapping[tuple[str, Condition], OutcomeMatrix | None]
-    scores: Mapping[tuple[str, Condition], Estimate | None]
+    cells: Mapping[tuple[str, Condition], Cell]
     baselines: Mapping[tuple[str, Condition], float]
 
 
 def grid_of(
     scene: str,
-    runs: Mapping[str, Sequence[Run]],
+    series: Mapping[str, Sequence[Run]],
     conditions: Sequence[Condition],
     bootstrap: Bootstrap,
     baselines: Sequence[str] = BASELINES,
@@ -317,16 +313,19 @@ def grid_of(
 
     Without `baselines` where the runs' configs differ, since a baseline's drives may differ too.
     """
-    here = {name: [run for run in members if run.scene == scene] for name, members in runs.items()}
-    found = {(name, c): outcomes_of(here[name], c) for name, c in product(runs, conditions)}
-    scores = {place: m and bootstrap.success([m.outcomes]) for place, m in found.items()}
-    everybody = [run for members in here.values() for run in members]
-    shares = {
-        (name, c): share
-        for name, c in product(baselines, conditions)
-        if (share := baseline_share(everybody, c._replace(policy=name))) is not None
+    here = {name: [run for run in runs if run.scene == scene] for name, runs in series.items()}
+    cells = {
+        (name, condition): Cell(matrix, bootstrap.success([matrix.outcomes]))
+        for name, condition in product(series, conditions)
+        if (matrix := outcomes_of(here[name], condition)) is not None
     }
-    return Grid(scene, tuple(runs), tuple(conditions), found, scores, shares)
+    everybody = [run for runs in here.values() for run in runs]
+    shares = {
+        (name, condition): share
+        for name, condition in product(baselines, conditions)
+        if (share := baseline_share(everybody, condition._replace(policy=name))) is not None
+    }
+    return Grid(scene, tuple(series), tuple(conditions), cells, shares)
 
 
 class Curve(NamedTuple):

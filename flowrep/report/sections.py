@@ -1,8 +1,7 @@
 """The sections of a report on runs: headings, figures and tables, and their files."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 from pathlib import Path
 from typing import NamedTuple
@@ -10,27 +9,30 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from flowrep.report.figures import draw_bars, draw_curves, draw_rates, save, words
+from flowrep.report.figures import draw_bars, draw_curves, draw_rates, encoded, words
 from flowrep.report.runs import (
     BASELINES,
+    COMPLEMENTARY_STACKS,
+    FLOW_STACKS,
     SPEEDS,
+    STACKS,
     Condition,
     Grid,
     Group,
     Run,
-    by_stack,
     change,
     curve_of,
     grid_of,
     groups_of,
     in_order,
+    in_stacks,
     out_of_bounds_of_both,
     pooled,
     scenes_of,
     side_by_side,
 )
 from flowrep.report.statistics import FEWEST_RUNS, Bootstrap, Comparison, Estimate, holm
-from flowrep.report.tables import MISSING, Table, listed, p_text, percent, points
+from flowrep.report.tables import MISSING, Table, listed, p_text, percent, points, ratio
 
 INTERVALS = (
     "the mean over seeds with 95 % intervals, by a bootstrap over seeds and episodes; of a single "
@@ -40,39 +42,30 @@ _MOST_PAIRS = 15  # in a table
 _LONGEST_LABEL = 30  # of a config, in a legend
 _ALL = "ego+obj+seg2+depth2"
 
-
-class Experiment(NamedTuple):
-    """One of the paper's comparisons: its stacks in the figure's order, its differences."""
-
-    name: str
-    title: str
-    stacks: tuple[str, ...]
-    pairs: tuple[tuple[str, str], ...]
-
-
-FLOW_COMPOSITION = Experiment(
-    "flow_composition",
-    "Composition of the flow maps",
-    ("ego", "raw", "obj", "ego+obj"),
-    (("ego+obj", "ego"), ("ego+obj", "raw"), ("ego+obj", "obj"), ("raw", "ego")),
-)
-COMPLEMENTARY = Experiment(
-    "complementary",
-    "Flow beside segmentation and depth",
-    ("seg2", "depth2", "ego+obj", "ego+obj+seg2", "ego+obj+depth2", _ALL),
+# The paper's comparisons: name, title, stacks, and differences (first, second).
+_EXPERIMENTS = (
     (
-        ("ego+obj+seg2", "seg2"),
-        ("ego+obj+depth2", "depth2"),
-        ("ego+obj+seg2", "ego+obj"),
-        ("ego+obj+depth2", "ego+obj"),
-        (_ALL, "ego+obj"),
-        ("ego+obj", "seg2"),
-        ("ego+obj", "depth2"),
+        "flow_composition",
+        "Composition of the flow maps",
+        FLOW_STACKS,
+        (("ego+obj", "ego"), ("ego+obj", "raw"), ("ego+obj", "obj"), ("raw", "ego")),
+    ),
+    (
+        "complementary",
+        "Flow beside segmentation and depth",
+        COMPLEMENTARY_STACKS,
+        (
+            ("ego+obj+seg2", "seg2"),
+            ("ego+obj+depth2", "depth2"),
+            ("ego+obj+seg2", "ego+obj"),
+            ("ego+obj+depth2", "ego+obj"),
+            (_ALL, "ego+obj"),
+            ("ego+obj", "seg2"),
+            ("ego+obj", "depth2"),
+        ),
     ),
 )
 _TABLE_III = ("ego+obj", "depth2", "seg2", "ego+obj+depth2", "ego+obj+seg2", _ALL)
-STACKS = tuple(dict.fromkeys((*FLOW_COMPOSITION.stacks, *COMPLEMENTARY.stacks)))
-"""All of the paper's, in the order of its figures."""
 
 
 class Settings(NamedTuple):
@@ -82,25 +75,20 @@ class Settings(NamedTuple):
     bootstrap: Bootstrap
 
 
-class Drawing(NamedTuple):
-    """A figure: the name of its files, its caption, and what draws it."""
-
-    name: str
-    caption: str
-    draw: Callable[[], Figure]
-
-
 class Section(NamedTuple):
-    """One part of a report: the name of its folder, its heading, its figure and its tables.
+    """One part of a report: its name, heading, tables, and figure with a caption.
 
-    `label` says what distinguishes the config of its runs from that of other sections' runs.
+    `label` says what distinguishes the config of its runs from that of other sections' runs;
+    `folder` is for its files.
     """
 
     name: str
     title: str
-    drawing: Drawing | None
     tables: tuple[Table, ...] = ()
+    figure: Figure | None = None
+    caption: str = ""
     label: str = ""
+    folder: str = ""
 
 
 class Report(NamedTuple):
@@ -119,9 +107,9 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], settings: Settings) -
     for number, group in enumerate(groups, start=1):
         prefix = f"{number}_" if len(groups) > 1 else ""
         for section in _group_sections(group, settings):
-            sections.append(section._replace(name=prefix + section.name, label=group.label))
+            sections.append(section._replace(folder=prefix + section.name, label=group.label))
     if len(groups) > 1:
-        sections.append(_configs_section(groups, settings))
+        sections.append(_configs_section(groups, settings)._replace(folder="configs"))
     return Report(tuple(runs), tuple(wrong), tuple(sections))
 
 
@@ -131,14 +119,15 @@ def write_files(report: Report, folder: Path) -> list[Path]:
     The same report gives the same files, byte for byte.
     """
     for section in report.sections:
-        place = folder / section.name
+        place = folder / section.folder
         place.mkdir(exist_ok=True)
-        if section.drawing:
-            save(section.drawing.draw(), place / section.drawing.name)
+        if section.figure:
+            for kind in ("png", "pdf"):
+                (place / f"{section.name}.{kind}").write_bytes(encoded(section.figure, kind))
         for table in section.tables:
             (place / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
             (place / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
-    return [folder / section.name for section in report.sections]
+    return [folder / section.folder for section in report.sections]
 
 
 def _unusable(run: Run, settings: Settings) -> str | None:
@@ -161,42 +150,34 @@ def _group_sections(group: Group, settings: Settings) -> list[Section]:
     runs = [run for run in group.runs if _unusable(run, settings) is None]
     if not runs:
         return _curves(group.runs)
-    stacks = in_order([run.stack for run in runs], STACKS)
-    sections = []
-    shown: set[str] = set()
-    for name, title, order, pairs in (FLOW_COMPOSITION, COMPLEMENTARY):
-        if len({*stacks} & {*order}) > 1:
-            ours = [run for run in runs if run.stack in order]
-            sections.append(success_section(name, title, by_stack(ours, order), pairs, settings))
-            shown |= {*order}
-    if {*stacks} - shown:
-        every = list(combinations(reversed(stacks), 2))
-        series = by_stack(runs, stacks)
-        sections.append(success_section("success", "Success", series, every, settings))
+    found = in_stacks(runs)
+    sections, shown = [], set[str]()
+    for name, title, stacks, pairs in _EXPERIMENTS:
+        if len({*found} & {*stacks}) > 1:
+            series = {stack: found.get(stack, []) for stack in stacks}
+            sections.append(_success_section(name, title, series, pairs, settings))
+            shown |= {*stacks}
+    if {*found} - shown:
+        every = list(combinations(reversed(found), 2))
+        sections.append(_success_section("success", "Success", found, every, settings))
     sections.append(_failure_section(runs, settings))
     if len(_rates(runs, settings.policy)) > 1:
         sections.append(_rate_section(runs, settings))
     return [*sections, *_curves(group.runs)]
 
 
-def in_stacks(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Returns the runs of each of their stacks, in the order of the paper's figures."""
-    return by_stack(runs, in_order([run.stack for run in runs], STACKS))
-
-
-def _speeds(runs: Sequence[Run], policy: str) -> list[str]:
-    """Returns the speed modes in which runs were evaluated at their frame rate."""
-    asked = (policy, runs[0].fps)
-    return in_order([c.speed for run in runs for c in run.conditions if c[::2] == asked], SPEEDS)
-
-
 def _rates(runs: Sequence[Run], policy: str) -> list[float]:
-    """Returns the frame rates at which runs were evaluated at their speed, the lowest first."""
     asked = (policy, runs[0].speed)
     return sorted({c.fps for run in runs for c in run.conditions if c[:2] == asked})
 
 
-def success_section(
+def _at_speeds(runs: Sequence[Run], policy: str) -> list[Condition]:
+    fps = runs[0].fps
+    driven = [c.speed for run in runs for c in run.conditions if c[::2] == (policy, fps)]
+    return [Condition(policy, speed, fps) for speed in in_order(driven, SPEEDS)]
+
+
+def _success_section(
     name: str,
     title: str,
     series: Mapping[str, Sequence[Run]],
@@ -206,50 +187,48 @@ def success_section(
 ) -> Section:
     """Returns bars, a table of success and one of the pairs' differences, for series of runs."""
     runs = [run for members in series.values() for run in members]
-    policy, bootstrap, fps = settings.policy, settings.bootstrap, runs[0].fps
-    conditions = [Condition(policy, speed, fps) for speed in _speeds(runs, policy)]
+    policy, bootstrap = settings
+    conditions = _at_speeds(runs, policy)
     grids = [grid_of(s, series, conditions, bootstrap, baselines) for s in scenes_of(runs)]
     trained = listed(sorted({run.speed for run in runs}))
     caption = (
-        f"Success of agents trained at {trained} speed, {policy} actions, {fps:g} frames per "
-        f"second: {INTERVALS}; dots are the seeds."
+        f"Success of agents trained at {trained} speed, {policy} actions, {runs[0].fps:g} frames "
+        f"per second: {INTERVALS}; dots are the seeds."
     )
     tables = (
         _success_table(name, grids, caption, bootstrap),
         *_difference_tables(name, grids, pairs, bootstrap),
     )
-    return Section(name, title, Drawing(name, caption, partial(draw_bars, grids)), tables)
+    return Section(name, title, tables, draw_bars(grids), caption)
 
 
 def _shares(grid: Grid, series: str) -> list[str]:
-    scores = [grid.scores[series, c] for c in grid.conditions]
-    return [percent(score) if score else MISSING for score in scores]
+    cells = [grid.cells.get((series, c)) for c in grid.conditions]
+    return [percent(cell.score) if cell else MISSING for cell in cells]
 
 
 def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bootstrap) -> Table:
     """Returns success in % by scene and series, and over all scenes where there are several."""
-    conditions = grids[0].conditions
+    _, series, conditions, *_ = grids[0]
     blocks = []
     for grid in grids:
         rows = []
-        for series in grid.series:
-            found = [grid.matrices[series, c] for c in conditions]
-            counts = dict.fromkeys(matrix.counts for matrix in found if matrix)
-            rows.append((series, *_shares(grid, series), ", ".join(counts) or "0"))
+        for one in series:
+            cells = [grid.cells[one, c] for c in conditions if (one, c) in grid.cells]
+            counts = dict.fromkeys(cell.matrix.counts for cell in cells)
+            rows.append((one, *_shares(grid, one), ", ".join(counts) or "0"))
         for baseline in dict.fromkeys(baseline for baseline, _ in grid.baselines):
             shares = [grid.baselines.get((baseline, c)) for c in conditions]
-            cells = [MISSING if share is None else f"{100 * share:.0f}" for share in shares]
-            rows.append((baseline.replace("_", " "), *cells, ""))
+            texts = [MISSING if share is None else f"{100 * share:.0f}" for share in shares]
+            rows.append((baseline.replace("_", " "), *texts, ""))
         blocks.append((words(grid.scene), tuple(rows)))
     if len(grids) > 1:
-        rows = []
-        for series in grids[0].series:
-            each = [[grid.matrices[series, c] for grid in grids] for c in conditions]
-            here = [[m.outcomes for m in of if m is not None] for of in each]
-            cells = [
-                percent(bootstrap.success(o)) if len(o) == len(grids) else MISSING for o in here
-            ]
-            rows.append((series, *cells, ""))
+
+        def over_all(place: tuple[str, Condition]) -> str:
+            found = [g.cells[place].matrix.outcomes for g in grids if place in g.cells]
+            return percent(bootstrap.success(found)) if len(found) == len(grids) else MISSING
+
+        rows = [(one, *(over_all((one, c)) for c in conditions), "") for one in series]
         blocks.append((f"All {len(grids)} scenes", tuple(rows)))
     header = ("representations", *(f"{c.speed} (%)" for c in conditions), "seeds × episodes")
     return Table(f"{name}_success", f"In %. {caption}", header, tuple(blocks))
@@ -268,7 +247,7 @@ def _difference_tables(
         found = [
             (f"{first} − {second}", c.speed, *compared)
             for (first, second), c in product(chosen, grids[0].conditions)
-            if (compared := _compared(members, first, second, c, bootstrap)) is not None
+            if (compared := _compared(members, (first, c), (second, c), bootstrap)) is not None
         ]
         corrected = holm([c.p_value for _, _, c, _ in found])
         rows = []
@@ -293,15 +272,15 @@ def _difference_tables(
 
 
 def _compared(
-    grids: Sequence[Grid], first: str, second: str, condition: Condition, bootstrap: Bootstrap
+    grids: Sequence[Grid],
+    first: tuple[str, Condition],
+    second: tuple[str, Condition],
+    bootstrap: Bootstrap,
 ) -> tuple[Comparison, int] | None:
     """Returns a comparison over scenes and the number of its episodes; None where one has none."""
-    sides = []
-    for grid in grids:
-        a, b = grid.matrices.get((first, condition)), grid.matrices.get((second, condition))
-        if a is None or b is None:
-            return None
-        sides.append(side_by_side(a, b))
+    if not all({first, second} <= {*grid.cells} for grid in grids):
+        return None
+    sides = [side_by_side(grid.cells[first].matrix, grid.cells[second].matrix) for grid in grids]
     shared = [ours.shape[1] for ours, _ in sides]
     return (bootstrap.compare(sides), sum(shared)) if all(shared) else None
 
@@ -312,16 +291,14 @@ def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
     At the speeds at which the paper evaluates, low and high together, or at that of training where
     they were not both driven; time-outs are left out, as in the paper.
     """
-    fps = runs[0].fps
-    speeds = ["low", "high"]
-    if not {*speeds} <= {*_speeds(runs, settings.policy)}:
-        speeds = [runs[0].speed]
+    fps, driven = runs[0].fps, {c.speed for c in _at_speeds(runs, settings.policy)}
+    speeds = ["low", "high"] if {"low", "high"} <= driven else [runs[0].speed]
     conditions = [Condition(settings.policy, speed, fps) for speed in speeds]
     stacks = in_order([run.stack for run in runs], _TABLE_III)
     blocks = []
     for scene in in_order(scenes_of(runs), ("s_turn",)):
-        here = by_stack([run for run in runs if run.scene == scene], stacks)
-        rows = [_failure_row(stack, here[stack], conditions, settings) for stack in stacks]
+        here = in_stacks([run for run in runs if run.scene == scene])
+        rows = [(s, *_failure_cells(here.get(s, []), conditions, settings)) for s in stacks]
         blocks.append((words(scene), tuple(rows)))
     caption = (
         "Causes of failure in % of collisions and departures from the road together, of all seeds; "
@@ -332,33 +309,23 @@ def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
     header = ("representations", "out of bounds (%)", "collision (%)", "out of bounds to collision")
     counts = ("failures", "time-outs", "episodes")
     table = Table("failure_causes", caption, (*header, *counts), tuple(blocks))
-    return Section("failure_causes", "Causes of failure", None, (table,))
+    return Section("failure_causes", "Causes of failure", (table,))
 
 
-def _failure_row(
-    stack: str, runs: Sequence[Run], conditions: Sequence[Condition], settings: Settings
+def _failure_cells(
+    runs: Sequence[Run], conditions: Sequence[Condition], settings: Settings
 ) -> tuple[str, ...]:
     outcomes = pooled(runs, conditions, out_of_bounds_of_both)
     timeouts = pooled(runs, conditions, lambda ends: (ends == "timeout").astype(float))
     if outcomes is None or timeouts is None:
-        return (stack, *[MISSING] * 3, "0", "0", "0")
+        return (*[MISSING] * 3, "0", "0", "0")
     share = settings.bootstrap.pooled_share(outcomes)
     counts = ((~np.isnan(outcomes)).sum(), np.nansum(timeouts), (~np.isnan(timeouts)).sum())
     counted = tuple(str(int(number)) for number in counts)
     if np.isnan(share.value):
-        return (stack, *["no failures"] * 3, *counted)
+        return (*["no failures"] * 3, *counted)
     collisions = Estimate(1 - share.value, 1 - share.high, 1 - share.low)
-    return (stack, percent(share, 1), percent(collisions, 1), ratio(share), *counted)
-
-
-def ratio(share: Estimate) -> str:
-    """Returns share : rest with its interval, as text.
-
-    >>> ratio(Estimate(0.2, 0.1, 0.5))
-    '0.250 [0.111–1.000]'
-    """
-    value, low, high = (f"{number / (1 - number):.3f}" if number < 1 else "∞" for number in share)
-    return f"{value} [{low}–{high}]"
+    return (percent(share, 1), percent(collisions, 1), ratio(share), *counted)
 
 
 def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
@@ -366,27 +333,27 @@ def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
     policy, speed, trained = settings.policy, runs[0].speed, runs[0].fps
     ours = [run for run in runs if len(_rates([run], policy)) > 1]
     conditions = [Condition(policy, speed, rate) for rate in _rates(ours, policy)]
+    low, high = conditions[0], conditions[-1]
     series = in_stacks(ours)
     grids = [grid_of(scene, series, conditions, settings.bootstrap) for scene in scenes_of(ours)]
+    blocks = []
+    for grid in grids:
+        rows = []
+        for name, members in series.items():
+            changes = change([run for run in members if run.scene == grid.scene], high, low)
+            lost = MISSING if changes is None else points(settings.bootstrap.mean([changes]))
+            rows.append((name, *_shares(grid, name), lost))
+        blocks.append((words(grid.scene), tuple(rows)))
     caption = (
         f"Success over the frame rate of the evaluation, trained at {trained:g} frames per second, "
         f"{speed} speed, {policy} actions: {INTERVALS}. Points of one rate stand side by side."
     )
-    drawing = Drawing("frame_rate", caption, partial(draw_rates, grids))
-    low, high = conditions[0], conditions[-1]
-    blocks = []
-    for grid in grids:
-        rows = []
-        for name in grid.series:
-            changes = change(grid.matrices[name, high], grid.matrices[name, low])
-            lost = MISSING if changes is None else points(settings.bootstrap.mean([changes]))
-            rows.append((name, *_shares(grid, name), lost))
-        blocks.append((words(grid.scene), tuple(rows)))
     heads = (*(f"{c.fps:g} Hz (%)" for c in conditions), f"{high.fps:g} → {low.fps:g} Hz (points)")
     extra = "The last column is the change of the same agents on the same episodes."
     header = ("representations", *heads)
     table = Table("frame_rate_success", f"In %. {caption} {extra}", header, tuple(blocks))
-    return Section("frame_rate", "Sensitivity to the frame rate", drawing, (table,))
+    title = "Sensitivity to the frame rate"
+    return Section("frame_rate", title, (table,), draw_rates(grids), caption)
 
 
 def _curves(runs: Sequence[Run]) -> list[Section]:
@@ -402,8 +369,7 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
         "Learning curves. Bold, with markers: greedy evaluations at the training speed, the mean "
         "over seeds. Thin: each seed's training episodes, sampled actions."
     )
-    drawing = Drawing("learning_curves", caption, partial(draw_curves, panels))
-    return [Section("learning_curves", "Learning curves", drawing)]
+    return [Section("learning_curves", "Learning curves", (), draw_curves(panels), caption)]
 
 
 def _configs_section(groups: Sequence[Group], settings: Settings) -> Section:
@@ -417,20 +383,17 @@ def _configs_section(groups: Sequence[Group], settings: Settings) -> Section:
     columns = tuple(range(1, len(groups) + 1))
     table = Table("configs", caption, ("key", *configs), (("", tuple(rows)),), columns)
 
+    series: dict[tuple[str, str], list[Run]] = {}  # of a stack and a config
     usable = [[run for run in g.runs if _unusable(run, settings) is None] for g in groups]
     places = Counter(place for runs in usable for place in {(r.scene, r.stack) for r in runs})
     shared = [place for place, configs_there in places.items() if configs_there > 1]
-    series = {
-        (stack, config): [
-            run for run in runs if (run.scene, stack) in shared and run.stack == stack
-        ]
-        for stack in in_order([stack for _, stack in shared], STACKS)
-        for config, runs in zip(configs, usable)
-    }
-    names = {place: ", ".join(place) for place, runs in series.items() if runs}
-    if not names:
-        return Section("configs", "Configs that differ", None, (table,))
-    pairs = [(names[b], names[a]) for a, b in combinations(names, 2) if a[0] == b[0]]
-    told = {name: series[place] for place, name in names.items()}
-    section = success_section("configs", "Configs that differ", told, pairs, settings, baselines=())
+    for stack in in_order([stack for _, stack in shared], STACKS):
+        for config, runs in zip(configs, usable):
+            here = [r for r in runs if r.stack == stack and (r.scene, stack) in shared]
+            series |= {(stack, config): here} if here else {}
+    if not series:
+        return Section("configs", "Configs that differ", (table,))
+    named = {", ".join(place): runs for place, runs in series.items()}
+    pairs = [(", ".join(b), ", ".join(a)) for a, b in combinations(series, 2) if a[0] == b[0]]
+    section = _success_section("configs", "Configs that differ", named, pairs, settings, ())
     return section._replace(tables=(table, *section.tables))

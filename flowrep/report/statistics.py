@@ -8,6 +8,9 @@ have different numbers of runs: all count the same in the mean over them, otherw
 seeds in the easier scene would seem better. And the score is the mean over runs, not the
 interquartile mean: of four runs the latter is the mean of the middle two, which drops the one run
 that ended in another way, and p of a test on means would belong to another number.
+
+Outcomes are arrays [R, E]: 1 where run r's episode e has a property such as success, 0 where not,
+nan where the run did not drive that episode or it does not count.
 """
 
 from collections.abc import Sequence
@@ -22,6 +25,7 @@ from flowrep.experiment.evaluation import wilson_interval
 
 Array = NDArray[np.float64]
 
+LEVEL = 0.05  # of tests; intervals hold the rest
 _OF_RUNS, _OF_EPISODES = 0, 1  # keep the two draws independent
 
 FEWEST_RUNS = 3
@@ -29,7 +33,7 @@ FEWEST_RUNS = 3
 
 
 class Estimate(NamedTuple):
-    """A number with the bounds of its interval."""
+    """A number with the bounds of its 95 % interval."""
 
     value: float
     low: float
@@ -54,14 +58,12 @@ class Comparison(NamedTuple):
     def verdict(self, p_value: float | None = None) -> str:
         """Returns in words how far the difference can be trusted.
 
-        It can't be told from noise if its interval contains 0, or if the t-test finds nothing: a
-        bootstrap over two or three runs gives intervals that are too narrow.
-
         Args:
             p_value: corrected for the number of comparisons; its own if None.
         """
+        # Both have to agree: a bootstrap over two or three runs has intervals that are too narrow.
         has_zero = self.difference.low <= 0 <= self.difference.high
-        if has_zero or (self.p_value if p_value is None else p_value) >= 0.05:
+        if has_zero or (self.p_value if p_value is None else p_value) >= LEVEL:
             return "can't be told from noise"
         word = "higher" if self.difference.value > 0 else "lower"
         if self.runs < FEWEST_RUNS:
@@ -71,16 +73,10 @@ class Comparison(NamedTuple):
 
 
 def rates(outcomes: Array, weights: Array | None = None) -> Array:
-    """Returns each run's share of episodes with a property, such as success.
+    """Returns each run's share of episodes with a property, such as success, [R].
 
-    Args:
-        outcomes: [R, E], 1 where run r's episode e has it, 0 where not, nan where the run did not
-            drive that episode.
-        weights: [N, E], how often each episode counts in each of N resamples; once if None.
-
-    Returns:
-        [N, R], or [R] without weights. A run without episodes in a resample keeps its own rate
-        there.
+    With `weights` [N, E], how often each episode counts in each of N resamples: [N, R]. A run
+    without episodes in a resample keeps its own rate there.
     """
     there = ~np.isnan(outcomes)
     found = np.where(there, outcomes, 0.0)
@@ -92,64 +88,58 @@ def rates(outcomes: Array, weights: Array | None = None) -> Array:
 
 
 class Bootstrap:
-    """Resamples runs and episodes; the same seed gives the same intervals.
+    """Resamples runs and episodes; the same outcomes give the same intervals.
 
     Args:
         resamples: the number of resamples.
-        confidence: the share of them inside an interval.
-        seed: the generator's seed; each estimate starts from it, whatever was estimated before.
     """
 
-    def __init__(self, resamples: int = 2000, confidence: float = 0.95, seed: int = 0) -> None:
-        self.resamples, self.confidence, self.seed = resamples, confidence, seed
+    def __init__(self, resamples: int = 2000) -> None:
+        self.resamples = resamples
 
     def success(self, scenes: Sequence[Array]) -> Estimate:
-        """Returns the mean over a scene's runs, in the mean over scenes.
+        """Returns the mean over a scene's runs, in the mean over scenes; Wilson's of a single run.
 
         Args:
-            scenes: for each scene [R, E], see `rates`. One run alone gives Wilson's interval.
+            scenes: the outcomes in each scene.
         """
         if sum(map(len, scenes)) == 1:
-            return self._wilson(scenes[0])
+            return _wilson(scenes[0])
         return self.mean(scenes, least=0.0)
 
     def mean(self, scenes: Sequence[Array], least: float = -1.0) -> Estimate:
         """Returns the same of outcomes from `least` to 1, such as changes between conditions."""
         value = np.mean([rates(outcomes).mean() for outcomes in scenes])
-        drawn = [self._draw(k, outcomes, [len(outcomes)])[0] for k, outcomes in enumerate(scenes)]
+        drawn = [self._rates(k, outcomes, [len(outcomes)])[0] for k, outcomes in enumerate(scenes)]
         means = np.mean([d.mean(axis=-1) for d in drawn], axis=0)
-        return self._estimate(float(value), means, sum(s.shape[1] for s in scenes), least)
+        return _estimate(float(value), means, sum(s.shape[1] for s in scenes), least)
 
     def pooled_share(self, outcomes: Array) -> Estimate:
-        """Returns the share over the pooled episodes of all runs; nan without episodes.
-
-        Args:
-            outcomes: [R, E], nan where an episode does not count.
-        """
+        """Returns the share over the pooled episodes of all runs; nan without episodes."""
         if np.isnan(outcomes).all():
             return Estimate(np.nan, np.nan, np.nan)
         if len(outcomes) == 1 or np.nanmin(outcomes) == np.nanmax(outcomes):
-            return self._wilson(outcomes)
-        rng = np.random.default_rng((self.seed, 0, _OF_RUNS))
-        weights = _episode_weights(self.seed, 0, outcomes.shape[1], self.resamples)
+            return _wilson(outcomes)
+        rng = np.random.default_rng((0, 0, _OF_RUNS))
+        weights = _episode_weights(0, outcomes.shape[1], self.resamples)
         chosen = rng.integers(len(outcomes), size=(self.resamples, len(outcomes)))
         there = ~np.isnan(outcomes)
         found = np.where(there, outcomes, 0.0)
         counts = np.take_along_axis(weights @ there.T, chosen, axis=1).sum(axis=1)
         sums = np.take_along_axis(weights @ found.T, chosen, axis=1).sum(axis=1)
         drawn = sums[counts > 0] / counts[counts > 0]
-        return self._estimate(float(found.sum() / there.sum()), drawn, int(there.sum()))
+        return _estimate(float(found.sum() / there.sum()), drawn, int(there.sum()))
 
     def compare(self, scenes: Sequence[tuple[Array, Array]]) -> Comparison:
         """Returns how much better the first of each pair does than the second.
 
         Args:
-            scenes: two sides for each scene, [R1, E] and [R2, E]. Column e is the same episode in
-                both, so that an episode's difficulty is not part of the difference.
+            scenes: the outcomes of two sides in each scene. Column e is the same episode in both,
+                so that an episode's difficulty is not part of the difference.
         """
         own = [(rates(a), rates(b)) for a, b in scenes]
         drawn = [
-            self._draw(k, np.concatenate(pair), [len(side) for side in pair])
+            self._rates(k, np.concatenate(pair), [len(side) for side in pair])
             for k, pair in enumerate(scenes)
         ]
         difference, differences = (
@@ -162,59 +152,52 @@ class Bootstrap:
         improvements = np.mean([_improvement(*pair) for pair in drawn], axis=0)
         episodes = sum(ours.shape[1] for ours, _ in scenes)  # shared by the runs
         return Comparison(
-            self._estimate(float(difference), differences, episodes, least=-1.0),
-            self._estimate(improvement, improvements, episodes),
+            _estimate(float(difference), differences, episodes, least=-1.0),
+            _estimate(improvement, improvements, episodes),
             effect(own).p_value,
             runs,
         )
 
-    def _draw(self, scene: int, outcomes: Array, sides: Sequence[int]) -> list[Array]:
+    def _rates(self, scene: int, outcomes: Array, sides: Sequence[int]) -> list[Array]:
         """Returns rates [N, R] of resampled runs of each side, over the same drawn episodes.
 
-        Args:
-            scene: the scene's number, so that each scene has draws of its own.
-            outcomes: [R, E] of all sides, stacked.
-            sides: the number of runs of each side.
+        `outcomes` is of all sides, stacked; `sides` has the number of runs of each.
         """
-        rng = np.random.default_rng((self.seed, scene, _OF_RUNS))
-        weights = _episode_weights(self.seed, scene, outcomes.shape[1], self.resamples)
-        drawn, first = [], 0
-        for count in sides:
-            side = rates(outcomes[first : first + count], weights)
-            chosen = rng.integers(count, size=(self.resamples, count))
-            drawn.append(np.take_along_axis(side, chosen, axis=1))
-            first += count
+        rng = np.random.default_rng((0, scene, _OF_RUNS))
+        weights = _episode_weights(scene, outcomes.shape[1], self.resamples)
+        drawn = []
+        for side in np.split(outcomes, np.cumsum(sides)[:-1]):
+            chosen = rng.integers(len(side), size=(self.resamples, len(side)))
+            drawn.append(np.take_along_axis(rates(side, weights), chosen, axis=1))
         return drawn
 
-    def _wilson(self, outcomes: Array) -> Estimate:
-        there = ~np.isnan(outcomes)
-        found, trials = int(outcomes[there].sum()), int(there.sum())
-        return Estimate(found / max(trials, 1), *wilson_interval(found, trials, self.confidence))
 
-    def _estimate(self, value: float, drawn: Array, episodes: int, least: float = 0.0) -> Estimate:
-        """Returns a value from `least` to 1 with the interval of its resamples.
+def _wilson(outcomes: Array) -> Estimate:
+    there = ~np.isnan(outcomes)
+    found, trials = int(outcomes[there].sum()), int(there.sum())
+    return Estimate(found / max(trials, 1), *wilson_interval(found, trials, 1 - LEVEL))
 
-        Where they all agree they say nothing of what other episodes would have shown, and the
-        interval is as wide as Wilson's of a share that is 0 in so many episodes.
-        """
-        tail = (1 - self.confidence) / 2
-        low, high = np.quantile(drawn, [tail, 1 - tail])
-        if np.ptp(drawn) < 1e-9:
-            unseen = wilson_interval(0, episodes, self.confidence)[1]
-            low, high = max(value - unseen, least), min(value + unseen, 1.0)
-        return Estimate(value, float(low), float(high))
+
+def _estimate(value: float, drawn: Array, episodes: int, least: float = 0.0) -> Estimate:
+    low, high = np.quantile(drawn, [LEVEL / 2, 1 - LEVEL / 2])
+    if np.ptp(drawn) < 1e-9:
+        # Resamples that all agree say nothing of what other episodes would have shown: the
+        # interval is then as wide as Wilson's of a share that is 0 in so many episodes.
+        unseen = wilson_interval(0, episodes, 1 - LEVEL)[1]
+        low, high = max(value - unseen, least), min(value + unseen, 1.0)
+    return Estimate(value, float(low), float(high))
 
 
 @lru_cache(maxsize=8)
-def _episode_weights(seed: int, scene: int, episodes: int, resamples: int) -> Array:
-    """How often each of `episodes` is in each resample, [N, E]."""
-    rng = np.random.default_rng((seed, scene, _OF_EPISODES))
+def _episode_weights(scene: int, episodes: int, resamples: int) -> Array:
+    """Returns how often each of `episodes` is in each resample, [N, E]."""
+    rng = np.random.default_rng((0, scene, _OF_EPISODES))
     shares = np.full(episodes, 1 / episodes)
     return rng.multinomial(episodes, shares, size=resamples).astype(np.float64)
 
 
 def _improvement(ours: Array, theirs: Array) -> Any:
-    """Share of pairs [..., R1] × [..., R2] in which ours is higher; a tie is half."""
+    """Returns the share of pairs [..., R1] × [..., R2] in which ours is higher; a tie is half."""
     a, b = ours[..., :, None], theirs[..., None, :]
     return ((a > b) + 0.5 * (a == b)).mean(axis=(-2, -1))
 
@@ -243,7 +226,7 @@ class Effect(NamedTuple):
         """Returns the difference with its 95 % interval, which leaves out 0 exactly if p < 0.05."""
         if self.error == 0:
             return Estimate(self.value, self.value, self.value)
-        half = self.error * float(stats.t.ppf(0.975, self.freedom))
+        half = self.error * float(stats.t.ppf(1 - LEVEL / 2, self.freedom))
         return Estimate(self.value, self.value - half, self.value + half)
 
 
@@ -251,15 +234,15 @@ def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
     """Returns the mean over scenes of the first side's mean minus the second's.
 
     Args:
-        scenes: for each scene the scores of the runs of both sides, or of one side alone. Variances
-            may differ between all of them: some stacks end in one of two ways.
+        scenes: for each scene the scores of the runs of both sides, or of one side alone.
     """
     means = [side[0].mean() - (side[1].mean() if len(side) > 1 else 0.0) for side in scenes]
     parts = [(s.var(ddof=1) / len(s), len(s) - 1) for side in scenes for s in side if len(s) > 1]
     if len(parts) < sum(map(len, scenes)):
         return Effect(float(np.mean(means)), float("nan"), float("nan"))
+    # Variances are not pooled, since some stacks end in one of two ways: Welch and Satterthwaite's
+    # degrees of freedom of a sum of means.
     variance = sum(part for part, _ in parts)
-    # Welch and Satterthwaite's degrees of freedom of a sum of means
     freedom = variance**2 / sum(part**2 / df for part, df in parts) if variance else float("nan")
     return Effect(float(np.mean(means)), variance**0.5 / len(scenes), freedom)
 

@@ -12,7 +12,7 @@ import gzip
 import io
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatch
 from itertools import groupby
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.experiment.run import Rows, RunFolder, RunFolderError
 from flowrep.report.runs import Columns, Run
 from flowrep.tables import TableError
 
@@ -76,12 +76,9 @@ def read_run(path: Path) -> Run:
         TableError: one of its tables lacks columns.
     """
     folder = RunFolder.existing(path)
-    config, tables = folder.read_config(), (folder.read_episodes(), folder.read_metrics())
-    episodes, metrics = (
-        (list(table[0]) if table else [], [list(row.values()) for row in table]) for table in tables
-    )
+    config, episodes, metrics = folder.read_config(), folder.read_episodes(), folder.read_metrics()
     try:
-        columns = _episodes(*episodes), _metrics(*metrics)
+        columns = episode_columns(episodes), _metric_columns(metrics)
         return Run(str(path), config, *columns, path, _machine(path / "machine.json"))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RunFolderError(
@@ -104,12 +101,17 @@ def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     return [run for run in runs if run in kept.values()], warnings
 
 
-def _episodes(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Columns:
-    cells, empty = dict(zip(header, zip(*rows))), ("",) * len(rows)
+def episode_columns(rows: Rows) -> Columns:
+    """Returns the columns of evaluation.csv that a report reads, "" in those that it lacks."""
     return {
-        name: np.array(cells.get(name, empty), dtype=_NUMBERS.get(name, str))
+        name: np.array([row.get(name, "") for row in rows], dtype=_NUMBERS.get(name, str))
         for name in EPISODE_COLUMNS
     }
+
+
+def _metric_columns(rows: Rows) -> Columns:
+    names = [name for name in (rows[0] if rows else ()) if name != "run"]
+    return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
 
 
 def _machine(path: Path) -> dict[str, str]:
@@ -119,11 +121,6 @@ def _machine(path: Path) -> dict[str, str]:
     return {key: " | ".join(found) or "unknown" for key, found in of_each.items()}
 
 
-def _metrics(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Columns:
-    cells = zip(header, zip(*rows))
-    return {name: np.array([float(cell or "nan") for cell in column]) for name, column in cells}
-
-
 def is_archive(folder: Path) -> bool:
     """Returns whether a folder holds packed runs."""
     return (folder / RUNS).is_file()
@@ -131,26 +128,20 @@ def is_archive(folder: Path) -> bool:
 
 def read_archive(folder: Path) -> list[Run]:
     """Returns the packed runs of a folder, in the order of their names."""
-    episodes, training = _read(folder / EPISODES), _read(folder / TRAINING)
+    episodes, training = _of_runs(folder / EPISODES), _of_runs(folder / TRAINING)
     runs = []
     for line in (folder / RUNS).read_text(encoding="utf-8").splitlines():
         entry = json.loads(line)
-        name, empty = entry["run"], (list[str](), list[list[str]]())
-        columns = _episodes(*episodes.get(name, empty)), _metrics(*training.get(name, empty))
-        machine = {key: entry[key] for key in _MACHINE}
+        name, machine = entry["run"], {key: entry[key] for key in _MACHINE}
+        columns = episode_columns(episodes.get(name, [])), _metric_columns(training.get(name, []))
         runs.append(Run(name, entry["config"], *columns, machine=machine))
     return runs
 
 
-def _read(path: Path) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Returns the header and rows of each run in a table, without the run's name."""
-    if not path.is_file():
-        return {}
+def _of_runs(path: Path) -> dict[str, Rows]:
     with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
-        lines = csv.reader(file)
-        header = next(lines)[1:]
-        of_runs = groupby(lines, key=lambda cells: cells[0])
-        return {name: (header, [cells[1:] for cells in rows]) for name, rows in of_runs}
+        rows = groupby(csv.DictReader(file), key=lambda row: row["run"])
+        return {run: list(of) for run, of in rows}
 
 
 def write_archive(runs: Sequence[Run], folder: Path) -> None:
@@ -160,23 +151,23 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     before = read_archive(folder) if is_archive(folder) else []
-    kept = sorted({Path(run.name).name: run for run in (*before, *runs)}.items())
-    logged = list(dict.fromkeys(name for _, run in kept for name in run.metrics))
-    _write(folder / EPISODES, EPISODE_COLUMNS, [(name, run.episodes) for name, run in kept])
-    _write(folder / TRAINING, logged, [(name, run.metrics) for name, run in kept])
+    kept = dict(sorted({Path(run.name).name: run for run in (*before, *runs)}.items()))
+    logged = list(dict.fromkeys(name for run in kept.values() for name in run.metrics))
+    _write(folder / EPISODES, EPISODE_COLUMNS, {name: run.episodes for name, run in kept.items()})
+    _write(folder / TRAINING, logged, {name: run.metrics for name, run in kept.items()})
     lines = []
-    for name, run in kept:
+    for name, run in kept.items():
         machine = {key: run.machine.get(key, "unknown") for key in _MACHINE}
         entry = {"run": name, **machine, "config": run.config}
         lines.append(json.dumps(entry, ensure_ascii=False) + "\n")
     (folder / RUNS).write_text("".join(lines), encoding="utf-8")
 
 
-def _write(path: Path, names: Sequence[str], tables: Iterable[tuple[str, Columns]]) -> None:
+def _write(path: Path, names: Sequence[str], tables: Mapping[str, Columns]) -> None:
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("run", *names))
-    for run, columns in tables:
+    for run, columns in tables.items():
         absent = np.full(max(map(len, columns.values()), default=0), np.nan)
         cells = [map(_text, columns.get(name, absent).tolist()) for name in names]
         writer.writerows((run, *row) for row in zip(*cells))

@@ -111,6 +111,16 @@ def points(estimate: Estimate) -> str:
     return f"{value} [{low}, {high}]"
 
 
+def ratio(share: Estimate) -> str:
+    """Returns share : rest with its interval.
+
+    >>> ratio(Estimate(0.2, 0.1, 0.5))
+    '0.250 [0.111–1.000]'
+    """
+    value, low, high = (f"{number / (1 - number):.3f}" if number < 1 else "∞" for number in share)
+    return f"{value} [{low}–{high}]"
+
+
 def signed(share: float) -> str:
     """Returns a difference in points with its sign, as text."""
     whole = round(100 * share)

@@ -1,6 +1,7 @@
 """The page of results: verdicts worked by hand, and a page that says what the stored runs say."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +11,20 @@ pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.report import results
-from flowrep.report.results import Claim, Contrast, claims_of, one_way, rate_table, scores
-from flowrep.report.runs import Run, drawn_paths
+from flowrep.report.results import (
+    Claim,
+    Contrast,
+    claims_of,
+    drawn_paths,
+    one_way,
+    rate_table,
+    scene_table,
+    scores,
+    studies_of,
+)
+from flowrep.report.runs import Run
 from flowrep.report.statistics import Effect
-from flowrep.report.storage import _episodes, is_archive, read_archive
+from flowrep.report.storage import episode_columns, is_archive, read_archive
 from tests.report.folders import config_of, letters, rows_of
 
 DECLARED = yaml.safe_load(results.CLAIMS.read_text(encoding="utf-8"))
@@ -27,14 +38,15 @@ def run_of(name, ends, *, scene="straight_road", stack="ego+obj", seed=0, paths=
     for condition, outcomes in ends.items():
         where = {"speed": condition} if isinstance(condition, str) else {"fps": float(condition)}
         rows += rows_of(config, outcomes, **where)
-    episodes = _episodes(list(rows[0]), [[str(c) for c in row.values()] for row in rows])
-    return Run(name, config, episodes, {})
+    return Run(name, config, episode_columns(rows), {})
 
 
-def declared(*contrasts, **changes):
+def claims(runs, *contrasts, **changes):
+    """The primary and secondary claims, one of these contrasts unless the changes say otherwise."""
     claim = {"claim": "c", "contrasts": list(contrasts), "limits": ""}
     base = {"studies": {"main": SCENES}, "scenes": [*SCENES], "primary": [claim], "secondary": []}
-    return base | changes
+    declared = base | changes
+    return claims_of(declared, studies_of(declared, runs))
 
 
 def runs_with(**successes):
@@ -66,7 +78,7 @@ HIGH = {"first": "ego+obj", "second": "raw", "success": {"high": 1}, "expect": "
 )
 def test_a_contrast_is_judged_by_its_test_and_its_direction(expect, both, raw, verdict):
     asked = HIGH | {"expect": expect}
-    (claim,) = claims_of(declared(asked), runs_with(both=both, raw=raw))["primary"]
+    (claim,), _ = claims(runs_with(both=both, raw=raw), asked)
     assert claim.verdict == verdict
     if verdict == "holds":
         assert abs(claim.contrasts[0].effect.value) == pytest.approx(0.5)
@@ -78,7 +90,7 @@ def test_a_scene_beside_the_others_is_shown_and_not_in_the_mean():
     runs += [
         run_of("st_raw", {"high": letters(8)}, scene="s_turn", stack="raw", seed=s) for s in (0, 1)
     ]
-    (claim,) = claims_of(declared(HIGH, scenes=["straight_road"]), runs)["primary"]
+    (claim,), _ = claims(runs, HIGH, scenes=["straight_road"])
     (contrast,) = claim.contrasts
     assert contrast.effect.value == pytest.approx(0.5)
     assert contrast.by_scene["s_turn"].value == pytest.approx(-3 / 16)
@@ -87,9 +99,9 @@ def test_a_scene_beside_the_others_is_shown_and_not_in_the_mean():
 def test_primary_contrasts_are_corrected_together_and_others_are_not():
     runs = runs_with(both=(6, 7), raw=(2, 3))
     claim = {"claim": "c", "contrasts": [HIGH], "limits": ""}
-    found = claims_of(declared(primary=[claim, claim], secondary=[claim]), runs)
-    first, second = (c.contrasts[0].p_value for c in found["primary"])
-    assert first == second == pytest.approx(2 * found["secondary"][0].contrasts[0].p_value)
+    primary, (other,) = claims(runs, primary=[claim, claim], secondary=[claim])
+    first, second = (c.contrasts[0].p_value for c in primary)
+    assert first == second == pytest.approx(2 * other.contrasts[0].p_value)
 
 
 @pytest.mark.parametrize(
@@ -118,7 +130,7 @@ def test_two_one_sided_tests_have_the_larger_of_their_p_values():
 
 def test_a_claim_of_several_contrasts_may_hold_in_part():
     held = Contrast(HIGH, Effect(0.5, 0.01, 5.0), {}, 3, 0.001)
-    unseen, against = held._replace(p_value=0.5), held._replace(effect=Effect(-0.5, 0.01, 5.0))
+    unseen, against = replace(held, p_value=0.5), replace(held, effect=Effect(-0.5, 0.01, 5.0))
     for contrasts, verdict in (
         ((held, unseen), "holds in part"),
         ((held, against), "holds in part"),
@@ -159,16 +171,27 @@ def test_a_run_finds_a_way_by_half_of_its_episodes():
         run_of("t_all", {"normal": "s" * 8}, paths=2),
         run_of("t_none", {"normal": "c" * 8}, paths=2),
     ]
-    forked = {"studies": {"main": {"straight_road": "t_*"}}, "forks": ["straight_road"]}
-    assert one_way(forked, runs) == (1, 1)
-    (block,) = results.scene_tables(forked, runs)
-    assert "1 of 3" in block["table"]
+    assert one_way(runs) == (1, 1)
+    assert "1 of 3" in scene_table(runs, is_fork=True)
 
 
 def test_frame_rates_are_compared_on_the_same_episodes():
     # at 12 Hz four more episodes were driven, all failures
     table = rate_table([run_of("a", {12: "sssscccc", 6: "sscc"})])
     assert "|50|100|−50|0.50|1|" in table
+
+
+def test_an_episodes_path_is_the_one_that_it_draws():
+    from flowrep.envs.episode import Episode, Rules
+    from flowrep.scenes import load_scene
+    from flowrep.scenes.layout import Layout
+
+    scene = load_scene("h_shaped_pathways")
+    rules = Rules(Layout(scene), 12.0, 2)
+    driven = [Episode(rules, seed, (1.2, 1.8), 10.0).path for seed in range(8)]
+    drawn = drawn_paths(np.arange(8), len(scene.paths))
+    assert [scene.paths[place] for place in drawn] == driven
+    assert len(set(drawn.tolist())) > 1
 
 
 def test_the_primary_contrasts_are_those_of_the_protocol():

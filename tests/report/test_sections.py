@@ -22,7 +22,7 @@ NORMAL = Condition("greedy", "normal", 12.0)
 def sections_of(folder):
     runs, warnings = read_runs([folder])
     report = assemble(runs, warnings, ASK)
-    found = {section.name: section for section in report.sections}
+    found = {section.folder: section for section in report.sections}
     return found, report
 
 
@@ -47,7 +47,7 @@ def test_an_episode_has_one_column_and_two_cells_share_those_that_all_their_runs
     flows, seg = (
         outcomes_of([r for r in runs if r.stack == s], NORMAL) for s in ("ego+obj", "seg2")
     )
-    assert (flows.seeds, flows.counts) == ((0, 1), "2 × 4")
+    assert flows.counts == "2 × 4"
     assert flows.episodes.tolist() == [100, 101, 102, 103, 104, 105]
     nan = math.nan
     np.testing.assert_array_equal(flows.outcomes, [[0, 1, 1, 0, nan, nan], [nan, nan, 0, 0, 1, 1]])
@@ -142,9 +142,9 @@ def test_a_run_that_drove_other_episodes_in_each_condition_is_no_part_of_a_chang
     rows = later(rows_of(config, "ss", speed="low"), 50) + rows_of(config, "ss")
     write_run(tmp_path / "b", config, rows)
     runs, _ = read_runs([tmp_path])
-    low, normal = outcomes_of(runs, Condition("greedy", "low", 12.0)), outcomes_of(runs, NORMAL)
-    np.testing.assert_array_equal(change(low, normal), [[-1, -1]])
-    assert change(outcomes_of(runs[1:], Condition("greedy", "low", 12.0)), normal) is None
+    low = Condition("greedy", "low", 12.0)
+    np.testing.assert_array_equal(change(runs, low, NORMAL), [[-1, -1]])
+    assert change(runs[1:], low, NORMAL) is None
 
 
 def test_configs_that_differ_are_shown_side_by_side_and_never_pooled(tmp_path):

@@ -8,10 +8,8 @@ import pytest
 import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
-pytest.importorskip("shapely", reason="a path is the first draw of an episode")
 
 from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolderError
-from flowrep.report.runs import drawn_paths
 from flowrep.report.storage import (
     EPISODES,
     read_run,
@@ -124,17 +122,3 @@ def test_packed_runs_are_chosen_by_name(tmp_path):
     assert [run.name for run in runs] == ["ab", "ac"]
     with pytest.raises(RunFolderError):
         read_runs([tmp_path / "p" / "z*"])
-
-
-def test_an_episodes_path_is_the_one_that_it_draws(tmp_path):
-    from flowrep.envs.episode import Episode, Rules
-    from flowrep.scenes import load_scene
-    from flowrep.scenes.layout import Layout
-
-    scene = load_scene("h_shaped_pathways")
-    rules = Rules(Layout(scene), 12.0, 2)
-    driven = [Episode(rules, seed, (1.2, 1.8), 10.0).path for seed in range(8)]
-    drawn = drawn_paths(np.arange(8), len(scene.paths))
-    assert [scene.paths[place] for place in drawn] == driven
-    assert len(set(drawn.tolist())) > 1
-    assert drawn_paths(np.arange(3), 1).tolist() == [0, 0, 0]
