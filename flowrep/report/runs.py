@@ -190,9 +190,6 @@ def _can_have(run: Run, key: str) -> bool:
     return place != "scene" or part in (*_OF_EVERY_SCENE, run.scene)
 
 
-# What episodes came to.
-
-
 def success(outcomes: NDArray[Any]) -> Array:
     """Returns 1 for each success, else 0."""
     return (outcomes == "success").astype(float)
@@ -289,10 +286,9 @@ class Cell(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Success in one scene by (series, condition); a place without runs has no cell.
+    """Success in one scene by series and condition; a place without runs has no cell.
 
-    `series` are the compared stacks in the figure's order, or stacks of groups; `conditions` are
-    groups of bars, or points of a line; baselines go by their name and condition.
+    A series is a stack, or a stack of one config. Baselines go by their name and condition.
     """
 
     scene: str

@@ -26,11 +26,10 @@ from flowrep.tables import TableError
 
 RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
 _MACHINE = ("commit", "precision", "cpu")
-_NUMBERS = {"frames": int, "fps": float, "episode_seed": int, "length": int}
-EPISODE_COLUMNS = (
-    "scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed",
-    "outcome", "hit", "length",
-)  # fmt: skip
+_EPISODES: dict[str, type] = {
+    "scene": str, "scene_id": str, "frames": int, "evaluation": str, "policy": str, "speed": str,
+    "fps": float, "episode_seed": int, "outcome": str, "hit": str, "length": int,
+}  # fmt: skip
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
@@ -81,10 +80,8 @@ def read_run(path: Path) -> Run:
         columns = episode_columns(episodes), _metric_columns(metrics)
         return Run(str(path), config, *columns, path, _machine(path / "machine.json"))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RunFolderError(
-            f"{path}: config.yaml or a table is not what a run leaves ({error!r}); restore the "
-            "file that the run wrote"
-        ) from None
+        what = f"config.yaml or a table is not what a run leaves ({error!r})"
+        raise RunFolderError(f"{path}: {what}; restore the file that the run wrote") from None
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
@@ -94,19 +91,14 @@ def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     for run in sorted(runs, key=lambda run: (-int(run.tested.sum()), -run.frames)):
         best = kept.setdefault((run.stack, run.seed, *sorted(run.settings.items())), run)
         if run is not best:
-            warnings.append(
-                f"{run.name} is the same run as {best.name}, config and seed: left out, it would "
-                "count as another seed"
-            )
+            same = f"{run.name} is the same run as {best.name}, config and seed"
+            warnings.append(f"{same}: left out, it would count as another seed")
     return [run for run in runs if run in kept.values()], warnings
 
 
 def episode_columns(rows: Rows) -> Columns:
     """Returns the columns of evaluation.csv that a report reads, "" in those that it lacks."""
-    return {
-        name: np.array([row.get(name, "") for row in rows], dtype=_NUMBERS.get(name, str))
-        for name in EPISODE_COLUMNS
-    }
+    return {n: np.array([row.get(n, "") for row in rows], kind) for n, kind in _EPISODES.items()}
 
 
 def _metric_columns(rows: Rows) -> Columns:
@@ -153,7 +145,7 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
     before = read_archive(folder) if is_archive(folder) else []
     kept = dict(sorted({Path(run.name).name: run for run in (*before, *runs)}.items()))
     logged = list(dict.fromkeys(name for run in kept.values() for name in run.metrics))
-    _write(folder / EPISODES, EPISODE_COLUMNS, {name: run.episodes for name, run in kept.items()})
+    _write(folder / EPISODES, [*_EPISODES], {name: run.episodes for name, run in kept.items()})
     _write(folder / TRAINING, logged, {name: run.metrics for name, run in kept.items()})
     lines = []
     for name, run in kept.items():

@@ -22,10 +22,10 @@ class Table(NamedTuple):
 
     Args:
         name: the name of its files.
-        caption: describes the numbers; shown with the table everywhere.
+        caption: describes the numbers.
         header: the columns' names; the first column is aligned left, the others right.
-        blocks: (heading, rows) of one or several groups of rows; a heading may be empty.
-        words: indices of further text columns, aligned left as well.
+        blocks: (heading, rows) of groups of rows; a heading may be empty.
+        words: indices of further columns that are aligned left.
     """
 
     name: str

@@ -48,11 +48,6 @@ def test_scenes_are_strata():
     assert found == pytest.approx((0.5, 0.339, 0.661), abs=0.001)
 
 
-def test_the_run_that_ended_in_another_way_counts():
-    # Three of 0.5 and one of 1: 0.625; the interquartile mean, of the middle two, would be 0.5.
-    assert Bootstrap(100).success([runs(5, 5, 5, 10)]).value == 0.625
-
-
 @pytest.mark.parametrize(
     ("successes", "expected"),
     [
@@ -107,18 +102,11 @@ def test_a_difference_on_the_same_episodes_is_free_of_what_they_have_in_common()
     assert found.verdict() == "can't be told from noise"
 
 
-def test_the_difference_is_first_minus_second():
-    found = Bootstrap(500).compare([(runs(9, 9, 9), runs(1, 1, 1))])
-    assert found.difference.value == pytest.approx(0.8)
-    assert found.improvement.value == found.improvement.high == 1.0
-    assert found.verdict() == "higher"
-    assert Bootstrap(500).compare([(runs(1, 1, 1), runs(9, 9, 9))]).verdict() == "lower"
-
-
 def test_improvement_is_the_share_of_pairs_in_which_the_first_is_higher():
     # 3 beats 1 and 2; 2 beats 1 and ties with 2; of four pairs 3.5
     found = Bootstrap(500).compare([(runs(3, 2), runs(1, 2))])
     assert found.improvement.value == 3.5 / 4
+    assert Bootstrap(500).compare([(runs(1, 1, 1), runs(9, 9, 9))]).verdict() == "lower"
 
 
 def test_welchs_test_is_the_textbooks():
