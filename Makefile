@@ -13,7 +13,7 @@ INSTALLED := $(ENV)/.installed
 DEVELOPED := $(ENV)/.developed
 
 .DEFAULT_GOAL := help
-.PHONY: help install develop train evaluate view results gallery test test-fast test-python schema lint types format bench bench-gpu smoke docs wheel clean check-python
+.PHONY: help install develop demo train evaluate view results gallery test test-fast test-python schema lint types format bench bench-gpu smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -46,6 +46,9 @@ evaluate: $(INSTALLED)  ## Evaluate a run: make evaluate ARGS="run=outputs/..."
 
 smoke: $(INSTALLED)  ## A whole run in seconds
 	$(BIN)/python -m flowrep.train debug=smoke $(ARGS)
+
+demo: $(INSTALLED)  ## A trained agent drives 20 episodes, the first as a film: make demo ARGS="scene=s_turn"
+	$(BIN)/python -m flowrep.view policy=pretrained episodes=20 $(ARGS)
 
 view: $(INSTALLED)  ## Look at a scene: make view ARGS="scene=s_turn"
 	$(BIN)/python -m flowrep.view $(ARGS)

@@ -12,6 +12,7 @@ from flowrep.extras import require
 
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
+from flowrep import pretrained
 from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, print_error, run_command
@@ -102,15 +103,20 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
-        load = partial(
-            load_external,
-            name,
-            scene=config.scene or {},
-            representations=config.representations or {},
-            flow=None if config.flow is None else config.flow.plain(),
-            motion=config.motion,
-            noise=None if config.noise is None else config.noise.plain(),
-            **machine,
+        load = partial(pretrained.load, config.scene or {}, **machine)
+        load = (
+            load
+            if name == "pretrained"
+            else partial(
+                load_external,
+                name,
+                scene=config.scene or {},
+                representations=config.representations or {},
+                flow=None if config.flow is None else config.flow.plain(),
+                motion=config.motion,
+                noise=None if config.noise is None else config.noise.plain(),
+                **machine,
+            )
         )
         targets.append(Target(RunFolder(folder), load, [name]))
     return targets

@@ -21,6 +21,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
+from flowrep import pretrained
 from flowrep.baselines import BASELINES, BaselinePolicy
 from flowrep.config import UsageError
 from flowrep.config.cli import run_command
@@ -73,7 +74,9 @@ def driver_of(config: ViewConfig, is_scene_given: bool) -> Driver:
     if name in BASELINES:
         return Driver(partial(make_env, config.scene, **rates), {}, partial(BaselinePolicy, name))
     machine: dict[str, Any] = {"device": "cpu", "num_envs": 1, "num_workers": 0}
-    if Path(name).is_dir():
+    if name == "pretrained":
+        agent = pretrained.load(config.scene, **machine)
+    elif Path(name).is_dir():
         scene = config.scene if is_scene_given else None
         agent = load_trained(RunFolder.existing(name), scene=scene, **machine)
     elif ":" in name or name.endswith(".pt2"):
@@ -84,8 +87,8 @@ def driver_of(config: ViewConfig, is_scene_given: bool) -> Driver:
         )
     else:
         raise UsageError(
-            f"policy={name}: give {', '.join(BASELINES)}, a run's folder, path.py:make, "
-            "package.module:make or path.pt2"
+            f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
+            "path.py:make, package.module:make or path.pt2"
         )
     return Driver(
         partial(agent.make_env, **rates), agent.config.representations, lambda env: agent.policy
@@ -143,6 +146,8 @@ def view(
         for row in rows:
             table.add_row(*map(str, row.values()))
         Console().print(table)
+    arrived = sum(each.outcome == "success" for each in episodes)
+    print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
     print(f"{folder}: {', '.join(written)}")
 
 

@@ -28,6 +28,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "tables": set(),
     "viz": {"viz", "scenes", "geometry", "palette"},
     "load_agent": set(),
+    "pretrained": {"experiment", "agent", "config"},
     "sequences": {"sequences", "progress", "extras", "transforms", "geometry", "viz"},
     "sweep": {"config", "progress", "tables"},
     "config": {"config"},

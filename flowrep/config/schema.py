@@ -449,10 +449,10 @@ class EvaluateConfig(Section):
         check_workers(self.num_workers, self.num_envs)
         own = self.own_policies
         for name in own:
-            if ":" not in name and not name.endswith(".pt2"):
+            if ":" not in name and not name.endswith(".pt2") and name != "pretrained":
                 raise ValueError(
-                    f"policy={name}: should be greedy, sampled, path.py:make, package.module:make "
-                    "or path.pt2"
+                    f"policy={name}: should be greedy, sampled, pretrained, path.py:make, "
+                    "package.module:make or path.pt2"
                 )
         if own and len(own) < len(self.policy):
             raise ValueError("policy: greedy and sampled are a run's; evaluate your own apart")
@@ -461,7 +461,7 @@ class EvaluateConfig(Section):
         if not own and self.run is None:
             raise ValueError("run needs a value: run=<a run's or a sweep's folder>")
         needed = ("scene", "representations") if own else ()
-        for key in needed:
+        for key in needed[:1] if own == ["pretrained"] else needed:
             if getattr(self, key) is None:
                 raise ValueError(f"{key} needs a value for policy={own[0]}")
         for key in () if own else ("representations", "flow", "motion", "noise", "output"):

@@ -22,7 +22,7 @@ from torchrl.data import Categorical, Composite, TensorSpec
 from torchrl.envs import EnvBase
 
 from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.config.schema import EnvConfig, Noise, validated, validated_run
+from flowrep.config.schema import EnvConfig, Noise, TrainConfig, validated, validated_run
 from flowrep.envs import street_envs
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import Policy
@@ -75,6 +75,33 @@ def load_trained(
     path = run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(own.plain()), path)
+    return with_weights(
+        own, state["policy"], state["frames"], f"the agent of {run.path}", scene=scene, **machine
+    )
+
+
+def with_weights(
+    own: TrainConfig,
+    weights: Mapping[str, Tensor],
+    frames: int,
+    name: str,
+    *,
+    scene: Mapping[str, Any] | None = None,
+    **machine: Any,
+) -> Agent:
+    """Returns the agent of a run's config with the given weights.
+
+    Args:
+        own: the run's config.
+        weights: the policy's state.
+        frames: the frames that it was trained for.
+        name: for messages, "the agent of ...".
+        scene: see `load_trained`.
+        machine: see `load_trained`.
+
+    Raises:
+        CheckpointError: the agent can't see all classes of the scene.
+    """
     if scene is not None:
         machine["scene"] = {**scene, "camera": own.scene["camera"]}
     config = own.model_copy(update=machine)
@@ -82,14 +109,14 @@ def load_trained(
     policy = build.policy(config, env)
     env.close()
     try:
-        policy.load_state_dict(state["policy"])
+        policy.load_state_dict(weights)
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise CheckpointError(
-            f"the agent of {run.path} can't be used in scene '{config.scene['name']}', which has "
-            f"other classes than its own ({reason})"
+            f"{name} can't be used in scene '{config.scene['name']}', which has other classes "
+            f"than its own ({reason})"
         ) from error
-    return Agent(policy, config, state["frames"], own.scene["name"])
+    return Agent(policy, config, frames, own.scene["name"])
 
 
 def load_external(
