@@ -20,7 +20,6 @@ from flowrep.sequences.calibration import opencv_intrinsics
 from flowrep.sequences.frames import measured
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output, OutputOptions
-from flowrep.sequences.recording import check_frame
 from flowrep.transforms import DIS
 
 
@@ -71,7 +70,7 @@ class ZedLive:
         runtime, picture, depth, pose = sl.RuntimeParameters(), sl.Mat(), sl.Mat(), sl.Pose()
         left = camera.get_camera_information().camera_configuration.calibration_parameters.left_cam
         K = opencv_intrinsics([left.fx, left.fy, left.cx, left.cy])
-        number, lost = 0, True
+        number, clip = 0, 0
         while True:
             error = camera.grab(runtime)
             if error == sl.ERROR_CODE.END_OF_SVOFILE_REACHED:
@@ -79,11 +78,11 @@ class ZedLive:
             self._check(error, "stopped giving pictures")
             state = camera.get_position(pose, sl.REFERENCE_FRAME.WORLD)
             if state != sl.POSITIONAL_TRACKING_STATE.OK:
-                lost = True
+                clip += 1
                 continue
             camera.retrieve_image(picture, sl.VIEW.LEFT)
             camera.retrieve_measure(depth, sl.MEASURE.DEPTH)
-            frame = Frame(
+            yield Frame(
                 name=f"{number:06d}",
                 source=self.source,
                 world_from_cam=np.array(pose.pose_data(sl.Transform()).m, dtype=np.float64),
@@ -93,11 +92,9 @@ class ZedLive:
                     np.uint8, copy=False
                 ),
                 timestamp_s=camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds() / 1e9,
-                starts_clip=lost,
+                clip=clip,
             )
-            check_frame(frame)
-            yield frame
-            number, lost = number + 1, False
+            number += 1
 
     def _check(self, error: Any, what: str) -> None:
         if error != self._sl.ERROR_CODE.SUCCESS:

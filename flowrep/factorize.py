@@ -26,7 +26,7 @@ from flowrep.sequences import (
     recorded_motion,
 )
 from flowrep.sequences.factorization import FlowSource, MotionSource
-from flowrep.sequences.job import Job, Selection
+from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output, OutputOptions
 
 MISTAKES = (SequenceError, ValueError, ImportError, OSError)
@@ -65,8 +65,8 @@ def factorize_recording(config: FactorizeConfig) -> int:
         rerun=config.rerun,
     )
     output = Output(config.output, options, config.plain())
-    frames = Selection(config.start, config.stop, config.stride)
-    job = Job(stream, flow_source, motion_source, output, frames)
+    start, stop, stride = config.start, config.stop, config.stride
+    job = Job(stream, flow_source, motion_source, output, start=start, stop=stop, stride=stride)
     with closing(output):
         diagnosis = job.examine()
         if diagnosis is not None:
@@ -75,7 +75,8 @@ def factorize_recording(config: FactorizeConfig) -> int:
             print(f"stopped after {len(output.rows)} frames, which are in {output.partial}")
             return 130
     if not output.rows:
-        raise SequenceError(config.input, f"no two of {frames} follow each other in one clip")
+        used = f"start={start} stop={stop} stride={stride}"
+        raise SequenceError(config.input, f"no two frames of {used} follow each other in a clip")
     output.finish(job.summary(diagnosis))
     print(f"{len(output.rows)} frames in {output.path}; time: {job.clock.summary()}")
     return 0

@@ -26,8 +26,6 @@ from flowrep.sequences.tum import Tum
 from flowrep.sequences.video import StillVideo
 
 __all__ = [
-    "RECORDINGS",
-    "STREAMS",
     "Diagnosis",
     "Doctor",
     "EstimatedFlowSource",
@@ -58,10 +56,3 @@ __all__ = [
     "write_flo",
     "write_kitti_flow",
 ]
-
-# By the names of conf/format/.
-RECORDINGS: dict[str, type[Recording]] = {
-    reader.__name__.lower(): reader
-    for reader in (Frames, Kitti, SevenScenes, Sintel, TartanAir, Tum, VKitti2, Zed)
-}
-STREAMS = {"video": StillVideo}

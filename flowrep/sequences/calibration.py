@@ -1,4 +1,4 @@
-"""Cameras of recordings: intrinsics, poses and their times, registration of depth to colour."""
+"""Cameras of recordings: intrinsics, poses, registration of depth to colour."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from flowrep.geometry import CameraAxes, PoseDirection, PoseLayout, adapt_pose
-from flowrep.sequences.files import read_bytes, read_table
+from flowrep.sequences.files import read_table
 from flowrep.sequences.recording import Pose, SequenceError
 
 
@@ -39,9 +39,9 @@ class Camera(BaseModel):
     @field_validator("first_pixel_centre")
     @classmethod
     def _is_corner_or_centre(cls, place: float) -> float:
-        if place not in (0.0, 0.5):
-            raise ValueError(f"is 0 (as OpenCV calibrates) or 0.5, not {place}")
-        return place
+        if place in (0.0, 0.5):
+            return place
+        raise ValueError("is 0 (as OpenCV calibrates) or 0.5")
 
     @field_validator("fy")
     @classmethod
@@ -86,13 +86,12 @@ def read_cameras(path: Path) -> Cameras:
         'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
         '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5}'
     )
+    if not path.is_file():
+        raise SequenceError(path, f"no such file; {remedy}")
     try:
-        return Cameras.model_validate_json(read_bytes(path, remedy))
+        return Cameras.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        lines = [
-            f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip()
-            for e in error.errors(include_url=False, include_input=False)
-        ]
+        lines = [f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors()]
         raise SequenceError(path, f"{', '.join(lines)}; {remedy}") from None
 
 
@@ -111,12 +110,10 @@ def opencv_intrinsics(numbers: Sequence[float]) -> NDArray[np.float64]:
     return intrinsics(fx, fy, cx + 0.5, cy + 0.5)
 
 
-def four_intrinsics(name: str, numbers: Sequence[float]) -> tuple[float, float, float, float]:
-    """Returns fx, fy, cx, cy of an option; the error for anything else names the option."""
-    if len(numbers) != 4 or not np.isfinite(numbers).all() or min(numbers[:2]) <= 0:
-        raise SequenceError(name, f"should be [fx, fy, cx, cy] in pixels, not {list(numbers)}")
-    fx, fy, cx, cy = numbers
-    return fx, fy, cx, cy
+def check_numbers(option: str, numbers: Sequence[float], meaning: str) -> None:
+    """Raises SequenceError if an option has not as many numbers as its meaning, "x, y, z"."""
+    if len(numbers) != len(meaning.split(", ")):
+        raise SequenceError(option, f"should be [{meaning}], not {list(numbers)}")
 
 
 def as_pose(
@@ -128,40 +125,26 @@ def as_pose(
     axes: CameraAxes = "opencv",
 ) -> Pose:
     """Returns `world_from_cam` from the 7, 12 or 16 numbers of one pose."""
-    values = torch.from_numpy(np.array(numbers, dtype=np.float64).reshape(-1))
-    if layout == "matrix":
-        last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-        values = torch.cat([values, last_row])[:16].reshape(4, 4)
+    values: NDArray[np.float64] = np.array(numbers, dtype=np.float64).ravel()
     try:
-        pose = adapt_pose(values, layout=layout, direction=direction, axes=axes)
+        if layout == "matrix":
+            values = np.append(values, [0.0, 0.0, 0.0, 1.0])[:16].reshape(4, 4)
+        pose = torch.from_numpy(values)
+        return adapt_pose(pose, layout=layout, direction=direction, axes=axes).numpy()
     except ValueError as error:
         raise SequenceError(source, str(error)) from None
-    return pose.numpy()
 
 
-def read_pose_lines(path: Path, layout: PoseLayout) -> NDArray[np.float64]:
-    """Returns the numbers of one pose per line, `[N, 7]`, `[N, 12]` or `[N, 16]`."""
+def read_pose_lines(path: Path, layout: PoseLayout, frames: int) -> NDArray[np.float64]:
+    """Returns the numbers of one pose per line and frame, `[N, 7]`, `[N, 12]` or `[N, 16]`."""
+    columns, remedies = [7], dict.fromkeys((12, 16), "matrices are format.pose_layout=matrix")
     if layout == "matrix":
         quaternions = "a position and a quaternion are format.pose_layout=xyz_xyzw (or xyz_wxyz)"
-        return read_table(path, [12, 16], remedies={7: quaternions})
-    matrices = "matrices are format.pose_layout=matrix"
-    return read_table(path, [7], remedies={12: matrices, 16: matrices})
-
-
-def check_count(path: Path, count: int, frames: int, what: str) -> None:
-    """Raises SequenceError if a file does not have a line for each frame."""
-    if count != frames:
-        raise SequenceError(path, f"has {count} {what} for {frames} frames")
-
-
-def check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
-    """Raises SequenceError if a time is not a number, or earlier than the one before it."""
-    if not np.isfinite(times_s).all():
-        raise SequenceError(path, "holds a timestamp that is not a number")
-    backwards = np.flatnonzero(np.diff(times_s) < 0)
-    if len(backwards):
-        before, after = times_s[backwards[0]], times_s[backwards[0] + 1]
-        raise SequenceError(path, f"timestamps go backwards: {after:.6f} follows {before:.6f}")
+        columns, remedies = [12, 16], {7: quaternions}
+    poses = read_table(path, columns, remedies=remedies)
+    if len(poses) != frames:
+        raise SequenceError(path, f"has {len(poses)} poses for {frames} frames")
+    return poses
 
 
 _LARGEST_FOOTPRINT_PX = 8

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple, get_args
 
 import cv2
@@ -55,62 +56,74 @@ _ASSUMED = {
 }
 
 
+class _Pair(NamedTuple):
+    """What is kept of a pair of frames: maps on a coarse grid, and the motions."""
+
+    raw: Tensor
+    depth: Tensor
+    K: Tensor
+    known: Tensor
+    step: int  # coarse pixels are this many fine ones
+    poses: tuple[Tensor, Tensor]
+    estimated: Tensor | None = None  # prev_from_curr
+
+
 @dataclass(frozen=True)
 class Mistake:
     """What the data may be instead, completing "if ...", and what makes correct data of them."""
 
     says: str
-    pose: Callable[[Tensor], Tensor] | None = None
-    reverses: bool = False  # the poses of a pair belong to each other's frames
-    depth: Callable[[Tensor, Tensor], Tensor] | None = None
-    flow: Callable[[Tensor], Tensor] | None = None
-    K: Callable[[Tensor], Tensor] | None = None
+    correct: Callable[[_Pair], _Pair]
 
 
 def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict[str, Mistake]:
     """Returns the usual mistakes by what would correct them, see `Doctor` for the arguments."""
     given = {**_ASSUMED, **given}
     found: dict[str, Mistake] = {}
-
-    def suppose(options: Mapping[str, tuple[str, str]], **corrections: Any) -> None:
-        """Adds what changes of the options, each a value and what it says, would correct."""
-        changed = {key: it for key, it in options.items() if it[0] != given[key]}
-        if changed:
-            name = " ".join(f"{key}={value}" for key, (value, _) in changed.items())
-            found[name] = Mistake(" and ".join(says for _, says in changed.values()), **corrections)
-
-    for direction in get_args(PoseDirection):
-        for axes in get_args(CameraAxes):
-            options = {
-                "pose_direction": (direction, f"the poses are {direction.replace('_', '-')}"),
-                "pose_axes": (axes, f"the camera's axes are {axes}"),
-            }
-            suppose(options, pose=_readapted(given, direction, axes))
-    if given["depth_kind"] != "z_buffer":
-        says = "depth is the length of the ray, not z"
-        suppose({"depth_kind": ("ray_length", says)}, depth=z_from_ray_length)
-        says = "depth is z, not the length of the ray"
-        suppose({"depth_kind": ("z", says)}, depth=_ray_from_z)
+    for direction, axes in product(get_args(PoseDirection), get_args(CameraAxes)):
+        says = {}
+        if direction != given["pose_direction"]:
+            says[f"pose_direction={direction}"] = f"the poses are {direction.replace('_', '-')}"
+        if axes != given["pose_axes"]:
+            says[f"pose_axes={axes}"] = f"the camera's axes are {axes}"
+        if says:
+            correct = _of_poses(_readapted(given, direction, axes))
+            found[" ".join(says)] = Mistake(" and ".join(says.values()), correct)
+    if given["depth_kind"] == "z":
+        found["depth_kind=ray_length"] = Mistake(
+            "depth is the length of the ray, not z",
+            lambda pair: pair._replace(depth=z_from_ray_length(pair.depth, pair.K)),
+        )
+    elif given["depth_kind"] == "ray_length":
+        found["depth_kind=z"] = Mistake("depth is z, not the length of the ray", _ray_from_z)
     if flow_is_recorded:
-        for direction, points in (("backward", "back to"), ("forward", "away from")):
-            says = f"the flow points {points} the previous frame"
-            suppose({"flow_direction": (direction, says)}, flow=lambda raw: -raw)
-        for channels in ("row_column", "uv"):
-            says = f"the flow's channels are {channels}"
-            suppose({"flow_channels": (channels, says)}, flow=lambda raw: raw.flip(0))
+        to = {"backward": "away from", "forward": "back to"}[given["flow_direction"]]
+        other = "forward" if given["flow_direction"] == "backward" else "backward"
+        found[f"flow_direction={other}"] = Mistake(
+            f"the flow points {to} the previous frame", lambda pair: pair._replace(raw=-pair.raw)
+        )
+        other = "row_column" if given["flow_channels"] == "uv" else "uv"
+        found[f"flow_channels={other}"] = Mistake(
+            f"the flow's channels are {other}", lambda pair: pair._replace(raw=pair.raw.flip(0))
+        )
     else:
         found["frames in reverse order"] = Mistake(
-            "the poses are in the reverse order of the pictures", reverses=True
+            "the poses are in the reverse order of the pictures",
+            lambda pair: pair._replace(poses=pair.poses[::-1]),
         )
     found["rotations transposed"] = Mistake(
-        "the rotations are stored column by column, or inverted", _transposed
+        "the rotations are stored column by column, or inverted", _of_poses(_transposed)
     )
     for factor, size in ((2.0, "twice"), (0.5, "half")):
         found[f"intrinsics times {factor:g}"] = Mistake(
             f"the pictures are {size} as large as those that the intrinsics belong to",
-            K=partial(_scaled, factor),
+            partial(_scaled, factor),
         )
     return found
+
+
+def _of_poses(change: Callable[[Tensor], Tensor]) -> Callable[[_Pair], _Pair]:
+    return lambda pair: pair._replace(poses=(change(pair.poses[0]), change(pair.poses[1])))
 
 
 def _readapted(given: Mapping[str, str], direction: str, axes: Any) -> Callable[[Tensor], Tensor]:
@@ -132,18 +145,18 @@ def _transposed(pose: Tensor) -> Tensor:
     return turned
 
 
-def _ray_from_z(depth: Tensor, K: Tensor) -> Tensor:
-    ray = depth.square() / z_from_ray_length(depth, K)
-    return torch.where(depth.isinf(), depth, ray)  # the sky stays at infinity
+def _ray_from_z(pair: _Pair) -> _Pair:
+    ray = pair.depth.square() / z_from_ray_length(pair.depth, pair.K)
+    return pair._replace(depth=torch.where(pair.depth.isinf(), pair.depth, ray))  # sky stays there
 
 
-def _scaled(factor: float, K: Tensor) -> Tensor:
-    return K * torch.tensor([[factor], [factor], [1.0]], dtype=K.dtype)
+def _scaled(factor: float, pair: _Pair) -> _Pair:
+    return pair._replace(K=pair.K * torch.tensor([[factor], [factor], [1.0]]))
 
 
-def _times(*factors: float) -> Callable[[Tensor, Tensor], Tensor]:
-    """Returns depths `[factors, 1, H, W]`."""
-    return lambda depth, K: torch.tensor(factors)[:, None, None, None] * depth
+def _times(*factors: float) -> Callable[[_Pair], _Pair]:
+    """Makes depths `[factors, 1, H, W]`."""
+    return lambda pair: pair._replace(depth=torch.tensor(factors)[:, None, None, None] * pair.depth)
 
 
 @dataclass(frozen=True)
@@ -172,18 +185,6 @@ class Diagnosis:
     words: str = "conventions could not be checked: hardly anything moves"
 
 
-class _Pair(NamedTuple):
-    """What is kept of a pair of frames: maps on a coarse grid, and the motions."""
-
-    raw: Tensor
-    depth: Tensor
-    K: Tensor
-    known: Tensor
-    step: int  # coarse pixels are this many fine ones
-    poses: tuple[Tensor, Tensor]
-    estimated: Tensor | None  # prev_from_curr
-
-
 @dataclass
 class Doctor:
     """Examines pairs of frames, one after the other, and gives a diagnosis.
@@ -208,11 +209,6 @@ class Doctor:
     flow_is_recorded: bool = True
     _pairs: list[_Pair] = field(default_factory=list)
 
-    @property
-    def pairs(self) -> int:
-        """The number of pairs that moved enough to be examined."""
-        return len(self._pairs)
-
     @torch.no_grad()
     def look(
         self,
@@ -224,8 +220,8 @@ class Doctor:
         *,
         picture: Tensor | None = None,
         static: Tensor | None = None,
-    ) -> None:
-        """Examines a pair of frames, unless hardly anything moves in it.
+    ) -> bool:
+        """Examines a pair of frames; returns whether it moves enough to be of use.
 
         Args:
             raw: `[2, H, W]`, pixels per step, assumed p_t - p_t' on the current grid; nan unknown.
@@ -238,13 +234,13 @@ class Doctor:
                 has to be.
         """
         raw = raw if static is None else torch.where(static, raw, torch.nan)
-        coarse = _sampled(raw, depth, K)
-        poses = world_from_prev.double(), world_from_curr.double()
-        pair = _Pair(*coarse, poses, estimated=None)
-        if float(_median_px(pair.raw, pair)) >= _LEAST_RAW_PX:
-            motion = estimate_motion(raw, depth, K, picture=picture)
-            estimated = torch.from_numpy(motion.prev_from_curr) if motion.known else None
-            self._pairs.append(pair._replace(estimated=estimated))
+        pair = _sampled(raw, depth, K, (world_from_prev.double(), world_from_curr.double()))
+        if not float(_median_px(pair.raw, pair)) >= _LEAST_RAW_PX:  # or nan
+            return False
+        motion = estimate_motion(raw, depth, K, picture=picture)
+        estimated = torch.from_numpy(motion.prev_from_curr) if motion.known else None
+        self._pairs.append(pair._replace(estimated=estimated))
+        return True
 
     @torch.no_grad()
     def diagnosis(self) -> Diagnosis:
@@ -259,20 +255,17 @@ class Doctor:
             if "depth_unit_m" in self.conventions:
                 correction = f"depth_unit_m={best * float(self.conventions['depth_unit_m']):g}"
             says = f"depth in metres is {best:g} times as large"
-            rivals[correction] = Mistake(says, depth=_times(best))
-        kept = self._pairs
+            rivals[correction] = Mistake(says, _times(best))
+        kept, start = self._pairs, torch.eye(4, dtype=torch.float64)
+        moved = [p._replace(poses=(start, p.estimated)) for p in kept if p.estimated is not None]
         found = Diagnosis(
-            pairs=self.pairs,
+            pairs=len(kept),
             raw_px=_mean(_median_px(pair.raw, pair) for pair in kept),
-            residual_px=_mean(_residual_px(pair) for pair in kept),
-            estimated_px=_mean(
-                _residual_px(pair, motion=pair.estimated)
-                for pair in kept
-                if pair.estimated is not None
-            ),
+            residual_px=_mean(map(_residual_px, kept)),
+            estimated_px=_mean(map(_residual_px, moved)),
             depth_factors=(least, most),
             rivals_px={
-                name: _mean(_residual_px(pair, mistake) for pair in kept)
+                name: _mean(_residual_px(mistake.correct(pair)) for pair in kept)
                 for name, mistake in rivals.items()
             },
         )
@@ -283,8 +276,8 @@ class Doctor:
         """Returns the factor of depth that explains the flow best, and the range of good ones."""
 
         def left_px(powers: NDArray[np.float64]) -> NDArray[np.float64]:
-            factors = Mistake("", depth=_times(*(10**powers).tolist()))
-            left = torch.stack([_residual_px(pair, factors) for pair in self._pairs])
+            multiply = _times(*(10**powers).tolist())
+            left = torch.stack([_residual_px(multiply(pair)) for pair in self._pairs])
             return left.mean(0).numpy()
 
         coarse = left_px(_POWERS)
@@ -312,21 +305,11 @@ def diagnose(
     return doctor.diagnosis()
 
 
-def _residual_px(
-    pair: _Pair, mistake: Mistake | None = None, motion: Tensor | None = None
-) -> Tensor:
+def _residual_px(pair: _Pair) -> Tensor:
     """Returns the median of |raw - ego|, `[*B]` for depths `[*B, 1, H, W]`."""
-    poses, depth, flow, K = pair.poses, pair.depth, pair.raw, pair.K
-    if mistake is not None:
-        poses = poses[::-1] if mistake.reverses else poses
-        poses = (mistake.pose(poses[0]), mistake.pose(poses[1])) if mistake.pose else poses
-        K = mistake.K(K) if mistake.K else K
-        depth = mistake.depth(depth, K) if mistake.depth else depth
-        flow = mistake.flow(flow) if mistake.flow else flow
-    motion = relative_motion(*poses) if motion is None else motion.float()
-    ego, valid = ego_flow(depth, K, motion)
+    ego, valid = ego_flow(pair.depth, pair.K, relative_motion(*pair.poses))
     # A convention does not explain the points that it puts behind the camera.
-    return _median_px(torch.where(valid, flow - ego, torch.inf), pair).clamp(max=1e6)
+    return _median_px(torch.where(valid, pair.raw - ego, torch.inf), pair).clamp(max=1e6)
 
 
 def _median_px(flow: Tensor, pair: _Pair) -> Tensor:
@@ -342,8 +325,8 @@ def _mean(values: Iterable[Tensor]) -> float:
     return float(np.mean(numbers)) if numbers else math.nan
 
 
-def _sampled(raw: Tensor, depth: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
-    """Returns the maps and K on a coarser grid, where all is known, and the grid's step.
+def _sampled(raw: Tensor, depth: Tensor, K: Tensor, poses: tuple[Tensor, Tensor]) -> _Pair:
+    """Returns a pair with its maps and K on a coarser grid.
 
     Pixel j of the coarser grid is pixel s j + o of the finer one. The centre of the latter,
     s j + o + 0.5, maps to j + 0.5: u' = (u - o - 0.5) / s + 0.5. Flow is in coarse pixels.
@@ -357,7 +340,7 @@ def _sampled(raw: Tensor, depth: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Ten
     coarse[:2, 2] -= offset + 0.5 - step / 2
     coarse[:2] /= step
     known = raw.isfinite().all(0, keepdim=True) & (depth > 0)
-    return raw, depth, coarse.float(), known, step
+    return _Pair(raw, depth, coarse.float(), known, step, poses)
 
 
 def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
@@ -389,7 +372,7 @@ def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
             return {}  # one of the usual ones
     columns = given_from_opencv[:3, :3].round(decimals=1).tolist()
     says = f"the camera's right, down and ahead are the columns of {columns} in the poses' axes"
-    return {"other axes": Mistake(says, lambda pose: pose @ given_from_opencv)}
+    return {"other axes": Mistake(says, _of_poses(lambda pose: pose @ given_from_opencv))}
 
 
 def _vectors(motion: Tensor) -> NDArray[np.float64]:

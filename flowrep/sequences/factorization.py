@@ -74,11 +74,7 @@ MotionSource = Callable[[Frame, Frame, Flow], Motion]  # from these and raw flow
 
 
 def recorded_flow(previous: Frame, current: Frame) -> Flow:
-    """Returns the recording's own flow.
-
-    Raises:
-        SequenceError: it has none for this frame, or it is measured from another frame.
-    """
+    """Returns the recording's own flow, if it is measured from the frame before."""
     if current.raw is None:
         raise SequenceError(current.source, "has no flow of its own: use flow=estimated")
     if current.raw_since != previous.name:
@@ -109,9 +105,8 @@ class EstimatedFlowSource:
         If the picture repeats the previous one although the camera moved, all flow is unknown.
         """
         if previous.rgb is None or current.rgb is None:
-            raise SequenceError(
-                current.source, "has no picture to estimate flow from: use flow=exact"
-            )
+            cause = "has no picture to estimate flow from: use flow=exact"
+            raise SequenceError(current.source, cause)
         if np.array_equal(previous.rgb, current.rgb):
             unknown = repeats(previous, current)
             return np.full((2, *current.size), np.nan if unknown else 0.0, dtype=np.float32)
@@ -162,19 +157,19 @@ def pairs(frames: Iterable[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
     """
     previous: Frame | None = None
     for current in frames:
-        if current.starts_clip:
+        if previous is not None and previous.clip != current.clip:
             previous = None
+        if previous is not None and previous.size != current.size:
+            (height, width), (own_height, own_width) = previous.size, current.size
+            cause = f"is {own_width} x {own_height}, the frame before {width} x {height}"
+            raise SequenceError(current.source, cause)
         yield previous, current
         if previous is None or not repeats(previous, current):
             previous = current
 
 
 def recorded_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
-    """Returns the camera's motion by the recorded poses.
-
-    Raises:
-        SequenceError: a frame has none.
-    """
+    """Returns the camera's motion by the recorded poses."""
     if previous.world_from_cam is None or current.world_from_cam is None:
         raise SequenceError(current.source, "has no pose: use poses=estimated")
     poses = (torch.from_numpy(frame.world_from_cam) for frame in (previous, current))
@@ -213,8 +208,6 @@ def factorize_frames(
 ) -> Iterator[FactorizedFrame | None]:
     """Yields the factorisation of each frame, None for a frame without a previous one.
 
-    Two frames are held in memory.
-
     Args:
         frames: a `Recording` or any other frames in order.
         flow_source: `recorded_flow` or an `EstimatedFlowSource`.
@@ -235,8 +228,6 @@ def factorize_pair(
     previous: Frame, current: Frame, raw: Flow, motion: Motion | None = None
 ) -> FactorizedFrame:
     """Returns the factorisation of one frame, by default with the recorded motion."""
-    if previous.size != current.size:
-        raise SequenceError(current.source, "differs in size from the frame before")
     motion = recorded_motion(previous, current, raw) if motion is None else motion
     measured = np.isfinite(raw).all(axis=0)
     ego, obj, ego_valid = factorize(

@@ -1,11 +1,15 @@
-"""Files of recordings: text, pictures, arrays, depth maps and flow; every error names its file."""
+"""Files of recordings: text, pictures, arrays, depth maps and flow.
+
+What is invalid raises `SequenceError`, which names the file; what is missing, `OSError`, which does
+so too.
+"""
 
 from __future__ import annotations
 
 import re
 import struct
 from collections.abc import Iterable, Mapping, Sequence
-from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -25,60 +29,32 @@ Flow = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
 
 def list_files(folder: Path, suffixes: Iterable[str], prefix: str = "") -> list[Path]:
-    """Returns a folder's files with one of the suffixes, sorted by number, then by name.
-
-    Raises:
-        SequenceError: no such folder, no such file in it, or two that differ in the suffix alone.
-    """
+    """Returns a folder's files with one of the suffixes, sorted by number, then by name."""
     suffixes = tuple(suffixes)
-    try:
-        found = [
-            path
-            for path in folder.iterdir()
-            if path.suffix.lower() in suffixes and path.name.startswith(prefix)
-        ]
-    except OSError as error:
-        raise SequenceError(folder, (error.strerror or str(error)).lower()) from None
+    found = [
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in suffixes and path.name.startswith(prefix)
+    ]
     if not found:
         raise SequenceError(folder, f"holds no {prefix}*{' or '.join(suffixes)} file")
-    by_stem: dict[str, Path] = {}
-    for path in sorted(found, key=_natural):
-        if (first := by_stem.setdefault(path.stem, path)) is not path:
-            raise SequenceError(path, f"belongs to the same frame as {first.name}; remove one")
-    return list(by_stem.values())
+    found.sort(key=_natural)
+    for first, second in pairwise(found):
+        if first.stem == second.stem:
+            raise SequenceError(second, f"belongs to the same frame as {first.name}; remove one")
+    return found
 
 
-def _natural(path: Path) -> tuple[list[tuple[int, int | str]], str]:
+def _natural(path: Path) -> tuple[list[int | str], str]:
     """Returns the key by which frame_9 comes before frame_10."""
-    pieces = re.split(r"([0-9]+)", path.name)
-    return [(1, p) if i % 2 == 0 else (0, int(p)) for i, p in enumerate(pieces)], path.name
+    pieces = re.split(r"([0-9]+)", path.stem)  # texts and numbers take turns, so all are comparable
+    return [int(piece) if piece.isdecimal() else piece for piece in pieces], path.name
 
 
-def read_bytes(path: Path, remedy: str = "") -> bytes:
-    """Returns a file's content; `remedy` says what to do if there is no such file.
-
-    Raises:
-        SequenceError: there is no such file, or it is empty.
-    """
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise SequenceError(path, f"no such file{remedy and f'; {remedy}'}") from None
-    except OSError as error:
-        raise SequenceError(path, (error.strerror or str(error)).lower()) from None
-    if not data:
-        raise SequenceError(path, "is empty")
-    return data
-
-
-def read_lines(path: Path, remedy: str = "") -> list[tuple[int, str]]:
-    """Returns the non-empty lines, each after its number; `#` starts a comment."""
-    try:
-        text = read_bytes(path, remedy).decode("utf-8")
-    except UnicodeDecodeError:
-        raise SequenceError(path, "is not text") from None
-    lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
-    return [(number, line) for number, line in lines if line and not line.startswith("#")]
+def read_lines(path: Path) -> list[str]:
+    """Returns the non-empty lines; `#` starts a comment."""
+    lines = map(str.strip, path.read_text("utf-8", errors="replace").splitlines())
+    return [line for line in lines if line and not line.startswith("#")]
 
 
 def read_table(
@@ -92,37 +68,27 @@ def read_table(
 
     Args:
         path: the file; numbers are separated by blanks or commas.
-        columns: the permitted numbers of columns; every line has the same one.
+        columns: the permitted numbers of columns.
         header: whether the first line has names.
         remedies: what to do about some other number of columns.
-
-    Raises:
-        SequenceError: there are no numbers, or a line has another number of columns.
     """
-    rows: list[list[float]] = []
-    for number, line in read_lines(path)[int(header) :]:
-        try:
-            row = [float(word) for word in line.replace(",", " ").split()]
-        except ValueError:
-            raise SequenceError(path, f"line {number}: {line[:40]!r} are not numbers") from None
-        wanted = [len(rows[0])] if rows else columns
-        if len(row) not in wanted:
-            expected = " or ".join(map(str, wanted))
-            remedy = f"; {remedies[len(row)]}" if len(row) in remedies else ""
-            cause = f"line {number} has {len(row)} numbers, expected {expected}{remedy}"
-            raise SequenceError(path, cause)
-        rows.append(row)
-    if not rows:
+    lines = [line.replace(",", " ") for line in read_lines(path)[int(header) :]]
+    if not lines:
         raise SequenceError(path, "holds no numbers")
-    return np.array(rows)
+    try:
+        table = np.loadtxt(lines, ndmin=2)
+    except ValueError as error:
+        raise SequenceError(path, str(error)) from None
+    width = table.shape[1]
+    if width not in columns:
+        remedy = f"; {remedies[width]}" if width in remedies else ""
+        expected = " or ".join(map(str, columns))
+        raise SequenceError(path, f"has {width} numbers in a line, expected {expected}{remedy}")
+    return table
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
-    """Returns a colour picture `[H, W, 3]`; a grey one has three equal channels.
-
-    Raises:
-        SequenceError: the file is not a picture, is damaged, or doesn't have 8 bits per channel.
-    """
+    """Returns a colour picture `[H, W, 3]`; a grey one has three equal channels."""
     picture = _decode(path)
     if picture.dtype != np.uint8:
         raise SequenceError(path, f"has {8 * picture.itemsize} bits per channel, colour has 8")
@@ -138,56 +104,33 @@ def read_png(path: Path, dtype: type, channels: int = 1) -> NDArray[Any]:
     picture = _decode(path)
     found = 1 if picture.ndim == 2 else picture.shape[2]
     if picture.dtype != dtype or found != channels:
-        bits = 8 * np.dtype(dtype).itemsize
+        expected = f"{channels} of {8 * np.dtype(dtype).itemsize}"
         raise SequenceError(
-            path,
-            f"has {found} channels of {8 * picture.itemsize} bits, expected {channels} of {bits}",
+            path, f"has {found} channels of {8 * picture.itemsize} bits, expected {expected}"
         )
     return picture if channels == 1 else picture[..., ::-1]
 
 
-# OpenCV fills up a picture that was cut off with grey and says nothing, so look for its end.
-_ENDS = {b"\x89PNG\r\n\x1a\n": b"IEND", b"\xff\xd8": b"\xff\xd9"}
-
-
 def _decode(path: Path) -> NDArray[Any]:
-    data = read_bytes(path)
-    end = next((end for start, end in _ENDS.items() if data.startswith(start)), None)
-    if end is None:
-        raise SequenceError(path, "is neither a PNG nor a JPEG")
-    if end not in data[-4096:]:  # some cameras write a few bytes after it
-        raise SequenceError(path, "is a picture that was cut off")
-    try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # a header that claims more than OpenCV decodes
-        picture = None
+    data = path.read_bytes()
+    # OpenCV fills up a picture that was cut off with grey and says nothing, so look for its end.
+    # Some cameras write a few bytes after it.
+    whole = b"IEND" in data[-4096:] or (data[:2] == b"\xff\xd8" and b"\xff\xd9" in data[-4096:])
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
     if picture is None:
-        raise SequenceError(path, "can't be decoded: its data are corrupt")
+        raise SequenceError(path, "is no PNG or JPEG, or was cut off")
     return picture
 
 
-def read_npy(path: Path, *, kind: str = "f", channels: int | None = None) -> NDArray[Any]:
-    """Returns an array, `[H, W]`, or `[H, W, channels]` if that is given.
-
-    Args:
-        path: the .npy file.
-        kind: the kind of its numbers, `"f"` for floats, which become float32, `"u"` for bytes.
-        channels: the size of its last dimension.
-
-    Raises:
-        SequenceError: the file is no .npy file, is cut off, or holds another shape or kind.
-    """
+def read_npy(path: Path, dims: int = 2) -> NDArray[Any]:
+    """Returns an array with a number of dimensions."""
     try:
-        array = np.load(BytesIO(read_bytes(path)), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise SequenceError(path, f"is no whole .npy file ({str(error)[:120]})") from None
-    expected = "[H, W]" if channels is None else f"[H, W, {channels}]"
-    if array.ndim != expected.count(",") + 1 or (channels and array.shape[2] != channels):
-        raise SequenceError(path, f"holds an array {list(array.shape)}, expected {expected}")
-    if array.dtype.kind != kind:
-        expected = {"f": "floats", "u": "bytes"}[kind]
-        raise SequenceError(path, f"holds {array.dtype}, expected {expected}")
-    return array.astype(np.float32, copy=False) if kind == "f" else array
+        array: NDArray[Any] = np.load(path)
+    except (ValueError, EOFError) as error:
+        raise SequenceError(path, f"is no whole .npy file ({error})") from None
+    if array.ndim != dims:
+        raise SequenceError(path, f"holds an array {list(array.shape)}, expected {dims} dimensions")
+    return array
 
 
 def depth_from_integers(
@@ -219,13 +162,12 @@ def read_depth(
         path: a .png, or a .npy of floats, in which nan is missing and inf no surface.
         size: height and width of its camera's pictures, from intrinsics.json.
         unit_m: the length of a stored 1; None is a millimetre in a .png and a metre in a .npy.
-
-    Raises:
-        SequenceError: it can't be read, or has another size.
     """
     if path.suffix.lower() == ".npy":
         depth = read_npy(path)
-        depth = depth if unit_m is None else (depth * np.float64(unit_m)).astype(np.float32)
+        if depth.dtype.kind != "f":
+            raise SequenceError(path, f"holds {depth.dtype}, expected floats")
+        depth = (depth * np.float64(1.0 if unit_m is None else unit_m)).astype(np.float32)
     else:
         unit_m = 0.001 if unit_m is None else unit_m
         depth = depth_from_integers(read_png(path, np.uint16), unit_m, missing=(0, 65535))
@@ -250,17 +192,13 @@ def read_flo(path: Path) -> Flow:
 
 def read_tagged_floats(path: Path, channels: int) -> NDArray[np.float32]:
     """Returns the floats of a .flo file or of Sintel's .dpt, `[H, W, channels]`."""
-    data = read_bytes(path)
-    if len(data) < 12 or struct.unpack_from("<f", data)[0] != FLO_TAG:
-        raise SequenceError(path, f"does not begin with the number {FLO_TAG}")
-    width, height = struct.unpack_from("<ii", data, 4)
-    expected = 12 + 4 * channels * width * height
-    if min(width, height) < 1 or len(data) != expected:
-        raise SequenceError(
-            path, f"claims {width} x {height}, {expected:,} bytes, and has {len(data):,}"
-        )
-    values = np.frombuffer(data, "<f4", offset=12).astype(np.float32)
-    return values.reshape(height, width, channels)
+    data = path.read_bytes()
+    if len(data) >= 12:
+        tag, width, height = struct.unpack_from("<fii", data)
+        if tag == FLO_TAG and len(data) == 12 + 4 * channels * width * height:
+            values = np.frombuffer(data, "<f4", offset=12).astype(np.float32)
+            return values.reshape(height, width, channels)
+    raise SequenceError(path, f"is not {FLO_TAG}, width, height and {channels} floats a pixel")
 
 
 def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
@@ -290,9 +228,8 @@ def write_kitti_flow(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = N
 
 def write_picture(path: Path, image: NDArray[Any]) -> None:
     """Writes a picture `[H, W, 3]` as a PNG with fast rather than strong compression."""
-    whole, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    if not whole:
-        raise OSError(f"{path}: OpenCV can't encode it")
+    # Not imwrite, which says nothing of a full disk.
+    data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
     path.write_bytes(data.tobytes())
 
 

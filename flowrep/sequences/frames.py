@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +21,7 @@ from flowrep.geometry import (
     adapt_depth,
     adapt_flow,
 )
-from flowrep.geometry.checks import check_name
-from flowrep.geometry.depth import check_depth_options
-from flowrep.geometry.flow import check_flow_options
-from flowrep.sequences.calibration import (
-    Registration,
-    as_pose,
-    check_ascending,
-    check_count,
-    read_cameras,
-    read_pose_lines,
-)
+from flowrep.sequences.calibration import Registration, as_pose, read_cameras, read_pose_lines
 from flowrep.sequences.files import (
     DEPTH_FILES,
     PICTURES,
@@ -66,9 +57,6 @@ class Frames(Recording):
         flow_direction: direction of `flow/`, see `flowrep.geometry.adapt_flow`.
         flow_grid: see there.
         flow_channels: see there.
-
-    Raises:
-        ValueError: a name is unknown, or an option doesn't apply to the kind of depth.
     """
 
     no_flow = "it has no folder flow/: use flow=estimated"
@@ -88,11 +76,6 @@ class Frames(Recording):
         flow_grid: Grid = "current",
         flow_channels: Channels = "uv",
     ) -> None:
-        check_name("pose_layout", pose_layout, PoseLayout)
-        check_name("pose_direction", pose_direction, PoseDirection)
-        check_name("pose_axes", pose_axes, CameraAxes)
-        check_depth_options(depth_kind, depth_kind == "ray_length", near_m, far_m)
-        check_flow_options(flow_direction, flow_grid, flow_channels)
         if depth_unit_m is not None and not depth_unit_m > 0:
             raise ValueError(f"depth_unit_m is positive, got {depth_unit_m}")
         self.folder, self.depth_unit_m = Path(folder), depth_unit_m
@@ -103,7 +86,27 @@ class Frames(Recording):
         self._flow_options: dict[str, Any] = {
             "direction": flow_direction, "grid": flow_grid, "channels": flow_channels,
         }  # fmt: skip
-        self._open()
+        self._depths = list_files(self.folder / "depth", DEPTH_FILES)
+        self.count, names = len(self._depths), [path.stem for path in self._depths]
+        self._rgbs = self._by_stem("rgb", PICTURES, names)
+        # The first frame has no flow since the frame before.
+        self._flows = self._by_stem("flow", FLOW_FILES, names[1:])
+        if not self._rgbs and not self._flows:
+            raise SequenceError(self.folder, "has neither rgb/ nor flow/: one of them is needed")
+        self.has_flow = bool(self._flows)
+        self._poses_path, times = self.folder / "poses.txt", self.folder / "timestamps.txt"
+        self.has_poses = self._poses_path.is_file()
+        if self.has_poses:
+            self._poses = read_pose_lines(self._poses_path, pose_layout, len(self))
+        self._times = read_table(times, [1])[:, 0] if times.is_file() else None
+        if self._times is not None and len(self._times) != len(self):
+            raise SequenceError(times, f"has {len(self._times)} times for {len(self)} frames")
+        path = self.folder / "intrinsics.json"
+        self._camera = read_cameras(path)
+        self._registration, self.K = None, self._camera.K
+        if colour := self._camera.colour:
+            extrinsics, self.K = as_pose(np.array(colour.colour_from_depth), path), colour.K
+            self._registration = Registration(self._camera.K, self.K, extrinsics, colour.size)
         unit_m = depth_unit_m or (1.0 if self._depths[0].suffix.lower() == ".npy" else 0.001)
         self.conventions = {
             "pose_direction": pose_direction,
@@ -114,43 +117,17 @@ class Frames(Recording):
             "flow_channels": flow_channels,
         }
 
-    def _open(self) -> None:
-        self._depths = list_files(self.folder / "depth", DEPTH_FILES)
-        self.count = len(self._depths)
-        self._rgbs = self._by_stem("rgb", PICTURES)
-        self._flows = self._by_stem("flow", FLOW_FILES)
-        if not self._rgbs and not self._flows:
-            raise SequenceError(self.folder, "has neither rgb/ nor flow/: one of them is needed")
-        self._check_names()
-        self.has_flow = bool(self._flows)
-        self._poses_path, times_path = self.folder / "poses.txt", self.folder / "timestamps.txt"
-        self.has_poses = self._poses_path.is_file()
-        if self.has_poses:
-            self._poses = read_pose_lines(self._poses_path, self._pose_options["layout"])
-            check_count(self._poses_path, len(self._poses), len(self), "poses")
-        self._times: NDArray[np.float64] | None = None
-        if times_path.is_file():
-            self._times = read_table(times_path, [1])[:, 0]
-            check_count(times_path, len(self._times), len(self), "times")
-            check_ascending(times_path, self._times)
-        path = self.folder / "intrinsics.json"
-        self._camera = read_cameras(path)
-        self._registration, self.K = None, self._camera.K
-        if colour := self._camera.colour:
-            extrinsics, self.K = as_pose(np.array(colour.colour_from_depth), path), colour.K
-            self._registration = Registration(self._camera.K, self.K, extrinsics, colour.size)
-
-    def _check_names(self) -> None:
-        """Raises SequenceError if a frame lacks a file that the others have."""
-        names = [path.stem for path in self._depths]
-        # The first frame has no flow since the frame before.
-        for kind, found, first in (("rgb", self._rgbs, 0), ("flow", self._flows, 1)):
-            for name in names[first:] if found else ():
-                if name not in found:
-                    raise SequenceError(self.folder / kind, f"lacks a file for frame {name}")
-            for name, path in found.items():
-                if name not in names:
-                    raise SequenceError(self.folder / "depth", f"lacks a file for {path.name}")
+    def _by_stem(self, kind: str, suffixes: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
+        """Returns the files of a folder by frame, none without the folder."""
+        folder = self.folder / kind
+        found = (
+            {path.stem: path for path in list_files(folder, suffixes)} if folder.is_dir() else {}
+        )
+        if found and (lacking := [name for name in names if name not in found]):
+            raise SequenceError(folder, f"lacks a file for frame {lacking[0]}")
+        if others := found.keys() - {path.stem for path in self._depths}:
+            raise SequenceError(self.folder / "depth", f"lacks a file for {kind}/{min(others)}")
+        return found
 
     def _read(self, index: int) -> Frame:
         depth_path = self._depths[index]
@@ -183,10 +160,6 @@ class Frames(Recording):
             raw_since=None if raw is None else self._depths[index - 1].stem,
         )
 
-    def _by_stem(self, kind: str, suffixes: tuple[str, ...]) -> dict[str, Path]:
-        folder = self.folder / kind
-        return {p.stem: p for p in list_files(folder, suffixes)} if folder.is_dir() else {}
-
 
 class Zed(Recording):
     """A folder exported from a ZED's SVO file.
@@ -200,13 +173,9 @@ class Zed(Recording):
         folder: the exported folder.
         pose_axes: the coordinate system of the exported poses: `"opencv"` for the SDK's
             IMAGE, `"opengl"` for RIGHT_HANDED_Y_UP, `"x_forward_z_up"` for RIGHT_HANDED_Z_UP_X_FWD.
-
-    Raises:
-        ValueError: the axes are unknown.
     """
 
     def __init__(self, folder: str | Path, *, pose_axes: CameraAxes = "opencv") -> None:
-        check_name("pose_axes", pose_axes, CameraAxes)
         self.folder, self.pose_axes = Path(folder), pose_axes
         self._pictures = list_files(self.folder, PICTURES, "left")
         depths = list_files(self.folder, DEPTH_FILES, "depth")
@@ -215,14 +184,8 @@ class Zed(Recording):
         self._poses_path = self.folder / "poses.txt"
         self.has_poses, self.conventions = self._poses_path.is_file(), {"pose_axes": pose_axes}
         if self.has_poses:
-            self._poses = read_pose_lines(self._poses_path, "xyz_xyzw")
-            check_count(self._poses_path, len(self._poses), len(self), "poses")
-        path = self.folder / "intrinsics.json"
-        self._camera = read_cameras(path)
-        if self._camera.colour is not None:
-            raise SequenceError(
-                path, "names a colour camera; a ZED's depth belongs to the left picture already"
-            )
+            self._poses = read_pose_lines(self._poses_path, "xyz_xyzw", len(self))
+        self._camera = read_cameras(self.folder / "intrinsics.json")
 
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]

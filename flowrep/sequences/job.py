@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, replace
 from itertools import count, islice
 from typing import Any
 
@@ -28,22 +27,18 @@ from flowrep.sequences.recording import Frame, Recording, Stream
 DOCTOR_PAIRS, DOCTOR_TRIES = 10, 3
 
 
-@dataclass(frozen=True)
-class Selection:
-    """The frames that are used: from `start` to before `stop` (None: to the end), every n-th."""
-
-    start: int = 0
-    stop: int | None = None
-    stride: int = 1
-
-    def __str__(self) -> str:
-        """Returns it as on the command line."""
-        stop = "" if self.stop is None else f" stop={self.stop}"
-        return f"the frames start={self.start}{stop} stride={self.stride}"
-
-
 class Job:
-    """The factorisation of one recording, or of a camera's frames, into a folder."""
+    """The factorisation of one recording, or of a camera's frames, into a folder.
+
+    Args:
+        stream: the recording or camera.
+        flow_source: `recorded_flow` or an `EstimatedFlowSource`.
+        motion_source: `recorded_motion` or `estimated_motion`.
+        output: the folder.
+        start: the index of the first frame that is used.
+        stop: the index after the last one, None for the end.
+        stride: every n-th frame is used.
+    """
 
     def __init__(
         self,
@@ -51,11 +46,17 @@ class Job:
         flow_source: FlowSource,
         motion_source: MotionSource,
         output: Output,
-        selection: Selection | None = None,
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
     ) -> None:
         self.stream, self.output = stream, output
         self.flow_source, self.motion_source = flow_source, motion_source
-        self.selection = selection or Selection()
+        self.start, self.stop, self.stride = start, stop, stride
+        self._indices = range(0)  # of the frames that are used, of a recording
+        if isinstance(stream, Recording):
+            self._indices = range(len(stream))[start:stop:stride]
         self.clock = Stopwatch()
 
     def examine(self) -> Diagnosis | None:
@@ -63,25 +64,21 @@ class Job:
         if not isinstance(self.stream, Recording) or not self.stream.has_poses:
             return None
         doctor = Doctor(self.stream.conventions, flow_is_recorded=self.flow_source is recorded_flow)
-        count = self._total() or 0
-        starts = np.linspace(1, count, DOCTOR_PAIRS, endpoint=False).astype(int)
+        used = self._indices
+        places = np.linspace(1, len(used), DOCTOR_PAIRS, endpoint=False).astype(int)
         with self.clock("doctor"):
-            for first, end in zip(starts, [*starts[1:], count]):
+            for first, end in zip(places, [*places[1:], len(used)]):
                 for place in range(first, min(end, first + DOCTOR_TRIES)):
-                    if self._show(doctor, place):
+                    if self._show(doctor, [self.stream[i] for i in used[place - 1 : place + 1]]):
                         break
         return doctor.diagnosis()
 
-    def _show(self, doctor: Doctor, place: int) -> bool:
-        """Shows the doctor the pair that ends with a frame; returns whether it moves enough."""
-        current = self._frame(place)
-        if current.starts_clip:
+    def _show(self, doctor: Doctor, frames: list[Frame]) -> bool:
+        """Shows the doctor a pair of frames; returns whether it moves enough."""
+        _, (previous, current) = pairs(frames)
+        if previous is None or repeats(previous, current):
             return False
-        previous = self._frame(place - 1)
-        if repeats(previous, current):
-            return False
-        before = doctor.pairs
-        doctor.look(
+        return doctor.look(
             torch.from_numpy(self.flow_source(previous, current)),
             torch.from_numpy(current.depth)[None],
             torch.from_numpy(current.K),
@@ -89,15 +86,17 @@ class Job:
             torch.from_numpy(current.world_from_cam),
             picture=picture_of(current),
         )
-        return doctor.pairs > before
 
     def run(self) -> bool:
         """Factorises all frames; returns whether it came to the end.
 
         Ctrl-C ends it after the current frame. That is the end of a camera, which has no last one.
         """
-        with StopRequest() as interrupted, tqdm(total=self._total(), unit="frame") as bar:
-            for index, previous, current in self._pairs():
+        is_recording = isinstance(self.stream, Recording)
+        total = len(self._indices) if is_recording else None
+        with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
+            indices = count(self.start, self.stride)
+            for index, (previous, current) in zip(indices, pairs(self._frames())):
                 if previous is not None:
                     with self.clock("raw flow"):
                         raw = self.flow_source(previous, current)
@@ -112,7 +111,19 @@ class Job:
                     break
             bar.set_description("completing the video")
             self.output.close()
-        return not interrupted or not isinstance(self.stream, Recording)
+        return not interrupted or not is_recording
+
+    def _frames(self) -> Iterator[Frame]:
+        """Yields the frames that are used."""
+        frames: Iterator[Frame] = islice(self.stream, self.start, self.stop, self.stride)
+        if isinstance(self.stream, Recording):  # those in between are not read
+            frames = map(self.stream.__getitem__, self._indices)
+        while True:
+            with self.clock("reading"):
+                frame = next(frames, None)
+            if frame is None:
+                return
+            yield frame
 
     def summary(self, diagnosis: Diagnosis | None) -> dict[str, Any]:
         """Returns medians over the frames, the doctor's diagnosis and the times."""
@@ -124,46 +135,3 @@ class Job:
             "notes": list(self.stream.notes),
             "seconds": {name: round(spent, 3) for name, spent in self.clock.seconds.items()},
         }
-
-    def _total(self) -> int | None:
-        """Returns the number of frames to read, None for a camera."""
-        start, stop, stride = astuple(self.selection)
-        if isinstance(self.stream, Recording):
-            stop = len(self.stream) if stop is None else min(stop, len(self.stream))
-        return None if stop is None else len(range(start, stop, stride))
-
-    def _frame(self, place: int) -> Frame:
-        """Returns a frame that is used, by its place among them, of a recording.
-
-        It starts a clip if a frame skipped before it does.
-        """
-        assert isinstance(self.stream, Recording)
-        start, _, stride = astuple(self.selection)
-        index = start + place * stride
-        skipped = range(max(0, index - stride + 1), index)
-        frame = self.stream[index]
-        starts_clip = frame.starts_clip or any(map(self.stream.starts_clip, skipped))
-        return replace(frame, starts_clip=starts_clip)
-
-    def _frames(self) -> Iterator[Frame]:
-        """Yields the frames that are used."""
-        if isinstance(self.stream, Recording):
-            yield from map(self._frame, range(self._total() or 0))
-            return
-        start, stop, stride = astuple(self.selection)
-        starts_clip = False
-        for index, frame in islice(enumerate(self.stream), stop):
-            starts_clip |= frame.starts_clip
-            if index >= start and (index - start) % stride == 0:
-                yield replace(frame, starts_clip=starts_clip)
-                starts_clip = False
-
-    def _pairs(self) -> Iterator[tuple[int, Frame | None, Frame]]:
-        """Yields the index of each frame, the frame its flow is measured from, and itself."""
-        found = pairs(self._frames())
-        for index in count(self.selection.start, self.selection.stride):
-            with self.clock("reading"):
-                pair = next(found, None)
-            if pair is None:
-                return
-            yield index, *pair

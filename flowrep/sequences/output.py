@@ -29,9 +29,7 @@ from flowrep.viz import (
     strip,
 )
 
-FLOW_FORMATS = ("flo", "kitti", "npz")
 FLOW_NAMES = ("raw", "ego", "obj")
-TABLE, JOB, SUMMARY, VIDEO = "frames.csv", "job.json", "summary.json", "strip.mp4"
 _MOVING_SPREAD = 3.0
 _JPEG_QUALITY = 80
 _TILE_PX = 480  # the most of a tile of the video, so that two rows of three fit a screen
@@ -42,7 +40,7 @@ class OutputOptions:
     """The outputs to write.
 
     Attributes:
-        flow_files: formats of flow files, from `FLOW_FORMATS`.
+        flow_files: formats of flow files, of "flo", "kitti" and "npz".
         pictures_every: the number of frames from one set of flow pictures to the next; 0 for none.
         scale_px: the flow of full colour by name, pixels.
         depth_range_m: the depth at which the video's colours end, metres.
@@ -76,21 +74,17 @@ class Output:
         self, path: str | Path, options: OutputOptions, settings: Mapping[str, Any]
     ) -> None:
         self.path, self.options = Path(path), options
-        if self.path.exists():  # also . and /, which have no name
-            raise SequenceError(self.path, "exists already; remove it, or give another output")
-        self.partial = self.path.with_name(f"{self.path.name}.partial")
-        if self.partial.exists():
-            raise SequenceError(
-                self.partial,
-                "is left of a job that did not finish: remove it, or give another output",
-            )
+        self.partial = Path(f"{self.path}.partial")
+        for folder in (self.path, self.partial):
+            if folder.exists():
+                raise SequenceError(folder, "exists already; remove it, or give another output")
         self._rerun = RerunExport(self.path.name, options.scale_px) if options.rerun else None
         self.partial.mkdir(parents=True)
-        _write_json(self.partial / JOB, settings)
+        self._write_json("job.json", settings)
         self.rows: list[dict[str, Any]] = []
         self._video: Video | None = None
         if options.video_fps is not None:
-            self._video = Video(self.partial / VIDEO, fps=options.video_fps)
+            self._video = Video(self.partial / "strip.mp4", fps=options.video_fps)
         if self._rerun is not None:
             self._rerun.save(self.partial / "scene.rrd")
 
@@ -102,7 +96,7 @@ class Output:
         if self._rerun is not None:
             self._rerun.append(index, made)
         self.rows.append(score(index, made, moving_px=self.options.moving_px))
-        with (self.partial / TABLE).open("a", newline="", encoding="utf-8") as file:
+        with (self.partial / "frames.csv").open("a", newline="", encoding="utf-8") as file:
             table = csv.DictWriter(file, self.rows[-1].keys())
             if len(self.rows) == 1:
                 table.writeheader()
@@ -119,7 +113,7 @@ class Output:
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Writes the summary and gives the folder its final name."""
-        _write_json(self.partial / SUMMARY, summary)
+        self._write_json("summary.json", summary)
         self.partial.replace(self.path)
 
     def medians(self) -> dict[str, float | None]:
@@ -130,9 +124,8 @@ class Output:
             medians[name] = float(np.median(values)) if values else None
         return medians
 
-
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    def _write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        (self.partial / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from flowrep.geometry import check_intrinsics, check_rigid
+from flowrep.geometry import check_intrinsics
 
 Pose = NDArray[np.float64]  # world_from_cam [4, 4]
 
@@ -43,7 +43,7 @@ class Frame:
         raw: `[2, H, W]` float32, the recording's own p_t - p_t', with t' the previous frame in the
             recording's order; nan where unknown; None if it has none for this frame.
         raw_since: the name of the frame t' that `raw` is measured from.
-        starts_clip: whether the previous frames belong to another shot.
+        clip: the number of its shot. There is no flow from one clip to another.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Frame:
     timestamp_s: float | None = None
     raw: NDArray[np.float32] | None = None
     raw_since: str | None = None
-    starts_clip: bool = False
+    clip: int = 0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -78,8 +78,8 @@ class Stream(Protocol):
 class Recording(ABC):
     """Frames on disk, read on demand and not kept.
 
-    A reader's constructor and its frames raise `SequenceError` for files that are missing or
-    invalid.
+    A reader's constructor and its frames raise `SequenceError` for invalid files and `OSError` for
+    missing ones.
 
     Attributes:
         count: the number of frames.
@@ -87,7 +87,6 @@ class Recording(ABC):
         has_poses: whether frames bring the camera's pose.
         no_flow: why it has no flow of its own, and what to do.
         notes: notes for the user about this recording, a sentence each.
-        one_size: whether all frames must have one size.
         conventions: the options about conventions that it was opened with, by name, for the
             doctor's advice.
     """
@@ -97,17 +96,11 @@ class Recording(ABC):
     has_poses: bool = True
     no_flow: str = "the format has none: use flow=estimated"
     notes: tuple[str, ...] = ()
-    one_size: bool = True
     conventions: Mapping[str, str] = MappingProxyType({})
-    _size: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         """Returns the number of frames."""
         return self.count
-
-    def starts_clip(self, index: int) -> bool:
-        """Returns whether the frames before this one belong to another shot, without reading it."""
-        return False
 
     @abstractmethod
     def _read(self, index: int) -> Frame:
@@ -118,44 +111,25 @@ class Recording(ABC):
 
         Raises:
             IndexError: there is no such frame.
-            SequenceError: it can't be read, or does not fit the others.
+            SequenceError: its maps differ in size, or K is not a camera matrix.
         """
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         frame = self._read(index)
-        check_frame(frame)
-        first, own = (_size_text(size) for size in (self._size or frame.size, frame.size))
-        if self.one_size and own != first:
-            raise SequenceError(frame.source, f"is {own}, other frames are {first}")
-        self._size = self._size or frame.size
+        sizes: dict[str, tuple[int, ...]] = {"depth": frame.size}
+        if frame.rgb is not None:
+            sizes["colour"] = frame.rgb.shape[:2]
+        if frame.raw is not None:
+            sizes["flow"] = frame.raw.shape[1:]
+        if len({*sizes.values()}) > 1:
+            listing = ", ".join(f"{name} {w} x {h}" for name, (h, w) in sizes.items())
+            raise SequenceError(frame.source, f"pictures of one frame differ in size: {listing}")
+        try:
+            check_intrinsics("intrinsics", torch.from_numpy(frame.K))
+        except ValueError as error:
+            raise SequenceError(frame.source, str(error)) from None
         return frame
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields the frames in order."""
         return (self[index] for index in range(len(self)))
-
-
-def check_frame(frame: Frame) -> None:
-    """Checks that the parts of a frame fit together.
-
-    Raises:
-        SequenceError: if sizes differ, the pose is not rigid, or K is not a camera matrix.
-    """
-    sizes: dict[str, tuple[int, ...]] = {"depth": frame.size}
-    if frame.rgb is not None:
-        sizes["colour"] = frame.rgb.shape[:2]
-    if frame.raw is not None:
-        sizes["flow"] = frame.raw.shape[1:]
-    if len(set(sizes.values())) > 1:
-        listing = ", ".join(f"{name} {_size_text(size)}" for name, size in sizes.items())
-        raise SequenceError(frame.source, f"pictures of one frame differ in size: {listing}")
-    try:
-        if frame.world_from_cam is not None:
-            check_rigid("pose", torch.from_numpy(frame.world_from_cam))
-        check_intrinsics("intrinsics", torch.from_numpy(frame.K))
-    except ValueError as error:
-        raise SequenceError(frame.source, str(error)) from None
-
-
-def _size_text(size: tuple[int, ...]) -> str:
-    return f"{size[1]} x {size[0]}"

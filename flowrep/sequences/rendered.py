@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import re
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.sequences.calibration import (
     as_pose,
-    check_count,
     intrinsics,
     opencv_intrinsics,
     read_pose_lines,
@@ -22,7 +19,6 @@ from flowrep.sequences.files import (
     Flow,
     depth_from_integers,
     list_files,
-    read_bytes,
     read_flo,
     read_npy,
     read_png,
@@ -69,13 +65,11 @@ class Sintel(Recording):
         raw = since = None
         if self.has_flow and index > 0:
             number = picture.stem.removeprefix("frame_")
-            if not number.isdecimal():
-                raise SequenceError(picture, "is not named frame_<number>")
             since = f"frame_{int(number) + 1:0{len(number)}d}"
             raw = -read_flo(self._file("flow", picture, ".flo"))
             invalid = self._file("invalid", picture, ".png")
             if invalid.is_file():
-                _mask(raw, read_png(invalid, np.uint8), invalid)
+                raw[:, read_png(invalid, np.uint8) != 0] = np.nan
         return Frame(
             name=picture.stem,
             source=picture,
@@ -93,7 +87,7 @@ class Sintel(Recording):
 
 def _read_cam(path: Path) -> tuple[NDArray[np.float64], Pose]:
     """Returns K in flowrep's convention and `world_from_cam` of a .cam file."""
-    data = read_bytes(path)
+    data = path.read_bytes()
     if len(data) != 4 + 8 * (9 + 12) or struct.unpack_from("<f", data)[0] != FLO_TAG:
         raise SequenceError(path, f"is no .cam file: {FLO_TAG}, 9 and 12 doubles")
     K = np.frombuffer(data, "<f8", 9, offset=4).reshape(3, 3).copy()
@@ -118,8 +112,7 @@ class TartanAir(Recording):
         self._pictures = list_files(self.folder / "image_left", (".png",))[order]
         self.count = len(self._pictures)
         self._poses_path = self.folder / "pose_left.txt"
-        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw")[order]
-        check_count(self._poses_path, len(self._poses), len(self), "poses")
+        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw", len(self))[order]
         flow = self.folder / "flow"
         self.has_flow = backwards and flow.is_dir()
         self.no_flow = f"no such folder: {flow}" if backwards else PLAY_BACKWARDS
@@ -131,10 +124,10 @@ class TartanAir(Recording):
         if self.has_flow and index > 0:
             since = self._number(index - 1)
             flow = self.folder / "flow" / f"{number}_{since}_flow.npy"
-            raw = -read_npy(flow, channels=2).transpose(2, 0, 1)
+            raw = -read_npy(flow, dims=3).transpose(2, 0, 1)
             hidden = flow.with_name(f"{number}_{since}_mask.npy")
             if hidden.is_file():
-                _mask(raw, read_npy(hidden, kind="u"), hidden)
+                raw[:, read_npy(hidden) != 0] = np.nan
         return Frame(
             name=number,
             source=self._pictures[index],
@@ -176,10 +169,8 @@ class VKitti2(Recording):
 
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]
-        found = re.fullmatch(r"rgb_(\d+)", picture.stem)
-        if not found:
-            raise SequenceError(picture, "is not named rgb_<number>")
-        name, number = found[1], int(found[1])
+        name = picture.stem.removeprefix("rgb_")
+        number = int(name)
         if number not in self._poses or number not in self._intrinsics:
             raise SequenceError(self._poses_path, f"has no pose or intrinsics of frame {number}")
         depth = read_png(self._maps("depth") / f"depth_{name}.png", np.uint16)
@@ -217,10 +208,3 @@ def _read_vkitti_flow(path: Path) -> Flow:
     flow = share * np.array([width - 1, height - 1], np.float32)[:, None, None]
     flow[:, blue == 0] = np.nan
     return flow
-
-
-def _mask(flow: Flow, mask: NDArray[Any], path: Path) -> None:
-    """Marks flow as unknown where the data set's mask is not 0."""
-    if mask.shape != flow.shape[1:]:
-        raise SequenceError(path, "differs in size from its flow")
-    flow[:, mask != 0] = np.nan

@@ -7,17 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrep.sequences.calibration import Registration, as_pose, four_intrinsics, intrinsics
-from flowrep.sequences.files import (
-    depth_from_integers,
-    list_files,
-    read_png,
-    read_rgb,
-    read_table,
-)
+from flowrep.sequences.calibration import Registration, as_pose, check_numbers, intrinsics
+from flowrep.sequences.files import depth_from_integers, list_files, read_png, read_rgb, read_table
 from flowrep.sequences.recording import Frame, Recording, SequenceError
-
-_COLOUR = (".color.png", ".color.jpg")
 
 
 class SevenScenes(Recording):
@@ -44,22 +36,17 @@ class SevenScenes(Recording):
         colour_from_depth_m: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         self.folder = Path(folder)
-        self._K_depth = intrinsics(*four_intrinsics("depth_intrinsics", depth_intrinsics))
-        self.K = intrinsics(*four_intrinsics("colour_intrinsics", colour_intrinsics))
+        check_numbers("depth_intrinsics", depth_intrinsics, "fx, fy, cx, cy")
+        check_numbers("colour_intrinsics", colour_intrinsics, "fx, fy, cx, cy")
+        check_numbers("colour_from_depth_m", colour_from_depth_m, "x, y, z")
+        self._K_depth, self.K = intrinsics(*depth_intrinsics), intrinsics(*colour_intrinsics)
         self._colour_from_depth = np.eye(4)
-        if len(colour_from_depth_m) != 3:
-            raise SequenceError(
-                "colour_from_depth_m", f"should be [x, y, z], not {list(colour_from_depth_m)}"
-            )
         self._colour_from_depth[:3, 3] = colour_from_depth_m
-        self._colours = [
-            path
-            for path in list_files(self.folder, (".png", ".jpg"), "frame-")
-            if path.name.endswith(_COLOUR)
-        ]
-        if not self._colours:
-            raise SequenceError(self.folder, "holds no frame-*.color.png or .color.jpg")
+        pictures = list_files(self.folder, (".png", ".jpg"), "frame-")
+        self._colours = [path for path in pictures if path.stem.endswith(".color")]
         self.count = len(self._colours)
+        if not self.count:
+            raise SequenceError(self.folder, "holds no frame-*.color.png or .color.jpg")
         first = self._colours[0].name.split(".")[0]
         self.has_poses = (self.folder / f"{first}.pose.txt").is_file()
         self._registration: Registration | None = None
@@ -69,18 +56,14 @@ class SevenScenes(Recording):
         name = colour.name.split(".")[0]
         rgb = read_rgb(colour)
         stored = read_png(self.folder / f"{name}.depth.png", np.uint16)
-        size = (rgb.shape[0], rgb.shape[1])
+        if self._registration is None:
+            size = rgb.shape[0], rgb.shape[1]
+            self._registration = Registration(self._K_depth, self.K, self._colour_from_depth, size)
         register = self._registration
-        if register is None or register.size != size:
-            register = Registration(self._K_depth, self.K, self._colour_from_depth, size)
-            self._registration = register
         world_from_cam = None
         if self.has_poses:
             path = self.folder / f"{name}.pose.txt"
-            table = read_table(path, [4])
-            if len(table) != 4:
-                raise SequenceError(path, f"has {len(table)} lines, expected 4")
-            world_from_cam = as_pose(table, path) @ register.depth_from_colour
+            world_from_cam = as_pose(read_table(path, [4]), path) @ register.depth_from_colour
         return Frame(
             name=name,
             source=colour,

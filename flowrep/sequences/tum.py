@@ -9,19 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.calibration import (
-    as_pose,
-    check_ascending,
-    four_intrinsics,
-    opencv_intrinsics,
-)
-from flowrep.sequences.files import (
-    depth_from_integers,
-    read_lines,
-    read_png,
-    read_rgb,
-    read_table,
-)
+from flowrep.sequences.calibration import as_pose, check_numbers, opencv_intrinsics
+from flowrep.sequences.files import depth_from_integers, read_lines, read_png, read_rgb, read_table
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 
@@ -48,7 +37,8 @@ class Tum(Recording):
         interpolate: bool = False,
     ) -> None:
         self.folder = Path(folder)
-        self.K = opencv_intrinsics(four_intrinsics("intrinsics", intrinsics))
+        check_numbers("intrinsics", intrinsics, "fx, fy, cx, cy")
+        self.K = opencv_intrinsics(intrinsics)
         self.tolerance_s, self.interpolate = tolerance_s, interpolate
         rgb_times, rgb_paths = self._index("rgb.txt")
         depth_times, depth_paths = self._index("depth.txt")
@@ -61,7 +51,7 @@ class Tum(Recording):
         if self.has_poses:
             needed = "depth map or pose"
             poses = read_table(self.trajectory, [8])
-            check_ascending(self.trajectory, poses[:, 0])
+            _check_ascending(self.trajectory, poses[:, 0])
             self._poses = poses[:, 1:]
             self._before, self._after, self._share = self._between(poses[:, 0], rgb_times)
             found &= self._before >= 0
@@ -95,21 +85,15 @@ class Tum(Recording):
 
     def _index(self, name: str) -> tuple[NDArray[np.float64], list[Path]]:
         path = self.folder / name
-        times, files = [], []
-        remedy = f"TUM lists its pictures in it, '<time> {path.stem}/<file>' per line"
-        for number, line in read_lines(path, remedy):
-            words = line.split(maxsplit=1)
-            try:
-                times.append(float(words[0]))
-                files.append(self.folder / words[1])
-            except (ValueError, IndexError):
-                raise SequenceError(
-                    path, f"line {number} is not a timestamp and file name"
-                ) from None
-        if not times:
+        lines = [line.split(maxsplit=1) for line in read_lines(path)]
+        try:
+            times = np.array([float(time) for time, _ in lines])
+        except ValueError:
+            raise SequenceError(path, f"is not '<time> {path.stem}/<file>' in each line") from None
+        if not lines:
             raise SequenceError(path, "names no pictures")
-        check_ascending(path, np.array(times))
-        return np.array(times), files
+        _check_ascending(path, times)
+        return times, [self.folder / name for _, name in lines]
 
     def _between(
         self, pose_times: NDArray[np.float64], times_s: NDArray[np.float64]
@@ -132,6 +116,11 @@ class Tum(Recording):
         )
         share = float(self._share[place])
         return interpolated_pose(before, after, share) if share else before
+
+
+def _check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
+    if not (np.diff(times_s) >= 0).all():  # nan compares False
+        raise SequenceError(path, "times go backwards, or are not numbers")
 
 
 def nearest(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from flowrep.sequences.calibration import intrinsics
 from flowrep.sequences.recording import Frame, SequenceError
 
 
@@ -23,11 +25,10 @@ class StillVideo:
         still: whether the camera stands still.
 
     Raises:
-        SequenceError: `still` is false, or the source can't be opened.
+        SequenceError: `still` is false, or there is no such file.
     """
 
-    has_flow = False
-    has_poses = True
+    has_flow, has_poses = False, True
     notes: tuple[str, ...] = ()
 
     def __init__(self, source: str | Path | int, *, still: bool = False) -> None:
@@ -38,33 +39,29 @@ class StillVideo:
                 "a video has no depth, without which flow of a moving camera can't be split; if it "
                 "stands still say format.still=true, else bring depth too: format=frames",
             )
-        self._is_camera = str(source).isdecimal()
-        if not self._is_camera and not self.source.is_file():
+        self._place: int | str = int(str(source)) if str(source).isdecimal() else str(source)
+        if isinstance(self._place, str) and not self.source.is_file():
             raise SequenceError(source, "no such file; give a video file or a camera's number")
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields frames until the file ends, or endlessly from a camera."""
-        name = str(self.source)
-        capture: Any = cv2.VideoCapture(int(name) if self._is_camera else name)
+        capture: Any = cv2.VideoCapture(self._place)
         try:
-            number = 0
-            while (picture := capture.read()[1]) is not None:
-                yield self._frame(number, picture)
-                number += 1
+            for number in count():
+                picture = capture.read()[1]
+                if picture is None:
+                    break
+                height, width = picture.shape[:2]
+                yield Frame(
+                    name=f"{number:06d}",
+                    source=self.source,
+                    world_from_cam=np.eye(4),
+                    # A camera that stands still has no ego flow with any depth and any K.
+                    K=intrinsics(width, width, width / 2, height / 2),
+                    depth=np.full((height, width), np.inf, dtype=np.float32),
+                    rgb=np.ascontiguousarray(picture[..., ::-1]),
+                )
             if number == 0:
                 raise SequenceError(self.source, "OpenCV reads no picture of it as a video")
         finally:
             capture.release()
-
-    def _frame(self, number: int, picture: Any) -> Frame:
-        height, width = picture.shape[:2]
-        # A camera that stands still has no ego flow with any depth and any K.
-        K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float64)
-        return Frame(
-            name=f"{number:06d}",
-            source=self.source,
-            world_from_cam=np.eye(4),
-            K=K,
-            depth=np.full((height, width), np.inf, dtype=np.float32),
-            rgb=np.ascontiguousarray(picture[..., ::-1]),
-        )

@@ -99,7 +99,7 @@ def sdk(monkeypatch):
 def test_frames_come_in_flowreps_conventions_and_lost_tracking_starts_a_clip(sdk):
     frames = list(ZedLive("live"))
     assert [frame.name for frame in frames] == ["000000", "000001", "000002"]
-    assert [frame.starts_clip for frame in frames] == [True, True, False]
+    assert [frame.clip for frame in frames] == [0, 1, 1]
     assert [frame.world_from_cam[0, 3] for frame in frames] == [0.0, 1.0, 1.5]
     frame = frames[0]
     assert frame.rgb[0, 0].tolist() == [30, 20, 10]

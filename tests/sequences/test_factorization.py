@@ -145,7 +145,7 @@ def test_what_moves_stands_out_of_the_frames_own_error():
 
 def test_a_new_clip_has_no_flow_since_the_last_one():
     source = EstimatedFlowSource(DIS(), check_consistency=False)
-    frames = [frame("a"), frame("b"), frame("c", starts_clip=True), frame("d")]
+    frames = [frame("a"), frame("b"), frame("c", clip=1), frame("d", clip=1)]
     assert [made is None for made in factorize_frames(frames, source)] == [True, False, True, False]
 
 
