@@ -1,7 +1,7 @@
 """Representations as plain numpy maps, for gymnasium learners without TorchRL."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,7 +12,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import Compose
 
 from flowrep.envs.episode import Outcome, hit_code
 from flowrep.envs.street_env import StreetEnv
@@ -81,11 +80,7 @@ class RepresentationObservation(gym.Wrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Maps, dict[str, Any]]:
-        """Begins an episode.
-
-        Raises:
-            ValueError: the options ask for another frame rate than that of flow in px/s.
-        """
+        """Begins an episode; the options may not change the seconds a step of flow in px/s."""
         check_rate(self._stack, options, self._frame_rate_hz)
         observation, info = self.env.reset(seed=seed, options=options)
         sensed = _sensed(observation)
@@ -100,11 +95,7 @@ class RepresentationObservation(gym.Wrapper):
 
     def _maps(self) -> Maps:
         maps = {name: self._now[name].numpy() for name in self.names}
-        if not self.joined:
-            return maps
-        if all(value.dtype == np.uint8 for value in maps.values()):
-            return np.concatenate(list(maps.values()))
-        return np.concatenate([_as_float(value) for value in maps.values()])
+        return _joined(maps.values()) if self.joined else maps
 
     def _space(self, sensors: spaces.Space) -> spaces.Space:
         if not isinstance(sensors, spaces.Dict):
@@ -114,13 +105,8 @@ class RepresentationObservation(gym.Wrapper):
         boxes = {name: _box(spec[name]) for name in self.names}
         if not self.joined:
             return spaces.Dict(dict[str, spaces.Space](boxes))
-        narrow = all(box.dtype == np.uint8 for box in boxes.values())
-        sides = [
-            [bound if narrow else _as_float(bound) for bound in bounds]
-            for bounds in zip(*((box.low, box.high) for box in boxes.values()))
-        ]
-        low, high = (np.concatenate(side) for side in sides)
-        return spaces.Box(low, high, dtype=np.uint8 if narrow else np.float32)
+        low, high = map(_joined, zip(*((box.low, box.high) for box in boxes.values())))
+        return spaces.Box(low, high, dtype=low.dtype)
 
 
 class NumericInfo(gym.Wrapper):
@@ -180,32 +166,21 @@ def make_street(
 ) -> gym.Env:
     """Returns the environment for `gymnasium.make`: a `StreetEnv`, or its representations.
 
-    With neither representations nor `truncate_timeouts` it is the plain `StreetEnv`, with its
-    sensors and strings in `info`.
-
-    Args:
-        scene: as in `StreetEnv`.
-        representations: names, or a mapping from name to options.
-        joined: as in `RepresentationObservation`.
-        truncate_timeouts: as in `NumericInfo`.
-        options: passed to `StreetEnv`.
+    With neither representations nor `truncate_timeouts` (see `RepresentationObservation` and
+    `NumericInfo`) it is the plain `StreetEnv` of the `options`, with strings in `info`.
     """
     if representations and "sensors" not in options:
-        options["sensors"] = _sensors_for(representations)
+        # which sensors are read doesn't depend on K and classes
+        read = representation_stack(
+            representations, intrinsics=torch.eye(3), num_classes=1, dt_s=1.0
+        )
+        options["sensors"] = sensors_read(read)
     env: gym.Env = StreetEnv(scene, **options)
     if representations or truncate_timeouts:
         env = NumericInfo(env, truncate_timeouts=truncate_timeouts)
     if representations:
         env = RepresentationObservation(env, representations, joined=joined)
     return env
-
-
-def _sensors_for(representations: Representations) -> list[str]:
-    """Returns the sensors that representations read; they don't depend on K and classes."""
-    stack: Compose = representation_stack(
-        representations, intrinsics=torch.eye(3), num_classes=1, dt_s=1.0
-    )
-    return sensors_read(stack)
 
 
 def _onehot(representations: Representations) -> dict[str, dict[str, Any]]:
@@ -223,8 +198,13 @@ def _sensed(observation: Mapping[str, NDArray[Any]]) -> TensorDict:
     return TensorDict({"sensor": {key: torch.as_tensor(m) for key, m in observation.items()}})
 
 
-def _as_float(values: NDArray[Any]) -> NDArray[np.float32]:
-    return values.astype(np.float32) / (255.0 if values.dtype == np.uint8 else 1.0)
+def _joined(maps: Iterable[NDArray[Any]]) -> NDArray[Any]:
+    """Returns maps [C, H, W] along their channels: float32, with bytes divided by 255."""
+    maps = list(maps)
+    if any(each.dtype != np.uint8 for each in maps):
+        scales = (255.0 if each.dtype == np.uint8 else 1.0 for each in maps)
+        maps = [each.astype(np.float32) / scale for each, scale in zip(maps, scales)]
+    return np.concatenate(maps)
 
 
 def _spec(box: spaces.Space) -> Bounded | Unbounded:

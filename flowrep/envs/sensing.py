@@ -6,8 +6,7 @@ a test holds them equal to `flowrep.geometry`.
 Convention: `<to>_from_<from>`; a planar pose is (x, y, yaw), metres and radians, z up.
 """
 
-from collections.abc import Callable, Sequence, Set
-from functools import cache
+from collections.abc import Sequence, Set
 from typing import Any
 
 import numpy as np
@@ -91,7 +90,7 @@ def instance_motion(
 Arrays = dict[str, Array]
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb", "frame")
 _MAPS = frozenset({"depth", "semantic", "instance"})
-_MOTIONS = frozenset({"prev_from_curr", "instance_motion"})
+_DRAWN = _MAPS | {"rgb"}
 
 
 class Sensing:
@@ -116,33 +115,46 @@ class Sensing:
         self.K = sampled_intrinsics(focal, focal, *size)
         self._projection = gl_projection(focal, focal, *size, camera.near_m, camera.far_m)
         self._vehicle_from_cam = vehicle_from_camera(camera)
-        self._class_of_body = street.simulator.class_lookup()
-        self._instance_of_body = street.simulator.instance_lookup()
+        self._ids_by_number = street.ids_by_number()
         self.renderer, self._scale = choose_renderer(renderer), picture_scale
-        self._rasterise: Callable[..., Any] | None = None
-        if not {"rgb", *_MAPS}.isdisjoint(sensors):
-            self._rasterise = self._rasteriser(1)
-            if picture_scale != 1 and self._rasterise is None:
-                raise ValueError(f"picture_scale={picture_scale} needs renderer 'rasteriser'")
-        self._picture: Picture | None = None
+        if picture_scale != 1 and self.renderer == "pybullet":
+            raise ValueError(f"picture_scale={picture_scale} needs renderer 'rasteriser'")
+        self._rasterisers: dict[int, Any] = {}  # by scale
+        if self.renderer != "pybullet" and not _DRAWN.isdisjoint(sensors):
+            self._rasteriser(1)  # compiled before the first step
 
     def observe(self, episode: Episode) -> dict[str, Any]:
         """Returns an episode's current observation; renders only if a map is requested."""
-        return {name: stack[0] for name, stack in observe_together([self], [episode]).items()}
+        return {name: stack[0] for name, stack in self.observe_all([episode]).items()}
+
+    def observe_all(self, episodes: Sequence[Episode]) -> Arrays:
+        """Returns the current observations of N episodes of the scene, [N, ...].
+
+        Each is identical, bit for bit, to the observation of the episode alone.
+        """
+        names = _DRAWN.intersection(self.names)
+        observation = self._draw(episodes, names) if names else {}
+        if not {"prev_from_curr", "instance_motion"}.isdisjoint(self.names):
+            now = self._camera_poses([episode.now for episode in episodes])
+            before = self._camera_poses([episode.before for episode in episodes])
+            if "instance_motion" in self.names:
+                parts_before = _parts([episode.poses_before for episode in episodes])
+                parts = _parts([episode.poses for episode in episodes])
+                rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
+                observation |= {"instance_motion": rows, "prev_from_curr": rows[:, 0].copy()}
+            else:
+                observation["prev_from_curr"] = relative_camera(before, now).astype(np.float32)
+        if "frame" in self.names:
+            named = [(episode.seed, episode.steps) for episode in episodes]
+            observation["frame"] = np.array(named, dtype=np.int64)
+        return {name: observation[name] for name in self.names}
 
     def rgb(self, episode: Episode) -> NDArray[np.uint8]:
-        """Returns the colour picture [H, W, 3] of an episode's last observed step."""
-        if self._rasterise is None:
-            self._rasterise = self._rasteriser(1)
-        if self._rasterise is not None:
-            return self._drawn([episode], {"rgb"})["rgb"][0].transpose(1, 2, 0)
-        picture = self._seen(episode)
-        rgb = picture.rgba[..., :3].copy()
-        rgb[picture.body < 0] = CLASS_COLOURS["sky"]
-        return rgb
+        """Returns the colour picture [H, W, 3] of an episode's current step."""
+        return self._draw([episode], {"rgb"})["rgb"][0].transpose(1, 2, 0)
 
     def look(self, episode: Episode) -> Picture:
-        """Returns a picture from an episode's camera of the bodies as last placed."""
+        """Returns PyBullet's picture from an episode's camera, of the bodies as last placed."""
         camera, pose = self._camera, self._camera_poses([episode.now])
         return self._street.simulator.look(
             gl_view(pose.cam_from_world[0]), self._projection, camera.height_px, camera.width_px
@@ -164,97 +176,53 @@ class Sensing:
         }
         return spaces.Dict({name: every[name] for name in self.names})
 
-    @cache  # noqa: B019 - a sensing lives as long as its environment
-    def _rasteriser(self, scale: int) -> Callable[..., Any] | None:
-        """Returns a rasteriser of pictures so many times the maps' size; None for PyBullet."""
+    def _draw(self, episodes: Sequence[Episode], names: Set[str]) -> Arrays:
+        """Returns at least the named maps and colours, [N, ...]."""
         if self.renderer == "pybullet":
-            return None
-        from flowrep.simulator.rasteriser import Rasteriser
-
-        camera = self._camera
-        size = scale * camera.height_px, scale * camera.width_px
-        K = np.diag([scale, scale, 1.0]) @ self.K
-        return Rasteriser(self._street.triangles, K, size, (camera.near_m, camera.far_m))
-
-    def _drawn(self, episodes: Sequence[Episode], names: Set[str]) -> Arrays:
-        """Returns the maps and the colours that are named, [N, ...], by the rasteriser."""
+            pictured = [self._pictured(episode) for episode in episodes]
+            return {name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]}
         views = (
             self._camera_poses([episode.now for episode in episodes]).cam_from_world,
             _parts([episode.poses for episode in episodes]),
-            np.stack([self._street.solids(each.path.closures).is_shown for each in episodes]),
+            np.stack([self._street.is_shown(episode.path.closures) for episode in episodes]),
         )
         arrays: Arrays = {}
-        at_once = "rgb" in names and self._scale == 1
-        if at_once or not names.isdisjoint(_MAPS):
-            assert self._rasterise is not None
-            drawn = self._rasterise(*views, rgb=at_once)
+        colours_too = "rgb" in names and self._scale == 1
+        if colours_too or not names.isdisjoint(_MAPS):
+            drawn = self._rasteriser(1)(*views, rgb=colours_too)
             arrays = {name: getattr(drawn, name)[:, None] for name in _MAPS} | {"rgb": drawn.rgb}
-        if "rgb" in names and not at_once:
-            photograph = self._rasteriser(self._scale)
-            assert photograph is not None
-            arrays["rgb"] = photograph(*views, rgb=True).rgb
+        if "rgb" in names and not colours_too:
+            arrays["rgb"] = self._rasteriser(self._scale)(*views, rgb=True).rgb
         return arrays
 
-    def _seen(self, episode: Episode) -> Picture:
-        if self._picture is None:
-            with self._street.lock:
-                self._street.close_exits(episode.path.closures)
-                self._street.place_pedestrians(episode.poses, episode.now.vehicle)
-                self._picture = self.look(episode)
-        return self._picture
+    def _rasteriser(self, scale: int) -> Any:
+        """Returns a rasteriser of pictures so many times the maps' size."""
+        if scale not in self._rasterisers:
+            from flowrep.simulator.rasteriser import Rasteriser
+
+            camera = self._camera
+            size = scale * camera.height_px, scale * camera.width_px
+            K = np.diag([scale, scale, 1.0]) @ self.K
+            range_m = camera.near_m, camera.far_m
+            self._rasterisers[scale] = Rasteriser(self._street.triangles, K, size, range_m)
+        return self._rasterisers[scale]
+
+    def _pictured(self, episode: Episode) -> Arrays:
+        self._street.close_exits(episode.path.closures)
+        self._street.place_pedestrians(episode.poses)
+        picture = self.look(episode)
+        is_sky = picture.body < 0
+        depth = depth_from_zbuffer(picture.zbuffer, self._camera.near_m, self._camera.far_m)
+        depth[is_sky] = np.inf
+        semantic, instance = np.moveaxis(self._ids_by_number[picture.body], -1, 0)
+        rgb = picture.rgba[..., :3].transpose(2, 0, 1).copy()
+        rgb[:, is_sky] = np.array(CLASS_COLOURS["sky"])[:, None]
+        maps = {"depth": depth, "semantic": semantic, "instance": instance}
+        return {name: array[None] for name, array in maps.items()} | {"rgb": rgb}
 
     def _camera_poses(self, moments: Sequence[Moment]) -> CameraPose:
         x_m, y_m, yaw_rad, _ = np.array([moment.vehicle for moment in moments]).T
         return CameraPose(x_m, y_m, yaw_rad, self._vehicle_from_cam)
-
-    def _pictured(self, episode: Episode) -> Arrays:
-        picture = self._seen(episode)
-        maps: Arrays = {}
-        body = picture.body.astype(np.intp)  # index type of take()
-        if "depth" in self.names:
-            depth = depth_from_zbuffer(picture.zbuffer, self._camera.near_m, self._camera.far_m)
-            np.putmask(depth, body < 0, np.inf)
-            maps["depth"] = depth[None]
-        if "semantic" in self.names:
-            maps["semantic"] = self._class_of_body.take(body)[None]
-        if "instance" in self.names:
-            maps["instance"] = self._instance_of_body.take(body)[None]
-        return maps
-
-
-def observe_together(sensings: Sequence[Sensing], episodes: Sequence[Episode]) -> Arrays:
-    """Returns the current observations of N episodes of one scene, [N, ...].
-
-    Each is identical, bit for bit, to the observation of its environment alone.
-    """
-    for sensing in sensings:
-        sensing._picture = None
-    first = sensings[0]
-    observation: Arrays = {}
-    names = frozenset(first.names)
-    if first._rasterise is not None:
-        observation = first._drawn(episodes, names)
-    elif not names.isdisjoint(_MAPS):
-        pictured = [s._pictured(episode) for s, episode in zip(sensings, episodes)]
-        observation = {name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]}
-    if not names.isdisjoint(_MOTIONS):
-        now = first._camera_poses([episode.now for episode in episodes])
-        before = first._camera_poses([episode.before for episode in episodes])
-        if "instance_motion" in names:
-            parts_before = _parts([episode.poses_before for episode in episodes])
-            parts = _parts([episode.poses for episode in episodes])
-            rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
-            observation["instance_motion"] = rows
-            observation["prev_from_curr"] = rows[:, 0].copy()
-        else:
-            observation["prev_from_curr"] = relative_camera(before, now).astype(np.float32)
-    if "rgb" in names and first._rasterise is None:
-        colours = [s.rgb(episode) for s, episode in zip(sensings, episodes)]
-        observation["rgb"] = np.ascontiguousarray(np.stack(colours).transpose(0, 3, 1, 2))
-    if "frame" in names:
-        named = [(episode.seed, episode.steps) for episode in episodes]
-        observation["frame"] = np.array(named, dtype=np.int64)
-    return {name: observation[name] for name in first.names}
 
 
 def _parts(poses: Sequence[Array]) -> Array:

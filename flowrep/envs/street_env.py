@@ -77,11 +77,10 @@ class StreetEnv(gym.Env):
         self.scene = load_scene(scene)
         self.speed_mps = _speed_range(self.scene, speed)
         self.frame_rate_hz = _frame_rate(self.scene, frame_rate_hz)
-        self.render_mode = _render_mode(render_mode)
+        self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
         self._street = Street.shared(self.scene)
-        self._is_open = True
         self._rules: dict[tuple[float, int], Rules] = {}  # by frame rate and ticks a step
         self.sensing = Sensing(self.scene, self._street, sensors, renderer, picture_scale)
         self.K = self.sensing.K
@@ -105,7 +104,8 @@ class StreetEnv(gym.Env):
             seed: seeds the generator that draws the episodes' seeds.
             options: `episode_seed` (int) selects the episode and `path` (str) its path;
                 `vehicle_speed_mps` (float) replaces the scene's speed, with 0 for a still camera;
-                `speed` and `frame_rate_hz` replace the env's for this episode.
+                `speed` and `frame_rate_hz` replace the env's for this episode. Or `state` alone, of
+                `get_state`, with which an episode goes on.
 
         Raises:
             ValueError: an option is unknown or out of range.
@@ -116,8 +116,11 @@ class StreetEnv(gym.Env):
     def begin(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begins an episode as `reset` does, without an observation."""
         super().reset(seed=seed)
-        drawn = int(self.np_random.integers(1 << 31))
-        self._begin({"episode_seed": drawn} | (options or {}))
+        options = options or {}
+        if "state" in options:
+            self._resume(options["state"])
+        else:
+            self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drives one step. Every end of an episode is `terminated`, including the time-out."""
@@ -131,11 +134,14 @@ class StreetEnv(gym.Env):
         Raises:
             ValueError: the action is not 0, 1 or 2.
         """
-        action = _action(action)
+        if action not in range(len(YAW_SIGN)):
+            raise ValueError(
+                f"action is {action!r}; give 0 (keep the yaw rate), 1 (turn left) or 2 (turn right)"
+            )
         if self.episode.outcome:
             label = self.episode.outcome.label
             raise RuntimeError(f"the episode has ended ({label}): call reset() first")
-        self.episode.step(action, self._street)
+        self.episode.step(int(action), self._street)
         return self.episode.outcome
 
     def render(self) -> Any:
@@ -145,10 +151,8 @@ class StreetEnv(gym.Env):
         return self.sensing.rgb(self.episode)
 
     def close(self) -> None:
-        """Leaves the street; the last environment to do so disconnects the simulator's client."""
-        if self._is_open:
-            self._is_open = False
-            self._street.leave()
+        """Leaves the street, whose simulator is gone when the last environment has left it."""
+        self.sensing = self._street = None  # type: ignore[assignment]
 
     def get_state(self) -> dict[str, Any]:
         """Returns the complete state as JSON-serialisable data."""
@@ -169,28 +173,34 @@ class StreetEnv(gym.Env):
 
     def set_state(self, state: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Restores a state from `get_state`; returns its observation and info."""
+        return self.reset(options={"state": state})
+
+    def _resume(self, state: Mapping[str, Any]) -> None:
         self.np_random.bit_generator.state = state["np_random"]
         self._begin({name: state[name] for name in _OPTIONS})
         episode = self.episode
         episode.steps, episode.hit = state["steps"], state["hit"]
         episode.outcome = Outcome[state["outcome"].upper()]
-        episode.resume(_moment(state["before"]), _moment(state["now"]))
-        return self.sensing.observe(self.episode), self._info()
+        episode.resume(*(_moment(state[name]) for name in ("before", "now")))
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         if unknown := sorted(options.keys() - set(_OPTIONS)):
             raise ValueError(f"unknown reset options {unknown}; they are: {', '.join(_OPTIONS)}")
         rate = _frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz))
         speed_mps = _speed_range(self.scene, options.get("speed", self.speed_mps))
-        vehicle_speed_mps = _vehicle_speed(self.scene, options.get("vehicle_speed_mps"))
+        vehicle_speed_mps = options.get("vehicle_speed_mps")
+        if vehicle_speed_mps is None:
+            vehicle_speed_mps = self.scene.vehicle.speed_mps
+        if not 0 <= vehicle_speed_mps < math.inf:
+            raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 to stand")
         clock = rate, ticks_for(self.scene, rate, speed_mps, vehicle_speed_mps)
         if clock not in self._rules:
             self._rules[clock] = Rules(self._street.layout, *clock)
         self._episode = Episode(
             self._rules[clock],
-            _episode_seed(options["episode_seed"]),
+            operator.index(options["episode_seed"]),
             speed_mps,
-            vehicle_speed_mps,
+            float(vehicle_speed_mps),
             path=options.get("path"),
         )
 
@@ -204,72 +214,24 @@ class StreetEnv(gym.Env):
         }
 
 
-def _action(action: Any) -> int:
-    try:
-        number = operator.index(action)  # accepts integers of NumPy and torch too
-    except TypeError:
-        number = -1
-    if number not in range(len(YAW_SIGN)):
-        raise ValueError(
-            f"action is {action!r}; give 0 (keep the yaw rate), 1 (turn left) or 2 (turn right)"
-        )
-    return number
-
-
-def _episode_seed(episode_seed: Any) -> int:
-    try:
-        number = operator.index(episode_seed)
-    except TypeError:
-        number = -1
-    if not 0 <= number < 1 << 31:
-        raise ValueError(
-            f"episode_seed is {episode_seed!r}; give a whole number from 0 to {(1 << 31) - 1}"
-        )
-    return number
-
-
 def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
     if isinstance(speed, str):
         if speed not in scene.pedestrian_speed_mps:
             modes = ", ".join(scene.pedestrian_speed_mps)
             raise ValueError(f"unknown speed {speed!r}; choose one of {modes}, or give (low, high)")
         return scene.pedestrian_speed_mps[speed]
-    try:
-        low, high = (float(bound) for bound in speed)
-    except (TypeError, ValueError):
-        low = high = math.nan
+    low, high = (float(bound) for bound in speed)
     if not 0 <= low <= high < math.inf:
-        remedy = "give (lowest, highest) in m/s, or a mode's name"
-        raise ValueError(f"speed is {speed!r}; {remedy}")
+        raise ValueError(f"speed is {speed!r}; give (lowest, highest) in m/s, or a mode's name")
     return low, high
-
-
-def _vehicle_speed(scene: Scene, vehicle_speed_mps: float | None) -> float:
-    given = scene.vehicle.speed_mps if vehicle_speed_mps is None else vehicle_speed_mps
-    try:
-        speed = float(given)
-    except (TypeError, ValueError):
-        speed = math.nan
-    if not 0 <= speed < math.inf:
-        remedy = "give a speed in m/s, 0 for a still camera"
-        raise ValueError(f"vehicle_speed_mps is {given!r}; {remedy}")
-    return speed
 
 
 def _frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
     rate = scene.frame_rate_hz if frame_rate_hz is None else float(frame_rate_hz)
     lowest, highest = FRAME_RATES_HZ
     if not lowest <= rate <= highest:
-        raise ValueError(
-            f"frame_rate_hz is {rate}; give a rate from {lowest:g} to {highest:g}, say 12"
-        )
+        raise ValueError(f"frame_rate_hz is {rate}; give a rate from {lowest:g} to {highest:g}")
     return rate
-
-
-def _render_mode(render_mode: str | None) -> str | None:
-    if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"unknown render_mode {render_mode!r}; give 'rgb_array' or None")
-    return render_mode
 
 
 def _plain(moment: Moment) -> dict[str, Any]:

@@ -35,21 +35,16 @@ def check_rate(
 ) -> None:
     """Checks that a reset's options leave the steps as long as flow in px/s takes them to be.
 
-    Args:
-        transforms: those that write the representations.
-        options: of the reset, see `StreetEnv.reset`.
-        frame_rate_hz: the rate for which the transforms were made.
-
     Raises:
-        ValueError: flow is in px/s and the options ask for another rate.
+        ValueError: flow is in px/s and the options ask for another rate than `frame_rate_hz`.
     """
     asked = (options or {}).get("frame_rate_hz")
     if asked is None or not any(getattr(t, "is_per_second", False) for t in transforms):
         return
     if not math.isclose(float(asked), frame_rate_hz):
         raise ValueError(
-            f"flow in px_per_s was set up for {frame_rate_hz:g} frames a second, and a reset can't "
-            f"change that to {asked}: make another env, with frame_rate_hz={asked}"
+            f"flow in px_per_s was set up for {frame_rate_hz:g} frames a second, not {asked}: make "
+            f"another env, with frame_rate_hz={asked}"
         )
 
 
@@ -61,13 +56,6 @@ class VectorWrapper(GymWrapper):
 
     TorchRL 0.14 passes them on from the TensorDict's device, which fails on CUDA, and requires them
     in every TensorDict; here, all environments are reset if they are missing.
-
-    Args:
-        env: the environments.
-        scene: their scene.
-        frame_rate_hz: their frame rate, which no reset may change if flow is in px/s.
-        transforms: those that write the representations.
-        kwargs: passed to TorchRL's wrapper.
     """
 
     def __init__(
@@ -94,10 +82,12 @@ class VectorWrapper(GymWrapper):
 
 
 class DropSensor(ExcludeTransform):
-    """Drops all ("sensor", ...) keys after the representations have been computed from them."""
+    """Drops all ("sensor", ...) keys after the representations have been computed from them.
+
+    TorchRL's own transform looks for "sensor" among the leaves of the specs, and finds none.
+    """
 
     def __init__(self) -> None:
-        """Excludes "sensor"."""
         super().__init__("sensor")
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
@@ -131,15 +121,13 @@ def make_env(
     i's k-th episode does not depend on the policy.
 
     Args:
-        scene: a scene's name, file, mapping, or `Scene`.
+        scene: see `StreetEnv`, as for `speed`, `frame_rate_hz`, `renderer` and `picture_scale`.
         representations: names, or a mapping from name to options; only the sensors that they need
             are rendered, none for an empty list.
         num_envs: number of environments.
         num_workers: number of processes that step them, see `WorkerVectorEnv`; 0 steps them in this
             process. The results are the same.
         device: device of the TensorDicts.
-        speed: the pedestrians' speed mode, or their (lowest, highest) speed in m/s.
-        frame_rate_hz: steps a second; the scene's own if None.
         seed: seeds the envs, which draw their episodes from it; None leaves that to `set_seed`.
         keep_sensor: whether the ("sensor", ...) keys are kept; rgb and frame are kept only if a
             representation needs them.
@@ -151,8 +139,6 @@ def make_env(
             drawn by frame, so that a repeated episode looks the same.
         compiled: whether flow is computed through `torch.compile`: up to two and a half times as
             fast on a CPU and equal up to rounding, after up to a minute of compilation.
-        renderer: what renders depth, classes and ids, see `StreetEnv`.
-        picture_scale: size of `rgb` in sizes of the maps, with the rasteriser.
 
     Raises:
         SceneError: if the scene is invalid.
@@ -164,12 +150,8 @@ def make_env(
     torch.Size([2, 3, 2, 84, 84])
     >>> env.close()
     """
-    counts = isinstance(num_envs, int) and isinstance(num_workers, int)
-    if not counts or num_envs < 1 or not 0 <= num_workers <= num_envs:
-        raise ValueError(
-            f"num_envs is {num_envs} and num_workers {num_workers}; give whole numbers, at least "
-            "one environment and no more workers than environments"
-        )
+    if num_envs < 1:
+        raise ValueError(f"num_envs is {num_envs}; give at least one environment")
     loaded = load_scene(scene)
     street = partial(
         StreetEnv,
@@ -290,17 +272,13 @@ def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None
     Raises:
         ValueError: if the number of states is not the number of environments.
     """
-    env.reset()
     vector = _vector(env)
     if len(states) != vector.num_envs:
         raise ValueError(
             f"{len(states)} states for {vector.num_envs} environments; give one for each"
         )
-    if isinstance(vector, WorkerVectorEnv):
-        vector.call_each("set_state", states)
-    else:
-        for street, state in zip(street_envs(env), states):
-            street.set_state(state)
+    env.reset()
+    vector.reset(options={"episodes": [{"state": state} for state in states]})
 
 
 def _vector(env: TransformedEnv) -> Any:

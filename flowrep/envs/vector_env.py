@@ -12,7 +12,6 @@ from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 
 from flowrep.envs.episode import NOTHING_HIT, Episode, Outcome, hit_code, reward
-from flowrep.envs.sensing import observe_together
 
 
 class SensorObservation(gym.Wrapper):
@@ -127,7 +126,7 @@ class StreetVectorEnv(SyncVectorEnv):
             return deepcopy(self._latest)
         streets = [self._streets[row] for row in rows]
         episodes = [street.episode for street in streets]
-        seen = observe_together([street.sensing for street in streets], episodes)
+        seen = streets[0].sensing.observe_all(episodes)
         status = _status(episodes)
         if len(rows) < self.num_envs:
             # Arrays returned before belong to the caller: copy them instead of writing to them.

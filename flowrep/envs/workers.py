@@ -12,7 +12,7 @@ from itertools import pairwise
 from multiprocessing import forkserver, get_context, resource_tracker, util
 from multiprocessing.connection import Connection
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -43,8 +43,7 @@ class WorkerVectorEnv(VectorEnv):
     Observations come back through shared memory, everything else through pipes. `step_async` begins
     a step, so that the caller can do other work until it calls `step` for the outcome.
 
-    Workers are forked from a server that has imported neither PyTorch nor the caller's main module.
-    They don't react to SIGINT and SIGTERM, which terminals and schedulers send to whole process
+    Workers don't react to SIGINT and SIGTERM, which terminals and schedulers send to whole process
     groups, and end when the caller closes them or dies.
 
     Args:
@@ -55,7 +54,7 @@ class WorkerVectorEnv(VectorEnv):
 
     Raises:
         ValueError: if there are fewer environments than workers.
-        WorkerError: if a worker could not start; any method raises it once a worker has stopped.
+        WorkerError: if a worker could not start; any method raises it if a worker has stopped.
     """
 
     def __init__(
@@ -67,8 +66,8 @@ class WorkerVectorEnv(VectorEnv):
         """Starts the workers and waits until they have built their environments."""
         if not 1 <= num_workers <= len(env_factories):
             raise ValueError(
-                f"num_workers is {num_workers} for {len(env_factories)} environments; "
-                "give one environment at least to each worker, and one worker at least"
+                f"num_workers is {num_workers} for {len(env_factories)} environments; give each "
+                "worker one at least"
             )
         self.num_envs, self.num_workers = len(env_factories), num_workers
         self.autoreset_mode = AutoresetMode.DISABLED
@@ -91,10 +90,13 @@ class WorkerVectorEnv(VectorEnv):
             forkserver.ensure_running()
             memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
             for rows in self._rows:
-                make = partial(_Environments, env_factories[rows], rows, memory, in_each)
-                self._workers.append(_Worker(context, partial(make, self.num_envs), _name(rows)))
-        self._shared = _views(self.single_observation_space, memory, self.num_envs)
-        self._receive()
+                made_of = env_factories[rows], rows, memory, self.num_envs, in_each
+                self._workers.append(_Worker(context, made_of, rows))
+        self._shared: Any = read_from_shared_memory(
+            self.single_observation_space, memory, self.num_envs
+        )
+        for worker in self._workers:
+            worker.receive()
 
     def reset(
         self,
@@ -111,22 +113,17 @@ class WorkerVectorEnv(VectorEnv):
             options: passed to every worker's `reset`, except `reset_mask`, bool [num_envs], and
                 `episodes` of `StreetVectorEnv`, of which each gets its own part.
         """
-        self.drop_step()
         options = dict(options or {})
-        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
         episodes = options.pop("episodes", None)
         if isinstance(seed, int):
             seed = range(seed, seed + self.num_envs)
         seeds = [None] * self.num_envs if seed is None else list(seed)
-        if mask.shape != (self.num_envs,) or len(seeds) != self.num_envs:
-            raise ValueError(
-                f"reset: seeds and reset_mask should be one for each of {self.num_envs} "
-                f"environments, got {len(seeds)} seeds and a mask {mask.shape}"
-            )
 
-        def arguments(rows: slice) -> tuple[Any, ...]:
-            part = {} if episodes is None else {"episodes": episodes[rows]}
-            return seeds[rows], mask[rows], options | part
+        def arguments(rows: slice) -> dict[str, Any]:
+            own = {"reset_mask": mask[rows]}
+            own |= {} if episodes is None else {"episodes": episodes[rows]}
+            return {"seed": seeds[rows], "options": options | own}
 
         self._call("reset", arguments)
         return deepcopy(self._shared), {}
@@ -136,7 +133,7 @@ class WorkerVectorEnv(VectorEnv):
         if self._begun is not None:
             raise RuntimeError("a step is under way: call step() for its outcome first")
         actions = np.array(actions)
-        self._send("step", lambda rows: (actions[rows],))
+        self._send("step", lambda rows: {"actions": actions[rows]})
         self._begun = actions
 
     def step(
@@ -148,99 +145,66 @@ class WorkerVectorEnv(VectorEnv):
         elif not np.array_equal(self._begun, actions):
             raise ValueError(f"step_async began a step with {self._begun}, step got {actions}")
         self._begun = None
-        rewards, terminated, truncated = map(np.concatenate, zip(*self._receive()))
+        outcomes = [worker.receive()[:3] for worker in self._workers]
+        rewards, terminated, truncated = map(np.concatenate, zip(*outcomes))
         return deepcopy(self._shared), rewards, terminated, truncated, {}
-
-    def drop_step(self) -> None:
-        """Waits for a step under way and discards its outcome."""
-        if self._begun is not None:
-            self._begun = None
-            self._receive()
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Returns the result of a method, or the value of an attribute, for each environment."""
-        self.drop_step()
-        return self._call("call", lambda rows: (name, args, kwargs))
-
-    def call_each(self, name: str, arguments: Sequence[Any]) -> tuple[Any, ...]:
-        """Returns the result of a method called with one argument for each environment."""
-        self.drop_step()
-        return self._call("call_each", lambda rows: (name, list(arguments[rows])))
+        results = self._call("call", lambda rows: {"name": name, "args": args, "kwargs": kwargs})
+        return tuple(result for own in results for result in own)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the workers."""
         self._end()
 
-    def _call(self, method: str, arguments: Callable[[slice], tuple[Any, ...]]) -> tuple[Any, ...]:
+    def _call(self, method: str, arguments: Callable[[slice], dict[str, Any]]) -> list[Any]:
         self._send(method, arguments)
-        return tuple(result for results in self._receive() for result in results)
+        return [worker.receive() for worker in self._workers]
 
-    def _send(self, method: str, arguments: Callable[[slice], tuple[Any, ...]]) -> None:
+    def _send(self, method: str, arguments: Callable[[slice], dict[str, Any]]) -> None:
         if not self._workers:
-            raise WorkerError("the workers have ended, by close() or by a failure before")
-        with self._ending_together():
-            for worker, rows in zip(self._workers, self._rows):
-                worker.send(method, arguments(rows))
-
-    def _receive(self) -> list[Any]:
-        with self._ending_together():
-            return [worker.receive() for worker in self._workers]
-
-    @contextmanager
-    def _ending_together(self) -> Iterator[None]:
-        # The other workers' answers are useless without the failed one's.
-        try:
-            yield
-        except WorkerError:
-            self._end()
-            raise
-
-
-class _Answer(NamedTuple):
-    content: Any = ()
-    failure: str | None = None
+            raise WorkerError("the workers have ended: close() was called")
+        self._begun = None
+        for worker, rows in zip(self._workers, self._rows):
+            worker.send(method, arguments(rows))
 
 
 class _Worker:
-    """The caller's side of a process that makes an object and calls its methods."""
+    """The caller's side of a process that steps environments."""
 
-    def __init__(self, context: Any, make: Callable[[], Any], name: str) -> None:
-        self.name = name
+    def __init__(self, context: Any, made_of: tuple[Any, ...], rows: slice) -> None:
+        self.name = f"environments {rows.start} to {rows.stop - 1}"
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, make), daemon=True)
+        self.process = context.Process(target=_work, args=(theirs, *made_of), daemon=True)
         self.process.start()
         theirs.close()
-        self.owes_answer = True  # that the object is made
+        self._owes_answer = True  # that its environments are made
 
-    def send(self, method: str, arguments: tuple[Any, ...]) -> None:
-        """Calls a method; an answer that nobody waited for, after an interrupt, is dropped."""
-        if self.owes_answer:
+    def send(self, method: str, arguments: dict[str, Any]) -> None:
+        """Calls a method of the worker's vector env."""
+        if self._owes_answer:  # that of a step which was dropped, or of a call that was interrupted
             self.receive()
-        try:
-            self.pipe.send((method, arguments))
-            self.owes_answer = True
-        except OSError as error:
-            raise self._gone() from error
+        self._talk(self.pipe.send, (method, arguments))
+        self._owes_answer = True
 
     def receive(self) -> Any:
         """Waits for what the method returned."""
-        try:
-            answer: _Answer = self.pipe.recv()
-            self.owes_answer = False
-        except (EOFError, OSError) as error:
-            raise self._gone() from error
-        if answer.failure is not None:
-            raise WorkerError(f"the worker process of {self.name} failed:\n{answer.failure}")
-        return answer.content
+        result, failure = self._talk(self.pipe.recv)
+        self._owes_answer = False
+        if failure:
+            raise WorkerError(f"the worker process of {self.name} failed:\n{failure}")
+        return result
 
-    def _gone(self) -> WorkerError:
-        self.process.join(timeout=1.0)
-        code = self.process.exitcode
-        reason = f"exit code {code}" if code is None or code >= 0 else signal.Signals(-code).name
-        return WorkerError(
-            f"the worker process of {self.name} is gone ({reason}): perhaps the system killed it "
-            "for want of memory"
-        )
+    def _talk(self, act: Callable[..., Any], *args: Any) -> Any:
+        try:
+            return act(*args)
+        except (EOFError, OSError) as error:
+            self.process.join(timeout=1.0)
+            raise WorkerError(
+                f"the worker process of {self.name} is gone (exit code {self.process.exitcode}): "
+                "perhaps the system killed it for want of memory"
+            ) from error
 
 
 def _end(workers: list[_Worker]) -> None:
@@ -255,22 +219,48 @@ def _end(workers: list[_Worker]) -> None:
     workers.clear()
 
 
-def _work(pipe: Connection, make: Callable[[], Any]) -> None:
-    """Makes an object and calls its methods, until the other end of the pipe is closed."""
-    made = None
+def _work(
+    pipe: Connection,
+    env_factories: Sequence[EnvFactory],
+    rows: slice,
+    memory: Any,
+    num_envs: int,
+    in_each: VectorFactory,
+) -> None:
+    """Calls methods of a vector env until the other end of the pipe is closed.
+
+    Observations are written into their rows of the shared memory, what else is returned is sent.
+    """
+    vector: Any = None
     try:
-        made = make()
-        pipe.send(_Answer())
+        vector = in_each(env_factories)
+        shared: Any = read_from_shared_memory(vector.single_observation_space, memory, num_envs)
+        pipe.send((None, None))
         while True:
             method, arguments = pipe.recv()
-            pipe.send(_Answer(getattr(made, method)(*arguments)))
+            if method == "call":
+                result = vector.call(arguments["name"], *arguments["args"], **arguments["kwargs"])
+            elif method == "reset" and not arguments["options"]["reset_mask"].any():
+                result = ()  # which gymnasium's vector env refuses
+            else:
+                observation, *result = getattr(vector, method)(**arguments)
+                _copy(observation, shared, rows)
+            pipe.send((result, None))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the caller has closed, or is gone
     except Exception:
-        pipe.send(_Answer(failure=traceback.format_exc()))
+        pipe.send((None, traceback.format_exc()))
     finally:
-        if made is not None:
-            made.close()
+        if vector is not None:
+            vector.close()
+
+
+def _copy(source: Mapping[str, Any], target: Mapping[str, Any], rows: slice) -> None:
+    for name, value in source.items():
+        if isinstance(value, Mapping):
+            _copy(value, target[name], rows)
+        else:
+            target[name][rows] = value
 
 
 @contextmanager
@@ -292,71 +282,6 @@ def sheltered() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-class _Environments:
-    """The environments of one worker, which write observations into their rows of shared memory."""
-
-    def __init__(
-        self,
-        env_factories: Sequence[EnvFactory],
-        rows: slice,
-        memory: Any,
-        in_each: VectorFactory,
-        num_envs: int,
-    ) -> None:
-        self._vector: Any = in_each(env_factories)
-        everything = _views(self._vector.single_observation_space, memory, num_envs)
-        self._shared = _map(lambda array: array[rows], everything)
-
-    def reset(
-        self, seeds: list[int | None], mask: NDArray[np.bool_], options: dict[str, Any]
-    ) -> tuple[()]:
-        if mask.any():
-            observation, _ = self._vector.reset(seed=seeds, options=options | {"reset_mask": mask})
-            _copy(observation, self._shared)
-        return ()
-
-    def step(self, actions: NDArray[Any]) -> tuple[Any, ...]:
-        observation, *outcome, _ = self._vector.step(actions)
-        _copy(observation, self._shared)
-        return tuple(outcome)
-
-    def call(self, name: str, args: Any, kwargs: Any) -> tuple[Any, ...]:
-        return self._vector.call(name, *args, **kwargs)
-
-    def call_each(self, name: str, arguments: list[Any]) -> list[Any]:
-        pairs = zip(self._vector.envs, arguments)
-        return [env.get_wrapper_attr(name)(given) for env, given in pairs]
-
-    def close(self) -> None:
-        self._vector.close()
-
-
 def available_cores() -> int:
     """Returns the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _name(rows: slice) -> str:
-    first, last = rows.start, rows.stop - 1
-    return f"environment {first}" if first == last else f"environments {first} to {last}"
-
-
-def _views(space: gym.Space, memory: Any, num_envs: int) -> Arrays:
-    """Returns the shared memory of a `Dict` space as writable arrays [num_envs, ...]."""
-    views: Any = read_from_shared_memory(space, memory, num_envs)
-    return _map(np.asarray, views)
-
-
-def _map(change: Callable[[Any], Any], arrays: Mapping[str, Any]) -> Arrays:
-    return {
-        name: _map(change, value) if isinstance(value, Mapping) else change(value)
-        for name, value in arrays.items()
-    }
-
-
-def _copy(source: Mapping[str, Any], target: Arrays) -> None:
-    for name, value in source.items():
-        if isinstance(value, Mapping):
-            _copy(value, target[name])
-        else:
-            np.copyto(target[name], value)

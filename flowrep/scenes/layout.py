@@ -216,6 +216,11 @@ class Layout:
         """Returns the ground that the vehicle covers in the middle of a start zone."""
         return Polygon(footprint_corners(self.start_state(zone_name), self.scene.vehicle))
 
+    def boxes(self, path: Path) -> list[Box]:
+        """Returns all that stands in the episodes of a path, its closures included."""
+        closures = [self.closures[name] for name in path.closures]
+        return [*self.buildings, *self.obstacles, *closures]
+
     def walk_line(self, walk: Walk, lateral_m: float = 0.0) -> Array:
         """Returns the points [M, 2] of a walk, moved `lateral_m` to the left of its direction."""
         if walk not in self._walks:
@@ -324,8 +329,7 @@ class Layout:
 
 def free_ground(layout: Layout, path: Path) -> BaseGeometry:
     """Returns the road minus the buildings, obstacles and closures of a path's episodes."""
-    boxes = [*layout.buildings, *layout.obstacles]
-    boxes += [layout.closures[name] for name in path.closures]
-    free = layout.drivable.difference(shapely.union_all([box.footprint for box in boxes]))
+    taken = shapely.union_all([box.footprint for box in layout.boxes(path)])
+    free = layout.drivable.difference(taken)
     shapely.prepare(free)
     return free

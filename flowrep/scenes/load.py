@@ -8,12 +8,11 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-import shapely
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from flowrep.config import CONF_DIR
-from flowrep.scenes.checks import check_consistency, check_paths, check_places, check_walks
+from flowrep.scenes.checks import check_path, check_references, check_walks
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.scene import Scene, SceneError
 
@@ -69,32 +68,28 @@ def _checked(pickled: bytes) -> Scene:
 def _loaded(data: Any, source: str) -> Scene:
     try:
         scene = _adapter().validate_python(data)
-    except ValidationError as error:
-        raise _refusal(error, source) from error
-    check_consistency(scene, source)
-    try:
+        check_references(scene)
         layout = Layout(scene)
-        check_places(layout, source)
-        check_paths(layout, source)
-        check_walks(layout, source)
-    except shapely.errors.GEOSException as error:
-        problem = f"can't be laid out: {error}"
-        raise SceneError(source, "roads", problem, "give simpler roads and walks") from error
+        for path in scene.paths:
+            check_path(layout, path)
+        check_walks(layout)
+    except ValidationError as error:
+        raise SceneError(f"{source}: {_complaint(error)}") from error
+    except SceneError as error:
+        raise SceneError(f"{source}: {error}") from error
     return scene
 
 
-def _refusal(error: ValidationError, source: str) -> SceneError:
+def _complaint(error: ValidationError) -> str:
     """Returns pydantic's first complaint, on one line."""
     # A misspelt key is also missing under its right name; the misspelling explains it.
     first = min(error.errors(), key=lambda each: each["type"] != "unexpected_keyword_argument")
-    key = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in first["loc"])
+    key = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in first["loc"])[1:]
     if first["type"] == "unexpected_keyword_argument":
-        return SceneError(source, key[1:], "unknown key", "the keys are in docs/scenes.md")
-    if first["type"] == "missing":
-        return SceneError(source, key[1:], "missing", "add it")
-    given = repr(first["input"])
-    given = given if len(given) <= 60 else f"{given[:60]}..."
-    return SceneError(source, key[1:], f"got {given}", first["msg"].removeprefix("Value error, "))
+        return f"{key}: unknown key; the keys are in docs/scenes.md"
+    problem = first["msg"].removeprefix("Value error, ")
+    given = "" if first["type"] == "missing" else f"; got {first['input']!r:.60}"
+    return f"{key}: {problem}{given}"
 
 
 class _Loader(yaml.SafeLoader):
@@ -113,8 +108,7 @@ def _read(path: Path) -> Any:
     try:
         return yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (OSError, ValueError, yaml.YAMLError) as error:
-        problem = f"can't be read: {' '.join(str(error).split())}"
-        raise SceneError(str(path), "", problem, "fix the file") from error
+        raise SceneError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
 
 
 def _find(scene: str | Path) -> Path:
@@ -122,6 +116,6 @@ def _find(scene: str | Path) -> Path:
     if path.suffix in (".yaml", ".yml"):
         return path
     if str(scene) not in scene_names():
-        remedy = f"choose one of {', '.join(scene_names())}, or give a YAML file"
-        raise SceneError(f"scene {str(scene)!r}", "", "unknown name", remedy)
+        known = ", ".join(scene_names())
+        raise SceneError(f"unknown scene {str(scene)!r}; choose one of {known}, or a YAML file")
     return CONF_DIR / "scene" / f"{scene}.yaml"

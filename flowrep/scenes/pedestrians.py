@@ -5,7 +5,7 @@ which the left leg is swung backwards and the right leg forwards about the axis 
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -23,34 +23,6 @@ RADIUS_M, HEIGHT_M = 0.3, 1.75
 PARTS = ("upper body", "left leg", "right leg")
 HIP_M, _HIP_ASIDE_M = 0.82, 0.1
 _SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
-
-
-class Parts(NamedTuple):
-    """Poses of the parts of P people: positions [P, 3, 3] in metres, quaternions [P, 3, 4]."""
-
-    positions: Array
-    quaternions_xyzw: Array
-
-
-def place_parts(poses: Array) -> Parts:
-    """Returns the poses of the parts of people at poses [P, 4]."""
-    x, y, yaw, swing = poses.T
-    positions = np.zeros((len(poses), len(PARTS), 3))
-    positions[:, :, 0] = x[:, None]
-    positions[:, :, 1] = y[:, None]
-    aside = _HIP_ASIDE_M * _SIDES
-    positions[:, 1:, 0] -= np.sin(yaw)[:, None] * aside
-    positions[:, 1:, 1] += np.cos(yaw)[:, None] * aside
-    positions[:, 1:, 2] = HIP_M
-    # Rotation about y by the leg's own angle, then about z by yaw.
-    sine_z, cosine_z = np.sin(yaw / 2)[:, None], np.cos(yaw / 2)[:, None]
-    half = np.zeros((len(poses), len(PARTS)))
-    half[:, 1:] = 0.5 * swing[:, None] * _SIDES
-    sine_y, cosine_y = np.sin(half), np.cos(half)
-    quaternions = np.stack(
-        [-sine_z * sine_y, cosine_z * sine_y, sine_z * cosine_y, cosine_z * cosine_y], axis=-1
-    )
-    return Parts(positions, quaternions)
 
 
 def world_from_parts(poses: Array) -> Array:
@@ -76,6 +48,17 @@ def world_from_parts(poses: Array) -> Array:
     transforms[:, 1:, 2, 3] = HIP_M
     transforms[..., 3, 3] = 1.0
     return transforms.reshape(-1, 4, 4)
+
+
+def quaternions_of_parts(poses: Array) -> Array:
+    """Returns the rotations of `world_from_parts` as quaternions [3·P, 4], x, y, z, w."""
+    _, _, yaw, swing = poses.T
+    sine_z, cosine_z = np.sin(yaw / 2)[:, None], np.cos(yaw / 2)[:, None]
+    half = np.zeros((len(poses), len(PARTS)))
+    half[:, 1:] = 0.5 * swing[:, None] * _SIDES
+    sine_y, cosine_y = np.sin(half), np.cos(half)
+    quaternions = [-sine_z * sine_y, cosine_z * sine_y, sine_z * cosine_y, cosine_z * cosine_y]
+    return np.stack(quaternions, axis=-1).reshape(-1, 4)
 
 
 APART_M = 2 * RADIUS_M
@@ -215,17 +198,10 @@ class Crowd:
 
     def _places(self, along: Array) -> tuple[Array, Array]:
         at = np.minimum(along, self._there_and_back - along)
-        if self._points.shape[1] == 2:
-            points, marks, directions, headings = (
-                array[:, 0]
-                for array in (self._points, self._marks, self._directions, self._headings)
-            )
-        else:
-            pieces = (at[..., None] >= self._marks[:, 1:-1]).sum(axis=-1)
-            here = self._people, np.minimum(pieces, self._last_piece)
-            points, marks = self._points[here], self._marks[here]
-            directions, headings = self._directions[here], self._headings[here]
-        return points + (at - marks)[..., None] * directions, headings
+        pieces = (at[..., None] >= self._marks[:, 1:-1]).sum(axis=-1)
+        here = self._people, np.minimum(pieces, self._last_piece)
+        points, directions = self._points[here], self._directions[here]
+        return points + (at - self._marks[here])[..., None] * directions, self._headings[here]
 
     def _facing(self, along: Array) -> Array:
         # 0 on the way out, π on the way back, with a uniform turn over _TURN_S at either end.

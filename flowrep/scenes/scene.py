@@ -1,10 +1,12 @@
 """The data of a scene: frozen dataclasses whose field names are the keys of the YAML file.
 
-Pydantic checks types and ranges when a file is loaded; other code sees plain floats and ints.
+Pydantic checks types and ranges when a scene is loaded, and names the key of whatever else a
+`__post_init__` refuses; other code sees plain floats and ints.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -35,10 +37,6 @@ LEAST_HEIGHT_M: dict[Kind, float] = {"car": 0.7, "traffic_light": 1.0, "lamp_pos
 class SceneError(ValueError):
     """An invalid scene; the message names the file, the key, the problem and the remedy."""
 
-    def __init__(self, source: str, key: str, problem: str, remedy: str) -> None:
-        """Composes the message from the location (`source`, `key`), the problem and the remedy."""
-        super().__init__(f"{source}: {key or 'the scene'}: {problem}; {remedy}")
-
 
 def _in_order(bounds: Range) -> Range:
     if bounds[0] > bounds[1]:
@@ -50,6 +48,24 @@ def _all_modes(ranges: dict[SpeedMode, Range]) -> dict[SpeedMode, Range]:
     if set(ranges) != set(get_args(SpeedMode)):
         raise ValueError(f"give all of {', '.join(get_args(SpeedMode))}")
     return ranges
+
+
+def _named_once(parts: Sequence[Any]) -> Sequence[Any]:
+    names = [getattr(part, "name", part) for part in parts]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"two are named {name!r}; rename one of them")
+    return parts
+
+
+def _check_forward(from_m: float, to_m: float) -> None:
+    if from_m >= to_m:
+        raise ValueError("give from_m below to_m")
+
+
+def _check_height(kind: Kind, size_m: tuple[float, float, float]) -> None:
+    if size_m[2] < (least_m := LEAST_HEIGHT_M.get(kind, 0.0)):
+        raise ValueError(f"a {kind} is at least {least_m} m high")
 
 
 # Strict: a number in quotes, or true for 1, is a mistake.
@@ -87,6 +103,10 @@ class CameraConfig(Part):
     near_m: Positive
     far_m: Positive
 
+    def __post_init__(self) -> None:
+        if self.near_m >= self.far_m:
+            raise ValueError("give far_m beyond near_m")
+
     @property
     def focal_px(self) -> float:
         """The focal length in pixels, the same along both axes."""
@@ -112,6 +132,12 @@ class Piece(Part):
     straight_m: Positive | None = None
     arc_radius_m: Positive | None = None
     arc_deg: Angle | None = None
+
+    def __post_init__(self) -> None:
+        arc = (self.arc_radius_m, self.arc_deg)
+        is_straight = self.straight_m is not None and arc == (None, None)
+        if not is_straight and (self.straight_m is not None or None in arc or self.arc_deg == 0):
+            raise ValueError("give straight_m alone, or arc_radius_m and an arc_deg other than 0")
 
 
 @dataclass(frozen=True)
@@ -139,6 +165,9 @@ class Zone(Part):
     to_m: Number
     reverse: Annotated[bool, Strict()] = False
 
+    def __post_init__(self) -> None:
+        _check_forward(self.from_m, self.to_m)
+
 
 @dataclass(frozen=True)
 class Path(Part):
@@ -161,6 +190,13 @@ class Closure(Part):
     height_m: Positive
 
 
+_KEYS_OF_WALK = {
+    "across": {"road", "at_m"},
+    "along": {"road", "from_m", "to_m", "offset_m"},
+    "points": {"points_m"},
+}
+
+
 @dataclass(frozen=True)
 class Walk(Part):
     """The walk of a group, back and forth: across a road, along it, or through given points."""
@@ -172,6 +208,14 @@ class Walk(Part):
     to_m: Number | None = None
     offset_m: Number = 0.0
     points_m: tuple[Point, ...] = ()
+
+    def __post_init__(self) -> None:
+        keys = _KEYS_OF_WALK[self.kind]
+        given = {field.name for field in fields(self) if getattr(self, field.name) != field.default}
+        if given - {"kind", "offset_m"} != keys - {"offset_m"} or not given <= {"kind", *keys}:
+            raise ValueError(f"a walk of kind {self.kind!r} has {', '.join(sorted(keys))}")
+        if self.kind == "along" and self.from_m == self.to_m:
+            raise ValueError("give from_m and to_m that differ")
 
 
 @dataclass(frozen=True)
@@ -190,6 +234,10 @@ class PedestrianGroup(Part):
     draw: Literal["group", "pedestrian"] = "group"
     speed_mps: SpeedRange | None = None
 
+    def __post_init__(self) -> None:
+        if self.standing > self.count:
+            raise ValueError("standing is more than count")
+
 
 @dataclass(frozen=True)
 class BuildingRow(Part):
@@ -207,6 +255,12 @@ class BuildingRow(Part):
     depth_m: HouseRange
     height_m: HouseRange
 
+    def __post_init__(self) -> None:
+        if self.side in ("left", "right"):
+            _check_forward(self.from_m, self.to_m)
+        elif self.from_m or self.to_m:
+            raise ValueError(f"give 0 for from_m and to_m: it is one house at the {self.side}")
+
 
 @dataclass(frozen=True)
 class Obstacle(Part):
@@ -220,6 +274,9 @@ class Obstacle(Part):
     center_m: Point
     yaw_deg: Angle
     size_m: Size3
+
+    def __post_init__(self) -> None:
+        _check_height(self.kind, self.size_m)
 
 
 @dataclass(frozen=True)
@@ -237,6 +294,10 @@ class ObstacleRow(Part):
     to_m: Number
     every_m: Positive
     size_m: Size3
+
+    def __post_init__(self) -> None:
+        _check_forward(self.from_m, self.to_m)
+        _check_height(self.kind, self.size_m)
 
 
 @dataclass(frozen=True)
@@ -259,19 +320,19 @@ class Scene(Part):
     name: FileName
     frame_rate_hz: Annotated[float, Strict(), Field(ge=FRAME_RATES_HZ[0], le=FRAME_RATES_HZ[1])]
     time_limit_steps: Count
-    categories: tuple[Name, ...]
+    categories: Annotated[tuple[Name, ...], AfterValidator(_named_once)]
     layout_seed: Whole
     camera: CameraConfig
     vehicle: VehicleConfig
-    roads: Annotated[tuple[Road, ...], Field(min_length=1)]
-    zones: Annotated[tuple[Zone, ...], Field(min_length=1)]
-    paths: Annotated[tuple[Path, ...], Field(min_length=1)]
+    roads: Annotated[tuple[Road, ...], Field(min_length=1), AfterValidator(_named_once)]
+    zones: Annotated[tuple[Zone, ...], Field(min_length=1), AfterValidator(_named_once)]
+    paths: Annotated[tuple[Path, ...], Field(min_length=1), AfterValidator(_named_once)]
     pedestrian_speed_mps: Annotated[dict[SpeedMode, SpeedRange], AfterValidator(_all_modes)]
-    pedestrian_groups: tuple[PedestrianGroup, ...] = ()
+    pedestrian_groups: Annotated[tuple[PedestrianGroup, ...], AfterValidator(_named_once)] = ()
     building_rows: tuple[BuildingRow, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     obstacle_rows: tuple[ObstacleRow, ...] = ()
-    closures: tuple[Closure, ...] = ()
+    closures: Annotated[tuple[Closure, ...], AfterValidator(_named_once)] = ()
     crosswalks: tuple[Crosswalk, ...] = ()
     terrain_m: NotNegative = 0.0
     corner_radius_m: NotNegative = 0.0

@@ -1,6 +1,6 @@
 """Bodies, collisions and pictures by PyBullet; no other module imports it.
 
-Each simulator has a DIRECT client of its own, disconnected by `close()` or at garbage collection.
+Each simulator has a DIRECT client of its own, disconnected when nothing refers to it any more.
 """
 
 import contextlib
@@ -9,13 +9,12 @@ import math
 import os
 import tempfile
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.palette import CATEGORY_ID
 from flowrep.simulator.meshes import Mesh
 from flowrep.simulator.paint import AMBIENT, DIFFUSE, LIGHT
 
@@ -45,7 +44,6 @@ _LIGHT = {
     "shadow": 0,
     "renderer": pybullet.ER_TINY_RENDERER,
 }
-_HIDDEN_Z_M = -1000.0
 
 
 @functools.cache
@@ -69,31 +67,16 @@ class Simulator:
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError("PyBullet gave no client: close some environments first")
-        self._finalizer = weakref.finalize(self, pybullet.disconnect, self._client)
+        weakref.finalize(self, pybullet.disconnect, self._client)
         self._texture = self._load_texture(texture_rgb)
-        self._class_of_body: list[int] = []
-        self._instance_of_body: list[int] = []
-        self._vehicle = -1
-        self._vehicle_half_height_m = 0.0
-
-    def close(self) -> None:
-        """Disconnects the client; further calls do nothing."""
-        self._finalizer()
 
     def add_body(
-        self,
-        mesh: Mesh,
-        category: str,
-        *,
-        instance: int = 0,
-        boxes_m: tuple[tuple[float, float, float, float, float, float], ...] = (),
+        self, mesh: Mesh, boxes_m: Sequence[tuple[float, float, float, float, float, float]] = ()
     ) -> int:
-        """Returns the number of a new body at the origin.
+        """Returns PyBullet's number of a new body at the origin.
 
         Args:
             mesh: its visible geometry.
-            category: its class in the semantic map.
-            instance: its id in the instance map; 0 for the static world.
             boxes_m: collision boxes (x, y, yaw, length, width, height), standing on the ground.
         """
         arrays = {
@@ -112,38 +95,38 @@ class Simulator:
         # the numbers are the same objects for every client of the process.
         for array in arrays.values():
             array.clear()
-        collision = self._collision_shape(boxes_m)
+        collision = -1
+        if boxes_m:
+            collision = pybullet.createCollisionShapeArray(
+                shapeTypes=[pybullet.GEOM_BOX] * len(boxes_m),
+                halfExtents=[[side / 2 for side in box[3:]] for box in boxes_m],
+                collisionFramePositions=[[x, y, height / 2] for x, y, *_, height in boxes_m],
+                collisionFrameOrientations=[_about_z(box[2]) for box in boxes_m],
+                physicsClientId=self._client,
+            )
         body = pybullet.createMultiBody(
             0.0, collision, visual, [0.0, 0.0, 0.0], physicsClientId=self._client
         )
         pybullet.changeVisualShape(
             body, -1, textureUniqueId=self._texture, physicsClientId=self._client
         )
-        self._register(body, category, instance)
         return body
 
-    def add_vehicle(self, length_m: float, width_m: float, height_m: float) -> None:
-        """Adds the vehicle: a collision box that is invisible to cameras."""
+    def add_box(self, length_m: float, width_m: float, height_m: float) -> int:
+        """Returns the number of a collision box that stands on the ground, invisible to cameras."""
         half = [length_m / 2, width_m / 2, height_m / 2]
-        collision = pybullet.createCollisionShape(
-            pybullet.GEOM_BOX, halfExtents=half, physicsClientId=self._client
-        )
-        self._vehicle = self._add_unseen(collision)
-        self._vehicle_half_height_m = height_m / 2
+        return self._add_unseen(height_m, shapeType=pybullet.GEOM_BOX, halfExtents=half)
 
     def add_cylinder(self, radius_m: float, height_m: float) -> int:
         """Returns the number of an upright collision cylinder, invisible to cameras."""
-        return self._add_unseen(
-            pybullet.createCollisionShape(
-                pybullet.GEOM_CYLINDER,
-                radius=radius_m,
-                height=height_m,
-                collisionFramePosition=[0.0, 0.0, height_m / 2],
-                physicsClientId=self._client,
-            )
-        )
+        shape = {"shapeType": pybullet.GEOM_CYLINDER, "radius": radius_m, "height": height_m}
+        return self._add_unseen(height_m, **shape)
 
-    def _add_unseen(self, collision: int) -> int:
+    def _add_unseen(self, height_m: float, **shape: Any) -> int:
+        above = [0.0, 0.0, height_m / 2]
+        collision = pybullet.createCollisionShape(
+            collisionFramePosition=above, physicsClientId=self._client, **shape
+        )
         # PyBullet draws a body's collision shape if it has no visual one, so it gets a point.
         point = pybullet.createVisualShape(
             pybullet.GEOM_MESH,
@@ -151,28 +134,16 @@ class Simulator:
             indices=[0, 1, 2],
             physicsClientId=self._client,
         )
-        body = pybullet.createMultiBody(
+        return pybullet.createMultiBody(
             1.0, collision, point, [0.0, 0.0, 0.0], physicsClientId=self._client
         )
-        self._register(body, "sky", 0)
-        return body
 
-    def class_lookup(self) -> NDArray[np.uint8]:
-        """Returns class ids by body number; the last entry, which index -1 reads, is the sky."""
-        return np.array([*self._class_of_body, CATEGORY_ID["sky"]], dtype=np.uint8)
-
-    def instance_lookup(self) -> NDArray[np.uint8]:
-        """Returns instance ids by body number; the last entry, which index -1 reads, is 0."""
-        return np.array([*self._instance_of_body, 0], dtype=np.uint8)
-
-    def place(self, body: int, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Places a body on the ground at a planar pose."""
-        half = 0.5 * yaw_rad
+    def place(
+        self, body: int, x_m: float, y_m: float, yaw_rad: float, height_m: float = 0.0
+    ) -> None:
+        """Places a body at a planar pose, on the ground unless a height is given."""
         pybullet.resetBasePositionAndOrientation(
-            body,
-            (x_m, y_m, 0.0),
-            (0.0, 0.0, math.sin(half), math.cos(half)),
-            physicsClientId=self._client,
+            body, (x_m, y_m, height_m), _about_z(yaw_rad), physicsClientId=self._client
         )
 
     def place_all(
@@ -183,30 +154,12 @@ class Simulator:
     ) -> None:
         """Places N bodies at positions [N, 3] and orientations [N, 4]."""
         put, client = pybullet.resetBasePositionAndOrientation, self._client
-        for body, position, turn in zip(bodies, positions.tolist(), quaternions_xyzw.tolist()):
-            put(body, position, turn, client)
+        for pose in zip(bodies, positions.tolist(), quaternions_xyzw.tolist()):
+            put(*pose, client)
 
-    def hide(self, body: int) -> None:
-        """Moves a body out of reach of the camera and the vehicle."""
-        pybullet.resetBasePositionAndOrientation(
-            body, (0.0, 0.0, _HIDDEN_Z_M), (0.0, 0.0, 0.0, 1.0), physicsClientId=self._client
-        )
-
-    def place_vehicle(self, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Places the vehicle's footprint at a planar pose."""
-        half = 0.5 * yaw_rad
-        pybullet.resetBasePositionAndOrientation(
-            self._vehicle,
-            (x_m, y_m, self._vehicle_half_height_m),
-            (0.0, 0.0, math.sin(half), math.cos(half)),
-            physicsClientId=self._client,
-        )
-
-    def vehicle_touches(self, body: int) -> bool:
-        """Returns whether the vehicle and a body overlap at their current poses."""
-        return bool(
-            pybullet.getClosestPoints(self._vehicle, body, 0.0, physicsClientId=self._client)
-        )
+    def touch(self, body: int, other: int) -> bool:
+        """Returns whether two bodies overlap at their current poses."""
+        return bool(pybullet.getClosestPoints(body, other, 0.0, physicsClientId=self._client))
 
     def look(
         self, view: list[float], projection: list[float], height_px: int, width_px: int
@@ -222,28 +175,6 @@ class Simulator:
             np.asarray(body, dtype=np.int32).reshape(shape),
         )
 
-    def _collision_shape(
-        self, boxes_m: tuple[tuple[float, float, float, float, float, float], ...]
-    ) -> int:
-        if not boxes_m:
-            return -1
-        return pybullet.createCollisionShapeArray(
-            shapeTypes=[pybullet.GEOM_BOX] * len(boxes_m),
-            halfExtents=[[box[3] / 2, box[4] / 2, box[5] / 2] for box in boxes_m],
-            collisionFramePositions=[[box[0], box[1], box[5] / 2] for box in boxes_m],
-            collisionFrameOrientations=[
-                [0.0, 0.0, math.sin(box[2] / 2), math.cos(box[2] / 2)] for box in boxes_m
-            ],
-            physicsClientId=self._client,
-        )
-
-    def _register(self, body: int, category: str, instance: int) -> None:
-        # PyBullet numbers a client's bodies from 0, so the lists serve as lookup tables.
-        if body != len(self._class_of_body):
-            raise RuntimeError(f"PyBullet numbered body {len(self._class_of_body)} as {body}")
-        self._class_of_body.append(CATEGORY_ID[category])
-        self._instance_of_body.append(instance)
-
     def _load_texture(self, rgb: NDArray[np.uint8]) -> int:
         # PyBullet reads textures only from files, with v counted upwards from the bottom row. A TGA
         # file is an 18-byte header and the pixels as BGR.
@@ -257,3 +188,7 @@ class Simulator:
             return pybullet.loadTexture(path, physicsClientId=self._client)
         finally:
             os.unlink(path)
+
+
+def _about_z(yaw_rad: float) -> tuple[float, float, float, float]:
+    return 0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)

@@ -1,7 +1,7 @@
 """Low-polygon meshes of coloured triangles, and rigid bodies as arrays for the rasteriser."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -216,15 +216,6 @@ class Mesh:
                 for triangle in shapely.constrained_delaunay_triangles(cell).geoms:
                     ring = shapely.geometry.polygon.orient(triangle).exterior.coords[:3]
                     self.polygon(np.array([(u, v, height_m) for u, v in ring]), uv)
-
-    def parts(self, triangles: int) -> Iterator["Mesh"]:
-        """Yields this mesh in parts of up to so many triangles; none may share a vertex."""
-        for first in range(0, len(self.vertices), 3 * triangles):
-            own = slice(first, first + 3 * triangles)
-            part = Mesh()
-            part.vertices, part.normals = self.vertices[own], self.normals[own]
-            part.uvs, part.indices = self.uvs[own], list(range(len(part.vertices)))
-            yield part
 
     def moved(self, x_m: float, y_m: float, yaw_rad: float) -> "Mesh":
         """Returns this mesh turned and moved on the ground."""

@@ -2,9 +2,8 @@
 
 import math
 import pickle
-import threading
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -12,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from flowrep.palette import CATEGORY_ID
+from flowrep.palette import CATEGORY_ID, CLASS_COLOURS
 from flowrep.scenes import pedestrians
 from flowrep.scenes.layout import Box, Layout
 from flowrep.scenes.scene import Scene, VehicleState
@@ -22,9 +21,9 @@ from flowrep.simulator.meshes import Body, gather, person_meshes
 from flowrep.simulator.paint import texture
 
 Array = NDArray[Any]
-_BEHIND_M = 2.0  # people further behind the camera are out of view: none reach that far
+_CATEGORIES = tuple(CLASS_COLOURS)  # by class id
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
-_TRIANGLES_A_BODY = 43_690  # PyBullet's limit for one mesh is 131,072 vertices
+_HIDDEN_M = -1000.0  # out of reach of the camera and the vehicle
 _SAFE_CELL_M = 0.25
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
@@ -58,24 +57,6 @@ class SafeGround:
         return is_on_table and self._columns[i][j] == 1
 
 
-class Solid(NamedTuple):
-    """Static boxes that form one body."""
-
-    body: int
-    category: str
-    boxes: tuple[Box, ...]
-    number: int  # index in `Street.bodies`
-
-
-class Solids(NamedTuple):
-    """The boxes that can be hit, and the bodies present, for one set of closed exits."""
-
-    owners: tuple[Solid, ...]
-    centres: Array  # [B, 2]
-    reaches_m: Array  # [B], distance from a box within which the vehicle may touch it
-    is_shown: Array  # for each of `Street.bodies`
-
-
 class Street:
     """The bodies of one scene, shared by all environments of a process with that scene.
 
@@ -87,91 +68,66 @@ class Street:
         """Builds every body of the scene in a simulator."""
         self.layout = layout
         self.is_safe = SafeGround(layout)
-        self.lock = threading.RLock()  # held from placing bodies to rendering them
-        self.users = 0
         self.simulator = Simulator(texture())
         self.bodies: list[Body] = []
-        vehicle = layout.scene.vehicle
-        self.simulator.add_vehicle(vehicle.length_m, vehicle.width_m, vehicle.height_m)
-        self._vehicle_reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
-        self._person_reach_m = self._vehicle_reach_m + pedestrians.RADIUS_M
+        self._numbers: list[int] = []  # PyBullet's, of the bodies
+        vehicle, count = layout.scene.vehicle, layout.scene.num_pedestrians
+        self._vehicle = self.simulator.add_box(vehicle.length_m, vehicle.width_m, vehicle.height_m)
         self._person = self.simulator.add_cylinder(pedestrians.RADIUS_M, pedestrians.HEIGHT_M)
-        self._solids: list[Solid] = []
+        self._boxes: list[tuple[Box, int]] = []  # all that can be hit, each with its body
         self._add_ground(layout)
-        self._add_solids(layout)
-        self._closures = {name: self._add_closure(box) for name, box in layout.closures.items()}
-        count = layout.scene.num_pedestrians
+        self._add_solids([*layout.buildings, *layout.obstacles])
+        self._closures = {
+            name: self._add_solid([box], meshes.mesh_of(box, both_sides=True))
+            for name, box in layout.closures.items()
+        }
         meshes_of_all = [mesh for i in range(count) for mesh in person_meshes(i)]
-        parts = [
-            self._add_body(mesh, "pedestrian", instance=number)
-            for number, mesh in enumerate(meshes_of_all, start=1)
-        ]
-        self._parts = np.array(parts, dtype=int).reshape(count, len(pedestrians.PARTS))
-        self._placed = np.full((count, 4), np.nan)  # where everyone's parts were last placed
+        for instance, mesh in enumerate(meshes_of_all, start=1):
+            self._add_body(mesh, "pedestrian", instance=instance)
         self.triangles = gather(self.bodies)
-        self._solids_while_closed: dict[tuple[str, ...], Solids] = {}
-        self._closed: tuple[str, ...] | None = None
-        self.close_exits(())
+        reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
+        self._person_reach_m = reach_m + pedestrians.RADIUS_M
+        self._owners = np.array([body for _, body in self._boxes], dtype=int)
+        self._centres = np.array([(box.x_m, box.y_m) for box, _ in self._boxes]).reshape(-1, 2)
+        reaches = [math.hypot(*box.size_m[:2]) / 2 for box, _ in self._boxes]
+        self._reaches_m = np.array(reaches) + reach_m
+        self._shown: dict[tuple[str, ...], Array] = {}
 
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
-        """Returns the street shared by all open environments of the process with this scene."""
+        """Returns the street shared by all environments of the process with this scene."""
         key = pickle.dumps(scene)
         street = _STREETS.get(key)
         if street is None:
             street = _STREETS[key] = cls(Layout(scene))
-        street.users += 1
         return street
 
-    def leave(self) -> None:
-        """Disconnects the simulator's client when the last environment that shares it leaves."""
-        self.users -= 1
-        if self.users == 0:
-            self.simulator.close()
-            for key in [key for key, street in _STREETS.items() if street is self]:
-                del _STREETS[key]
+    def ids_by_number(self) -> NDArray[np.uint8]:
+        """Returns class and instance by PyBullet's number [N, 2]; number -1 reads the sky's."""
+        ids = np.zeros((max(self._numbers) + 2, 2), dtype=np.uint8)
+        ids[self._numbers] = [(body.semantic, body.instance) for body in self.bodies]
+        return ids
 
-    def solids(self, closures: tuple[str, ...]) -> Solids:
-        """Returns the boxes that can be hit and the bodies shown with the named closures."""
-        if closures not in self._solids_while_closed:
-            solids = [*self._solids, *(self._closures[name] for name in closures)]
-            boxes = [box for solid in solids for box in solid.boxes]
-            reaches = [math.hypot(*box.size_m[:2]) / 2 for box in boxes]
-            is_shown = np.ones(len(self.bodies), dtype=bool)
-            for name, solid in self._closures.items():
-                is_shown[solid.number] = name in closures
-            self._solids_while_closed[closures] = Solids(
-                tuple(solid for solid in solids for _ in solid.boxes),
-                np.array([(box.x_m, box.y_m) for box in boxes]).reshape(-1, 2),
-                np.array(reaches) + self._vehicle_reach_m,
-                is_shown,
-            )
-        return self._solids_while_closed[closures]
+    def is_shown(self, closures: tuple[str, ...]) -> NDArray[np.bool_]:
+        """Returns which of the bodies are present while the named exits are closed."""
+        if closures not in self._shown:
+            shown = np.ones(len(self.bodies), dtype=bool)
+            for name, body in self._closures.items():
+                shown[body] = name in closures
+            self._shown[closures] = shown
+        return self._shown[closures]
 
     def close_exits(self, closures: tuple[str, ...]) -> None:
         """Places the named closures and hides all others."""
-        if closures == self._closed:
-            return
-        for name, solid in self._closures.items():
-            if name in closures:
-                self.simulator.place(solid.body, 0.0, 0.0, 0.0)
-            else:
-                self.simulator.hide(solid.body)
-        self._closed = closures
+        for name, body in self._closures.items():
+            height_m = 0.0 if name in closures else _HIDDEN_M
+            self.simulator.place(self._numbers[body], 0.0, 0.0, 0.0, height_m)
 
-    def place_pedestrians(self, poses: Array, viewer: VehicleState) -> None:
-        """Places people at poses [P, 4] who have moved and are, or were last placed, in view."""
-        depths = self._depths(np.stack([poses, self._placed]), viewer)
-        is_behind = (depths < -_BEHIND_M).all(axis=0)
-        due = np.flatnonzero((poses != self._placed).any(axis=-1) & ~is_behind)
-        if due.size:
-            places = pedestrians.place_parts(poses[due])
-            self.simulator.place_all(
-                self._parts[due].ravel().tolist(),
-                places.positions.reshape(-1, 3),
-                places.quaternions_xyzw.reshape(-1, 4),
-            )
-            self._placed[due] = poses[due]
+    def place_pedestrians(self, poses: Array) -> None:
+        """Places people at poses [P, 4], for a picture."""
+        positions = pedestrians.world_from_parts(poses)[:, :3, 3]
+        parts = self._numbers[len(self._numbers) - len(positions) :]  # the bodies added last
+        self.simulator.place_all(parts, positions, pedestrians.quaternions_of_parts(poses))
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
         """Returns at which times someone is near enough to be touched [T].
@@ -194,31 +150,20 @@ class Street:
             poses: everyone's poses [P, 4].
             closures: names of the closures in place.
         """
-        gaps = np.hypot(poses[:, 0] - state.x_m, poses[:, 1] - state.y_m)
-        people_near = np.flatnonzero(gaps <= self._person_reach_m).tolist()
-        solids = self.solids(closures)
-        gaps = np.hypot(solids.centres[:, 0] - state.x_m, solids.centres[:, 1] - state.y_m)
-        owners = (solids.owners[i] for i in np.flatnonzero(gaps <= solids.reaches_m).tolist())
-        near = {solid.body: solid.category for solid in owners}
-        with self.lock:
-            self.close_exits(closures)
-            self.simulator.place_vehicle(state.x_m, state.y_m, state.yaw_rad)
-            for i in people_near:
-                self.simulator.place(self._person, *poses[i, :3].tolist())
-                if self.simulator.vehicle_touches(self._person):
-                    return "pedestrian"
-            touched = (name for body, name in near.items() if self.simulator.vehicle_touches(body))
-            return next(touched, "")
-
-    def _depths(self, poses: Array, viewer: VehicleState) -> Array:
-        """Returns the depths [...] of the middles of people at poses [..., 4], for the camera."""
-        camera = self.layout.scene.camera
-        pitch = math.radians(camera.pitch_deg)
-        x, y = math.cos(viewer.yaw_rad), math.sin(viewer.yaw_rad)
-        at = viewer.x_m * x + viewer.y_m * y + camera.mount_forward_m
-        above_m = pedestrians.HEIGHT_M / 2 - camera.mount_height_m
-        forward_m = poses[..., 0] * x + poses[..., 1] * y - at
-        return math.cos(pitch) * forward_m + math.sin(pitch) * above_m
+        simulator, at = self.simulator, state[:2]
+        simulator.place(self._vehicle, *state[:3])
+        is_near = np.hypot(*(poses[:, :2] - at).T) <= self._person_reach_m
+        for pose in poses[is_near, :3].tolist():
+            simulator.place(self._person, *pose)
+            if simulator.touch(self._vehicle, self._person):
+                return "pedestrian"
+        self.close_exits(closures)
+        is_near = np.hypot(*(self._centres - at).T) <= self._reaches_m
+        is_near &= self.is_shown(closures)[self._owners]
+        for body in dict.fromkeys(self._owners[is_near].tolist()):
+            if simulator.touch(self._vehicle, self._numbers[body]):
+                return _CATEGORIES[self.bodies[body].semantic]
+        return ""
 
     def _add_ground(self, layout: Layout) -> None:
         striped = shapely.union_all([area.polygon for area in layout.crosswalks])
@@ -242,8 +187,8 @@ class Street:
             (paving, "sidewalk"),
             (grass, "terrain"),
         ):
-            for part in mesh.parts(_TRIANGLES_A_BODY):
-                self._add_body(part, category)
+            if mesh.indices:
+                self._add_body(mesh, category)
 
     def _lane_marks(self, layout: Layout, name: str, striped: BaseGeometry) -> meshes.Mesh:
         if layout.width_m(name) < _TWO_LANES_M:
@@ -251,37 +196,33 @@ class Street:
         others = [ground for other, ground in layout.ribbons.items() if other != name]
         return meshes.lane_marks(layout.lines[name], shapely.union_all([*others, striped]))
 
-    def _add_solids(self, layout: Layout) -> None:
+    def _add_solids(self, boxes: list[Box]) -> None:
         by_category: dict[str, list[Box]] = {}
-        for box in (*layout.buildings, *layout.obstacles):
+        for box in boxes:
             by_category.setdefault(box.category, []).append(box)
-        for category, boxes in by_category.items():
-            for first in range(0, len(boxes), _BOXES_A_BODY):
-                mesh, chunk = meshes.Mesh(), boxes[first : first + _BOXES_A_BODY]
+        for own in by_category.values():
+            for first in range(0, len(own), _BOXES_A_BODY):
+                mesh, chunk = meshes.Mesh(), own[first : first + _BOXES_A_BODY]
                 for box in chunk:
                     mesh.add(meshes.mesh_of(box))
-                self._solids.append(self._add_solid(mesh, category, chunk))
+                self._add_solid(chunk, mesh)
 
-    def _add_closure(self, box: Box) -> Solid:
-        return self._add_solid(meshes.mesh_of(box, both_sides=True), box.category, [box])
-
-    def _add_solid(self, mesh: meshes.Mesh, category: str, boxes: list[Box]) -> Solid:
-        body = self._add_body(
-            mesh,
-            category,
-            boxes_m=tuple((box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes),
-        )
-        return Solid(body, category, tuple(boxes), len(self.bodies) - 1)
+    def _add_solid(self, boxes: list[Box], mesh: meshes.Mesh) -> int:
+        places = [(box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes]
+        body = self._add_body(mesh, boxes[0].category, boxes_m=places)
+        self._boxes += [(box, body) for box in boxes]
+        return body
 
     def _add_body(
-        self, mesh: meshes.Mesh, category: str, *, instance: int = 0, **options: Any
+        self, mesh: meshes.Mesh, category: str, *, instance: int = 0, boxes_m: Sequence[Any] = ()
     ) -> int:
         vertices = np.array(mesh.vertices, dtype=np.float64)
         triangles = np.array(mesh.indices).reshape(-1, 3)
         seen_as = CATEGORY_ID[category], instance
         uvs = np.array(mesh.uvs).reshape(-1, 2)
         self.bodies.append(Body(vertices, triangles, *seen_as, moves=instance > 0, uvs=uvs))
-        return self.simulator.add_body(mesh, category, instance=instance, **options)
+        self._numbers.append(self.simulator.add_body(mesh, boxes_m))
+        return len(self.bodies) - 1
 
 
 _STREETS: WeakValueDictionary[bytes, Street] = WeakValueDictionary()

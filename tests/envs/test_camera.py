@@ -30,9 +30,8 @@ def slanted_plane():
     corners = [(x, y, 6 + 0.6 * x - 0.5 * y) for x, y in ((-5, 5), (5, 5), (5, -5), (-5, -5))]
     mesh = Mesh()
     mesh.quad(np.array(corners, dtype=float), swatch("asphalt"))
-    simulator.add_body(mesh, "road")
-    yield simulator
-    simulator.close()
+    simulator.add_body(mesh)
+    return simulator
 
 
 def relative_depth_error(simulator, size, principal_point):

@@ -45,7 +45,7 @@ def test_maps_of_the_mirrored_street(name):
     drawn = rasterise(
         ACROSS @ seen_from @ SIDEWAYS,
         SIDEWAYS @ _parts([episode.poses]) @ SIDEWAYS,
-        street.solids(episode.path.closures).is_shown[None],
+        street.is_shown(episode.path.closures)[None],
     )
     here = {key: torch.from_numpy(value) for key, value in observation.items()}
     there = {key: torch.from_numpy(value) for key, value in drawn._asdict().items()}

@@ -76,7 +76,7 @@ def test_a_tensordict_without_marks_resets_every_street(make):
     again = env.reset(TensorDict({}, env.batch_size))
     assert (again["episode_seed"] != first["episode_seed"]).all()
     assert not again["done"].any()
-    with pytest.raises(ValueError, match="action is 7; give 0"):
+    with pytest.raises(ValueError, match="action is 7"):
         env.step(again.set("action", torch.tensor([0, 7])))
 
 
@@ -91,7 +91,7 @@ def test_marks_that_name_no_street_reset_none(make):
 
 @pytest.mark.parametrize(("num_envs", "num_workers"), [(0, 0), (-1, 0), (2, 3), (2, -1)])
 def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers):
-    with pytest.raises(ValueError, match="at least one environment and no more workers than"):
+    with pytest.raises(ValueError, match=r"num_\w+ is "):
         make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
 
 

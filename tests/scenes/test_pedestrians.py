@@ -16,7 +16,7 @@ from flowrep.scenes.pedestrians import (
     draw_lanes,
     keeps_its_stretches,
     keeps_lanes_apart,
-    place_parts,
+    quaternions_of_parts,
     world_from_parts,
 )
 from flowrep.scenes.scene import PedestrianGroup, Walk
@@ -136,9 +136,7 @@ def test_the_upper_body_turns_with_the_person_alone():
 def test_quaternions_are_the_matrices():
     poses = np.array([*POSE, [1.0, -3.0, -2.0, -0.3]])
     transforms = world_from_parts(poses)
-    parts = place_parts(poses)
-    np.testing.assert_allclose(parts.positions.reshape(-1, 3), transforms[:, :3, 3], atol=1e-12)
-    for (x, y, z, w), transform in zip(parts.quaternions_xyzw.reshape(-1, 4), transforms):
+    for (x, y, z, w), transform in zip(quaternions_of_parts(poses), transforms):
         # Of a unit quaternion's matrix, the columns for x and z.
         first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
         third = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
