@@ -1,7 +1,6 @@
 """Reports on runs: `python -m flowrep.report outputs/<sweep>`."""
 
 from pathlib import Path
-from typing import Any
 
 from flowrep.extras import require
 
@@ -63,9 +62,8 @@ def show(table: Table, title: str) -> None:
     """Prints a table."""
     heading = Text(title, style="table.title")  # in a str, brackets would be markup
     shown = rich.table.Table(title=heading, box=rich.box.SIMPLE, pad_edge=False)
-    for place, name in enumerate(table.header):
-        justify: Any = "left" if table.is_text(place) else "right"
-        shown.add_column(Text(name), justify=justify, no_wrap=True)
+    for name, side in zip(table.header, table.alignment):
+        shown.add_column(Text(name), justify="left" if side == "l" else "right", no_wrap=True)
     for block, rows in table.blocks:
         if block:
             shown.add_row(Text(block, style="italic"))

@@ -44,7 +44,7 @@ class Comparison(NamedTuple):
     """How much better one side does than another.
 
     Args:
-        difference: of the means over runs, in the mean over scenes, with its bootstrap interval.
+        difference: of the means over runs, in the mean over scenes.
         improvement: the probability that a run of the first side beats one of the second.
         p_value: of Welch's t-test over the runs' scores; nan where a side has one run alone.
         runs: the number of runs per side; that of one scene if a scene has one run of a side.
@@ -55,15 +55,10 @@ class Comparison(NamedTuple):
     p_value: float
     runs: int
 
-    def verdict(self, p_value: float | None = None) -> str:
-        """Returns in words how far the difference can be trusted.
-
-        Args:
-            p_value: corrected for the number of comparisons; its own if None.
-        """
+    def verdict(self, p_value: float) -> str:
+        """Returns in words how far the difference can be trusted, by its p value, corrected."""
         # Both have to agree: a bootstrap over two or three runs has intervals that are too narrow.
-        has_zero = self.difference.low <= 0 <= self.difference.high
-        if has_zero or (self.p_value if p_value is None else p_value) >= LEVEL:
+        if self.difference.low <= 0 <= self.difference.high or p_value >= LEVEL:
             return "can't be told from noise"
         word = "higher" if self.difference.value > 0 else "lower"
         if self.runs < FEWEST_RUNS:
@@ -78,8 +73,7 @@ def rates(outcomes: Array, weights: Array | None = None) -> Array:
     With `weights` [N, E], how often each episode counts in each of N resamples: [N, R]. A run
     without episodes in a resample keeps its own rate there.
     """
-    there = ~np.isnan(outcomes)
-    found = np.where(there, outcomes, 0.0)
+    there, found = ~np.isnan(outcomes), np.nan_to_num(outcomes)
     own = found.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
     if weights is None:
         return own
@@ -87,22 +81,13 @@ def rates(outcomes: Array, weights: Array | None = None) -> Array:
     return np.where(counts > 0, weights @ found.T / np.maximum(counts, 1), own)
 
 
-class Bootstrap:
-    """Resamples runs and episodes; the same outcomes give the same intervals.
+class Bootstrap(NamedTuple):
+    """Resamples runs and episodes so many times; the same outcomes give the same intervals."""
 
-    Args:
-        resamples: the number of resamples.
-    """
-
-    def __init__(self, resamples: int = 2000) -> None:
-        self.resamples = resamples
+    resamples: int = 2000
 
     def success(self, scenes: Sequence[Array]) -> Estimate:
-        """Returns the mean over a scene's runs, in the mean over scenes; Wilson's of a single run.
-
-        Args:
-            scenes: the outcomes in each scene.
-        """
+        """Returns the mean over a scene's runs, in the mean over scenes; Wilson's of one run."""
         if sum(map(len, scenes)) == 1:
             return _wilson(scenes[0])
         return self.mean(scenes, least=0.0)
@@ -123,8 +108,7 @@ class Bootstrap:
         rng = np.random.default_rng((0, 0, _OF_RUNS))
         weights = _episode_weights(0, outcomes.shape[1], self.resamples)
         chosen = rng.integers(len(outcomes), size=(self.resamples, len(outcomes)))
-        there = ~np.isnan(outcomes)
-        found = np.where(there, outcomes, 0.0)
+        there, found = ~np.isnan(outcomes), np.nan_to_num(outcomes)
         counts = np.take_along_axis(weights @ there.T, chosen, axis=1).sum(axis=1)
         sums = np.take_along_axis(weights @ found.T, chosen, axis=1).sum(axis=1)
         drawn = sums[counts > 0] / counts[counts > 0]

@@ -34,13 +34,13 @@ class Table(NamedTuple):
     blocks: tuple[tuple[str, tuple[tuple[str, ...], ...]], ...]
     words: tuple[int, ...] = ()
 
-    def is_text(self, column: int) -> bool:
-        """Returns whether a column is aligned left."""
-        return column == 0 or column in self.words
+    @property
+    def alignment(self) -> str:
+        """A letter for each column, "l" or "r"."""
+        return "".join("l" if i in (0, *self.words) else "r" for i in range(len(self.header)))
 
     def to_latex(self) -> str:
         """Returns a table environment for booktabs."""
-        columns = "".join("l" if self.is_text(i) else "r" for i in range(len(self.header)))
         lines = [_latex_row(self.header)]
         for heading, rows in self.blocks:
             lines.append(r"\midrule")
@@ -53,7 +53,7 @@ class Table(NamedTuple):
   \centering
   \caption{{{latex_text(self.caption)}}}
   \label{{tab:{self.name}}}
-  \begin{{tabular}}{{{columns}}}
+  \begin{{tabular}}{{{self.alignment}}}
     \toprule
     {body}
     \bottomrule

@@ -10,11 +10,18 @@ pytest.importorskip("scipy", reason="reports are an extra")
 from flowrep.report.statistics import Bootstrap, effect, holm, rates
 
 NAN = np.nan
+NOISE = "can't be told from noise"
 
 
 def runs(*successes, episodes=10):
     """A row a run, the first of its episodes successes."""
     return np.array([[1.0] * n + [0.0] * (episodes - n) for n in successes])
+
+
+def compared(*scenes):
+    """A comparison over scenes, and its verdict."""
+    found = Bootstrap(500).compare(scenes)
+    return found, found.verdict(found.p_value)
 
 
 def test_a_rate_counts_the_episodes_that_a_run_drove():
@@ -28,8 +35,7 @@ def test_a_rate_counts_the_episodes_that_a_run_drove():
 def test_runs_are_resampled():
     # All or nothing, so that episodes say nothing: means of two draws of {0, 1} are 0, 1/2 and 1,
     # with 1/4, 1/2 and 1/4; Wilson's of 10 of 20 would be 0.30 to 0.70.
-    found = Bootstrap(4000).success([runs(0, 10)])
-    assert found == (0.5, 0.0, 1.0)
+    assert Bootstrap(4000).success([runs(0, 10)]) == (0.5, 0.0, 1.0)
 
 
 def test_episodes_are_resampled_the_same_ones_for_all_runs():
@@ -41,11 +47,14 @@ def test_episodes_are_resampled_the_same_ones_for_all_runs():
     assert found.high == pytest.approx(0.598, abs=0.011)
 
 
-def test_scenes_are_strata():
+def test_scenes_are_strata_that_are_resampled_independently():
     # One scene always succeeds, the other never: resampled within scenes the mean stays 0.5 in
     # every draw, and the interval is that of 0 of 20; resampled from all runs it would be 0 to 1.
     found = Bootstrap(500).success([runs(10, 10), runs(0, 0)])
     assert found == pytest.approx((0.5, 0.339, 0.661), abs=0.001)
+    # Two scenes of one run at 0.5 in 100 episodes: the variance of their mean is half of one's.
+    found = Bootstrap(8000).success([runs(50, episodes=100), runs(50, episodes=100)])
+    assert found.high - 0.5 == pytest.approx(1.96 * 0.05 / math.sqrt(2), abs=0.008)
 
 
 @pytest.mark.parametrize(
@@ -67,17 +76,10 @@ def test_more_runs_in_the_easier_scene_are_no_advantage():
     # it would be (2 · 0.9 + 4 · 0.15) / 6 = 0.4 against 0.6.
     easy = (runs(90, 90, episodes=100), runs(85, 85, 85, 85, episodes=100))
     hard = (runs(15, 15, 15, 15, episodes=100), runs(10, 10, episodes=100))
-    found = Bootstrap(500).compare([easy, hard])
+    found, verdict = compared(easy, hard)
     assert found.difference.value == pytest.approx(0.05)
-    assert found.verdict() == "higher"
-    assert found.verdict(0.06) == "can't be told from noise"  # corrected for many comparisons
-    assert found.p_value == 0
-
-
-def test_scenes_are_resampled_independently():
-    # Two scenes of one run at 0.5 in 100 episodes: the variance of their mean is half of one's.
-    found = Bootstrap(8000).success([runs(50, episodes=100), runs(50, episodes=100)])
-    assert found.high - 0.5 == pytest.approx(1.96 * 0.05 / math.sqrt(2), abs=0.008)
+    assert (found.p_value, verdict) == (0, "higher")
+    assert found.verdict(0.06) == NOISE  # corrected for many comparisons
 
 
 def test_a_pooled_share_counts_all_runs_failures_together():
@@ -95,45 +97,34 @@ def test_a_pooled_share_counts_all_runs_failures_together():
 def test_a_difference_on_the_same_episodes_is_free_of_what_they_have_in_common():
     # Equal outcomes episode by episode: paired, the difference is 0 in every draw, and its interval
     # Wilson's of 0 of 100; unpaired it would be ± 0.14.
-    pair = (runs(50, episodes=100), runs(50, episodes=100))
-    found = Bootstrap(500).compare([pair])
+    found, verdict = compared((runs(50, episodes=100), runs(50, episodes=100)))
     assert found.difference == pytest.approx((0.0, -0.037, 0.037), abs=0.001)
     assert found.improvement.value == 0.5  # a tie is half
-    assert found.verdict() == "can't be told from noise"
+    assert verdict == NOISE
 
 
 def test_improvement_is_the_share_of_pairs_in_which_the_first_is_higher():
     # 3 beats 1 and 2; 2 beats 1 and ties with 2; of four pairs 3.5
-    found = Bootstrap(500).compare([(runs(3, 2), runs(1, 2))])
+    found, _ = compared((runs(3, 2), runs(1, 2)))
     assert found.improvement.value == 3.5 / 4
-    assert Bootstrap(500).compare([(runs(1, 1, 1), runs(9, 9, 9))]).verdict() == "lower"
-
-
-def test_welchs_test_is_the_textbooks():
-    # Scores 0.5, 0.6, 0.7 and 0.2, 0.4, 0.6: means 0.6 and 0.4, variances 0.01 and 0.04;
-    # t = 0.2 / sqrt(0.05 / 3) = 1.549 at (0.05/3)² / ((0.01/3)²/2 + (0.04/3)²/2) = 2.94 degrees
-    found = Bootstrap(500).compare([(runs(5, 6, 7), runs(2, 4, 6))])
-    assert found.p_value == pytest.approx(0.221, abs=0.002)
-    assert found.verdict() == "can't be told from noise"
+    assert compared((runs(1, 1, 1), runs(9, 9, 9)))[1] == "lower"
 
 
 def test_few_seeds_say_it_of_these_agents_alone():
-    one = Bootstrap(500).compare([(runs(90, episodes=100), runs(10, episodes=100))])
+    one, verdict = compared((runs(90, episodes=100), runs(10, episodes=100)))
     assert math.isnan(one.p_value)
-    assert one.verdict() == "higher for these agents; one seed a side say no more"
-    two = Bootstrap(500).compare([(runs(90, 91, episodes=100), runs(10, 11, episodes=100))])
-    assert two.verdict() == "higher for these agents; 2 seeds a side say no more"
-    # of two scenes there are four runs a side
+    assert verdict == "higher for these agents; one seed a side say no more"
     pair = (runs(90, 91, episodes=100), runs(10, 11, episodes=100))
-    assert Bootstrap(500).compare([pair, pair]).verdict() == "higher"
+    assert compared(pair)[1] == "higher for these agents; 2 seeds a side say no more"
+    assert compared(pair, pair)[1] == "higher"  # of two scenes there are four runs a side
 
 
 def test_a_bootstrap_that_is_too_sure_is_overruled():
     # Scores 0.1 and 0.9 against 0 and 0.05: every draw of runs has the first ahead or level, yet
     # two runs that differ by 0.8 among themselves tell nothing.
-    found = Bootstrap(500).compare([(runs(10, 90, episodes=100), runs(0, 5, episodes=100))])
+    found, verdict = compared((runs(10, 90, episodes=100), runs(0, 5, episodes=100)))
     assert found.difference.low > 0
-    assert found.verdict() == "can't be told from noise"
+    assert verdict == NOISE
 
 
 def scores(*values):

@@ -9,7 +9,7 @@ import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolderError
+from flowrep.experiment.run import RunFolderError
 from flowrep.report.storage import (
     EPISODES,
     read_run,
@@ -39,16 +39,10 @@ def test_runs_are_found_wherever_they_lie_and_once(tmp_path, name):
     ("file", "text", "expected"),
     [
         ("config.yaml", "seed: [", "config.yaml"),
-        ("config.yaml", "", "config.yaml"),
         ("config.yaml", "seed: 1\n", "scene"),
         ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
-        (
-            "evaluation.csv",
-            ",".join(EVALUATION_COLUMNS) + "\n" + ",".join("x" * len(EVALUATION_COLUMNS)) + "\n",
-            "'x'",
-        ),
     ],
 )
 def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, text, expected):
