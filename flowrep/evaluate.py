@@ -12,37 +12,16 @@ from flowrep.extras import require
 
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
-from flowrep import pretrained
-from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
-from flowrep.config.cli import EXIT_USAGE, folder_name, print_error, run_command
+from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
 from flowrep.config.schema import EvaluateConfig
-from flowrep.envs import WorkerError
 from flowrep.experiment import build
-from flowrep.experiment.agents import Agent, PolicyError, load_external, load_trained
-from flowrep.experiment.evaluation import (
-    Comparison,
-    evaluation_seeds,
-    print_failures,
-    print_table,
-    save_drives,
-    scene_id,
-    write_failures,
-)
+from flowrep.experiment.agents import Agent, load_trained
+from flowrep.experiment.evaluation import Comparison, print_results
 from flowrep.experiment.film import record_episode
 from flowrep.experiment.run import RunFolder
+from flowrep.policies import load_agent
 from flowrep.progress import StopRequest
-from flowrep.scenes import load_scene
-
-MISTAKES = (
-    UsageError,
-    CheckpointError,
-    WorkerError,
-    PolicyError,
-    ValueError,
-    ImportError,
-    OSError,
-)
 
 
 class Target(NamedTuple):
@@ -67,8 +46,8 @@ def run(config: EvaluateConfig) -> None:
             try:
                 with target.folder.held("evaluating"):
                     evaluate_one(config, target, comparisons, stop)
-            except MISTAKES as error:
-                if len(targets) == 1:
+            except Exception as error:
+                if len(targets) == 1 or not is_a_mistake(error):
                     raise
                 print_error(error)
                 failed.append(str(target.folder.path))
@@ -103,20 +82,15 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
-        load = partial(pretrained.load, config.scene or {}, **machine)
-        load = (
-            load
-            if name == "pretrained"
-            else partial(
-                load_external,
-                name,
-                scene=config.scene or {},
-                representations=config.representations or {},
-                flow=None if config.flow is None else config.flow.plain(),
-                motion=config.motion,
-                noise=None if config.noise is None else config.noise.plain(),
-                **machine,
-            )
+        load = partial(
+            load_agent,
+            name,
+            scene=config.scene,
+            representations=config.representations,
+            flow=config.flow,
+            motion=config.motion,
+            noise=config.noise,
+            **machine,
         )
         targets.append(Target(RunFolder(folder), load, [name]))
     return targets
@@ -127,10 +101,10 @@ def evaluate_one(
 ) -> None:
     """Runs an agent's episodes, keeps finished ones even if interrupted, and films some."""
     agent, folder = target.load(), target.folder
-    scene = load_scene(agent.config.scene)
+    origin = agent.origin("evaluate")
     # agents of one scene share the baselines' episodes
     comparison = comparisons.setdefault(
-        f"{scene_id(scene)} {target.policies}",
+        f"{origin['scene_id']} {target.policies}",
         Comparison(
             speeds=config.speed,
             fps=config.fps,
@@ -144,44 +118,29 @@ def evaluate_one(
     num_envs = min(agent.config.num_envs, comparison.total)
     pool = build.evaluation_pool(agent.config, agent.policy, num_envs)
 
-    def save() -> list[dict[str, Any]]:
-        rows = comparison.rows(
-            scene=scene.name,
-            scene_id=scene_id(scene),
-            representations="+".join(agent.config.representations),
-            flow=agent.config.flow.source,
-            seed=agent.config.seed if agent.frames else "",
-            frames=agent.frames,
-            evaluation="evaluate",
-        )
-        folder.save_episodes(rows, table)
-        return rows
-
     def try_to_save() -> None:
         with suppress(OSError):  # the last time, it is reported
-            save()
+            folder.save_episodes(comparison.rows(**origin), table)
 
     try:
         comparison.run(
-            agent.make_env, agent.policy, num_envs, lambda: bool(stop), try_to_save, pool
+            agent.make_env, agent.policy, num_envs, stop=stop, save=try_to_save, pool=pool
         )
     finally:
         if pool is not None:
             pool.close()
-        if results := comparison.results():
+        if rows := comparison.rows(**origin):
             try:
-                rows = save()
-                save_drives(folder.drives_path, rows, [e.positions for _, e in results])
-                folder.plot_episodes(rows)
-                write_failures(folder.failures_path, folder.read_episodes())
+                positions = [episode.positions for _, episode in comparison.results()]
+                folder.log_episodes(rows, positions, table)
+                folder.write_failures()
             except OSError as error:
                 raise OSError(
                     f"{folder.path}: {error}. Free some space or make the folder writable, then "
                     "evaluate again"
                 ) from error
             print(folder.path)
-            print_table(rows)
-            print_failures(rows)
+            print_results(rows)
             print(f"{len(rows)} episodes are in {folder.evaluation_path}")
     film(config, agent, folder, stop)
 
@@ -194,7 +153,7 @@ def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequ
     for speed, rate, number in conditions:
         if stop:
             return
-        (episode_seed,) = evaluation_seeds(config.seed + number, 1)
+        episode_seed = config.seed + number
         path = folder.video_path(f"{where}{speed}_{rate:g}fps_{episode_seed}")
         make_env = partial(agent.make_env, speed=speed, frame_rate_hz=float(rate))
         seen = agent.config.representations

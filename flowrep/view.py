@@ -1,11 +1,11 @@
 """Shows a scene and how a policy drives in it: `python -m flowrep.view scene=s_turn`."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import cycle, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from flowrep.extras import require
 
@@ -14,24 +14,20 @@ require("viewing", "train", "hydra", "pydantic", module=__name__)
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from rich import box
-from rich.console import Console
-from rich.table import Table
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm.auto import tqdm
 
-from flowrep import pretrained
-from flowrep.baselines import BASELINES, BaselinePolicy
+from flowrep.baselines import BaselinePolicy
 from flowrep.config import UsageError
 from flowrep.config.cli import run_command
 from flowrep.config.schema import ViewConfig
-from flowrep.envs import make_env, street_envs
-from flowrep.experiment.agents import load_external, load_trained
-from flowrep.experiment.evaluation import Episode, Policy, evaluate, evaluation_seeds
+from flowrep.envs import street_envs
+from flowrep.experiment.agents import Agent
+from flowrep.experiment.evaluation import Episode, Policy, evaluate, print_table
 from flowrep.experiment.film import Maps, film_episode, make_filmed, maps_of
-from flowrep.experiment.run import RunFolder
 from flowrep.palette import CATEGORY_ID
+from flowrep.policies import load_agent
 from flowrep.scenes import Scene
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.scene import NO_OP, TURN_LEFT, TURN_RIGHT
@@ -42,57 +38,36 @@ from flowrep.viz.plan import Track, draw_plan
 ENVS = 16  # side by side, for the episodes that are not filmed
 
 
-class Driver(NamedTuple):
-    """What drives: its env, what it sees, and its policy in an env."""
-
-    make_env: Callable[..., EnvBase]
-    representations: Mapping[str, Any]
-    policy_in: Callable[[EnvBase], Policy]
-
-
 def run(config: ViewConfig) -> None:
     """Writes pictures, a video and tables of the scene, or opens a window on it."""
     job = HydraConfig.get()
     is_scene_given = any(text.startswith("scene") for text in job.overrides.task)
-    driver = driver_of(config, is_scene_given)
-    env = make_filmed(driver.make_env, driver.representations)
+    agent = agent_of(config, is_scene_given)
+    env = make_filmed(make_env_of(config, agent), agent.config.representations)
     options = episodes_of(config, env.base_env.scene)
     if config.interactive:
-        drive_by_hand(driver, Path(config.policy).name, env, options[0])
+        drive_by_hand(agent.policy, Path(config.policy).name, env, options[0])
     else:
-        view(config, driver, env, options, Path(job.runtime.output_dir))
+        view(config, agent, env, options, Path(job.runtime.output_dir))
     env.close()
 
 
-def driver_of(config: ViewConfig, is_scene_given: bool) -> Driver:
-    """Returns the baseline, run or policy of the user's own that drives.
-
-    A run's agent drives in its own scene unless one was given.
-    """
-    rates: dict[str, Any] = {"speed": config.speed, "frame_rate_hz": config.frame_rate_hz}
-    name = config.policy
-    if name in BASELINES:
-        return Driver(partial(make_env, config.scene, **rates), {}, partial(BaselinePolicy, name))
-    machine: dict[str, Any] = {"device": "cpu", "num_envs": 1, "num_workers": 0}
-    if name == "pretrained":
-        agent = pretrained.load(config.scene, **machine)
-    elif Path(name).is_dir():
-        scene = config.scene if is_scene_given else None
-        agent = load_trained(RunFolder.existing(name), scene=scene, **machine)
-    elif ":" in name or name.endswith(".pt2"):
-        if config.representations is None:
-            raise UsageError(f"representations needs a value for policy={name}")
-        agent = load_external(
-            name, scene=config.scene, representations=config.representations, **machine
-        )
-    else:
-        raise UsageError(
-            f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
-            "path.py:make, package.module:make or path.pt2"
-        )
-    return Driver(
-        partial(agent.make_env, **rates), agent.config.representations, lambda env: agent.policy
+def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
+    """Returns what drives; a run's agent drives in its own scene unless one was given."""
+    is_at_home = Path(config.policy).is_dir() and not is_scene_given
+    return load_agent(
+        config.policy,
+        scene=None if is_at_home else config.scene,
+        representations=config.representations,
+        device="cpu",
+        num_envs=1,
+        num_workers=0,
     )
+
+
+def make_env_of(config: ViewConfig, agent: Agent) -> Callable[..., EnvBase]:
+    """Returns what makes the agent's envs, at the speed and frame rate of the config."""
+    return partial(agent.make_env, speed=config.speed, frame_rate_hz=config.frame_rate_hz)
 
 
 def episodes_of(config: ViewConfig, scene: Scene) -> list[dict[str, Any]]:
@@ -105,12 +80,12 @@ def episodes_of(config: ViewConfig, scene: Scene) -> list[dict[str, Any]]:
     if config.path not in (*paths, None):
         raise UsageError(f"path should be {', '.join(paths)} or null, not '{config.path}'")
     path = {} if config.path is None else {"path": config.path}
-    seeds = evaluation_seeds(config.seed, config.episodes)
+    seeds = range(config.seed, config.seed + config.episodes)
     return [{"episode_seed": seed, "speed": config.speed} | path for seed in seeds]
 
 
 def view(
-    config: ViewConfig, driver: Driver, env: EnvBase, options: list[dict[str, Any]], folder: Path
+    config: ViewConfig, agent: Agent, env: EnvBase, options: list[dict[str, Any]], folder: Path
 ) -> None:
     """Drives episodes and writes their pictures, plan, video and tables into a folder.
 
@@ -118,63 +93,41 @@ def view(
     """
     scene, fps = env.base_env.scene, env.base_env.frame_rate_hz
     with tqdm(desc="driving", unit="frame") as bar:
-        policy = driver.policy_in(env)
-        frames, episode = film_episode(env, policy, options[0], lambda _: bar.update())
-    episodes = [episode, *drive_on(driver, options[1:])]
+        frames, episode = film_episode(env, agent.policy, options[0], lambda _: bar.update())
+    episodes = [episode, *drive_on(config, agent, options[1:])]
     strips = [representation_strip(maps) for maps in tqdm(frames, desc="drawing", unit="frame")]
     chosen = moments([moving_pixels(maps) for maps in frames], config.sheet_rows)
     folder.mkdir(parents=True, exist_ok=True)
     write_png(folder / "sheet.png", contact_sheet(strips[i] for i in chosen))
-    written = ["sheet.png", "plan.png", "episodes.csv", "categories.csv"]
     if config.video:
         write_video(folder / "episode.mp4", strips, fps=fps)
-        written.insert(1, "episode.mp4")
     paths = {each.path for each in episodes}
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = paths.pop() if len(paths) == 1 else None
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
     draw_plan(Layout(scene), tracks, path=path).savefig(folder / "plan.png", dpi=110)
     tables = {
-        "episodes": [row_of(each) for each in episodes],
+        "episodes": [{"path": each.path, **each.row()} for each in episodes],
         "categories": category_rows(scene.categories, (maps["semantic"] for maps in frames)),
     }
     for name, rows in tables.items():
         write_rows(folder / f"{name}.csv", rows)
-        table = Table(title=name, box=box.SIMPLE, pad_edge=False)
-        for column in rows[0]:
-            table.add_column(column.replace("_", " "), no_wrap=True)
-        for row in rows:
-            table.add_row(*map(str, row.values()))
-        Console().print(table)
+        print_table(name, rows)
     arrived = sum(each.outcome == "success" for each in episodes)
     print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
-    print(f"{folder}: {', '.join(written)}")
+    written = ["sheet.png", *["episode.mp4"] * config.video, "plan.png"]
+    print(f"{folder}: {', '.join([*written, 'episodes.csv', 'categories.csv'])}")
 
 
-def drive_on(driver: Driver, options: list[dict[str, Any]]) -> list[Episode]:
+def drive_on(config: ViewConfig, agent: Agent, options: list[dict[str, Any]]) -> list[Episode]:
     """Returns the episodes after the first, in their order, with what the policy sees alone."""
     if not options:
         return []
-    env = driver.make_env(
-        representations=driver.representations, num_envs=min(ENVS, len(options)), num_workers=0
-    )
-    found = evaluate(env, driver.policy_in(env), options)
+    env = make_env_of(config, agent)(num_envs=min(ENVS, len(options)))
+    found = evaluate(env, agent.policy, options)
     episodes = list(tqdm(found, desc="driving on", unit="episode", total=len(options)))
     env.close()
-    seeds = [each["episode_seed"] for each in options]
-    return sorted(episodes, key=lambda episode: seeds.index(episode.seed))
-
-
-def row_of(episode: Episode) -> dict[str, Any]:
-    """Returns an episode's row in a table."""
-    return {
-        "episode_seed": episode.seed,
-        "path": episode.path,
-        "outcome": episode.outcome,
-        "hit": episode.hit,
-        "steps": episode.length,
-        "return": round(episode.total_reward, 2),
-    }
+    return sorted(episodes, key=lambda episode: episode.seed)
 
 
 def category_rows(categories: Iterable[str], semantic: Iterable[Any]) -> list[dict[str, Any]]:
@@ -254,7 +207,7 @@ class Keyboard:
         return tensordict.set("action", torch.full(tensordict.shape, action))
 
 
-def drive_by_hand(driver: Driver, name: str, env: EnvBase, options: dict[str, Any]) -> None:
+def drive_by_hand(policy: Policy | str, name: str, env: EnvBase, options: dict[str, Any]) -> None:
     """Opens a window and drives one episode after the other until it is closed.
 
     A finished episode stays in view until R begins the next.
@@ -264,7 +217,7 @@ def drive_by_hand(driver: Driver, name: str, env: EnvBase, options: dict[str, An
     """
     import matplotlib.pyplot as plt
 
-    keyboard = Keyboard(driver.policy_in(env), name)
+    keyboard = Keyboard(BaselinePolicy(policy, env) if isinstance(policy, str) else policy, name)
     # Disable Matplotlib's own shortcuts for the driver's keys (left: back, r: home, q: quit).
     shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
     with plt.rc_context(shortcuts):

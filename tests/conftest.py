@@ -78,14 +78,13 @@ def make_street():
 @pytest.fixture
 def drive():
     """Drives episodes 0, 1, ... with a baseline, and returns them as they end."""
-    from flowrep.baselines import BaselinePolicy
     from flowrep.envs import make_env
     from flowrep.experiment.evaluation import evaluate
 
     def drive(baseline, count, scene="straight_road", **options):
         env = make_env(scene, num_envs=min(count, 20))
         episodes = [{"episode_seed": seed, **options} for seed in range(count)]
-        found = list(evaluate(env, BaselinePolicy(baseline, env), episodes))
+        found = list(evaluate(env, baseline, episodes))
         env.close()
         return found
 

@@ -21,14 +21,14 @@ from flowrep.envs import make_env, street_envs
 from flowrep.experiment.film import make_filmed
 from flowrep.scenes import load_scene
 from flowrep.view import (
-    Driver,
     Keyboard,
+    agent_of,
     category_rows,
     drive_by_hand,
     drive_in_window,
     drive_on,
-    driver_of,
     episodes_of,
+    make_env_of,
     moments,
     moving_pixels,
 )
@@ -45,6 +45,10 @@ def view(*arguments):
 
 def options_of(config):
     return episodes_of(config, load_scene(config.scene))
+
+
+def driven(config, is_scene_given=True):
+    return drive_on(config, agent_of(config, is_scene_given), options_of(config))
 
 
 def asked(*overrides):
@@ -68,7 +72,7 @@ def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
     assert len(seen) == 11
     assert min(seen["road"], seen["sky"], seen["pedestrian"], seen["tree"]) > 0
     frames = imageio.imread(out / "episode.mp4", plugin="FFMPEG")
-    assert len(frames) == int(first["steps"]) + 1
+    assert len(frames) == int(first["length"]) + 1
     # Six tiles of 32 x 24, enlarged by a whole factor to some 240 px each.
     assert frames.shape[2] > 6 * 200
 
@@ -80,37 +84,30 @@ def test_a_run_and_a_policy_of_ones_own_drive_as_baselines_do(tmp_path):
     run = trained(tmp_path / "run", "representations=[obj]")
     path = tmp_path / "mine.py"
     path.write_text("def make(task):\n    return lambda maps: [0] * len(maps)\n")
-    driven = {}
+    ended = {}
     for policy, scene in ((str(run.path), "straight_road"), (f"{path}:make", "s_turn")):
         config = asked(f"policy={policy}", "scene=s_turn", "representations=[seg]", "episodes=3")
-        driver = driver_of(config, is_scene_given=False)
-        env = make_filmed(driver.make_env, driver.representations)
+        agent = agent_of(config, is_scene_given=False)
+        env = make_filmed(make_env_of(config, agent), agent.config.representations)
         assert env.base_env.scene.name == scene  # a run's agent is at home in its own
         env.close()
-        driven[policy] = drive_on(driver, options_of(config))
-        assert [episode.seed for episode in driven[policy]] == [0, 1, 2]
-    never = drive_on(
-        driver_of(asked("policy=never_turn", "scene=s_turn"), True), options_of(config)
-    )
-    assert [e.outcome for e in driven[f"{path}:make"]] == [e.outcome for e in never]
+        ended[policy] = drive_on(config, agent, options_of(config))
+        assert [episode.seed for episode in ended[policy]] == [0, 1, 2]
+    never = driven(asked("policy=never_turn", "scene=s_turn", "episodes=3"))
+    assert [e.outcome for e in ended[f"{path}:make"]] == [e.outcome for e in never]
 
 
-def test_what_is_no_policy_is_named():
-    with pytest.raises(UsageError, match="policy=pilot"):
-        driver_of(asked("policy=pilot"), True)
+def test_what_is_no_policy_or_path_is_named():
+    for config, key in ((asked("policy=pilot"), "policy=pilot"), (asked("path=up"), "path")):
+        with pytest.raises(UsageError, match=key):
+            driven(config)
     with pytest.raises(UsageError, match="representations"):
-        driver_of(asked("policy=mine.py:make"), True)
-
-
-def test_a_path_that_is_not_there_is_named():
-    with pytest.raises(UsageError, match="path"):
-        options_of(asked("path=up"))
+        driven(asked("policy=mine.py:make"))
 
 
 def test_the_path_can_be_chosen():
     config = asked("policy=never_turn", "scene=three_way_junction", "path=right", "episodes=6")
-    episodes = drive_on(driver_of(config, True), options_of(config))
-    assert [episode.path for episode in episodes] == ["right"] * 6
+    assert [episode.path for episode in driven(config)] == ["right"] * 6
 
 
 def test_pixels_are_counted_by_category():
@@ -215,9 +212,8 @@ def test_an_episode_can_be_left_for_the_next_and_the_window_be_closed(env):
 
 
 def test_without_a_screen_one_line_says_what_is_missing(env):
-    driver = Driver(make_env, {}, lambda env: never)
     with (
         matplotlib.rc_context({"backend": "agg"}),
         pytest.raises(UsageError, match=r"^interactive=true .*screen.*$"),
     ):
-        drive_by_hand(driver, "never_turn", env, {"episode_seed": 1})
+        drive_by_hand(never, "never_turn", env, {"episode_seed": 1})

@@ -22,16 +22,21 @@ from torchrl.data import Categorical, Composite, TensorSpec
 from torchrl.envs import EnvBase
 
 from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.config.schema import EnvConfig, Noise, TrainConfig, validated, validated_run
+from flowrep.config.schema import EnvConfig, TrainConfig, validated_run
 from flowrep.envs import street_envs
 from flowrep.experiment import build
-from flowrep.experiment.evaluation import Policy
+from flowrep.experiment.evaluation import Policy, scene_id
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
+from flowrep.scenes import load_scene
 
 PROGRAM, CARD, LOADER = "agent.pt2", "agent.json", "load_agent.py"
 """The files of an exported agent: the program that runs it, what describes it, what loads it."""
 
-_STANDARD_LIBRARY = (sysconfig.get_path("stdlib"), "<frozen ")
+_NOT_THE_USERS = (
+    sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1]),
+    "<frozen ",
+)  # fmt: skip
+"""Beginnings of the names of files with other people's code."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +44,13 @@ class Agent:
     """A policy and the env in which it acts.
 
     Args:
-        policy: writes `action`.
+        policy: writes `action`; or the name of a baseline.
         config: of the env.
         frames: the frames that the policy was trained for; 0 if unknown.
         trained_in: the name of the scene in which it was trained, None if unknown.
     """
 
-    policy: Policy
+    policy: Policy | str
     config: EnvConfig
     frames: int = 0
     trained_in: str | None = None
@@ -54,6 +59,19 @@ class Agent:
     def make_env(self) -> Callable[..., EnvBase]:
         """Makes envs of its config; arguments override those of `make_env`."""
         return partial(build.env, self.config)
+
+    def origin(self, evaluation: str) -> dict[str, Any]:
+        """Returns the columns of evaluation.csv that tell which agent drove where."""
+        scene = load_scene(self.config.scene)
+        return {
+            "scene": scene.name,
+            "scene_id": scene_id(scene),
+            "representations": "+".join(self.config.representations),
+            "flow": self.config.flow.source,
+            "seed": self.config.seed if self.frames else "",
+            "frames": self.frames,
+            "evaluation": evaluation,
+        }
 
 
 def load_trained(
@@ -119,44 +137,12 @@ def with_weights(
     return Agent(policy, config, frames, own.scene["name"])
 
 
-def load_external(
-    reference: str,
-    *,
-    scene: Mapping[str, Any],
-    representations: Mapping[str, Any],
-    flow: Mapping[str, Any] | None = None,
-    motion: str | None = None,
-    noise: Mapping[str, float] | None = None,
-    **machine: Any,
-) -> Agent:
-    """Returns a policy of the user's own, with the observations that are asked for.
-
-    Args:
-        reference: see `load_policy`.
-        scene: the scene to act in.
-        representations: what the policy sees: a mapping from name to options.
-        flow: the source of raw and obj; exact if None.
-        motion: the source of the camera's motion; exact if None.
-        noise: errors of depth and motion; none if None.
-        machine: `device`, `num_envs` and `num_workers`.
+def load_external(reference: str, config: EnvConfig) -> Agent:
+    """Returns a policy of the user's own, in the env of the config.
 
     Raises:
         PolicyError: as `check_card` and `load_policy`.
     """
-    config = validated(
-        EnvConfig,
-        {
-            "scene": scene,
-            "representations": representations,
-            "flow": flow or {"source": "exact"},
-            "motion": motion or "exact",
-            "noise": noise or dict.fromkeys(Noise.key_names(), 0.0),
-            "speed": "normal",
-            "renderer": "auto",
-            "seed": 0,
-        }
-        | machine,
-    )
     env = build.env(config, num_envs=1, num_workers=0)
     task = Task(
         scene=config.scene["name"],
@@ -252,23 +238,18 @@ def load_policy(reference: str, task: Task) -> ExternalPolicy:
     Args:
         reference: `path.py:make` or `package.module:make`, a function that is called with the task
             and returns the policy's function; or `path.pt2`, a program saved by `torch.export.save`
-            that takes the maps as arguments, in the task's order, and returns a score per action.
+            that takes the maps as arguments, in the task's order (that of flowrep's export in the
+            order of its agent.json), and returns a score per action.
         task: the policy's task.
 
     Raises:
         PolicyError: if the file, module or function doesn't exist or fails.
     """
-    place, _, name = reference.rpartition(":")
     with _named(reference):
         if reference.endswith(".pt2"):
             return ExternalPolicy(reference, _program(reference, task), task)
-        module = _module(place)
-        make = getattr(module, name, None)
-        if not callable(make):
-            there = [key for key, value in vars(module).items() if _is_own(value, module)]
-            found = ", ".join(there) or "none"
-            raise PolicyError(f"{place} has no function '{name}'; there are: {found}")
-        act = make(task)
+        place, _, name = reference.rpartition(":")
+        act = getattr(_module(place), name)(task)
         if not callable(act):
             raise PolicyError(
                 f"{name}(task) returned a {type(act).__name__}; expected a function of a "
@@ -279,19 +260,9 @@ def load_policy(reference: str, task: Task) -> ExternalPolicy:
 
 def _module(place: str) -> Any:
     if not place.endswith(".py"):
-        try:
-            return import_module(place)
-        except ModuleNotFoundError as error:
-            if error.name and place.startswith(error.name):
-                raise PolicyError(
-                    f"there is no module {error.name}; is its folder in PYTHONPATH? A file is "
-                    "named with its ending: path.py:make"
-                ) from None
-            raise
-    path = Path(place)
-    if not path.is_file():
-        raise PolicyError(f"there is no file {place}")
-    sys.path.insert(0, str(path.parent.resolve()))  # as Python does for a script
+        return import_module(place)
+    path = Path(place).resolve(strict=True)
+    sys.path.insert(0, str(path.parent))  # as Python does for a script
     spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
@@ -302,15 +273,11 @@ def _module(place: str) -> Any:
 
 
 def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
-    if not Path(path).is_file():
-        raise PolicyError("there is no such file")
     # moving the module alone would leave the devices that its graph names
     program = move_to_device_pass(torch.export.load(path), task.device).module()
-    return lambda maps: program(*(maps[name] for name in task.representations)).argmax(-1)
-
-
-def _is_own(value: Any, module: Any) -> bool:
-    return callable(value) and getattr(value, "__module__", "") == module.__name__
+    card = _card(path)
+    names = task.representations if card is None else [each["name"] for each in card["maps"]]
+    return lambda maps: program(*(maps[name] for name in names)).argmax(-1)
 
 
 @contextmanager
@@ -322,25 +289,13 @@ def _named(name: str) -> Iterator[None]:
         raise PolicyError(f"policy '{name}': {error}") from error.__cause__
     except Exception as error:
         text = str(error).strip().splitlines()
+        # the last line of the author's own code, rather than one deep in a library
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [frame for frame in frames if not frame.filename.startswith(_NOT_THE_USERS)]
+        place = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
         raise PolicyError(
-            f"policy '{name}' failed: {type(error).__name__}: {text[0] if text else ''}"
-            f"{_place(error.__traceback__)}"
+            f"policy '{name}' failed: {type(error).__name__}: {text[0] if text else ''}{place}"
         ) from error
-
-
-def _place(trace: Any) -> str:
-    """Returns the last line of the author's own code, rather than one deep in a library."""
-    frames = [frame for frame in traceback.extract_tb(trace) if frame.filename != __file__]
-    installed = [frame for frame in frames if "site-packages" in frame.filename]
-    own = [
-        frame
-        for frame in frames
-        if frame not in installed and not frame.filename.startswith(_STANDARD_LIBRARY)
-    ]
-    # a policy may be installed as well; then it is the line that flowrep called
-    for frame in own[-1:] or installed[:1]:
-        return f" ({frame.filename}, line {frame.lineno})"
-    return ""
 
 
 def check_card(reference: str, task: Task) -> None:
@@ -356,18 +311,11 @@ def check_card(reference: str, task: Task) -> None:
         PolicyError: the maps differ in what they are, in size, field of view, options or classes;
             the message has the overrides that give the right ones. Or agent.json is damaged.
     """
-    agent = Path(reference.removesuffix(":make"))
-    path = agent.parent / CARD
-    if agent.name not in (PROGRAM, LOADER) or not path.is_file():
-        return
-    try:
-        card = json.loads(path.read_text(encoding="utf-8"))
-        trained, here = _settings(card, task, any_order=agent.name == LOADER)
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise PolicyError(
-            f"policy '{reference}': {path} doesn't describe an exported agent "
-            f"({type(error).__name__}: {error}); export it again"
-        ) from error
+    with _named(reference):
+        card = _card(reference)
+        if card is None:
+            return
+        trained, here = _settings(card, task)
     if wrong := [key for key in trained if trained[key] != here[key]]:
         raise PolicyError(
             f"policy '{reference}' was trained on other maps than those of "
@@ -375,19 +323,27 @@ def check_card(reference: str, task: Task) -> None:
         )
 
 
-def _settings(
-    card: Mapping[str, Any], task: Task, *, any_order: bool
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def _card(reference: str) -> Any:
+    """Returns the content of an exported agent's agent.json, None for other policies."""
+    agent = Path(reference.removesuffix(":make"))
+    path = agent.with_name(CARD) if agent.name in (PROGRAM, LOADER) else None
+    if path is None or not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise PolicyError(f"{path} is damaged: {error}; export the agent again") from error
+
+
+def _settings(card: Mapping[str, Any], task: Task) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns what the maps depend on, by its key on the command line: in training, and here."""
     maps = {each["name"]: each for each in card["maps"]}
-    shown = [name for name in maps if name in task.representations]
-    suffices = any_order and shown == list(maps)
-    trained: dict[str, Any] = {"representations": list(maps)}
-    here: dict[str, Any] = {"representations": shown if suffices else list(task.representations)}
     shape = task.observation_spec[next(iter(task.representations))].shape
-    trained |= _camera(card["maps"][0]["shape"], card["intrinsics"])
-    here |= _camera(shape, task.intrinsics.tolist())
-    for name in shown:
+    trained = _camera(card["maps"][0]["shape"], card["intrinsics"])
+    here = _camera(shape, task.intrinsics.tolist())
+    if maps.keys() - task.representations.keys():
+        trained["representations"], here["representations"] = list(maps), list(task.representations)
+    for name in maps.keys() & task.representations.keys():
         for option, value in maps[name]["options"].items():
             key = f"representations.{name}.{option}"
             trained[key], here[key] = value, task.representations[name].get(option)

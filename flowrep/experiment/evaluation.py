@@ -1,4 +1,4 @@
-"""Runs whole episodes of any policy, and makes tables of them: outcomes, causes of failure, drives.
+"""Runs whole episodes of any policy, and makes tables of how they ended.
 
 Training, `flowrep.evaluate`, films, `flowrep.view` and baselines all drive through `evaluate`.
 """
@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from itertools import count, product
-from pathlib import Path
+from itertools import product, takewhile
 from statistics import NormalDist
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,8 +28,11 @@ from tqdm.auto import tqdm
 from flowrep.baselines import BaselinePolicy
 from flowrep.envs import Outcome
 from flowrep.envs.episode import hit_name
+from flowrep.progress import StopRequest
 from flowrep.scenes import Scene
-from flowrep.tables import write_rows
+
+if TYPE_CHECKING:
+    from flowrep.experiment.evaluation_pool import EvaluationPool
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Row = dict[str, Any]
@@ -42,12 +44,8 @@ CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout
 _FAILURE_GROUP = (
     "scene", "scene_id", "representations", "flow", "frames", "evaluation", "policy", "speed", "fps"
 )  # fmt: skip
-_WITHOUT_OBSERVATIONS: dict[str, Any] = {
-    "representations": {},
-    "noise": None,
-    "num_workers": 0,
-    "device": "cpu",
-}  # baselines read the simulator
+_BLIND: dict[str, Any] = {"representations": {}, "noise": None, "num_workers": 0, "device": "cpu"}
+"""The env of baselines, which read the simulator and need no observation."""
 _DRAWS = 1  # separates a policy's draws from other draws of an episode's seed
 
 
@@ -77,15 +75,27 @@ class Episode:
     length: int
     positions: NDArray[np.float32] = field(repr=False, compare=False)
 
+    def row(self) -> Row:
+        """Returns its columns in evaluation.csv."""
+        return {
+            "speed": self.speed,
+            "fps": self.fps,
+            "episode_seed": self.seed,
+            "outcome": self.outcome,
+            "hit": self.hit,
+            "return": round(self.total_reward, 4),
+            "length": self.length,
+        }
 
-@dataclass
+
 class _Running:
-    """An episode that a place of the batch is driving."""
+    """An episode that a place of the env's batch is driving."""
 
-    options: Mapping[str, Any]
-    rng: np.random.Generator
-    positions: list[list[float]]
-    total_reward: float = 0.0
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        self.options = dict(options)
+        self.rng = np.random.default_rng((options["episode_seed"], _DRAWS))
+        self.positions: list[list[float]] = []
+        self.total_reward = 0.0
 
     @property
     def length(self) -> int:
@@ -95,11 +105,11 @@ class _Running:
 @torch.no_grad()
 def evaluate(
     env: EnvBase,
-    policy: Policy,
+    policy: Policy | str,
     episodes: Iterable[Mapping[str, Any]],
     *,
     greedy: bool = True,
-    on_frame: Callable[[TensorDictBase], None] | None = None,
+    on_frame: Callable[[TensorDictBase], Any] | None = None,
 ) -> Iterator[Episode]:
     """Yields finished episodes, in the order in which they end.
 
@@ -108,34 +118,35 @@ def evaluate(
     `env_id` int64 `[N]`, the place, and `is_init` bool `[N, 1]`, whether its episode just began.
 
     Args:
-        env: made by `make_env`.
-        policy: writes `action` `[N]`; one that isn't greedy has `get_dist`.
+        env: made by `make_env`; without workers for a baseline.
+        policy: writes `action` `[N]`, and has `get_dist` if it isn't greedy; or a baseline's name.
         episodes: options of `StreetEnv.reset`, `episode_seed` among them.
         greedy: whether the policy's likeliest action is taken. If not, it is drawn from the
             episode's own generator, so that an episode repeats whatever else is in the batch.
         on_frame: called with the env's TensorDict after each reset and each step.
     """
+    if isinstance(policy, str):
+        policy = BaselinePolicy(policy, env)
     waiting = deque(episodes)
     paths = [path.name for path in env.base_env.scene.paths]
-    places: list[_Running | None] = [None] * env.batch_size[0]
+    running: dict[int, _Running] = {}  # by place
     tensordict: TensorDictBase | None = None
-    ended = list(range(len(places)))
+    free = list(range(env.batch_size[0]))
     while True:
-        if ended:
-            for i in ended:
-                places[i] = _begun(waiting.popleft()) if waiting else None
-            if not any(places):
+        if free:
+            begun = {place: _Running(waiting.popleft()) for place in free if waiting}
+            running |= begun
+            if not running:
                 return
-            tensordict = _reset(env, tensordict, ended, places)
-            vehicles = tensordict["vehicle"][ended, :2].tolist()
-            for i, position in zip(ended, vehicles):
-                if (running := places[i]) is not None:
-                    running.positions.append(position)
+            tensordict = _reset(env, tensordict, free, running)
+            vehicles = tensordict["vehicle"].tolist()
+            for place, episode in begun.items():
+                episode.positions.append(vehicles[place][:2])
             if on_frame is not None:
                 on_frame(tensordict)
         assert tensordict is not None
-        rows = [i for i, running in enumerate(places) if running is not None]
-        tensordict["action"] = _act(policy, tensordict, rows, places, greedy)
+        busy = sorted(running)
+        tensordict["action"] = _act(policy, tensordict, busy, running, greedy)
         tensordict = env.step(tensordict)["next"]
         if on_frame is not None:
             on_frame(tensordict)
@@ -143,68 +154,64 @@ def evaluate(
             key: tensordict[key].tolist()
             for key in ("vehicle", "reward", "outcome", "hit", "path", "episode_seed")
         }
-        ended = []
-        for i in rows:
-            running = places[i]
-            assert running is not None
-            running.positions.append(status["vehicle"][i][:2])
-            running.total_reward += status["reward"][i][0]
-            if status["outcome"][i][0]:
-                ended.append(i)
-                yield Episode(
-                    seed=status["episode_seed"][i][0],
-                    path=paths[status["path"][i][0]],
-                    speed=running.options.get("speed", ""),
-                    fps=env.base_env.frame_rate_hz,
-                    outcome=OUTCOMES[status["outcome"][i][0]],
-                    hit=hit_name(status["hit"][i][0]),
-                    total_reward=running.total_reward,
-                    length=running.length,
-                    positions=np.array(running.positions, dtype=np.float32),
-                )
-
-
-def _begun(options: Mapping[str, Any]) -> _Running:
-    return _Running(options, np.random.default_rng((options["episode_seed"], _DRAWS)), [])
+        free = [place for place in busy if status["outcome"][place][0]]
+        for place in busy:
+            running[place].positions.append(status["vehicle"][place][:2])
+            running[place].total_reward += status["reward"][place][0]
+        for place in free:
+            ended = running.pop(place)
+            yield Episode(
+                seed=status["episode_seed"][place][0],
+                path=paths[status["path"][place][0]],
+                speed=ended.options.get("speed", ""),
+                fps=env.base_env.frame_rate_hz,
+                outcome=OUTCOMES[status["outcome"][place][0]],
+                hit=hit_name(status["hit"][place][0]),
+                total_reward=ended.total_reward,
+                length=ended.length,
+                positions=np.array(ended.positions, dtype=np.float32),
+            )
 
 
 def _reset(
     env: EnvBase,
     tensordict: TensorDictBase | None,
-    ended: Sequence[int],
-    places: Sequence[_Running | None],
+    free: Sequence[int],
+    running: Mapping[int, _Running],
 ) -> TensorDictBase:
     """Begins the episodes of places whose last one has ended."""
-    options = {"episodes": [None if p is None else dict(p.options) for p in places]}
+    places = range(env.batch_size[0])
+    options = {"episodes": [running[i].options if i in running else None for i in places]}
     if tensordict is None:
         return env.reset(options=options)
     mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool, device=env.device)
-    mask[ended] = True
+    mask[free] = True
     return env.reset(tensordict.set("_reset", mask), options=options)
 
 
 def _act(
     policy: Any,
     tensordict: TensorDictBase,
-    rows: Sequence[int],
-    places: Sequence[_Running | None],
+    busy: list[int],
+    running: Mapping[int, _Running],
     greedy: bool,
 ) -> torch.Tensor:
-    """Returns actions `[num_envs]`, chosen by the policy for the given rows."""
-    running = [places[i] for i in rows]
-    seen = tensordict.copy() if len(rows) == len(places) else tensordict[list(rows)]
+    """Returns actions `[num_envs]`, chosen by the policy for the busy places."""
     device = tensordict.device
-    seen["env_id"] = torch.tensor(rows, device=device)
-    seen["is_init"] = torch.tensor([[not r.length] for r in running if r], device=device)
-    actions = torch.zeros(len(places), dtype=torch.int64, device=device)
+    seen = tensordict.copy() if len(busy) == len(tensordict) else tensordict[busy]
+    seen["env_id"] = torch.tensor(busy, device=device)
+    seen["is_init"] = torch.tensor([[not running[i].length] for i in busy], device=device)
+    actions = torch.zeros(len(tensordict), dtype=torch.int64, device=device)
     if greedy:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            actions[rows] = policy(seen)["action"].to(device)
+            actions[busy] = policy(seen)["action"].to(device)
     else:
         shares = policy.get_dist(seen).probs.double().cumsum(-1).cpu().numpy()
-        drawn = np.array([r.rng.random() for r in running if r])[:, None]
+        drawn = np.array([running[i].rng.random() for i in busy])[:, None]
+        # the least action whose cumulated share exceeds the draw; the last share is 1 but for
+        # rounding
         chosen = (drawn * shares[:, -1:] >= shares[:, :-1]).sum(axis=-1)
-        actions[rows] = torch.as_tensor(chosen, device=device)
+        actions[busy] = torch.as_tensor(chosen, device=device)
     return actions
 
 
@@ -235,11 +242,6 @@ def outcome_shares(outcomes: Iterable[str]) -> dict[str, tuple[float, float, flo
     }
 
 
-def evaluation_seeds(first: int, count: int) -> list[int]:
-    """Returns consecutive seeds of episodes, within the range that an env takes."""
-    return [(first + k) % (1 << 31) for k in range(count)]
-
-
 class Comparison:
     """The same episodes for an agent and baselines: which to run, and the results so far.
 
@@ -266,28 +268,29 @@ class Comparison:
     ) -> None:
         self.speeds, self.fps = [*speeds], [float(rate) for rate in fps]
         self.policies, self.baselines = [*policies], [*baselines]
-        self._seeds = evaluation_seeds(seed, episodes)
-        self._found: dict[tuple[str, float, str], dict[int, Episode]] = defaultdict(dict)
+        self._seeds = range(seed, seed + episodes)
+        groups = product(self.speeds, self.fps, [*self.policies, *self.baselines])
+        self._found: dict[tuple[str, float, str], dict[int, Episode]] = {key: {} for key in groups}
 
     @property
     def total(self) -> int:
         """The number of episodes to run."""
-        names = len(self.policies) + len(self.baselines)
-        return len(self.speeds) * len(self.fps) * names * len(self._seeds)
+        return len(self._found) * len(self._seeds)
 
     @property
-    def is_complete(self) -> bool:
-        """Whether all episodes have been run."""
-        return sum(map(len, self._found.values())) == self.total
+    def done(self) -> int:
+        """The number of episodes that have been run."""
+        return sum(map(len, self._found.values()))
 
     def run(
         self,
         make_env: Callable[..., EnvBase],
-        policy: Policy,
+        policy: Policy | str,
         num_envs: int,
-        should_stop: Callable[[], bool] = lambda: False,
-        save: Callable[[], None] = lambda: None,
-        pool: Any = None,
+        *,
+        stop: StopRequest | None = None,
+        save: Callable[[], Any] = lambda: None,
+        pool: "EvaluationPool | None" = None,
     ) -> None:
         """Runs the episodes; finished ones are kept even if it is interrupted.
 
@@ -297,78 +300,66 @@ class Comparison:
             make_env: called with changes of `make_env`'s arguments for each frame rate.
             policy: the agent's.
             num_envs: the number of environments side by side, at most.
-            should_stop: called after each episode.
+            stop: checked after each episode.
             save: called when all episodes of a policy at one speed and frame rate have been run.
-            pool: an `EvaluationPool`, whose processes run the episodes; this one does if None.
+            pool: its processes run the episodes; this one does if None.
         """
-        for key in list(self._found):
-            if key[-1] in self.policies:
-                del self._found[key]
-        done = sum(map(len, self._found.values()))
-        steps = count(1)
-
-        def show_step(_: TensorDictBase) -> None:
-            """Shows that the bar is alive: the first episodes end after seconds, many at once."""
-            bar.set_postfix_str(f"step {next(steps)}", refresh=False)
-            bar.update(0)
-
+        for (_, _, name), episodes in self._found.items():
+            if name in self.policies:
+                episodes.clear()
         with tqdm(
-            total=self.total, initial=done, unit="episode", desc="evaluating", leave=False,
+            total=self.total, initial=self.done, unit="episode", desc="evaluating", leave=False,
             miniters=0, mininterval=0.5,
         ) as bar:  # fmt: skip
-            driven = self._episodes(make_env, policy, num_envs, show_step, should_stop, pool)
-            for name, episode in driven:
+
+            def show(_: TensorDictBase) -> None:
+                bar.update(0)  # its clock goes on: the first episodes take seconds
+
+            for name, episode in self._episodes(make_env, policy, num_envs, stop, show, pool):
                 found = self._found[episode.speed, episode.fps, name]
                 found[episode.seed] = episode
                 bar.update()
                 if len(found) == len(self._seeds):
                     save()
-                if should_stop():
+                if stop:
                     return
 
     def _episodes(
         self,
         make_env: Callable[..., EnvBase],
-        policy: Policy,
+        policy: Policy | str,
         num_envs: int,
-        on_frame: Callable[[TensorDictBase], None],
-        should_stop: Callable[[], bool],
-        pool: Any,
+        stop: StopRequest | None,
+        on_frame: Callable[[TensorDictBase], Any],
+        pool: "EvaluationPool | None",
     ) -> Iterator[tuple[str, Episode]]:
+        """Yields the missing episodes, each with its policy's name."""
         for rate in self.fps:
-            if should_stop():
-                return
-            for names, changes in ((self.policies, {}), (self.baselines, _WITHOUT_OBSERVATIONS)):
-                missing = {name: self._missing(rate, name) for name in names}
-                most = max(map(len, missing.values()), default=0)
-                if not most:
+            for names, changes in ((self.policies, {}), (self.baselines, _BLIND)):
+                jobs = {name: self._job(name, policy, rate) for name in names}
+                most = max((len(job["episodes"]) for job in jobs.values()), default=0)
+                if stop or not most:
                     continue
-                changes = {"frame_rate_hz": rate, "num_envs": min(num_envs, most), **changes}
+                make = partial(make_env, **changes, frame_rate_hz=rate)
+                side_by_side = min(num_envs, most)
                 if pool is not None:
-                    changes["num_envs"] = -(-changes["num_envs"] // pool.num_processes)
-                    make = partial(make_env, **changes | {"num_workers": 0})
-                    for name, episodes in missing.items():
-                        driver = name if name in self.baselines else policy
-                        greedy = name != "sampled"
-                        found = pool.evaluate(
-                            make, driver, episodes, greedy=greedy, should_stop=should_stop
-                        )
-                        yield from ((name, episode) for episode in found)
+                    yield from pool.evaluate(make, side_by_side, jobs, stop)
                     continue
-                with closing(make_env(**changes)) as env:
-                    for name, episodes in missing.items():
-                        how: dict[str, Any] = {"greedy": name != "sampled", "on_frame": on_frame}
-                        driver = BaselinePolicy(name, env) if name in self.baselines else policy
-                        for episode in evaluate(env, driver, episodes, **how):
+                with closing(make(num_envs=side_by_side)) as env:
+                    for name, job in jobs.items():
+                        for episode in evaluate(env, **job, on_frame=on_frame):
                             yield name, episode
 
-    def _missing(self, rate: float, name: str) -> list[dict[str, Any]]:
-        return [
+    def _job(self, name: str, policy: Policy | str, rate: float) -> dict[str, Any]:
+        """Returns the arguments of `evaluate` for a policy's missing episodes at a frame rate."""
+        missing = [
             {"episode_seed": seed, "speed": speed}
             for speed in self.speeds
             for seed in self._seeds
             if seed not in self._found[speed, rate, name]
         ]
+        driver = name if name in self.baselines else policy
+        return {"policy": driver, "episodes": missing, "greedy": name != "sampled"}
 
     def results(self) -> list[tuple[str, Episode]]:
         """Returns each episode with its policy's name, by speed, frame rate, policy and seed.
@@ -376,95 +367,21 @@ class Comparison:
         Of an incomplete group, only the episodes before the first gap are returned: short episodes
         finish first, so taking all that are done would bias the result.
         """
-        results = []
-        for key in product(self.speeds, self.fps, [*self.policies, *self.baselines]):
-            for seed in self._seeds:
-                if seed not in self._found[key]:
-                    break
-                results.append((key[-1], self._found[key][seed]))
-        return results
+        return [
+            (name, found[seed])
+            for (_, _, name), found in self._found.items()
+            for seed in takewhile(found.__contains__, self._seeds)
+        ]
 
     def rows(self, **origin: Any) -> list[Row]:
         """Returns the rows of `results` for evaluation.csv, after the columns of their origin."""
-        return [
-            origin
-            | {
-                "policy": name,
-                "speed": episode.speed,
-                "fps": episode.fps,
-                "episode_seed": episode.seed,
-                "outcome": episode.outcome,
-                "hit": episode.hit,
-                "return": round(episode.total_reward, 4),
-                "length": episode.length,
-            }
-            for name, episode in self.results()
-        ]
+        return [{**origin, "policy": name, **episode.row()} for name, episode in self.results()]
 
 
 def scene_id(scene: Scene) -> str:
     """Returns a short hash of all that a scene is: rows with the same one share a scene."""
     text = json.dumps(asdict(scene), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
-
-
-_DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed", "outcome")
-
-
-def save_drives(
-    path: Path, rows: Sequence[Mapping[str, Any]], positions: Sequence[NDArray[np.float32]]
-) -> None:
-    """Adds where vehicles drove to a file, in place of the same episodes' earlier drives.
-
-    The file holds `positions` [sum of T + 1, 2], x and y in metres; `starts` [N + 1], so that
-    episode n is `positions[starts[n]:starts[n + 1]]`; and for each episode the columns of
-    evaluation.csv that name it.
-
-    Args:
-        path: of the npz file.
-        rows: of evaluation.csv.
-        positions: for each row, `[T + 1, 2]`.
-    """
-    drives: dict[tuple[Any, ...], NDArray[np.float32]] = {}
-    if path.is_file():
-        with np.load(path, allow_pickle=False) as saved:
-            names = zip(*(saved[column].tolist() for column in _DRIVE))
-            drives = dict(zip(names, np.split(saved["positions"], saved["starts"][1:-1])))
-    for row, driven in zip(rows, positions):
-        name = tuple(row[column] for column in _DRIVE)
-        drives[name] = driven
-    arrays: dict[str, Any] = {
-        column: np.array(values) for column, values in zip(_DRIVE, zip(*drives))
-    }
-    whole = path.with_suffix(".tmp.npz")
-    np.savez_compressed(
-        whole,
-        positions=np.concatenate([*drives.values()]),
-        starts=np.cumsum([0, *map(len, drives.values())]),
-        **arrays,
-    )
-    whole.replace(path)
-
-
-def print_table(rows: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
-    """Prints the share of each outcome in %, with its 95 % Wilson interval."""
-    table = Table(title="Share of episodes in % [95 % interval]", box=box.SIMPLE, pad_edge=False)
-    for heading in ("speed", "fps", "policy", "episodes"):
-        table.add_column(heading, no_wrap=heading != "policy", overflow="fold")  # it may be a path
-    for heading in OUTCOMES[1:]:
-        table.add_column(heading.replace("_", " "), justify="right", no_wrap=True)
-    by_policy: dict[tuple[str, float, str], list[str]] = defaultdict(list)
-    for row in rows:
-        by_policy[row["speed"], row["fps"], row["policy"]].append(row["outcome"])
-    shown: tuple[str, float] | None = None
-    for (speed, fps, policy), outcomes in by_policy.items():
-        if shown not in (None, (speed, fps)):
-            table.add_section()
-        shown = speed, fps
-        shares = outcome_shares(outcomes).values()
-        cells = [f"{100 * s:.0f} [{100 * low:.0f}–{100 * high:.0f}]" for s, low, high in shares]
-        table.add_row(speed, f"{float(fps):g}", policy, str(len(outcomes)), *cells)
-    (console or Console(width=max(100, Console().width))).print(table)
 
 
 def cause_of(outcome: str, hit: str) -> str | None:
@@ -498,35 +415,57 @@ def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
         counts = Counter(cause for cause in causes if cause is not None)
         failures = counts.total()
         shares = {c: round(100 * counts[c] / failures, 1) if failures else "" for c in CAUSES}
-        line = (
-            dict(zip(_FAILURE_GROUP, key))
-            | {"episodes": len(causes), "failures": failures}
-            | shares
-        )
-        collisions = sum(counts[cause] for cause in CAUSES if cause.startswith("collision"))
+        collisions = counts["collision: pedestrian"] + counts["collision: other"]
         ratio = round(counts["out of bounds"] / collisions, 3) if collisions else ""
-        table.append(line | {"out of bounds to collisions": ratio})
+        table.append(
+            {
+                **dict(zip(_FAILURE_GROUP, key)),
+                "episodes": len(causes),
+                "failures": failures,
+                **shares,
+                "out of bounds to collisions": ratio,
+            }
+        )
     return table
 
 
-def print_failures(rows: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
-    """Prints the causes of failure by policy and speed."""
-    table = Table(title="Causes of failure in % of the failures", box=box.SIMPLE, pad_edge=False)
-    for heading in ("speed", "fps", "policy", "failures"):
-        table.add_column(heading, no_wrap=heading != "policy", overflow="fold")  # it may be a path
-    lines = failure_causes(rows)
-    for cause in CAUSES:
-        # In two lines, so that all fit into 100 columns.
-        heading = cause.replace(": ", ":\n").replace("of ", "of\n")
-        table.add_column(heading, justify="right", no_wrap=True)
-    for line in lines:
-        shares = ["" if line[cause] == "" else f"{line[cause]:.0f}" for cause in CAUSES]
-        failed = f"{line['failures']} of {line['episodes']}"
-        rate = f"{float(line['fps']):g}"
-        table.add_row(line["speed"], rate, line["policy"], failed, *shares)
+def print_results(rows: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
+    """Prints the share of each outcome, and the causes of failure, by policy and speed.
+
+    Args:
+        rows: rows of evaluation.csv.
+        console: where to.
+    """
+    by_policy: dict[tuple[Any, ...], list[str]] = defaultdict(list)
+    for row in rows:
+        by_policy[row["speed"], f"{float(row['fps']):g}", row["policy"]].append(row["outcome"])
+    table = [
+        {"speed": speed, "fps": fps, "policy": policy, "episodes": len(outcomes)}
+        | {
+            name: f"{100 * share:.0f} [{100 * low:.0f}–{100 * high:.0f}]"
+            for name, (share, low, high) in outcome_shares(outcomes).items()
+        }
+        for (speed, fps, policy), outcomes in by_policy.items()
+    ]
+    print_table("Share of episodes in % [95 % interval]", table, console)
+    table = [
+        {"speed": line["speed"], "fps": f"{float(line['fps']):g}", "policy": line["policy"]}
+        | {"failures": f"{line['failures']} of {line['episodes']}"}
+        | {cause: "" if line[cause] == "" else f"{line[cause]:.0f}" for cause in CAUSES}
+        for line in failure_causes(rows)
+    ]
+    print_table("Causes of failure in % of the failures", table, console)
+
+
+def print_table(
+    title: str, rows: Sequence[Mapping[str, Any]], console: Console | None = None
+) -> None:
+    """Prints rows that have the same keys, which are the headings."""
+    table = Table(title=title, box=box.SIMPLE, pad_edge=False)
+    for name in rows[0] if rows else ():
+        heading = name.replace("_", " ").replace(": ", ":\n")
+        # a policy's name may be a long path
+        table.add_column(heading, no_wrap=name != "policy", overflow="fold")
+    for row in rows:
+        table.add_row(*map(str, row.values()))
     (console or Console(width=max(100, Console().width))).print(table)
-
-
-def write_failures(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes the causes of failure as CSV, in place of an older table."""
-    write_rows(path, failure_causes(rows))

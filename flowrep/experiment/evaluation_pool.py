@@ -4,10 +4,10 @@ import os
 import pickle
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from functools import lru_cache
+from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
 from typing import Any
 
@@ -15,10 +15,10 @@ import torch
 from torchrl.envs import EnvBase
 
 from flowrep.agent import keep_freed_memory
-from flowrep.baselines import BaselinePolicy
 from flowrep.envs import WorkerError
 from flowrep.envs.workers import sheltered
-from flowrep.experiment.evaluation import Episode, Policy, evaluate
+from flowrep.experiment.evaluation import Episode, evaluate
+from flowrep.progress import StopRequest
 
 _stop: Any = None  # an event that ends the shares under way; set by `_begin`
 
@@ -42,39 +42,39 @@ class EvaluationPool:
     def evaluate(
         self,
         make_env: Callable[..., EnvBase],
-        policy: Policy | str,
-        episodes: Sequence[Mapping[str, Any]],
-        *,
-        greedy: bool = True,
-        should_stop: Callable[[], bool] = lambda: False,
-    ) -> Iterator[Episode]:
-        """Yields episodes share by share; closing the iterator ends those under way.
+        num_envs: int,
+        jobs: Mapping[str, Mapping[str, Any]],
+        stop: StopRequest | None = None,
+    ) -> Iterator[tuple[str, Episode]]:
+        """Yields episodes, each with its job's name; closing the iterator ends those under way.
 
         Args:
-            make_env: picklable; makes the env of a process, without workers.
-            policy: picklable, or the name of a baseline.
-            episodes: see `flowrep.experiment.evaluation.evaluate`.
-            greedy: see there.
-            should_stop: ends the shares under way.
+            make_env: picklable; takes changes of `make_env`'s arguments.
+            num_envs: the number of environments side by side, in all processes together.
+            jobs: for each name, arguments of `flowrep.experiment.evaluation.evaluate`.
+            stop: ends what is under way.
 
         Raises:
             WorkerError: a process has died.
         """
+        each = -(-num_envs // self.num_processes)
         # Sent as they are, tensors would be moved to shared memory, the caller's weights included.
-        env, given = pickle.dumps(make_env), pickle.dumps(policy)
+        env = pickle.dumps(partial(make_env, num_envs=each, num_workers=0))
         count = 2 * self.num_processes  # so that none waits for long for the others
-        shares = [episodes[first::count] for first in range(count)]
-        waiting: set[Future[list[Episode]]] = set()
+        waiting: dict[Future[list[Episode]], str] = {}
         try:
             with sheltered():
-                for share in filter(None, shares):
-                    waiting.add(self._executor.submit(_evaluate_share, env, given, share, greedy))
-            while waiting and not should_stop():
-                done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-                for future in done:
-                    yield from future.result()
+                for name, job in jobs.items():
+                    for first in range(min(count, len(job["episodes"]))):
+                        share = pickle.dumps({**job, "episodes": job["episodes"][first::count]})
+                        waiting[self._executor.submit(_evaluate_share, env, share)] = name
+            while waiting and not stop:
+                for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
+                    name = waiting.pop(future)
+                    for episode in future.result():
+                        yield name, episode
         except BrokenProcessPool as error:
-            if should_stop():  # a scheduler's SIGTERM ended all of them
+            if stop:  # a scheduler's SIGTERM ended all of them
                 return
             raise WorkerError(
                 "a process of the evaluation is gone: perhaps the system killed it for want of "
@@ -93,7 +93,12 @@ class EvaluationPool:
 
 
 def can_travel(policy: Any) -> bool:
-    """Returns whether a policy can be sent to another process."""
+    """Returns whether a policy can be sent to another process.
+
+    One of the user's own stays where it was made, whatever it holds.
+    """
+    if not isinstance(policy, torch.nn.Module):
+        return False
     try:
         pickle.dumps(policy)
     except (pickle.PicklingError, AttributeError, TypeError, RuntimeError):
@@ -125,13 +130,9 @@ def _made(env: bytes) -> EnvBase:
     return pickle.loads(env)()
 
 
-def _evaluate_share(
-    env: bytes, policy: bytes, episodes: Sequence[Mapping[str, Any]], greedy: bool
-) -> list[Episode]:
-    made, given = _made(env), pickle.loads(policy)
-    driver = BaselinePolicy(given, made) if isinstance(given, str) else given
+def _evaluate_share(env: bytes, share: bytes) -> list[Episode]:
     found = []
-    for episode in evaluate(made, driver, episodes, greedy=greedy):
+    for episode in evaluate(_made(env), **pickle.loads(share)):
         found.append(episode)
         if _stop.is_set():
             break

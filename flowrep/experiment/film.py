@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Episode, Policy, evaluate, outcome_shares
+from flowrep.experiment.run import replace_file
 from flowrep.geometry import factorize, rigid_flow
 from flowrep.viz import representation_strip, write_video
 from flowrep.viz.maps import tile_zoom
@@ -46,7 +47,7 @@ def make_filmed(make_env: Callable[..., EnvBase], representations: Mapping[str, 
 
 def film_episode(
     env: EnvBase,
-    policy: Policy,
+    policy: Policy | str,
     options: Mapping[str, Any],
     on_frame: Callable[[TensorDictBase], None] = lambda tensordict: None,
 ) -> tuple[list[Maps], Episode]:
@@ -54,7 +55,7 @@ def film_episode(
 
     Args:
         env: see `make_filmed`.
-        policy: writes `action`.
+        policy: see `evaluate`.
         options: of `StreetEnv.reset`; `episode_seed` identifies the episode.
         on_frame: called with the sensors of each frame.
     """
@@ -97,7 +98,7 @@ def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> M
 
 def record_episode(
     make_env: Callable[..., EnvBase],
-    policy: Policy,
+    policy: Policy | str,
     representations: Mapping[str, Any],
     path: Path,
     *,
@@ -107,7 +108,7 @@ def record_episode(
 
     Args:
         make_env: takes changes of `make_env`'s arguments.
-        policy: writes `action`.
+        policy: see `evaluate`.
         representations: the policy's inputs, a mapping from name to options.
         path: the mp4 file.
         episode_seed: identifies the episode, as in evaluation.csv.
@@ -115,17 +116,10 @@ def record_episode(
     env = make_filmed(make_env, representations)
     frames, episode = film_episode(env, policy, {"episode_seed": episode_seed})
     env.close()
-    _write_whole(
+    replace_file(
         path, partial(write_video, frames=map(representation_strip, frames), fps=episode.fps)
     )
     return episode
-
-
-def _write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Writes a file so that `path` is never half of one."""
-    whole = path.with_suffix(f".tmp{path.suffix}")
-    write(whole)
-    whole.replace(path)
 
 
 def draw_learning_curve(
@@ -175,4 +169,4 @@ def draw_learning_curve(
         )
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)  # covers no curve
     axes.grid(alpha=0.3)
-    _write_whole(path, partial(figure.savefig, dpi=120, format="png"))
+    replace_file(path, partial(figure.savefig, dpi=120, format="png"))

@@ -11,25 +11,25 @@ import sys
 import time
 import uuid
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
+from numpy.typing import NDArray
 from torchrl.record.loggers import TensorboardLogger
 
 from flowrep import __version__
 from flowrep.agent import CheckpointError
 from flowrep.config.schema import ALGORITHMS
-from flowrep.experiment.evaluation import OUTCOMES
+from flowrep.experiment.evaluation import OUTCOMES, failure_causes
 from flowrep.extras import require
 from flowrep.tables import append_rows, is_whole, read_rows, write_rows
-
-Rows = Sequence[Mapping[str, str]]
 
 EVALUATION_COLUMNS = (
     "scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation",
@@ -37,6 +37,8 @@ EVALUATION_COLUMNS = (
 )  # fmt: skip
 _EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
 """The columns that identify a row's policy and episode."""
+_DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed", "outcome")
+"""The columns in drives.npz."""
 
 _IDENTITY = (
     "scene", "representations", "flow", "noise", "algorithm", "speed", "seed", "num_envs",
@@ -55,55 +57,12 @@ class FolderInUseError(OSError):
     """Another process works in the folder; the message says which."""
 
 
-@contextmanager
-def folder_lock(folder: Path, doing: str, patience_s: float = 0.0) -> Iterator[None]:
-    """Locks a folder against other processes.
-
-    The lock is released when the process ends, however it ends.
-
-    Args:
-        folder: an existing folder; `.lock` is created in it and kept.
-        doing: the activity, for the error that other processes get, e.g. "training".
-        patience_s: how long to wait for a process that still saves.
-
-    Raises:
-        FolderInUseError: another process holds the folder; gives its id, host and start time.
-    """
-    with (folder / ".lock").open("a+", encoding="utf-8") as file:
-        until = time.monotonic() + patience_s
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() >= until:
-                    raise FolderInUseError(
-                        f"'{folder}' is in use: {_holder(file.name)}. Wait until it has ended, or "
-                        "stop it"
-                    ) from None
-                time.sleep(0.5)
-            except OSError as error:
-                if error.errno not in _NO_LOCKS:
-                    raise
-                print(f"warning: no locks on the disk of '{folder}' ({error})", file=sys.stderr)
-                break
-        file.truncate(0)
-        now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-        holder = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
-        json.dump(holder, file)
-        file.flush()
-        try:
-            yield
-        finally:
-            file.truncate(0)
-
-
 def _holder(lock: str) -> str:
     """Describes the process that wrote a lock file."""
     try:
         holder = json.loads(Path(lock).read_text(encoding="utf-8"))
         return "process {pid} on {host} has been {doing} in it since {since}".format(**holder)
-    except (ValueError, KeyError, TypeError):  # it has not written its description yet
+    except ValueError:  # it has not written its description yet
         return "another process has just begun in it"
 
 
@@ -140,24 +99,24 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
             "install that version, or start a new run"
         )
-    known = {key: value for key, value in saved.items() if key in expected}
-    known["algorithm"] = _without_defaults(known["algorithm"])
-    for place, there, here in _differences(known, expected):
-        raise CheckpointError(
-            f"{path} belongs to a run with {place}={there}, the config.yaml of its folder says "
-            f"{place}={here}: restore the file that was there, or start a new run"
-        )
+    there = _flat({**saved, "algorithm": _without_defaults(saved["algorithm"])})
+    here = _flat(expected)
+    for key in {**there, **here}:
+        was, now = there.get(key, "absent"), here.get(key, "absent")
+        if was != now and key.partition(".")[0] in expected:
+            raise CheckpointError(
+                f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
+                f"{key}={now}: restore the file that was there, or start a new run"
+            )
 
 
-def _differences(saved: Any, expected: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yields the dotted key of each difference with the two values."""
-    if not (isinstance(saved, Mapping) and isinstance(expected, Mapping)):
-        if saved != expected:
-            yield place, saved, expected
-        return
-    for key in dict.fromkeys([*saved, *expected]):
-        there, here = saved.get(key, "absent"), expected.get(key, "absent")
-        yield from _differences(there, here, f"{place}.{key}" if place else key)
+def _flat(config: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+    """Returns nested values by their dotted keys; an empty mapping is a value."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        nested = _flat(value, f"{place}{key}.") if isinstance(value, Mapping) else {}
+        flat |= nested or {f"{place}{key}": value}
+    return flat
 
 
 def machine_of(precision: torch.dtype) -> dict[str, Any]:
@@ -287,9 +246,44 @@ class RunFolder:
                 "folder of its own with hydra.run.dir="
             )
 
-    def held(self, doing: str, patience_s: float = 0.0) -> AbstractContextManager[None]:
-        """Locks the folder against other processes; see `folder_lock`."""
-        return folder_lock(self.path, doing, patience_s)
+    @contextmanager
+    def held(self, doing: str, patience_s: float = 0.0) -> Iterator[None]:
+        """Locks the folder against other processes, until the process ends in whatever way.
+
+        Args:
+            doing: the activity, for the error that other processes get, e.g. "training".
+            patience_s: how long to wait for a process that still saves.
+
+        Raises:
+            FolderInUseError: another process holds the folder; gives its id, host and start time.
+        """
+        with (self.path / ".lock").open("a+", encoding="utf-8") as file:
+            until = time.monotonic() + patience_s
+            while True:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() >= until:
+                        raise FolderInUseError(
+                            f"'{self.path}' is in use: {_holder(file.name)}. Wait until it has "
+                            "ended, or stop it"
+                        ) from None
+                    time.sleep(0.5)
+                except OSError as error:
+                    if error.errno not in _NO_LOCKS:
+                        raise
+                    print(f"warning: no locks in '{self.path}' ({error})", file=sys.stderr)
+                    break
+            file.truncate(0)
+            now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+            holder = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
+            json.dump(holder, file)
+            file.flush()
+            try:
+                yield
+            finally:
+                file.truncate(0)
 
     def video_path(self, name: str) -> Path:
         """The file for a video of that name."""
@@ -300,8 +294,8 @@ class RunFolder:
         """Writes the resolved config, and the typed overrides where Hydra keeps them."""
         (self.path / ".hydra").mkdir(exist_ok=True)
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
-        _replace(self.path / ".hydra" / "overrides.yaml", typed)
-        _replace(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
+        _write_text(self.path / ".hydra" / "overrides.yaml", typed)
+        _write_text(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:
         """Returns the resolved config as plain data, see `flowrep.config.schema.validated_run`.
@@ -323,7 +317,7 @@ class RunFolder:
         path = self.path / "machine.json"
         noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
         if noted[-1:] != [machine]:
-            _replace(path, json.dumps([*noted, machine], indent=1) + "\n")
+            _write_text(path, json.dumps([*noted, machine], indent=1) + "\n")
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
         """Appends one row to metrics.csv and logs the same values to TensorBoard and wandb."""
@@ -355,7 +349,7 @@ class RunFolder:
 
         kept = self.path / "wandb_id"
         if not kept.is_file():
-            _replace(kept, uuid.uuid4().hex[:12])
+            _write_text(kept, uuid.uuid4().hex[:12])
         logger = WandbLogger(
             self.path.name,
             project="flowrep",
@@ -407,18 +401,29 @@ class RunFolder:
         needed = [name for name in EVALUATION_COLUMNS if name != "scene_id"]
         return [{"scene_id": ""} | row for row in read_rows(self.evaluation_path, needed)]
 
-    def log_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Saves evaluated episodes and plots them, see `save_episodes` and `plot_episodes`."""
-        rows = list(rows)
-        self.save_episodes(rows)
-        self.plot_episodes(rows)
+    def log_episodes(
+        self,
+        rows: Sequence[Mapping[str, Any]],
+        positions: Sequence[NDArray[np.float32]] = (),
+        table: Sequence[Mapping[str, str]] | None = None,
+    ) -> None:
+        """Saves evaluated episodes and logs their means to TensorBoard and wandb.
 
-    def plot_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Logs the means of evaluated episodes to TensorBoard and wandb."""
+        Args:
+            rows: of evaluation.csv.
+            positions: where the vehicle was in each episode, `[T + 1, 2]`; not kept if empty.
+            table: see `save_episodes`.
+        """
+        # first, as a final evaluation whose rows are in the table is not run again
+        if positions:
+            self._save_drives(rows, positions)
+        self.save_episodes(rows, table)
         for frames, scalars in evaluation_scalars(rows).items():
             self._plot(frames, scalars)
 
-    def save_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
+    def save_episodes(
+        self, rows: Iterable[Mapping[str, Any]], table: Sequence[Mapping[str, str]] | None = None
+    ) -> None:
         """Adds evaluated episodes to evaluation.csv.
 
         An episode that the table already has, with the same policy, frames, speed and frame rate,
@@ -434,9 +439,37 @@ class RunFolder:
         by_episode = {tuple(row[name] for name in _EPISODE): row for row in (*before, *new)}
         write_rows(self.evaluation_path, by_episode.values(), EVALUATION_COLUMNS)
 
+    def _save_drives(
+        self, rows: Iterable[Mapping[str, Any]], positions: Iterable[NDArray[np.float32]]
+    ) -> None:
+        """Adds where vehicles drove to drives.npz, in place of the same episodes' earlier drives.
 
-def _replace(path: Path, text: str) -> None:
-    """Writes a file; if it is interrupted, the file is the old one or the new one."""
-    whole = path.with_name(f"{path.name}.tmp")
-    whole.write_text(text, encoding="utf-8")
+        The file holds `positions` [sum of T + 1, 2], x and y in metres; `starts` [N + 1], so that
+        episode n is `positions[starts[n]:starts[n + 1]]`; and for each episode the columns of
+        evaluation.csv that name it.
+        """
+        drives: dict[tuple[Any, ...], NDArray[np.float32]] = {}
+        if self.drives_path.is_file():
+            with np.load(self.drives_path, allow_pickle=False) as saved:
+                names = zip(*(saved[column].tolist() for column in _DRIVE))
+                drives = dict(zip(names, np.split(saved["positions"], saved["starts"][1:-1])))
+        drives |= {tuple(row[c] for c in _DRIVE): driven for row, driven in zip(rows, positions)}
+        arrays: dict[str, Any] = {name: np.array(all_) for name, all_ in zip(_DRIVE, zip(*drives))}
+        arrays["positions"] = np.concatenate([*drives.values()])
+        arrays["starts"] = np.cumsum([0, *map(len, drives.values())])
+        replace_file(self.drives_path, lambda path: np.savez_compressed(path, **arrays))
+
+    def write_failures(self) -> None:
+        """Writes the causes of failure in evaluation.csv, in place of an older table."""
+        write_rows(self.failures_path, failure_causes(self.read_episodes()))
+
+
+def replace_file(path: Path, write: Callable[[Path], Any]) -> None:
+    """Writes a file; if it is interrupted, `path` is the old one or the new one."""
+    whole = path.with_name(f"{path.stem}.tmp{path.suffix}")
+    write(whole)
     whole.replace(path)
+
+
+def _write_text(path: Path, text: str) -> None:
+    replace_file(path, lambda whole: whole.write_text(text, encoding="utf-8"))

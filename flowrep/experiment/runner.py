@@ -26,15 +26,8 @@ from flowrep.config.schema import FINAL_POLICIES, TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
 from flowrep.envs.workers import available_cores
 from flowrep.experiment import build
-from flowrep.experiment.evaluation import (
-    OUTCOMES,
-    Comparison,
-    print_failures,
-    print_table,
-    save_drives,
-    scene_id,
-    write_failures,
-)
+from flowrep.experiment.agents import Agent
+from flowrep.experiment.evaluation import OUTCOMES, Comparison, print_results
 from flowrep.experiment.evaluation_pool import EvaluationPool
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch
@@ -179,7 +172,7 @@ class Runner:
                 rate, beside the baselines.
             stop: checked after each episode.
         """
-        config, asked = self.config, self.config.evaluation
+        config, asked, fps = self.config, self.config.evaluation, self.env.base_env.frame_rate_hz
         if kind == "final":
             comparison = Comparison(
                 speeds=asked.speeds,
@@ -191,38 +184,23 @@ class Runner:
             )
         else:
             comparison = Comparison(
-                speeds=[config.speed],
-                fps=[config.scene["frame_rate_hz"]],
-                episodes=asked.episodes,
-                seed=EVALUATION_SEED,
-                policies=["greedy"],
+                speeds=[config.speed], fps=[fps], episodes=asked.episodes, seed=EVALUATION_SEED
             )
+        agent = Agent(self.agent.policy, config, self.frames)
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
-            num_envs, policy = max(EVALUATION_ENVS, config.num_envs), self.agent.policy
+            num_envs = max(EVALUATION_ENVS, config.num_envs)
             if self._pool is None:
                 most = min(num_envs, max(asked.episodes, asked.final_total))
-                self._pool = build.evaluation_pool(config, policy, most)
-            make_env = partial(build.env, config)
-            comparison.run(make_env, policy, num_envs, lambda: bool(stop), pool=self._pool)
-        if not comparison.is_complete:
+                self._pool = build.evaluation_pool(config, agent.policy, most)
+            comparison.run(agent.make_env, agent.policy, num_envs, stop=stop, pool=self._pool)
+        if comparison.done < comparison.total:
             return False
-        scene = self.env.base_env.scene
-        rows = comparison.rows(
-            scene=scene.name,
-            scene_id=scene_id(scene),
-            representations="+".join(config.representations),
-            flow=config.flow.source,
-            seed=config.seed,
-            frames=self.frames,
-            evaluation=kind,
-        )
+        rows = comparison.rows(**agent.origin(kind))
         if kind == "final":
-            positions = [episode.positions for _, episode in comparison.results()]
-            save_drives(self.folder.drives_path, rows, positions)
-        self.folder.log_episodes(rows)
-        if kind == "final":
-            print_table(rows)
-            print_failures(rows)
+            self.folder.log_episodes(rows, [e.positions for _, e in comparison.results()])
+            print_results(rows)
+        else:
+            self.folder.log_episodes(rows)
         return True
 
     def film(self) -> None:
@@ -235,7 +213,7 @@ class Runner:
 
         self.close()
         metrics, episodes = self.folder.read_metrics(), self.folder.read_episodes()
-        write_failures(self.folder.failures_path, episodes)
+        self.folder.write_failures()
         fps = self.env.base_env.frame_rate_hz
         path = self.folder.curve_path
         draw_learning_curve(path, metrics, episodes, speed=self.config.speed, fps=fps)

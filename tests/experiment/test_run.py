@@ -21,18 +21,16 @@ from flowrep.experiment.run import (
     RunFolder,
     RunFolderError,
     check_origin,
-    folder_lock,
     machine_of,
     origin_of,
 )
-from flowrep.tables import TableError, append_rows
+from flowrep.tables import TableError
 from tests.test_configs import composed
 
 HOLD = """
 import sys, time
-from pathlib import Path
-from flowrep.experiment.run import folder_lock
-with folder_lock(Path(sys.argv[1]), "training"):
+from flowrep.experiment.run import RunFolder
+with RunFolder(sys.argv[1]).held("training"):
     print("held", flush=True)
     time.sleep(100)
 """
@@ -40,33 +38,29 @@ with folder_lock(Path(sys.argv[1]), "training"):
 
 @pytest.mark.slow
 def test_who_holds_a_folder_is_named_and_one_that_was_killed_holds_it_no_more(tmp_path):
+    run = RunFolder(tmp_path)
     with subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE) as other:
         try:
             assert other.stdout.readline() == b"held\n"
-            message = rf"in use: process {other.pid} on {platform.node()} has been training in it "
-            with pytest.raises(FolderInUseError, match=message + r"since \d{4}-\d\d-\d\d .*Wait"):
-                folder_lock(tmp_path, "evaluating").__enter__()
+            holder = rf"process {other.pid} on {platform.node()} .*training.* \d{{4}}-\d\d-\d\d "
+            with pytest.raises(FolderInUseError, match=holder), run.held("evaluating"):
+                pass
         finally:
             other.kill()
     assert other.returncode == -signal.SIGKILL
-    with folder_lock(tmp_path, "evaluating"):
+    with run.held("evaluating"):
         assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
 
 
 def test_it_is_given_back_whatever_happens_in_it(tmp_path):
-    with pytest.raises(ZeroDivisionError), folder_lock(tmp_path, "training"):
+    run = RunFolder(tmp_path)
+    with pytest.raises(ZeroDivisionError), run.held("training"):
         raise ZeroDivisionError
     assert (tmp_path / ".lock").read_text() == ""
-    with folder_lock(tmp_path, "training"), pytest.raises(FolderInUseError):
-        folder_lock(tmp_path, "training").__enter__()
-
-
-@pytest.mark.parametrize("text", ["", "half of {", "[1]", "{}"])
-def test_a_holder_that_has_not_yet_written_who_it_is(tmp_path, text):
-    with folder_lock(tmp_path, "training"):
-        (tmp_path / ".lock").write_text(text)
-        with pytest.raises(FolderInUseError, match="another process has just begun"):
-            folder_lock(tmp_path, "training").__enter__()
+    with run.held("training"):
+        (tmp_path / ".lock").write_text("half of {")  # the other has not said yet who it is
+        with pytest.raises(FolderInUseError), run.held("training"):
+            pass
 
 
 def test_a_disk_without_locks_is_said_so_and_used(tmp_path, monkeypatch, capsys):
@@ -74,9 +68,9 @@ def test_a_disk_without_locks_is_said_so_and_used(tmp_path, monkeypatch, capsys)
         raise OSError(37, "No locks available")
 
     monkeypatch.setattr("flowrep.experiment.run.fcntl.flock", no_locks)
-    with folder_lock(tmp_path, "training"):
+    with RunFolder(tmp_path).held("training"):
         pass
-    assert "no locks on the disk" in capsys.readouterr().err
+    assert "No locks" in capsys.readouterr().err
 
 
 PATH = Path("run/checkpoint/latest.safetensors")
@@ -157,16 +151,7 @@ def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_p
     assert (tmp_path / "metrics.csv").read_text().splitlines()[1:] == ["10,0.1", "20,0.05"]
 
 
-CONFIG = {
-    "scene": {"camera": {"height_px": 48}},
-    "representations": {"ego": None},
-    "flow": {"source": "exact"},
-    "noise": {"drift_m": 0.0},
-    "algorithm": {"gamma": 0.5},
-    "seed": 3,
-    "num_envs": 2,
-    "total_frames": 10,
-}
+CONFIG = {"representations": {"ego": None}, "flow": {"source": "exact"}, "seed": 3}
 
 
 def rows_of(path):
@@ -174,51 +159,34 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
-def test_metrics_go_to_csv_and_tensorboard(tmp_path):
-    run = RunFolder(tmp_path / "run")
-    run.log_metrics(10, {"alpha": 0.5})
-    run.log_metrics(20, {"alpha": 0.25})
-    assert rows_of(run.metrics_path) == [
-        {"frames": "10", "alpha": "0.5"},
-        {"frames": "20", "alpha": "0.25"},
-    ]
-    assert list(run.path.rglob("events.out.tfevents.*"))
-
-
-def test_evaluations_go_to_tensorboard_as_shares_and_means(tmp_path):
+def test_metrics_and_means_of_evaluations_go_to_tensorboard(tmp_path):
     """Two of four succeed; returns 1, 2, 3 and 10, lengths 10, 20, 30 and 60."""
     run = RunFolder(tmp_path)
-    same = {
-        "scene": "s_turn", "scene_id": "0a", "representations": "ego", "flow": "exact", "seed": 3,
-        "frames": 500,
-        "evaluation": "training", "policy": "greedy", "speed": "normal", "fps": 12.0, "hit": "",
-    }  # fmt: skip
-    ends = [
-        ("success", 1.0, 10),
-        ("timeout", 2.0, 20),
-        ("collision", 3.0, 30),
-        ("success", 10.0, 60),
-    ]
-    rows = [
-        same | {"episode_seed": k, "outcome": outcome, "return": total, "length": length}
-        for k, (outcome, total, length) in enumerate(ends)
-    ]
-    run.log_episodes(rows)
+    run.log_metrics(10, {"alpha": 0.5})
+    same = {"scene": "s_turn", "evaluation": "training", "policy": "greedy", "frames": 500}
+    same = dict.fromkeys(EVALUATION_COLUMNS, "") | same | {"speed": "normal", "fps": 12.0}
+    ends = [("success", 1, 10), ("timeout", 2, 20), ("collision", 3, 30), ("success", 10, 60)]
+    run.log_episodes(
+        [
+            same | {"episode_seed": k, "outcome": outcome, "return": total, "length": length}
+            for k, (outcome, total, length) in enumerate(ends)
+        ]
+    )
     for logger in run._loggers:
         logger.experiment.flush()
     events = EventAccumulator(str(next(tmp_path.rglob("events.out.tfevents.*"))))
     events.Reload()
     title = "evaluation/s_turn/normal/12fps/greedy"
     plotted = {tag: events.Scalars(tag)[0] for tag in events.Tags()["scalars"]}
-    assert {tag: event.value for tag, event in plotted.items()} == {
-        f"{title}/success": 0.5,
-        f"{title}/collision": 0.25,
-        f"{title}/out_of_bounds": 0.0,
-        f"{title}/timeout": 0.25,
-        f"{title}/return": 4.0,
-        f"{title}/length": 30.0,
+    assert {tag: (event.step, event.value) for tag, event in plotted.items()} == {
+        "alpha": (10, 0.5),
+        f"{title}/success": (500, 0.5),
+        f"{title}/collision": (500, 0.25),
+        f"{title}/out_of_bounds": (500, 0.0),
+        f"{title}/timeout": (500, 0.25),
+        f"{title}/return": (500, 4.0),
+        f"{title}/length": (500, 30.0),
     }
-    assert {event.step for event in plotted.values()} == {500}
 
 
 def test_a_resumed_run_drops_the_rows_it_will_write_again(tmp_path):
@@ -250,12 +218,6 @@ def test_only_what_was_written_before_the_first_checkpoint_is_dropped_without_on
     assert len(rows_of(run.metrics_path)) == len(run.read_episodes()) == 1
 
 
-def test_a_column_that_the_table_lacks_is_refused(tmp_path):
-    append_rows(tmp_path / "t.csv", [{"a": 1}])
-    with pytest.raises(ValueError, match="b"):
-        append_rows(tmp_path / "t.csv", [{"a": 2, "b": 3}])
-
-
 def test_config_comes_back_as_written(tmp_path):
     run = RunFolder(tmp_path)
     run.write_config(CONFIG, ["seed=3"])
@@ -263,7 +225,7 @@ def test_config_comes_back_as_written(tmp_path):
     assert (tmp_path / ".hydra" / "overrides.yaml").read_text() == "- seed=3\n"
 
 
-@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "seed: [1", "\x00"])
+@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "seed: [1"])
 def test_a_damaged_config_is_named(tmp_path, text):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(RunFolderError, match=r"config\.yaml"):
@@ -302,14 +264,9 @@ def test_a_folder_that_holds_a_run_is_no_place_for_a_new_one(tmp_path, name):
     run = RunFolder(tmp_path)
     run.check_is_new()
     (tmp_path / name).write_text("something")
-    with pytest.raises(RunFolderError, match=rf"holds a run already \({name}\).*hydra.run.dir="):
+    resume = "resume=.*" if name == "config.yaml" else ""
+    with pytest.raises(RunFolderError, match=rf"\({name}\).*{resume}hydra.run.dir="):
         run.check_is_new()
-
-
-def test_a_folder_with_a_config_is_to_be_resumed(tmp_path):
-    RunFolder(tmp_path).write_config(CONFIG)
-    with pytest.raises(RunFolderError, match=f"continue it with resume={tmp_path}"):
-        RunFolder(tmp_path).check_is_new()
 
 
 def test_an_episode_that_is_evaluated_again_takes_its_place(tmp_path):
@@ -337,31 +294,7 @@ DAMAGED = {
 def test_a_damaged_table_is_refused_and_stays_as_it_is(tmp_path, text):
     run = RunFolder(tmp_path)
     run.evaluation_path.write_text(text)
-    for touch in (run.read_episodes, lambda: run.log_episodes([episode(5)])):
+    for touch in (lambda: run.log_episodes([episode(5)]), lambda: run.forget_after(0)):
         with pytest.raises(TableError, match=r"evaluation\.csv"):
             touch()
-    with pytest.raises(TableError):
-        run.forget_after(0)
     assert run.evaluation_path.read_text() == text
-
-
-@pytest.mark.parametrize("text", ["\ufeff" + f"{HEADER}\n{ROW}\n", f"{HEADER}\n{ROW}\n{ROW[:9]}"])
-def test_a_mark_at_its_beginning_and_half_a_line_at_its_end_are_no_damage(tmp_path, text):
-    run = RunFolder(tmp_path)
-    run.evaluation_path.write_text(text)
-    run.log_episodes([episode(5)])
-    assert run.read_episodes() == [episode(1), episode(5)]
-
-
-def test_a_table_that_can_not_be_replaced_stays(tmp_path, monkeypatch):
-    run = RunFolder(tmp_path)
-    run.log_episodes([episode(1)])
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("flowrep.tables.os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        run.log_episodes([episode(2)])
-    assert run.read_episodes() == [episode(1)]
-    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["evaluation.csv"]

@@ -1,0 +1,66 @@
+"""The agents that `policy=` names in `flowrep.view` and `flowrep.evaluate`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from flowrep import pretrained
+from flowrep.baselines import BASELINES
+from flowrep.config import UsageError
+from flowrep.config.schema import EnvConfig, ExactFlow, Noise
+from flowrep.experiment.agents import Agent, load_external, load_trained
+from flowrep.experiment.run import RunFolder
+
+
+def load_agent(
+    name: str,
+    *,
+    scene: Mapping[str, Any] | None,
+    representations: Mapping[str, Any] | None = None,
+    flow: Any = None,
+    motion: str | None = None,
+    noise: Noise | None = None,
+    **machine: Any,
+) -> Agent:
+    """Returns the agent that `policy=` names.
+
+    Args:
+        name: a baseline, "pretrained", the folder of a run, or a policy of the user's own, see
+            `flowrep.experiment.agents.load_policy`.
+        scene: the scene to act in; None is the run's own.
+        representations: what a policy of the user's own sees, a mapping from name to options.
+        flow: the source of its raw and obj, a section of a config; exact if None.
+        motion: the source of its camera's motion; exact if None.
+        noise: errors of its depth and motion; none if None.
+        machine: `device`, `num_envs` and `num_workers`.
+
+    Raises:
+        UsageError: it is nothing of this kind, or no agent for the scene comes with flowrep.
+        CheckpointError: a run's agent can't be loaded.
+        PolicyError: a policy of the user's own can't be used.
+    """
+    is_baseline, is_own = name in BASELINES, ":" in name or name.endswith(".pt2")
+    if name == "pretrained":
+        return pretrained.load(scene or {}, **machine)
+    if Path(name).is_dir() and not is_baseline:
+        return load_trained(RunFolder.existing(name), scene=scene, **machine)
+    if not (is_baseline or is_own):
+        raise UsageError(
+            f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
+            "path.py:make, package.module:make or path.pt2"
+        )
+    if is_own and not representations:
+        raise UsageError(f"representations needs a value for policy={name}")
+    # not checked again: the values are of a command's config
+    config = EnvConfig.model_construct(
+        scene=scene,
+        representations=representations if is_own else {},
+        flow=flow or ExactFlow(source="exact"),
+        motion=motion or "exact",
+        noise=noise or Noise(**dict.fromkeys(Noise.key_names(), 0.0)),
+        speed="normal",
+        renderer="auto",
+        seed=0,
+        **machine,
+    )
+    return load_external(name, config) if is_own else Agent(name, config)
