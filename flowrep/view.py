@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 from itertools import cycle, pairwise
 from pathlib import Path
@@ -46,7 +47,9 @@ def run(config: ViewConfig) -> None:
     env = make_filmed(make_env_of(config, agent), agent.config.representations)
     options = episodes_of(config, env.base_env.scene)
     if config.interactive:
-        drive_by_hand(agent.policy, Path(config.policy).name, env, options[0])
+        policy = agent.policy
+        other = BaselinePolicy(policy, env) if isinstance(policy, str) else policy
+        drive_by_hand(Keyboard(other, Path(config.policy).name), env, options[0])
     else:
         view(config, agent, env, options, Path(job.runtime.output_dir))
     env.close()
@@ -160,9 +163,6 @@ def moments(motion: list[int], count: int) -> list[int]:
     return [max(range(a, b), key=lambda i: motion[i]) for a, b in pairwise(ends) if b > a]
 
 
-# The interactive window.
-
-
 class NewEpisode(Exception):
     """The episode was left for the next one."""
 
@@ -170,7 +170,7 @@ class NewEpisode(Exception):
 class Keyboard:
     """A policy that takes the action of the held keys, or lets another, of this name, drive.
 
-    A key acts while it is held; both together cancel out. A key press switches between the drivers.
+    A key acts while it is held; both together cancel out. S switches between the drivers.
     """
 
     ACTIONS = {"left": TURN_LEFT, "right": TURN_RIGHT}  # noqa: RUF012 - never changed
@@ -189,10 +189,8 @@ class Keyboard:
             self._held.add(key)
         elif key == "s":
             self.driver = next(self._names)
-        elif key == "r":
-            self.is_new = True
-        elif key in ("q", "escape"):
-            self.is_over = True
+        self.is_new |= key == "r"
+        self.is_over |= key in ("q", "escape")
 
     def release(self, key: str | None) -> None:
         """Handles a key release."""
@@ -207,28 +205,46 @@ class Keyboard:
         return tensordict.set("action", torch.full(tensordict.shape, action))
 
 
-def drive_by_hand(policy: Policy | str, name: str, env: EnvBase, options: dict[str, Any]) -> None:
+def drive_by_hand(
+    keyboard: Keyboard,
+    env: EnvBase,
+    options: dict[str, Any],
+    pause: Callable[[float], Any] | None = None,
+) -> None:
     """Opens a window and drives one episode after the other until it is closed.
 
-    A finished episode stays in view until R begins the next.
+    A finished episode stays in view until R begins the next, which has the next seed.
+
+    Args:
+        keyboard: what drives.
+        env: made by `make_filmed`.
+        options: of the first episode.
+        pause: draws, and handles keys for some seconds; by default in a window on the screen.
 
     Raises:
         UsageError: there is no screen, or no GUI toolkit.
     """
     import matplotlib.pyplot as plt
 
-    keyboard = Keyboard(BaselinePolicy(policy, env) if isinstance(policy, str) else policy, name)
     # Disable Matplotlib's own shortcuts for the driver's keys (left: back, r: home, q: quit).
     shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
     with plt.rc_context(shortcuts):
         figure = plt.figure(figsize=(15, 3.2))
-        if type(figure.canvas).required_interactive_framework is None:
+        if pause is None and type(figure.canvas).required_interactive_framework is None:
             plt.close(figure)
             raise UsageError(
                 "interactive=true needs a screen, and tkinter or PyQt to open a window on it "
                 f"(matplotlib found only the backend {plt.get_backend()!r})"
             )
-        drive_in_window(figure, keyboard, env, options, plt.pause)
+        listen = figure.canvas.mpl_connect
+        listen("key_press_event", lambda event: keyboard.press(event.key))
+        listen("key_release_event", lambda event: keyboard.release(event.key))
+        listen("close_event", lambda event: keyboard.press("q"))
+        while not keyboard.is_over:
+            keyboard.is_new = False
+            with suppress(NewEpisode):
+                drive_in_window(figure, keyboard, env, options, pause or plt.pause)
+            options = options | {"episode_seed": options["episode_seed"] + 1}
         plt.close(figure)
 
 
@@ -237,20 +253,13 @@ def drive_in_window(
     keyboard: Keyboard,
     env: EnvBase,
     options: dict[str, Any],
-    pause: Callable[[float], None],
+    pause: Callable[[float], Any],
 ) -> None:
-    """Draws each step into a figure at the env's frame rate, and listens to its keys.
-
-    `options` are of the first episode; later ones have the seeds after it. `pause` draws, and
-    handles key presses for some seconds.
-    """
+    """Drives an episode, draws each step at the env's frame rate, and waits for R or Q."""
+    figure.clear()
     axes = figure.add_axes((0, 0, 1, 0.92))
     axes.set_axis_off()
     title = figure.suptitle("", fontfamily="monospace", fontsize=10)
-    listen = figure.canvas.mpl_connect
-    listen("key_press_event", lambda event: keyboard.press(event.key))
-    listen("key_release_event", lambda event: keyboard.release(event.key))
-    listen("close_event", lambda event: keyboard.press("q"))
     intrinsics = torch.from_numpy(street_envs(env)[0].K)
     image, drawn_at = None, time.monotonic()
 
@@ -265,18 +274,12 @@ def drive_in_window(
         pause(max(1e-3, 1 / env.base_env.frame_rate_hz - (time.monotonic() - drawn_at)))
         drawn_at = time.monotonic()
 
-    while not keyboard.is_over:
-        keyboard.is_new = False
-        try:
-            for episode in evaluate(env, keyboard, [options], on_frame=draw):
-                hit = f" ({episode.hit})" if episode.hit else ""
-                outcome = f"{episode.outcome.replace('_', ' ')}{hit} after {episode.length} steps"
-                title.set_text(f"{outcome}, return {episode.total_reward:.2f}    {keyboard.HELP}")
-                while not (keyboard.is_over or keyboard.is_new):
-                    pause(0.05)
-        except NewEpisode:
-            pass
-        options = options | {"episode_seed": options["episode_seed"] + 1}
+    (episode,) = evaluate(env, keyboard, [options], on_frame=draw)
+    hit = f" ({episode.hit})" if episode.hit else ""
+    outcome = f"{episode.outcome.replace('_', ' ')}{hit} after {episode.length} steps"
+    title.set_text(f"{outcome}, return {episode.total_reward:.2f}    {keyboard.HELP}")
+    while not (keyboard.is_over or keyboard.is_new):
+        pause(0.05)
 
 
 def main() -> None:

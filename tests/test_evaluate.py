@@ -31,12 +31,13 @@ from tests.test_configs import composed
 pytestmark = pytest.mark.slow
 
 QUICK = ["speed=normal", "num_envs=2", "num_workers=0", "device=cpu"]
+SHORT = "scene.time_limit_steps=40"
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=24"]
 
 
 def trained(path, *overrides):
-    """A run of 64 frames, its checkpoint saved."""
-    smoke = ["debug=smoke", "total_frames=64", "device=cpu", "evaluation.every_frames=1000"]
+    """A run of 64 frames, its checkpoint saved; episodes are short."""
+    smoke = ["debug=smoke", "total_frames=64", "device=cpu", "evaluation.every_frames=1000", SHORT]
     config = validated(TrainConfig, composed(*smoke, *overrides))
     folder = RunFolder(path)
     folder.write_config(config.plain())
@@ -142,7 +143,7 @@ def straight_on(tensordict):
 @pytest.fixture
 def some(tmp_path, monkeypatch):
     """Makes runs, and the config that evaluates them."""
-    tiny = ["representations=[obj]", "scene.camera.height_px=12", "scene.camera.width_px=20"]
+    tiny = ["representations=[obj]", "scene.camera.height_px=12", "scene.camera.width_px=20", SHORT]
     config = validated(TrainConfig, composed(*tiny, "device=cpu", "num_envs=2", "num_workers=0"))
 
     def load(folder, *, scene=None, **machine):
@@ -241,7 +242,7 @@ def test_a_stop_ends_between_two_films(some, monkeypatch):
         signal.raise_signal(signal.SIGTERM)  # as schedulers send it
 
     monkeypatch.setattr("flowrep.evaluate.record_episode", record)
-    _, config = some("good", overrides=["video=2", "seed=7"])
+    _, config = some("good", overrides=["video=2", "seed=7", "episodes=1"])
     with pytest.raises(SystemExit) as ended:
         evaluate(config)
     assert ended.value.code == 128 + signal.SIGTERM
@@ -292,8 +293,8 @@ def test_an_agent_of_stable_baselines3_drives(tmp_path, monkeypatch):
     name = f"{Path('examples/stable_baselines3_ppo.py').resolve()}:make"
     monkeypatch.chdir(tmp_path)
     train(8, num_envs=2, rollout_length=4).save("ppo_street")
-    rows = own(name, tmp_path / "out", "representations=[ego,obj]")
-    assert len(episodes(rows, name)) == 2
+    rows = own(name, tmp_path / "out", "representations=[ego,obj]", "episodes=1")
+    assert len(episodes(rows, name)) == 1
 
 
 def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
@@ -307,10 +308,11 @@ def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
     assert [each["name"] for each in card["maps"]] == ["ego", "obj"]
     camera = run.read_config()["scene"]["camera"]
     same = [f"scene.camera.{key}={camera[key]}" for key in ("height_px", "width_px", "fov_deg")]
-    for number, name in enumerate([f"{folder}/load_agent.py:make", f"{folder}/agent.pt2"]):
-        with pytest.raises(PolicyError, match=r"scene\.camera\.height_px"):
-            own(name, tmp_path / "refused", *given[1:])
-        rows = own(name, tmp_path / str(number), *given[1:], *same, "episodes=3")
+    program = f"{folder}/agent.pt2"
+    with pytest.raises(PolicyError, match=r"scene\.camera\.height_px"):
+        own(program, tmp_path / "refused", *given[1:])
+    for number, name in enumerate([f"{folder}/load_agent.py:make", program]):
+        rows = own(name, tmp_path / str(number), *given[1:], *same, "episodes=3", SHORT)
         driven = [(row["episode_seed"], row["outcome"], row["return"]) for row in rows]
         assert driven == [(row["episode_seed"], row["outcome"], row["return"]) for row in mine]
 

@@ -25,7 +25,6 @@ from flowrep.view import (
     agent_of,
     category_rows,
     drive_by_hand,
-    drive_in_window,
     drive_on,
     episodes_of,
     make_env_of,
@@ -58,14 +57,15 @@ def asked(*overrides):
 @pytest.mark.slow
 def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
     out = tmp_path / "seen"
-    done = view("scene=three_way_junction", "policy=never_turn", *SMALL, f"hydra.run.dir={out}")
+    short = ["scene=three_way_junction", "scene.time_limit_steps=40", "policy=never_turn"]
+    done = view(*short, *SMALL, f"hydra.run.dir={out}")
     assert done.returncode == 0, done.stderr
     assert {path.name for path in out.iterdir()} == {
         "sheet.png", "episode.mp4", "plan.png", "episodes.csv", "categories.csv"
     }  # fmt: skip
     with (out / "episodes.csv").open(newline="") as file:
         first, second = csv.DictReader(file)
-    assert (first["outcome"], first["hit"]) == ("out_of_bounds", "")
+    assert (first["outcome"], first["hit"], first["length"]) == ("timeout", "", "40")
     assert [first["episode_seed"], second["episode_seed"]] == ["0", "1"]
     with (out / "categories.csv").open(newline="") as file:
         seen = {row["category"]: int(row["pixels"]) for row in csv.DictReader(file)}
@@ -177,11 +177,12 @@ def env(straight_road):
 
 def drive_with_keys(env, keys):
     """Drives in a window; at each pause the next key is pressed, None presses none."""
-    figure, seen, keys = plt.figure(), [], iter(keys)
+    seen, keys = [], iter(keys)
 
     def pause(seconds):
-        title = figure.texts[0].get_text() if figure.texts else figure._suptitle.get_text()
+        figure = plt.gcf()
         episode = street_envs(env)[0].episode
+        title = figure._suptitle.get_text()
         seen.append((title, episode.seed, episode.steps, episode.now.vehicle.yaw_rad))
         key = next(keys, "q")
         if key == "close":
@@ -191,8 +192,7 @@ def drive_with_keys(env, keys):
             figure.canvas.callbacks.process("key_press_event", event)
 
     with matplotlib.rc_context({"backend": "agg"}):
-        drive_in_window(figure, Keyboard(never, "planner"), env, {"episode_seed": 1}, pause)
-    plt.close(figure)
+        drive_by_hand(Keyboard(never, "planner"), env, {"episode_seed": 1}, pause)
     return seen
 
 
@@ -216,4 +216,4 @@ def test_without_a_screen_one_line_says_what_is_missing(env):
         matplotlib.rc_context({"backend": "agg"}),
         pytest.raises(UsageError, match=r"^interactive=true .*screen.*$"),
     ):
-        drive_by_hand(never, "never_turn", env, {"episode_seed": 1})
+        drive_by_hand(Keyboard(never, "never_turn"), env, {"episode_seed": 1})

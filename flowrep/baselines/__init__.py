@@ -1,12 +1,68 @@
-"""Baselines to compare an agent with: a privileged planner, never turning, random actions."""
+"""Baselines to compare an agent with: a privileged planner, never turning, random actions.
 
-from flowrep.baselines.baselines import (
-    BASELINES,
-    Baseline,
-    BaselinePolicy,
-    RandomActions,
-    never_turn,
-)
+They learn nothing and may read the env's state.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
+
 from flowrep.baselines.planner import Planner
+from flowrep.envs import StreetEnv, street_envs
+from flowrep.scenes.scene import NO_OP
 
 __all__ = ["BASELINES", "Baseline", "BaselinePolicy", "Planner", "RandomActions", "never_turn"]
+
+Baseline = Callable[[StreetEnv], int]
+"""Returns the next action; may read the env's whole state."""
+
+
+def never_turn(env: StreetEnv) -> int:
+    """Returns NO_OP: drives straight on."""
+    return NO_OP
+
+
+class RandomActions:
+    """Draws actions uniformly; those of an episode don't depend on earlier episodes."""
+
+    def __init__(self, seed: int = 0) -> None:
+        """Takes a seed; other seeds give other actions."""
+        self._seed = seed
+        self._rng = np.random.default_rng(seed)
+
+    def __call__(self, env: StreetEnv) -> int:
+        """Returns one of the three actions."""
+        if not env.episode.steps:
+            self._rng = np.random.default_rng((env.episode.seed, self._seed))
+        return int(self._rng.integers(3))
+
+
+BASELINES: dict[str, Callable[[], Baseline]] = {
+    "planner": Planner,
+    "never_turn": lambda: never_turn,
+    "random": RandomActions,
+}
+
+
+class BaselinePolicy:
+    """Lets a baseline choose the actions of an env's streets, as a policy of `evaluate`.
+
+    It needs no observation: an env without representations renders nothing.
+
+    Args:
+        name: one of `BASELINES`.
+        env: made by `make_env` without workers.
+    """
+
+    def __init__(self, name: str, env: TransformedEnv) -> None:
+        self._streets = street_envs(env)
+        self._baselines = [BASELINES[name]() for _ in self._streets]
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes `action` for the streets that `env_id` names."""
+        ids = tensordict["env_id"].tolist()
+        actions = [self._baselines[i](self._streets[i]) for i in ids]
+        return tensordict.set("action", torch.tensor(actions, device=tensordict.device))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+from inspect import signature
 from pkgutil import resolve_name
 from typing import Any
 
@@ -135,12 +136,11 @@ def algorithm_class(section: AnyAlgorithm) -> Any:
         raise UsageError(
             f"algorithm._target_={target} is not a subclass of flowrep.agent.Algorithm"
         )
-    if target in ALGORITHMS:
-        return found
-    given, known = section.options(), found.options()
-    for key in given.keys() - known.keys():
-        raise UsageError(f"unknown key 'algorithm.{key}'; {target} has: {', '.join(known)}")
-    for key, parameter in known.items():
-        if parameter.default is parameter.empty and key not in given:
-            raise UsageError(f"algorithm.{key} needs a value: +algorithm.{key}=...")
+    if target not in ALGORITHMS:
+        try:
+            required = {"total_frames": 0, "device": None}
+            signature(found).bind(None, None, None, **required | section.options())
+        except TypeError as error:
+            known = ", ".join(found.options())
+            raise UsageError(f"algorithm: {error}; the options of {target} are: {known}") from None
     return found

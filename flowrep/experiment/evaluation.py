@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import product, takewhile
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,9 +30,6 @@ from flowrep.envs import Outcome
 from flowrep.envs.episode import hit_name
 from flowrep.progress import StopRequest
 from flowrep.scenes import Scene
-
-if TYPE_CHECKING:
-    from flowrep.experiment.evaluation_pool import EvaluationPool
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Row = dict[str, Any]
@@ -242,6 +239,7 @@ def outcome_shares(outcomes: Iterable[str]) -> dict[str, tuple[float, float, flo
     }
 
 
+@dataclass
 class Comparison:
     """The same episodes for an agent and baselines: which to run, and the results so far.
 
@@ -256,21 +254,18 @@ class Comparison:
         baselines: names in `flowrep.baselines.BASELINES`.
     """
 
-    def __init__(
-        self,
-        *,
-        speeds: Sequence[str],
-        fps: Sequence[float],
-        episodes: int,
-        seed: int,
-        policies: Sequence[str] = ("greedy",),
-        baselines: Sequence[str] = (),
-    ) -> None:
-        self.speeds, self.fps = [*speeds], [float(rate) for rate in fps]
-        self.policies, self.baselines = [*policies], [*baselines]
-        self._seeds = range(seed, seed + episodes)
-        groups = product(self.speeds, self.fps, [*self.policies, *self.baselines])
-        self._found: dict[tuple[str, float, str], dict[int, Episode]] = {key: {} for key in groups}
+    speeds: Sequence[str]
+    fps: Sequence[float]
+    episodes: int
+    seed: int
+    policies: Sequence[str] = ("greedy",)
+    baselines: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        self._seeds = range(self.seed, self.seed + self.episodes)
+        self._found: dict[tuple[str, float, str], dict[int, Episode]] = {
+            key: {} for key in product(self.speeds, self.fps, [*self.policies, *self.baselines])
+        }
 
     @property
     def total(self) -> int:
@@ -290,7 +285,7 @@ class Comparison:
         *,
         stop: StopRequest | None = None,
         save: Callable[[], Any] = lambda: None,
-        pool: "EvaluationPool | None" = None,
+        pool: Any = None,
     ) -> None:
         """Runs the episodes; finished ones are kept even if it is interrupted.
 
@@ -302,7 +297,7 @@ class Comparison:
             num_envs: the number of environments side by side, at most.
             stop: checked after each episode.
             save: called when all episodes of a policy at one speed and frame rate have been run.
-            pool: its processes run the episodes; this one does if None.
+            pool: an `EvaluationPool`, whose processes run the episodes; this one does if None.
         """
         for (_, _, name), episodes in self._found.items():
             if name in self.policies:
@@ -331,7 +326,7 @@ class Comparison:
         num_envs: int,
         stop: StopRequest | None,
         on_frame: Callable[[TensorDictBase], Any],
-        pool: "EvaluationPool | None",
+        pool: Any,
     ) -> Iterator[tuple[str, Episode]]:
         """Yields the missing episodes, each with its policy's name."""
         for rate in self.fps:

@@ -121,33 +121,29 @@ def _flat(config: Mapping[str, Any], place: str = "") -> dict[str, Any]:
 
 def machine_of(precision: torch.dtype) -> dict[str, Any]:
     """Returns what a run is computed with: versions, commit, processor and number format."""
-    home, found = Path(__file__).parents[2], ""
+    home, commit = Path(__file__).parents[2], None
     if (home / ".git").exists() and shutil.which("git"):
         ask = ["git", "-C", str(home), "describe", "--always", "--dirty", "--abbrev=40"]
-        found = subprocess.run([*ask, "--exclude=*"], capture_output=True, text=True).stdout.strip()
-    is_gpu = torch.cuda.is_available()
+        found = subprocess.run([*ask, "--exclude=*"], capture_output=True, text=True)
+        commit = found.stdout.strip() or None
     return {
         "flowrep": __version__,
-        "commit": found or None,
+        "commit": commit,
         "torch": torch.__version__,
         "python": platform.python_version(),
         "precision": str(precision).removeprefix("torch."),
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
-        "gpu": torch.cuda.get_device_name() if is_gpu else None,
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 
 
 def cpu_name() -> str:
     """Returns the processor's name."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(x for x in lines if x.startswith("model name")).partition(":")[2].strip()
-    except (OSError, StopIteration):  # not on Linux, or not on this processor
-        return platform.processor() or platform.machine()
-
-
-_TITLES = {"training": "evaluation"}  # training itself has scalars too
+    info = Path("/proc/cpuinfo")  # of Linux, where platform.processor() is empty
+    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return next(iter(names), platform.processor() or platform.machine())
 
 
 def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
@@ -161,19 +157,18 @@ def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str,
     >>> evaluation_scalars([row])[100]["final/s_turn/low/12fps/greedy/success"]
     1.0
     """
-    groups: dict[tuple[int, str], list[Mapping[str, Any]]] = defaultdict(list)
+    values: dict[int, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
-        kind, rate = row["evaluation"], f"{float(row['fps']):g}fps"
-        words = _TITLES.get(kind, kind), row["scene"], row["speed"], rate, row["policy"]
-        groups[int(row["frames"]), "/".join(words)].append(row)
-    scalars: dict[int, dict[str, float]] = defaultdict(dict)
-    for (frames, title), episodes in groups.items():
-        outcomes = [episode["outcome"] for episode in episodes]
-        for name in OUTCOMES[1:]:
-            scalars[frames][f"{title}/{name}"] = outcomes.count(name) / len(outcomes)
-        for name in ("return", "length"):
-            scalars[frames][f"{title}/{name}"] = fmean(float(e[name]) for e in episodes)
-    return dict(scalars)
+        kind = row["evaluation"].replace("training", "evaluation")  # training has scalars too
+        rate = f"{float(row['fps']):g}fps"
+        title = "/".join((kind, row["scene"], row["speed"], rate, row["policy"]))
+        found = {name: float(row["outcome"] == name) for name in OUTCOMES[1:]}
+        for name, value in (found | {key: float(row[key]) for key in ("return", "length")}).items():
+            values[int(row["frames"])][f"{title}/{name}"].append(value)
+    return {
+        frames: {title: fmean(list_) for title, list_ in scalars.items()}
+        for frames, scalars in values.items()
+    }
 
 
 class RunFolder:

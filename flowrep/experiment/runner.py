@@ -354,10 +354,9 @@ class RecentEpisodes:
         """Adds a step of every environment, `[num_envs]`, as the env returned it."""
         after = stepped["next"]
         rewards = after["reward"].flatten().double()
-        if self._running is None:
-            self._running = torch.zeros(2, *rewards.shape, dtype=torch.float64)
-        self._running = self._running.to(rewards.device)
-        self._running += torch.stack([rewards, torch.ones_like(rewards)])
+        step = torch.stack([rewards, torch.ones_like(rewards)])
+        # not in place, as restored sums are on the CPU
+        self._running = step if self._running is None else self._running.to(step.device) + step
         done = after["done"].flatten()
         outcomes = after["outcome"].flatten()[done].tolist()
         if outcomes:
@@ -370,9 +369,8 @@ class RecentEpisodes:
         if not self._ended:
             return dict.fromkeys([*OUTCOMES[1:], "return", "length"], math.nan)
         outcomes, returns, lengths = zip(*self._ended)
-        shares = {
-            name: outcomes.count(code) / len(outcomes) for code, name in enumerate(OUTCOMES) if code
-        }
+        shares = {name: outcomes.count(code) / len(outcomes) for code, name in enumerate(OUTCOMES)}
+        shares.pop(OUTCOMES[0])
         return shares | {"return": fmean(returns), "length": fmean(lengths)}
 
     def state(self) -> dict[str, Any]:
@@ -384,10 +382,7 @@ class RecentEpisodes:
         """Continues from a `state`."""
         running = state["running"]
         self._running = running.clone() if running.numel() else None
-        self._ended.clear()
-        self._ended.extend(
-            (int(code), total, int(length)) for code, total, length in state["ended"]
-        )
+        self._ended = deque(map(tuple, state["ended"]), maxlen=RECENT_EPISODES)
 
 
 class Means:

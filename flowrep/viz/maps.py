@@ -6,7 +6,6 @@ Images are numpy uint8 `[H, W, 3]`. Maps go in as numpy or torch, `[C, H, W]`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from functools import lru_cache, partial
@@ -40,7 +39,6 @@ _OFF_WHITE = 255 * (
     1 - np.clip(np.abs((6 * np.arange(_HUES)[:, None] / _HUES + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
 ).astype(np.float32)
 _BAR_PX = 28
-_MOST_CODEC_PX = 16_384  # a side
 _NOTE_PX = 20
 _GAP_PX = 4
 _GAP_GREY = 200  # so that the white of no motion has an edge
@@ -196,14 +194,22 @@ def strip(
     with_wheel = frozenset(wheel_for)
     columns: list[Image] = []
     for label, image in images.items():
-        bars = [_label_bar(label, width * zoom, label in with_wheel)]
+        bar = _text_bar(label, width * zoom, _BAR_PX, 18, 0).copy()
+        if label in with_wheel and width * zoom >= _BAR_PX:
+            bar[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
+        column = [bar]
         if notes.keys() & images.keys():
-            bars.append(_note_bar(notes.get(label, ""), width * zoom))
-        tile = image
-        if image.shape == size:
-            tile = image.repeat(zoom, axis=0).repeat(zoom, axis=1)
-        column = np.concatenate([*bars, tile])
-        columns += [column, np.full((len(column), _GAP_PX, 3), _GAP_GREY, np.uint8)]
+            note = notes.get(label, "")
+            if isinstance(note, str):
+                column.append(_text_bar(note, width * zoom, _NOTE_PX, 14, 70))
+            else:
+                legend = note(width * zoom)
+                rows = (0, _NOTE_PX - len(legend)), (0, 0), (0, 0)
+                column.append(np.pad(legend, rows, constant_values=255))
+        is_small = image.shape == size
+        column.append(image.repeat(zoom, axis=0).repeat(zoom, axis=1) if is_small else image)
+        gap = np.full((sum(map(len, column)), _GAP_PX, 3), _GAP_GREY, np.uint8)
+        columns += [np.concatenate(column), gap]
     return np.concatenate(columns[:-1], axis=1)
 
 
@@ -238,8 +244,8 @@ def write_png(path: str | Path, image: Image) -> None:
 class Video:
     """An mp4 (H.264) that browsers play, written frame by frame.
 
-    Odd sizes, which the codec does not support, are padded with a white row or column, and frames
-    that are too large for it are sampled. Frames of other sizes than the first are cut or padded.
+    Odd sizes, which the codec does not support, are padded with a white row or column. Frames of
+    other sizes than the first are cut or padded.
 
     Args:
         path: the file; its folder is created if needed.
@@ -253,9 +259,6 @@ class Video:
 
     def append(self, image: Image) -> None:
         """Adds a frame `[H, W, 3]`."""
-        # Every n-th row and column, with the least n for which H.264 takes the image.
-        step = math.ceil(max(image.shape[:2]) / _MOST_CODEC_PX)
-        image = image[::step, ::step]
         if self._writer is None:
             import imageio.v2 as imageio
 
@@ -286,20 +289,9 @@ def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> Non
 
 
 @lru_cache(maxsize=64)
-def _label_bar(label: str, width: int, with_wheel: bool) -> Image:
-    bar = np.full((_BAR_PX, width, 3), 255, np.uint8)
-    bar = _written(bar, {(2, _BAR_PX // 2): (label, "lm", (0, 0, 0))}, size=18)
-    if with_wheel and width >= _BAR_PX:
-        bar[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
-    return bar
-
-
-def _note_bar(note: Note, width: int) -> Image:
-    bar = np.full((_NOTE_PX, width, 3), 255, np.uint8)
-    if isinstance(note, str):
-        return _written(bar, {(2, _NOTE_PX // 2): (note, "lm", (70, 70, 70))}, size=14)
-    bar[: _NOTE_PX - 2] = note(width)
-    return bar
+def _text_bar(text: str, width: int, height: int, size: int, grey: int) -> Image:
+    bar = np.full((height, width, 3), 255, np.uint8)
+    return _written(bar, {(2, height // 2): (text, "lm", (grey, grey, grey))}, size=size)
 
 
 def _written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, size: int) -> Image:

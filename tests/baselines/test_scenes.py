@@ -4,6 +4,7 @@ Counts are small here; `examples/scene_validity.py` runs hundreds of episodes a 
 """
 
 from dataclasses import replace
+from itertools import repeat
 
 import gymnasium
 import numpy as np
@@ -33,13 +34,8 @@ TURNING = [name for name in TABLE_1 if name != "straight_road"]
 
 
 def kinds_of_people(scene):
-    kinds = set()
-    for group in scene.pedestrian_groups:
-        if group.standing:
-            kinds.add("standing")
-        if group.standing < group.count:
-            kinds.add(group.walk.kind)
-    return kinds
+    walking = {g.walk.kind for g in scene.pedestrian_groups if g.standing < g.count}
+    return walking | {"standing" for g in scene.pedestrian_groups if g.standing}
 
 
 @pytest.mark.parametrize("name", TABLE_1)
@@ -59,13 +55,10 @@ def test_a_scene_has_the_numbers_of_the_paper(name):
     assert scene.pedestrian_speed_mps == speeds
 
 
-def test_the_scenes_have_one_camera():
+def test_the_four_scenes_are_those_of_the_paper_and_have_one_camera():
+    assert set(scene_names()) == set(SCENE_BY_ID.values()) == set(TABLE_1)
     cameras = [load_scene(name).camera for name in TABLE_1]
     assert all(camera == cameras[0] for camera in cameras)
-
-
-def test_the_four_scenes_are_those_of_the_paper():
-    assert set(scene_names()) == set(SCENE_BY_ID.values()) == set(TABLE_1)
 
 
 @pytest.mark.slow_after_first
@@ -81,13 +74,12 @@ def test_gymnasium_makes_and_checks_every_scene(env_id):
 @pytest.mark.parametrize("name", TURNING)
 def test_every_path_is_drawn_equally_often(make_street, name):
     env = make_street(name, sensors=())
-    draws = 400
+    draws, paths = 200, [path.name for path in env.scene.paths]
     drawn = [env.reset(seed=5 if i == 0 else None)[1]["path"] for i in range(draws)]
-    expected = draws / len(env.scene.paths)
-    for path in env.scene.paths:
-        # Four standard deviations of a binomial count.
-        spread = 4 * (expected * (1 - 1 / len(env.scene.paths))) ** 0.5
-        assert abs(drawn.count(path.name) - expected) < spread
+    # Four standard deviations of a binomial count.
+    spread = 4 * (draws / len(paths) * (1 - 1 / len(paths))) ** 0.5
+    for path in paths:
+        assert abs(drawn.count(path) - draws / len(paths)) < spread
 
 
 @pytest.mark.parametrize("name", ["h_shaped_pathways", "three_way_junction"])
@@ -115,23 +107,24 @@ CLOSED_EXITS = [
 ]
 
 
+def driven_to_its_end(env, actions, **options):
+    """Drives an episode with the given actions and returns how it ended."""
+    env.reset(seed=0, options=options)
+    for action in actions:
+        info = env.step(action)[4]
+        if info["outcome"] != "running":
+            return info["outcome"], info["hit"]
+    return "running", ""
+
+
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize(("name", "driven", "path", "closed"), CLOSED_EXITS)
 def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, closed):
     env = make_street(replace(load_scene(name), pedestrian_groups=()), sensors=())
     env.reset(seed=0, options={"path": driven})
     actions = Planner().search(env.episode)
-    for action in actions:
-        info = env.step(action)[4]
-        if info["outcome"] != "running":
-            break
-    assert info["outcome"] == "success"
-    env.reset(options={"path": path})
-    for action in actions:
-        info = env.step(action)[4]
-        if info["outcome"] != "running":
-            break
-    assert (info["outcome"], info["hit"]) == ("collision", "building")
+    assert driven_to_its_end(env, actions, path=driven)[0] == "success"
+    assert driven_to_its_end(env, actions, path=path) == ("collision", "building")
     # Right there: the vehicle's middle is no further off than half its diagonal, a square metre's.
     x, y = env.episode.now.vehicle[:2]
     front = Layout(env.scene).closures[closed].footprint.exterior.distance(shapely.Point(x, y))
@@ -151,11 +144,7 @@ def test_a_closed_exit_ends_the_drive_into_it(make_street, name, driven, path, c
 )
 def test_straight_on_in_the_h_stands_a_house(make_street, path, y_m):
     env = make_street(replace(load_scene("h_shaped_pathways"), pedestrian_groups=()), sensors=())
-    env.reset(seed=0, options={"path": path})
-    info = {"outcome": "running"}
-    while info["outcome"] == "running":
-        info = env.step(0)[4]
-    assert (info["outcome"], info["hit"]) == ("collision", "building")
+    assert driven_to_its_end(env, repeat(0), path=path) == ("collision", "building")
     assert env.episode.now.vehicle[:2] == pytest.approx((0.0, y_m), abs=1e-6)
 
 
@@ -199,8 +188,7 @@ def test_every_category_is_seen_on_a_drive(make_street, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", TURNING)
-@pytest.mark.parametrize("speed", ["low", "normal", "high"])
+@pytest.mark.parametrize(("name", "speed"), zip(TURNING, ["low", "normal", "high"]))
 def test_the_planner_arrives_and_habit_and_chance_do_not(drive, name, speed):
     planned = [e.outcome for e in drive("planner", 3, name, speed=speed)]
     assert planned == ["success"] * 3

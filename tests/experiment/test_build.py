@@ -45,8 +45,8 @@ def test_an_algorithm_is_found_by_its_name():
         ("flowrep.agent.load_checkpoint", {}, "Algorithm"),
         ("nowhere.Learner", {}, "nowhere"),
         ("someones.Nobody", {"patience": 3}, "Nobody"),
-        ("someones.Learner", {}, "algorithm.patience"),
-        ("someones.Learner", {"patience": 3, "moood": 2}, "algorithm.moood.*mood"),
+        ("someones.Learner", {}, "patience"),
+        ("someones.Learner", {"patience": 3, "moood": 2}, "moood.*mood"),
     ],
 )
 @pytest.mark.usefixtures("own_module")

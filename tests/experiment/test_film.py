@@ -71,9 +71,8 @@ def test_the_curve_shows_the_runs_own_greedy_evaluations_at_its_own_speed(tmp_pa
     others = {"evaluation": "evaluate", "policy": "sampled", "speed": "low", "fps": "6.0"}
     rows = [row, row | {"outcome": "timeout"}, row | {"evaluation": "final", "frames": "200"}]
     rows += [row | {key: value} for key, value in others.items()]
-    path = tmp_path / "learning_curve.png"
     metrics = [{"frames": "50", "success": "0.5"}, {"frames": "100", "success": "nan"}]
-    draw_learning_curve(path, metrics, rows, speed="normal", fps=12.0)
+    for points, episodes in ((metrics, rows), ([], [])):
+        draw_learning_curve(tmp_path / "a.png", points, episodes, speed="normal", fps=12.0)
     assert drawn == [(100, 0.5), (200, 1.0)]
-    assert [file.name for file in tmp_path.iterdir()] == ["learning_curve.png"]
-    draw_learning_curve(path, [], [], speed="normal", fps=12.0)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
