@@ -155,9 +155,8 @@ def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequ
             return
         episode_seed = config.seed + number
         path = folder.video_path(f"{where}{speed}_{rate:g}fps_{episode_seed}")
-        make_env = partial(agent.make_env, speed=speed, frame_rate_hz=float(rate))
-        seen = agent.config.representations
-        record_episode(make_env, agent.policy, seen, path, episode_seed=episode_seed)
+        rates: dict[str, Any] = {"speed": speed, "frame_rate_hz": float(rate)}
+        record_episode(agent, path, episode_seed=episode_seed, **rates)
         print(f"video: {path}")
 
 

@@ -237,7 +237,7 @@ def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(some, monkeypatch):
 def test_a_stop_ends_between_two_films(some, monkeypatch):
     filmed = []
 
-    def record(make, policy, seen, path, episode_seed):
+    def record(agent, path, **_):
         filmed.append(path.name)
         signal.raise_signal(signal.SIGTERM)  # as schedulers send it
 

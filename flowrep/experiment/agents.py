@@ -218,14 +218,15 @@ class ExternalPolicy:
         n = int(self._task.action_spec.space.n)
         try:
             actions = torch.as_tensor(given).cpu()
-            what = f"{actions.dtype} of shape {tuple(actions.shape)}"
+            whole = actions.long()
+            if actions.shape != (count,):
+                what = f"{actions.dtype} of shape {tuple(actions.shape)}"
+            elif ((whole == actions) & (whole >= 0) & (whole < n)).all():
+                return whole
+            else:
+                what = str(actions.tolist())
         except (TypeError, ValueError, RuntimeError):
-            actions, what = torch.empty(0), f"a {type(given).__name__}"
-        is_whole = not (actions.is_floating_point() or actions.is_complex())
-        if is_whole and actions.shape == (count,):
-            if ((actions >= 0) & (actions < n)).all():
-                return actions.long()
-            what = str(actions.tolist())
+            what = f"a {type(given).__name__}"
         raise PolicyError(
             f"policy '{self.name}' returned {what}; expected {count} whole numbers from 0 to "
             f"{n - 1}, one action per environment"

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from flowrep.envs import street_envs
+from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import Episode, Policy, evaluate, outcome_shares
 from flowrep.experiment.run import replace_file
 from flowrep.geometry import factorize, rigid_flow
@@ -96,29 +97,20 @@ def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> M
     }
 
 
-def record_episode(
-    make_env: Callable[..., EnvBase],
-    policy: Policy | str,
-    representations: Mapping[str, Any],
-    path: Path,
-    *,
-    episode_seed: int,
-) -> Episode:
+def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: Any) -> Episode:
     """Writes the video of one greedy episode to `path` and returns the episode.
 
     Args:
-        make_env: takes changes of `make_env`'s arguments.
-        policy: see `evaluate`.
-        representations: the policy's inputs, a mapping from name to options.
+        agent: what drives.
         path: the mp4 file.
         episode_seed: identifies the episode, as in evaluation.csv.
+        changes: arguments of `make_env`, in place of the agent's.
     """
-    env = make_filmed(make_env, representations)
-    frames, episode = film_episode(env, policy, {"episode_seed": episode_seed})
+    env = make_filmed(partial(agent.make_env, **changes), agent.config.representations)
+    frames, episode = film_episode(env, agent.policy, {"episode_seed": episode_seed})
     env.close()
-    replace_file(
-        path, partial(write_video, frames=map(representation_strip, frames), fps=episode.fps)
-    )
+    strips = map(representation_strip, frames)
+    replace_file(path, partial(write_video, frames=strips, fps=episode.fps))
     return episode
 
 

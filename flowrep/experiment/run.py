@@ -31,6 +31,8 @@ from flowrep.experiment.evaluation import OUTCOMES, failure_causes
 from flowrep.extras import require
 from flowrep.tables import append_rows, is_whole, read_rows, write_rows
 
+Rows = Sequence[Mapping[str, str]]
+
 EVALUATION_COLUMNS = (
     "scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation",
     "policy", "speed", "fps", "episode_seed", "outcome", "hit", "return", "length",
@@ -146,17 +148,8 @@ def cpu_name() -> str:
     return next(iter(names), platform.processor() or platform.machine())
 
 
-def evaluation_scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
-    """Returns shares of outcomes, mean return and mean length of each evaluation, by frames.
-
-    Args:
-        rows: rows of evaluation.csv.
-
-    >>> row = {"scene": "s_turn", "evaluation": "final", "policy": "greedy", "speed": "low"}
-    >>> row |= {"fps": 12.0, "frames": 100, "outcome": "success", "return": 7.5, "length": 90}
-    >>> evaluation_scalars([row])[100]["final/s_turn/low/12fps/greedy/success"]
-    1.0
-    """
+def _scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
+    """Returns shares of outcomes, mean return and mean length of each evaluation, by frames."""
     values: dict[int, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         kind = row["evaluation"].replace("training", "evaluation")  # training has scalars too
@@ -400,7 +393,7 @@ class RunFolder:
         self,
         rows: Sequence[Mapping[str, Any]],
         positions: Sequence[NDArray[np.float32]] = (),
-        table: Sequence[Mapping[str, str]] | None = None,
+        table: Rows | None = None,
     ) -> None:
         """Saves evaluated episodes and logs their means to TensorBoard and wandb.
 
@@ -413,12 +406,10 @@ class RunFolder:
         if positions:
             self._save_drives(rows, positions)
         self.save_episodes(rows, table)
-        for frames, scalars in evaluation_scalars(rows).items():
+        for frames, scalars in _scalars(rows).items():
             self._plot(frames, scalars)
 
-    def save_episodes(
-        self, rows: Iterable[Mapping[str, Any]], table: Sequence[Mapping[str, str]] | None = None
-    ) -> None:
+    def save_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
         """Adds evaluated episodes to evaluation.csv.
 
         An episode that the table already has, with the same policy, frames, speed and frame rate,

@@ -6,7 +6,6 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from statistics import fmean
 from typing import Any
 
@@ -164,6 +163,10 @@ class Runner:
         self.folder.log_metrics(self.frames, row)
         return row
 
+    def trained(self) -> Agent:
+        """Returns the agent as it is now."""
+        return Agent(self.agent.policy, self.config, self.frames)
+
     def evaluate(self, kind: str, stop: StopRequest) -> bool:
         """Adds episodes to evaluation.csv; returns whether all were run before a stop.
 
@@ -186,7 +189,7 @@ class Runner:
             comparison = Comparison(
                 speeds=[config.speed], fps=[fps], episodes=asked.episodes, seed=EVALUATION_SEED
             )
-        agent = Agent(self.agent.policy, config, self.frames)
+        agent = self.trained()
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
             if self._pool is None:
@@ -219,8 +222,7 @@ class Runner:
         draw_learning_curve(path, metrics, episodes, speed=self.config.speed, fps=fps)
         path = self.folder.video_path(f"episode_{self.config.speed}")
         if self.config.evaluation.video and not path.exists():
-            make_env, seen = partial(build.env, self.config), self.config.representations
-            record_episode(make_env, self.agent.policy, seen, path, episode_seed=FINAL_SEED)
+            record_episode(self.trained(), path, episode_seed=FINAL_SEED)
             print(f"video: {path}")
 
     def close(self) -> None:

@@ -45,10 +45,10 @@ def load(scene: str | Mapping[str, Any], **machine: Any) -> Agent:
         about = file.metadata()
         weights = unpacked({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
     config = validated_run(json.loads(about["config"]), path.name)
-    machine = {"device": "auto", "num_workers": 0} | machine
+    here: dict[str, Any] = {"device": "auto", "num_workers": 0} | machine
     if not isinstance(scene, str):
-        machine["scene"] = scene
-    return with_weights(config, weights, int(about["frames"]), "the trained agent", **machine)
+        here["scene"] = scene
+    return with_weights(config, weights, int(about["frames"]), "the trained agent", **here)
 
 
 def pack(run: str | Path, path: Path) -> None:

@@ -15,6 +15,8 @@ from flowrep.experiment.film import (
     maps_of,
     record_episode,
 )
+from flowrep.policies import load_agent
+from tests.config.composing import composed
 
 
 def leave_the_road(tensordict):
@@ -54,9 +56,10 @@ def test_the_picture_is_large_unless_something_else_reads_it(representation, flo
 @pytest.mark.slow
 def test_a_recorded_episode_is_a_whole_film(tmp_path):
     imageio = pytest.importorskip("imageio.v3")
-    path = tmp_path / "episode.mp4"
-    make = partial(make_env, "straight_road")
-    episode = record_episode(make, leave_the_road, {"obj": {}}, path, episode_seed=3)
+    path, scene = tmp_path / "episode.mp4", composed("debug=smoke").scene
+    agent = load_agent("random", scene=scene, device="cpu", num_envs=1, num_workers=0)
+    episode = record_episode(agent, path, episode_seed=3, frame_rate_hz=6.0)
+    assert episode.fps == 6.0
     assert len(imageio.imread(path, plugin="FFMPEG")) == episode.length + 1
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
 
