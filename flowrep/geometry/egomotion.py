@@ -1,8 +1,8 @@
 """The camera's motion from flow and depth: the robust inverse of ego flow.
 
 With x the ray of pixel p (z = 1), q the inverse of its depth and `prev_from_curr` = (R, T), the
-point that p shows was seen at the projection of R x + q T. The residual is raw flow's p' minus this
-one, in pixels. Sky has q = 0 and so constrains the rotation alone, without a case of its own.
+point that p shows was seen at the projection of R x + q T. The residual is this place minus raw
+flow's p', in pixels. Sky has q = 0 and so constrains the rotation alone, without a case of its own.
 
 Moving bodies are outliers. The start is the best of many motions, each from four pixels; then
 Gauss-Newton steps on more pixels with Geman-McClure weights, whose scale follows the residuals.
@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from flowrep.geometry.camera import centred_pixels
 from flowrep.geometry.checks import broadcast_batch, check_shape
 from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST
 from flowrep.geometry.pose import rotation_from_vector
@@ -66,44 +65,28 @@ class MotionEstimate(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """Known pixels of each frame: `[B, N]`, the first `number` ones."""
+    """Pixels of B frames, `[B, N]` each, of which the first `number` are known."""
 
-    ray: Tensor  # x, y, 1 and q: [B, 4, N]
-    flow: Tensor  # [B, 2, N]
-    structure: Tensor | None  # xx, xy, yy: [B, 3, N]
-    known: Tensor
-    number: Tensor  # of known ones, [B]
+    focal: Tensor  # fx, skew, fy: [B, 3]
+    values: Tensor  # [B, 6 or 9, N]: ray x, y, 1 and q; flow u, v; with a picture xx, xy, yy
+    known: Tensor  # [B, N]
+    number: Tensor  # [B]
 
     def part(self, index: Tensor) -> _Samples:
-        """Returns the samples at `index` `[B, M]`."""
+        """Returns the pixels at `index` `[B, M, N]` as those of B * M frames."""
+        times, at = index.shape[1], index.flatten(1)
+        values = self.values.gather(-1, at.unsqueeze(1).expand(-1, self.values.shape[1], -1))
+        values = values.unflatten(-1, index.shape[1:]).movedim(-2, 1).flatten(0, 1)
+        known = self.known.gather(-1, at).reshape(-1, index.shape[-1])
+        return _Samples(
+            self.focal.repeat_interleave(times, 0), values, known,
+            self.number.repeat_interleave(times, 0),
+        )  # fmt: skip
 
-        def at(values: Tensor) -> Tensor:
-            return values.gather(-1, index.unsqueeze(1).expand(-1, values.shape[1], -1))
-
-        structure = None if self.structure is None else at(self.structure)
-        known = self.known.gather(-1, index)
-        return _Samples(at(self.ray), at(self.flow), structure, known, self.number)
-
-    def split_pixels(self, size: int) -> _Samples:
-        """Returns every `size` pixels of a frame as a frame, `[B * N / size, size]`."""
-
-        def parts(values: Tensor) -> Tensor:
-            return values.unflatten(-1, (-1, size)).movedim(-2, 1).flatten(0, 1).double()
-
-        structure = None if self.structure is None else parts(self.structure)
-        known = self.known.reshape(-1, size)
-        return _Samples(parts(self.ray), parts(self.flow), structure, known, self.number)
-
-    def repeated(self, times: int) -> _Samples:
-        """Returns each frame `times` times, `[B * times, N]`."""
-        ray, flow, known, number = (
-            part.repeat_interleave(times, 0)
-            for part in (self.ray, self.flow, self.known, self.number)
-        )
-        structure = None
-        if self.structure is not None:
-            structure = self.structure.repeat_interleave(times, 0)
-        return _Samples(ray, flow, structure, known, number)
+    def in_pixels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns how far a shift of rays at z = 1 is in the picture, `[B, ..., N]`."""
+        fx, skew, fy = self.focal.to(x.dtype).reshape(-1, 3, *[1] * (x.ndim - 1)).unbind(1)
+        return fx * x + skew * y, fy * y
 
 
 @torch.no_grad()
@@ -174,14 +157,13 @@ def camera_motion(
             tensor.to(to).expand(*batch, *tensor.shape[-dims:]).reshape(-1, *tensor.shape[-dims:])
         )
 
-    K = flat(K, 2, torch.float64)
     structure = None if picture is None else structure_tensor(flat(picture, 3))
-    samples = _samples(flat(flow, 3), flat(depth, 3), K.to(dtype), structure)
+    samples = _samples(flat(flow, 3), flat(depth, 3), flat(K, 2, torch.float64), structure)
     expected = torch.eye(4) if prior is None else prior
     expected = flat(expected.to(depth.device), 2, torch.float64)
-    motion = _best_hypothesis(samples, K, expected, has_prior=prior is not None)
-    motion = _descended(samples, K, motion, _STEPS)
-    share, covariance, valid = _described(samples, K, motion)
+    motion = _best_hypothesis(samples, expected, has_prior=prior is not None)
+    motion = _descended(samples, motion, _STEPS)
+    share, covariance, valid = _described(samples, motion)
     motion = torch.where(valid[:, None, None], motion, expected)
     motion, share, covariance, valid = (
         part.reshape((*batch, *part.shape[1:])) for part in (motion, share, covariance, valid)
@@ -224,10 +206,8 @@ def _samples(flow: Tensor, depth: Tensor, K: Tensor, structure: Tensor | None) -
         s for s in range(int(size / 1.618033988749895) + 1, 2 * size + 2) if math.gcd(s, size) == 1
     )
     pixel = torch.arange(looked_at, device=flow.device) * step % size
-    maps = [flow.flatten(-2)[..., pixel], depth.flatten(-2)[..., pixel]]
-    if structure is not None:
-        maps.append(structure.flatten(-2)[..., pixel])
-    values = torch.cat(maps, 1)  # [B, 3 or 6, M]
+    maps = [flow, depth] if structure is None else [flow, depth, structure]
+    values = torch.cat([each.flatten(-2)[..., pixel] for each in maps], 1)  # [B, 3 or 6, M]
     u, v, z = values[:, :3].unbind(1)
     known = u.isfinite() & v.isfinite() & (z >= SMALLEST)  # nan compares False
     if structure is not None:
@@ -238,142 +218,94 @@ def _samples(flow: Tensor, depth: Tensor, K: Tensor, structure: Tensor | None) -
     order = torch.zeros(batch, PIXELS + 1, dtype=torch.long, device=flow.device)
     order.scatter_(1, slot, torch.arange(looked_at, device=flow.device).expand(batch, -1))
     order = order[:, :PIXELS]
-    count = known.sum(-1).clamp(max=PIXELS)
-    is_known = torch.arange(PIXELS, device=flow.device) < count.unsqueeze(-1)
+    number = known.sum(-1).clamp(max=PIXELS)
+    is_known = torch.arange(PIXELS, device=flow.device) < number.unsqueeze(-1)
     values = values.gather(-1, order.unsqueeze(1).expand(-1, values.shape[1], -1))
     values = torch.where(is_known.unsqueeze(1), values, 1.0)
-    x_px, y_px = centred_pixels(height, width, K)
-    place = pixel[order]
-    x_px = x_px.squeeze(-2).gather(-1, place % width)
-    y_px = y_px.squeeze(-1).gather(-1, place // width)
-    y = y_px / K[:, 1, 1, None]
-    x = (x_px - K[:, 0, 1, None] * y) / K[:, 0, 0, None]
+    place, focal = pixel[order], K[:, [0, 0, 1], [0, 1, 1]]
+    fx, skew, fy, cx, cy = (
+        torch.cat([focal, K[:, :2, 2]], -1).to(values.dtype).unsqueeze(-1).unbind(1)
+    )
+    y = (place // width + 0.5 - cy) / fy
+    x = (place % width + 0.5 - cx - skew * y) / fx
     ray = torch.stack([x, y, torch.ones_like(x), values[:, 2].reciprocal()], 1)
-    structure = None if structure is None else values[:, 3:]
-    return _Samples(ray, values[:, :2], structure, is_known, count)
+    return _Samples(focal, torch.cat([ray, values[:, :2], values[:, 3:]], 1), is_known, number)
 
 
-def _residuals(samples: _Samples, K: Tensor, motion: Tensor) -> tuple[Tensor, ...]:
-    """Returns the residuals `[B, ..., N]` in px and where the projection lies, for Jacobians.
-
-    Args:
-        samples: N of each frame.
-        K: `[B, 3, 3]`.
-        motion: `[B, 4, 4]`, or `[B, M, 4, 4]` for M motions of each frame.
-    """
-    ray = samples.ray
-    # As in `closed_form`, the difference from no motion: exactly 0 for none, and rounded finer.
-    still = torch.eye(3, 4, dtype=motion.dtype, device=motion.device)
-    moved = (motion[..., :3, :] - still).to(ray.dtype)
-    moved = (moved.flatten(1, -2) @ ray).unflatten(1, moved.shape[1:-1])  # [B, (M,) 3, N]
-    dx, dy, dz = moved.unbind(-2)
-    in_front = 1 + dz > MIN_DEPTH_RATIO
-    per_z = torch.where(in_front, 1 + dz, 1.0).reciprocal()
-    per_frame = (slice(None), *[None] * (dx.ndim - 2))
-    x, y = ray[:, 0][per_frame], ray[:, 1][per_frame]
-    dn, dm = (dx - x * dz) * per_z, (dy - y * dz) * per_z
-    u, v = samples.flow[:, 0][per_frame], samples.flow[:, 1][per_frame]
-    k = K.to(ray.dtype)[(..., *[None] * (dx.ndim - 1))]
-    ru = -(k[:, 0, 0] * dn + k[:, 0, 1] * dm) - u
-    rv = -k[:, 1, 1] * dm - v
-    return ru, rv, x + dn, y + dm, per_z, in_front
-
-
-def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
-    """Returns the squared lengths of residuals, as the pixels' structure sees them."""
-    if samples.structure is None:
-        return ru * ru + rv * rv
-    xx, xy, yy = (s if ru.ndim == 2 else s.unsqueeze(1) for s in samples.structure.unbind(1))
-    return (xx * ru * ru + 2 * xy * ru * rv + yy * rv * rv).clamp(min=0.0)
-
-
-def _normal_equations(samples: _Samples, K: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns J^T J `[B, 6, 6]` and J^T r `[B, 6]` of a step after the motion, all pixels alike."""
-    ru, rv, n, m, per_z, in_front = _residuals(samples, K, motion)
-    Ju, Jv = _jacobian(samples, K, n, m, per_z)
-    return _products(samples, Ju, Jv, ru, rv, in_front.to(ru.dtype))
-
-
-def _jacobian(
-    samples: _Samples, K: Tensor, n: Tensor, m: Tensor, per_z: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Returns du and dv `[B, 6, N]` by a rotation vector and a translation after the motion."""
-    q = samples.ray[:, 3] * per_z
-    zero, nm = torch.zeros_like(n), n * m
-    dn = torch.stack([-nm, 1 + n * n, -m, q, zero, -n * q], 1)
-    dm = torch.stack([-1 - m * m, nm, n, zero, q, -m * q], 1)
-    k = K.to(n.dtype)[..., None, None]
-    return k[:, 0, 0] * dn + k[:, 0, 1] * dm, k[:, 1, 1] * dm
-
-
-def _products(
-    samples: _Samples, Ju: Tensor, Jv: Tensor, ru: Tensor, rv: Tensor, weight: Tensor
-) -> tuple[Tensor, Tensor]:
-    if samples.structure is None:
-        Wu, Wv = weight.unsqueeze(1) * Ju, weight.unsqueeze(1) * Jv
-    else:
-        xx, xy, yy = (weight.unsqueeze(1) * samples.structure).unsqueeze(2).unbind(1)
-        Wu, Wv = xx * Ju + xy * Jv, xy * Ju + yy * Jv
-    normal = Wu @ Ju.mT + Wv @ Jv.mT
-    right = Wu @ ru.unsqueeze(-1) + Wv @ rv.unsqueeze(-1)
-    return normal.double(), right.squeeze(-1).double()
-
-
-def _after(motion: Tensor, step: Tensor) -> Tensor:
-    """Returns the motion followed by a small one, (rotation vector, translation) `[..., 6]`."""
-    turn, shift = step.split([3, 3], -1)
-    moved = rotation_from_vector(turn) @ motion[..., :3, :]
-    moved = torch.cat([moved[..., :3], moved[..., 3:] + shift.unsqueeze(-1)], -1)
-    return torch.cat([moved, motion[..., 3:, :]], -2)
-
-
-def _best_hypothesis(samples: _Samples, K: Tensor, expected: Tensor, *, has_prior: bool) -> Tensor:
+def _best_hypothesis(samples: _Samples, expected: Tensor, *, has_prior: bool) -> Tensor:
     """Returns the best of the expected motion and those that four pixels tell, `[B, 4, 4]`."""
     batch = len(expected)
-    draws = torch.tensor(_DRAWS, dtype=torch.float64, device=K.device)
-    index = (draws * samples.number[:, None, None]).long()  # [B, H, 4]
-    each = samples.part(index.flatten(1)).split_pixels(PIXELS_EACH)
-    K_each = K.repeat_interleave(HYPOTHESES, 0)
+    draws = torch.tensor(_DRAWS, dtype=torch.float64, device=expected.device)
+    drawn = samples.part((draws * samples.number[:, None, None]).long())  # [B, H, 4]
+    each = _Samples(drawn.focal, drawn.values.double(), drawn.known, drawn.number)
     motion = expected.repeat_interleave(HYPOTHESES, 0)
     for _ in range(_HYPOTHESIS_STEPS):
-        normal, right = _normal_equations(each, K_each, motion)
+        at = _linearised(each, motion)
+        normal, right = _normal_equations(each, at, at.in_front.double())
         # Damped, so that four pixels in a row don't throw the motion away.
         diagonal = normal.diagonal(dim1=-2, dim2=-1)
         damping = 1e-9 * diagonal + 1e-12 * diagonal.amax(-1, keepdim=True) + 1e-30
         step = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)[0]
         step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0).clamp(-10.0, 10.0)
-        motion = _after(motion, step)
-    motions = torch.cat([expected.unsqueeze(1), motion.unflatten(0, (batch, HYPOTHESES))], 1)
-    shares = torch.arange(SCORED_PIXELS, device=K.device) / SCORED_PIXELS
-    scored = samples.part((shares * samples.number.unsqueeze(-1)).long())
+        motion = _after(motion, -step)
+    shares = torch.arange(SCORED_PIXELS, device=expected.device) / SCORED_PIXELS
+    scored = samples.part((shares * samples.number.unsqueeze(-1)).long().unsqueeze(1))
+    first = _descended(scored, expected, _STEPS) if has_prior else expected
+    motions = torch.cat([first.unsqueeze(1), motion.unflatten(0, (batch, HYPOTHESES))], 1)
     # What the expected motion is ahead of others: of none but exact ties, unless it is a prior.
-    lead = torch.zeros(1 + HYPOTHESES, device=K.device)
+    lead = torch.zeros(1 + HYPOTHESES, device=expected.device)
     lead[0] = _PRIORS_LEAD * SCORED_PIXELS if has_prior else 1e-6
-    if has_prior:
-        motions = torch.cat(
-            [_descended(scored, K, expected, _STEPS).unsqueeze(1), motions[:, 1:]], 1
-        )
     # Neighbouring hypotheses lead to different optima: the best ones are refined and scored again.
-    first = (_costs(scored, K, motions) - lead).topk(_REFINED, largest=False).indices
-    motions = motions.gather(1, first[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
-    K_refined = K.repeat_interleave(_REFINED, 0)
-    motions = _descended(scored.repeated(_REFINED), K_refined, motions, _REFINING_STEPS)
-    motions = motions.unflatten(0, (batch, _REFINED))
-    best = (_costs(scored, K, motions) - lead[first]).argmin(-1)
-    return motions[torch.arange(batch, device=K.device), best]
+    best = (_costs(scored, motions) - lead).topk(_REFINED, largest=False).indices
+    motions = motions.gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
+    repeated = _Samples(*(part.repeat_interleave(_REFINED, 0) for part in scored))
+    motions = _descended(repeated, motions, _REFINING_STEPS).unflatten(0, (batch, _REFINED))
+    choice = (_costs(scored, motions) - lead[best]).argmin(-1)
+    return motions[torch.arange(batch, device=expected.device), choice]
 
 
-def _costs(samples: _Samples, K: Tensor, motions: Tensor) -> Tensor:
+def _costs(samples: _Samples, motions: Tensor) -> Tensor:
     """Returns the truncated costs `[B, M]` of motions `[B, M, 4, 4]` of each frame.
 
     They are truncated at a few standard deviations of the residuals of the motion that fits best.
     """
-    ru, rv, *_, in_front = _residuals(samples, K, motions)
+    ru, rv, in_front, *_ = _residuals(samples, motions)
     known = in_front & samples.known.unsqueeze(1)
     squared = torch.where(known, _squared(samples, ru, rv), torch.inf)
     number = samples.known.sum(-1, keepdim=True)
     scale = (_SCORE_SCALES * _scale(squared, number).amin(-1)).clamp(min=_LEAST_SCORE_PX)
     return -(1 + squared / scale.square()[:, None, None]).reciprocal().sum(-1)
+
+
+def _residuals(samples: _Samples, motion: Tensor) -> tuple[Tensor, ...]:
+    """Returns residuals in px, where points were in front of the camera, and how they moved.
+
+    `motion` is `[B, 4, 4]`, or `[B, M, 4, 4]` for M motions of each frame; the results are
+    `[B, (M,) N]`: u, v, in front, the shift of x / z and of y / z, and z now over z then.
+    """
+    ray = samples.values[:, :4]
+    # As in `closed_form`, the difference from no motion: exactly 0 for none, and rounded finer.
+    still = torch.eye(3, 4, dtype=motion.dtype, device=motion.device)
+    moved = (motion[..., :3, :] - still).to(ray.dtype)
+    moved = (moved.flatten(1, -2) @ ray).unflatten(1, moved.shape[1:-1])  # [B, (M,) 3, N]
+    dx, dy, dz = moved.unbind(-2)
+    z_ratio = 1 + dz
+    in_front = z_ratio > MIN_DEPTH_RATIO
+    per_z = torch.where(in_front, z_ratio, 1.0).reciprocal()
+    per_frame = samples.values if motion.ndim == 3 else samples.values.unsqueeze(2)
+    x, y, u, v = (per_frame[:, channel] for channel in (0, 1, 4, 5))
+    dn, dm = (dx - x * dz) * per_z, (dy - y * dz) * per_z
+    du, dv = samples.in_pixels(dn, dm)
+    return du + u, dv + v, in_front, dn, dm, per_z
+
+
+def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
+    """Returns the squared lengths of residuals, as the pixels' structure sees them."""
+    structure = samples.values[:, 6:].unbind(1)
+    if not structure:
+        return ru * ru + rv * rv
+    xx, xy, yy = (s if ru.ndim == 2 else s.unsqueeze(1) for s in structure)
+    return (xx * ru * ru + 2 * xy * ru * rv + yy * rv * rv).clamp(min=0.0)
 
 
 def _scale(squared: Tensor, number: Tensor) -> Tensor:
@@ -386,76 +318,111 @@ def _scale(squared: Tensor, number: Tensor) -> Tensor:
     return squared.sort(-1).values.gather(-1, rank).squeeze(-1).sqrt() / _RAYLEIGH
 
 
-class _Weighted(NamedTuple):
-    """A motion's residuals and their weights, for one step or for the covariance."""
+class _Linear(NamedTuple):
+    """A motion's residuals `[B, N]`, px, and their change by a small motion after it."""
 
-    normal: Tensor  # J^T W J, [B, 6, 6]
-    right: Tensor  # J^T W r, [B, 6]
-    squared: Tensor
-    ratio: Tensor  # squared over the scale's square
-    weight: Tensor
-    Ju: Tensor
+    ru: Tensor
+    rv: Tensor
+    in_front: Tensor
+    Ju: Tensor  # by rotation vector and translation, [B, 6, N]
     Jv: Tensor
 
 
-def _weighted(samples: _Samples, K: Tensor, motion: Tensor) -> _Weighted:
-    ru, rv, n, m, per_z, in_front = _residuals(samples, K, motion)
-    usable = samples.known & in_front
-    squared = torch.where(usable, _squared(samples, ru, rv), torch.inf)
+def _linearised(samples: _Samples, motion: Tensor) -> _Linear:
+    ru, rv, in_front, dn, dm, per_z = _residuals(samples, motion)
+    n, m = samples.values[:, 0] + dn, samples.values[:, 1] + dm
+    q = samples.values[:, 3] * per_z
+    zero, nm = torch.zeros_like(n), n * m
+    dn = torch.stack([-nm, 1 + n * n, -m, q, zero, -n * q], 1)
+    dm = torch.stack([-1 - m * m, nm, n, zero, q, -m * q], 1)
+    return _Linear(ru, rv, in_front, *samples.in_pixels(dn, dm))
+
+
+def _normal_equations(samples: _Samples, at: _Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns J^T W J `[B, 6, 6]` and J^T W r `[B, 6]`, float64."""
+    weight, structure = weight.unsqueeze(1), samples.values[:, 6:]
+    if structure.shape[1] == 0:
+        Wu, Wv = weight * at.Ju, weight * at.Jv
+    else:
+        xx, xy, yy = (weight * structure).unsqueeze(2).unbind(1)
+        Wu, Wv = xx * at.Ju + xy * at.Jv, xy * at.Ju + yy * at.Jv
+    normal = Wu @ at.Ju.mT + Wv @ at.Jv.mT
+    right = Wu @ at.ru.unsqueeze(-1) + Wv @ at.rv.unsqueeze(-1)
+    return normal.double(), right.squeeze(-1).double()
+
+
+def _after(motion: Tensor, step: Tensor) -> Tensor:
+    """Returns the motion followed by a small one, (rotation vector, translation) `[..., 6]`."""
+    turn, shift = step.split([3, 3], -1)
+    moved = rotation_from_vector(turn) @ motion[..., :3, :]
+    moved = torch.cat([moved[..., :3], moved[..., 3:] + shift.unsqueeze(-1)], -1)
+    return torch.cat([moved, motion[..., 3:, :]], -2)
+
+
+class _Weighted(NamedTuple):
+    """A motion's residuals, their Geman-McClure weights and what these pixels tell.
+
+    A parameter's unit moves the pixels by one pixel in all (root of the sum of squares), so that
+    radians and metres compare; 0 for a parameter that moves none. Eigenvalues and vectors are those
+    of the normal matrix in these units. Where the structure hides a motion, its value is near 0.
+    """
+
+    at: _Linear
+    squared: Tensor
+    ratio: Tensor  # squared over the scale's square
+    weight: Tensor
+    right: Tensor  # J^T W r, [B, 6]
+    unit: Tensor  # of the six parameters, [B, 6]
+    values: Tensor
+    vectors: Tensor
+    seen: Tensor  # which directions count
+
+
+def _weighted(samples: _Samples, motion: Tensor) -> _Weighted:
+    at = _linearised(samples, motion)
+    usable = samples.known & at.in_front
+    squared = torch.where(usable, _squared(samples, at.ru, at.rv), torch.inf)
     scale = _SCALES * _scale(squared, samples.known.sum(-1))
     ratio = squared / scale.clamp(min=_LEAST_SCALE_PX, max=1e4).square().unsqueeze(-1)
     weight = (1 + ratio).square().reciprocal()
-    Ju, Jv = _jacobian(samples, K, n, m, per_z)
-    normal, right = _products(samples, Ju, Jv, ru, rv, weight)
-    return _Weighted(normal, right, squared, ratio, weight, Ju, Jv)
+    normal, right = _normal_equations(samples, at, weight)
+    moves = (weight.unsqueeze(1) * (at.Ju.square() + at.Jv.square())).sum(-1).double()
+    unit = torch.where(moves > 1e-12, moves, torch.inf).rsqrt()
+    values, vectors = torch.linalg.eigh(unit.unsqueeze(-1) * normal * unit.unsqueeze(-2))
+    seen = values > _LEAST_EIGENVALUE
+    return _Weighted(at, squared, ratio, weight, right, unit, values, vectors, seen)
 
 
-def _descended(samples: _Samples, K: Tensor, motion: Tensor, steps: int) -> Tensor:
-    """Returns the motion after Gauss-Newton steps with Geman-McClure weights."""
+def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
+    """Returns the motion after Gauss-Newton steps, along the directions that the pixels tell."""
     for _ in range(steps):
-        now = _weighted(samples, K, motion)
-        unit, values, vectors, seen = _directions(now)
-        # Only along what the pixels tell.
-        along = (vectors.mT @ (unit * now.right).unsqueeze(-1)).squeeze(-1)
-        along = torch.where(seen, along / values, 0.0)
-        motion = _after(motion, unit * (vectors @ along.unsqueeze(-1)).squeeze(-1))
+        now = _weighted(samples, motion)
+        along = (now.vectors.mT @ (now.unit * now.right).unsqueeze(-1)).squeeze(-1)
+        along = torch.where(now.seen, along / now.values, 0.0)
+        motion = _after(motion, -now.unit * (now.vectors @ along.unsqueeze(-1)).squeeze(-1))
     return motion
 
 
-def _described(samples: _Samples, K: Tensor, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Returns a motion's inlier share, its covariance and whether the pixels tell all of it."""
-    now = _weighted(samples, K, motion)
-    unit, values, vectors, seen = _directions(now)
+    now = _weighted(samples, motion)
     # An M-estimator's covariance is A^-1 B A^-1, A the derivative of its equations: that of
     # w(r^2) r is w (1 - 2 ratio / (1 + ratio)), averaged over the directions of r.
-    weight, ratio = now.weight, now.ratio
+    weight, ratio, seen = now.weight, now.ratio, now.seen
     slope = torch.where(weight > 0, weight * (1 - 2 * ratio / (1 + ratio)), 0.0).sum(-1)
     slope = (slope / weight.sum(-1).clamp(min=1e-12)).clamp(min=0.1).double()
     spread = torch.where(weight > 0, weight.square() * now.squared / 2, 0.0)
-    none = torch.zeros_like(spread)
-    own, _ = _products(samples, now.Ju, now.Jv, none, none, spread)
-    scaled = unit.unsqueeze(-1) * vectors * torch.where(seen, values.rsqrt(), 0.0).unsqueeze(-2)
+    own, _ = _normal_equations(samples, now.at, spread)
+    scaled = now.unit[..., None] * now.vectors * torch.where(seen, now.values.rsqrt(), 0.0)[:, None]
     inverse = scaled @ scaled.mT
     covariance = inverse @ own @ inverse / slope.square()[:, None, None]
     # A parameter that a direction without information has a part in is not known at all.
-    is_open = (vectors.square() * ~seen.unsqueeze(-2)).sum(-1) > 1e-6  # [B, 6]
+    is_open = (now.vectors.square() * ~seen.unsqueeze(-2)).sum(-1) > 1e-6  # [B, 6]
     covariance = torch.where(is_open.unsqueeze(-1) | is_open.unsqueeze(-2), 0.0, covariance)
     variance = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)  # of exact flow, rounding
     variance = torch.where(is_open, torch.inf, variance)
-    covariance = torch.where(torch.eye(6, device=K.device) > 0, variance.unsqueeze(-1), covariance)
+    diagonal = torch.eye(6, dtype=torch.bool, device=motion.device)
+    covariance = torch.where(diagonal, variance.unsqueeze(-1), covariance)
     share = (ratio < 1).sum(-1) / samples.number.clamp(min=1)
     enough = (samples.number >= MIN_PIXELS) & seen.all(-1) & motion.flatten(1).isfinite().all(-1)
     return share, covariance, enough
-
-
-def _directions(now: _Weighted) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Returns units of the six parameters, and in these the eigenvalues, vectors and which count.
-
-    A parameter's unit moves the pixels by one pixel in all (root of the sum of squares), so that
-    radians and metres compare; 0 for a parameter that moves none. Where the structure hides a
-    motion, its eigenvalue is near 0.
-    """
-    moves = (now.weight.unsqueeze(1) * (now.Ju.square() + now.Jv.square())).sum(-1).double()
-    unit = torch.where(moves > 1e-12, moves, torch.inf).rsqrt()
-    values, vectors = torch.linalg.eigh(unit.unsqueeze(-1) * now.normal * unit.unsqueeze(-2))
-    return unit, values, vectors, values > _LEAST_EIGENVALUE
