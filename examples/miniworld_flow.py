@@ -5,7 +5,7 @@
     python examples/miniworld_flow.py strip.png
 
 A box slides through a room. MiniWorld's conventions, as measured by warping frames in
-tests/examples/test_miniworld_flow.py:
+tests/examples/test_other_simulators.py:
 
 - depth is metres along the optical axis, from a 16-bit z-buffer: steps of 4 cm at 10 m;
 - y is up and an agent's `dir` is an angle about it; camera axes are OpenGL's;

@@ -1,4 +1,9 @@
-"""Cameras, rigid motions and the flow they cause, as pure batched functions on torch tensors."""
+"""Cameras, rigid motions and the flow they cause, as pure batched functions on torch tensors.
+
+`*B` is any leading batch; those of several arguments broadcast. Every function raises ValueError
+for a shape that does not fit and TypeError for an argument that holds no floats (or no integers,
+where ids are wanted), and names it.
+"""
 
 from flowrep.geometry.camera import (
     FovAxis,

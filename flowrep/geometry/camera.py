@@ -8,7 +8,13 @@ from typing import Literal, TypeAlias
 import torch
 from torch import Tensor
 
-from flowrep.geometry.checks import broadcast_batch, check_name, check_shape
+from flowrep.geometry.checks import (
+    broadcast_batch,
+    check_name,
+    check_shape,
+    first_wrong,
+    over_points,
+)
 
 FovAxis: TypeAlias = Literal["horizontal", "vertical"]
 
@@ -26,24 +32,13 @@ def project(points_cam: Tensor, K: Tensor) -> Tensor:
         points_cam: `[*B, ..., 3]`, metres, in the camera's frame.
         K: `[*B, 3, 3]`; its batch dims are the leading dims of `points_cam`.
 
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor.
-
     >>> K = torch.tensor([[100.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
     >>> project(torch.tensor([1.0, 2.0, 4.0]), K)
     tensor([57., 49.])
     """
     check_shape("points_cam", points_cam, (3,))
     check_shape("K", K, (3, 3))
-    point_dims = points_cam.ndim - 1 - (K.ndim - 2)
-    if point_dims < 0:
-        raise ValueError(
-            f"K has batch {list(K.shape[:-2])}, which points_cam {list(points_cam.shape)} lacks; "
-            "K's batch dims are the leading dims of points_cam"
-        )
-    broadcast_batch(K=K.shape[:-2], points_cam=points_cam.shape[: K.ndim - 2])
-    K = K.reshape(*K.shape[:-2], *[1] * point_dims, 3, 3)
+    K = over_points("K", K, "points_cam", points_cam)
     x, y, z = points_cam.unbind(-1)
     in_front = z > 0
     z = torch.where(in_front, z, 1.0)
@@ -66,10 +61,6 @@ def unproject(depth: Tensor, K: Tensor) -> Tensor:
     Args:
         depth: `[*B, 1, H, W]`, metres.
         K: `[*B, 3, 3]`, batch broadcastable with depth's.
-
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor.
 
     >>> K = torch.tensor([[2.0, 0.0, 1.0], [0.0, 4.0, 0.5], [0.0, 0.0, 1.0]])
     >>> unproject(torch.tensor([[[8.0, 8.0]]]), K)
@@ -153,10 +144,6 @@ def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
     Args:
         K_opencv: `[*B, 3, 3]`, in the convention of OpenCV's calibration and most data sets.
 
-    Raises:
-        ValueError: not `[*B, 3, 3]`.
-        TypeError: no float tensor.
-
     >>> intrinsics_from_opencv(torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 2.0], [0.0, 0.0, 1.0]]))
     tensor([[4.0000, 0.0000, 1.5000],
             [0.0000, 8.0000, 2.5000],
@@ -180,7 +167,6 @@ def check_intrinsics(name: str, K: Tensor) -> None:
     Raises:
         ValueError: for nan or inf, other rows, or a focal length that is not positive; names the
             index of the first such K in the batch.
-        TypeError: if it is not a float tensor.
 
     >>> check_intrinsics("K", torch.tensor([[4.0, 0.0, 0.0], [0.0, 8.0, 0.0], [1.5, 2.5, 1.0]]))
     Traceback (most recent call last):
@@ -195,10 +181,9 @@ def check_intrinsics(name: str, K: Tensor) -> None:
         & ((zeros_and_one - fixed).abs() <= 1e-6).all(-1)
     )
     if not bool(right.all()):
-        index = (~right).nonzero()[0].tolist()
-        where = f"{name}[{', '.join(map(str, index))}]" if index else name
+        where, index = first_wrong(name, ~right)
         raise ValueError(
             f"{where} should have the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, "
-            f"finite, fx and fy positive; got {K[tuple(index)].tolist()}. Pass K.T if it is "
+            f"finite, fx and fy positive; got {K[index].tolist()}. Pass K.T if it is "
             "transposed"
         )

@@ -8,42 +8,28 @@ import torch
 from torch import Tensor
 
 
-def check_shape(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> None:
-    """Checks that `tensor` holds floats and its last dims are `trailing`.
+def check_shape(
+    name: str, tensor: Tensor, trailing: tuple[int | str, ...], *, ids: bool = False
+) -> None:
+    """Checks that `tensor` holds floats (integers if `ids`) and that its last dims are `trailing`.
 
-    Args:
-        name: the argument's name, for the message.
-        tensor: the argument.
-        trailing: sizes of the last dims; a string is the name of a dim of any size.
-
-    Raises:
-        ValueError: if the number or a size of the trailing dims differs.
-        TypeError: if it is not a float tensor.
+    Of those, a string is the name of a dim of any size. Raises TypeError or ValueError.
     """
-    check_is_tensor(name, tensor)
-    if not tensor.is_floating_point():
-        raise TypeError(
-            f"{name} must be floating point (metres, pixels), got {tensor.dtype}; "
-            "convert it first, e.g. millimetres with `depth.float() / 1000`"
-        )
-    check_trailing(name, tensor, trailing)
-
-
-def check_is_tensor(name: str, tensor: object) -> None:
-    """Raises TypeError if `tensor` is not a torch tensor."""
     if not isinstance(tensor, Tensor):
         raise TypeError(
             f"{name} must be a torch.Tensor, got {type(tensor).__name__}; "
             "wrap it with torch.as_tensor"
         )
-
-
-def check_trailing(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -> None:
-    """Raises ValueError if the last dims of `tensor` are not `trailing`."""
-    wanted_dims = len(trailing)
-    fits = tensor.ndim >= wanted_dims and all(
+    if ids and (tensor.is_floating_point() or tensor.is_complex() or tensor.dtype is torch.bool):
+        raise TypeError(f"{name} must hold integer ids, got {tensor.dtype}")
+    if not ids and not tensor.is_floating_point():
+        raise TypeError(
+            f"{name} must be floating point (metres, pixels), got {tensor.dtype}; "
+            "convert it first, e.g. millimetres with `depth.float() / 1000`"
+        )
+    fits = tensor.ndim >= len(trailing) and all(
         isinstance(want, str) or got == want
-        for got, want in zip(tensor.shape[tensor.ndim - wanted_dims :], trailing)
+        for got, want in zip(tensor.shape[tensor.ndim - len(trailing) :], trailing)
     )
     if not fits:
         wanted = ", ".join(["*B", *(str(size) for size in trailing)])
@@ -51,11 +37,7 @@ def check_trailing(name: str, tensor: Tensor, trailing: tuple[int | str, ...]) -
 
 
 def broadcast_batch(**batches: torch.Size) -> torch.Size:
-    """Returns the common leading batch of several arguments.
-
-    Raises:
-        ValueError: if they do not broadcast; lists the batch of each argument.
-    """
+    """Returns the common leading batch of several arguments; ValueError lists each one's."""
     try:
         return torch.broadcast_shapes(*batches.values())
     except RuntimeError as error:
@@ -63,6 +45,25 @@ def broadcast_batch(**batches: torch.Size) -> torch.Size:
         raise ValueError(
             f"leading batch dims do not broadcast: {listing}; give each the same batch, or none"
         ) from error
+
+
+def over_points(name: str, matrix: Tensor, points_name: str, points: Tensor) -> Tensor:
+    """Returns matrices `[*B, r, c]` that broadcast with points `[*B, ..., 3]`."""
+    batch = matrix.shape[:-2]
+    point_dims = points.ndim - 1 - len(batch)
+    if point_dims < 0:
+        raise ValueError(
+            f"{name} has batch {list(batch)}, which {points_name} {list(points.shape)} lacks; "
+            f"its batch dims are the leading dims of {points_name}"
+        )
+    broadcast_batch(**{name: batch, points_name: points.shape[: len(batch)]})
+    return matrix.reshape(*batch, *[1] * point_dims, *matrix.shape[-2:])
+
+
+def first_wrong(name: str, wrong: Tensor) -> tuple[str, tuple[int, ...]]:
+    """Returns the name and the index of the first item of a batch that is wrong."""
+    index = wrong.nonzero()[0].tolist()
+    return (f"{name}[{', '.join(map(str, index))}]" if index else name), tuple(index)
 
 
 def check_name(option: str, name: object, names: Any) -> None:

@@ -42,9 +42,8 @@ def adapt_depth(
         nothing: a value, before scaling, that means no measurement; it becomes nan.
 
     Raises:
-        ValueError: an unknown kind, a shape that does not fit, or an argument that the kind needs
-            and lacks or does not use.
-        TypeError: no float tensor, without `scale_m`.
+        ValueError: an unknown kind, or an argument that it needs and lacks or does not use.
+        TypeError: whole numbers without `scale_m`.
 
     >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
     tensor([[[1., 2., inf]]])
@@ -59,12 +58,9 @@ def adapt_depth(
     if unmeasured is not None:
         depth = torch.where(unmeasured, torch.nan, depth)
     check_shape("depth", depth, (1, "H", "W"))
-    if kind == "ray_length":
-        assert K is not None
+    if K is not None:
         return z_from_ray_length(depth, K)
-    if kind == "z_buffer":
-        assert near_m is not None
-        assert far_m is not None
+    if near_m is not None and far_m is not None:
         return z_from_z_buffer(depth, near_m=near_m, far_m=far_m)
     return depth
 
@@ -75,10 +71,6 @@ def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
     Args:
         ray_length: `[*B, 1, H, W]`, metres from the camera's centre.
         K: `[*B, 3, 3]`, pixels.
-
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor.
 
     >>> K = torch.tensor([[4.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]])
     >>> z_from_ray_length(torch.full((1, 1, 1), 5.0), K)  # it looks along (0.75, 0, 1)
@@ -104,8 +96,7 @@ def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
         far_m: the far plane, metres; may be inf.
 
     Raises:
-        ValueError: a shape does not fit, or not 0 < near_m < far_m.
-        TypeError: no float tensor.
+        ValueError: not 0 < near_m < far_m.
 
     >>> z_from_z_buffer(torch.tensor([[[0.5]]]), near_m=0.5, far_m=torch.inf)
     tensor([[[1.]]])

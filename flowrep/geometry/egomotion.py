@@ -121,10 +121,6 @@ def camera_motion(
         picture: the current picture `[*B, C, H, W]`, 0 to 255; give it if flow is estimated.
         prior: the motion expected `[*B, 4, 4]`, the last one or odometry's; identity by default.
 
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor (`picture` may be uint8).
-
     >>> from flowrep.geometry import ego_flow
     >>> K = torch.tensor([[40.0, 0.0, 10.0], [0.0, 50.0, 8.0], [0.0, 0.0, 1.0]])
     >>> depth = torch.linspace(2.0, 9.0, 320).reshape(1, 16, 20)

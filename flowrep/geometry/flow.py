@@ -15,14 +15,7 @@ from torch.autograd import forward_ad
 
 from flowrep.geometry import closed_form
 from flowrep.geometry.camera import centred_pixels
-from flowrep.geometry.checks import (
-    broadcast_batch,
-    check_is_tensor,
-    check_name,
-    check_rows,
-    check_shape,
-    check_trailing,
-)
+from flowrep.geometry.checks import broadcast_batch, check_name, check_rows, check_shape
 from flowrep.geometry.closed_form import Planes, flow_planes, known_camera, motion_coefficients
 from flowrep.jit import numba_is_installed
 
@@ -74,10 +67,6 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
             into the previous camera's.
         dt: time between the frames, a number or `[*B]`; 1 gives px/step, seconds give px/s.
 
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor.
-
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> prev_from_curr = torch.eye(4)
     >>> prev_from_curr[0, 3] = 0.5  # the camera moved half a metre to the right
@@ -86,9 +75,7 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
     (tensor([[-0.5000, -0.5000]]), tensor([[True, True]]))
     """
     batch = _check(depth, K, prev_from_curr, dt)
-    dtypes = _dtypes(depth, K, prev_from_curr)
-    depth = depth.expand(*batch, -1, -1, -1)
-    u, v, valid = _camera_planes(depth, K, prev_from_curr, dt, dtypes)
+    u, v, valid = _planes(batch, depth, None, K, prev_from_curr.unsqueeze(-3), dt)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
@@ -109,15 +96,11 @@ def rigid_flow(
     known makes only the pixels of its instance invalid.
 
     Args:
-        depth: `[*B, 1, H, W]`, metres along the optical axis.
+        depth: see `ego_flow`, as for `K` and `dt`.
         instance: `[*B, 1, H, W]`, integers in [0, N), 0 for the static world.
-        K: `[*B, 3, 3]`.
         prev_from_curr_by_instance: `[*B, N, 4, 4]`.
-        dt: time between the frames, a number or `[*B]`.
 
     Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor, or `instance` is not an integer tensor.
         RuntimeError: an id in `instance` without a row.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
@@ -128,17 +111,10 @@ def rigid_flow(
     tensor([[2., 2.]])
     """
     motions = prev_from_curr_by_instance
-    check_is_tensor("instance", instance)
-    if instance.is_floating_point() or instance.is_complex() or instance.dtype == torch.bool:
-        raise TypeError(f"instance must hold integer ids, got {instance.dtype}")
-    check_trailing("instance", instance, (1, "H", "W"))
+    check_shape("instance", instance, (1, "H", "W"), ids=True)
     check_shape("prev_from_curr_by_instance", motions, ("N", 4, 4))
-    batch = _check(depth, K, motions[..., 0, :, :], dt)
-    _check_same_size("instance", instance, depth)
-    batch = broadcast_batch(others=batch, instance=instance.shape[:-3])
-    dtypes = _dtypes(depth, K, motions)
-    depth, instance = (image.expand(*batch, -1, -1, -1) for image in (depth, instance))
-    u, v, valid = _body_planes(depth, instance, K, motions, dt, dtypes)
+    batch = _check(depth, K, motions[..., 0, :, :], dt, instance=instance)
+    u, v, valid = _planes(batch, depth, instance, K, motions, dt)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
@@ -162,14 +138,8 @@ def factorize(
     Args:
         raw: `[*B, 2, H, W]`, pixels per dt, nan where it isn't known; or what `rigid_flow` returns,
             which says so with a mask (its flow alone, 0 there, would count as measured).
-        depth: `[*B, 1, H, W]`, metres along the optical axis.
-        K: `[*B, 3, 3]`.
-        prev_from_curr: `[*B, 4, 4]`.
-        dt: time between the frames, a number or `[*B]`; the unit of `raw` must agree.
-
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor.
+        depth: see `ego_flow`, as for `K` and `prev_from_curr`.
+        dt: see `ego_flow`; the unit of `raw` must agree.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> prev_from_curr = torch.eye(4)
@@ -184,14 +154,10 @@ def factorize(
         # Viewed as bytes, as inductor's CPU code fails to compile a `where` on a bool view.
         raw = torch.where(raw.valid.view(torch.uint8) != 0, raw.flow, math.nan)
     check_shape("raw", raw, (2, "H", "W"))
-    batch = _check(depth, K, prev_from_curr, dt)
-    _check_same_size("raw", raw, depth)
-    batch = broadcast_batch(others=batch, raw=raw.shape[:-3])
+    batch = _check(depth, K, prev_from_curr, dt, raw=raw)
     # Ego flow is rounded regardless of raw's dtype, so that static pixels have exactly 0 obj.
-    own, compute = _dtypes(depth, K, prev_from_curr)
-    dtype = torch.promote_types(own, raw.dtype)
-    depth = depth.expand(*batch, -1, -1, -1)
-    u, v, valid = _camera_planes(depth, K, prev_from_curr, dt, (own, compute))
+    u, v, valid = _planes(batch, depth, None, K, prev_from_curr.unsqueeze(-3), dt)
+    dtype, compute = torch.promote_types(u.dtype, raw.dtype), _computed_in(u.dtype)
     raw = raw.to(dtype).expand(*batch, -1, -1, -1)
     if _suits_numba(depth, u, v, raw):
         from flowrep.geometry import numba_flow  # needs numba
@@ -235,8 +201,7 @@ def adapt_flow(
         channels: `"uv"` (column first) or `"row_column"`.
 
     Raises:
-        ValueError: an unknown name, a shape that does not fit, or flow on the previous grid.
-        TypeError: no float tensor.
+        ValueError: an unknown name, or flow on the previous grid.
 
     >>> flow = torch.tensor([3.0, -2.0]).reshape(2, 1, 1)  # 3 rows up, 2 columns right it was
     >>> adapt_flow(flow, direction="backward", grid="current", channels="row_column").flatten()
@@ -264,12 +229,21 @@ def check_flow_options(direction: str, grid: str, channels: str) -> None:
         )
 
 
-def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torch.Size:
+def _check(
+    depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor, **image: Tensor
+) -> torch.Size:
     """Checks the arguments' shapes and returns their common leading batch."""
     check_shape("depth", depth, (1, "H", "W"))
     check_shape("K", K, (3, 3))
     check_shape("prev_from_curr", motion, (4, 4))
     batches = {"depth": depth.shape[:-3], "K": K.shape[:-2], "prev_from_curr": motion.shape[:-2]}
+    for name, other in image.items():
+        batches[name] = other.shape[:-3]
+        if other.shape[-2:] != depth.shape[-2:]:
+            raise ValueError(
+                f"{name} and depth must have one (height, width), "
+                f"got {list(other.shape[-2:])} and {list(depth.shape[-2:])}"
+            )
     if isinstance(dt, Tensor):
         batches["dt"] = dt.shape
     elif not closed_form.SMALLEST <= dt < math.inf:
@@ -280,95 +254,63 @@ def _check(depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor) -> torc
     return broadcast_batch(**batches)
 
 
-def _check_same_size(name: str, image: Tensor, depth: Tensor) -> None:
-    """Raises ValueError if an image and depth differ in height or width."""
-    if image.shape[-2:] != depth.shape[-2:]:
-        raise ValueError(
-            f"{name} and depth must have one (height, width), "
-            f"got {list(image.shape[-2:])} and {list(depth.shape[-2:])}"
-        )
+def _computed_in(dtype: torch.dtype) -> torch.dtype:
+    return torch.promote_types(dtype, torch.float32)
 
 
-def _dtypes(*tensors: Tensor) -> tuple[torch.dtype, torch.dtype]:
-    """Returns the dtypes of the result (the widest) and of the computation (at least float32)."""
-    dtype = tensors[0].dtype
-    for tensor in tensors[1:]:
-        dtype = torch.promote_types(dtype, tensor.dtype)
-    return dtype, torch.promote_types(dtype, torch.float32)
-
-
-def _camera_planes(
+def _planes(
+    batch: torch.Size,
     depth: Tensor,
+    instance: Tensor | None,
     K: Tensor,
-    prev_from_curr: Tensor,
+    motions: Tensor,
     dt: float | Tensor,
-    dtypes: tuple[torch.dtype, torch.dtype],
 ) -> Planes:
-    """Returns the flow planes of one motion for the whole image.
+    """Returns the flow planes of a motion per instance, `[*B, N, 4, 4]`; without ids, of the first.
 
-    `dtypes` are those of the result and of the computation.
+    Their type is the widest of the arguments'.
     """
-    dtype, compute = dtypes
+    height, width = depth.shape[-2:]
+    dtype = torch.promote_types(torch.promote_types(depth.dtype, K.dtype), motions.dtype)
+    compute = _computed_in(dtype)
     K, dt, known = known_camera(K.to(compute), dt)
-    coefficients = motion_coefficients(K, prev_from_curr.to(compute), known)
-    x, y = centred_pixels(depth.shape[-2], depth.shape[-1], K)
-    if _suits_numba(depth, coefficients, x, dt):
+    motions = motions.to(compute)
+    by_motion = motion_coefficients(K.unsqueeze(-3), motions, known.unsqueeze(-1))  # [*B, N, 12]
+    x, y = centred_pixels(height, width, K)
+    depth = depth.squeeze(-3).expand(*batch, -1, -1)
+    if instance is not None:
+        instance = instance.squeeze(-3).expand(*batch, -1, -1)
+    if _suits_numba(depth, by_motion, x, dt):
         from flowrep.geometry import numba_flow  # needs numba
 
-        motions = coefficients.unsqueeze(-2)
-        return numba_flow.planes_of_motions(depth.squeeze(-3), None, motions, x, y, dt)
-    by_motion = coefficients[..., None, None, :]  # [*B, 1, 1, 12]
-    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = by_motion.unbind(-1)
-    # A x~ is the sum of a term per column and one per row, tabulated to save work per pixel.
-    x, *columns = _table(x, axx * x, ayx * x, azx * x)
-    y, *rows = _table(y, axy * y + ax, ayy * y + ay, azy * y + az)
+        return numba_flow.planes_of_motions(depth, instance, by_motion, x, y, dt)
+    if instance is None:
+        coefficients = by_motion.unsqueeze(-2).unbind(-1)  # [*B, 1, 1] each
+    else:
+        coefficients = _of_pixels(by_motion, instance)
+    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = coefficients
+    # A x~ is the sum of a term per column and one per row.
+    columns, rows = (axx * x, ayx * x, azx * x), (axy * y + ax, ayy * y + ay, azy * y + az)
+    if instance is None:  # tabulated, to save work per pixel
+        x, *columns = _table(x, *columns)
+        y, *rows = _table(y, *rows)
     q_far = [column + row for column, row in zip(columns, rows)]
     if isinstance(dt, Tensor):
         dt = dt[..., None, None]
-    return flow_planes(depth.squeeze(-3), x, y, q_far, e, dt, dtype)
+    return flow_planes(depth, x, y, q_far, e, dt, dtype)
 
 
-def _body_planes(
-    depth: Tensor,
-    instance: Tensor,
-    K: Tensor,
-    prev_from_curr_by_instance: Tensor,
-    dt: float | Tensor,
-    dtypes: tuple[torch.dtype, torch.dtype],
-) -> Planes:
-    """Returns the flow planes of one motion per instance; `depth` and `instance` share a batch.
-
-    Raises:
-        RuntimeError: an id without a motion.
-    """
-    dtype, compute = dtypes
-    *batch, _, height, width = depth.shape
-    K, dt, known = known_camera(K.to(compute), dt)
-    motions = prev_from_curr_by_instance.to(compute)
-    by_instance = motion_coefficients(K.unsqueeze(-3), motions, known.unsqueeze(-1))  # [*B, N, 12]
-    x, y = centred_pixels(height, width, K)
-    if _suits_numba(depth, by_instance, x, dt):
-        from flowrep.geometry import numba_flow  # needs numba
-
-        maps = depth.squeeze(-3), instance.squeeze(-3)
-        return numba_flow.planes_of_motions(*maps, by_instance, x, y, dt)
-    row_of_pixel = instance.long().flatten(-3)  # [*B, H * W]
+def _of_pixels(by_motion: Tensor, instance: Tensor) -> list[Tensor]:
+    """Returns the twelve coefficients `[*B, H, W]` of each pixel's motion."""
+    row_of_pixel = instance.long().flatten(-2)
     try:
-        axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = (
-            rows.expand(*batch, -1).gather(-1, row_of_pixel).unflatten(-1, (height, width))
-            for rows in by_instance.unbind(-1)
-        )
+        return [
+            rows.expand(*instance.shape[:-2], -1).gather(-1, row_of_pixel).view(instance.shape)
+            for rows in by_motion.unbind(-1)
+        ]
     except RuntimeError:
-        check_rows(int(instance.min()), int(instance.max()), by_instance.shape[-2])
+        check_rows(int(instance.min()), int(instance.max()), by_motion.shape[-2])
         raise
-    q_far = [
-        axx * x + (axy * y + ax),
-        ayx * x + (ayy * y + ay),
-        azx * x + (azy * y + az),
-    ]
-    if isinstance(dt, Tensor):
-        dt = dt[..., None, None]
-    return flow_planes(depth.squeeze(-3), x, y, q_far, e, dt, dtype)
 
 
 def _table(*entries: Tensor) -> tuple[Tensor, ...]:

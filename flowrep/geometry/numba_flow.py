@@ -43,9 +43,6 @@ def planes_of_motions(
         x: pixel centres relative to the principal point, `[*B, 1, W]`.
         y: the same, `[*B, H, 1]`.
         dt: time between the frames, a number or `[*B]`.
-
-    Raises:
-        RuntimeError: an id without a motion.
     """
     *batch, height, width = depth.shape
     maps, motions = math.prod(batch), coefficients.shape[-2]

@@ -11,7 +11,13 @@ from typing import Literal, TypeAlias
 import torch
 from torch import Tensor
 
-from flowrep.geometry.checks import broadcast_batch, check_is_tensor, check_name, check_shape
+from flowrep.geometry.checks import (
+    broadcast_batch,
+    check_name,
+    check_shape,
+    first_wrong,
+    over_points,
+)
 
 PoseLayout: TypeAlias = Literal[
     "matrix", "matrix_3x4", "xyz_xyzw", "xyz_wxyz", "xyz_yaw", "xyz_yaw_pitch"
@@ -19,12 +25,12 @@ PoseLayout: TypeAlias = Literal[
 PoseDirection: TypeAlias = Literal["camera_to_world", "world_to_camera"]
 CameraAxes: TypeAlias = Literal["opencv", "opengl", "ned", "x_forward_z_up"]
 
-# The columns are OpenCV's right, down and forward, expressed in the other convention.
-_GIVEN_FROM_OPENCV: dict[str, list[list[float]]] = {
-    "opencv": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "opengl": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],  # x right, y up, z backward
-    "ned": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],  # x forward, y right, z down
-    "x_forward_z_up": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],  # x forward, y left, z up
+# OpenCV's right, down and forward as (axis, sign) of the other convention.
+_OPENCV_AXES = {
+    "opencv": ((0, 1), (1, 1), (2, 1)),
+    "opengl": ((0, 1), (1, -1), (2, -1)),  # x right, y up, z backward
+    "ned": ((1, 1), (2, 1), (0, 1)),  # x forward, y right, z down
+    "x_forward_z_up": ((1, -1), (2, -1), (0, 1)),  # x forward, y left, z up
 }
 
 
@@ -33,10 +39,6 @@ def invert_rigid(a_from_b: Tensor) -> Tensor:
 
     Args:
         a_from_b: `[*B, 4, 4]`, a rotation and a translation (no scale, no shear).
-
-    Raises:
-        ValueError: not `[*B, 4, 4]`.
-        TypeError: no float tensor.
 
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
@@ -62,10 +64,6 @@ def relative_motion(
         world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world).
         world_from_curr: `[*B, 4, 4]`, pose of the current camera.
         dtype: of the result.
-
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor.
 
     >>> prev, curr = torch.eye(4), torch.eye(4)
     >>> curr[2, 3] = 0.5  # half a metre forward along the camera's z
@@ -112,10 +110,6 @@ def instance_motion(
         world_from_curr_body: `[*B, N, 4, 4]`, poses of the same bodies, in the same order, now.
         dtype: of the result.
 
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor.
-
     >>> camera, before, now = torch.eye(4), torch.eye(4), torch.eye(4)
     >>> now[0, 3] = 0.5  # the body moved half a metre along x
     >>> instance_motion(camera, camera, before[None], now[None])[:, 0, 3]
@@ -152,18 +146,12 @@ def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
         ids: integers of any shape, as the simulator renders them.
         body_ids: `[N]`, integers, in the order of the bodies' poses.
 
-    Raises:
-        ValueError: `body_ids` is not `[N]`.
-        TypeError: not integers.
-
     >>> ids = torch.tensor([[[0, 17, 3, -1, 18]]])
     >>> instance_rows(ids, torch.tensor([17, 3]))
     tensor([[[0, 1, 2, 0, 0]]], dtype=torch.uint8)
     """
-    for name, value in {"ids": ids, "body_ids": body_ids}.items():
-        check_is_tensor(name, value)
-        if value.is_floating_point() or value.is_complex() or value.dtype is torch.bool:
-            raise TypeError(f"{name} must hold integer ids, got {value.dtype}")
+    check_shape("ids", ids, (), ids=True)
+    check_shape("body_ids", body_ids, (), ids=True)
     if body_ids.ndim != 1:
         raise ValueError(f"body_ids must be [N], got {list(body_ids.shape)}")
     count = len(body_ids)
@@ -190,7 +178,6 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
     Raises:
         ValueError: for nan or inf, a last row other than (0, 0, 0, 1), scale or shear, or a
             left-handed frame; names the index of the first such transform in the batch.
-        TypeError: if it is not a float tensor.
 
     >>> check_rigid("pose", torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])))
     Traceback (most recent call last):
@@ -211,10 +198,8 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
     }
     for complaint, wrong in complaints.items():
         if bool(wrong.any()):
-            index = wrong.nonzero()[0].tolist()
-            where = f"{name}[{', '.join(map(str, index))}]" if index else name
-            shown = a_from_b[tuple(index)].tolist()
-            raise ValueError(f"{where} {complaint}; got {shown}")
+            where, index = first_wrong(name, wrong)
+            raise ValueError(f"{where} {complaint}; got {a_from_b[index].tolist()}")
 
 
 def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
@@ -224,10 +209,6 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
         a_from_b: `[*B, 4, 4]`; its batch dims are the leading dims of `points_b`.
         points_b: `[*B, ..., 3]`, in frame b.
 
-    Raises:
-        ValueError: a shape does not fit.
-        TypeError: an argument is not a float tensor.
-
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
     >>> transform_points(a_from_b, torch.tensor([[10.0, 10.0, 10.0]]))
@@ -235,15 +216,8 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
     """
     check_shape("a_from_b", a_from_b, (4, 4))
     check_shape("points_b", points_b, (3,))
-    point_dims = points_b.ndim - 1 - (a_from_b.ndim - 2)
-    if point_dims < 0:
-        raise ValueError(
-            f"a_from_b has batch {list(a_from_b.shape[:-2])}, which points_b "
-            f"{list(points_b.shape)} lacks; its batch dims are the leading dims of points_b"
-        )
-    broadcast_batch(a_from_b=a_from_b.shape[:-2], points_b=points_b.shape[: a_from_b.ndim - 2])
     dtype = torch.promote_types(a_from_b.dtype, points_b.dtype)
-    a_from_b = a_from_b.to(dtype).reshape(*a_from_b.shape[:-2], *[1] * point_dims, 4, 4)
+    a_from_b = over_points("a_from_b", a_from_b, "points_b", points_b).to(dtype)
     rotated = (a_from_b[..., :3, :3] @ points_b.to(dtype).unsqueeze(-1)).squeeze(-1)
     return rotated + a_from_b[..., :3, 3]
 
@@ -294,8 +268,7 @@ def adapt_pose(
         check: whether an ill-formed pose raises ValueError. The check waits for a GPU.
 
     Raises:
-        ValueError: an unknown name, a shape that does not fit, a pose that is not rigid.
-        TypeError: no float tensor.
+        ValueError: an unknown name, or a pose that is not rigid.
 
     >>> pose = torch.tensor([5.0, 6.0, 7.0, 0.0, 0.0, 0.0, 1.0])
     >>> world_from_cam = adapt_pose(pose, layout="xyz_xyzw", axes="x_forward_z_up")
@@ -309,8 +282,7 @@ def adapt_pose(
         matrix = pose.double()
     elif layout == "matrix_3x4":
         check_shape("pose", pose, (3, 4))
-        pose = torch.nn.functional.pad(pose.double(), (0, 0, 0, 1))
-        matrix = pose + torch.nn.functional.pad(torch.ones_like(pose[..., :1, :1]), (3, 0, 3, 0))
+        matrix = _with_last_row(pose.double())
     elif layout.startswith("xyz_yaw"):
         matrix = _pose_from_angles(pose, has_pitch=layout == "xyz_yaw_pitch")
     else:
@@ -319,10 +291,10 @@ def adapt_pose(
         check_rigid("pose", matrix)
     if direction == "world_to_camera":
         matrix = invert_rigid(matrix)
-    rotation, rest = matrix[..., :3], matrix[..., 3:]
     # Each column is a given one or its opposite. They are picked, as a product would round and
     # constants created here would be copied to a GPU in every call.
-    return torch.cat([*_columns(rotation, axes), rest], -1)
+    columns = [sign * matrix[..., axis : axis + 1] for axis, sign in _OPENCV_AXES[axes]]
+    return torch.cat([*columns, matrix[..., 3:]], -1)
 
 
 def check_pose_options(layout: str, axes: str) -> None:
@@ -342,25 +314,19 @@ def _pose_from_angles(pose: Tensor, has_pitch: bool) -> Tensor:
     x, y, z, yaw, *rest = pose.double().unbind(-1)
     pitch = rest[0] if rest else torch.zeros_like(yaw)
     cos, sin, up, ahead = yaw.cos(), yaw.sin(), pitch.sin(), pitch.cos()
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
     rows = [
-        [cos * ahead, -sin, -cos * up, x],
-        [sin * ahead, cos, -sin * up, y],
-        [up, zero, ahead, z],
-        [zero, zero, zero, one],
+        *(cos * ahead, -sin, -cos * up, x),
+        *(sin * ahead, cos, -sin * up, y),
+        *(up, torch.zeros_like(yaw), ahead, z),
     ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return _with_last_row(torch.stack(rows, -1).unflatten(-1, (3, 4)))
 
 
-def _columns(rotation: Tensor, axes: CameraAxes) -> list[Tensor]:
-    """Returns the columns of `world_from_given @ given_from_opencv`."""
-    columns = []
-    for opencv_axis in range(3):
-        signs = [row[opencv_axis] for row in _GIVEN_FROM_OPENCV[axes]]
-        given_axis = next(i for i, sign in enumerate(signs) if sign)
-        column = rotation[..., given_axis : given_axis + 1]
-        columns.append(column if signs[given_axis] > 0 else -column)
-    return columns
+def _with_last_row(pose: Tensor) -> Tensor:
+    """Returns `[*B, 4, 4]` from `[*B, 3, 4]`."""
+    last = torch.zeros_like(pose[..., :1, :])
+    last[..., 3] = 1.0
+    return torch.cat([pose, last], -2)
 
 
 def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True) -> Tensor:
@@ -373,8 +339,7 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
             normalised away in either case.
 
     Raises:
-        ValueError: not `[*B, 7]`, or a quaternion that is not of unit length.
-        TypeError: no float tensor.
+        ValueError: a quaternion that is not of unit length.
 
     >>> half_turn_about_z = torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0])
     >>> pose_from_quaternion(half_turn_about_z, "xyz_xyzw")[0]
@@ -394,11 +359,9 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
     else:
         x, y, z, w = quaternion.unbind(-1)
     tx, ty, tz = translation.unbind(-1)
-    zero, one = torch.zeros_like(w), torch.ones_like(w)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), ty),
         *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), tz),
-        *(zero, zero, zero, one),
     ]
-    return torch.stack(rows, -1).unflatten(-1, (4, 4))
+    return _with_last_row(torch.stack(rows, -1).unflatten(-1, (3, 4)))

@@ -39,6 +39,18 @@ def depth_map(*batch: int, seed: int = 0) -> Tensor:
     return 2 + 18 * torch.rand(shape, generator=generator, dtype=torch.float64)
 
 
+def instance_map(*batch: int, count: int = 3, dtype=torch.uint8) -> Tensor:
+    """Returns ids from 0 to `count` - 1, `[*B, 1, 5, 7]`."""
+    generator = torch.Generator().manual_seed(4)
+    return torch.randint(count, (*batch, 1, HEIGHT, WIDTH), generator=generator).to(dtype)
+
+
+def raw_flow(*batch: int) -> Tensor:
+    """Returns flow of some pixels, `[*B, 2, 5, 7]`, float64."""
+    generator = torch.Generator().manual_seed(6)
+    return 5 * torch.randn((*batch, 2, HEIGHT, WIDTH), generator=generator, dtype=torch.float64)
+
+
 def flow_by_points(depth: Tensor, K: Tensor, prev_from_curr: Tensor) -> Tensor:
     """Returns ego flow by way of a point cloud: unproject, move, project, subtract (unbatched)."""
     points = transform_points(prev_from_curr, unproject(depth, K))

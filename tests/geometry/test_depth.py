@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import torch
 
 from flowrep.geometry import (
@@ -58,32 +57,7 @@ def test_a_z_buffer_without_far_plane():
     assert z.item() == 2.0
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (
-            {"kind": "zbuffer"},
-            r"\['z', 'ray_length', 'z_buffer'\], got 'zbuffer'",
-        ),
-        ({"kind": "ray_length"}, "'ray_length' needs K"),
-        ({"kind": "z", "K": CAMERA}, "the other kinds do not read it; kind is 'z'"),
-        ({"kind": "z_buffer", "near_m": 1.0}, "needs near_m and far_m.*far_m=None"),
-        ({"kind": "z", "far_m": 1.0}, "do not read them; kind is 'z'"),
-        ({"kind": "z_buffer", "near_m": 2.0, "far_m": 1.0}, "0 < near_m < far_m"),
-        ({"kind": "z_buffer", "near_m": 0.0, "far_m": 1.0}, "0 < near_m < far_m"),
-    ],
-)
-def test_depth_options_are_checked(options, expected):
-    with pytest.raises(ValueError, match=expected):
-        adapt_depth(depth_of(0.5), **options)
-
-
 def test_whole_numbers_become_metres_and_nothing_becomes_nan():
     millimetres = torch.tensor([[[0, 2500, 31000]]], dtype=torch.int16)
     z = adapt_depth(millimetres, "z", scale_m=1e-3, nothing=0)
     torch.testing.assert_close(z, torch.tensor([[[torch.nan, 2.5, 31.0]]]), equal_nan=True)
-    with pytest.raises(TypeError, match="depth"):  # 2500 m, if it were taken as it is
-        adapt_depth(millimetres, "z")
-    for wrong in (0.0, -1.0, torch.inf):
-        with pytest.raises(ValueError, match="scale_m"):
-            adapt_depth(millimetres, "z", scale_m=wrong)

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from itertools import product
 
 import pytest
 import torch
 
 from flowrep.geometry import (
-    adapt_depth,
     adapt_flow,
-    adapt_pose,
     ego_flow,
     factorize,
     rigid_flow,
 )
-from flowrep.geometry.depth import z_from_z_buffer
 from tests.geometry.scenes import (
     HEIGHT,
     MOTION,
@@ -26,6 +22,8 @@ from tests.geometry.scenes import (
     K,
     depth_map,
     flow_by_points,
+    instance_map,
+    raw_flow,
     rigid,
 )
 
@@ -102,18 +100,6 @@ def test_depth_that_is_no_depth_is_invalid(depth_m):
     assert flow[:, 0, 1].abs().min() > 0
 
 
-def test_points_that_were_behind_the_previous_camera_are_invalid():
-    # The camera backed off by 2 m: what is now 1 m or 2 m ahead was behind it or level with it.
-    flow, valid = ego_flow(torch.tensor([[[1.0, 2.0, 3.0]]]), camera(), moved(z=-2.0))
-    assert valid.tolist() == [[[False, False, True]]]
-    assert flow[..., :2].abs().max() == 0  # unmasked, the first would be mirrored, the second inf
-
-
-def test_rotation_turns_a_far_pixel_out_of_the_previous_view():
-    about_face = rigid((0.0, math.pi, 0.0), (0.0, 0.0, 0.0)).float()
-    assert not ego_flow(torch.tensor([[[INF, 5.0]]]), camera(), about_face).valid.any()
-
-
 def test_still_camera_sees_exactly_no_flow():
     depth = depth_map().float()
     depth[..., 0, 0] = INF
@@ -157,34 +143,6 @@ def test_inputs_stay_as_they_were():
     ego_flow(*given)
     for tensor, copy in zip(given, before):
         torch.testing.assert_close(tensor, copy, rtol=0, atol=0, equal_nan=True)
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda d, m: ego_flow(d[0], K, m), ValueError, r"depth must be \[\*B, 1, H, W\]"),
-        (lambda d, m: ego_flow(d.expand(2, -1, -1), K, m), ValueError, r"depth .* got \[2, 5, 7\]"),
-        (lambda d, m: ego_flow(d, K[:2], m), ValueError, r"K must be \[\*B, 3, 3\], got \[2, 3\]"),
-        (lambda d, m: ego_flow(d, K, m[:3]), ValueError, r"prev_from_curr must be \[\*B, 4, 4\]"),
-        (lambda d, m: ego_flow(d, K, m.numpy()), TypeError, "prev_from_curr must be a torch.Tens"),
-        (lambda d, m: ego_flow(d.int(), K, m), TypeError, "depth must be floating point"),
-        (
-            lambda d, m: ego_flow(d.expand(2, 1, 5, 7), K, m.expand(3, 4, 4)),
-            ValueError,
-            r"do not broadcast: depth \[2\], K \[\], prev_from_curr \[3\]",
-        ),
-        (lambda d, m: ego_flow(d, K, m, dt=0), ValueError, "dt must be positive .* got 0"),
-        (lambda d, m: ego_flow(d, K, m, dt=-1.0), ValueError, r"dt must be positive .* got -1\.0"),
-    ],
-)
-def test_mistakes_with_ego_flow_are_named(call, error, message):
-    with pytest.raises(error, match=message):
-        call(depth_map(), MOTION)
-
-
-def instance_map(*batch: int, count: int = 3, dtype=torch.uint8) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(4)
-    return torch.randint(count, (*batch, 1, HEIGHT, WIDTH), generator=generator).to(dtype)
 
 
 MOTIONS = torch.stack([MOTION, OTHER_MOTION, rigid((0.1, 0.0, 0.2), (1.0, 2.0, 0.5))])
@@ -241,40 +199,7 @@ def test_an_id_without_a_row_is_refused(id_, held):
         rigid_flow(depth_map(2), instance, K, MOTIONS)
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda d, i: rigid_flow(d, i.float(), K, MOTIONS), TypeError, "instance must hold integ"),
-        (lambda d, i: rigid_flow(d, i == 0, K, MOTIONS), TypeError, "integer ids, got torch.bool"),
-        (lambda d, i: rigid_flow(d, i[0], K, MOTIONS), ValueError, r"instance must be \[\*B, 1, H"),
-        (
-            lambda d, i: rigid_flow(d, i.mT, K, MOTIONS),
-            ValueError,
-            r"instance and depth must have one \(height, width\), got \[7, 5\] and \[5, 7\]",
-        ),
-        (
-            lambda d, i: rigid_flow(d, i, K, MOTION),
-            ValueError,
-            r"prev_from_curr_by_instance must be \[\*B, N, 4, 4\], got \[4, 4\]",
-        ),
-        (
-            lambda d, i: rigid_flow(d, i.expand(2, -1, -1, -1), K, MOTIONS.expand(3, -1, -1, -1)),
-            ValueError,
-            "leading batch dims do not broadcast",
-        ),
-    ],
-)
-def test_mistakes_with_rigid_flow_are_named(call, error, message):
-    with pytest.raises(error, match=message):
-        call(depth_map(), instance_map())
-
-
 STILL = torch.eye(4, dtype=torch.float64)
-
-
-def raw_flow(*batch: int) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(6)
-    return 5 * torch.randn((*batch, 2, HEIGHT, WIDTH), generator=generator, dtype=torch.float64)
 
 
 def test_factors_by_hand():
@@ -352,46 +277,6 @@ def test_unknown_flow_of_a_body_is_no_object_flow():
     assert valid.tolist() == [[[True, False]]]
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda r, d: factorize(r[:1], d, K, MOTION), ValueError, r"raw must be \[\*B, 2, H, W\]"),
-        (lambda r, d: factorize(r.int(), d, K, MOTION), TypeError, "raw must be floating point"),
-        (
-            lambda r, d: factorize(r, d[..., :-1], K, MOTION),
-            ValueError,
-            r"raw and depth must have one \(height, width\), got \[5, 7\] and \[5, 6\]",
-        ),
-        (
-            lambda r, d: factorize(r.expand(2, -1, -1, -1), d.expand(3, -1, -1, -1), K, MOTION),
-            ValueError,
-            r"do not broadcast: others \[3\], raw \[2\]",
-        ),
-    ],
-)
-def test_mistakes_with_factors_are_named(call, error, message):
-    with pytest.raises(error, match=message):
-        call(raw_flow(), depth_map())
-
-
-@pytest.mark.parametrize(
-    ("adapt", "expected"),
-    [
-        (partial(adapt_depth, kind="z"), r"^depth must be .*1, H, W\], got \[5, 7\]"),
-        (partial(z_from_z_buffer, near_m=0.1, far_m=9.0), r"^z_buffer must be .*1, H, W\]"),
-        (adapt_pose, r"^pose must be .*4, 4\], got \[5, 7\]"),
-        (
-            partial(adapt_flow, direction="forward", grid="current"),
-            r"^flow must be .*2, H, W\], got \[5, 7\]",
-        ),
-    ],
-    ids=["depth", "z-buffer", "pose", "flow"],
-)
-def test_a_tensor_of_another_shape_is_refused_by_name_and_with_the_right_one(adapt, expected):
-    with pytest.raises(ValueError, match=expected):
-        adapt(torch.ones(5, 7))
-
-
 def test_flow_that_needs_no_change_and_flow_that_points_back():
     # The point at column 7, row 2 came from column 4, row 3: p_t - p_t' = (3, -1).
     want = torch.tensor([3.0, -1.0]).reshape(2, 1, 1)
@@ -401,26 +286,6 @@ def test_flow_that_needs_no_change_and_flow_that_points_back():
     rows_first = torch.tensor([1.0, -3.0]).reshape(1, 2, 1, 1)
     back = adapt_flow(rows_first, direction="backward", channels="row_column", **grid)
     assert torch.equal(back[0], want)
-
-
-@pytest.mark.parametrize("direction", ["forward", "backward"])
-def test_flow_on_the_previous_grid_is_refused_with_a_way_out(direction):
-    with pytest.raises(ValueError, match=rf"{direction} flow on the previous.*swap the two"):
-        adapt_flow(torch.zeros(2, 3, 4), direction=direction, grid="previous")
-
-
-@pytest.mark.parametrize(
-    ("changed", "expected"),
-    [
-        ({"direction": "back"}, r"\['forward', 'backward'\], got 'back'"),
-        ({"grid": "next"}, r"\['current', 'previous'\], got 'next'"),
-        ({"channels": "vu"}, r"\['uv', 'row_column'\], got 'vu'"),
-    ],
-)
-def test_flow_options_are_checked(changed, expected):
-    options = {"direction": "forward", "grid": "current", **changed}
-    with pytest.raises(ValueError, match=expected):
-        adapt_flow(torch.zeros(2, 3, 4), **options)
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 1)])
