@@ -285,12 +285,12 @@ def _planes(
 
         return numba_flow.planes_of_motions(depth, instance, by_motion, x, y, dt)
     if instance is None:
-        coefficients = by_motion.unsqueeze(-2).unbind(-1)  # [*B, 1, 1] each
+        each = list(by_motion.unsqueeze(-2).unbind(-1))  # [*B, 1, 1]
     else:
-        coefficients = _of_pixels(by_motion, instance)
-    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = coefficients
+        each = _of_pixels(by_motion, instance)
+    axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = each
     # A x~ is the sum of a term per column and one per row.
-    columns, rows = (axx * x, ayx * x, azx * x), (axy * y + ax, ayy * y + ay, azy * y + az)
+    columns, rows = [axx * x, ayx * x, azx * x], [axy * y + ax, ayy * y + ay, azy * y + az]
     if instance is None:  # tabulated, to save work per pixel
         x, *columns = _table(x, *columns)
         y, *rows = _table(y, *rows)
