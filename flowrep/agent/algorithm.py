@@ -20,9 +20,9 @@ from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_p
 
 Step = Callable[[TensorDictBase], TensorDictBase]
 WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
-GIVEN_BY_THE_RUN = ["observation_spec", "action_spec", "keys", "total_frames", "device"]
-GIVEN_BY_THE_CLASS = ["self", "rate_factors", "policy_options", "network", "actor", "actions"]
-NOT_OPTIONS = {*GIVEN_BY_THE_RUN, *GIVEN_BY_THE_CLASS, "mirror_image"}
+# Arguments that a run gives to an algorithm, and an algorithm to its base class and its loss.
+NOT_OPTIONS = {"self", "observation_spec", "action_spec", "keys", "total_frames", "device"}
+NOT_OPTIONS |= {"mirror_image", "rate_factors", "policy_options", "network", "actor", "actions"}
 VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
@@ -85,12 +85,9 @@ class Algorithm(ABC):
             SoftUpdate(loss, tau=tau)  # tells TorchRL that something moves the targets
         self.tau = tau
         self.weights = weights_of(loss) | dict(self.other_weights())
-        self._targets = [w for n, w in self.weights.items() if n.startswith("target_")]
-        self._followed = [
-            self.weights[n.removeprefix("target_")].data
-            for n in self.weights
-            if n.startswith("target_")
-        ]
+        targets = [name for name in self.weights if name.startswith("target_")]
+        self._targets = [self.weights[name] for name in targets]
+        self._followed = [self.weights[name.removeprefix("target_")].data for name in targets]
         self.trained = {n: w for n, w in self.weights.items() if w.requires_grad}
         self.learning_rate, self.total_updates = learning_rate, max(1, total_updates)
         self.max_grad_norm = max_grad_norm
@@ -111,7 +108,6 @@ class Algorithm(ABC):
         self._capture()
 
     def _parameter_groups(self, rate_factors: Mapping[str, float]) -> list[dict[str, Any]]:
-        """Returns Adam's parameter groups, one for each learning rate."""
         groups: dict[float, list[Tensor]] = {}
         for name, weight in self.trained.items():
             groups.setdefault(rate_factors.get(name, 1.0), []).append(weight)
@@ -137,15 +133,8 @@ class Algorithm(ABC):
     ) -> Any:
         """Returns an untrained policy alone, for an agent that only acts.
 
-        Its `state_dict` is interchangeable with that of `policy`.
-
-        Args:
-            observation_spec: the environment's.
-            action_spec: `Categorical` or `OneHot`.
-            keys: the observation maps to read, in order.
-            device: where its networks live.
-            options: the constructor's, including `precision` and `hidden_size`; those that don't
-                affect acting are ignored.
+        Its `state_dict` is interchangeable with that of `policy`. The arguments are those of the
+        constructor of `OffPolicy`; options that don't affect acting are ignored.
         """
         network = acting_network(
             observation_spec,
@@ -182,10 +171,7 @@ class Algorithm(ABC):
         return found
 
     def step_eagerly(self) -> None:
-        """Runs all further updates eagerly instead of as a CUDA graph.
-
-        The numbers are the same; this is for debugging and timing.
-        """
+        """Runs all further updates eagerly, not as a CUDA graph, for debugging and timing."""
         self._is_eager = True
         self._capture()
 
@@ -195,7 +181,7 @@ class Algorithm(ABC):
 
     @classmethod
     def metric_names(cls) -> tuple[str, ...]:
-        """Returns the keys of the metrics that `update` returns."""
+        """Returns the names of the metrics that `update` returns."""
         return (*cls.METRICS, "grad_norm", "learning_rate")
 
     def act(self, observation: TensorDictBase) -> TensorDictBase:
@@ -244,7 +230,6 @@ class Algorithm(ABC):
         return metrics | {"learning_rate": torch.tensor(learning_rate)}
 
     def _take_step(self, batch: TensorDictBase) -> TensorDictBase:
-        """Runs the part of an update that is on the device and returns the metrics."""
         self.optimizer.zero_grad(set_to_none=True)
         losses = self.losses(batch)
         minimised = [loss for name, loss in losses.items() if name.endswith("_loss")]
@@ -258,7 +243,7 @@ class Algorithm(ABC):
 
     def _gradient_norm(self) -> Tensor:
         """Returns the norm over all gradients, then scales them down to `max_grad_norm`."""
-        trained = [w for w in self.trained.values() if w.grad is not None]
+        trained = self.trained.values()
         norm = torch.nn.utils.get_total_norm([w.grad for w in trained if w.grad is not None])
         if self.max_grad_norm is not None:
             torch.nn.utils.clip_grads_with_norm_(trained, self.max_grad_norm, norm)
@@ -318,6 +303,8 @@ class DivergenceError(ArithmeticError):
 class DivergenceWatch:
     """Keeps, on the device, the metrics of the first update that diverged.
 
+    Its tensors change in place, so that a CUDA graph can record.
+
     Args:
         watched: the metrics that have to be finite.
         others: further metrics to report with them.
@@ -344,17 +331,13 @@ class DivergenceWatch:
         """0.0 before the first bad update and 1.0 from then on, on the device."""
 
     def reset(self, good_updates: int = 0) -> None:
-        """Forgets what it has seen, changing its own tensors in place.
-
-        Args:
-            good_updates: updates before the next one, for its number in messages.
-        """
+        """Forgets what it has seen; `good_updates` have been taken before the next one."""
         self._values.zero_()
         self._good_updates.fill_(good_updates)
         self.is_bad.zero_()
 
     def record(self, metrics: Mapping[str, Tensor]) -> None:
-        """Records an update's metrics, changing its own tensors in place."""
+        """Records an update's metrics, unless an earlier one was bad."""
         values = torch.stack([metrics[name].float() for name in self.names])
         self._values.copy_(torch.where(self.is_bad.bool(), self._values, values))
         is_good = self._values[: len(self.watched)].isfinite().all()
@@ -365,8 +348,8 @@ class DivergenceWatch:
         """Waits for the device and raises if an update has diverged.
 
         Raises:
-            DivergenceError: if a watched metric is not finite; the message names the first such
-                metric and lists all metrics of that update.
+            DivergenceError: names the first metric that is not finite, and lists all of that
+                update.
         """
         values = dict(zip(self.names, self._values.tolist()))
         bad = [name for name in self.watched if not math.isfinite(values[name])]
@@ -384,46 +367,33 @@ def as_cuda_graph(step: Step, device: torch.device) -> Step:
     therefore reach `step` through its argument or through tensors changed in place, and `step`
     must not copy numbers between host and device. On any device but CUDA, `step` itself is
     returned.
-
-    Args:
-        step: takes and returns a TensorDict. On CUDA, a batch whose keys, shapes or dtypes differ
-            from the first one's raises ValueError.
-        device: where `step` computes.
     """
     if device.type != "cuda":
         return step
-    return OfOneShape(CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device))
+    graph = CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device)
+    return of_one_shape(graph)
 
 
-class OfOneShape:
-    """Passes batches on to `step` and rejects those whose layout differs from the first one's.
+def of_one_shape(step: Step) -> Step:
+    """Returns `step` with a check that batches have the layout of the first one.
 
     A graph copies each batch into the first one's memory. Without the check, a batch of one row
     would silently be broadcast, numbers be cast and a missing map keep its old values.
     """
+    first: dict[Any, tuple[Any, ...]] = {}
 
-    def __init__(self, step: Step) -> None:
-        self.step = step
-        self._expected: dict[Any, tuple[Any, ...]] | None = None
-
-    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Returns `step(batch)`.
-
-        Raises:
-            ValueError: if an entry differs from the first batch's; the message names it.
-        """
-        layout = {
-            key: (tuple(value.shape), value.dtype)
-            for key, value in batch.items(include_nested=True, leaves_only=True)
-        }
-        if self._expected is None:
-            self._expected = layout
+    def checked(batch: TensorDictBase) -> TensorDictBase:
+        items = batch.items(include_nested=True, leaves_only=True)
+        layout = {key: (tuple(value.shape), value.dtype) for key, value in items}
+        first.update(() if first else layout)
         # only the first batch's keys count: a loss may add its own to a batch that is reused
-        for key, expected in self._expected.items():
+        for key, expected in first.items():
             if layout.get(key) != expected:
                 raise ValueError(
                     f"the update is a CUDA graph of batches with {key!r} {expected}, this one has "
                     f"it {layout.get(key, 'absent')}: keep the layout of batches fixed, or call "
                     "step_eagerly() on the algorithm"
                 )
-        return self.step(batch)
+        return step(batch)
+
+    return checked

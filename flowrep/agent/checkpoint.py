@@ -79,25 +79,13 @@ def load_checkpoint(
     path = Path(path)
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}: name a run folder that has saved one")
-    # safetensors opens the file twice: if a run saved in between, it is read again
-    while True:
-        found: dict[str, Any] | CheckpointError
-        before = path.stat()
-        try:
-            found = _read(path, parts)
-        except CheckpointError as error:
-            found = error
-        after = path.stat()
-        if (before.st_ino, before.st_mtime_ns) == (after.st_ino, after.st_mtime_ns):
-            if isinstance(found, CheckpointError):
-                raise found
-            return found
-
-
-def _read(path: Path, parts: Collection[str] | None) -> dict[str, Any]:
-    """Reads the file once, see `load_checkpoint`."""
     try:
-        with safe_open(path, framework="pt") as file:
+        # safetensors opens the name twice; that of an open file stays the same file if a run that
+        # goes on replaces the checkpoint in between
+        with (
+            path.open("rb") as opened,
+            safe_open(f"/dev/fd/{opened.fileno()}", framework="pt") as file,
+        ):
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
                 raise CheckpointError(
@@ -115,7 +103,6 @@ def _read(path: Path, parts: Collection[str] | None) -> dict[str, Any]:
 
 
 def _rename(file: Path, path: Path) -> None:
-    """Moves `file` to `path`, atomically replacing any file there."""
     os.replace(file, path)
 
 

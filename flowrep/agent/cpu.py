@@ -19,15 +19,13 @@ TRIALS = 3  # of each choice in a comparison
 
 
 def keep_freed_memory() -> bool:
-    """Tells glibc to reuse large freed blocks; returns whether it did.
-
-    By default glibc maps every block above a threshold (32 MiB at most) afresh and unmaps it when
-    freed, so the kernel zeroes each activation of a large batch page by page in every update. With
-    both thresholds at 1 GiB the blocks stay in the heap. With any other C library, nothing changes
-    and the function returns False.
+    """Tells glibc to reuse large freed blocks; returns whether this C library is glibc and did.
 
     Call it once and early, as blocks already allocated are not moved.
     """
+    # By default glibc maps every block above a threshold (32 MiB at most) afresh and unmaps it when
+    # freed, so the kernel zeroes each activation of a large batch page by page in every update.
+    # With both thresholds at 1 GiB the blocks stay in the heap.
     if platform.libc_ver()[0] != "glibc":
         return False
     mallopt = ctypes.CDLL(None).mallopt

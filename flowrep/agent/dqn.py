@@ -14,11 +14,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss, ValueEstimators
 
-from flowrep.agent.networks import (
-    DiscreteActions,
-    MapNetwork,
-    PolicyNetwork,
-)
+from flowrep.agent.networks import DiscreteActions, MapNetwork, PolicyNetwork
 from flowrep.agent.off_policy import OffPolicy
 
 
@@ -131,20 +127,16 @@ class DoubleDQN(OffPolicy):
         observation_spec: Composite,
         action_spec: TensorSpec,
         keys: Sequence[NestedKey],
-        *,
-        device: torch.device | str,
         **options: Any,
     ) -> EpsilonGreedyPolicy:
         """Returns an untrained policy, see `Algorithm.make_policy`; its state includes ε."""
-        stochastic = super().make_policy(
-            observation_spec, action_spec, keys, device=device, **options
-        )
+        stochastic = super().make_policy(observation_spec, action_spec, keys, **options)
         exploration = EGreedyModule(
             action_spec,
             float(options["initial_epsilon"]),
             float(options["final_epsilon"]),
             max(1, int(options["exploration_share"] * options["total_frames"])),
-            device=device,
+            device=options["device"],
         )
         actions = DiscreteActions.from_spec(action_spec)
         return EpsilonGreedyPolicy(stochastic[0].module, list(keys), actions, exploration)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor
 from torchrl.objectives import DiscreteSACLoss, LossModule, ValueEstimators
@@ -19,8 +19,8 @@ from flowrep.agent.networks import (
     heads_together,
     stochastic_policy,
 )
-from flowrep.agent.observation import MapCodec, decode_maps
-from flowrep.agent.off_policy import OffPolicy
+from flowrep.agent.observation import decode_maps
+from flowrep.agent.off_policy import OffPolicy, td_target, transition_keys
 
 ENCODERS = ("shared", "separate")
 METRICS = {
@@ -39,12 +39,9 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
 
     TorchRL's loss evaluates Q1 and Q2 one after the other (or by vmap), and twice at `s`: for L_Q
     with gradients, for L_π without. Here both share one hidden layer of twice the width and are
-    evaluated once. TorchRL keeps the networks, the targets and α.
-
-    Reads the maps, `action`, `steps_to_next_obs` and, under `next`, the maps, `reward`, `done` and
-    `terminated`. Returns `loss_qvalue`, `loss_actor` and `loss_alpha`, to be minimised as a sum,
-    with `alpha`, `entropy`, `q_mean` and `td_error`. Its target parameters are those of the
-    Q-functions and their encoder.
+    evaluated once. TorchRL keeps the networks, the targets and α. The sum of the losses that it
+    returns is to be minimised. Its target parameters are those of the Q-functions and their
+    encoder.
 
     Args:
         actor: the policy's network.
@@ -94,7 +91,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
             target_entropy_weight=target_entropy_weight,
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
-        self.codecs, self.encoder_is_shared = actor.codecs, shared
+        self.codecs, self.actions, self.encoder_is_shared = actor.codecs, actions, shared
         self.entropy_in_target = entropy_in_target
         self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
         if not shared:
@@ -121,9 +118,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         policy = log_policy.exp()
         negative_entropy = (policy * log_policy).sum(-1)
         q = heads_together(embedding, self.qvalue_network_params["module"])  # [2, N, n]
-        action = tensordict["action"]
-        if self.action_space != "categorical":
-            action = action.to(torch.uint8).argmax(-1)
+        action = self.actions.numbers(tensordict["action"])
         chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
         td_error = chosen - target
         expected_q = (policy * q.detach().amin(0)).sum(-1)
@@ -143,8 +138,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     @torch.no_grad()
     def _target(self, batch: TensorDictBase, alpha: Tensor) -> Tensor:
         """Returns y `[N]`."""
-        outcome = batch["next"]
-        images = decode_maps(self.codecs, outcome)
+        images = decode_maps(self.codecs, batch["next"])
         with self.target_critic_encoder_params.to_module(self.critic_encoder):
             embedding = self.critic_encoder(images)
         seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
@@ -153,24 +147,11 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         if self.entropy_in_target:
             q = q - alpha * log_policy
         value = (log_policy.exp() * q).sum(-1, keepdim=True)
-        # masked instead of multiplied: the value after an end may even be nan
-        value = value.masked_fill(outcome["terminated"], 0.0)
-        discount = self.gamma ** batch["steps_to_next_obs"]
-        return (outcome["reward"] + discount * value).squeeze(-1)
+        return td_target(batch, value, self.gamma)
 
     def _log_policy(self, embedding: Tensor) -> Tensor:
         """Returns log π `[N, n]`."""
         return self.actor_network[0].module(embedding).log_softmax(-1)
-
-
-def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
-    """Returns the keys of a sampled transition that a loss reads."""
-    maps = [codec.key for codec in codecs]
-    outcome = ["reward", "done", "terminated"]
-    following: list[NestedKey] = [
-        ("next", *(key if isinstance(key, tuple) else (key,))) for key in (*maps, *outcome)
-    ]
-    return [*maps, "action", "steps_to_next_obs", *following]
 
 
 class DiscreteSAC(OffPolicy):

@@ -11,9 +11,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams
 from torchrl.objectives import LossModule
 
-from flowrep.agent.dsac import DiscreteSAC, transition_keys
+from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.networks import DiscreteActions, MapNetwork
 from flowrep.agent.observation import decode_maps
+from flowrep.agent.off_policy import td_target, transition_keys
 
 METRICS = {
     "q_loss": "loss_qvalue",
@@ -30,16 +31,7 @@ METRICS = {
 class DiscreteSACValueLoss(LossModule):
     """The losses of `DiscreteSACWithValue` on stored maps, as `ReplayMemory` samples them.
 
-    Reads the same keys as `DiscreteSACMapLoss`. Returns `loss_qvalue`, `loss_value`, `loss_actor`
-    and `loss_alpha`, to be minimised as a sum, with `alpha`, `entropy`, `q_mean` and `value_mean`.
-    Its target parameters are those of V.
-
-    Args:
-        actor: the policy's network.
-        actions: the policy's action space.
-        initial_alpha: α before the first update.
-        target_entropy_weight: target entropy as a share of the largest, log n.
-        gamma: discount per frame.
+    Its target parameters are those of V; its arguments are those of `DiscreteSACMapLoss`.
     """
 
     actor: MapNetwork
@@ -75,17 +67,14 @@ class DiscreteSACValueLoss(LossModule):
         self.convert_to_functional(q2, "q2")
         self.convert_to_functional(value, "value", create_target_params=True)
         self.log_alpha = log_alpha
-        self.codecs, self.gamma = actor.codecs, gamma
+        self.codecs, self.actions, self.gamma = actor.codecs, actions, gamma
         self.target_entropy = target_entropy_weight * math.log(actions.count)
-        self.actions_are_one_hot = actions.space == "one-hot"
         self.in_keys = transition_keys(self.codecs)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
         images = decode_maps(self.codecs, tensordict)
-        outcome, action = tensordict["next"], tensordict["action"]
-        if self.actions_are_one_hot:
-            action = action.to(torch.uint8).argmax(-1)
+        action = self.actions.numbers(tensordict["action"])
         alpha = self.log_alpha.detach().exp()
 
         log_policy = self.actor(images).log_softmax(-1)
@@ -95,11 +84,8 @@ class DiscreteSACValueLoss(LossModule):
         value = self.value(images).squeeze(-1)
         with torch.no_grad():
             with self.target_value_params.to_module(self.value):
-                following = self.value(decode_maps(self.codecs, outcome))
-            # masked instead of multiplied: the value after an end may even be nan
-            following = following.masked_fill(outcome["terminated"], 0.0)
-            discount = self.gamma ** tensordict["steps_to_next_obs"]
-            y = (outcome["reward"] + discount * following).squeeze(-1)
+                following = self.value(decode_maps(self.codecs, tensordict["next"]))
+            y = td_target(tensordict, following, self.gamma)
             expected_q = torch.minimum((policy * q1).sum(-1), (policy * q2).sum(-1))
             value_target = expected_q - alpha * negative_entropy
         chosen = (q.gather(-1, action.unsqueeze(-1)).squeeze(-1) for q in (q1, q2))
@@ -129,13 +115,9 @@ class DiscreteSACWithValue(DiscreteSAC):
         L_π = mean Σ_a π(a|s) [α log π(a|s) - Q1(s, a)]
         L_α = mean -log α (Σ_a π(a|s) log π(a|s) + H̄),   H̄ = target_entropy_weight · log n
 
-    Each loss trains only its own network. All gradients are taken at the same weights, then Adam
-    steps once, then V̄ moves by `tau`. This is what the paper's trainer, ML-Agents, computes. It
-    needs five sets of encoders, against two for `DiscreteSAC` with a shared encoder. For
-    transitions of several steps, r is the discounted sum of their rewards, without the entropy
-    bonus of the steps between.
-
-    The arguments are those of `DiscreteSAC`, with the options of `DiscreteSACValueLoss`.
+    Each loss trains only its own network; everything else is as in `DiscreteSAC`. This is what the
+    paper's trainer, ML-Agents, computes. It needs five sets of encoders, against two for
+    `DiscreteSAC` with a shared encoder.
     """
 
     LOSS = DiscreteSACValueLoss

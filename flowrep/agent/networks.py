@@ -48,9 +48,11 @@ class DiscreteActions:
             return cls(int(spec.space.n), "categorical", torch.distributions.Categorical)
         if type(spec) is OneHot:
             return cls(int(spec.space.n), "one-hot", OneHotCategorical)
-        raise TypeError(
-            f"discrete SAC needs a Categorical or OneHot action spec, got {type(spec).__name__}"
-        )
+        raise TypeError(f"expected a Categorical or OneHot action spec, got {type(spec).__name__}")
+
+    def numbers(self, action: Tensor) -> Tensor:
+        """Returns actions `[N]` or `[N, count]`, as the spec encodes them, as numbers `[N]`."""
+        return action if self.space == "categorical" else action.to(torch.uint8).argmax(-1)
 
 
 def _autocast_like(x: Tensor) -> AbstractContextManager[Any]:
@@ -61,10 +63,7 @@ def _autocast_like(x: Tensor) -> AbstractContextManager[Any]:
 
 
 class NatureEncoder(nn.Module):
-    """Returns 512 features of a map: 32 × 8/4, 64 × 4/2, 64 × 3/1, linear; LeakyReLU after each.
-
-    The last map is flattened rows first, channels last: of a channels-last map, that is a view.
-    """
+    """Returns 512 features of a map: 32 × 8/4, 64 × 4/2, 64 × 3/1, linear; LeakyReLU after each."""
 
     def __init__(self, codec: MapCodec) -> None:
         super().__init__()
@@ -82,6 +81,7 @@ class NatureEncoder(nn.Module):
             x = image
             for convolution in (self.conv1, self.conv2, self.conv3):
                 x = F.leaky_relu_(convolution(x))
+            # rows first, channels last, which is a view of a channels-last map
             return F.leaky_relu_(self.linear(x.permute(0, 2, 3, 1).flatten(1)))
 
 
@@ -144,14 +144,7 @@ def heads_together(embedding: Tensor, weights: Mapping[str, Any]) -> Tensor:
 
 
 class MapNetwork(nn.Module):
-    """Maps decoded maps to `[N, outputs]` float32: one encoder per map, then a head.
-
-    Args:
-        codecs: the maps.
-        hidden_size: width of the single hidden layer after the embeddings.
-        outputs: numbers per observation.
-        layer_norm: normalise each map's embedding, see `Encoder`.
-    """
+    """Maps decoded maps to `[N, outputs]` float32: an `Encoder`, then a `Head`."""
 
     def __init__(
         self,
@@ -208,7 +201,7 @@ def acting_network(
     hidden_size: int,
     layer_norm: bool = False,
 ) -> PolicyNetwork:
-    """Returns the untrained network of a policy: one encoder per map, then a head."""
+    """Returns the untrained network of a policy, whose arguments are those of `OffPolicy`."""
     codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
     actions = DiscreteActions.from_spec(action_spec)
     with device:

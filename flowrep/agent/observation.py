@@ -56,10 +56,7 @@ def has_fast_bf16(device: torch.device) -> bool:
 
 @dataclass(frozen=True)
 class MapCodec:
-    """One map: its key in the TensorDict, its size, the meaning of its numbers and their encoding.
-
-    The network computes in `dtype`, bfloat16 or float32.
-    """
+    """One map's key, size, meaning and encoding, for a network in `dtype`, bfloat16 or float32."""
 
     key: NestedKey
     channels: int
@@ -82,9 +79,7 @@ class MapCodec:
         return torch.bfloat16 if self.dtype is torch.bfloat16 else torch.float16
 
     def store(self, x: Tensor) -> Tensor:
-        """Returns a raw map `[*B, C, H, W]` in `stored_dtype`.
-
-        Numbers beyond float16's range saturate.
+        """Returns a raw map `[*B, C, H, W]` in `stored_dtype`; numbers beyond its range saturate.
 
         Raises:
             ValueError: if the last three dims are not those of the spec.

@@ -8,15 +8,15 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
 from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.networks import DiscreteActions
-from flowrep.agent.observation import compute_dtype, map_codecs
-from flowrep.agent.replay import ReplayMemory
+from flowrep.agent.observation import MapCodec
+from flowrep.agent.replay import OUTCOME, ReplayMemory
 
 
 class PersistentExploration:
@@ -28,10 +28,7 @@ class PersistentExploration:
 
     Args:
         epsilon: ε at the first frame.
-        total_frames: frames of all environments over which ε falls.
-        num_envs: environments.
-        actions: the action space.
-        device: of the actions.
+        total_frames: frames of all `num_envs` environments over which ε falls.
     """
 
     LONGEST = 24
@@ -73,6 +70,28 @@ class PersistentExploration:
         return acted.set("action", torch.where(repeats, other.to(own.dtype), own))
 
 
+def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
+    """Returns the keys of a sampled transition that a loss reads."""
+    maps = [codec.key for codec in codecs]
+    following = [unravel_key(("next", key)) for key in (*maps, *OUTCOME)]
+    return [*maps, "action", "steps_to_next_obs", *following]
+
+
+def td_target(batch: TensorDictBase, next_value: Tensor, gamma: float) -> Tensor:
+    """Returns r + γⁿ (1 - terminated) V(s') `[N]` of transitions of n steps.
+
+    Args:
+        batch: of `ReplayMemory.sample`; its reward is the discounted sum over the n steps.
+        next_value: V(s') `[N, 1]`.
+        gamma: discount per step.
+    """
+    outcome = batch["next"]
+    # masked instead of multiplied: the value after an end may even be nan
+    next_value = next_value.masked_fill(outcome["terminated"], 0.0)
+    discount = gamma ** batch["steps_to_next_obs"]
+    return (outcome["reward"] + discount * next_value).squeeze(-1)
+
+
 class OffPolicy(Algorithm):
     """Takes one update every `frames_per_update` frames, on a uniform sample of recent frames.
 
@@ -96,10 +115,9 @@ class OffPolicy(Algorithm):
             becomes γ to that power.
         layer_norm: normalise each map's embedding, see `Encoder`.
         mirror: replace half of each batch by its left-right images, with `mirror_image`.
-        mirror_image: TorchRL transform that does so with a batch, maps in their stored form; for
-            what it has to know of maps, camera and actions, it comes from where they are known.
-        persistent_exploration: ε of `PersistentExploration` at the start, from which it falls
-            linearly to 0 over `total_frames`.
+        mirror_image: the transform of sampled batches that does so, such as
+            `flowrep.transforms.Mirror`.
+        persistent_exploration: ε of `PersistentExploration` at the start.
         rate_factors: see `Algorithm`.
         policy_options: further arguments of `make_policy`.
         loss_options: arguments of `LOSS` besides `gamma`.
@@ -136,8 +154,6 @@ class OffPolicy(Algorithm):
         policy_options: Mapping[str, Any] | None = None,
         **loss_options: Any,
     ) -> None:
-        device = torch.device(device)
-        self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
         self.policy = self.make_policy(
             observation_spec,
             action_spec,
@@ -149,11 +165,12 @@ class OffPolicy(Algorithm):
             **(policy_options or {}),
         )
         network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
+        self.codecs = network.codecs
         self.persistence: PersistentExploration | None = None
         if persistent_exploration > 0:
             num_envs = observation_spec.shape.numel()
             self.persistence = PersistentExploration(
-                persistent_exploration, total_frames, num_envs, actions, device
+                persistent_exploration, total_frames, num_envs, actions, torch.device(device)
             )
         loss = self.LOSS(network, actions, gamma=gamma, **loss_options)
         self.frames_per_update = frames_per_update
@@ -179,7 +196,7 @@ class OffPolicy(Algorithm):
             self.memory.append_transform(mirror_image)
 
     def act(self, observation: TensorDictBase) -> TensorDictBase:
-        """Returns an observation of N environments with the actions that collect experience."""
+        """Returns the policy's actions, some of them replaced by persistent exploration."""
         acted = super().act(observation)
         return acted if self.persistence is None else self.persistence(acted)
 
@@ -192,5 +209,5 @@ class OffPolicy(Algorithm):
         return max(0, frames - self.learning_starts) // self.frames_per_update - self.updates
 
     def sample(self) -> TensorDictBase:
-        """Returns `batch_size` transitions, uniform with replacement, maps in their stored form."""
+        """Returns a sample of the replay memory."""
         return self.memory.sample()

@@ -16,47 +16,31 @@ from torchrl.objectives.value import GAE
 
 from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork, stochastic_policy
-from flowrep.agent.observation import MapCodec, compute_dtype, decode_maps, map_codecs, store_maps
+from flowrep.agent.observation import MapCodec, decode_maps, store_maps
 from flowrep.agent.replay import time_first
 
 
 class Rollout:
-    """Keeps steps of N environments until `clear`, with their stored maps and next maps.
+    """Keeps steps of N environments until `clear`, with their stored maps and next maps."""
 
-    Args:
-        codecs: the maps to keep; see `flowrep.agent.observation`.
-        device: where they are kept.
-        extra_keys: entries kept besides the maps, `action` and its outcome.
-    """
-
-    def __init__(
-        self,
-        codecs: Sequence[MapCodec],
-        device: torch.device | str,
-        extra_keys: Sequence[NestedKey] = (),
-    ) -> None:
-        self.codecs, self.device = tuple(codecs), torch.device(device)
-        self._keys = ("action", *extra_keys)
+    def __init__(self, codecs: Sequence[MapCodec], device: torch.device) -> None:
+        self.codecs, self.device = tuple(codecs), device
         self._steps: list[TensorDictBase] = []
 
     def __len__(self) -> int:
         """Returns the number of steps of each environment."""
         return len(self._steps)
 
-    def numel(self) -> int:
-        """Returns the number of steps of all environments."""
-        return sum(step.numel() for step in self._steps)
-
     def extend(self, frames: TensorDictBase) -> None:
         """Stores steps of N environments: `[N]`, `[N, T]`, or as a TorchRL collector returns them.
 
         Args:
-            frames: with the maps, `action`, `extra_keys` and, under `next`, the maps, `reward`,
-                `done` and `terminated`. A dim named `time` is the time dim; without one, a single
-                dim is N.
+            frames: with the maps, `action`, `action_log_prob` and, under `next`, the maps,
+                `reward`, `done` and `terminated`; dims as in `time_first`.
         """
         for step in time_first(frames).unbind(0):
-            kept = store_maps(self.codecs, step).update(step.select(*self._keys).detach())
+            kept = store_maps(self.codecs, step)
+            kept.update(step.select("action", "action_log_prob").detach())
             outcome = step["next"].select("reward", "done", "terminated")
             kept["next"] = store_maps(self.codecs, step["next"]).update(outcome)
             self._steps.append(kept.to(self.device))
@@ -77,21 +61,11 @@ class Rollout:
         return {"length": len(self._steps), "steps": stacked}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`.
-
-        Raises:
-            ValueError: if an entry that this rollout keeps is missing.
-        """
+        """Continues from a `state_dict`."""
         self.clear()
         if state["length"]:
-            missing = [key for key in self._keys if key not in state["steps"]]
-            if missing:
-                raise ValueError(
-                    f"the saved rollout lacks {missing[0]!r}: the checkpoint is of an older "
-                    "version, start the run anew"
-                )
-            width = len(state["steps"]["action"][0])
-            steps = TensorDict(state["steps"], [state["length"], width]).to(self.device)
+            shape = [state["length"], len(state["steps"]["action"][0])]
+            steps = TensorDict(state["steps"], shape).to(self.device)
             steps["next"].batch_size = steps.batch_size
             self._steps = list(steps.unbind(0))
 
@@ -169,24 +143,18 @@ class PPO(Algorithm):
         L_V = value_weight · mean (V(s) - R)²
         L_H = entropy_weight · mean Σ_a π(a|s) log π(a|s)
 
+    Arguments that are not listed are those of `OffPolicy`.
+
     Args:
-        observation_spec: the environment's; the last three dims of each map are C, H, W, the
-            dims before them are the environments.
-        action_spec: `Categorical` or `OneHot`.
-        keys: the observation maps to read, in order.
-        total_frames: environment frames over the whole training, after which the learning rate
-            is 0.
-        device: where networks, rollout and updates live.
-        precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
-        learning_rate: Adam's, falling linearly to 0.
         rollout_length: steps of each environment between two rounds of learning.
         epochs: passes over them.
         batch_size: steps per update; an incomplete last batch is left out of its pass.
-        gamma: discount per frame.
         gae_lambda: GAE's λ, from 0 (relies on V) to 1 (relies on the rewards).
         max_grad_norm: the norm over all gradients is scaled down to this maximum.
-        hidden_size: width of the single hidden layer after the embeddings.
         loss_options: further arguments of `ClipPPOMapLoss`.
+
+    Raises:
+        ValueError: if a rollout does not fill a batch.
     """
 
     WRITES_LOG_PROB = True
@@ -221,16 +189,14 @@ class PPO(Algorithm):
         hidden_size: int = 512,
         **loss_options: Any,
     ) -> None:
-        device = torch.device(device)
-        self.codecs = map_codecs(observation_spec, keys, compute_dtype(precision, device))
-        num_envs = observation_spec.shape.numel()
         self.rollout_length, self.epochs, self.batch_size = rollout_length, epochs, batch_size
-        frames_per_round = rollout_length * num_envs
+        self.num_envs = observation_spec.shape.numel()
+        frames_per_round = rollout_length * self.num_envs
         if batch_size > frames_per_round:
             raise ValueError(
                 f"batch_size={batch_size} is more than the {frames_per_round} frames of a rollout "
-                f"({rollout_length} steps of {num_envs} environments): raise rollout_length or "
-                "num_envs, or lower batch_size"
+                f"({rollout_length} steps of {self.num_envs} environments): raise rollout_length "
+                "or num_envs, or lower batch_size"
             )
         self.policy = self.make_policy(
             observation_spec,
@@ -242,24 +208,24 @@ class PPO(Algorithm):
         )
         network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
         self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, device=device)
-        self.memory = Rollout(self.codecs, device, extra_keys=["action_log_prob"])
+        self.codecs = network.codecs
+        self.memory = Rollout(self.codecs, torch.device(device))
         self._round: TensorDictBase = TensorDict()  # the steps in training, [n]
         self._batches: list[Tensor] = []  # rows of the batches to come
         super().__init__(
             self.LOSS(network, actions, **loss_options),
             learning_rate=learning_rate,
-            total_updates=total_frames // frames_per_round * self._updates_of(frames_per_round),
+            total_updates=total_frames // frames_per_round * self._updates_of(rollout_length),
             max_grad_norm=max_grad_norm,
         )
 
     def _updates_of(self, steps: int) -> int:
-        return self.epochs * (steps // self.batch_size)
+        return self.epochs * (steps * self.num_envs // self.batch_size)
 
     def updates_due(self, frames: int) -> int:
         """Returns the number of updates of one round if a rollout is complete, else 0."""
-        if len(self.memory) < self.rollout_length:
-            return 0
-        return self._updates_of(self.memory.numel())
+        steps = len(self.memory)
+        return 0 if steps < self.rollout_length else self._updates_of(steps)
 
     def sample(self) -> TensorDictBase:
         """Returns the round's next batch; the first call begins the round and clears the memory."""
@@ -273,14 +239,9 @@ class PPO(Algorithm):
 
     @torch.no_grad()
     def _with_advantages(self, steps: TensorDictBase) -> TensorDictBase:
-        """Returns steps `[N, T]` with `advantage` and `value_target`."""
-        judged = [self._judge(part) for part in steps.reshape(-1).split(self.batch_size)]
-        steps = steps.update(torch.cat(judged).reshape(steps.shape))
+        """Returns steps `[N, T]` with `advantage` and `value_target`, by the current weights."""
+        for some in (steps, steps["next"]):
+            parts = some.reshape(-1).split(self.batch_size)  # as large as training has them
+            values = torch.cat([self.loss.state_value(part) for part in parts])
+            some["state_value"] = values.reshape(*steps.shape, 1)
         return self._advantage(steps)
-
-    def _judge(self, steps: TensorDictBase) -> TensorDictBase:
-        """Returns V and V' of the steps under the current weights."""
-        value = self.loss.state_value
-        judged = steps.empty().update({"state_value": value(steps)})
-        judged["next"] = steps["next"].empty().update({"state_value": value(steps["next"])})
-        return judged

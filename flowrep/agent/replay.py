@@ -36,9 +36,6 @@ class ReplayMemory(TensorDictReplayBuffer):
         device: of rows and samples.
         n_steps: largest number of steps that a transition spans.
         gamma: discount per step of the rewards within a transition.
-
-    Raises:
-        ValueError: if n_steps is below 1.
     """
 
     def __init__(
@@ -62,14 +59,14 @@ class ReplayMemory(TensorDictReplayBuffer):
         )
 
     def add(self, data: TensorDictBase) -> int:
-        """Stores one step of a single environment, as `extend` does, and returns its row."""
+        """Stores one step of a single environment and returns its row."""
         return int(self.extend(data.reshape(1)))
 
 
 class PackSteps(Transform):
     """Turns steps into rows on `extend`.
 
-    Samples keep their maps in their stored form, which losses decode.
+    Samples are returned as they are: losses decode their maps.
 
     | steps, on `extend` | rows |
     | --- | --- |
@@ -114,8 +111,7 @@ class RowStorage(LazyTensorStorage):
 
     Args:
         max_size: rows to keep; beyond that, the oldest is overwritten.
-        observation_keys: the maps that a transition takes from both of its rows; `action` comes
-            from the first.
+        observation_keys: the maps that a transition takes from both of its rows.
         device: where the rows are kept.
     """
 
@@ -210,7 +206,12 @@ class SuccessorSampler(Sampler):
         written = torch.stack([mark[index.to(mark.device)].long() for mark in marks]).cpu()
         env, (done, terminated, is_init) = written[0], written[1:].bool()
         index, envs = index.cpu(), int(env.max()) + 1
-        self._check_capacity(len(index), envs, storage.max_size)
+        if len(index) + envs > storage.max_size:
+            raise ValueError(
+                f"a replay capacity of {storage.max_size} cannot take {len(index) // envs} steps "
+                f"of {envs} environments; it has to hold {len(index) + envs}: raise "
+                "replay_capacity or lower num_envs"
+            )
         if not len(self._next_row):
             self._next_row = torch.full((storage.max_size,), -1)
         self._next_row[index] = torch.where(terminated, index, -1)
@@ -222,15 +223,6 @@ class SuccessorSampler(Sampler):
         self._next_row[before[follows]] = index[after][follows]
         self._latest = ahead[-envs:].clone()
         self._usable = (self._next_row >= 0).nonzero().squeeze(-1)
-
-    @staticmethod
-    def _check_capacity(written: int, envs: int, capacity: int) -> None:
-        if written + envs > capacity:
-            raise ValueError(
-                f"a replay capacity of {capacity} cannot take {written // envs} steps of {envs} "
-                f"environments; it has to hold {written + envs}: raise replay_capacity or lower "
-                "num_envs"
-            )
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[NestedKey, Tensor]]:
         """Returns the rows `[batch_size, 2]`, with reward, end flags and step count between them.
@@ -288,7 +280,10 @@ class SuccessorSampler(Sampler):
 
 
 def time_first(frames: TensorDictBase) -> TensorDictBase:
-    """Returns the frames as `[T, N]`."""
+    """Returns frames of N environments as `[T, N]`.
+
+    A dim named `time` is T; without one, a single dim is N, and of several the last is T.
+    """
     names = list(frames.names)
     time = names.index("time") if "time" in names else None
     if time is None and frames.ndim < 2:

@@ -31,17 +31,14 @@ def observation_spec():
 def make_agent(observation_spec):
     """Builds a small float32 agent; keyword arguments replace its settings."""
 
-    def make(spec=observation_spec, keys=("flow", "seg"), action_spec=None, seed=0, **changes):
-        settings = {
-            "total_frames": 1000,
-            "precision": "fp32",
-            "hidden_size": 32,
-            "batch_size": 16,
-            "replay_capacity": 100,
-        }
+    def make(
+        algorithm=DiscreteSAC, *, spec=observation_spec, keys=("flow", "seg"), seed=0,
+        action_spec=None, **changes,
+    ):  # fmt: skip
         torch.manual_seed(seed)
         action_spec = Categorical(3) if action_spec is None else action_spec
-        return DiscreteSAC(spec, action_spec, list(keys), **(settings | changes))
+        settings = {"total_frames": 1000} | SMALL | changes
+        return algorithm(spec, action_spec, list(keys), **settings)
 
     return make
 

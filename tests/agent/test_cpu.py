@@ -65,10 +65,3 @@ def test_updates_take_the_number_of_threads_that_was_faster_of_late(clock):
     later = [set(used[i * cpu.PERIOD + 2 * cpu.TRIALS : (i + 1) * cpu.PERIOD]) for i in range(3)]
     assert later == [{2}, {1}, {2}]
     assert used[: 2 * cpu.TRIALS] == [1, 2] * cpu.TRIALS
-
-
-def test_a_single_thread_stays_one(clock):
-    threads = FasterThreads(1)
-    for _ in range(cpu.PERIOD):
-        with threads:
-            assert torch.get_num_threads() == 1

@@ -1,10 +1,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
-from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+from torchrl.data import Composite, Unbounded
 
 from flowrep.agent.networks import Encoder, NatureEncoder
 from flowrep.agent.observation import map_codecs
@@ -94,54 +91,3 @@ def test_any_leading_batch_acts_like_a_loop(make_agent, random_maps, batch):
 def test_writes_the_action_and_nothing_else(make_agent, random_maps):
     agent, maps = make_agent(), random_maps(2)
     assert set(agent.policy(maps.clone()).keys()) - set(maps.keys()) == {"action"}
-
-
-class Clock(EnvBase):
-    """Three environments whose one map shows the time; environment i ends at time 2 + i."""
-
-    def __init__(self):
-        super().__init__(batch_size=[3])
-        shape = (3, 1, 36, 36)
-        self.observation_spec = Composite(view=Unbounded(shape), shape=(3,))
-        self.action_spec = Categorical(3, shape=(3,))
-        self.reward_spec = Unbounded((3, 1))
-        self.time = torch.zeros(3)
-
-    def view(self):
-        return self.time.view(3, 1, 1, 1).expand(3, 1, 36, 36).clone()
-
-    def _reset(self, tensordict):
-        reset = torch.ones(3, dtype=torch.bool)
-        if tensordict is not None and "_reset" in tensordict:
-            reset = tensordict["_reset"].reshape(3)
-        self.time = torch.where(reset, torch.zeros(3), self.time)
-        return TensorDict({"view": self.view()}, [3])
-
-    def _step(self, tensordict):
-        self.time = self.time + 1
-        done = (self.time == torch.tensor([2.0, 3.0, 4.0])).unsqueeze(1)
-        reward = self.time.unsqueeze(1)
-        return TensorDict(
-            {"view": self.view(), "reward": reward, "done": done, "terminated": done}, [3]
-        )
-
-    def _set_seed(self, seed):
-        pass
-
-
-def test_a_torchrl_collector_acts_with_it_and_the_replay_takes_its_frames(make_agent):
-    env = TransformedEnv(Clock(), InitTracker())
-    agent = make_agent(
-        env.observation_spec, ["view"], env.full_action_spec["action"], batch_size=200
-    )
-    collector = Collector(env, agent.policy, frames_per_batch=9, total_frames=54)
-    for frames in collector:
-        agent.memory.extend(frames)
-    collector.shutdown()
-    batch = agent.memory.sample()
-    now, later = batch["view"][:, 0, 0, 0], batch["next", "view"][:, 0, 0, 0]
-    terminated = batch["next", "terminated"].squeeze(1)
-    assert len(agent.memory) == 54
-    assert terminated.any()
-    assert torch.equal(batch["next", "reward"].squeeze(1), now.float() + 1)
-    assert torch.equal(later[~terminated], now[~terminated] + 1)

@@ -71,14 +71,6 @@ def test_a_round_is_due_when_the_rollout_is_complete_and_no_frame_is_learnt_from
     assert agent.total_updates == 600 // 8 * 6
 
 
-def test_counting_the_updates_that_are_due_copies_no_step(monkeypatch):
-    agent = make_ppo(rollout_length=3, batch_size=2)
-    for each in STEPS:  # one more than a rollout
-        agent.remember(each)
-    monkeypatch.setattr(agent.memory, "steps", None)
-    assert agent.updates_due(8) == 12  # 4 batches in each of 3 epochs
-
-
 def test_advantages_by_hand():
     """Environment 0 terminates in its second step, environment 1 is cut off in its third."""
     agent = make_ppo()
@@ -134,15 +126,6 @@ def test_steps_that_earlier_weights_took_count_by_how_likely_they_then_were():
     advantage = (advantage - advantage.mean()) / advantage.std()
     expected = -((now - then).exp() * advantage).mean()
     torch.testing.assert_close(agent.losses(batch)["policy_loss"], expected, rtol=1e-4, atol=1e-6)
-
-
-def test_a_rollout_of_before_probabilities_were_kept_is_refused():
-    agent, other = make_ppo(), make_ppo()
-    agent.remember(STEPS[0])
-    state = agent.memory.state_dict()
-    del state["steps"]["action_log_prob"]
-    with pytest.raises(ValueError, match=r"lacks 'action_log_prob'.*start the run anew"):
-        other.memory.load_state_dict(state)
 
 
 def test_gradients_are_scaled_down_to_the_largest_norm():

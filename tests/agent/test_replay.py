@@ -10,8 +10,8 @@ from flowrep.transforms import Mirror
 SPEC = Composite(view=Unbounded((1, 36, 36)))
 
 
-def memory(capacity=100, batch_size=400, dtype=torch.float32, **options):
-    codecs = map_codecs(SPEC, ["view"], dtype)
+def memory(capacity=100, batch_size=400, **options):
+    codecs = map_codecs(SPEC, ["view"], torch.float32)
     return ReplayMemory(codecs, capacity=capacity, batch_size=batch_size, device="cpu", **options)
 
 
@@ -47,15 +47,19 @@ def step(seen, following, ended="", action=None, begun=""):
     )
 
 
-def transitions(replay):
-    """The distinct (seen, action, reward, next, terminated) among a large sample, sorted."""
+def transitions(replay, steps=False):
+    """The distinct (seen, action, reward, next, terminated) among a large sample, sorted.
+
+    With `steps`, the number of steps of each comes after its action.
+    """
     batch = replay.sample()
     columns = [
-        batch["view"][:, 0, 0, 0], batch["action"], batch["next", "reward"][:, 0],
-        batch["next", "view"][:, 0, 0, 0], batch["next", "terminated"][:, 0],
+        batch["view"][:, 0, 0, 0], batch["action"], batch["steps_to_next_obs"][:, 0],
+        batch["next", "reward"][:, 0], batch["next", "view"][:, 0, 0, 0],
+        batch["next", "terminated"][:, 0],
     ]  # fmt: skip
-    rows = torch.stack([column.double() for column in columns], 1)
-    return [tuple(int(x) for x in row) for row in rows.unique(dim=0)]
+    rows = torch.stack([c.double() for i, c in enumerate(columns) if steps or i != 2], 1)
+    return [tuple(row.tolist()) for row in rows.unique(dim=0)]
 
 
 def test_next_is_the_frame_that_followed_in_the_same_environment():
@@ -98,24 +102,16 @@ def test_a_restart_between_two_calls_does_not_join_two_episodes():
 
 def test_an_episode_that_begins_with_what_the_last_one_ended_with_is_not_joined_to_it():
     replay = memory(n_steps=3)
-    # object flow where nothing moves: every map is the same
-    replay.extend(step([0, 0], [0, 0], action=[1, 2]))
-    replay.extend(step([0, 0], [0, 0], action=[3, 4], ended="tc"))
-    replay.extend(step([0, 0], [0, 0], action=[5, 6], begun="bb"))
-    replay.extend(step([0, 0], [0, 0], action=[7, 8]))
+    # object flow where nothing moves, or where nothing is known: every map is the same
+    zero, nan = [0, 0], [float("nan")] * 2
+    replay.extend(step(zero, zero, action=[1, 2]))
+    replay.extend(step(zero, zero, action=[3, 4], ended="tc"))
+    replay.extend(step(zero, nan, action=[5, 6], begun="bb"))
+    replay.extend(step(nan, nan, action=[7, 8]))
     batch = replay.sample()
     spans = set(zip(batch["action"].tolist(), batch["steps_to_next_obs"][:, 0].tolist()))
     # what was cut off, action 4, has no successor, so 2 ends before it
     assert spans == {(1, 2), (3, 1), (2, 1), (5, 1), (6, 1)}
-
-
-@pytest.mark.parametrize("value", [-0.0, float("nan"), float("inf"), -3.0])
-def test_a_step_is_joined_to_the_next_whatever_the_maps_show(value):
-    replay = memory()
-    replay.extend(step([value, 20], [value, 21], action=[0, 20]))
-    replay.extend(step([value, 21], [value, 22], action=[1, 21]))
-    replay.extend(step([value, 22], [value, 23], action=[2, 22]))
-    assert replay.sample()["action"].unique().tolist() == [0, 1, 20, 21]
 
 
 def test_steps_without_the_mark_of_restarts_are_refused():
@@ -123,7 +119,7 @@ def test_steps_without_the_mark_of_restarts_are_refused():
         memory().extend(step([1], [2]).exclude("is_init"))
 
 
-def test_a_batch_of_steps_is_stored_as_the_steps_one_by_one():
+def test_steps_may_come_one_by_one_or_in_a_batch_with_its_time_last_or_named():
     steps = [
         step([10, 20], [11, 21]),
         step([11, 21], [12, 22], ended="-t"),
@@ -143,24 +139,12 @@ def test_a_batch_of_steps_is_stored_as_the_steps_one_by_one():
         (21, 21, 22, 21, 1), (40, 40, 41, 41, 0),
     ]  # fmt: skip
     assert transitions(one_by_one) == transitions(at_once) == transitions(named) == expected
-
-
-def test_a_single_trajectory_names_its_time():
-    replay = memory()
-    steps = torch.cat([step([i], [i + 1]) for i in range(4)])
+    trajectory, single = memory(), memory()
+    steps = torch.cat([step([i], [i + 1]) for i in range(3)])
     steps.names = ["time"]
-    replay.extend(steps)
-    assert transitions(replay) == [(i, i, i + 1, i + 1, 0) for i in range(3)]
-
-
-def test_a_single_step_is_added_as_it_is_extended_by():
-    added, extended = memory(), memory()
-    for i in (3, 4, 5):
-        assert added.add(step([i], [i + 1])[0]) == i - 3
-        extended.extend(step([i], [i + 1]))
-    assert transitions(added) == transitions(extended) == [(3, 3, 4, 4, 0), (4, 4, 5, 5, 0)]
-    with pytest.raises(RuntimeError):
-        added.add(step([3, 4], [4, 5]))
+    trajectory.extend(steps)
+    assert [single.add(each) for each in steps.unbind(0)] == [0, 1, 2]
+    assert transitions(trajectory) == transitions(single) == [(0, 0, 1, 1, 0), (1, 1, 2, 2, 0)]
 
 
 def test_the_oldest_are_overwritten():
@@ -174,25 +158,13 @@ def test_the_oldest_are_overwritten():
     ]  # fmt: skip
 
 
-def n_step_transitions(replay):
-    """The distinct (seen, action, steps, reward, next, terminated) among a large sample, sorted."""
-    batch = replay.sample()
-    columns = [
-        batch["view"][:, 0, 0, 0], batch["action"], batch["steps_to_next_obs"][:, 0],
-        batch["next", "reward"][:, 0], batch["next", "view"][:, 0, 0, 0],
-        batch["next", "terminated"][:, 0],
-    ]  # fmt: skip
-    rows = torch.stack([column.double() for column in columns], 1)
-    return [tuple(row.tolist()) for row in rows.unique(dim=0)]
-
-
 def test_a_transition_of_three_steps_sums_discounted_rewards_and_looks_three_frames_ahead():
     replay = memory(n_steps=3, gamma=0.5)
     for seen in range(10, 15):  # the reward of the step to 11 is 11
         replay.extend(step([seen], [seen + 1]))
     # from 10: 11 + 12 / 2 + 13 / 4 = 20.25 and 13; undiscounted it would be 36. From 12 on, what
     # follows the third step is not stored: transitions are shorter
-    assert n_step_transitions(replay) == [
+    assert transitions(replay, steps=True) == [
         (10, 10, 3, 20.25, 13, 0),
         (11, 11, 3, 22.0, 14, 0),
         (12, 12, 2, 20.0, 14, 0),
@@ -207,18 +179,13 @@ def test_a_transition_of_three_steps_ends_with_its_episode():
     replay.extend(step([50, 60], [51, 61]))
     replay.extend(step([51, 61], [52, 62]))
     # 10 ends at the terminal step, whose own map stands in; 20 before the one that was cut off
-    assert n_step_transitions(replay) == [
+    assert transitions(replay, steps=True) == [
         (10, 10, 2, 17.0, 11, 1),
         (11, 11, 1, 12.0, 11, 1),
         (20, 20, 1, 21.0, 21, 0),
         (50, 50, 1, 51.0, 51, 0),
         (60, 60, 1, 61.0, 61, 0),
     ]
-
-
-def test_transitions_of_no_steps_are_refused():
-    with pytest.raises(ValueError, match="n_steps is 0: a transition spans at least 1 step"):
-        memory(n_steps=0)
 
 
 def test_sampling_is_uniform_with_replacement():
@@ -230,9 +197,8 @@ def test_sampling_is_uniform_with_replacement():
     assert ((counts - 800).abs() < 101).all()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_maps_are_kept_once_and_in_two_bytes_a_number(dtype):
-    replay = memory(capacity=50, dtype=dtype)
+def test_maps_are_kept_once_and_in_two_bytes_a_number():
+    replay = memory(capacity=50)
     for i in range(30):
         replay.extend(step([i, 50 + i], [i + 1, 51 + i]))
     rows = replay.state_dict()["_storage"]["rows"]
@@ -241,44 +207,33 @@ def test_maps_are_kept_once_and_in_two_bytes_a_number(dtype):
 
 
 def test_what_does_not_fit_is_refused_with_the_size_that_does():
+    with pytest.raises(ValueError, match="n_steps is 0"):
+        memory(n_steps=0)
     with pytest.raises(ValueError, match=r"capacity of 5 .* one|hold 6"):
         memory(capacity=5).extend(step([1, 2, 3], [2, 3, 4]))
     memory(capacity=6).extend(step([1, 2, 3], [2, 3, 4]))
 
 
-def test_an_empty_memory_says_so():
-    with pytest.raises(RuntimeError, match="nothing to sample"):
-        memory().sample()
-
-
-def test_a_restored_memory_goes_on_as_the_saved_one():
-    first = memory(capacity=11)
-    for i in range(8):
-        first.extend(step([i, 100 + i], [i + 1, 101 + i]))
+def by_state(first, second, _):
     state = first.state_dict()
-    state = {k: dict(v) if isinstance(v, dict) else v for k, v in state.items()}
-    second = memory(capacity=11)
-    second.load_state_dict(state)
-    for replay in (first, second):
-        replay.extend(step([8, 108], [9, 109]))
-        torch.manual_seed(3)
-        replay.drawn = replay.sample()
-    assert (first.drawn == second.drawn).all()
-    with pytest.raises(ValueError, match="capacity 11, this one 12; set replay_capacity=11"):
-        memory(capacity=12).load_state_dict(state)
+    second.load_state_dict({k: dict(v) if isinstance(v, dict) else v for k, v in state.items()})
 
 
+def by_folder(first, second, folder):
+    for _ in range(2):  # the second time over the first
+        first.dumps(folder / "replay")
+    second.loads(folder / "replay")
+
+
+@pytest.mark.parametrize("move", [by_state, by_folder])
 @pytest.mark.parametrize("used", [0, 9])
-def test_a_memory_loaded_from_a_folder_goes_on_as_the_one_that_was_dumped(tmp_path, used):
+def test_a_restored_memory_goes_on_as_the_saved_one(tmp_path, move, used):
     first, second = memory(capacity=11), memory(capacity=11)
     for i in range(8):  # more rows than it holds
         first.extend(step([i, 100 + i], [i + 1, 101 + i]))
     for i in range(used):
         second.extend(step([50 + i], [51 + i]))
-    for _ in range(2):  # the second time over the first
-        first.dumps(tmp_path / "replay")
-    second.loads(tmp_path / "replay")
-    assert transitions(second) == transitions(first)
+    move(first, second, tmp_path)
     for replay in (first, second):
         replay.extend(step([8, 108], [9, 109]))
         torch.manual_seed(3)
@@ -286,11 +241,15 @@ def test_a_memory_loaded_from_a_folder_goes_on_as_the_one_that_was_dumped(tmp_pa
     assert (first.drawn == second.drawn).all()
 
 
-def test_a_memory_restored_before_any_frame_works():
+def test_an_empty_memory_is_restored_and_one_of_another_capacity_refused():
     replay = memory()
+    with pytest.raises(RuntimeError, match="nothing to sample"):
+        replay.sample()
     replay.load_state_dict(memory().state_dict())
     replay.extend(step([1], [2], ended="t"))
     assert transitions(replay) == [(1, 1, 2, 1, 1)]
+    with pytest.raises(ValueError, match="capacity 100, this one 12; set replay_capacity=100"):
+        memory(capacity=12).load_state_dict(replay.state_dict())
 
 
 def test_an_agent_that_mirrors_learns_from_what_was_seen_and_from_its_image(
