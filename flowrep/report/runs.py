@@ -148,9 +148,9 @@ def scenes_of(runs: Sequence[Run]) -> list[str]:
     return in_order([run.scene for run in runs], SCENES)
 
 
-def in_stacks(runs: Sequence[Run], order: Sequence[str] = STACKS) -> dict[str, list[Run]]:
-    """Returns the runs of each of their stacks, those in `order` first."""
-    stacks = in_order([run.stack for run in runs], order)
+def in_stacks(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Returns the runs of each of their stacks, the paper's first."""
+    stacks = in_order([run.stack for run in runs], STACKS)
     return {stack: [run for run in runs if run.stack == stack] for stack in stacks}
 
 
@@ -173,6 +173,7 @@ def groups_of(runs: Sequence[Run]) -> list[Group]:
     Runs of a group differ in scene, representations and seed alone.
     """
     keys = dict.fromkeys(key for run in runs for key in run.settings)
+    # a key that a run could have and doesn't is a difference, as when a later version added it
     own = [{k: run.settings.get(k, "absent") for k in keys if _can_have(run, k)} for run in runs]
     differing = [key for key in keys if len({of[key] for of in own if key in of}) > 1]
     groups: dict[tuple[tuple[str, str], ...], list[Run]] = {}
@@ -270,11 +271,9 @@ def change(runs: Iterable[Run], before: Condition, after: Condition) -> Array | 
 
 
 def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:
-    """Returns the success rate of a baseline, the condition's policy; None if it did not drive.
-
-    Its drive of an episode doesn't depend on the agent beside it, so each episode counts once.
-    """
+    """Returns the success rate of a baseline, the condition's policy; None if it did not drive."""
     driven = outcomes_of(runs, condition)
+    # its drive of an episode doesn't depend on the agent beside it: each episode counts once
     return None if driven is None else float(np.nanmax(driven.outcomes, axis=0).mean())
 
 
@@ -332,15 +331,12 @@ class Curve(NamedTuple):
 
 
 def curve_of(run: Run) -> Curve:
-    """Returns greedy evaluations at the run's own speed and frame rate, and training episodes.
-
-    At the frames of the final evaluation, that one alone counts: its episodes are others.
-    """
+    """Returns greedy evaluations at the run's own speed and frame rate, and training episodes."""
     e = run.episodes
     own = (e["scene"] == run.scene) & (e["speed"] == run.speed) & (e["fps"] == run.fps)
     own &= e["policy"] == "greedy"
     evaluated: dict[int, float] = {}
-    for kind in ("training", "final"):
+    for kind in ("training", "final"):  # at the final frames that one alone: other episodes
         chosen = own & (e["evaluation"] == kind)
         frames, outcomes = e["frames"][chosen], success(e["outcome"][chosen])
         at = np.unique(frames).tolist()

@@ -166,6 +166,8 @@ def _group_sections(group: Group, settings: Settings) -> list[Section]:
     return [*sections, *_curves(group.runs)]
 
 
+# Runs of a group differ in scene, stack and seed alone: the first one's speed and frame rate are
+# those of all.
 def _rates(runs: Sequence[Run], policy: str) -> list[float]:
     asked = (policy, runs[0].speed)
     return sorted({c.fps for run in runs for c in run.conditions if c[:2] == asked})

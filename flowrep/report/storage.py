@@ -41,7 +41,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
     Raises:
         RunFolderError: one of the folders holds no run at all.
     """
-    runs: dict[str, Run] = {}
+    runs: dict[str, Run] = {}  # by path, so that a folder given twice counts once
     warnings: list[str] = []
     for folder in folders:
         place, pattern = (folder, "*") if folder.exists() else (folder.parent, folder.name)

@@ -45,7 +45,7 @@ def sweep(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(sweep):
-    numbers = {"resamples": 200, "trajectories": 1, "videos": 1}
+    numbers = {"resamples": 20, "trajectories": 1, "videos": 1}
     return report(ReportConfig(run=[str(sweep)], output=None, policy="greedy", **numbers))
 
 

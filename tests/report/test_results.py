@@ -11,17 +11,7 @@ pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
 from flowrep.report import results
-from flowrep.report.results import (
-    Claim,
-    Contrast,
-    claims_of,
-    drawn_paths,
-    one_way,
-    rate_table,
-    scene_table,
-    scores,
-    studies_of,
-)
+from flowrep.report.results import Claim, Contrast, rate_table, scores
 from flowrep.report.runs import Run
 from flowrep.report.statistics import Effect
 from flowrep.report.storage import episode_columns, is_archive, read_archive
@@ -46,7 +36,7 @@ def claims(runs, *contrasts, **changes):
     claim = {"claim": "c", "contrasts": list(contrasts), "limits": ""}
     base = {"studies": {"main": SCENES}, "scenes": [*SCENES], "primary": [claim], "secondary": []}
     declared = base | changes
-    return claims_of(declared, studies_of(declared, runs))
+    return results.claims_of(declared, results.studies_of(declared, runs))
 
 
 def runs_with(**successes):
@@ -164,15 +154,15 @@ def test_scores_weigh_conditions():
 
 def test_a_run_finds_a_way_by_half_of_its_episodes():
     seeds = np.arange(100, 108)
-    on_first = drawn_paths(seeds, 2) == 0
+    on_first = results.drawn_paths(seeds, 2) == 0
     one = "".join("s" if first else "c" for first in on_first)
     runs = [
         run_of("t_one", {"normal": one}, paths=2),
         run_of("t_all", {"normal": "s" * 8}, paths=2),
         run_of("t_none", {"normal": "c" * 8}, paths=2),
     ]
-    assert one_way(runs) == (1, 1)
-    assert "1 of 3" in scene_table(runs, is_fork=True)
+    assert results.one_way(runs) == (1, 1)
+    assert "1 of 3" in results.scene_table(runs, is_fork=True)
 
 
 def test_frame_rates_are_compared_on_the_same_episodes():
@@ -189,7 +179,7 @@ def test_an_episodes_path_is_the_one_that_it_draws():
     scene = load_scene("h_shaped_pathways")
     rules = Rules(Layout(scene), 12.0, 2)
     driven = [Episode(rules, seed, (1.2, 1.8), 10.0).path for seed in range(8)]
-    drawn = drawn_paths(np.arange(8), len(scene.paths))
+    drawn = results.drawn_paths(np.arange(8), len(scene.paths))
     assert [scene.paths[place] for place in drawn] == driven
     assert len(set(drawn.tolist())) > 1
 
