@@ -28,7 +28,8 @@ def run_of(name, ends, *, scene="straight_road", stack="ego+obj", seed=0, paths=
     for condition, outcomes in ends.items():
         where = {"speed": condition} if isinstance(condition, str) else {"fps": float(condition)}
         rows += rows_of(config, outcomes, **where)
-    return Run(name, config, episode_columns(rows), {})
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    return Run(name, config, episode_columns(columns), {})
 
 
 def claims(runs, *contrasts, **changes):
