@@ -213,6 +213,7 @@ class Algorithm(ABC):
         """Moves the targets by `tau` towards the weights; called after each optimizer step."""
         if self.tau is not None:
             with torch.no_grad():
+                # one call for all weights, where SoftUpdate's step makes some for each
                 torch._foreach_lerp_(self._targets, self._followed, self.tau)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -233,10 +234,10 @@ class Algorithm(ABC):
         self.optimizer.zero_grad(set_to_none=True)
         losses = self.losses(batch)
         minimised = [loss for name, loss in losses.items() if name.endswith("_loss")]
-        torch.stack(minimised).sum().backward()
+        torch.stack(minimised).sum().backward()  # all gradients at the same weights
         metrics = {name: value.detach() for name, value in losses.items()}
         metrics["grad_norm"] = self._gradient_norm()
-        self.divergence.record(metrics)
+        self.divergence.record(metrics)  # before the step, which is skipped if they are bad
         self.optimizer.step()
         self.after_update()
         return TensorDict(metrics, [])
@@ -277,7 +278,7 @@ class Algorithm(ABC):
             )
         for name, weight in self.weights.items():
             weight.copy_(saved[name])
-        self.optimizer.state.clear()
+        self.optimizer.state.clear()  # a state of no updates has no moments
         for name, moments in state["moments"].items():
             weight = self.trained[name]
             self.optimizer.state[weight] = {

@@ -144,6 +144,7 @@ class DoubleDQN(OffPolicy):
     def remember(self, steps: TensorDictBase) -> None:
         """Stores steps and lowers ε for each of them."""
         super().remember(steps)
+        # EGreedyModule.step would loop over the frames
         e = self.exploration
         fall = (e.eps_init - e.eps_end) / e.annealing_num_steps * steps.numel()
         e.eps.copy_(torch.maximum(e.eps - fall, e.eps_end))

@@ -107,7 +107,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch, with gradients, and further metrics, without."""
-        alpha = self.log_alpha.detach().exp()
+        alpha = self.log_alpha.detach().exp()  # L_α alone trains it
         # before the other maps are decoded: one-hot maps are large
         target = self._target(tensordict, alpha)
         images = decode_maps(self.codecs, tensordict)
@@ -121,13 +121,15 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         action = self.actions.numbers(tensordict["action"])
         chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
         td_error = chosen - target
+        # the smaller of both Qs: a policy that maximises one seeks out its errors
         expected_q = (policy * q.detach().amin(0)).sum(-1)
-        surplus = (negative_entropy.detach() + self.target_entropy).mean()
+        # H̄ - H: where the policy lacks entropy, L_α raises α
+        lack = (negative_entropy.detach() + self.target_entropy).mean()
         return TensorDict(
             {
                 "loss_qvalue": td_error.square().mean(-1).sum(),
                 "loss_actor": (alpha * negative_entropy - expected_q).mean(),
-                "loss_alpha": -self.log_alpha * surplus,
+                "loss_alpha": -self.log_alpha * lack,
                 "alpha": alpha,
                 "entropy": -negative_entropy.detach().mean(),
                 "q_mean": expected_q.detach().mean(),
@@ -139,6 +141,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     def _target(self, batch: TensorDictBase, alpha: Tensor) -> Tensor:
         """Returns y `[N]`."""
         images = decode_maps(self.codecs, batch["next"])
+        # the target encoder is the same module with other weights
         with self.target_critic_encoder_params.to_module(self.critic_encoder):
             embedding = self.critic_encoder(images)
         seen = embedding if self.encoder_is_shared else self.actor_encoder(images)

@@ -93,6 +93,7 @@ class DiscreteSACValueLoss(LossModule):
             {
                 "loss_qvalue": 0.5 * sum(F.mse_loss(q, y) for q in chosen),
                 "loss_value": 0.5 * F.mse_loss(value, value_target),
+                # Q1 alone, as ML-Agents has it
                 "loss_actor": (policy * (alpha * log_policy - q1.detach())).sum(-1).mean(),
                 "loss_alpha": -self.log_alpha
                 * (negative_entropy.detach() + self.target_entropy).mean(),

@@ -124,6 +124,7 @@ class Head(nn.Module):
         """Returns one float32 number per output."""
         with _autocast_like(embedding):
             hidden = F.silu(self.hidden(embedding))
+        # float32, as actions are chosen by small differences of the outputs
         return self.output(hidden.float())
 
 
@@ -139,6 +140,7 @@ def heads_together(embedding: Tensor, weights: Mapping[str, Any]) -> Tensor:
     hidden, output = weights["hidden"], weights["output"]
     with _autocast_like(embedding):
         x = F.silu(F.linear(embedding, hidden["weight"].flatten(0, 1), hidden["bias"].flatten()))
+    # [N, heads * hidden] to [heads, N, hidden]
     x = x.float().unflatten(-1, hidden["bias"].shape).movedim(-2, 0)
     return torch.baddbmm(output["bias"].unsqueeze(-2), x, output["weight"].mT)
 

@@ -63,6 +63,7 @@ class PersistentExploration:
         steps_left.copy_(torch.where(begins, lengths, steps_left))
         drawn = torch.randint_like(repeated, self.actions.count)
         repeated.copy_(torch.where(begins, drawn, repeated))
+        # a length of n covers this step and the n - 1 that follow
         own, other, repeats = acted["action"], repeated, steps_left > 0
         if self.actions.space == "one-hot":
             other, repeats = F.one_hot(other, self.actions.count), repeats.unsqueeze(-1)

@@ -41,6 +41,7 @@ class Rollout:
         for step in time_first(frames).unbind(0):
             kept = store_maps(self.codecs, step)
             kept.update(step.select("action", "action_log_prob").detach())
+            # with the next maps, since after a truncated step the next row is another episode's
             outcome = step["next"].select("reward", "done", "terminated")
             kept["next"] = store_maps(self.codecs, step["next"]).update(outcome)
             self._steps.append(kept.to(self.device))
@@ -231,7 +232,7 @@ class PPO(Algorithm):
         """Returns the round's next batch; the first call begins the round and clears the memory."""
         if not self._batches:
             self._round = self._with_advantages(self.memory.steps()).reshape(-1)
-            self.memory.clear()
+            self.memory.clear()  # no frame is learnt from in two rounds
             for _ in range(self.epochs):
                 rows = torch.randperm(len(self._round)).split(self.batch_size)
                 self._batches += [r for r in rows if len(r) == self.batch_size]

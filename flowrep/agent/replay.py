@@ -214,7 +214,9 @@ class SuccessorSampler(Sampler):
             )
         if not len(self._next_row):
             self._next_row = torch.full((storage.max_size,), -1)
+        # also forgets the links of the rows that these overwrite
         self._next_row[index] = torch.where(terminated, index, -1)
+        # `before` and `after` pair each step with the one before it, `envs` rows back
         ahead = torch.where(done | terminated, -1, index)
         known = self._latest if len(self._latest) == envs else self._latest[:0]
         before = torch.cat([known, ahead[:-envs]])
@@ -255,6 +257,7 @@ class SuccessorSampler(Sampler):
             # a terminal step is its own successor, and one without a successor can't be the last
             goes_on = (ahead != last) & (self._next_row[ahead] >= 0)
             last = torch.where(goes_on, ahead, last)
+            # γ to the number of steps so far, or 0 where the transition has ended
             weight = (self.gamma**steps * goes_on[:, None]).to(rewards.device)
             reward = reward + weight * rewards.index_select(0, last.to(rewards.device))
             steps = steps + goes_on[:, None]

@@ -1,6 +1,5 @@
 """What holds for every algorithm of conf/algorithm/."""
 
-import copy
 import math
 from functools import partial
 from unittest.mock import patch
@@ -45,7 +44,7 @@ def weights(agent):
 def test_an_update_moves_all_weights_and_returns_what_it_says(make_any, random_steps):
     agent = make_any()
     before = weights(agent)
-    (*_, last) = learn(agent, random_steps, 20)
+    (*_, last) = learn(agent, random_steps, 12)
     assert [name for name, weight in weights(agent).items() if weight.equal(before[name])] == []
     assert tuple(sorted(last)) == tuple(sorted(agent.metric_names()))
     assert all(value.shape == () and not value.requires_grad for value in last.values())
@@ -66,8 +65,8 @@ def test_a_transition_of_three_steps_is_discounted_three_times(make_any, random_
 
 @pytest.mark.slow_after_first
 def test_the_learning_rate_ends_at_zero_with_the_frames(make_any, random_steps):
-    agent = make_any(total_frames=200, learning_rate=2**-10)
-    metrics = learn(agent, random_steps, 40)
+    agent = make_any(total_frames=100, learning_rate=2**-10)
+    metrics = learn(agent, random_steps, 20)
     rates = [m["learning_rate"].item() for m in metrics]
     assert len(rates) == agent.total_updates
     assert rates[0] == 2**-10
@@ -108,50 +107,31 @@ def test_a_resumed_agent_equals_an_uninterrupted_one_bit_for_bit(make_any, rando
 
 
 @pytest.mark.slow_after_first
-@pytest.mark.parametrize("before", [0, 2], ids=["before any update", "after two"])
-def test_a_used_agent_that_is_loaded_equals_a_new_one_bit_for_bit(make_any, random_steps, before):
-    used, new = make_any(learning_rate=0.01), make_any(learning_rate=0.01, seed=9)
+def test_an_agent_that_diverged_keeps_its_weights_and_can_begin_anew(make_any, random_steps):
+    used, new = make_any(learning_rate=0.01), make_any(learning_rate=0.01)
     for _ in range(12):
         used.remember(random_steps(ENVS))
-    batches = [used.sample() for _ in range(before + 4)]
-    for batch in batches[:before]:
-        used.update(batch.clone())
-    state = copy.deepcopy(used.state_dict())
-    for batch in batches:
-        used.update(batch.clone())
+    batches = [used.sample() for _ in range(3)]
     bad = spoilt(batches[0])
-    used.update(bad.clone())
-    with pytest.raises(DivergenceError, match=rf"in update {2 * before + 5} "):
-        used.divergence.check()
-    for agent in (used, new):
-        agent.load_state_dict(state)
-        for batch in batches[before:]:
-            agent.update(batch.clone())
-        agent.divergence.check()
-    a, b = weights(used), weights(new)
-    assert [name for name in a if not torch.equal(a[name], b[name])] == []
-    used.update(bad)
-    with pytest.raises(DivergenceError, match=rf"in update {before + 5} "):
-        used.divergence.check()
 
+    def diverge():
+        for batch in batches:
+            used.update(batch.clone())
+        used.divergence.check()
+        before = weights(used)
+        used.update(bad.clone())
+        used.update(batches[0].clone())
+        assert [n for n in used.trained if not torch.equal(used.weights[n], before[n])] == []
+        with pytest.raises(DivergenceError, match=r"_loss became nan in update 4 "):
+            used.divergence.check()
+        return before
 
-@pytest.mark.slow_after_first
-def test_a_loss_that_is_no_number_stops_the_weights_and_is_named(make_any, random_steps):
-    agent = make_any()
-    learn(agent, random_steps, 12)
-    agent.divergence.check()
-    before, updates = weights(agent), agent.updates
-    rewards = random_steps(ENVS)
-    rewards["next", "reward"] = torch.full((ENVS, 1), math.inf)
-    rewards["next", "terminated"] = torch.ones(ENVS, 1, dtype=torch.bool)
-    for _ in range(16):
-        agent.remember(rewards)
-    for _ in range(3):
-        agent.update(agent.sample())
-    moved = {n for n, w in weights(agent).items() if not torch.equal(w, before[n])}
-    assert not moved & agent.trained.keys()
-    with pytest.raises(DivergenceError, match=rf"_loss became (nan|inf) in update {updates + 1} "):
-        agent.divergence.check()
+    diverge()
+    used.load_state_dict(new.state_dict())
+    after = diverge()
+    for batch in batches:
+        new.update(batch.clone())
+    assert [name for name, w in weights(new).items() if not torch.equal(w, after[name])] == []
 
 
 def test_where_nothing_is_observed_nothing_is_done(make_any, random_maps):
@@ -162,6 +142,7 @@ def test_where_nothing_is_observed_nothing_is_done(make_any, random_maps):
             assert agent.policy(maps)["action"].shape == maps.shape
 
 
+@pytest.mark.slow_after_first
 def test_one_hot_actions_are_learnt_from_as_well(make_any, random_steps):
     agent = make_any(action_spec=OneHot(3))
 
@@ -179,16 +160,15 @@ def test_a_state_of_other_maps_is_refused_by_name(make_any):
         make_any(keys=["flow", "seg"]).load_state_dict(saved)
 
 
-@pytest.mark.parametrize("changes", [{}, {"layer_norm": True}], ids=["as is", "layer norm"])
 def test_a_policy_is_built_and_loaded_without_its_learner(
-    make_any, observation_spec, random_steps, random_maps, tmp_path, changes
+    make_any, observation_spec, random_steps, random_maps, tmp_path
 ):
     """Of one environment, too, where a rollout would be less than a batch of PPO's."""
-    agent = make_any(**changes)
+    agent = make_any(layer_norm=True)
     learn(agent, random_steps, 12)
     save_checkpoint(tmp_path / "c", {"policy": dict(agent.policy.state_dict())})
     options = make_any.options | {"total_frames": 1000}
-    options |= {name: value for name, value in changes.items() if name in options}
+    options |= {"layer_norm": True} if "layer_norm" in options else {}
     policy = type(agent).make_policy(
         observation_spec[:1], Categorical(3), ["flow", "seg"], device="cpu", **options
     )
@@ -211,10 +191,10 @@ def test_actions_are_drawn_as_the_distribution_says(make_any, random_steps, rand
     maps = random_maps(1)
     with torch.no_grad():
         expected = agent.policy.get_dist(maps.clone()).probs[0]
-        drawn = agent.policy(maps.expand(3000).contiguous())["action"]
-    # three standard deviations of a share are 0.027
-    shares = torch.bincount(drawn, minlength=3) / 3000
-    torch.testing.assert_close(shares, expected, atol=0.03, rtol=0)
+        drawn = agent.policy(maps.expand(1000).contiguous())["action"]
+    # three standard deviations of a share are 0.047
+    shares = torch.bincount(drawn, minlength=3) / 1000
+    torch.testing.assert_close(shares, expected, atol=0.05, rtol=0)
 
 
 def test_the_first_bad_update_is_counted_and_told_with_its_metrics():

@@ -34,8 +34,6 @@ def test_one_hot_actions_learn_what_categorical_ones_do(make_agent, random_steps
 def test_settings_that_do_not_exist_are_refused(make_agent):
     with pytest.raises(ValueError, match="encoder='both'"):
         make_agent(encoder="both")
-    with pytest.raises(ValueError, match="precision='fp16'"):
-        make_agent(precision="fp16")
     with pytest.raises(TypeError, match="Binary"):
         make_agent(action_spec=Binary(3))
 
