@@ -35,7 +35,6 @@ from flowrep.extras import require
 
 require("flowrep.torchrl_configs", "train", "hydra")
 
-from hydra.core.config_store import ConfigStore
 from torchrl.trainers.algorithms.configs.data import (
     ReplayBufferBaseConfig,
     SamplerConfig,
@@ -47,7 +46,7 @@ from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from flowrep.agent import dqn, dsac, dsac_v, ppo, replay
 from flowrep.envs import torchrl_env
-from flowrep.transforms.hydra_configs import config_class
+from flowrep.transforms.hydra_configs import config_class, register
 
 # By group and name.
 CONFIGS: dict[tuple[str, str], type] = {
@@ -66,12 +65,4 @@ CONFIGS: dict[tuple[str, str], type] = {
     ("transform", "pack_steps"): config_class(replay.PackSteps, TransformConfig, partial=True),
 }
 
-
-def register() -> None:
-    """Stores each config in its group; importing the module calls this."""
-    store = ConfigStore.instance()
-    for (group, name), config in CONFIGS.items():
-        store.store(group=group, name=name, node=config, provider="flowrep")
-
-
-register()
+register(CONFIGS)

@@ -130,9 +130,8 @@ class AdaptPose(MapTransform):
         direction: `"camera_to_world"` or `"world_to_camera"`.
         axes: `"opencv"`, `"opengl"` (Blender's), `"ned"` or `"x_forward_z_up"`.
         check: whether ill-formed poses raise ValueError at resets, in the envs that are reset, and
-            on batches, except after an episode's end where TorchRL writes nan; steps aren't
-            checked. A check waits for a GPU: switch it off if resets or replay samples have to be
-            fast there.
+            at the root of batches; steps aren't checked. A check waits for a GPU: switch it off if
+            resets or replay samples have to be fast there.
         in_keys: key of the env's pose.
         out_keys: key of the result; must differ, so that nothing is adapted twice.
 
@@ -178,10 +177,9 @@ class AdaptPose(MapTransform):
 
     def _refuse_ill_formed(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> None:
         """Raises ValueError for an ill-formed pose, in the given rows `[*B]` or in all."""
-        pose = tensordict.get(self.in_keys[0], None)
-        if not self.check or pose is None:
+        if not self.check or tensordict.get(self.in_keys[0], None) is None:
             return
-        self._check_layout([pose], tensordict.batch_size)
+        (pose,) = self._inputs(tensordict)
         if rows is not None:
             # A stand-in for the others; a quaternion has length 1 with either end as its real part.
             rank = len(self.reads[0].shape)
@@ -202,21 +200,7 @@ class AdaptPose(MapTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the poses of a batch of any shape, at its root and under `"next"`."""
         self._refuse_ill_formed(tensordict)
-        following = tensordict.get("next", None)
-        if following is not None:
-            self._refuse_ill_formed(following, self._observed(following))
         return super().forward(tensordict)
-
-    def _observed(self, following: TensorDictBase) -> Tensor | None:
-        """Returns where the next step was observed: TorchRL hides that of an env that reset itself.
-
-        There the pose is nan throughout, and the step is done.
-        """
-        pose, done = (following.get(key, None) for key in (self.in_keys[0], "done"))
-        if pose is None or done is None:
-            return None
-        hidden = ~pose.isfinite().flatten(following.ndim).any(-1)
-        return ~(hidden & flags_of_batch(done, following))
 
     def output_specs(self, pose: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded float64 spec."""

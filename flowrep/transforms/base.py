@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
@@ -62,6 +62,7 @@ class MapTransform(Transform):
         reads: the expected layout of each input, in the order of `in_keys`.
         in_keys: keys to read.
         out_keys: keys to write.
+        writes: the number of outputs, each of which needs a key.
 
     Attributes:
         label: the representations that it serves, for error messages; by default its out_keys.
@@ -72,26 +73,43 @@ class MapTransform(Transform):
     # Takes the specs of the input keys, returns those of the output keys.
     output_specs: Callable[..., tuple[TensorSpec, ...]]
 
-    def __init__(self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys) -> None:
+    def __init__(
+        self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys, writes: int = 1
+    ) -> None:
         super().__init__(in_keys=as_keys(in_keys), out_keys=as_keys(out_keys))
         if len(self.in_keys) != len(reads):
             raise ValueError(
                 f"{type(self).__name__} reads {len(reads)} keys "
                 f"({', '.join(map(str, reads))}), in_keys has {len(self.in_keys)}: {self.in_keys}"
             )
+        if len(self.out_keys) != writes:
+            raise ValueError(
+                f"{type(self).__name__} writes {writes} keys, out_keys has {self.out_keys}"
+            )
         self.reads = tuple(reads)
         self.compiled = False
         self.label = " and ".join(repr(key) for key in self.out_keys)
 
-    def _check_layout(self, maps: Sequence[Tensor | TensorSpec], batch: torch.Size) -> None:
-        """Raises ValueError for the first input whose layout is wrong or contradicts the others.
+    def _inputs(self, source: TensorDictBase | Composite) -> list[Any]:
+        """Returns the tensors or the specs under `in_keys`.
 
-        `batch` is the TensorDict's or the spec's; that of the inputs may have further dims.
+        Raises:
+            MissingKey: one is not there; names the others.
+            ValueError: the layout of one is wrong, or contradicts that of those before it.
         """
-        agreed: dict[str, int] = {}
-        leading = maps[0].shape[: -len(self.reads[0].shape)]
+        maps = [source.get(key, None) for key in self.in_keys]
+        for key, value in zip(self.in_keys, maps):
+            if value is None:
+                offered = sorted(source.keys(True, True), key=str)
+                raise MissingKey(
+                    f"representation {self.label} needs key {key!r}; the env offers {offered}. "
+                    "Name another one with in_keys=, or let the env emit it."
+                )
+        # The TensorDict's or the spec's batch; that of the inputs may have further dims.
+        batch, leading = source.shape, maps[0].shape[: -len(self.reads[0].shape)]
         if leading[: len(batch)] == batch:
             batch = leading
+        agreed: dict[str, int] = {}
         for key, reads, value in zip(self.in_keys, self.reads, maps):
             rank = len(reads.shape)
             sizes = [
@@ -107,22 +125,11 @@ class MapTransform(Transform):
                     f"got {value.dtype} {list(value.shape)}"
                 )
             agreed |= {name: n for name, n in zip(reads.shape, sizes) if isinstance(name, str)}
-
-    def _missing(self, key: NestedKey, offered: TensorDictBase | Composite) -> MissingKey:
-        keys = sorted(offered.keys(True, True), key=str)
-        return MissingKey(
-            f"representation {self.label} needs key {key!r}; "
-            f"the env offers {keys}. Name another one with in_keys=, or let the env emit it."
-        )
+        return maps
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Returns the inputs; raises if one is missing or has another layout."""
-        maps = [tensordict.get(key, None) for key in self.in_keys]
-        for key, value in zip(self.in_keys, maps):
-            if value is None:
-                raise self._missing(key, tensordict)
-        self._check_layout(maps, tensordict.batch_size)
-        return maps
+        """Returns the inputs of `compute`; a subclass may check their values."""
+        return self._inputs(tensordict)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         lacks = (next_tensordict.get(key, None) is None for key in self.in_keys)
@@ -156,12 +163,7 @@ class MapTransform(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Returns the specs including those of the outputs."""
-        offered = observation_spec.keys(True, True)
-        for key in self.in_keys:
-            if key not in offered:
-                raise self._missing(key, observation_spec)
-        specs = [observation_spec[key] for key in self.in_keys]
-        self._check_layout(specs, observation_spec.shape)
+        specs = self._inputs(observation_spec)
         observation_spec = observation_spec.clone()
         for key, spec in zip(self.out_keys, self.output_specs(*specs)):
             observation_spec[key] = spec
@@ -176,15 +178,21 @@ class RecurrentTransform(MapTransform):
     """Reads the step before from the TensorDict passed to `step`, and keeps no state itself.
 
     The env declares the `carried_keys` as part of its state, so that episodes and envs can't mix.
-    `compute` returns the outputs at an episode's first frame, `advance` those of any other. In an
-    env that resets itself within a step (TorchRL's native auto-reset), the next frame of an env
-    that is done is a first one, for the transforms that follow too.
+    `compute` returns the outputs at an episode's first frame, `advance` those of any other.
+
+    In a replay buffer, stored outputs are left as they are. Outputs that are missing under `"next"`
+    follow from the root. Those that are missing at the root need a trajectory: a dimension named
+    "time", and `("next", "done")`; its first frame counts as an episode's first.
     """
 
     @property
-    @abstractmethod
     def carried_keys(self) -> list[NestedKey]:
-        """The entries of the step before that `advance` needs."""
+        """The entries of the step before that `advance` needs: by default the inputs."""
+        return self.in_keys
+
+    def compute(self, *now: Tensor) -> tuple[Tensor, ...]:
+        """Returns the outputs at an episode's first frame: by default as if nothing changed."""
+        return self.advance(now, now)
 
     @abstractmethod
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -192,6 +200,18 @@ class RecurrentTransform(MapTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         now = self._read(next_tensordict)
+        made = self.advance(self._carried(tensordict), now)
+        env = self.parent
+        if env is not None and env.__dict__.get("_torchrl_native_autoreset", False):
+            # The next frame of an env that is done is a first one already, and the transforms that
+            # follow have to see what is computed from it.
+            done = flags_of_batch(next_tensordict.get("done"), next_tensordict)
+            made = self._begun_anew(done, now, made)
+        for key, value in zip(self.out_keys, made):
+            next_tensordict.set(key, value)
+        return next_tensordict
+
+    def _carried(self, tensordict: TensorDictBase) -> list[Tensor]:
         before = [tensordict.get(key, None) for key in self.carried_keys]
         for key, value in zip(self.carried_keys, before):
             if value is None:
@@ -199,36 +219,60 @@ class RecurrentTransform(MapTransform):
                     f"representation {self.label} needs {key!r} of the previous step: pass step "
                     f"the TensorDict of reset or step_mdp, which holds {key!r}"
                 )
-        for key, value in zip(self.out_keys, self.advance(before, now)):
-            next_tensordict.set(key, value)
-        env = self.parent
-        if env is not None and env.__dict__.get("_torchrl_native_autoreset", False):
-            self.begin_anew(next_tensordict.get("done"), next_tensordict)
-        return next_tensordict
+        return before
 
-    def begin_anew(self, begins: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
-        """Replaces the outputs of envs that have just begun an episode by those of a first frame.
+    def _begun_anew(
+        self, begins: Tensor, now: Sequence[Tensor], made: Sequence[Tensor]
+    ) -> tuple[Tensor, ...]:
+        """Returns outputs with those of a first frame where an episode `begins`, bool `[*B]`."""
+        return tuple(
+            torch.where(expand_as_right(begins, first), first, later)
+            for first, later in zip(self.compute(*now), made)
+        )
 
-        Args:
-            begins: bool `[*B]` or `[*B, 1]`.
-            tensordict: `[*B]`, with the inputs and the outputs.
-        """
-        begins = flags_of_batch(begins, tensordict)
-        for key, first in zip(self.out_keys, self.compute(*self._read(tensordict))):
-            mask = expand_as_right(begins, first)
-            tensordict.set(key, torch.where(mask, first, tensordict.get(key)))
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the outputs that a replay batch lacks, at its root and under `"next"`."""
+        if missing := [key for key in self.out_keys if tensordict.get(key, None) is None]:
+            made = self._along_trajectory(tensordict, missing[0])
+            for key in missing:
+                tensordict.set(key, made[key])
+        following = tensordict.get("next", None)
+        if following is None or not any(key in following.keys(True) for key in self.in_keys):
+            return tensordict
+        # What is stored there is right even if the next frame is several steps ahead.
+        if missing := [key for key in self.out_keys if following.get(key, None) is None]:
+            _refuse_n_step(tensordict, missing[0])
+            later = self.advance(self._carried(tensordict), self._read(following))
+            for key, value in zip(self.out_keys, later):
+                if key in missing:
+                    following.set(key, value)
+            tensordict.set("next", following)
         return tensordict
 
-    def _trajectory(self, tensordict: TensorDictBase, key: NestedKey) -> tuple[Tensor, int]:
-        """Returns `done` `[*B]` of a trajectory that lacks `key`, and which dimension is time."""
-        done = tensordict.get(("next", "done"), None)
+    def _along_trajectory(
+        self, tensordict: TensorDictBase, missing: NestedKey
+    ) -> dict[NestedKey, Tensor]:
+        """Returns the outputs at each step of a trajectory, as the env would have given them."""
+        now, done = self._read(tensordict), tensordict.get(("next", "done"), None)
         if done is None or "time" not in tensordict.names:
             raise MissingKey(
-                f"{key!r} is not in the batch, and the step before can't be told: store {key!r}, "
-                f"or give a trajectory with ('next', 'done') and a dimension named 'time' "
-                f"(td.refine_names(..., 'time')); names are {tensordict.names}"
+                f"{missing!r} is not in the batch, and the step before can't be told: store "
+                f"{missing!r}, or give a trajectory with ('next', 'done') and a dimension named "
+                f"'time' (td.refine_names(..., 'time')); names are {tensordict.names}"
             )
-        return flags_of_batch(done, tensordict), tensordict.names.index("time")
+        time = tensordict.names.index("time")
+        ended = flags_of_batch(done, tensordict).unbind(time)
+        steps: list[tuple[Tensor, ...]] = []
+        before: list[Tensor] = []
+        for t, frame in enumerate(zip(*(value.unbind(time) for value in now))):
+            made = self.compute(*frame)
+            if t > 0:
+                made = self._begun_anew(ended[t - 1], frame, self.advance(before, frame))
+            moment = dict(zip([*self.in_keys, *self.out_keys], [*frame, *made]))
+            before = [moment[key] for key in self.carried_keys]
+            steps.append(made)
+        return {key: torch.stack(made, time) for key, made in zip(self.out_keys, zip(*steps))}
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Returns the input specs of `step`, including the carried entries."""
@@ -259,22 +303,24 @@ def check_own_keys(transform: MapTransform) -> None:
         )
 
 
+def check_choice(option: str, chosen: Sequence[str], known: Collection[str]) -> None:
+    """Raises ValueError unless `chosen` is a list of some of the known names, each once."""
+    is_wrong = isinstance(chosen, str) or not chosen or not set(chosen) <= set(known)
+    if is_wrong or len(set(chosen)) != len(chosen):
+        raise ValueError(
+            f"{option} must be a list with some of {list(known)}, each once; got {chosen!r}"
+        )
+
+
 def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
     """Returns flags such as `done`, `[*B]` or `[*B, 1]`, as `[*B]`, the TensorDict's batch."""
     batch_dims = tensordict.ndim
     return flags.flatten(batch_dims).any(-1) if flags.ndim > batch_dims else flags
 
 
-def refuse_n_step(tensordict: TensorDictBase, key: NestedKey) -> None:
-    """Raises MissingKey if a batch's next frames are more than one step after its root's.
-
-    TorchRL's `MultiStep` and `MultiStepTransform` write the number of steps to
-    `"steps_to_next_obs"`.
-
-    Args:
-        tensordict: a replay batch that lacks `("next", key)`.
-        key: the entry that needs two consecutive steps.
-    """
+def _refuse_n_step(tensordict: TensorDictBase, key: NestedKey) -> None:
+    """Raises MissingKey if the next frames of a batch are more than one step after its root's."""
+    # TorchRL's MultiStep and MultiStepTransform write the number of steps to this key.
     steps = tensordict.get("steps_to_next_obs", None)
     if steps is not None and bool((steps != 1).any()):
         raise MissingKey(
@@ -296,8 +342,3 @@ def _is_kind(dtype: torch.dtype, kind: str) -> bool:
     if kind == "integer":
         return not (dtype.is_floating_point or dtype.is_complex or dtype is torch.bool)
     return True
-
-
-def unknown_name(what: str, name: str, known: Sequence[str] | Mapping[str, Any]) -> str:
-    """Returns an error message for an unknown name, with the known ones."""
-    return f"unknown {what} {name!r}. There are {list(known)}"

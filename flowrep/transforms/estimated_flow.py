@@ -7,25 +7,26 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torchrl.data import TensorSpec, Unbounded
 
+from flowrep.extras import require
+from flowrep.geometry.checks import check_name
 from flowrep.transforms.base import Keys, Reads
-from flowrep.transforms.flow import FlowTransform, checked_outputs, mask_spec
+from flowrep.transforms.flow import FlowTransform
 
 PICTURE_PAIR = Reads((6, "H", "W"), "integer")
 
 # Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
 Estimator = Callable[[Tensor, Tensor], Tensor]
 
-PRESETS = ("ultrafast", "fast", "medium")  # OpenCV's numbers 0, 1, 2
+Preset = Literal["ultrafast", "fast", "medium"]  # OpenCV's numbers 0, 1, 2
+Network = Literal["raft_small", "raft_large"]
 SMALLEST_SIDE_PX = 128  # the network's coarsest correlation level has 1 / 64 of this
 _MULTIPLE_PX = 8  # the network works at an eighth of the size
-NETWORKS = ("raft_small", "raft_large")
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,10 @@ class DIS:
 
     def __post_init__(self) -> None:
         """Raises ValueError for invalid options, and ImportError without OpenCV."""
-        if self.preset not in PRESETS:
-            raise ValueError(f"preset must be one of {list(PRESETS)}, got {self.preset!r}")
+        check_name("preset", self.preset, Preset)
         if self.min_side_px < 1:
             raise ValueError(f"min_side_px must be at least 1, got {self.min_side_px}")
-        _opencv()
+        require("flow estimated by DIS", "flow", "cv2")
 
     def __call__(self, first: Tensor, second: Tensor) -> Tensor:
         """Returns the displacement of each pixel from the first picture to the second.
@@ -77,7 +77,8 @@ class DIS:
             first: uint8 `[N, 3, H, W]`, RGB.
             second: as `first`.
         """
-        pairs = list(zip(_channels_last(first), _channels_last(second)))
+        arrays = (x.movedim(-3, -1).contiguous().cpu().numpy() for x in (first, second))
+        pairs = list(zip(*arrays))
         with ThreadPoolExecutor(max(1, min(len(pairs), torch.get_num_threads()))) as pool:
             flows = list(pool.map(lambda pair: self._flow(*pair), pairs))
         if not flows:
@@ -85,7 +86,8 @@ class DIS:
         return torch.stack(flows).to(first.device)
 
     def _flow(self, first: Any, second: Any) -> Tensor:
-        cv2 = _opencv()
+        import cv2  # here, as it is an extra
+
         height, width = first.shape[:2]
         factor = whole_factor(height, width, self.min_side_px)
         grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second)]
@@ -93,7 +95,7 @@ class DIS:
             size = (width * factor, height * factor)
             grey = [cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC) for picture in grey]
         # One estimator per call: its buffers aren't thread-safe, and creating it is cheap.
-        flow = cv2.DISOpticalFlow_create(PRESETS.index(self.preset)).calc(*grey, None)
+        flow = cv2.DISOpticalFlow_create(get_args(Preset).index(self.preset)).calc(*grey, None)
         if factor > 1:
             flow = cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) / factor
         return torch.from_numpy(flow).movedim(-1, 0)
@@ -106,21 +108,6 @@ def whole_factor(height: int, width: int, min_side_px: int) -> int:
     (4, 1)
     """
     return max(1, math.ceil(min_side_px / min(height, width)))
-
-
-def _channels_last(pictures: Tensor) -> Any:
-    """Returns the pictures as a numpy array [N, H, W, 3], which OpenCV reads."""
-    return pictures.movedim(-3, -1).contiguous().cpu().numpy()
-
-
-def _opencv() -> Any:
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError(
-            "flow estimated by DIS needs OpenCV: pip install 'flowrep-rl[flow]'"
-        ) from error
-    return cv2
 
 
 class RAFT(nn.Module):
@@ -152,8 +139,7 @@ class RAFT(nn.Module):
         min_side_px: int = SMALLEST_SIDE_PX,
     ) -> None:
         super().__init__()
-        if network not in NETWORKS:
-            raise ValueError(f"network must be one of {list(NETWORKS)}, got {network!r}")
+        check_name("network", network, Network)
         if min_side_px < SMALLEST_SIDE_PX or updates < 1:
             raise ValueError(
                 f"RAFT needs min_side_px of at least {SMALLEST_SIDE_PX} and at least one update, "
@@ -172,14 +158,7 @@ class RAFT(nn.Module):
 
     @torch.no_grad()
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """Returns the displacement of each pixel from the first picture to the second.
-
-        Convention: `[N, 2, H, W]` float32, (u right, v down), pixels, on the first picture's grid.
-
-        Args:
-            first: uint8 `[N, 3, H, W]`, RGB.
-            second: as `first`.
-        """
+        """Returns the displacement of each pixel, see `DIS.__call__`."""
         height, width = first.shape[-2:]
         factor = whole_factor(height, width, self.min_side_px)
         first, second = (self._prepared(picture, factor) for picture in (first, second))
@@ -191,8 +170,7 @@ class RAFT(nn.Module):
         """Keeps the network in evaluation mode, even if its env is put into training mode."""
         return super().train(False)
 
-    @staticmethod
-    def _prepared(pictures: Tensor, factor: int) -> Tensor:
+    def _prepared(self, pictures: Tensor, factor: int) -> Tensor:
         """Returns pictures in [-1, 1], enlarged, with sides that are multiples of 8."""
         scaled = pictures.float() / 127.5 - 1.0
         if factor > 1:
@@ -204,34 +182,29 @@ class RAFT(nn.Module):
 
 
 def _read_weights(path: Path) -> dict[str, Tensor]:
+    """Returns a file's state dict; torch's and safetensors' errors advise trusting the file."""
     if not path.is_file():
         raise FileNotFoundError(
             f"no RAFT weights at '{path}': give weights= the state dict of a torchvision RAFT, "
             "a .safetensors or .pth file; none come with flowrep"
         )
-    if path.suffix == ".safetensors":
-        try:
-            from safetensors.torch import load_file
-        except ImportError as error:
-            raise ImportError(f"'{path}' needs safetensors: pip install safetensors") from error
-        return _state_of(path, lambda: load_file(path))
-    return _state_of(path, lambda: torch.load(path, map_location="cpu", weights_only=True))
-
-
-def _state_of(path: Path, read: Callable[[], Any]) -> dict[str, Tensor]:
-    """Returns a reader's state dict; hides its error message, which advises trusting the file."""
     try:
-        state = read()
-    except Exception as error:  # readers fail on garbage in as many ways as there is garbage
-        if isinstance(error, OSError):
-            raise
-        raise ValueError(
-            f"'{path}' is not a readable weights file ({type(error).__name__}): it is damaged, or "
-            "holds more than a state dict. Save the network's state_dict() again, preferably as "
-            ".safetensors"
-        ) from None
+        if path.suffix == ".safetensors":
+            require(f"'{path}'", "raft", "safetensors")
+            from safetensors.torch import load_file
+
+            state = load_file(path)
+        else:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+    except (ImportError, OSError):
+        raise
+    except Exception:  # readers fail on garbage in as many ways as there is garbage
+        state = None
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise ValueError(f"'{path}' holds no state dict, a mapping from names to tensors")
+        raise ValueError(
+            f"'{path}' is not a readable weights file: it is damaged, or holds more than a state "
+            "dict. Save the network's state_dict() again, preferably as .safetensors"
+        )
     return state
 
 
@@ -300,6 +273,8 @@ class EstimatedFlow(FlowTransform):
         tensor(2.)
     """
 
+    known = masked = ("raw", "unscaled")
+
     def __init__(
         self,
         estimator: str | Estimator = "dis",
@@ -314,20 +289,16 @@ class EstimatedFlow(FlowTransform):
         in_keys: Keys = "rgb2",
         out_keys: Keys | None = None,
     ) -> None:
-        outputs = checked_outputs(outputs, ("raw", "unscaled"))
-        factors: dict[str, Any] = {"raw": scale, "unscaled": 1.0}
-        units = {"raw": unit, "unscaled": "px_per_step"}
         super().__init__(
             None,
             [PICTURE_PAIR],
             outputs=outputs,
-            scale={name: factors[name] for name in outputs},
-            unit={name: units[name] for name in outputs},
+            scale={name: scale if name == "raw" else 1.0 for name in outputs},
+            unit={name: unit if name == "raw" else "px_per_step" for name in outputs},
             dt_s=dt_s,
             compiled=False,
             in_keys=in_keys,
             out_keys=out_keys,
-            masked=["raw", "unscaled"],
         )
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
 
@@ -348,35 +319,24 @@ class EstimatedFlow(FlowTransform):
         flow = torch.where(differs, flow, 0.0).reshape(*batch, 2, *size)
         known = flow.isfinite().all(-3, keepdim=True)
         flow = torch.where(known, flow, 0.0)
-        made = [self._in_unit(name, flow) for name in self.outputs]
-        return (*made, *[known] * len(self.masks))
-
-    def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns an unbounded spec per flow and a boolean one per mask."""
-        (pair,) = specs
-        batch, size = pair.shape[:-3], pair.shape[-2:]
-        flows = [Unbounded((*batch, 2, *size), device=pair.device) for _ in self.outputs]
-        return (*flows, *(mask_spec(batch, size, pair.device) for _ in self.masks))
+        return self._written({"raw": flow, "unscaled": flow}, known)
 
 
 def _estimator(
     estimator: str | Estimator, weights: str | Path | None, preset: str, min_side_px: int
 ) -> Estimator:
-    if estimator in NETWORKS:
+    if estimator in get_args(Network):
         if weights is None:
             raise ValueError(f"estimator {estimator!r} needs weights=, a file with its state dict")
         return RAFT(weights, estimator, min_side_px=max(min_side_px, SMALLEST_SIDE_PX))
     if weights is not None:
         raise ValueError(f"weights= are RAFT's; estimator {estimator!r} has none")
-    if estimator == "dis":
+    if not callable(estimator):
+        check_name("estimator", estimator, Literal["dis", Network])
         return DIS(preset, min_side_px)
-    if callable(estimator):
-        if (preset, min_side_px) != (DIS.preset, DIS.min_side_px):
-            raise ValueError(
-                f"preset={preset!r} and min_side_px={min_side_px} are not read if the estimator is "
-                "a function: set them in it, e.g. estimator=DIS(preset, min_side_px)"
-            )
-        return estimator
-    raise ValueError(
-        f"estimator must be one of {['dis', *NETWORKS]} or a function, got {estimator!r}"
-    )
+    if (preset, min_side_px) != (DIS.preset, DIS.min_side_px):
+        raise ValueError(
+            f"preset={preset!r} and min_side_px={min_side_px} are not read if the estimator is "
+            "a function: set them in it, e.g. estimator=DIS(preset, min_side_px)"
+        )
+    return estimator

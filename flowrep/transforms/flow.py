@@ -1,4 +1,4 @@
-"""Base classes of transforms that write optical flow: intrinsics, outputs and units."""
+"""Transforms that write optical flow: exact raw flow, and its split into ego and object flow."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.data import Categorical, TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.geometry import check_intrinsics
+from flowrep.geometry.checks import check_name
 from flowrep.transforms.base import (
     DEPTH,
     FLOW,
@@ -28,9 +28,10 @@ from flowrep.transforms.base import (
     MapTransform,
     Reads,
     as_keys,
+    check_choice,
 )
 
-UNITS = ("px_per_step", "px_per_s")
+Unit = Literal["px_per_step", "px_per_s"]
 
 CAMERA = Reads((3, 3), "float")
 _RAW_KEYS: list[NestedKey] = [
@@ -50,9 +51,7 @@ class CameraTransform(MapTransform):
     Args:
         intrinsics: K `[3, 3]`, its key in the TensorDict, where it is `[*B, 3, 3]`, or None if K
             isn't needed. A key is read after all other keys.
-        reads: see `MapTransform`.
-        in_keys: see `MapTransform`.
-        out_keys: see `MapTransform`.
+        reads: see `MapTransform`, as for the other arguments.
 
     Raises:
         ValueError: for a K that is not finite, not positive in fx and fy, or transposed.
@@ -66,12 +65,16 @@ class CameraTransform(MapTransform):
         reads: Sequence[Reads],
         in_keys: Keys,
         out_keys: Keys,
+        writes: int = 1,
     ) -> None:
-        key = None if intrinsics is None else intrinsics_key(intrinsics)
-        camera: list[NestedKey] = [] if key is None else [key]
-        super().__init__([*reads, *[CAMERA] * len(camera)], [*as_keys(in_keys), *camera], out_keys)
-        given = intrinsics is not None and key is None
-        self.register_buffer("K", as_intrinsics(intrinsics) if given else None, persistent=False)
+        K = None
+        if intrinsics is not None:
+            if isinstance(intrinsics, str) or all(isinstance(part, str) for part in intrinsics):
+                reads, in_keys = [*reads, CAMERA], [*as_keys(in_keys), *as_keys([intrinsics])]
+            else:
+                K = as_intrinsics(intrinsics)
+        super().__init__(reads, in_keys, out_keys, writes)
+        self.register_buffer("K", K, persistent=False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CameraTransform:
         """Moves K between devices but keeps its type, as bfloat16 would round 319.5 px to 320."""
@@ -85,23 +88,12 @@ class CameraTransform(MapTransform):
 class FlowTransform(CameraTransform):
     """Base of flow transforms, with the intrinsics K, the chosen outputs and their unit.
 
-    Args:
-        intrinsics: K `[3, 3]` of the input maps, in pixels, or its key in the TensorDict, where it
-            is `[*B, 3, 3]`; a key is read after all other keys. None if K isn't needed.
-        reads: see `MapTransform`.
-        outputs: which of the class's outputs to write, in this order.
-        scale: factor on every flow, or one per output.
-        unit: `"px_per_step"` or `"px_per_s"`.
-        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
-        compiled: whether `compute` runs through `torch.compile`.
-        in_keys: see `MapTransform`.
-        out_keys: one key per output.
-        masked: outputs beside which the class writes where they are known, under `mask_key`.
-
-    Raises:
-        ValueError: for a number of keys, a unit or a `dt_s` that does not fit, and for
-            `compiled=True` on a machine without a C++ compiler.
+    A subclass names the outputs that it knows, and those that are `masked`: beside them it writes
+    where they are known, under `mask_key`. For the arguments see `RawFlow`.
     """
+
+    known: tuple[str, ...]
+    masked: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -115,18 +107,13 @@ class FlowTransform(CameraTransform):
         compiled: bool,
         in_keys: Keys,
         out_keys: Keys | None,
-        masked: Sequence[str] = (),
     ) -> None:
-        keys = as_keys(list(outputs) if out_keys is None else out_keys)
-        if len(keys) != len(outputs):
-            raise ValueError(
-                f"{type(self).__name__} writes {list(outputs)}: out_keys needs as many keys, "
-                f"got {keys}"
-            )
-        masks = [mask_key(key) for name, key in zip(outputs, keys) if name in masked]
-        super().__init__(intrinsics, reads, in_keys, [*keys, *masks])
-        self.label = " and ".join(map(repr, keys))
-        self.outputs, self.masks = tuple(outputs), tuple(masks)
+        check_choice("outputs", outputs, self.known)
+        keys = list(outputs) if out_keys is None else out_keys
+        super().__init__(intrinsics, reads, in_keys, keys, writes=len(outputs))
+        self.outputs = tuple(outputs)
+        self.masks = [mask_key(k) for name, k in zip(outputs, self.out_keys) if name in self.masked]
+        self.out_keys = [*self.out_keys, *self.masks]
         flows = [output for output in outputs if output != "valid"]
         scales = _per_output("scale", scale, flows)
         units = _per_output("unit", unit, flows)
@@ -136,35 +123,38 @@ class FlowTransform(CameraTransform):
             _check_compiler()
         self.compiled = bool(compiled)
 
-    def _with_camera(self, maps: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
-        """Returns the maps and K, which is the last of them if it is read from a key."""
-        return ([*maps], self.K) if self.K is not None else ([*maps[:-1]], maps[-1])
-
-    def _in_unit(self, name: str, flow: Tensor) -> Tensor:
-        factor = self.factors[name]
-        return flow if factor == 1.0 else flow * factor
-
-    def _at_one_precision(self, *maps: Tensor, depth: Tensor, K: Tensor) -> list[Tensor]:
-        """Returns the maps, depth and K in depth's float type, at least float32.
+    def _at_one_precision(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """Returns the inputs and K, the last, in depth's float type, at least float32.
 
         Raw and ego flow have to round alike; otherwise obj would be rounding noise on static
         pixels.
         """
+        (depth,) = (x for x, reads in zip(maps, self.reads) if reads == DEPTH)
         dtype = torch.promote_types(depth.dtype, torch.float32)
-        return [tensor.to(dtype) for tensor in (*maps, depth, K)]
+        maps = [*maps] if self.K is None else [*maps, self.K]
+        return [x.to(dtype) if x.is_floating_point() else x for x in maps]
+
+    def _written(self, made: Mapping[str, Tensor], valid: Tensor) -> tuple[Tensor, ...]:
+        """Returns the chosen outputs, flows in their units, and the masks."""
+        made = {
+            name: made[name] if factor == 1.0 else made[name] * factor
+            for name, factor in self.factors.items()
+        }
+        return (*(made.get(name, valid) for name in self.outputs), *[valid] * len(self.masks))
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns an unbounded spec per flow and a boolean one for the mask."""
-        depth = next(spec for spec, reads in zip(specs, self.reads) if reads == DEPTH)
-        batch, size, device = depth.shape[:-3], depth.shape[-2:], depth.device
+        """Returns an unbounded spec per flow and a boolean one per mask."""
+        like = next((x for x, reads in zip(specs, self.reads) if reads == DEPTH), specs[0])
+        batch, size, device = like.shape[:-3], like.shape[-2:], like.device
         self._warn_of_foreign_camera(size)
-        dtype = torch.promote_types(depth.dtype, torch.float32)
-        return tuple(
-            mask_spec(batch, size, device)
-            if name == "valid"
-            else Unbounded((*batch, 2, *size), device=device, dtype=dtype)
-            for name in (*self.outputs, *["valid"] * len(self.masks))
+        flow = Unbounded(
+            (*batch, 2, *size),
+            device=device,
+            dtype=torch.promote_types(like.dtype, torch.float32),
         )
+        valid = Categorical(2, shape=(*batch, 1, *size), device=device, dtype=torch.bool)
+        names = (*self.outputs, *["valid"] * len(self.masks))
+        return tuple((valid if name == "valid" else flow).clone() for name in names)
 
     def _warn_of_foreign_camera(self, size: torch.Size) -> None:
         """Warns if the principal point is outside the maps, as K of a larger picture has it."""
@@ -208,7 +198,6 @@ class RawFlow(FlowTransform):
             on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
             the result in torch's cache. Otherwise numba, where it is installed, computes large
             float32 batches on a CPU two to five times as fast as PyTorch, with the same bits.
-        invalid: value, before scaling, where flow isn't known.
         in_keys: depth, instance ids and one motion per instance.
         out_keys: one key per output; their names by default. The mask's key follows raw's:
             `("sensor", "flow_valid")` for `("sensor", "flow")`.
@@ -234,6 +223,9 @@ class RawFlow(FlowTransform):
         tensor(5.)
     """
 
+    known = ("raw", "valid")
+    masked = ("raw",)
+
     def __init__(
         self,
         intrinsics: Intrinsics,
@@ -243,11 +235,9 @@ class RawFlow(FlowTransform):
         unit: str = "px_per_step",
         dt_s: float | None = None,
         compiled: bool = False,
-        invalid: float = 0.0,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        outputs = checked_outputs(outputs, ("raw", "valid"))
         super().__init__(
             intrinsics,
             [DEPTH, IDS, MOTIONS],
@@ -258,20 +248,13 @@ class RawFlow(FlowTransform):
             compiled=compiled,
             in_keys=_RAW_KEYS if in_keys is None else in_keys,
             out_keys=out_keys,
-            masked=["raw"],
         )
-        self.invalid = float(invalid)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from depth, instance ids and motions (and K)."""
-        (depth, instance, motions), K = self._with_camera(maps)
-        motions, depth, K = self._at_one_precision(motions, depth=depth, K=K)
+        depth, instance, motions, K = self._at_one_precision(maps)
         flow, valid = geometry.rigid_flow(depth, instance, K, motions)
-        if self.invalid != 0.0:
-            # Viewed as bytes, as inductor's CPU code fails to compile a `where` on a bool view.
-            flow = torch.where(valid.view(torch.uint8) != 0, flow, self.invalid)
-        made = [valid if name == "valid" else self._in_unit(name, flow) for name in self.outputs]
-        return (*made, *[valid] * len(self.masks))
+        return self._written({"raw": flow}, valid)
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns the outputs' specs; ids that say how many they are must be one per motion."""
@@ -305,17 +288,13 @@ class FlowFactorize(FlowTransform):
     With the simulator's raw flow, obj is exactly 0 on everything static.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
-            it, `[*B, 3, 3]`.
+        intrinsics: K `[3, 3]` of the maps, or its key, see `RawFlow`.
         outputs: which of `"ego"`, `"obj"`, `"raw"` (the raw flow itself, in the chosen unit, 0
             where it isn't finite) and `"valid"` to write. With ego alone, raw flow isn't read.
         scale: factor on the flows, or a mapping from output to factor.
         unit: `"px_per_step"` or `"px_per_s"`, or a mapping from output to unit.
         dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
-        compiled: whether `compute` runs through `torch.compile`, which is some five times as fast
-            on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
-            the result in torch's cache. Otherwise numba, where it is installed, computes large
-            float32 batches on a CPU two to five times as fast as PyTorch, with the same bits.
+        compiled: whether `compute` runs through `torch.compile`, see `RawFlow`.
         in_keys: raw flow (in px/step, unscaled), depth and camera motion; without raw flow for ego
             alone.
         out_keys: one key per output; their names by default.
@@ -340,6 +319,8 @@ class FlowFactorize(FlowTransform):
         (tensor([[-5., -5.]]), tensor([[0., 5.]]))
     """
 
+    known = ("ego", "obj", "raw", "valid")
+
     def __init__(
         self,
         intrinsics: Intrinsics,
@@ -352,7 +333,6 @@ class FlowFactorize(FlowTransform):
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        outputs = checked_outputs(outputs, ("ego", "obj", "raw", "valid"))
         reads, keys = [DEPTH, MOTION], _EGO_KEYS
         if {"obj", "raw"} & set(outputs):
             reads, keys = [FLOW, *reads], ["raw", *keys]
@@ -377,25 +357,15 @@ class FlowFactorize(FlowTransform):
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""
-        (*raw, depth, motion), K = self._with_camera(maps)
-        *raw, motion, depth, K = self._at_one_precision(*raw, motion, depth=depth, K=K)
-        made: dict[str, Tensor] = {}
-        if raw:
-            factors = geometry.factorize(raw[0], depth, K, motion)
-            made["ego"], made["obj"], made["valid"] = factors
-            if "raw" in self.outputs:
-                made["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
-        else:
-            made["ego"], made["valid"] = geometry.ego_flow(depth, K, motion)
-        return tuple(
-            made[name] if name == "valid" else self._in_unit(name, made[name])
-            for name in self.outputs
-        )
-
-
-def mask_spec(batch: torch.Size, size: torch.Size, device: torch.device | None) -> TensorSpec:
-    """Returns the spec of a mask, bool `[*B, 1, H, W]`."""
-    return Categorical(2, shape=(*batch, 1, *size), device=device, dtype=torch.bool)
+        *raw, depth, motion, K = self._at_one_precision(maps)
+        if not raw:
+            ego, valid = geometry.ego_flow(depth, K, motion)
+            return self._written({"ego": ego}, valid)
+        ego, obj, valid = geometry.factorize(raw[0], depth, K, motion)
+        made = {"ego": ego, "obj": obj}
+        if "raw" in self.outputs:
+            made["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
+        return self._written(made, valid)
 
 
 def mask_key(flow: NestedKey) -> NestedKey:
@@ -423,16 +393,6 @@ def unknown_as_nan(transform: MapTransform, tensordict: TensorDictBase, raw: Ten
     return torch.where(known, raw, math.nan)
 
 
-def checked_outputs(outputs: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:
-    """Returns the outputs as a tuple; raises ValueError if one is unknown or named twice."""
-    unknown = [name for name in outputs if name not in known]
-    if isinstance(outputs, str) or unknown or not outputs or len(set(outputs)) != len(outputs):
-        raise ValueError(
-            f"outputs must be a list with some of {list(known)}, each once; got {outputs!r}"
-        )
-    return tuple(outputs)
-
-
 def _per_output(option: str, value: object, flows: Sequence[str]) -> dict[str, object]:
     if not isinstance(value, Mapping):
         return dict.fromkeys(flows, value)
@@ -442,8 +402,7 @@ def _per_output(option: str, value: object, flows: Sequence[str]) -> dict[str, o
 
 
 def _factor(scale: object, unit: object, dt_s: float | None) -> float:
-    if unit not in UNITS:
-        raise ValueError(f"unit must be one of {list(UNITS)}, got {unit!r}")
+    check_name("unit", unit, Unit)
     factor = float(scale)  # type: ignore[arg-type]
     if not math.isfinite(factor) or factor == 0.0:
         raise ValueError(f"scale must be a finite number other than 0, got {scale}")
@@ -454,16 +413,7 @@ def _factor(scale: object, unit: object, dt_s: float | None) -> float:
     return factor / dt_s
 
 
-def intrinsics_key(intrinsics: Intrinsics) -> NestedKey | None:
-    """Returns the key of the intrinsics, or None if they are K itself."""
-    if isinstance(intrinsics, str):
-        return intrinsics
-    if isinstance(intrinsics, (tuple, list)) and all(isinstance(part, str) for part in intrinsics):
-        return tuple(intrinsics)
-    return None
-
-
-def as_intrinsics(intrinsics: Intrinsics) -> Tensor:
+def as_intrinsics(intrinsics: Tensor | Sequence[Sequence[float]]) -> Tensor:
     """Returns K as a float tensor `[3, 3]`; raises ValueError if it is none."""
     K = torch.as_tensor(intrinsics)
     K = K.clone() if K.is_floating_point() else K.to(torch.get_default_dtype())
@@ -472,7 +422,7 @@ def as_intrinsics(intrinsics: Intrinsics) -> Tensor:
             f"intrinsics is K, [3, 3], or the key of [*B, 3, 3] in the TensorDict; got "
             f"{list(K.shape)}"
         )
-    check_intrinsics("intrinsics", K)
+    geometry.check_intrinsics("intrinsics", K)
     return K
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import dispatch
-from tensordict.utils import NestedKey, expand_as_right
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
-from flowrep.transforms.base import Keys, Reads, RecurrentTransform, refuse_n_step
+from flowrep.transforms.base import Keys, Reads, RecurrentTransform, check_own_keys
 
 
 class FrameStack(RecurrentTransform):
@@ -28,9 +26,8 @@ class FrameStack(RecurrentTransform):
     wrong if samples are shuffled.
 
     In a replay buffer the stored root stack and the next frame give the next stack exactly,
-    shuffled or not. If `("next", out_key)` is not stored, a transition takes k + 1 frames instead
-    of 2 k. A stack stored under `"next"` is left unchanged; n-step returns need it stored, since
-    their next frame is several steps ahead.
+    shuffled or not: without `("next", out_key)` a transition takes k + 1 frames instead of 2 k.
+    n-step returns need it stored, since their next frame is several steps ahead.
 
     A batch without a stored stack has to be a trajectory, with a dimension named "time" and
     `("next", "done")`; its first frame counts as an episode's first. A buffer may thus store single
@@ -61,87 +58,31 @@ class FrameStack(RecurrentTransform):
     def __init__(self, *, k: int = 2, in_keys: Keys, out_keys: Keys) -> None:
         maps = len(in_keys) if isinstance(in_keys, list) else 1
         reads = [Reads((f"C{i}", f"H{i}", f"W{i}")) for i in range(maps)]
-        super().__init__(reads, in_keys, out_keys)
+        super().__init__(reads, in_keys, out_keys, writes=maps)
+        check_own_keys(self)
         if k < 1:
             raise ValueError(f"k, the number of frames, must be at least 1; got {k}")
-        if len(self.out_keys) != len(self.in_keys) or set(self.in_keys) & set(self.out_keys):
-            raise ValueError(
-                f"FrameStack needs an output key of its own for each input key; "
-                f"got {self.in_keys} -> {self.out_keys}"
-            )
         self.k = int(k)
-
-    def compute(self, *frames: Tensor) -> tuple[Tensor, ...]:
-        """Returns the stacks at an episode's first frame, which is repeated k times."""
-        return tuple(torch.cat([frame] * self.k, -3) for frame in frames)
 
     @property
     def carried_keys(self) -> list[NestedKey]:
         """The stacks of the step before."""
         return self.out_keys
 
+    def compute(self, *frames: Tensor) -> tuple[Tensor, ...]:
+        """Returns the stacks at an episode's first frame, which is repeated k times."""
+        return tuple(torch.cat([frame] * self.k, -3) for frame in frames)
+
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Returns the stacks of the step before with the current frames appended."""
-        return tuple(push_frame(stack, frame) for stack, frame in zip(before, now))
-
-    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the stacks of a replay batch, at its root and under `"next"`."""
-        following = tensordict.get("next", None)
-        for frame_key, stack_key in zip(self.in_keys, self.out_keys):
-            stack = tensordict.get(stack_key, None)
-            if stack is None:
-                stack = self._stack_from_trajectory(tensordict, frame_key, stack_key)
-                tensordict.set(stack_key, stack)
-            if following is None or following.get(stack_key, None) is not None:
-                continue  # stored: correct even if the next frame is several steps ahead
-            frame = following.get(frame_key, None)
-            if frame is not None:
-                refuse_n_step(tensordict, stack_key)
-                tensordict.set(_under_next(stack_key), push_frame(stack, frame))
-        return tensordict
-
-    def _stack_from_trajectory(
-        self, tensordict: TensorDictBase, frame_key: NestedKey, stack_key: NestedKey
-    ) -> Tensor:
-        frames = tensordict.get(frame_key, None)
-        if frames is None:
-            raise self._missing(frame_key, tensordict)
-        done, time_dim = self._trajectory(tensordict, stack_key)
-        return stack_trajectory(frames, done, self.k, time_dim)
+        """Returns the stacks of the step before without their oldest frames, and with the new."""
+        return tuple(
+            torch.cat([stack[..., frame.shape[-3] :, :, :], frame], -3)
+            for stack, frame in zip(before, now)
+        )
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns each map's spec with k times the channels."""
         return tuple(_stacked(spec, self.k) for spec in specs)
-
-
-def push_frame(stack: Tensor, frame: Tensor) -> Tensor:
-    """Returns the stack `[*B, k·C, H, W]` with `frame` appended and the oldest frame dropped."""
-    return torch.cat([stack[..., frame.shape[-3] :, :, :], frame], -3)
-
-
-def stack_trajectory(frames: Tensor, done: Tensor, k: int, time_dim: int) -> Tensor:
-    """Returns the stack at every step of a trajectory, equal to the env's.
-
-    Args:
-        frames: `[*B, C, H, W]`, with time at `time_dim` of the batch.
-        done: `[*B]`, whether the episode ended with the step after the frame.
-        k: number of frames.
-        time_dim: position of time in the batch.
-    """
-    frames, done = frames.movedim(time_dim, 0), done.movedim(time_dim, 0)
-    step = torch.arange(len(frames), device=frames.device)
-    step = expand_as_right(step, done)  # [T, *B]
-    begins = torch.cat([torch.ones_like(done[:1]), done[:-1]])
-    first = torch.where(begins, step, 0).cummax(0).values  # where each step's episode begins
-    ages = range(k - 1, -1, -1)  # oldest first
-    picked = [torch.maximum(step - age, first) for age in ages]
-    stack = torch.cat([frames.gather(0, expand_as_right(i, frames)) for i in picked], -3)
-    return stack.movedim(0, time_dim)
-
-
-def _under_next(key: NestedKey) -> tuple[str, ...]:
-    return ("next", key) if isinstance(key, str) else ("next", *key)
 
 
 def _stacked(spec: TensorSpec, k: int) -> TensorSpec:

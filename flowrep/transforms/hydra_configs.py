@@ -22,11 +22,13 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
+from torchrl.envs.transforms import Transform
 from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from flowrep import transforms
@@ -78,49 +80,22 @@ def _field(name: str, default: Any) -> Any:
     return default
 
 
-AdaptDepthConfig = config_class(transforms.AdaptDepth)
-AdaptFlowConfig = config_class(transforms.AdaptFlow)
-AdaptPoseConfig = config_class(transforms.AdaptPose)
-CameraMotionConfig = config_class(transforms.CameraMotion)
-DepthConfig = config_class(transforms.Depth)
-EstimateCameraMotionConfig = config_class(transforms.EstimateCameraMotion)
-EstimatedFlowConfig = config_class(transforms.EstimatedFlow)
-FlowFactorizeConfig = config_class(transforms.FlowFactorize)
-FrameStackConfig = config_class(transforms.FrameStack)
-InstanceIdsConfig = config_class(transforms.InstanceIds)
-InstanceMotionConfig = config_class(transforms.InstanceMotion)
-MirrorConfig = config_class(transforms.Mirror)
-RawFlowConfig = config_class(transforms.RawFlow)
-RgbConfig = config_class(transforms.Rgb)
-SegmentationConfig = config_class(transforms.Segmentation)
-SensorNoiseConfig = config_class(transforms.SensorNoise)
-
-# By name in the group `transform`.
+# By name in the group `transform`: `raw_flow` for `RawFlow`.
 CONFIGS: dict[str, type[TransformConfig]] = {
-    "adapt_depth": AdaptDepthConfig,
-    "adapt_flow": AdaptFlowConfig,
-    "adapt_pose": AdaptPoseConfig,
-    "camera_motion": CameraMotionConfig,
-    "depth": DepthConfig,
-    "estimate_camera_motion": EstimateCameraMotionConfig,
-    "estimated_flow": EstimatedFlowConfig,
-    "flow_factorize": FlowFactorizeConfig,
-    "frame_stack": FrameStackConfig,
-    "instance_ids": InstanceIdsConfig,
-    "instance_motion": InstanceMotionConfig,
-    "mirror": MirrorConfig,
-    "raw_flow": RawFlowConfig,
-    "rgb": RgbConfig,
-    "segmentation": SegmentationConfig,
-    "sensor_noise": SensorNoiseConfig,
+    re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower(): config_class(getattr(transforms, name))
+    for name in transforms.__all__
+    if isinstance(getattr(transforms, name), type)
+    and issubclass(getattr(transforms, name), Transform)
 }
+# `RawFlowConfig` and the others by name, too, as pickle looks classes up.
+globals().update({config.__name__: config for config in CONFIGS.values()})
 
 
-def register() -> None:
-    """Stores each config in the group `transform`; importing the module calls this."""
+def register(configs: Mapping[tuple[str, str], type]) -> None:
+    """Stores configs by group and name; importing a module with configs calls this."""
     store = ConfigStore.instance()
-    for name, config in CONFIGS.items():
-        store.store(group="transform", name=name, node=config, provider="flowrep")
+    for (group, name), config in configs.items():
+        store.store(group=group, name=name, node=config, provider="flowrep")
 
 
-register()
+register({("transform", name): config for name, config in CONFIGS.items()})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -11,9 +12,10 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec
 
 from flowrep import geometry
+from flowrep.geometry.checks import check_name
 from flowrep.transforms.base import DEPTH, IDS, RGB, Keys, MapTransform, check_own_keys
 
-ENCODINGS = ("ids", "onehot")
+Encoding = Literal["ids", "onehot"]
 
 
 class Rgb(MapTransform):
@@ -95,24 +97,29 @@ class Segmentation(MapTransform):
         self,
         num_classes: int,
         *,
-        encoding: str = "ids",
+        encoding: Encoding = "ids",
         in_keys: Keys = ("sensor", "semantic"),
         out_keys: Keys = "seg",
     ) -> None:
         super().__init__([IDS], in_keys, out_keys)
-        if encoding not in ENCODINGS:
-            raise ValueError(f"encoding must be one of {list(ENCODINGS)}, got {encoding!r}")
+        check_name("encoding", encoding, Encoding)
         if not 1 <= num_classes <= 256:
             raise ValueError(f"num_classes must be 1 to 256 (ids are uint8), got {num_classes}")
         self.num_classes = int(num_classes)
         self.encoding = encoding
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        ids = next_tensordict.get(self.in_keys[0], None)
-        if self.encoding == "ids" and ids is not None:
-            self._check_layout([ids], next_tensordict.batch_size)
-            _check_fits_uint8(self.in_keys[0], ids)
-        return super()._call(next_tensordict)
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Returns the ids; raises ValueError for ids that wrap in uint8: 300 would become 44."""
+        (ids,) = super()._read(tensordict)
+        if self.encoding == "ids" and ids.dtype is not torch.uint8 and ids.numel():
+            least, most = (int(bound) for bound in ids.aminmax())
+            if least < 0 or most > 255:
+                raise ValueError(
+                    f"{self.in_keys[0]!r} holds class ids from {least} to {most}, but uint8 only "
+                    "ids from 0 to 255; give pixels without a class an id in that range, e.g. "
+                    "ids.where((ids >= 0) & (ids < num_classes), 255), or use encoding='onehot'"
+                )
+        return [ids]
 
     def compute(self, ids: Tensor) -> tuple[Tensor]:
         """Returns the classes in the chosen encoding."""
@@ -124,25 +131,10 @@ class Segmentation(MapTransform):
     def output_specs(self, ids: TensorSpec) -> tuple[TensorSpec]:
         """Returns a categorical spec for ids, a bounded one for one-hot maps."""
         if self.encoding == "ids":
-            spec = Categorical(
-                self.num_classes, shape=ids.shape, device=ids.device, dtype=torch.uint8
-            )
-            return (spec,)
+            n, dtype = self.num_classes, torch.uint8
+            return (Categorical(n, shape=ids.shape, device=ids.device, dtype=dtype),)
         shape = (*ids.shape[:-3], self.num_classes, *ids.shape[-2:])
         return (Bounded(0.0, 1.0, shape=shape, device=ids.device, dtype=torch.float32),)
-
-
-def _check_fits_uint8(key: object, ids: Tensor) -> None:
-    """Raises ValueError for ids that wrap in uint8, where 300 would become 44."""
-    if ids.dtype is torch.uint8 or not ids.numel():
-        return
-    least, most = (int(bound) for bound in ids.aminmax())
-    if least < 0 or most > 255:
-        raise ValueError(
-            f"{key!r} holds class ids from {least} to {most}, but uint8 only ids "
-            "from 0 to 255; give pixels without a class an id in that range, e.g. "
-            "ids.where((ids >= 0) & (ids < num_classes), 255), or use encoding='onehot'"
-        )
 
 
 class Depth(MapTransform):

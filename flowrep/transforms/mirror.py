@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
+from flowrep.geometry.checks import check_name
 from flowrep.transforms.base import Keys, MissingKey, as_keys
 
 Images = Literal["half", "both", "all"]
@@ -93,8 +94,7 @@ class Mirror(Transform):
                 "swapped_actions gives each action's mirror image, and the image's is the action "
                 f"again; got {swapped.tolist()}"
             )
-        if images not in get_args(Images):
-            raise ValueError(f"images={images!r}: expected one of {', '.join(get_args(Images))}")
+        check_name("images", images, Images)
         self.register_buffer("swapped_actions", swapped, persistent=False)
         self.twice_cx = None if intrinsics is None else _twice_cx(intrinsics)
         self.images, self.generator = images, generator
@@ -140,9 +140,6 @@ class Mirror(Transform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         raise RuntimeError("Mirror is for replay: append it to a replay buffer, not to an env")
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._call(next_tensordict)
-
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
@@ -154,14 +151,7 @@ class Mirror(Transform):
 
 
 def mirror_map(x: Tensor, chosen: Tensor, twice_cx: int | None, *, is_flow: bool) -> Tensor:
-    """Returns maps `[*B, C, H, W]`, the `chosen` `[*B]` of them mirrored.
-
-    Args:
-        x: maps.
-        chosen: which to mirror.
-        twice_cx: 2·cx of the camera, see `Mirror`; None for W.
-        is_flow: whether channels are u, v, u, v, …, of which u changes its sign.
-    """
+    """Returns maps `[*B, C, H, W]`, the `chosen` `[*B]` of them mirrored; see `Mirror`."""
     width = x.shape[-1]
     column = torch.arange(width, device=x.device)
     opposite = ((width if twice_cx is None else twice_cx) - 1 - column).clamp(0, width - 1)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import dispatch
-from tensordict.utils import NestedKey, expand_as_right
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
@@ -20,12 +18,11 @@ from flowrep.transforms.base import (
     MOTIONS,
     RGB,
     Keys,
-    Reads,
     RecurrentTransform,
     as_keys,
-    refuse_n_step,
+    check_choice,
 )
-from flowrep.transforms.flow import CameraTransform, Intrinsics, checked_outputs, unknown_as_nan
+from flowrep.transforms.flow import CameraTransform, Intrinsics, unknown_as_nan
 
 _CAMERA: NestedKey = ("sensor", "world_from_cam")
 _BODIES: NestedKey = ("sensor", "world_from_body")
@@ -39,71 +36,7 @@ _ESTIMATES: dict[str, NestedKey] = {
 }
 
 
-class PoseTransform(RecurrentTransform):
-    """Base of transforms that write the motion between the poses of two steps.
-
-    A subclass defines the motion between two sets of poses.
-
-    Args:
-        reads: see `MapTransform`.
-        in_keys: see `MapTransform`.
-        out_keys: one key.
-    """
-
-    def __init__(self, reads: Sequence[Reads], in_keys: Keys, out_keys: Keys) -> None:
-        super().__init__(reads, in_keys, out_keys)
-        if len(self.out_keys) != 1:
-            raise ValueError(f"{type(self).__name__} writes 1 key, out_keys has {self.out_keys}")
-
-    @abstractmethod
-    def between(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> Tensor:
-        """Returns the motion from the previous step's poses to the current ones."""
-
-    def compute(self, *poses: Tensor) -> tuple[Tensor]:
-        """Returns the motion at an episode's first frame, where nothing moves."""
-        return (self.between(poses, poses),)
-
-    @property
-    def carried_keys(self) -> list[NestedKey]:
-        """The poses of the step before."""
-        return self.in_keys
-
-    def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
-        """Returns the motion between two steps."""
-        return (self.between(before, now),)
-
-    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the motions of a replay batch, at its root and under `"next"`."""
-        key = self.out_keys[0]
-        now = self._read(tensordict)
-        if tensordict.get(key, None) is None:
-            tensordict.set(key, self._along_trajectory(tensordict, now))
-        following = tensordict.get("next", None)
-        if following is None or following.get(key, None) is not None:
-            return tensordict  # stored: correct even if the next frame is several steps ahead
-        if any(k in following.keys(True) for k in self.in_keys):
-            refuse_n_step(tensordict, key)
-            following.set(key, self.between(now, self._read(following)))
-            tensordict.set("next", following)
-        return tensordict
-
-    def _along_trajectory(self, tensordict: TensorDictBase, now: Sequence[Tensor]) -> Tensor:
-        """Returns the motion to each step of a trajectory, without motion at an episode's start."""
-        done, time = self._trajectory(tensordict, self.out_keys[0])
-        begins = torch.cat([torch.ones_like(done.narrow(time, 0, 1)), _but_last(done, time)], time)
-        before = [
-            torch.where(
-                expand_as_right(begins, pose),
-                pose,
-                torch.cat([pose.narrow(time, 0, 1), _but_last(pose, time)], time),
-            )
-            for pose in now
-        ]
-        return self.between(before, now)
-
-
-class CameraMotion(PoseTransform):
+class CameraMotion(RecurrentTransform):
     """The camera's motion, for envs that give only its pose.
 
     | reads | writes | shape | range | unit |
@@ -116,10 +49,10 @@ class CameraMotion(PoseTransform):
     and returned in float32. After a reset it is exactly the identity.
 
     The previous step's pose is read from the TensorDict passed to `step`; no state is kept between
-    calls. In a replay buffer the stored root motion and the two poses give the next motion,
-    shuffled or not. A motion stored under `"next"` is left unchanged; n-step returns need it
-    stored. A batch without a stored motion has to be a trajectory, with a dimension named "time"
-    and `("next", "done")`; its first frame counts as an episode's first.
+    calls. In a replay buffer the poses at the root and under `"next"` give the next motion,
+    shuffled or not; n-step returns need it stored. A batch without a stored root motion has to be a
+    trajectory, with a dimension named "time" and `("next", "done")`; its first frame counts as an
+    episode's first.
 
     Args:
         in_keys: key of the pose.
@@ -145,16 +78,16 @@ class CameraMotion(PoseTransform):
     ) -> None:
         super().__init__([MOTION], in_keys, out_keys)
 
-    def between(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> Tensor:
+    def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
         """Returns `prev_from_curr`."""
-        return geometry.relative_motion(before[0], now[0])
+        return (geometry.relative_motion(before[0], now[0]),)
 
     def output_specs(self, pose: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded float32 spec."""
         return (Unbounded(pose.shape, device=pose.device, dtype=torch.float32),)
 
 
-class InstanceMotion(PoseTransform):
+class InstanceMotion(RecurrentTransform):
     """The bodies' motions relative to the camera, for simulators that give their bodies' poses.
 
     | reads | writes | shape | range | unit |
@@ -195,19 +128,16 @@ class InstanceMotion(PoseTransform):
             [MOTION, MOTIONS], [_CAMERA, _BODIES] if in_keys is None else in_keys, out_keys
         )
 
-    def between(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> Tensor:
+    def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
         """Returns `instance_motion`."""
-        return geometry.instance_motion(before[0], now[0], before[1], now[1])
+        (camera_before, bodies_before), (camera, bodies) = before, now
+        return (geometry.instance_motion(camera_before, camera, bodies_before, bodies),)
 
     def output_specs(self, camera: TensorSpec, bodies: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded float32 spec."""
         *batch, count, _, _ = bodies.shape
         shape = (*batch, 1 + count, 4, 4)
         return (Unbounded(shape, device=bodies.device, dtype=torch.float32),)
-
-
-def _but_last(values: Tensor, dim: int) -> Tensor:
-    return values.narrow(dim, 0, values.shape[dim] - 1)
 
 
 class EstimateCameraMotion(CameraTransform):
@@ -267,19 +197,16 @@ class EstimateCameraMotion(CameraTransform):
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        self.outputs = checked_outputs(outputs, tuple(_ESTIMATES))
+        check_choice("outputs", outputs, _ESTIMATES)
         reads, keys = [FLOW, DEPTH], as_keys(["raw", _DEPTH] if in_keys is None else in_keys)
         for key, layout in ((picture, RGB), (prior, MOTION)):
             if key is not None:
                 reads.append(layout)
                 keys += as_keys([key])
-        own_keys: Keys = [_ESTIMATES[name] for name in self.outputs]
-        super().__init__(intrinsics, reads, keys, own_keys if out_keys is None else out_keys)
-        if len(self.out_keys) != len(self.outputs):
-            raise ValueError(
-                f"EstimateCameraMotion writes {list(self.outputs)}: out_keys needs as many keys, "
-                f"got {self.out_keys}"
-            )
+        own_keys: Keys = [_ESTIMATES[name] for name in outputs]
+        written = own_keys if out_keys is None else out_keys
+        super().__init__(intrinsics, reads, keys, written, writes=len(outputs))
+        self.outputs = tuple(outputs)
         self.has_picture, self.has_prior = picture is not None, prior is not None
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:

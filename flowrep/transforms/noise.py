@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import multiprocessing
 import zlib
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from tensordict.utils import NestedKey
@@ -14,21 +14,31 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
 from flowrep.geometry.pose import rotation_from_vector
-from flowrep.transforms.base import DEPTH, FLOW, MOTION, Keys, MapTransform, Reads, as_keys
+from flowrep.transforms.base import (
+    DEPTH,
+    FLOW,
+    MOTION,
+    Keys,
+    MapTransform,
+    Reads,
+    as_keys,
+    check_choice,
+)
 
 FRAME = Reads(("F",), "integer")
-_READS = {"depth": DEPTH, "motion": MOTION, "flow": FLOW}
-_KEYS: dict[str, NestedKey] = {
-    "depth": ("sensor", "depth"),
-    "motion": ("sensor", "prev_from_curr"),
-    "flow": "raw",
+
+
+class _Sensor(NamedTuple):
+    reads: Reads
+    key: NestedKey
+    options: tuple[str, ...]
+
+
+SENSORS = {
+    "depth": _Sensor(DEPTH, ("sensor", "depth"), ("depth_sigma_per_m", "depth_dropout")),
+    "motion": _Sensor(MOTION, ("sensor", "prev_from_curr"), ("drift_m", "drift_rad")),
+    "flow": _Sensor(FLOW, "raw", ("flow_sigma_px",)),
 }
-_OPTIONS = {
-    "depth": ("depth_sigma_per_m", "depth_dropout"),
-    "motion": ("drift_m", "drift_rad"),
-    "flow": ("flow_sigma_px",),
-}
-_STREAMS = {sensor: number for number, sensor in enumerate(_READS)}
 
 # SplitMix64's constants as signed integers, torch's only 64-bit type; products wrap around.
 _GAMMA, _FIRST, _SECOND = (
@@ -114,88 +124,66 @@ class SensorNoise(MapTransform):
             "drift_rad": drift_rad,
             "flow_sigma_px": flow_sigma_px,
         }
-        _check(sensors, options)
-        keys = [_KEYS[sensor] for sensor in sensors] if in_keys is None else as_keys(in_keys)
-        reads = [_READS[sensor] for sensor in sensors]
+        check_choice("sensors", sensors, SENSORS)
+        _check_options(sensors, options)
+        read = [SENSORS[name].key for name in sensors] if in_keys is None else as_keys(in_keys)
         frame = [] if frame_key is None else as_keys([frame_key])
         super().__init__(
-            reads + [FRAME] * len(frame), keys + frame, keys if out_keys is None else out_keys
+            [SENSORS[name].reads for name in sensors] + [FRAME] * len(frame),
+            read + frame,
+            read if out_keys is None else out_keys,
+            writes=len(sensors),
         )
-        if len(self.out_keys) != len(sensors):
-            raise ValueError(
-                f"SensorNoise writes one key a sensor of {list(sensors)}, got {self.out_keys}"
-            )
         self.sensors = tuple(sensors)
         self.options = options
         self.seed = None if seed is None else int(seed)
         self.has_frames = bool(frame)
-        self._state: Tensor | None = None  # for the generator, which is created on first use
-        self._generator: torch.Generator | None = None
+        self._state: Tensor | None = None  # of the generator, after what has been drawn
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the sensors' maps with noise; with `frame_key`, frames are the last map."""
         frame = maps[-1] if self.has_frames else None
-        return tuple(self._noisy(*named, frame) for named in zip(self.sensors, maps))
+        return tuple(self._noisy(sensor, x, frame) for sensor, x in zip(self.sensors, maps))
 
     def _noisy(self, sensor: str, value: Tensor, frame: Tensor | None) -> Tensor:
-        used = {name: self.options[name] for name in _OPTIONS[sensor]}
-        if not any(used.values()):
+        options = [self.options[name] for name in SENSORS[sensor].options]
+        if not any(options):
             return value
-        normals, *uniforms = self._numbers(sensor, value, frame)
+        normals, uniforms = self._numbers(sensor, value, frame)
+        normals = normals.to(value.dtype)
         if sensor == "depth":
-            sigma_per_m, dropout = used.values()
-            return noisy_depth(value, normals, *uniforms, sigma_per_m=sigma_per_m, dropout=dropout)
+            return noisy_depth(value, normals, uniforms, sigma_per_m=options[0], dropout=options[1])
         if sensor == "motion":
-            return drifted_motion(
-                value, normals, drift_m=used["drift_m"], drift_rad=used["drift_rad"]
-            )
-        return value + used["flow_sigma_px"] * normals
+            return drifted_motion(value, normals, drift_m=options[0], drift_rad=options[1])
+        return value + options[0] * normals
 
-    def _numbers(self, sensor: str, value: Tensor, frame: Tensor | None) -> list[Tensor]:
-        """Returns normal numbers, one per pixel or six per motion, and for depth uniform ones."""
-        rank, is_depth = len(_READS[sensor].shape), sensor == "depth"
+    def _numbers(self, sensor: str, value: Tensor, frame: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Returns normal numbers, one per pixel or six per motion, and uniform ones for depth."""
+        rank, device = len(SENSORS[sensor].reads.shape), value.device
+        batch = value.shape[: value.ndim - rank]
         shape = (6,) if sensor == "motion" else tuple(value.shape[-rank:])
+        uniforms = torch.empty(0, device=device)
         if frame is not None:
-            bits = frame_bits(frame, shape, seed=self.seed or 0, stream=_STREAMS[sensor])
-            normals, *uniforms = [normal(bits), uniform(bits)] if is_depth else [normal(bits)]
+            stream = list(SENSORS).index(sensor)
+            bits = frame_bits(frame, shape, seed=self.seed or 0, stream=stream)
+            return normal(bits), uniform(bits) if sensor == "depth" else uniforms
+        generator = torch.Generator(device)
+        if self._state is None:
+            generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
         else:
-            generator = self._generator_on(value.device)
-            normals, *uniforms = (
-                draw(
-                    (*value.shape[: value.ndim - rank], *shape),
-                    generator=generator,
-                    device=value.device,
-                )
-                for draw in ((torch.randn, torch.rand) if is_depth else (torch.randn,))
-            )
-        return [normals.to(value.dtype), *uniforms]
-
-    def _generator_on(self, device: torch.device) -> torch.Generator:
-        """Returns the generator, created on first use on a device."""
-        if self._generator is None or self._generator.device != device:
-            self._generator = torch.Generator(device=device)
-            if self._state is not None:
-                self._generator.set_state(self._state)
-                self._state = None
-            else:
-                self._generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
-        return self._generator
-
-    def clone(self) -> SensorNoise:
-        """Returns a copy that continues the sequence with a generator of its own."""
-        copied = super().clone()
-        copied._generator = copy.deepcopy(self._generator)
-        return copied
+            generator.set_state(self._state)
+        normals = torch.randn((*batch, *shape), generator=generator, device=device)
+        if sensor == "depth":
+            uniforms = torch.rand((*batch, *shape), generator=generator, device=device)
+        self._state = generator.get_state()
+        return normals, uniforms
 
     def get_extra_state(self) -> Tensor:
         """Returns the generator's state for `state_dict`, empty before the first use."""
-        if self._generator is not None:
-            return self._generator.get_state()
-        return torch.empty(0, dtype=torch.uint8) if self._state is None else self._state.clone()
+        return torch.empty(0, dtype=torch.uint8) if self._state is None else self._state
 
     def set_extra_state(self, state: Tensor) -> None:
         """Continues from a `state_dict` at the next use, on a device of the same kind."""
-        self._generator = None
         self._state = state.clone().cpu() if len(state) else None
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
@@ -250,21 +238,15 @@ def drifted_motion(
     return rigid.to(prev_from_curr.dtype)
 
 
-def _check(sensors: Sequence[str], options: dict[str, float]) -> None:
-    unknown = [sensor for sensor in sensors if sensor not in _READS]
-    if isinstance(sensors, str) or unknown or not sensors or len(set(sensors)) != len(sensors):
-        raise ValueError(
-            f"sensors must be a list with some of {list(_READS)}, each once; got {sensors!r}"
-        )
+def _check_options(sensors: Sequence[str], options: dict[str, float]) -> None:
     for name, value in options.items():
         if not 0.0 <= value < math.inf:
             raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
+        (sensor,) = (sensor for sensor in SENSORS if name in SENSORS[sensor].options)
+        if value and sensor not in sensors:
+            raise ValueError(f"{name} needs {sensor!r} among sensors, got {list(sensors)}")
     if options["depth_dropout"] > 1.0:
         raise ValueError(f"depth_dropout must be a probability, got {options['depth_dropout']}")
-    for sensor, names in _OPTIONS.items():
-        idle = [name for name in names if options[name] and sensor not in sensors]
-        if idle:
-            raise ValueError(f"{idle[0]} needs {sensor!r} among sensors, got {list(sensors)}")
 
 
 def split_mix(state: Tensor) -> Tensor:

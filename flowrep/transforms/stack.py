@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
 
-from flowrep.transforms.base import unknown_name
 from flowrep.transforms.estimated_flow import EstimatedFlow
 from flowrep.transforms.flow import FlowFactorize, Intrinsics, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.maps import Depth, Rgb, Segmentation
 from flowrep.transforms.motion import EstimateCameraMotion
-from flowrep.transforms.noise import SensorNoise
+from flowrep.transforms.noise import SENSORS, SensorNoise
 
 FLOW_SOURCES = ("exact", "estimated")
 MOTION_SOURCES = ("exact", "estimated")
-NOISE_OPTIONS = ("depth_sigma_per_m", "depth_dropout", "drift_m", "drift_rad")
+NOISE_OPTIONS = SENSORS["depth"].options + SENSORS["motion"].options
 _ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px")
 _FLOW_OPTIONS = ("scale", "unit")
 
@@ -49,23 +48,16 @@ FLOWS = ("raw", "ego", "obj")  # of two channels, u and v
 REPRESENTATIONS: tuple[str, ...] = tuple(_REPRESENTATIONS)
 
 _UNSCALED_KEY = "_raw"  # exact raw flow in px/step, for FlowFactorize
+_PICTURE_KEY = ("sensor", "rgb")
 # Measurements, and what the next step needs, stay in the TensorDict.
 _PICTURES_KEY = "_rgb2"
 _ESTIMATED_FLOW_KEY = ("sensor", "flow")  # in px/step
+_ESTIMATED_MOTION_KEY = ("sensor", "estimated_motion")
 _NOISY_KEYS: dict[str, NestedKey] = {
     "depth": ("sensor", "noisy_depth"),
     "motion": ("sensor", "noisy_motion"),
 }
-_ESTIMATED_MOTION_KEY = ("sensor", "estimated_motion")
 _KEPT = (_PICTURES_KEY, _ESTIMATED_FLOW_KEY, _ESTIMATED_MOTION_KEY, *_NOISY_KEYS.values())
-_PICTURE_KEY = ("sensor", "rgb")
-
-
-class SensorKeys(NamedTuple):
-    """The keys under which representations read depth and the camera's motion."""
-
-    depth: NestedKey = ("sensor", "depth")
-    motion: NestedKey = ("sensor", "prev_from_curr")
 
 
 def representation_options(name: str) -> dict[str, Any]:
@@ -78,8 +70,7 @@ def representation_options(name: str) -> dict[str, Any]:
         >>> representation_options("depth2")
         {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
-    if name not in _REPRESENTATIONS:
-        raise ValueError(unknown_name("representation", name, REPRESENTATIONS))
+    _check_known("representation", [name], REPRESENTATIONS)
     entry = _REPRESENTATIONS[name]
     options = _defaults(FrameStack, ("k",)) if entry.frames_of else {}
     return options | _defaults(entry.transform, entry.options)
@@ -139,19 +130,19 @@ def representation_stack(
             FlowFactorize([('sensor', 'depth'), ('sensor', 'prev_from_curr')] -> ['ego']))
     """
     chosen = _with_options(representations)
-    if num_classes is None and ("seg" in chosen or "seg2" in chosen):
+    if num_classes is None and not {"seg", "seg2"}.isdisjoint(chosen):
         raise ValueError("representations seg and seg2 need num_classes=")
     estimator = _estimator_options(flow)
     flows = {name: chosen[name] for name in FLOWS if name in chosen}
     if intrinsics is None and flows and (estimator is None or set(flows) != {"raw"}):
         raise ValueError(f"representations {', '.join(FLOWS)} need intrinsics=, the camera's K")
-    if motion not in MOTION_SOURCES:
-        raise ValueError(unknown_name("source of motion", motion, MOTION_SOURCES))
-    estimates_motion = motion == "estimated" and not {"ego", "obj"}.isdisjoint(chosen)
+    _check_known("source of motion", [motion], MOTION_SOURCES)
     transforms, keys = _noise_transforms(noise, chosen, reads_motion=motion == "exact")
-    transforms += _map_transforms(chosen, num_classes, keys)
+    transforms += _map_transforms(chosen, num_classes, keys["depth"])
     context = {"dt_s": dt_s, "compiled": compiled}
-    transforms += _flow_transforms(flows, estimator, intrinsics, keys, estimates_motion, context)
+    if motion == "estimated" and not {"ego", "obj"}.isdisjoint(flows):
+        keys["motion"] = _ESTIMATED_MOTION_KEY
+    transforms += _flow_transforms(flows, estimator, intrinsics, keys, context)
     written = [key for transform in transforms for key in transform.out_keys]
     hidden = [key for key in written if key not in (*chosen, *_KEPT)]
     return Compose(*transforms, *([DropKeys(*hidden)] if hidden else []))
@@ -167,36 +158,64 @@ class DropKeys(ExcludeTransform):
         )
 
 
+def _check_known(what: str, names: Iterable[object], known: Collection[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise ValueError(f"unknown {what} {name!r}. There are {list(known)}")
+
+
 def _with_options(
     representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None],
 ) -> dict[str, dict[str, Any]]:
-    if isinstance(representations, str):
-        raise ValueError(f"representations must be a list of names, e.g. [{representations!r}]")
-    names = list(representations)
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"representation {name!r} is named {names.count(name)} times")
-    given = representations if isinstance(representations, Mapping) else {}
-    chosen = {}
-    for name in names:
+    if isinstance(representations, str) or not representations:
+        raise ValueError(
+            f"representations must be a list of names, some of {list(REPRESENTATIONS)}; "
+            f"got {representations!r}"
+        )
+    chosen: dict[str, dict[str, Any]] = {}
+    for name in representations:
+        if name in chosen:
+            raise ValueError(f"representation {name!r} is named twice")
+        own = representations[name] if isinstance(representations, Mapping) else None
         options = representation_options(name)
-        own = given.get(name) or {}
-        if not isinstance(own, Mapping):
-            raise ValueError(f"options of representation {name!r} are a mapping, got {own!r}")
-        for option, value in own.items():
-            if option not in options:
-                raise ValueError(
-                    unknown_name(f"option of representation {name!r}:", option, options)
-                )
-            options[option] = value
-        chosen[name] = options
-    if not chosen:
-        raise ValueError(f"no representation is named; there are {list(REPRESENTATIONS)}")
+        _check_known(f"option of representation {name!r}:", own or {}, options)
+        chosen[name] = options | dict(own or {})
     return chosen
 
 
+def _noise_transforms(
+    noise: Mapping[str, float] | None, chosen: Collection[str], *, reads_motion: bool
+) -> tuple[list[Transform], dict[str, NestedKey]]:
+    """Returns one `SensorNoise`, if a representation reads a noisy sensor, and the keys to read.
+
+    The exact values keep their keys, so that raw flow and a second pass over the same frames start
+    from them.
+    """
+    given: dict[str, Any] = dict.fromkeys(NOISE_OPTIONS, 0.0)
+    _check_known("option of noise:", noise or {}, given)
+    given |= noise or {}
+    SensorNoise(**given)  # checks all values, used or not
+    readers = {  # raw flow is not measured by a depth camera
+        "depth": [name for name in chosen if name in ("depth", "depth2", "ego", "obj")],
+        "motion": [name for name in chosen if name in ("ego", "obj") and reads_motion],
+    }
+    options = {name: {o: given[o] for o in SENSORS[name].options} for name in _NOISY_KEYS}
+    noisy = [name for name in _NOISY_KEYS if readers[name] and any(options[name].values())]
+    keys = {name: SENSORS[name].key for name in _NOISY_KEYS}
+    if not noisy:
+        return [], keys
+    transform = SensorNoise(
+        sensors=noisy,
+        **{option: value for name in noisy for option, value in options[name].items()},
+        frame_key=("sensor", "frame"),
+        out_keys=[_NOISY_KEYS[name] for name in noisy],
+    )
+    transform.label = " and ".join(readers["depth"])
+    return [transform], keys | {name: _NOISY_KEYS[name] for name in noisy}
+
+
 def _map_transforms(
-    chosen: dict[str, dict[str, Any]], num_classes: int | None, keys: SensorKeys
+    chosen: dict[str, dict[str, Any]], num_classes: int | None, depth_key: NestedKey
 ) -> list[Transform]:
     """Returns the transforms of all representations except flow."""
     transforms: list[Transform] = []
@@ -216,7 +235,7 @@ def _map_transforms(
         if frame == "seg":
             frame_options["num_classes"] = num_classes
         elif frame == "depth":
-            frame_options["in_keys"] = keys.depth
+            frame_options["in_keys"] = depth_key
         transforms.append(entry.transform(**frame_options, out_keys=key))
     return transforms + stacks
 
@@ -225,12 +244,9 @@ def _estimator_options(flow: str | Mapping[str, Any]) -> dict[str, Any] | None:
     """Returns `EstimatedFlow`'s options, or None if flow is exact."""
     options: dict[str, Any] = {"source": flow} if isinstance(flow, str) else dict(flow)
     source = options.pop("source", None)
-    if source not in FLOW_SOURCES:
-        raise ValueError(unknown_name("source of flow", source, FLOW_SOURCES))
+    _check_known("source of flow", [source], FLOW_SOURCES)
     known = _ESTIMATOR_OPTIONS if source == "estimated" else ()
-    for option in options:
-        if option not in known:
-            raise ValueError(unknown_name(f"option of {source} flow:", option, known))
+    _check_known(f"option of {source} flow:", options, known)
     return options if source == "estimated" else None
 
 
@@ -238,92 +254,54 @@ def _flow_transforms(
     flows: dict[str, dict[str, Any]],
     estimator: dict[str, Any] | None,
     intrinsics: Intrinsics | None,
-    keys: SensorKeys,
-    estimates_motion: bool,
+    keys: dict[str, NestedKey],
     context: dict[str, Any],
 ) -> list[Transform]:
     """Returns the sources of raw flow and of motion, if needed, and one FlowFactorize if it is."""
     transforms: list[Transform] = []
-    factors = {name: options for name, options in flows.items() if name != "raw"}
+    factors = dict(flows)
     unscaled: NestedKey = _UNSCALED_KEY
+    estimates_motion = keys["motion"] == _ESTIMATED_MOTION_KEY
     needs_unscaled = "obj" in flows or estimates_motion
     if estimator is not None and ("raw" in flows or needs_unscaled):
         unscaled = _ESTIMATED_FLOW_KEY
-        estimate = EstimatedFlow(
-            **estimator,
-            outputs=["unscaled", "raw"] if "raw" in flows else ["unscaled"],
-            **flows.get("raw", {}),
-            dt_s=context["dt_s"],
-            in_keys=_PICTURES_KEY,
-            out_keys=[unscaled, "raw"] if "raw" in flows else [unscaled],
-        )
-        pictures = FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])
-        pictures.label = estimate.label = "raw and obj by estimated flow"
-        transforms += [pictures, estimate]
-    elif needs_unscaled:
-        factors = flows  # raw too, from the unscaled flow
-        transforms.append(RawFlow(intrinsics, out_keys=unscaled, **context))
-        transforms[0].label = "'obj'" if "obj" in flows else "'ego' by estimated motion"
+        written = {"unscaled": unscaled} | ({"raw": "raw"} if "raw" in flows else {})
+        transforms = [
+            FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY]),
+            EstimatedFlow(
+                **estimator,
+                outputs=list(written),
+                **factors.pop("raw", {}),
+                dt_s=context["dt_s"],
+                in_keys=_PICTURES_KEY,
+                out_keys=list(written.values()),
+            ),
+        ]
+    elif needs_unscaled:  # raw, too, is then made from the unscaled flow
+        transforms = [RawFlow(intrinsics, out_keys=unscaled, **context)]
     elif "raw" in flows:
-        transforms.append(RawFlow(intrinsics, **flows["raw"], **context))
+        transforms = [RawFlow(intrinsics, **factors.pop("raw"), **context)]
     if estimates_motion:
         estimate_motion = EstimateCameraMotion(
             intrinsics,
             picture=None if estimator is None else _PICTURE_KEY,
             outputs=["motion"],
-            in_keys=[unscaled, keys.depth],
+            in_keys=[unscaled, keys["depth"]],
             out_keys=[_ESTIMATED_MOTION_KEY],
         )
-        estimate_motion.label = "ego and obj by estimated motion"
         transforms.append(estimate_motion)
-        keys = keys._replace(motion=_ESTIMATED_MOTION_KEY)
+    for transform in transforms:
+        if transform.out_keys[0] not in flows:  # errors name what is made of it
+            transform.label = " and ".join(map(repr, flows))
     if factors:
+        raw = [] if set(factors) == {"ego"} else [unscaled]
         split = FlowFactorize(
             intrinsics,
             outputs=list(factors),
             scale={name: options["scale"] for name, options in factors.items()},
             unit={name: options["unit"] for name, options in factors.items()},
-            in_keys=[unscaled, *keys] if {"obj", "raw"} & set(factors) else [*keys],
+            in_keys=[*raw, keys["depth"], keys["motion"]],
             **context,
         )
         transforms.append(split)
     return transforms
-
-
-def _noise_transforms(
-    noise: Mapping[str, float] | None, representations: Collection[str], *, reads_motion: bool
-) -> tuple[list[Transform], SensorKeys]:
-    """Returns one `SensorNoise`, if a representation reads a noisy sensor, and the keys to read.
-
-    The exact values keep their keys, so that raw flow and a second pass over the same frames start
-    from them. A frame's noise depends only on its name.
-
-    Raises:
-        ValueError: for an unknown option or an invalid value.
-    """
-    given: dict[str, Any] = dict(noise or {})
-    for option in given:
-        if option not in NOISE_OPTIONS:
-            raise ValueError(unknown_name("option of noise:", option, NOISE_OPTIONS))
-    SensorNoise(**given)  # checks all values, used or not
-    readers = {  # raw flow is not measured by a depth camera
-        "depth": {"depth", "depth2", "ego", "obj"},
-        "motion": {"ego", "obj"} if reads_motion else set(),
-    }
-    options = {"depth": NOISE_OPTIONS[:2], "motion": NOISE_OPTIONS[2:]}
-    noisy = [
-        sensor
-        for sensor in _NOISY_KEYS
-        if not readers[sensor].isdisjoint(representations) and any(map(given.get, options[sensor]))
-    ]
-    if not noisy:
-        return [], SensorKeys()
-    out_keys = {sensor: _NOISY_KEYS[sensor] for sensor in noisy}
-    transform = SensorNoise(
-        sensors=noisy,
-        **{name: given.get(name, 0.0) for sensor in noisy for name in options[sensor]},
-        frame_key=("sensor", "frame"),
-        out_keys=list(out_keys.values()),
-    )
-    transform.label = " and ".join(name for name in representations if name in readers["depth"])
-    return [transform], SensorKeys()._replace(**out_keys)

@@ -119,3 +119,20 @@ def sensor_map(name: str, sensor: dict[str, Tensor]) -> Tensor:
 
 def hole(sensor: dict[str, Tensor]) -> Tensor:
     return torch.full_like(sensor["depth"], math.nan)
+
+
+def brightening(first: Tensor, second: Tensor) -> Tensor:
+    """An estimator of flow worked by hand: by how much the first picture is brighter."""
+    return first[:, :2].float() - second[:, :2].float()
+
+
+def minus_one_but_at_resets(sensor: dict[str, Tensor]) -> Tensor:
+    """Returns flow by `brightening`, as the env's pictures brighten by 1 a step."""
+    # brightening(current, previous) = 1, negated; the pair swapped would give +1.
+    step = int(sensor["rgb"][0, 0, 0])
+    return torch.full((2, *sensor["rgb"].shape[-2:]), -1.0 if step else 0.0)
+
+
+def same_bits(a: Tensor, b: Tensor) -> bool:
+    """Returns whether two tensors are equal, holes (nan) included."""
+    return torch.equal(a.isnan(), b.isnan()) and torch.equal(a.nan_to_num(), b.nan_to_num())

