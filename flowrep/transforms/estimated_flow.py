@@ -66,7 +66,7 @@ class DIS:
         check_name("preset", self.preset, Preset)
         if self.min_side_px < 1:
             raise ValueError(f"min_side_px must be at least 1, got {self.min_side_px}")
-        require("flow estimated by DIS", "flow", "cv2")
+        _opencv()
 
     def __call__(self, first: Tensor, second: Tensor) -> Tensor:
         """Returns the displacement of each pixel from the first picture to the second.
@@ -86,8 +86,7 @@ class DIS:
         return torch.stack(flows).to(first.device)
 
     def _flow(self, first: Any, second: Any) -> Tensor:
-        import cv2  # here, as it is an extra
-
+        cv2 = _opencv()
         height, width = first.shape[:2]
         factor = whole_factor(height, width, self.min_side_px)
         grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second)]
@@ -108,6 +107,13 @@ def whole_factor(height: int, width: int, min_side_px: int) -> int:
     (4, 1)
     """
     return max(1, math.ceil(min_side_px / min(height, width)))
+
+
+def _opencv() -> Any:  # its own types lack DISOpticalFlow_create
+    require("flow estimated by DIS", "flow", "cv2")
+    import cv2
+
+    return cv2
 
 
 class RAFT(nn.Module):
@@ -325,7 +331,7 @@ class EstimatedFlow(FlowTransform):
 def _estimator(
     estimator: str | Estimator, weights: str | Path | None, preset: str, min_side_px: int
 ) -> Estimator:
-    if estimator in get_args(Network):
+    if isinstance(estimator, str) and estimator in get_args(Network):
         if weights is None:
             raise ValueError(f"estimator {estimator!r} needs weights=, a file with its state dict")
         return RAFT(weights, estimator, min_side_px=max(min_side_px, SMALLEST_SIDE_PX))

@@ -109,11 +109,11 @@ class FlowTransform(CameraTransform):
         out_keys: Keys | None,
     ) -> None:
         check_choice("outputs", outputs, self.known)
-        keys = list(outputs) if out_keys is None else out_keys
+        keys = as_keys(list(outputs) if out_keys is None else out_keys)
         super().__init__(intrinsics, reads, in_keys, keys, writes=len(outputs))
         self.outputs = tuple(outputs)
-        self.masks = [mask_key(k) for name, k in zip(outputs, self.out_keys) if name in self.masked]
-        self.out_keys = [*self.out_keys, *self.masks]
+        self.masks = [mask_key(key) for name, key in zip(outputs, keys) if name in self.masked]
+        self.out_keys: list[NestedKey] = [*keys, *self.masks]
         flows = [output for output in outputs if output != "valid"]
         scales = _per_output("scale", scale, flows)
         units = _per_output("unit", unit, flows)
