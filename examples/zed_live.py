@@ -32,21 +32,20 @@ class ZedLive:
         source: `"live"` for a connected camera, or an .svo or .svo2 file.
 
     Raises:
-        SequenceError: the SDK is not installed, or the camera or file can't be opened.
+        SequenceError: the camera or file can't be opened.
     """
 
     has_flow, has_poses = False, True
     notes: tuple[str, ...] = ()
 
     def __init__(self, source: str | Path) -> None:
-        self.source = Path(source)
-        self._sl = _sdk()
-        if str(source) != "live" and not self.source.is_file():
+        from pyzed import sl  # comes with the ZED SDK
+
+        self._sl, self.source, self._is_live = sl, Path(source), str(source) == "live"
+        if not self._is_live and not self.source.is_file():
             raise SequenceError(source, "no such file; give an .svo file, or live for the camera")
-        self._is_live = str(source) == "live"
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields frames until the file ends, or endlessly from a camera."""
         sl = self._sl
         camera = sl.Camera()
         options = sl.InitParameters()
@@ -101,18 +100,6 @@ class ZedLive:
             raise SequenceError(self.source, f"{what}: the ZED SDK says {error}")
 
 
-def _sdk() -> Any:
-    try:
-        from pyzed import sl
-    except ImportError:
-        raise SequenceError(
-            "pyzed",
-            "the Python package of Stereolabs' ZED SDK is not installed; a folder exported from a "
-            "recording is read without it: flowrep.factorize format=zed",
-        ) from None
-    return sl
-
-
 def main(source: str, folder: str) -> None:
     stream = ZedLive(source)
     options = OutputOptions(flow_files=(), video_fps=15)
@@ -125,5 +112,5 @@ def main(source: str, folder: str) -> None:
 if __name__ == "__main__":
     try:
         main(*sys.argv[1:])
-    except SequenceError as error:
+    except (SequenceError, ImportError) as error:
         sys.exit(f"error: {error}")

@@ -75,7 +75,7 @@ def factorize_recording(config: FactorizeConfig) -> int:
             print(f"stopped after {len(output.rows)} frames, which are in {output.partial}")
             return 130
     if not output.rows:
-        used = f"start={start} stop={stop} stride={stride}"
+        used = f"start={start} stride={stride}"
         raise SequenceError(config.input, f"no two frames of {used} follow each other in a clip")
     output.finish(job.summary(diagnosis))
     print(f"{len(output.rows)} frames in {output.path}; time: {job.clock.summary()}")

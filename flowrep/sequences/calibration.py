@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -34,14 +35,7 @@ class Camera(BaseModel):
     fy: float
     cx: float
     cy: float
-    first_pixel_centre: float
-
-    @field_validator("first_pixel_centre")
-    @classmethod
-    def _is_corner_or_centre(cls, place: float) -> float:
-        if place in (0.0, 0.5):
-            return place
-        raise ValueError("is 0 (as OpenCV calibrates) or 0.5")
+    first_pixel_centre: Literal[0.0, 0.5]  # type: ignore[valid-type]
 
     @field_validator("fy")
     @classmethod
@@ -124,27 +118,34 @@ def as_pose(
     direction: PoseDirection = "camera_to_world",
     axes: CameraAxes = "opencv",
 ) -> Pose:
-    """Returns `world_from_cam` from the 7, 12 or 16 numbers of one pose."""
-    values: NDArray[np.float64] = np.array(numbers, dtype=np.float64).ravel()
+    """Returns `world_from_cam` `[*B, 4, 4]` from the 7, 12 or 16 numbers of each pose."""
+    values = torch.from_numpy(np.array(numbers, dtype=np.float64))
+    if layout == "matrix":
+        values = values.unflatten(-1, (-1, 4))
+        layout = "matrix" if values.shape[-2] == 4 else "matrix_3x4"
     try:
-        if layout == "matrix":
-            values = np.append(values, [0.0, 0.0, 0.0, 1.0])[:16].reshape(4, 4)
-        pose = torch.from_numpy(values)
-        return adapt_pose(pose, layout=layout, direction=direction, axes=axes).numpy()
+        return adapt_pose(values, layout=layout, direction=direction, axes=axes).numpy()
     except ValueError as error:
         raise SequenceError(source, str(error)) from None
 
 
-def read_pose_lines(path: Path, layout: PoseLayout, frames: int) -> NDArray[np.float64]:
-    """Returns the numbers of one pose per line and frame, `[N, 7]`, `[N, 12]` or `[N, 16]`."""
+def read_poses(path: Path, frames: int, *, layout: PoseLayout = "xyz_xyzw", **options: Any) -> Pose:
+    """Returns `world_from_cam` `[N, 4, 4]` of a file with a pose per line and frame.
+
+    Args:
+        path: the file.
+        frames: the number of frames.
+        layout: of a line; a matrix has 12 or 16 numbers.
+        options: see `as_pose`.
+    """
     columns, remedies = [7], dict.fromkeys((12, 16), "matrices are format.pose_layout=matrix")
     if layout == "matrix":
         quaternions = "a position and a quaternion are format.pose_layout=xyz_xyzw (or xyz_wxyz)"
         columns, remedies = [12, 16], {7: quaternions}
-    poses = read_table(path, columns, remedies=remedies)
-    if len(poses) != frames:
-        raise SequenceError(path, f"has {len(poses)} poses for {frames} frames")
-    return poses
+    numbers = read_table(path, columns, remedies=remedies)
+    if len(numbers) != frames:
+        raise SequenceError(path, f"has {len(numbers)} poses for {frames} frames")
+    return as_pose(numbers, path, layout=layout, **options)
 
 
 _LARGEST_FOOTPRINT_PX = 8
@@ -160,9 +161,8 @@ class Registration:
 
     Args:
         K_depth: `[3, 3]` of the depth camera, pixels.
-        K_colour: `[3, 3]` of the colour camera, pixels.
-        colour_from_depth: `[4, 4]`, takes points of the depth camera into the colour camera's
-            frame, metres.
+        K_colour: `[3, 3]` of the colour camera.
+        colour_from_depth: `[4, 4]`, takes points of the former's frame into the latter's, metres.
         size: height and width of the colour pictures.
 
     >>> K = np.array([[4.0, 0.0, 1.0], [0.0, 4.0, 0.5], [0.0, 0.0, 1.0]])
@@ -191,11 +191,7 @@ class Registration:
         self._rays = np.empty((3, 0, 0), np.float32)  # to_colour @ pixel, of the last size seen
 
     def __call__(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the colour camera's depth, `[height, width]`, metres, nan where missing.
-
-        Args:
-            depth: `[H, W]` of the depth camera, metres; nan and inf are no surface.
-        """
+        """Returns the colour camera's depth, nan where missing; nan and inf are no surface."""
         if self._rays.shape[1:] != depth.shape:
             row, column = np.indices(depth.shape) + 0.5
             pixels = np.stack([column, row, np.ones(depth.shape)]).reshape(3, -1)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import cv2
@@ -32,7 +33,9 @@ from flowrep.geometry import (
     relative_motion,
     z_from_ray_length,
 )
-from flowrep.sequences.factorization import estimate_motion
+from flowrep.sequences.factorization import estimated_motion
+from flowrep.sequences.files import Flow
+from flowrep.sequences.recording import Frame
 
 # Residuals below these are normal: rounding of pixels, of estimators, of poses.
 _SMALL_PX, _SMALL_SHARE = 0.05, 0.05
@@ -193,16 +196,6 @@ class Doctor:
         conventions: the options that the data were read with, see `Recording.conventions`.
         flow_is_recorded: whether raw flow belongs to the data. Flow that flowrep estimated has no
             options that may be wrong.
-
-    >>> depth = torch.full((1, 8, 10), 4.0)
-    >>> K = torch.tensor([[20.0, 0.0, 5.0], [0.0, 20.0, 4.0], [0.0, 0.0, 1.0]])
-    >>> before, now = torch.eye(4).double(), torch.eye(4).double()
-    >>> now[0, 3] = 0.5  # the camera went to the right: all streams by 20 * 0.5 / 4 to the left
-    >>> raw = torch.tensor([2.5, 0.0]).reshape(2, 1, 1).expand(2, 8, 10)  # but this says right
-    >>> doctor = Doctor()
-    >>> doctor.look(raw, depth, K, before, now)
-    >>> "flow_direction=backward" in doctor.diagnosis().suspects
-    True
     """
 
     conventions: Mapping[str, str] = field(default_factory=dict)
@@ -210,34 +203,18 @@ class Doctor:
     _pairs: list[_Pair] = field(default_factory=list)
 
     @torch.no_grad()
-    def look(
-        self,
-        raw: Tensor,
-        depth: Tensor,
-        K: Tensor,
-        world_from_prev: Tensor,
-        world_from_curr: Tensor,
-        *,
-        picture: Tensor | None = None,
-        static: Tensor | None = None,
-    ) -> bool:
+    def look(self, previous: Frame, current: Frame, raw: Flow) -> bool:
         """Examines a pair of frames; returns whether it moves enough to be of use.
 
         Args:
-            raw: `[2, H, W]`, pixels per step, assumed p_t - p_t' on the current grid; nan unknown.
-            depth: `[1, H, W]`, of the current frame, assumed z in metres.
-            K: `[3, 3]`, pixels.
-            world_from_prev: `[4, 4]`, assumed camera-to-world with OpenCV's axes.
-            world_from_curr: `[4, 4]`, the same for the current frame.
-            picture: uint8 `[3, H, W]`, whose texture says where estimated flow can be trusted.
-            static: `[1, H, W]` bool, pixels known to be static; without it most of the picture
-                has to be.
+            previous: the frame before, assumed to be in flowrep's conventions.
+            current: the frame itself.
+            raw: its flow since then, assumed p_t - p_t' on its own grid; nan where unknown.
         """
-        raw = raw if static is None else torch.where(static, raw, torch.nan)
-        pair = _sampled(raw, depth, K, (world_from_prev.double(), world_from_curr.double()))
+        pair = _sampled(previous, current, raw)
         if not float(_median_px(pair.raw, pair)) >= _LEAST_RAW_PX:  # or nan
             return False
-        motion = estimate_motion(raw, depth, K, picture=picture)
+        motion = estimated_motion(previous, current, raw)
         estimated = torch.from_numpy(motion.prev_from_curr) if motion.known else None
         self._pairs.append(pair._replace(estimated=estimated))
         return True
@@ -299,9 +276,31 @@ def diagnose(
     *,
     static: Tensor | None = None,
 ) -> Diagnosis:
-    """Returns the diagnosis from a single pair of frames, see `Doctor.look`."""
+    """Returns the diagnosis from a single pair of frames, as tensors.
+
+    Args:
+        raw: `[2, H, W]`, pixels per step, assumed p_t - p_t' on the current grid; nan unknown.
+        depth: `[1, H, W]`, of the current frame, assumed z in metres.
+        K: `[3, 3]`, pixels.
+        world_from_prev: `[4, 4]`, assumed camera-to-world with OpenCV's axes.
+        world_from_curr: `[4, 4]`, the same for the current frame.
+        static: `[1, H, W]` bool, pixels known to be static; without it most of the picture has
+            to be.
+
+    >>> K = torch.tensor([[20.0, 0.0, 5.0], [0.0, 20.0, 4.0], [0.0, 0.0, 1.0]])
+    >>> before, now = torch.eye(4), torch.eye(4)
+    >>> now[0, 3] = 0.5  # the camera went to the right: all streams by 20 * 0.5 / 4 to the left
+    >>> raw = torch.tensor([2.5, 0.0]).reshape(2, 1, 1).expand(2, 8, 10)  # but this says right
+    >>> diagnosis = diagnose(raw, torch.full((1, 8, 10), 4.0), K, before, now)
+    >>> "flow_direction=backward" in diagnosis.suspects
+    True
+    """
+    raw = raw if static is None else torch.where(static, raw, torch.nan)
+    flow, z = (np.asarray(tensor.float().cpu()) for tensor in (raw, depth[0]))
+    camera, *poses = (np.asarray(x.double().cpu()) for x in (K, world_from_prev, world_from_curr))
+    previous, current = (Frame("", Path(), pose, camera, z) for pose in poses)
     doctor = Doctor()
-    doctor.look(raw, depth, K, world_from_prev, world_from_curr, static=static)
+    doctor.look(previous, current, flow)
     return doctor.diagnosis()
 
 
@@ -325,21 +324,23 @@ def _mean(values: Iterable[Tensor]) -> float:
     return float(np.mean(numbers)) if numbers else math.nan
 
 
-def _sampled(raw: Tensor, depth: Tensor, K: Tensor, poses: tuple[Tensor, Tensor]) -> _Pair:
+def _sampled(previous: Frame, current: Frame, flow: Flow) -> _Pair:
     """Returns a pair with its maps and K on a coarser grid.
 
     Pixel j of the coarser grid is pixel s j + o of the finer one. The centre of the latter,
     s j + o + 0.5, maps to j + 0.5: u' = (u - o - 0.5) / s + 0.5. Flow is in coarse pixels.
     """
-    height, width = depth.shape[-2:]
+    height, width = current.size
     step = max(1, int((height * width / _SAMPLED_PIXELS) ** 0.5))
     offset = step // 2
     every = (..., slice(offset, None, step), slice(offset, None, step))
-    raw, depth = raw[every].float() / step, depth[every].float()
-    coarse = K.double().clone()
+    raw = torch.from_numpy(flow[every]) / step
+    depth = torch.from_numpy(current.depth[every])[None]
+    coarse = torch.from_numpy(current.K.copy())
     coarse[:2, 2] -= offset + 0.5 - step / 2
     coarse[:2] /= step
     known = raw.isfinite().all(0, keepdim=True) & (depth > 0)
+    poses = torch.from_numpy(previous.world_from_cam), torch.from_numpy(current.world_from_cam)
     return _Pair(raw, depth, coarse.float(), known, step, poses)
 
 

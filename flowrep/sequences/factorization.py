@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from flowrep.geometry import camera_motion, factorize, relative_motion
 from flowrep.sequences.files import Flow
@@ -178,24 +177,12 @@ def recorded_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
 
 def estimated_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
     """Returns the camera's motion that most of the picture's flow and depth agree on."""
-    depth, K = torch.from_numpy(current.depth)[None], torch.from_numpy(current.K)
-    picture = None if raw is current.raw else picture_of(current)
-    return estimate_motion(torch.from_numpy(raw), depth, K, picture=picture)
-
-
-def picture_of(frame: Frame) -> Tensor | None:
-    """Returns a frame's picture `[3, H, W]`.
-
-    Its texture tells which estimated flow can be trusted: where there is none, flow is 0.
-    """
-    return None if frame.rgb is None else torch.from_numpy(frame.rgb).permute(2, 0, 1)
-
-
-def estimate_motion(
-    raw: Tensor, depth: Tensor, K: Tensor, *, picture: Tensor | None = None
-) -> Motion:
-    """Returns the camera's motion by `flowrep.geometry.camera_motion`, see there."""
-    found = camera_motion(raw, depth, K.float(), picture=picture)
+    depth, K = torch.from_numpy(current.depth)[None], torch.from_numpy(current.K).float()
+    picture = None
+    # Texture tells which estimated flow can be trusted: where there is none, flow is 0.
+    if current.rgb is not None and raw is not current.raw:
+        picture = torch.from_numpy(current.rgb).permute(2, 0, 1)
+    found = camera_motion(torch.from_numpy(raw), depth, K, picture=picture)
     if not found.valid:
         return Motion(known=False, inlier_share=0.0)
     return Motion(found.prev_from_curr.double().numpy(), inlier_share=float(found.inlier_share))

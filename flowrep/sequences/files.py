@@ -64,10 +64,10 @@ def read_table(
     header: bool = False,
     remedies: Mapping[int, str] = MappingProxyType({}),
 ) -> NDArray[np.float64]:
-    """Returns the numbers of a text file, one row per line, `[N, columns]`.
+    """Returns the numbers of a text file, separated by blanks or commas, `[N, columns]`.
 
     Args:
-        path: the file; numbers are separated by blanks or commas.
+        path: the file.
         columns: the permitted numbers of columns.
         header: whether the first line has names.
         remedies: what to do about some other number of columns.
@@ -180,11 +180,7 @@ def read_depth(
 
 
 def read_flo(path: Path) -> Flow:
-    """Returns a .flo file's flow `[2, H, W]`, nan where unknown.
-
-    Raises:
-        SequenceError: it is another file, or not as long as its header says.
-    """
+    """Returns a .flo file's flow `[2, H, W]`, nan where unknown."""
     flow = read_tagged_floats(path, channels=2).transpose(2, 0, 1)
     known = np.abs(flow).max(0) <= _FLO_LARGEST  # nan compares False
     return np.where(known, flow, np.float32(np.nan))

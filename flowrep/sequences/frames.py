@@ -21,7 +21,7 @@ from flowrep.geometry import (
     adapt_depth,
     adapt_flow,
 )
-from flowrep.sequences.calibration import Registration, as_pose, read_cameras, read_pose_lines
+from flowrep.sequences.calibration import Registration, as_pose, read_cameras, read_poses
 from flowrep.sequences.files import (
     DEPTH_FILES,
     PICTURES,
@@ -46,17 +46,11 @@ class Frames(Recording):
 
     Args:
         folder: the recording's folder.
-        pose_layout: layout of a line, see `flowrep.geometry.adapt_pose`; a matrix has 12 or 16
-            numbers.
-        pose_direction: see there.
-        pose_axes: see there.
+        pose_layout, pose_direction, pose_axes: of a line, see `flowrep.geometry.adapt_pose`; a
+            matrix has 12 or 16 numbers.
         depth_unit_m: the length of a stored 1, metres; None is 0.001 in a .png and 1 in a .npy.
-        depth_kind: see `flowrep.geometry.adapt_depth`.
-        near_m: only for `"z_buffer"`.
-        far_m: only for `"z_buffer"`.
-        flow_direction: direction of `flow/`, see `flowrep.geometry.adapt_flow`.
-        flow_grid: see there.
-        flow_channels: see there.
+        depth_kind, near_m, far_m: see `flowrep.geometry.adapt_depth`.
+        flow_direction, flow_grid, flow_channels: of `flow/`, see `flowrep.geometry.adapt_flow`.
     """
 
     no_flow = "it has no folder flow/: use flow=estimated"
@@ -79,9 +73,6 @@ class Frames(Recording):
         if depth_unit_m is not None and not depth_unit_m > 0:
             raise ValueError(f"depth_unit_m is positive, got {depth_unit_m}")
         self.folder, self.depth_unit_m = Path(folder), depth_unit_m
-        self._pose_options: dict[str, Any] = {
-            "layout": pose_layout, "direction": pose_direction, "axes": pose_axes,
-        }  # fmt: skip
         self._depth_options: dict[str, Any] = {"kind": depth_kind, "near_m": near_m, "far_m": far_m}
         self._flow_options: dict[str, Any] = {
             "direction": flow_direction, "grid": flow_grid, "channels": flow_channels,
@@ -94,10 +85,11 @@ class Frames(Recording):
         if not self._rgbs and not self._flows:
             raise SequenceError(self.folder, "has neither rgb/ nor flow/: one of them is needed")
         self.has_flow = bool(self._flows)
-        self._poses_path, times = self.folder / "poses.txt", self.folder / "timestamps.txt"
-        self.has_poses = self._poses_path.is_file()
+        path, times = self.folder / "poses.txt", self.folder / "timestamps.txt"
+        self.has_poses = path.is_file()
         if self.has_poses:
-            self._poses = read_pose_lines(self._poses_path, pose_layout, len(self))
+            options: Any = {"layout": pose_layout, "direction": pose_direction, "axes": pose_axes}
+            self._poses = read_poses(path, len(self), **options)
         self._times = read_table(times, [1])[:, 0] if times.is_file() else None
         if self._times is not None and len(self._times) != len(self):
             raise SequenceError(times, f"has {len(self._times)} times for {len(self)} frames")
@@ -105,7 +97,7 @@ class Frames(Recording):
         self._camera = read_cameras(path)
         self._registration, self.K = None, self._camera.K
         if colour := self._camera.colour:
-            extrinsics, self.K = as_pose(np.array(colour.colour_from_depth), path), colour.K
+            extrinsics, self.K = as_pose(np.ravel(colour.colour_from_depth), path), colour.K
             self._registration = Registration(self._camera.K, self.K, extrinsics, colour.size)
         unit_m = depth_unit_m or (1.0 if self._depths[0].suffix.lower() == ".npy" else 0.001)
         self.conventions = {
@@ -132,9 +124,7 @@ class Frames(Recording):
     def _read(self, index: int) -> Frame:
         depth_path = self._depths[index]
         name = depth_path.stem
-        world_from_cam = None
-        if self.has_poses:
-            world_from_cam = as_pose(self._poses[index], self._poses_path, **self._pose_options)
+        world_from_cam = self._poses[index] if self.has_poses else None
         stored = torch.from_numpy(read_depth(depth_path, self._camera.size, self.depth_unit_m))
         is_ray = self._depth_options["kind"] == "ray_length"
         K = torch.from_numpy(self._camera.K).float() if is_ray else None
@@ -176,15 +166,15 @@ class Zed(Recording):
     """
 
     def __init__(self, folder: str | Path, *, pose_axes: CameraAxes = "opencv") -> None:
-        self.folder, self.pose_axes = Path(folder), pose_axes
+        self.folder = Path(folder)
         self._pictures = list_files(self.folder, PICTURES, "left")
         depths = list_files(self.folder, DEPTH_FILES, "depth")
         self._depths = {path.stem.removeprefix("depth"): path for path in depths}
         self.count = len(self._pictures)
-        self._poses_path = self.folder / "poses.txt"
-        self.has_poses, self.conventions = self._poses_path.is_file(), {"pose_axes": pose_axes}
+        path, self.conventions = self.folder / "poses.txt", {"pose_axes": pose_axes}
+        self.has_poses = path.is_file()
         if self.has_poses:
-            self._poses = read_pose_lines(self._poses_path, "xyz_xyzw", len(self))
+            self._poses = read_poses(path, len(self), axes=pose_axes)
         self._camera = read_cameras(self.folder / "intrinsics.json")
 
     def _read(self, index: int) -> Frame:
@@ -192,15 +182,10 @@ class Zed(Recording):
         number = picture.stem.removeprefix("left")
         if number not in self._depths:
             raise SequenceError(self.folder, f"lacks depth{number} for {picture.name}")
-        world_from_cam = None
-        if self.has_poses:
-            world_from_cam = as_pose(
-                self._poses[index], self._poses_path, layout="xyz_xyzw", axes=self.pose_axes
-            )
         return Frame(
             name=number,
             source=picture,
-            world_from_cam=world_from_cam,
+            world_from_cam=self._poses[index] if self.has_poses else None,
             K=self._camera.K,
             depth=measured(read_depth(self._depths[number], self._camera.size)),
             rgb=read_rgb(picture),

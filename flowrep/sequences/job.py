@@ -7,7 +7,6 @@ from itertools import count, islice
 from typing import Any
 
 import numpy as np
-import torch
 from tqdm.auto import tqdm
 
 from flowrep.progress import StopRequest, Stopwatch
@@ -17,7 +16,6 @@ from flowrep.sequences.factorization import (
     MotionSource,
     factorize_pair,
     pairs,
-    picture_of,
     recorded_flow,
     repeats,
 )
@@ -28,16 +26,10 @@ DOCTOR_PAIRS, DOCTOR_TRIES = 10, 3
 
 
 class Job:
-    """The factorisation of one recording, or of a camera's frames, into a folder.
+    """The factorisation of a recording, or of a camera's frames, into a folder.
 
-    Args:
-        stream: the recording or camera.
-        flow_source: `recorded_flow` or an `EstimatedFlowSource`.
-        motion_source: `recorded_motion` or `estimated_motion`.
-        output: the folder.
-        start: the index of the first frame that is used.
-        stop: the index after the last one, None for the end.
-        stride: every n-th frame is used.
+    The frames `start`, `start + stride`, ... before `stop` are used. For the sources of flow and of
+    motion see `factorize_frames`.
     """
 
     def __init__(
@@ -68,6 +60,7 @@ class Job:
         places = np.linspace(1, len(used), DOCTOR_PAIRS, endpoint=False).astype(int)
         with self.clock("doctor"):
             for first, end in zip(places, [*places[1:], len(used)]):
+                # A pair that hardly moves, or repeats a picture, is passed over for the next one.
                 for place in range(first, min(end, first + DOCTOR_TRIES)):
                     if self._show(doctor, [self.stream[i] for i in used[place - 1 : place + 1]]):
                         break
@@ -78,14 +71,7 @@ class Job:
         _, (previous, current) = pairs(frames)
         if previous is None or repeats(previous, current):
             return False
-        return doctor.look(
-            torch.from_numpy(self.flow_source(previous, current)),
-            torch.from_numpy(current.depth)[None],
-            torch.from_numpy(current.K),
-            torch.from_numpy(previous.world_from_cam),
-            torch.from_numpy(current.world_from_cam),
-            picture=picture_of(current),
-        )
+        return doctor.look(previous, current, self.flow_source(previous, current))
 
     def run(self) -> bool:
         """Factorises all frames; returns whether it came to the end.

@@ -87,11 +87,13 @@ class Kitti(Recording):
             cam0_from_velo = self._rigid("calib_velo_to_cam", pair)
             cam_from_imu = cam_from_cam0 @ cam0_from_velo @ self._rigid("calib_imu_to_velo", pair)
             packets, first = self._oxts[int(pair)]
+            # The map is true to scale at the latitude of the pair's first frame in time.
             before, path = (packets / f"{first + later:010d}.txt" for later in (0, not is_current))
             latitude_deg = read_table(before, [_OXTS_NUMBERS])[0, 0]
             packet = read_table(path, [_OXTS_NUMBERS])[0]
             world_from_imu = _pose_from_oxts(packet, latitude_deg)
             world_from_cam = world_from_imu @ np.linalg.inv(cam_from_imu)
+        # Given is p_11 - p_10. Here 11 is the frame before, so that p_t - p_t' is the opposite.
         flow = self.folder / "flow_occ" / f"{name}.png"
         return Frame(
             name=name,
@@ -111,7 +113,7 @@ class Kitti(Recording):
         left, right, rotation = _matrices(
             path, {"P_rect_02": (3, 4), "P_rect_03": (3, 4), "R_rect_00": (3, 3)}
         )
-        rectified_from_cam0 = as_pose(np.hstack([rotation, np.zeros((3, 1))]), path)
+        rectified_from_cam0 = as_pose(np.hstack([rotation, np.zeros((3, 1))]).ravel(), path)
         # P = K [I | t], so that the left colour camera sees a rectified point at x + K^-1 p.
         cam_from_rectified = np.eye(4)
         cam_from_rectified[:3, 3] = np.linalg.solve(left[:, :3], left[:, 3])
@@ -120,7 +122,8 @@ class Kitti(Recording):
 
     def _rigid(self, kind: str, pair: str) -> Pose:
         path = self.folder / kind / f"{pair}.txt"
-        return as_pose(np.hstack(_matrices(path, {"R": (3, 3), "T": (3, 1)})), path)
+        parts = _matrices(path, {"R": (3, 3), "T": (3, 1)})
+        return as_pose(np.hstack(parts).ravel(), path)
 
 
 def _depth_from_disparity(stored: NDArray[np.uint16], focal_baseline: float) -> NDArray[np.float32]:

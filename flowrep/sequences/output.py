@@ -62,12 +62,9 @@ class Output:
     """The folder of a job: `<path>.partial` while it runs, `<path>` once it is complete.
 
     Args:
-        path: the final folder.
+        path: the final folder, which may not exist yet.
         options: what is written.
         settings: the job's settings, kept in `job.json`.
-
-    Raises:
-        SequenceError: the folder exists already.
     """
 
     def __init__(
@@ -96,6 +93,7 @@ class Output:
         if self._rerun is not None:
             self._rerun.append(index, made)
         self.rows.append(score(index, made, moving_px=self.options.moving_px))
+        # Opened anew for each frame, so that a killed job leaves the rows that are done.
         with (self.partial / "frames.csv").open("a", newline="", encoding="utf-8") as file:
             table = csv.DictWriter(file, self.rows[-1].keys())
             if len(self.rows) == 1:
@@ -129,21 +127,13 @@ class Output:
 
 
 def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, Any]:
-    """Returns a row of frames.csv: medians over valid pixels, shares in [0, 1].
-
-    A pixel moves by itself if its object flow is longer than three times the frame's median, which
-    is the error of estimated flow and of poses where most of the picture is static.
-
-    Args:
-        index: the frame's index in the recording.
-        made: its flow.
-        moving_px: see `OutputOptions`.
-    """
+    """Returns a row of frames.csv: medians over valid pixels, shares in [0, 1]."""
     frame, truth = made.frame, made.frame.raw
     raw_px, ego_px, obj_px = (
         np.hypot(*flow)[made.valid] for flow in (made.raw, made.ego, made.obj)
     )
     obj_median_px = _median(obj_px)
+    # Where most of the picture is static, the median is the error of estimated flow and of poses.
     moves = obj_px > max(moving_px, _MOVING_SPREAD * obj_median_px)
     row: dict[str, Any] = {
         "index": index,
@@ -181,7 +171,8 @@ def _beside_the_recorded_motion(made: FactorizedFrame) -> dict[str, float]:
     """Returns how an estimated motion compares with the recorded one, nan without either."""
     has_poses = not any(f.world_from_cam is None for f in (made.previous, made.frame))
     obj_px = turn_rad = shift_m = math.nan
-    if has_poses and made.motion.known and not math.isnan(made.motion.inlier_share):
+    is_estimated = not math.isnan(made.motion.inlier_share)
+    if has_poses and made.motion.known and is_estimated:
         recorded = factorize_pair(made.previous, made.frame, made.raw)
         off = np.linalg.inv(recorded.motion.prev_from_curr) @ made.motion.prev_from_curr
         obj_px = _median(np.hypot(*recorded.obj)[recorded.valid])
@@ -195,14 +186,7 @@ def _beside_the_recorded_motion(made: FactorizedFrame) -> dict[str, float]:
 
 
 def write_frame(folder: Path, index: int, made: FactorizedFrame, options: OutputOptions) -> None:
-    """Writes the files of one frame.
-
-    ```
-    flow/<raw, ego, obj>/<name>.flo      and / or .png, KITTI's
-    flow/<name>.npz                      raw, ego, obj, valid, ego_valid, K, prev_from_curr
-    pictures/<raw, ego, obj>/<name>.png  colours, with the scale and the wheel
-    ```
-    """
+    """Writes the flow files and, every so often, the pictures of one frame."""
     name = made.frame.name
     for kind in FLOW_NAMES:
         flow, valid = getattr(made, kind), known(kind, made)
@@ -246,6 +230,7 @@ def video_frame(made: FactorizedFrame, options: OutputOptions) -> Image:
     height, width = frame.size
     shrink = min(1.0, _TILE_PX / max(height, width))
     size = round(height * shrink), round(width * shrink)
+    # Maps are sampled before they are coloured, which halves the time: pixel centres, as resize.
     places: Any = np.ix_(
         *(((np.arange(n) + 0.5) * full / n).astype(int) for n, full in zip(size, frame.size))
     )

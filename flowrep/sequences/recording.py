@@ -60,8 +60,7 @@ class Frame:
     @property
     def size(self) -> tuple[int, int]:
         """Height and width."""
-        height, width = self.depth.shape
-        return height, width
+        return self.depth.shape
 
 
 class Stream(Protocol):
@@ -71,8 +70,7 @@ class Stream(Protocol):
     has_poses: bool
     notes: tuple[str, ...]
 
-    def __iter__(self) -> Iterator[Frame]:
-        """Yields the frames in order."""
+    def __iter__(self) -> Iterator[Frame]: ...
 
 
 class Recording(ABC):
@@ -99,7 +97,6 @@ class Recording(ABC):
     conventions: Mapping[str, str] = MappingProxyType({})
 
     def __len__(self) -> int:
-        """Returns the number of frames."""
         return self.count
 
     @abstractmethod
@@ -107,12 +104,7 @@ class Recording(ABC):
         """Returns a frame, unchecked."""
 
     def __getitem__(self, index: int) -> Frame:
-        """Returns one frame.
-
-        Raises:
-            IndexError: there is no such frame.
-            SequenceError: its maps differ in size, or K is not a camera matrix.
-        """
+        """Returns a frame whose maps have one size and whose K is a camera's."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         frame = self._read(index)
@@ -131,5 +123,4 @@ class Recording(ABC):
         return frame
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields the frames in order."""
         return (self[index] for index in range(len(self)))

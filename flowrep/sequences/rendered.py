@@ -8,12 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.sequences.calibration import (
-    as_pose,
-    intrinsics,
-    opencv_intrinsics,
-    read_pose_lines,
-)
+from flowrep.sequences.calibration import as_pose, intrinsics, opencv_intrinsics, read_poses
 from flowrep.sequences.files import (
     FLO_TAG,
     Flow,
@@ -66,6 +61,7 @@ class Sintel(Recording):
         if self.has_flow and index > 0:
             number = picture.stem.removeprefix("frame_")
             since = f"frame_{int(number) + 1:0{len(number)}d}"
+            # Given is the next frame's position minus this one's, and the next was the one before.
             raw = -read_flo(self._file("flow", picture, ".flo"))
             invalid = self._file("invalid", picture, ".png")
             if invalid.is_file():
@@ -111,8 +107,7 @@ class TartanAir(Recording):
         self.folder, order = Path(folder), slice(None, None, -1 if backwards else 1)
         self._pictures = list_files(self.folder / "image_left", (".png",))[order]
         self.count = len(self._pictures)
-        self._poses_path = self.folder / "pose_left.txt"
-        self._poses = read_pose_lines(self._poses_path, "xyz_xyzw", len(self))[order]
+        self._poses = read_poses(self.folder / "pose_left.txt", len(self), axes="ned")[order]
         flow = self.folder / "flow"
         self.has_flow = backwards and flow.is_dir()
         self.no_flow = f"no such folder: {flow}" if backwards else PLAY_BACKWARDS
@@ -122,7 +117,7 @@ class TartanAir(Recording):
         depth = read_npy(self.folder / "depth_left" / f"{number}_left_depth.npy")
         height, width = depth.shape
         if self.has_flow and index > 0:
-            since = self._number(index - 1)
+            since = self._number(index - 1)  # named in the file, so a gap is a missing file
             flow = self.folder / "flow" / f"{number}_{since}_flow.npy"
             raw = -read_npy(flow, dims=3).transpose(2, 0, 1)
             hidden = flow.with_name(f"{number}_{since}_mask.npy")
@@ -131,9 +126,7 @@ class TartanAir(Recording):
         return Frame(
             name=number,
             source=self._pictures[index],
-            world_from_cam=as_pose(
-                self._poses[index], self._poses_path, layout="xyz_xyzw", axes="ned"
-            ),
+            world_from_cam=self._poses[index],
             # 90 degrees of horizontal view, a centred axis: 320, 320, 320, 240 at 640 x 480.
             K=intrinsics(width / 2, width / 2, width / 2, height / 2),
             depth=depth,

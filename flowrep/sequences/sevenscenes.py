@@ -63,7 +63,8 @@ class SevenScenes(Recording):
         world_from_cam = None
         if self.has_poses:
             path = self.folder / f"{name}.pose.txt"
-            world_from_cam = as_pose(read_table(path, [4]), path) @ register.depth_from_colour
+            pose = as_pose(read_table(path, [4]).ravel(), path)
+            world_from_cam = pose @ register.depth_from_colour
         return Frame(
             name=name,
             source=colour,

@@ -52,7 +52,7 @@ class Tum(Recording):
             needed = "depth map or pose"
             poses = read_table(self.trajectory, [8])
             _check_ascending(self.trajectory, poses[:, 0])
-            self._poses = poses[:, 1:]
+            self._poses = as_pose(poses[:, 1:], self.trajectory, layout="xyz_xyzw")
             self._before, self._after, self._share = self._between(poses[:, 0], rgb_times)
             found &= self._before >= 0
         kept = np.flatnonzero(found)
@@ -78,7 +78,7 @@ class Tum(Recording):
             source=rgb,
             world_from_cam=self._pose(place) if self.has_poses else None,
             K=self.K,
-            depth=depth_from_integers(stored, 1 / 5000, missing=(0,)),
+            depth=depth_from_integers(stored, 1 / 5000, missing=(0,)),  # 5000 is a metre
             rgb=read_rgb(rgb),
             timestamp_s=float(self._times[place]),
         )
@@ -110,12 +110,10 @@ class Tum(Recording):
         return np.where(inside, before, -1), after, gaps[0] / span
 
     def _pose(self, place: int) -> Pose:
-        before, after = (
-            as_pose(self._poses[i], self.trajectory, layout="xyz_xyzw")
-            for i in (self._before[place], self._after[place])
-        )
-        share = float(self._share[place])
-        return interpolated_pose(before, after, share) if share else before
+        before, share = self._poses[self._before[place]], float(self._share[place])
+        if not share:
+            return before
+        return interpolated_pose(before, self._poses[self._after[place]], share)
 
 
 def _check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:

@@ -121,5 +121,5 @@ def test_a_file_that_is_not_there_is_named(sdk, tmp_path):
 
 def test_without_the_sdk_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyzed", None)
-    with pytest.raises(SequenceError, match="ZED SDK"):
+    with pytest.raises(ImportError, match="pyzed"):
         ZedLive("live")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,13 +23,13 @@ from flowrep.geometry import (
 from flowrep.sequences import (
     Doctor,
     EstimatedFlowSource,
+    Frame,
     Frames,
     SevenScenes,
     diagnose,
     recorded_flow,
 )
 from flowrep.sequences.doctor import _sampled, mistakes
-from flowrep.sequences.factorization import picture_of
 from flowrep.transforms import DIS
 from tests.geometry.scenes import rigid
 from tests.sequences.synthetic import SEVEN_SCENES, needs_7scenes
@@ -50,9 +51,13 @@ class Case:
     now: torch.Tensor = NOW
     K: torch.Tensor = K
 
-    def diagnosis(self, conventions=None, *, flow_is_recorded=True, **options):
+    def frames(self):
+        poses, z, camera = (self.before, self.now), self.depth[0].numpy(), self.K.double().numpy()
+        return [Frame("", Path(), pose.numpy(), camera, z) for pose in poses]
+
+    def diagnosis(self, conventions=None, *, flow_is_recorded=True):
         doctor = Doctor(conventions or {}, flow_is_recorded=flow_is_recorded)
-        doctor.look(self.raw, self.depth, self.K, self.before, self.now, **options)
+        doctor.look(*self.frames(), self.raw.numpy())
         return doctor.diagnosis()
 
 
@@ -120,6 +125,8 @@ WRONG = {
 
 
 def test_right_conventions_are_left_in_peace(right):
+    right.raw[:, :, ::7] = torch.nan
+    right.depth[:, ::5] = torch.nan
     found = right.diagnosis()
     assert found.suspects == ()
     assert found.residual_px < 1e-3 < found.raw_px
@@ -161,7 +168,7 @@ def test_axes_that_have_no_name_are_found_from_the_motions():
     doctor = Doctor()
     for case in (case_of(BEFORE, NOW), case_of(NOW, LATER, seed=1)):
         case = poses(case, lambda pose: pose @ mount)
-        doctor.look(case.raw, case.depth, K, case.before, case.now)
+        doctor.look(*case.frames(), case.raw.numpy())
     found = doctor.diagnosis()
     assert found.suspects[0] == "other axes"
     assert found.rivals_px["other axes"] < 0.05 < found.residual_px
@@ -179,7 +186,8 @@ def test_the_sky_is_at_infinity_as_either_kind_of_depth():
     sky[0, 30, 50] = 2.0
     to_ray = mistakes({"depth_kind": "ray_length"})["depth_kind=z"]
     to_z = mistakes({})["depth_kind=ray_length"]
-    pair = _sampled(torch.zeros(2, HEIGHT, WIDTH), sky, K, (BEFORE, NOW))
+    case = Case(torch.zeros(2, HEIGHT, WIDTH), sky)
+    pair = _sampled(*case.frames(), case.raw.numpy())
     for mistake, expected in (
         (to_z, 4.0 / float(ray_length(sky)[0, 30, 50])),
         (to_ray, float(ray_length(sky)[0, 30, 50])),
@@ -206,14 +214,8 @@ def test_where_most_moves_what_stands_still_can_be_told(right):
     static = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
     static[..., 52:] = True
     assert crowd.diagnosis().residual_px > 1
-    assert crowd.diagnosis(static=static).residual_px < 1e-3
-
-
-def test_unknown_flow_and_missing_depth_are_left_out(right):
-    raw, z = right.raw.clone(), right.depth.clone()
-    raw[:, :, ::2] = torch.nan
-    z[:, ::2] = torch.nan
-    assert dataclasses.replace(right, raw=raw, depth=z).diagnosis().suspects == ()
+    found = diagnose(crowd.raw, crowd.depth, K, BEFORE, NOW, static=static)
+    assert found.residual_px < 1e-3
 
 
 def test_flow_that_no_motion_explains_and_poses_of_another_recording_are_no_convention(right):
@@ -245,11 +247,9 @@ def test_several_pairs_are_weighed_together(right):
     doctor = Doctor()
     for mistake in ("flow_direction=backward", "flow_direction=backward", "pose_axes=opengl"):
         case = WRONG[mistake](right)
-        doctor.look(case.raw, case.depth, K, case.before, case.now)
-    assert doctor.diagnosis().pairs == 3
-    assert min(doctor.diagnosis().rivals_px.items(), key=lambda item: item[1])[0] == (
-        "flow_direction=backward"
-    )
+        doctor.look(*case.frames(), case.raw.numpy())
+    rivals_px = doctor.diagnosis().rivals_px
+    assert min(rivals_px, key=rivals_px.get) == "flow_direction=backward"
 
 
 def test_large_pictures_are_sampled_without_a_shift():
@@ -264,25 +264,14 @@ def test_large_pictures_are_sampled_without_a_shift():
     assert found.residual_px < 1e-3
 
 
-def show(doctor, previous, current, raw, change=lambda pose: pose, factor=1.0, **options):
-    """Shows the doctor a pair of frames, with poses and depth of another convention."""
-    doctor.look(
-        torch.from_numpy(raw),
-        torch.from_numpy(np.float32(factor) * current.depth)[None],
-        torch.from_numpy(current.K),
-        *(change(torch.from_numpy(frame.world_from_cam)) for frame in (previous, current)),
-        **options,
-    )
-
-
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    """Four frames of a drive through a turn."""
+    """Three frames of a drive through a turn."""
     pytest.importorskip("pybullet", reason="the streets are PyBullet's")
     from examples.make_recording import make_recording
 
     folder = tmp_path_factory.mktemp("made") / "turn"
-    make_recording(folder, scene="s_turn", frames=4, size=(90, 120), skipped=60)
+    make_recording(folder, scene="s_turn", frames=3, size=(90, 120), skipped=60)
     return folder
 
 
@@ -303,7 +292,7 @@ def test_the_doctor_corrects_the_options_of_a_recorded_street(options, correctio
     read = Frames(street, **options)
     doctor = Doctor(read.conventions)
     for previous, current in pairwise(read):
-        show(doctor, previous, current, recorded_flow(previous, current))
+        doctor.look(previous, current, recorded_flow(previous, current))
     found = doctor.diagnosis()
     assert bool(found.suspects) == bool(correction), found.words
     if correction is not None:
@@ -334,6 +323,14 @@ def real_pairs():
 def test_mistakes_about_a_real_recording_are_named(correction, real_pairs):
     factor, change = REAL[correction]
     doctor = Doctor(flow_is_recorded=False)
-    for previous, current, raw in real_pairs:
-        show(doctor, previous, current, raw, change, factor, picture=picture_of(current))
+    for *pair, raw in real_pairs:
+        wrong = [
+            dataclasses.replace(
+                frame,
+                depth=np.float32(factor) * frame.depth,
+                world_from_cam=change(torch.from_numpy(frame.world_from_cam)).numpy(),
+            )
+            for frame in pair
+        ]
+        doctor.look(*wrong, raw)
     assert doctor.diagnosis().suspects[:1] == ((correction,) if correction else ())

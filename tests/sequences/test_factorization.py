@@ -24,7 +24,7 @@ from flowrep.sequences import (
     recorded_flow,
 )
 from flowrep.sequences.factorization import consistent
-from flowrep.sequences.output import end_point_error, known, score
+from flowrep.sequences.output import known, score
 from flowrep.transforms import DIS
 
 K = np.array([[30.0, 0, 30.5], [0, 28.0, 21.0], [0, 0, 1]])
@@ -127,11 +127,10 @@ def test_without_poses_the_motion_is_estimated():
 
 
 def test_a_motion_that_nothing_tells_leaves_flow_unknown():
-    before, now = frame("a", world_from_cam=None), frame("b", world_from_cam=None)
     nothing = np.full((2, 40, 60), np.nan, np.float32)
-    made = factorize_pair(before, now, nothing, estimated_motion(before, now, nothing))
-    assert not made.motion.known
-    assert not made.ego_valid.any()
+    motion = estimated_motion(frame("a"), frame("b"), nothing)
+    assert not motion.known
+    assert not factorize_pair(frame("a"), frame("b"), nothing, motion).ego_valid.any()
 
 
 def test_what_moves_stands_out_of_the_frames_own_error():
@@ -199,30 +198,20 @@ def test_a_row_says_medians_shares_and_the_error():
 
 def test_what_is_unknown_is_empty_in_the_row():
     nothing = np.full((2, 40, 60), np.nan, np.float32)
-    row = score(1, factorize_pair(frame("a"), frame("b"), nothing), moving_px=1.0)
+    of_b = frame("c", raw=np.ones((2, 40, 60), np.float32), raw_since="b")  # not of a
+    row = score(1, factorize_pair(frame("a"), of_b, nothing), moving_px=1.0)
     assert float(row["valid_share"]) == 0.0
     assert [name for name, value in row.items() if value != ""] == ["index", "name", "valid_share"]
-
-
-def test_the_error_against_flow_of_another_pair_is_not_counted():
-    now = frame("c", raw=np.ones((2, 40, 60), np.float32), raw_since="b")
-    zero = np.zeros((2, 40, 60), np.float32)
-    assert score(1, factorize_pair(frame("a"), now, zero), moving_px=1.0)["epe_px"] == ""
-    of_b = dataclasses.replace(frame("b"), depth=now.depth)
-    assert float(score(1, factorize_pair(of_b, now, zero), moving_px=1.0)["epe_px"]) == (
-        pytest.approx(2**0.5, rel=1e-5)
-    )
-    assert np.isnan(end_point_error(zero, np.full_like(zero, np.nan)))
 
 
 def test_people_move_and_the_street_stands_still(tmp_path):
     pytest.importorskip("pybullet", reason="the streets are PyBullet's")
     from examples.make_recording import make_recording
 
-    make_recording(tmp_path / "street", frames=4, size=(60, 80), skipped=20, seed=3)
+    make_recording(tmp_path / "street", frames=3, size=(60, 80), skipped=20, seed=3)
     first, *others = factorize_frames(Frames(tmp_path / "street"), recorded_flow)
     assert first is None
-    assert len(others) == 3
+    assert len(others) == 2
     for made in others:
         obj_px = np.hypot(*made.obj)[made.valid]
         assert made.valid.mean() > 0.95

@@ -187,7 +187,7 @@ MISTAKES = [
     ("tum", "depth.txt", ["1.0"], "<time> depth/<file>"),
     ("tum", "depth.txt", ["# none"], "no pictures"),
     ("sintel", "camdata_left/cave/frame_0001.cam", bytes(60), "no .cam"),
-    ("sevenscenes", "frame-000001.pose.txt", ["1 0 0 0"], "reshape"),
+    ("sevenscenes", "frame-000001.pose.txt", ["1 0 0 0"], "must be"),
     ("kitti", "training/calib_cam_to_cam/000000.txt", ["P_rect_02: 1 2 3"], "P_rect_02"),
 ]
 
