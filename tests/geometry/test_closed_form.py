@@ -239,19 +239,6 @@ def test_a_point_level_with_the_previous_camera_sends_back_zero_not_nan():
     assert motion.grad.isfinite().all()
 
 
-def test_gradient_by_hand():
-    # u = -fx * t / Z with fx = 4, t = 0.5, Z = 4: du/dZ = fx t / Z^2, du/dfx = -t/Z, du/dt = -fx/Z.
-    camera, motion = leaves(torch.tensor([[4.0, 0.0, 0.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]),
-                            torch.eye(4))  # fmt: skip
-    with torch.no_grad():
-        motion[0, 3] = 0.5
-    depth = torch.full((1, 1, 1), 4.0, requires_grad=True)
-    ego_flow(depth, camera, motion).flow[0].sum().backward()
-    assert depth.grad.item() == 0.125
-    assert camera.grad[0, 0].item() == -0.125
-    assert motion.grad[0, 3].item() == -1.0
-
-
 SIZE = 84
 
 

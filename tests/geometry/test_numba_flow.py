@@ -121,17 +121,6 @@ def test_one_camera_for_any_batch(calls, batch):
     assert len(calls) == 2
 
 
-def test_each_map_s_pixels_follow_its_own_camera_and_body():
-    depth, instance, Ks, motions = scene()
-    valid = rigid_flow(depth, instance, Ks, motions).valid[:, 0]
-    # By hand: body 3 was 9 m further back, so z - 9 > 0.01 z; body 2's motion is unknown, and so
-    # is all of the last map except its bodies 1 and 4.
-    assert torch.equal(valid[0, :3, 1:], depth[0, 0, :3, 1:] > 9 / 0.99)
-    assert not valid[1, :2].any()
-    assert valid[1, 2:4].all()
-    assert valid[2].sum() == 2 + 5 + 1  # columns 0 and 4 of row 0, row 1, and body 4's pixel
-
-
 @pytest.mark.parametrize("id_", [-1, 6])
 def test_an_id_without_a_motion_is_named(id_):
     depth, instance, Ks, motions = scene()
