@@ -75,7 +75,11 @@ TYPES = {
     "depth must be floating point": lambda: g.adapt_depth(Z.short(), "z"),
 }
 OPTIONS = {
-    "dt must be positive": lambda: g.ego_flow(Z, K, MOTION, dt=0),
+    "finite; got 0": lambda: g.ego_flow(Z, K, MOTION, dt=0),
+    "finite; got -0.5": lambda: g.rigid_flow(Z, IDS, K, MOTIONS, dt=-0.5),
+    "dt must be positive (current time minus previous time)": lambda: g.factorize(
+        RAW, Z, K, MOTION, dt=torch.nan
+    ),
     "['z', 'ray_length', 'z_buffer'], got 'zbuffer'": lambda: g.adapt_depth(Z, "zbuffer"),
     "'ray_length' needs K": lambda: g.adapt_depth(Z, "ray_length"),
     "other kinds do not read it; kind is 'z'": lambda: g.adapt_depth(Z, "z", K=K),
