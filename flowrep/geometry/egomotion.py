@@ -74,14 +74,12 @@ class _Samples(NamedTuple):
 
     def part(self, index: Tensor) -> _Samples:
         """Returns the pixels at `index` `[B, M, N]` as those of B * M frames."""
-        times, at = index.shape[1], index.flatten(1)
+        at = index.flatten(1)
         values = self.values.gather(-1, at.unsqueeze(1).expand(-1, self.values.shape[1], -1))
         values = values.unflatten(-1, index.shape[1:]).movedim(-2, 1).flatten(0, 1)
         known = self.known.gather(-1, at).reshape(-1, index.shape[-1])
-        return _Samples(
-            self.focal.repeat_interleave(times, 0), values, known,
-            self.number.repeat_interleave(times, 0),
-        )  # fmt: skip
+        focal, number = (x.repeat_interleave(index.shape[1], 0) for x in (self.focal, self.number))
+        return _Samples(focal, values, known, number)
 
     def in_pixels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Returns how far a shift of rays at z = 1 is in the picture, `[B, ..., N]`."""
@@ -132,26 +130,25 @@ def camera_motion(
     >>> motion.prev_from_curr[[0, 2], 3], motion.valid
     (tensor([0.1000, 0.5000]), tensor(True))
     """
-    check_shape("flow", flow, (2, "H", "W"))
-    check_shape("depth", depth, (1, "H", "W"))
-    check_shape("K", K, (3, 3))
-    batches = {"flow": flow.shape[:-3], "depth": depth.shape[:-3], "K": K.shape[:-2]}
+    given: dict[str, tuple[Tensor, tuple[int | str, ...]]]
+    given = {"flow": (flow, (2, "H", "W")), "depth": (depth, (1, "H", "W")), "K": (K, (3, 3))}
     if prior is not None:
-        check_shape("prior", prior, (4, 4))
-        batches["prior"] = prior.shape[:-2]
+        given["prior"] = prior, (4, 4)
     if picture is not None:
-        check_shape("picture", picture.float(), ("C", "H", "W"))
-        batches["picture"] = picture.shape[:-3]
+        given["picture"] = picture.float(), ("C", "H", "W")
+    for name, (tensor, trailing) in given.items():
+        check_shape(name, tensor, trailing)
     sizes = {tuple(image.shape[-2:]) for image in (flow, depth, picture) if image is not None}
     if len(sizes) > 1:
         raise ValueError(f"flow, depth and picture must have one (height, width), got {sizes}")
-    batch = broadcast_batch(**batches)
+    batch = broadcast_batch(
+        **{name: tensor.shape[: -len(trailing)] for name, (tensor, trailing) in given.items()}
+    )
     dtype = torch.promote_types(torch.promote_types(flow.dtype, depth.dtype), torch.float32)
 
     def flat(tensor: Tensor, dims: int, to: torch.dtype = dtype) -> Tensor:
-        return (
-            tensor.to(to).expand(*batch, *tensor.shape[-dims:]).reshape(-1, *tensor.shape[-dims:])
-        )
+        size = tensor.shape[-dims:]
+        return tensor.to(to).expand(*batch, *size).reshape(-1, *size)
 
     structure = None if picture is None else structure_tensor(flat(picture, 3))
     samples = _samples(flat(flow, 3), flat(depth, 3), flat(K, 2, torch.float64), structure)
@@ -168,24 +165,17 @@ def camera_motion(
 
 
 def structure_tensor(picture: Tensor) -> Tensor:
-    """Returns what each pixel's surroundings tell of a shift: xx, xy and yy, `[*B, 3, H, W]`.
+    """Returns what surroundings tell of a shift: xx, xy, yy, `[B, 3, H, W]` from `[B, C, H, W]`.
 
     Its eigenvalues are 0 without texture and tend to 1 across a contrast: S (S + n I)^-1, with S
     the mean of the gradients' products around the pixel and n that of a gradient that is noise.
-
-    Args:
-        picture: `[*B, C, H, W]`, floats from 0 to 255.
     """
     grey = picture.mean(-3)
     dx, dy = torch.zeros_like(grey), torch.zeros_like(grey)
     dx[..., 1:-1] = (grey[..., 2:] - grey[..., :-2]) / 2
     dy[..., 1:-1, :] = (grey[..., 2:, :] - grey[..., :-2, :]) / 2
     products = torch.stack([dx * dx, dx * dy, dy * dy], -3)
-    batch = products.shape[:-3]
-    mean = functional.avg_pool2d(
-        products.reshape(-1, *products.shape[-3:]), _WINDOW, 1, _WINDOW // 2
-    )
-    xx, xy, yy = mean.reshape(*batch, *mean.shape[-3:]).unbind(-3)
+    xx, xy, yy = functional.avg_pool2d(products, _WINDOW, 1, _WINDOW // 2).unbind(-3)
     noise = _GRADIENT_NOISE**2
     det = (xx + noise) * (yy + noise) - xy * xy
     own = xx * yy - xy * xy
@@ -198,9 +188,9 @@ def _samples(flow: Tensor, depth: Tensor, K: Tensor, structure: Tensor | None) -
     size = height * width
     looked_at = min(size, CANDIDATES)
     # Steps of the golden ratio spread any number of pixels evenly; coprime steps meet each once.
-    step = next(
-        s for s in range(int(size / 1.618033988749895) + 1, 2 * size + 2) if math.gcd(s, size) == 1
-    )
+    step = int(size / 1.618033988749895) + 1
+    while math.gcd(step, size) > 1:
+        step += 1
     pixel = torch.arange(looked_at, device=flow.device) * step % size
     maps = [flow, depth] if structure is None else [flow, depth, structure]
     values = torch.cat([each.flatten(-2)[..., pixel] for each in maps], 1)  # [B, 3 or 6, M]
