@@ -54,7 +54,7 @@ view: $(INSTALLED)  ## Look at a scene: make view ARGS="scene=s_turn"
 	$(BIN)/python -m flowrep.view $(ARGS)
 
 results: $(INSTALLED)  ## Make the page of results from the stored runs
-	$(BIN)/python -m flowrep.report.results
+	$(BIN)/python -m docs.results
 
 SCENES = straight_road s_turn h_shaped_pathways three_way_junction
 

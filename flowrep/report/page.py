@@ -27,7 +27,7 @@ from flowrep.viz.plan import Track, draw_plan
 DRIVES = "drives.npz"
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent),
-    autoescape=lambda name: name == "page.html.jinja",
+    autoescape=lambda name: name is not None and name.endswith(".html.jinja"),
     undefined=StrictUndefined,
     trim_blocks=True,
     lstrip_blocks=True,

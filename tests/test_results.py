@@ -10,8 +10,8 @@ import yaml
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
-from flowrep.report import results
-from flowrep.report.results import Claim, Contrast, rate_table, scores
+from docs import results
+from docs.results import Claim, Contrast, rate_table, scores
 from flowrep.report.runs import Run
 from flowrep.report.statistics import Effect
 from flowrep.report.storage import episode_columns, is_archive, read_archive

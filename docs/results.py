@@ -1,4 +1,4 @@
-"""The page of results: `python -m flowrep.report.results` writes docs/results.md and its figure.
+"""The page of results: `make results` writes docs/results.md and its figure.
 
 What is tested is declared in claims.yaml, the words around the numbers in results.md.jinja, and
 all numbers come from the packed runs. A run counts with its success rate: its episodes are those
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from jinja2 import FileSystemLoader
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -41,10 +42,10 @@ from flowrep.report.statistics import LEVEL, Array, Bootstrap, Effect, effect, h
 from flowrep.report.storage import read_archive
 from flowrep.report.tables import markdown, p_text, percent, points, signed
 
-ROOT = Path(__file__).parents[2]
-DATA, PAGE = ROOT / "outputs" / "reference", ROOT / "docs" / "results.md"
+HERE = Path(__file__).parent
+DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
 FIGURE = "images/results_claims.svg"
-CLAIMS = Path(__file__).with_name("claims.yaml")
+CLAIMS = HERE / "claims.yaml"
 _SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
 _WIDEST = 80  # points of the figure's axis
@@ -446,31 +447,37 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
     main, forks = studies["main"], declared["forks"]
     every = [run for of in main.values() for run in of]
     smallest = smallest_differences(primary) or [float("nan")]
-    text = TEMPLATES.get_template("results.md.jinja").render(
-        primary=claims_table(primary, "p (Holm)"),
-        secondary=claims_table(secondary, "p"),
-        wide=claims_table(wide, "p (Holm)") if all(c.contrasts[0].effect for c in wide) else "",
-        figure=FIGURE,
-        scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
-        one_way=one_way(run for run in every if run.scene in forks),
-        failures=failure_table(declared["table_iii"], main.get("s_turn", [])),
-        frame_rates={words(scene): rate_table(of) for scene, of in studies["frame_rate"].items()},
-        variations=variation_table(declared["variations"], studies),
-        runs=runs_table(studies),
-        commands=declared["commands"],
-        number=len(runs),
-        pixels=sorted(
-            {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
-        ),
-        frames=sorted({run.total_frames for run in every}),
-        episodes=sum(len(run.episodes["outcome"]) for run in runs),
-        fewest=min(c.fewest for claim in primary for c in claim.contrasts),
-        smallest=f"{min(smallest):.0f} to {max(smallest):.0f}",
-        repeats=repeats(every, [run for run in runs if run not in every]),
-        sampled=sampled_minus_greedy(every),
-        collapsed=collapses(main.get("straight_road", [])),
-        unknown=sum(run.machine.get("precision") == "unknown" for run in runs),
-        np=np,
+    text = (
+        TEMPLATES.overlay(loader=FileSystemLoader(HERE))
+        .get_template("results.md.jinja")
+        .render(
+            primary=claims_table(primary, "p (Holm)"),
+            secondary=claims_table(secondary, "p"),
+            wide=claims_table(wide, "p (Holm)") if all(c.contrasts[0].effect for c in wide) else "",
+            figure=FIGURE,
+            scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
+            one_way=one_way(run for run in every if run.scene in forks),
+            failures=failure_table(declared["table_iii"], main.get("s_turn", [])),
+            frame_rates={
+                words(scene): rate_table(of) for scene, of in studies["frame_rate"].items()
+            },
+            variations=variation_table(declared["variations"], studies),
+            runs=runs_table(studies),
+            commands=declared["commands"],
+            number=len(runs),
+            pixels=sorted(
+                {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
+            ),
+            frames=sorted({run.total_frames for run in every}),
+            episodes=sum(len(run.episodes["outcome"]) for run in runs),
+            fewest=min(c.fewest for claim in primary for c in claim.contrasts),
+            smallest=f"{min(smallest):.0f} to {max(smallest):.0f}",
+            repeats=repeats(every, [run for run in runs if run not in every]),
+            sampled=sampled_minus_greedy(every),
+            collapsed=collapses(main.get("straight_road", [])),
+            unknown=sum(run.machine.get("precision") == "unknown" for run in runs),
+            np=np,
+        )
     )
     return text, draw_claims([*primary, *secondary])
 
