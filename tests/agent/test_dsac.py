@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from torchrl.data import Binary, Composite, OneHot, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 
 from flowrep.agent import DiscreteSACWithValue
 
@@ -20,15 +20,6 @@ def test_bfloat16_stays_near_float32(make_agent, random_steps, as_batch):
         torch.testing.assert_close(
             losses["bf16"][name].detach(), losses["fp32"][name].detach(), rtol=0.02, atol=2e-3
         )
-
-
-def test_one_hot_actions_learn_what_categorical_ones_do(make_agent, random_steps, as_batch):
-    steps = random_steps(8)
-    agent = make_agent()
-    expected = agent.losses(as_batch(agent, steps))["q_loss"]
-    agent = make_agent(action_spec=OneHot(3))
-    steps["action"] = torch.nn.functional.one_hot(steps["action"], 3)
-    torch.testing.assert_close(agent.losses(as_batch(agent, steps))["q_loss"], expected)
 
 
 def test_settings_that_do_not_exist_are_refused(make_agent):
