@@ -79,9 +79,9 @@ def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_and_a_policy_of_ones_own_drive_as_baselines_do(tmp_path):
-    from tests.test_evaluate import trained
+    from tests.test_evaluate import saved
 
-    run = trained(tmp_path / "run", "representations=[obj]")
+    run = saved(tmp_path / "run", "representations=[obj]")
     path = tmp_path / "mine.py"
     path.write_text("def make(task):\n    return lambda maps: [0] * len(maps)\n")
     ended = {}

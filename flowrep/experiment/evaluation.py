@@ -457,10 +457,16 @@ def print_table(
 ) -> None:
     """Prints rows that have the same keys, which are the headings."""
     table = Table(title=title, box=box.SIMPLE, pad_edge=False)
-    for name in rows[0] if rows else ():
+    for name in rows[0]:
         heading = name.replace("_", " ").replace(": ", ":\n")
+        is_number = all(str(row[name])[:1] in "-0123456789" for row in rows)
         # a policy's name may be a long path
-        table.add_column(heading, no_wrap=name != "policy", overflow="fold")
+        table.add_column(
+            heading,
+            no_wrap=name != "policy",
+            overflow="fold",
+            justify="right" if is_number else "left",
+        )
     for row in rows:
         table.add_row(*map(str, row.values()))
     (console or Console(width=max(100, Console().width))).print(table)

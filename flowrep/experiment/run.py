@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -57,6 +57,19 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some net
 
 class FolderInUseError(OSError):
     """Another process works in the folder; the message says which."""
+
+
+def _locked(file: IO[str]) -> bool:
+    """Locks a file; returns False if another process holds it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        print(f"warning: no locks on the disk of '{file.name}' ({error})", file=sys.stderr)
+    return True
 
 
 def _holder(lock: str) -> str:
@@ -247,22 +260,13 @@ class RunFolder:
         """
         with (self.path / ".lock").open("a+", encoding="utf-8") as file:
             until = time.monotonic() + patience_s
-            while True:
-                try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                except BlockingIOError:
-                    if time.monotonic() >= until:
-                        raise FolderInUseError(
-                            f"'{self.path}' is in use: {_holder(file.name)}. Wait until it has "
-                            "ended, or stop it"
-                        ) from None
-                    time.sleep(0.5)
-                except OSError as error:
-                    if error.errno not in _NO_LOCKS:
-                        raise
-                    print(f"warning: no locks in '{self.path}' ({error})", file=sys.stderr)
-                    break
+            while not _locked(file):
+                if time.monotonic() >= until:
+                    raise FolderInUseError(
+                        f"'{self.path}' is in use: {_holder(file.name)}. Wait until it has ended, "
+                        "or stop it"
+                    )
+                time.sleep(0.5)
             file.truncate(0)
             now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
             holder = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}

@@ -1,8 +1,4 @@
-"""Pictures: of representations, of scenes from above, of episodes and of learning.
-
-Functions that draw representations are exported here; `flowrep.viz.plan`, `film`, `curves` and
-`window` need the packages of an extra.
-"""
+"""Pictures of representations, fixed in colour and scale; `flowrep.viz.plan` draws scenes."""
 
 from flowrep.viz.maps import (
     DEPTH_RANGE_M,

@@ -123,17 +123,6 @@ def test_an_episode_does_not_depend_on_what_else_is_in_the_batch(scene, greedy):
     assert len({(outcome, length) for _, _, outcome, _, _, length in runs[0]}) > 3
 
 
-@pytest.mark.slow
-def test_sampled_actions_differ_from_greedy_ones_and_repeat(scene):
-    env = make_env(scene, ["obj"], num_envs=3)
-    greedy, *sampled = (
-        outcomes(evaluate(env, weigher("obj"), episodes(4), greedy=greedy))
-        for greedy in (True, False, False)
-    )
-    env.close()
-    assert sampled[0] == sampled[1] != greedy
-
-
 def test_a_baseline_and_its_agent_twin_live_through_the_same_episodes(scene):
     seeing, blind = make_env(scene, ["depth"], num_envs=2), make_env(scene, num_envs=3)
     agent = outcomes(evaluate(seeing, straight_on, episodes(6)))
@@ -143,15 +132,6 @@ def test_a_baseline_and_its_agent_twin_live_through_the_same_episodes(scene):
     assert random != agent
     seeing.close()
     blind.close()
-
-
-def test_every_frame_is_shown_from_the_reset_to_the_last_step(scene):
-    env, frames = make_env(scene, ["seg"], keep_sensor=True), []
-    (episode,) = evaluate(env, straight_on, episodes(1), on_frame=frames.append)
-    env.close()
-    assert len(frames) == episode.length + 1
-    assert [int(frame["outcome"]) for frame in frames[:-1]] == [0] * episode.length
-    assert int(frames[-1]["outcome"]) != 0
 
 
 ASKED = {"speeds": ["low", "high"], "fps": [12, 6], "episodes": 3, "seed": 5}
@@ -167,8 +147,8 @@ def comparison(scene):
 @pytest.mark.slow
 def test_rows_come_in_the_order_of_what_was_asked(comparison):
     assert comparison.done == comparison.total == 36
-    names = ("scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation")
-    rows = comparison.rows(**dict.fromkeys(names, ""))
+    origin = ("scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation")
+    rows = comparison.rows(**dict.fromkeys(origin, ""))
     assert tuple(rows[0]) == EVALUATION_COLUMNS
     order = [(row["speed"], row["fps"], row["policy"], row["episode_seed"]) for row in rows]
     names = "greedy", "sampled", "random"
@@ -179,6 +159,8 @@ def test_rows_come_in_the_order_of_what_was_asked(comparison):
         for name in names
         for k in (5, 6, 7)
     ]
+    ends = [[row["length"] for row in rows if row["policy"] == name] for name in names[:2]]
+    assert ends[0] != ends[1]  # sampled actions are not the greedy ones
     for row in rows:
         end = 5.0 if row["outcome"] == "success" else -5.0
         assert row["return"] == pytest.approx(end + 0.01 * row["length"], abs=1e-9)

@@ -93,9 +93,7 @@ def test_the_same_run_on_another_machine_is_the_same(config):
         ("scene.name", "s_turn", "scene.name=straight_road, "),
         ("representations.ego.scale", 0.3, "representations.ego.scale=.* says .*=0.3"),
         ("representations.seg", {}, "representations.seg=absent"),
-        ("algorithm.gamma", 0.5, "algorithm.gamma=0.99"),
         ("noise.drift_m", 0.1, "noise.drift_m=0.0, .* says noise.drift_m=0.1"),
-        ("seed", 1, "seed=0"),
     ],
 )
 def test_an_edited_config_is_refused_by_the_name_of_the_key(config, place, value, says):
@@ -122,9 +120,8 @@ def test_a_run_from_before_an_option_existed_is_the_same_as_with_its_default(con
 
 
 def test_another_version_is_refused(config):
-    saved = origin_of(config) | {"flowrep": "0.0.9"}
-    with pytest.raises(CheckpointError, match=r"by flowrep 0\.0\.9, this is .*: install that"):
-        check_origin(saved, origin_of(config), PATH)
+    with pytest.raises(CheckpointError, match=r"0\.0\.9"):
+        check_origin(origin_of(config) | {"flowrep": "0.0.9"}, origin_of(config), PATH)
 
 
 def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
@@ -193,11 +190,11 @@ def test_a_resumed_run_drops_the_rows_it_will_write_again(tmp_path):
     run = RunFolder(tmp_path)
     for frames in (10, 20, 30):
         run.log_metrics(frames, {"alpha": 1 / frames})
+        run.log_episodes([episode(frames, frames=str(frames))])
     run.forget_after(20)
-    assert [row["frames"] for row in rows_of(run.metrics_path)] == ["10", "20"]
-    run.forget_after(5)
-    run.log_metrics(10, {"alpha": 0.5})
-    assert [row["frames"] for row in rows_of(run.metrics_path)] == ["10"]
+    run.log_metrics(25, {"alpha": 0.5})
+    assert [row["frames"] for row in rows_of(run.metrics_path)] == ["10", "20", "25"]
+    assert [row["frames"] for row in run.read_episodes()] == ["10", "20"]
 
 
 @pytest.mark.parametrize(("frames", "kind"), [(17, "training"), (8, "final"), (8, "evaluate")])

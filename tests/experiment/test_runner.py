@@ -3,7 +3,6 @@
 import csv
 import math
 import re
-import shutil
 from pathlib import Path
 
 import pytest
@@ -14,11 +13,11 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from flowrep.agent import DivergenceError
 from flowrep.config import UsageError, group_choices
 from flowrep.config.schema import validated_run
+from flowrep.experiment import build
 from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.experiment.runner import Means, RecentEpisodes, Runner
 from flowrep.progress import StopRequest
 from flowrep.train import resumed
-from flowrep.transforms import FlowFactorize, RawFlow
 from tests.config.composing import composed, plain
 
 RUNNING, SUCCESS, COLLISION = 0, 1, 2
@@ -123,13 +122,11 @@ def trained(runner: Runner, stop: StopRequest | None = None) -> Runner:
     return runner
 
 
-@pytest.mark.slow
-def test_flow_is_compiled_where_the_config_says_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(shutil, "which", lambda name: name)
-    runner = new_run(tmp_path, more=["compiled=true"])
-    flows = [t.compiled for t in runner.env.transform if isinstance(t, RawFlow | FlowFactorize)]
-    runner.close()
-    assert flows == [True, True]
+def test_the_config_says_whether_flow_is_compiled(tmp_path, monkeypatch):
+    made, asked = build.env, []
+    monkeypatch.setattr(build, "env", lambda *of, **with_: asked.append(with_) or made(*of))
+    new_run(tmp_path, more=["compiled=true"]).close()
+    assert asked == [{"compiled": True}]
 
 
 def test_a_resumed_run_keeps_its_machine_settings_unless_others_are_given(tmp_path):

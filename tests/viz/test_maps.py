@@ -131,11 +131,9 @@ def test_half_the_saturation_is_where_the_note_says():
 
 
 def test_the_given_scale_is_that_of_the_colours():
-    given = {"ego": torch.full((2, 3, 40), 0.0), "obj": torch.full((2, 3, 40), 2.0)}
-    image = representation_strip(given, flow_scale_px={"ego": 8.0, "obj": 8.0})
-    assert len({tuple(pixel) for pixel in image[48:, 250].tolist()}) == 1
-    down_and_right = flow_to_rgb(given["obj"], 8.0)[0, 0]
-    assert (image[-1, -1] == down_and_right).all()
+    given = {"obj": torch.full((2, 3, 40), 2.0)}
+    image = representation_strip(given, flow_scale_px={"obj": 8.0})
+    assert (image[48:] == flow_to_rgb(given["obj"], 8.0)[0, 0]).all()
 
 
 def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
@@ -168,8 +166,7 @@ def test_contact_sheet_stacks_rows_of_different_width():
     wide, narrow = np.zeros((2, 9, 3), np.uint8), np.zeros((3, 4, 3), np.uint8)
     sheet = contact_sheet([wide, narrow])
     assert sheet.shape == (2 + 4 + 3, 9, 3)
-    assert (sheet[6:, :4] == 0).all()
-    assert (sheet[6:, 4:] == 255).all()
+    assert (sheet[6:] == [[[0]] * 4 + [[255]] * 5] * 3).all()
 
 
 def test_png_comes_back_bit_for_bit(tmp_path):
