@@ -125,43 +125,36 @@ def _draw_solids(axes: Axes, layout: Layout, path: str | None) -> dict[str, Any]
 
 
 def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
-    names: dict[str, None] = {}
+    """Fills zones, names each at its road, and shows with an arrow where vehicles start."""
+    scene, named = layout.scene, set[str]()
+    starts = {path.start for path in scene.paths}
     for kind, colour in _ZONE_COLOURS.items():
-        for name in dict.fromkeys(getattr(path, kind) for path in layout.scene.paths):
-            names[name] = None
+        for name in dict.fromkeys(getattr(path, kind) for path in scene.paths):
             _fill(axes, layout.zones[name], colour)
             if kind == "start":
-                state = layout.start_state(name)
-                ahead = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)]) * 8.0
-                axes.annotate(
-                    "",
-                    (state.x_m + ahead[0], state.y_m + ahead[1]),
-                    (state.x_m, state.y_m),
-                    arrowprops={"arrowstyle": "->", "color": "black", "lw": 1.5},
-                    zorder=5,
-                )
-    _name_zones(axes, layout, names)
+                x, y, yaw, _ = layout.start_state(name)
+                ahead = x + 8.0 * math.cos(yaw), y + 8.0 * math.sin(yaw)
+                style = {"arrowstyle": "->", "color": "black", "lw": 1.5}
+                axes.annotate("", ahead, (x, y), arrowprops=style, zorder=5)
+            if name in named:
+                continue
+            named.add(name)
+            zone = next(zone for zone in scene.zones if zone.name == name)
+            x, y, heading = layout.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
+            # Starts to the left of the road and ends to its right: one place may be both.
+            reach = _LABEL_PT if name in starts else -_LABEL_PT
+            axes.annotate(
+                _words(name),
+                (x, y),
+                (-reach * math.sin(heading), reach * math.cos(heading)),
+                textcoords="offset points",
+                ha="center",
+                va="center",
+                fontsize="small",
+                bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0},
+                zorder=6,
+            )
     return [Patch(color=c, label=f"{k} zone") for k, c in reversed(_ZONE_COLOURS.items())]
-
-
-def _name_zones(axes: Axes, layout: Layout, names: Iterable[str]) -> None:
-    # Names of starts go to the left of the road and of ends to its right: a zone may be both.
-    for name in names:
-        zone = next(zone for zone in layout.scene.zones if zone.name == name)
-        x, y, heading = layout.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
-        side = 1 if any(path.start == name for path in layout.scene.paths) else -1
-        reach = side * _LABEL_PT
-        axes.annotate(
-            _words(name),
-            (x, y),
-            (-reach * math.sin(heading), reach * math.cos(heading)),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            fontsize="small",
-            bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0},
-            zorder=6,
-        )
 
 
 def _draw_walks(axes: Axes, layout: Layout) -> list[Any]:
@@ -183,7 +176,5 @@ def _draw_tracks(axes: Axes, tracks: Iterable[Track]) -> list[Any]:
         axes.plot(*points.T, color=colour, linewidth=1.4, alpha=0.8)
         if outcome != "success":
             axes.plot(*points[-1], "x", color=colour, markersize=7, markeredgewidth=2)
-    names = [name for name in OUTCOME_COLOURS if name in outcomes]
-    return [
-        Line2D([], [], color=OUTCOME_COLOURS[name], label=name.replace("_", " ")) for name in names
-    ]
+    shown = {name: colour for name, colour in OUTCOME_COLOURS.items() if name in outcomes}
+    return [Line2D([], [], color=colour, label=_words(name)) for name, colour in shown.items()]
