@@ -252,24 +252,14 @@ def episodes(rows, policy):
     return [{**row, "policy": ""} for row in rows if row["policy"] == policy]
 
 
-def test_a_policy_that_goes_on_drives_as_the_baseline_does(tmp_path):
-    path = tmp_path / "straight.py"
-    path.write_text("def make(task):\n    return lambda maps: [0] * len(maps)\n")
-    name = f"{path}:make"
-    given = ["representations=[seg]", "episodes=3", "baselines=[never_turn]"]
-    rows = own(name, tmp_path / "out", *given)
-    assert len(episodes(rows, name)) == 3
-    assert episodes(rows, name) == episodes(rows, "never_turn")
-    assert {(row["representations"], row["frames"], row["seed"]) for row in rows} == {
-        ("seg", "0", "")
-    }
-
-
 def test_the_documented_example_beats_never_turning_and_is_filmed(tmp_path):
     given = ["representations=[obj,depth]", "episodes=12", "num_envs=12", "video=1", *SMALL]
     rows = own("examples/own_policy.py:make", tmp_path, "baselines=[never_turn]", *given)
     mine = episodes(rows, "examples/own_policy.py:make")
     assert len(mine) == 12
+    assert {(r["representations"], r["frames"], r["seed"]) for r in mine} == {
+        ("obj+depth", "0", "")
+    }
     ends = ([row["outcome"] for row in of] for of in (mine, episodes(rows, "never_turn")))
     reached, by_chance = (of.count("success") for of in ends)
     assert reached > 2 * by_chance
@@ -302,8 +292,9 @@ def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
     program = f"{folder}/agent.pt2"
     with pytest.raises(PolicyError, match=r"scene\.camera\.height_px"):
         own(program, tmp_path / "refused", *given[1:])
-    for number, name in enumerate([f"{folder}/load_agent.py:make", program]):
-        rows = own(name, tmp_path / str(number), *given[1:], *same, "episodes=3", SHORT)
+    for name, maps in ((f"{folder}/load_agent.py:make", "[ego,obj]"), (program, "[obj,ego]")):
+        asked_for = [f"representations={maps}", *same, "episodes=3", SHORT]
+        rows = own(name, tmp_path / maps[1:4], *asked_for)
         driven = [(row["episode_seed"], row["outcome"], row["return"]) for row in rows]
         assert driven == [(row["episode_seed"], row["outcome"], row["return"]) for row in mine]
 

@@ -221,6 +221,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     """
     if not trials:
         return 0.0, 1.0
+    # the shares p from which the one found is at most z standard errors away: the solutions of
+    # (share - p)² = z² p (1 - p) / trials
     z2 = NormalDist().inv_cdf(0.5 + confidence / 2) ** 2
     share = successes / trials
     centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)

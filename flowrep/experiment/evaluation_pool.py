@@ -60,7 +60,9 @@ class EvaluationPool:
         each = -(-num_envs // self.num_processes)
         # Sent as they are, tensors would be moved to shared memory, the caller's weights included.
         env = pickle.dumps(partial(make_env, num_envs=each, num_workers=0))
-        count = 2 * self.num_processes  # so that none waits for long for the others
+        # Interleaved, so that shares take equally long whatever the speeds of the episodes; two for
+        # each process, so that none waits for long for the others.
+        count = 2 * self.num_processes
         waiting: dict[Future[list[Episode]], str] = {}
         try:
             with sheltered():
