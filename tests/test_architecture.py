@@ -29,6 +29,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "viz": {"viz", "scenes", "geometry", "palette"},
     "load_agent": set(),
     "pretrained": {"experiment", "agent", "config"},
+    "policies": {"pretrained", "experiment", "baselines", "config"},
     "sequences": {"sequences", "progress", "extras", "transforms", "geometry", "viz"},
     "sweep": {"config", "progress", "tables"},
     "config": {"config"},
