@@ -40,7 +40,7 @@ from flowrep.report.runs import (
 )
 from flowrep.report.statistics import LEVEL, Array, Bootstrap, Effect, effect, holm, rates
 from flowrep.report.storage import read_archive
-from flowrep.report.tables import markdown, p_text, percent, points, signed
+from flowrep.report.tables import p_text, percent, points, signed
 
 HERE = Path(__file__).parent
 DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
@@ -201,6 +201,12 @@ def _under(run: Run, names: Iterable[str | int]) -> list[Columns]:
     """Returns a run's greedy episodes at each speed mode, or frame rate at its own speed."""
     of = [(n, run.fps) if isinstance(n, str) else (run.speed, float(n)) for n in names]
     return [run.under(Condition("greedy", *condition)) for condition in of]
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Returns a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"|{'|'.join(cells)}|" for cells in lines)
 
 
 def claims_table(claims: Sequence[Claim], p_name: str) -> str:

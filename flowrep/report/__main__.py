@@ -22,12 +22,7 @@ from flowrep.report.tables import Table
 
 
 def report(config: ReportConfig) -> Path:
-    """Writes figures, tables and a page of runs; returns the page's path.
-
-    Raises:
-        UsageError: nothing in the folders can be read.
-        RunFolderError: a folder holds no run.
-    """
+    """Writes figures, tables and a page of runs; returns the page's path."""
     folders = list(map(Path, config.run))
     is_of_runs = folders[0].is_dir() and not is_archive(folders[0])
     output = Path(config.output or (folders[0] if is_of_runs else Path("outputs")) / "report")

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flowrep.report.runs import Curve, Grid, mean_curve
+from flowrep.report.runs import SCENES, Curve, Grid, mean_curve
 from flowrep.report.statistics import Estimate, rates
 
 # Okabe and Ito's colours for single maps and for the two flows. A map added to the flows has its
@@ -38,15 +38,9 @@ _OF_VARIANTS = ("", "......", "++++", "||||")  # no stack uses them
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
 _TEXT, _FAINT = "#1b1f24", "#6b7480"
 
-_TITLES = {
-    "straight_road": "Straight Road",
-    "s_turn": "S-Turn",
-    "h_shaped_pathways": "H-Shaped Pathways",
-    "three_way_junction": "Three-Way Junction",
-}
+_TITLES = dict(zip(SCENES, ("Straight Road", "S-Turn", "H-Shaped Pathways", "Three-Way Junction")))
 _BASELINE_LINES: dict[str, Any] = {"never_turn": ":", "random": "-.", "planner": "--"}
 _COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page
-_FONT_PT = 7.5
 _MOST_IN_A_ROW = 4  # panels
 _WIDEST_BAR = 0.3  # of a group
 _CAPS: dict[str, Any] = {"capsize": 1.8, "capthick": 0.9, "clip_on": False}  # of whiskers
@@ -96,7 +90,7 @@ def words(name: str) -> str:
 
 
 @contextmanager
-def styled(font_pt: float) -> Iterator[None]:
+def styled(font_pt: float = 7.5) -> Iterator[None]:
     """Draws figures in one style."""
     settings: Any = {
         "font.size": font_pt,
@@ -129,10 +123,7 @@ def encoded(figure: Figure, kind: str, dpi: int = 300) -> bytes:
 
 
 def draw_bars(grids: Sequence[Grid]) -> Figure:
-    """Returns grouped bars: a panel per scene, a group per speed mode, a bar per stack.
-
-    Whiskers are the intervals, small dots the seeds, dotted lines the baselines.
-    """
+    """Returns grouped bars: a panel per scene, a group per speed mode, a bar per stack."""
     handles: list[Any] = [
         Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="white", lw=0, label=name)
         for name, look in looks(grids[0].series).items()
@@ -175,7 +166,7 @@ def _panels(
     columns = min(len(panels), _MOST_IN_A_ROW)
     rows = -(-len(panels) // columns)
     width = _COLUMN_IN if len(panels) == 1 else _PAGE_IN
-    with styled(_FONT_PT):
+    with styled():
         figure = Figure(figsize=(width, 2.2 * rows), layout="constrained")
         all_axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel().tolist()
         for spare in all_axes[len(panels) :]:

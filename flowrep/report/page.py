@@ -52,13 +52,7 @@ class Drives(NamedTuple):
 
 
 def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
-    """Returns plans and films of one finished agent of each scene, stack and group.
-
-    Args:
-        runs: the runs of a report.
-        trajectories: the number of episodes in a plan, none without plans.
-        videos: the number of films of each agent, none without films.
-    """
+    """Returns plans of so many drives, and so many films, of an agent of each scene and stack."""
     drives = Drives({}, {}, [])
     finished: dict[Any, Run] = {}  # the one of the lowest seed
     for number, group in enumerate(groups_of(runs)):

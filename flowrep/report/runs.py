@@ -14,16 +14,14 @@ from flowrep.report.statistics import Array, Bootstrap, Estimate
 
 Columns = dict[str, NDArray[Any]]
 Metric = Callable[[NDArray[Any]], Array]
-SPEEDS = ("low", "normal", "high")
-"""Pedestrians' speed modes, in the order of figures."""
+SPEEDS = ("low", "normal", "high")  # of pedestrians
+# The paper's scenes and stacks, in the order of its figures.
 SCENES = ("straight_road", "s_turn", "h_shaped_pathways", "three_way_junction")
-"""The paper's scenes in its order."""
 FLOW_STACKS = ("ego", "raw", "obj", "ego+obj")
 COMPLEMENTARY_STACKS = (
     "seg2", "depth2", "ego+obj", "ego+obj+seg2", "ego+obj+depth2", "ego+obj+seg2+depth2",
 )  # fmt: skip
 STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
-"""The paper's stacks, in the order of its figures."""
 BASELINES = ("never_turn", "random", "planner")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
 _OF_EVERY_SCENE = ("camera", "frame_rate_hz")

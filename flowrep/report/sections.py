@@ -114,10 +114,7 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], settings: Settings) -
 
 
 def write_files(report: Report, folder: Path) -> list[Path]:
-    """Writes figures as PNG and PDF, tables as LaTeX and CSV, and returns the sections' folders.
-
-    The same report gives the same files, byte for byte.
-    """
+    """Writes figures as PNG and PDF, tables as LaTeX and CSV; returns the sections' folders."""
     for section in report.sections:
         place = folder / section.folder
         place.mkdir(exist_ok=True)
@@ -288,11 +285,8 @@ def _compared(
 
 
 def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
-    """Returns Table III for the scenes of the runs, the paper's scene first.
-
-    At the speeds at which the paper evaluates, low and high together, or at that of training where
-    they were not both driven; time-outs are left out, as in the paper.
-    """
+    """Returns Table III for the scenes of the runs, the paper's scene first."""
+    # the paper evaluates at low and high speed
     fps, driven = runs[0].fps, {c.speed for c in _at_speeds(runs, settings.policy)}
     speeds = ["low", "high"] if {"low", "high"} <= driven else [runs[0].speed]
     conditions = [Condition(settings.policy, speed, fps) for speed in speeds]

@@ -26,10 +26,8 @@ from flowrep.experiment.evaluation import wilson_interval
 Array = NDArray[np.float64]
 
 LEVEL = 0.05  # of tests; intervals hold the rest
+FEWEST_RUNS = 3  # with fewer a side, a difference is one of these agents, not of their stacks
 _OF_RUNS, _OF_EPISODES = 0, 1  # keep the two draws independent
-
-FEWEST_RUNS = 3
-"""With fewer per side, a difference is stated for these agents only, not for their stacks."""
 
 
 class Estimate(NamedTuple):
@@ -187,12 +185,9 @@ def _improvement(ours: Array, theirs: Array) -> Any:
 
 
 class Effect(NamedTuple):
-    """A difference in the mean over scenes, by the t distribution over runs.
+    """A difference in the mean over scenes, its standard error and degrees of freedom.
 
-    Args:
-        value: the difference.
-        error: its standard error; nan where a scene has one run of a side alone.
-        freedom: Welch and Satterthwaite's degrees of freedom.
+    Error and p value are nan where a scene has one run of a side alone.
     """
 
     value: float

@@ -73,8 +73,7 @@ def read_run(path: Path) -> Run:
     """Returns the run in a folder.
 
     Raises:
-        RunFolderError: its config or a cell of a table is not what a run leaves.
-        TableError: one of its tables lacks columns.
+        RunFolderError, TableError: its config or a table is not what a run leaves.
     """
     folder = RunFolder.existing(path)
     config, tables = folder.read_config(), (folder.read_episodes(), folder.read_metrics())

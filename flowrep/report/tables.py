@@ -72,12 +72,6 @@ class Table(NamedTuple):
         return text.getvalue()
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Returns a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"|{'|'.join(cells)}|" for cells in lines)
-
-
 def latex_text(text: str) -> str:
     r"""Returns text with LaTeX's special characters escaped.
 
