@@ -13,12 +13,10 @@ import dataclasses
 import statistics
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from flowrep.baselines import Planner
@@ -30,7 +28,6 @@ from flowrep.scenes.scene import Scene
 
 MAPS = ("ego", "obj")
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion")
-ONE_BY_ONE = partial(SyncVectorEnv, autoreset_mode=AutoresetMode.DISABLED)
 
 
 def in_size(name: str, size: int) -> Scene:
@@ -72,8 +69,7 @@ def together(scene: Scene, num_envs: int) -> EnvBase:
 
 
 def one_by_one(scene: Scene, num_envs: int) -> EnvBase:
-    with patch("flowrep.envs.torchrl_env.StreetVectorEnv", ONE_BY_ONE):
-        return make_env(scene, MAPS, num_envs=num_envs, seed=0, renderer="pybullet")
+    return make_env(scene, MAPS, num_envs=num_envs, seed=0, renderer="pybullet")
 
 
 def stepper(env: EnvBase, clock: Callable[[], float] = time.process_time) -> Callable[[int], float]:

@@ -125,26 +125,23 @@ def cost_row(name: str, size: int, count: int) -> str:
     scene = load_scene(name)
     camera = dataclasses.replace(scene.camera, height_px=size, width_px=size)
     pair = Pair(dataclasses.replace(scene, camera=camera))
-    pictures, drawings, maps = [], [], []
-    rasterise = pair.drawn.sensing._rasterise
-
-    def timed(*views: np.ndarray) -> Any:
-        started = time.process_time()
-        drawn = rasterise(*views)
-        drawings.append(1e3 * (time.process_time() - started))
-        return drawn
-
-    pair.drawn.sensing._rasterise = timed
+    pictures, drawings, colours, maps = [], [], [], []
+    env, sensing = pair.pictured, pair.drawn.sensing
+    rasterise = sensing._rasteriser(1)
     for _ in pair.views(count, seed=1):
-        env = pair.pictured
         env.sensing.observe(env.episode)  # puts everyone where they are
-        pictures.append(cpu_ms(lambda: env.sensing.look(env.episode)))  # noqa: B023
-        maps.append(cpu_ms(lambda: pair.drawn.sensing.observe(pair.drawn.episode)))
+        pictures.append(cpu_ms(lambda: env.sensing.look(env.episode)))
+        views = sensing.views([pair.drawn.episode])
+        drawings.append(cpu_ms(lambda: rasterise(*views)))  # noqa: B023
+        colours.append(cpu_ms(lambda: rasterise(*views, rgb=True)))  # noqa: B023
+        maps.append(cpu_ms(lambda: sensing.observe(pair.drawn.episode)))
     triangles = sum(len(body.triangles) for body in pair.drawn._street.bodies)
     pair.close()
-    picture, drawing, whole = (statistics.median(each) for each in (pictures, drawings, maps))
-    ratio = statistics.median(p / d for p, d in zip(pictures, drawings))
-    times = f"{picture:.2f} | {drawing:.3f} | {ratio:.1f} | {whole:.3f}"
+    picture, whole = statistics.median(pictures), statistics.median(maps)
+    times = f"{picture:.2f} | {whole:.3f}"
+    for each in (drawings, colours):
+        ratio = statistics.median(p / d for p, d in zip(pictures, each))
+        times += f" | {statistics.median(each):.3f} | {ratio:.1f}"
     return f"| {scene.name} | {size} | {triangles} | {times} |"
 
 
@@ -162,9 +159,10 @@ def main() -> None:
             print(agreement_row(name, args.views), flush=True)
     if args.sizes:
         print(
-            "\n| scene | pixels | triangles | getCameraImage, ms | drawing, ms | ratio | maps, ms |"
+            "\n| scene | pixels | triangles | getCameraImage, ms | observing maps, ms "
+            "| drawing maps, ms | ratio | with colours, ms | ratio |"
         )
-        print("| --- | --- | --- | --- | --- | --- | --- |")
+        print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
         for name in args.scenes:
             for size in args.sizes:
                 print(cost_row(name, size, args.timed_views), flush=True)

@@ -19,6 +19,8 @@ MODULES = {
     "view.py": "viewing needs hydra; run: pip install 'flowrep-rl[train]'",
     "factorize.py": "factorising needs cv2; run: pip install 'flowrep-rl[factorize]'",
     "agent/__init__.py": "flowrep.agent needs safetensors; run: pip install 'flowrep-rl[train]'",
+    "envs/__init__.py": "flowrep.envs needs pybullet; run: pip install 'flowrep-rl[sim]'",
+    "scenes/__init__.py": "flowrep.scenes needs shapely; run: pip install 'flowrep-rl[sim]'",
     "torchrl_configs.py": "needs hydra; run: pip install 'flowrep-rl[train]'",
     "transforms/hydra_configs.py": "needs hydra; run: pip install 'flowrep-rl[train]'",
 }

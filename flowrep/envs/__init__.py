@@ -65,7 +65,3 @@ def __getattr__(name: str) -> Any:
     is_wrapper = name in ("NumericInfo", "RepresentationObservation")
     home = import_module(f"flowrep.envs.{'gym_wrappers' if is_wrapper else 'torchrl_env'}")
     return getattr(home, name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})

@@ -18,7 +18,6 @@ from flowrep.scenes.layout import Layout
 from flowrep.scenes.pedestrians import Crowd, draw_crowd
 from flowrep.scenes.scene import (
     YAW_SIGN,
-    Path,
     Range,
     Scene,
     VehicleState,
@@ -117,10 +116,9 @@ class Rules:
     """The constants of a scene's episodes: ground plan, clock and limits."""
 
     def __init__(self, layout: Layout, frame_rate_hz: float, ticks_per_step: int) -> None:
-        """Prepares the checks for a layout, a frame rate and the number of checks in a step."""
         self.layout, self.frame_rate_hz = layout, frame_rate_hz
         self.dt_s = 1.0 / frame_rate_hz
-        self.ticks_per_step = ticks_per_step
+        self.ticks_per_step = ticks_per_step  # checks of the footprint in a step
         self.tick_s = self.dt_s / self.ticks_per_step
         self.tick_times_s = [(1 + i) * self.tick_s for i in range(self.ticks_per_step)]
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
@@ -145,12 +143,15 @@ class Episode:
     ) -> None:
         """Draws the path and the pedestrians from the seed; the vehicle is at its start."""
         scene = rules.layout.scene
+        paths = {each.name: each for each in scene.paths}
+        if path is not None and path not in paths:
+            raise ValueError(f"unknown path {path!r}; the scene has {[*paths]}")
         rng = np.random.default_rng(episode_seed)
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
         self.rules = rules
         self.seed, self.speed_mps = episode_seed, speed_mps
         self.vehicle_speed_mps = vehicle_speed_mps
-        self.path = drawn if path is None else _path_named(scene.paths, path)
+        self.path = drawn if path is None else paths[path]
         self.crowd: Crowd = draw_crowd(rules.layout, scene.pedestrian_groups, speed_mps, rng)
         self.goal = rules.layout.zones[self.path.end]
         self.now = Moment(rules.layout.start_state(self.path.start), 0)
@@ -159,17 +160,14 @@ class Episode:
         self.outcome = Outcome.RUNNING
         self.hit = ""
         self.poses = self.poses_before = self.crowd.poses(0.0)
-        self._foreseen = np.empty(
-            (0, len(self.crowd), 4)
-        )  # poses at the ticks from the next one on
+        self._foreseen = self.poses[:0, None]  # poses at the ticks from `_foreseen_from` on
         self._foreseen_from = 0
 
     def resume(self, before: Moment, now: Moment) -> None:
         """Jumps to a later step, given its moment and the one before it."""
         self.before, self.now = before, now
-        self.poses_before, self.poses = (
-            self.crowd.poses(moment.ticks * self.rules.tick_s) for moment in (before, now)
-        )
+        self.poses_before = self.crowd.poses(before.ticks * self.rules.tick_s)
+        self.poses = self.crowd.poses(now.ticks * self.rules.tick_s)
 
     def step(self, action: int, street: Street) -> None:
         """Drives one step, or part of it if the episode ends."""
@@ -189,8 +187,7 @@ class Episode:
         if not self.outcome and self.steps >= rules.limit_steps:
             self.outcome = Outcome.TIMEOUT
 
-    def _poses_ahead(self) -> Array:
-        """Returns everyone's poses at the checks of the next step, [T, P, 4]."""
+    def _poses_ahead(self) -> Array:  # at the checks of the next step, [T, P, 4]
         count, first = self.rules.ticks_per_step, self.now.ticks + 1
         at = first - self._foreseen_from
         if not 0 <= at <= len(self._foreseen) - count:
@@ -207,10 +204,3 @@ class Episode:
             self.outcome = Outcome.OUT_OF_BOUNDS
         elif shapely.contains_xy(self.goal, vehicle.x_m, vehicle.y_m):
             self.outcome = Outcome.SUCCESS
-
-
-def _path_named(paths: tuple[Path, ...], name: str) -> Path:
-    for path in paths:
-        if path.name == name:
-            return path
-    raise ValueError(f"unknown path {name!r}; the scene has {[path.name for path in paths]}")

@@ -104,7 +104,6 @@ class Sensing:
         renderer: str = "auto",
         picture_scale: int = 1,
     ) -> None:
-        """Precomputes the constants of all pictures."""
         unknown = [name for name in sensors if name not in SENSORS]
         if unknown:
             raise ValueError(f"unknown sensors {unknown}; they are: {', '.join(SENSORS)}")
@@ -181,12 +180,7 @@ class Sensing:
         if self.renderer == "pybullet":
             pictured = [self._pictured(episode) for episode in episodes]
             return {name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]}
-        views = (
-            self._camera_poses([episode.now for episode in episodes]).cam_from_world,
-            _parts([episode.poses for episode in episodes]),
-            np.stack([self._street.is_shown(episode.path.closures) for episode in episodes]),
-        )
-        arrays: Arrays = {}
+        views, arrays = self.views(episodes), {}
         colours_too = "rgb" in names and self._scale == 1
         if colours_too or not names.isdisjoint(_MAPS):
             drawn = self._rasteriser(1)(*views, rgb=colours_too)
@@ -194,6 +188,14 @@ class Sensing:
         if "rgb" in names and not colours_too:
             arrays["rgb"] = self._rasteriser(self._scale)(*views, rgb=True).rgb
         return arrays
+
+    def views(self, episodes: Sequence[Episode]) -> tuple[Array, Array, Array]:
+        """Returns the poses of cameras and people's parts and what is shown, of N episodes."""
+        return (
+            self._camera_poses([episode.now for episode in episodes]).cam_from_world,
+            _parts([episode.poses for episode in episodes]),
+            np.stack([self._street.is_shown(episode.path.closures) for episode in episodes]),
+        )
 
     def _rasteriser(self, scale: int) -> Any:
         """Returns a rasteriser of pictures so many times the maps' size."""

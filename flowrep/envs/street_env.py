@@ -73,7 +73,6 @@ class StreetEnv(gym.Env):
         renderer: str = "auto",
         picture_scale: int = 1,
     ) -> None:
-        """Builds the street; the first `reset` begins an episode."""
         self.scene = load_scene(scene)
         self.speed_mps = _speed_range(self.scene, speed)
         self.frame_rate_hz = _frame_rate(self.scene, frame_rate_hz)
@@ -81,7 +80,6 @@ class StreetEnv(gym.Env):
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
         self._street = Street.shared(self.scene)
-        self._rules: dict[tuple[float, int], Rules] = {}  # by frame rate and ticks a step
         self.sensing = Sensing(self.scene, self._street, sensors, renderer, picture_scale)
         self.K = self.sensing.K
         self._episode: Episode | None = None
@@ -193,11 +191,9 @@ class StreetEnv(gym.Env):
             vehicle_speed_mps = self.scene.vehicle.speed_mps
         if not 0 <= vehicle_speed_mps < math.inf:
             raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 to stand")
-        clock = rate, ticks_for(self.scene, rate, speed_mps, vehicle_speed_mps)
-        if clock not in self._rules:
-            self._rules[clock] = Rules(self._street.layout, *clock)
+        ticks = ticks_for(self.scene, rate, speed_mps, vehicle_speed_mps)
         self._episode = Episode(
-            self._rules[clock],
+            Rules(self._street.layout, rate, ticks),
             operator.index(options["episode_seed"]),
             speed_mps,
             float(vehicle_speed_mps),

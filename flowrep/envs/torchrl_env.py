@@ -15,7 +15,7 @@ from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
 
 from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv
-from flowrep.envs.vector_env import StreetVectorEnv, make_sensing
+from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
 from flowrep.scenes.load import load_scene
 from flowrep.scenes.scene import YAW_SIGN, Range, Scene, SpeedMode
@@ -181,7 +181,7 @@ def make_env(
         sensors = [name for name in SENSORS if name in sensors or name not in _SELDOM]
     elif sensors:
         transforms.append(DropSensor())
-    factories = [partial(make_sensing, street, sensors)] * num_envs
+    factories = [partial(street, sensors=sensors)] * num_envs
     vector: VectorEnv
     if num_workers:
         vector = WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)

@@ -8,76 +8,46 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.vector.utils import create_empty_array
+from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from flowrep.envs.episode import NOTHING_HIT, Episode, Outcome, hit_code, reward
 
+_STATUS: dict[str, spaces.Space] = {
+    "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
+    "hit": spaces.Box(0, NOTHING_HIT, (1,), np.uint8),
+    "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
+    "path": spaces.Box(0, 1 << 31, (1,), np.int64),
+    "vehicle": spaces.Box(-np.inf, np.inf, (3,), np.float32),
+}
 
-class SensorObservation(gym.Wrapper):
-    """Nests the observation under "sensor" and adds the status of the episode.
+
+class StreetVectorEnv(SyncVectorEnv):
+    """`StreetEnv`s that are drawn together, with the status of their episodes, without autoreset.
 
     | key | shape | dtype | meaning |
     | --- | --- | --- | --- |
-    | `sensor` | | | the wrapped environment's observation |
+    | `sensor` | | | the observation of the `StreetEnv`; absent without sensors |
     | `outcome` | [1] | uint8 | code of `flowrep.envs.Outcome`; 0 while the episode runs |
     | `hit` | [1] | uint8 | class id of what was hit; 255 for nothing |
     | `episode_seed` | [1] | int64 | identifies the episode, see `StreetEnv.reset` |
     | `path` | [1] | int64 | index of the episode's path in the scene |
     | `vehicle` | [3] | float32 | x and y in metres and yaw in radians, in the world |
-    """
 
-    def __init__(self, env: gym.Env) -> None:
-        """Wraps a `StreetEnv`."""
-        super().__init__(env)
-        status: dict[str, spaces.Space] = {
-            "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
-            "hit": spaces.Box(0, NOTHING_HIT, (1,), np.uint8),
-            "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
-            "path": spaces.Box(0, 1 << 31, (1,), np.int64),
-            "vehicle": spaces.Box(-np.inf, np.inf, (3,), np.float32),
-        }
-        sensor = env.observation_space
-        has_sensors = isinstance(sensor, spaces.Dict) and len(sensor.spaces) > 0
-        self._names = ("sensor",) if has_sensors else ()
-        self.observation_space = spaces.Dict(dict.fromkeys(self._names, sensor) | status)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begins an episode."""
-        observation, _ = self.env.reset(seed=seed, options=options)
-        return self._arranged(observation), {}
-
-    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drives one step."""
-        observation, reward, terminated, truncated, _ = self.env.step(action)
-        return self._arranged(observation), float(reward), terminated, truncated, {}
-
-    def _arranged(self, observation: dict[str, Any]) -> dict[str, Any]:
-        street: Any = self.unwrapped
-        status = _status([street.episode])
-        return dict.fromkeys(self._names, observation) | {k: v[0] for k, v in status.items()}
-
-
-def make_sensing(street: Callable[..., gym.Env], sensors: Sequence[str]) -> SensorObservation:
-    """Returns a street with sensors; picklable in a partial, and imported without PyTorch."""
-    return SensorObservation(street(sensors=sensors))
-
-
-class StreetVectorEnv(SyncVectorEnv):
-    """A faster `SyncVectorEnv` for `StreetEnv`s, without autoreset and infos.
-
-    Its results are identical, bit for bit, and belong to the caller.
+    Observations are identical, bit for bit, to those of the environments alone, and belong to the
+    caller. There are no infos.
 
     Args:
-        env_fns: make `SensorObservation`s of one scene with the same sensors.
+        env_fns: make `StreetEnv`s of one scene with the same sensors.
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
-        """Makes the environments."""
         super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
         self._streets: list[Any] = [env.unwrapped for env in self.envs]
+        sensor: Any = self.single_observation_space
+        nested: dict[str, spaces.Space] = {"sensor": sensor} if sensor.spaces else {}
+        self.single_observation_space = spaces.Dict(nested | _STATUS)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._is_idle = [False] * self.num_envs
         self._latest: Any = create_empty_array(
             self.single_observation_space, self.num_envs, np.zeros
@@ -137,7 +107,7 @@ class StreetVectorEnv(SyncVectorEnv):
 
 
 def _status(episodes: Sequence[Episode]) -> dict[str, NDArray[Any]]:
-    """Returns what `SensorObservation` says of N episodes, `[N, ...]` each."""
+    """Returns the status of N episodes, `[N, ...]` each."""
     numbers = np.array(
         [
             (e.outcome, hit_code(e.hit), e.seed, e.rules.layout.scene.paths.index(e.path))

@@ -63,7 +63,6 @@ class WorkerVectorEnv(VectorEnv):
         num_workers: int,
         in_each: VectorFactory = _SIDE_BY_SIDE,
     ) -> None:
-        """Starts the workers and waits until they have built their environments."""
         if not 1 <= num_workers <= len(env_factories):
             raise ValueError(
                 f"num_workers is {num_workers} for {len(env_factories)} environments; give each "
@@ -71,10 +70,10 @@ class WorkerVectorEnv(VectorEnv):
             )
         self.num_envs, self.num_workers = len(env_factories), num_workers
         self.autoreset_mode = AutoresetMode.DISABLED
-        example = env_factories[0]()
-        self.metadata = example.metadata | {"autoreset_mode": self.autoreset_mode}
-        self.single_observation_space = example.observation_space
-        self.single_action_space = example.action_space
+        example = in_each(env_factories[:1])
+        self.metadata = example.metadata
+        self.single_observation_space = example.single_observation_space
+        self.single_action_space = example.single_action_space
         example.close()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)

@@ -165,7 +165,6 @@ class Layout:
     """The ground plan of one scene."""
 
     def __init__(self, scene: Scene) -> None:
-        """Lays out roads, zones, buildings and obstacles."""
         self.scene = scene
         self.lines = centrelines(scene)
         self._roads = {road.name: road for road in scene.roads}

@@ -67,44 +67,43 @@ class Triangles(NamedTuple):
 
 def gather(bodies: Sequence[Body]) -> Triangles:
     """Returns the triangles of all bodies, numbered in the given order."""
-    points: list[NDArray[np.float64]] = [np.empty((0, 3))]
-    corners: list[NDArray[np.int32]] = [np.empty((0, 3), dtype=np.int32)]
-    owners: list[int] = []
-    poses: list[int] = []
-    looks: list[Painted] = []
+    chunks = []
     movers = iter(range(len(bodies)))
     for number, body in enumerate(bodies):
         pose = next(movers) if body.moves else -1
-        triangles = body.vertices[body.triangles]
         uvs = np.zeros((len(body.vertices), 2)) if body.uvs is None else body.uvs
-        look = painted(triangles, uvs[body.triangles], body.semantic, body.instance)
+        triangles, places = body.vertices[body.triangles], uvs[body.triangles]
         for chunk in _chunks(triangles.mean(axis=1), np.arange(len(triangles))):
             own, inverse = np.unique(triangles[chunk].reshape(-1, 3), axis=0, return_inverse=True)
-            looks.append(look.of(chunk))
-            points.append(own)
-            corners.append(inverse.reshape(-1, 3).astype(np.int32))
-            owners.append(number)
-            poses.append(pose)
-    spheres = [_sphere(own) for own in points[1:]]
+            corners = inverse.reshape(-1, 3).astype(np.int32)
+            chunks.append((own, corners, triangles[chunk], places[chunk], number, pose))
+    points, indices, corners_m, uvs_of_all, owners, poses = zip(*chunks)
+    semantic = np.array([body.semantic for body in bodies], dtype=np.uint8)
+    instance = np.array([body.instance for body in bodies], dtype=np.uint8)
+    of_triangle = np.repeat(owners, [len(each) for each in indices])
+    spheres = [_sphere(own) for own in points]
     return Triangles(
         points=np.concatenate(points),
-        corners=np.concatenate(corners),
-        point_bounds=_bounds(points[1:]),
-        corner_bounds=_bounds(corners[1:]),
-        centres=np.array([centre for centre, _ in spheres]).reshape(-1, 3),
-        radii=np.array([radius for _, radius in spheres], dtype=np.float64),
+        corners=np.concatenate(indices),
+        point_bounds=_bounds(points),
+        corner_bounds=_bounds(indices),
+        centres=np.array([centre for centre, _ in spheres]),
+        radii=np.array([radius for _, radius in spheres]),
         bodies=np.array(owners, dtype=np.int32),
         poses=np.array(poses, dtype=np.int32),
-        semantic=np.array([body.semantic for body in bodies], dtype=np.uint8),
-        instance=np.array([body.instance for body in bodies], dtype=np.uint8),
-        look=Painted.joined(looks),
+        semantic=semantic,
+        instance=instance,
+        look=painted(
+            np.concatenate(corners_m),
+            np.concatenate(uvs_of_all),
+            semantic[of_triangle],
+            instance[of_triangle],
+        ),
     )
 
 
 def _chunks(middles: NDArray[np.float64], triangles: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Returns triangles in groups of neighbours; `middles` are those of all triangles."""
-    if len(triangles) == 0:
-        return []
     if len(triangles) <= _CHUNK_TRIANGLES:
         return [triangles]
     own = middles[triangles]
@@ -134,7 +133,6 @@ class Mesh:
     """Triangles with normals and texture coordinates, in PyBullet's order."""
 
     def __init__(self) -> None:
-        """Starts without triangles."""
         self.vertices: list[list[float]] = []
         self.normals: list[list[float]] = []
         self.uvs: list[list[float]] = []

@@ -5,7 +5,6 @@ and clothes have something to follow: without it, the flow estimated from two pi
 asphalt is 0.
 """
 
-from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -132,21 +131,14 @@ class Painted(NamedTuple):
     fronts: NDArray[np.int32]  # [T], the house front; -1 for a plain colour
     front_from_point: NDArray[np.float32]  # [T, 2, 4], texels of the house front
 
-    def of(self, triangles: NDArray[np.int64]) -> "Painted":
-        """Returns the look of some of the triangles."""
-        return Painted._make(array[triangles] for array in self)
-
-    @classmethod
-    def joined(cls, looks: Sequence["Painted"]) -> "Painted":
-        """Returns the look of the triangles of all, in order."""
-        nothing = painted(np.empty((0, 3, 3)), np.empty((0, 3, 2)), 0, 0)
-        return cls._make(np.concatenate(arrays) for arrays in zip(nothing, *looks))
-
 
 def painted(
-    corners: NDArray[np.float64], uvs: NDArray[np.float64], semantic: int, instance: int
+    corners: NDArray[np.float64],
+    uvs: NDArray[np.float64],
+    semantic: NDArray[np.uint8],
+    instance: NDArray[np.uint8],
 ) -> Painted:
-    """Returns the look of a body's triangles.
+    """Returns the look of triangles.
 
     The grain lies on level ground as a map does, so it runs on over its triangles. On other faces
     its axes are the level direction along the face and the one across.
@@ -154,8 +146,8 @@ def painted(
     Args:
         corners: [T, 3, 3], metres, counter-clockwise seen from outside.
         uvs: [T, 3, 2], the corners' places in the texture.
-        semantic: their id in the semantic map.
-        instance: 0 for the static world.
+        semantic: [T], their ids in the semantic map.
+        instance: [T], 0 for the static world.
     """
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normals = np.cross(a, b)
@@ -166,11 +158,11 @@ def painted(
     along[is_level] = 1.0, 0.0, 0.0
     across = np.cross(normals, along)
     across[is_level] = 0.0, 1.0, 0.0
-    per_m = _PEOPLE_TEXELS_A_M if instance else _TEXELS_A_M
+    per_m = np.where(instance > 0, _PEOPLE_TEXELS_A_M, _TEXELS_A_M)
     # Any numbers do: they give parallel faces, and people, grains of their own.
     plane_m = np.where(is_level, 0.0, (normals * corners[:, 0]).sum(axis=1))
     grain_axes = np.zeros((len(a), 2, 4))
-    grain_axes[:, 0, :3], grain_axes[:, 1, :3] = per_m * along, per_m * across
+    grain_axes[:, 0, :3], grain_axes[:, 1, :3] = per_m[:, None] * along, per_m[:, None] * across
     grain_axes[:, 0, 3] = 37.7 * per_m * plane_m + 97.0 * instance
     grain_axes[:, 1, 3] = 17.3 * per_m * plane_m + 61.0 * instance
     # A plain colour is one place of the texture; only a house front covers an area of it.
@@ -189,7 +181,7 @@ def painted(
     return Painted(
         normals.astype(np.float32),
         texture()[row, column].astype(np.float32),
-        np.full(len(a), _CONTRAST[semantic], dtype=np.float32),
+        np.array(_CONTRAST, dtype=np.float32)[semantic],
         grain_axes.astype(np.float32),
         fronts.astype(np.int32),
         front_axes.astype(np.float32),

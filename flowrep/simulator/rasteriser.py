@@ -38,6 +38,7 @@ _FRONT_LEVELS = FRONT_SIZE.bit_length()
 _GRAIN_STARTS = np.cumsum([0, *((GRAIN_SIZE >> i) ** 2 for i in range(_GRAIN_LEVELS))])
 _FRONT_STARTS = np.cumsum([0, *((FRONT_SIZE >> i) ** 2 for i in range(_FRONT_LEVELS))])
 _SCALES = 0.5 ** np.arange(_GRAIN_LEVELS)
+_NO_TABLES = np.empty((0, 2), np.float32), np.empty((0, 3), np.float32)
 
 
 _compiled = compiled()
@@ -71,7 +72,6 @@ class Rasteriser:
         size: tuple[int, int],
         range_m: tuple[float, float],
     ) -> None:
-        """Compiles the drawing functions unless they are in the cache."""
         # Column i is sampled at u = i + 0.5.
         K_of_index = K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
         shape = triangles[: triangles._fields.index("bodies") + 1]
@@ -80,18 +80,11 @@ class Rasteriser:
         ids = triangles.semantic[owners], triangles.instance[owners]
         self._world = (*shape, triangles.poses, *ids, K_of_index, *map(float, range_m))
         poses = np.repeat(triangles.poses, np.diff(triangles.corner_bounds))
-        # Tables of 4 MB are made when colours are first drawn.
-        self._look = (
-            poses,
-            *triangles.look,
-            np.empty((0, 2), np.float32),
-            np.empty((0, 3), np.float32),
-        )
-        self._is_painted = False
+        self._look = poses, *triangles.look
         self._size = size
         moving = int(triangles.poses.max(initial=-1)) + 1
         nothing = np.empty((0, 4, 4)), np.empty((0, moving, 4, 4))
-        self(*nothing, np.empty((0, len(triangles.semantic)), dtype=bool))
+        self(*nothing, np.empty((0, len(triangles.semantic)), dtype=bool))  # compiles or loads
 
     def __call__(
         self,
@@ -109,9 +102,8 @@ class Rasteriser:
             is_shown: which bodies are present, [N, B].
             rgb: whether to draw colours too.
         """
-        if rgb and not self._is_painted:
-            self._look = *self._look[:-2], grain(), front_levels()
-            self._is_painted = True
+        # Tables of 4 MB are made when colours are first drawn.
+        look = *self._look, *((grain(), front_levels()) if rgb else _NO_TABLES)
         views = len(cam_from_world)
         shape = (views, *self._size)
         maps = Maps(
@@ -120,7 +112,7 @@ class Rasteriser:
             np.empty(shape, np.uint8),
             np.empty((views if rgb else 0, 3, *self._size), np.uint8),
         )
-        _draw(*self._world, self._look, cam_from_world, world_from_body, is_shown, *maps)
+        _draw(*self._world, look, cam_from_world, world_from_body, is_shown, *maps)
         return maps
 
 
@@ -132,7 +124,7 @@ def _draw(
 ):  # fmt: skip
     views, height, width = depth.shape
     planes = _side_planes(K, height, width)
-    most = (point_bounds[1:] - point_bounds[:-1]).max() if len(bodies) else 0
+    most = (point_bounds[1:] - point_bounds[:-1]).max()
     q = np.empty((most, 3))
     inverse = np.empty((height, width))
     number = np.empty((height, width), dtype=np.int32)

@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict
 
 from flowrep.envs import StreetEnv, make_mirror
-from flowrep.envs.sensing import _parts
 from flowrep.geometry import factorize, rigid_flow
 from flowrep.scenes import load_scene, scene_names
 from flowrep.simulator.rasteriser import Rasteriser
@@ -41,12 +40,8 @@ def test_maps_of_the_mirrored_street(name):
     size = camera.height_px, camera.width_px
     rasterise = Rasteriser(other_way_round(street.triangles), env.K, size, range_m)
     episode = env.episode
-    seen_from = env.sensing._camera_poses([episode.now]).cam_from_world
-    drawn = rasterise(
-        ACROSS @ seen_from @ SIDEWAYS,
-        SIDEWAYS @ _parts([episode.poses]) @ SIDEWAYS,
-        street.is_shown(episode.path.closures)[None],
-    )
+    seen_from, parts, is_shown = env.sensing.views([episode])
+    drawn = rasterise(ACROSS @ seen_from @ SIDEWAYS, SIDEWAYS @ parts @ SIDEWAYS, is_shown)
     here = {key: torch.from_numpy(value) for key, value in observation.items()}
     there = {key: torch.from_numpy(value) for key, value in drawn._asdict().items()}
     motion = torch.tensor(ACROSS, dtype=torch.float32)

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrep.envs import StreetEnv
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
-from flowrep.scenes.scene import PedestrianGroup, Walk
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "rasterise.py"
 CROSSROADS = Path(__file__).parents[1] / "scenes" / "crossroads.yaml"
@@ -65,53 +63,6 @@ def test_the_exits_that_an_episode_closes_are_seen(make_street, renderer, path, 
     assert open_side == 0
 
 
-def test_a_person_fills_the_picture_and_is_cut_by_the_near_plane(make_street, straight_road):
-    walk = Walk("points", points_m=((4.0, -0.01), (4.0, 0.01)))
-    person = PedestrianGroup("one", 1, 0.0, walk, standing=1)
-    scene = replace(straight_road, pedestrian_groups=(person,))
-    maps = []
-    for renderer in ("pybullet", "rasteriser"):
-        env = make_street(scene, renderer=renderer)
-        env.reset(seed=0)
-        observations = []
-        while not env.episode.outcome:
-            observations.append(env.step(0)[0])
-        maps.append(observations[-1])
-    pictured, drawn = maps
-    assert (drawn["semantic"] == CATEGORY_ID["pedestrian"]).mean() > 0.3
-    assert (drawn["instance"] == pictured["instance"]).mean() > 0.999
-    seen = np.isfinite(drawn["depth"]) & np.isfinite(pictured["depth"])
-    ratio = drawn["depth"][seen] / pictured["depth"][seen]
-    np.testing.assert_allclose(np.median(ratio), 1.0, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "mount",
-    [
-        {"mount_forward_m": -8.0, "mount_height_m": 3.0},
-        {"mount_height_m": 12.0, "pitch_deg": -90.0},
-    ],
-    ids=["behind the vehicle", "above it"],
-)
-def test_people_behind_the_vehicle_are_seen_where_they_are(make_street, straight_road, mount):
-    # 3 m behind the vehicle, which stands still: 5 m before the one camera, 11 m below the other.
-    walk = Walk("points", points_m=((-3.0, -2.0), (-3.0, 2.0)))
-    walker = PedestrianGroup("one", 1, 0.0, walk, speed_mps=(1.5, 1.5))
-    camera = replace(straight_road.camera, **mount)
-    scene = replace(straight_road, pedestrian_groups=(walker,), camera=camera)
-    streets = [make_street(scene, renderer=name) for name in ("pybullet", "rasteriser")]
-    seen = []
-    for street in streets:
-        first, _ = street.reset(options={"episode_seed": 0, "vehicle_speed_mps": 0.0})
-        last = [street.step(0)[0] for _ in range(12)][-1]
-        seen.append([shown["instance"][0] > 0 for shown in (first, last)])
-    (first, last), (first_drawn, last_drawn) = seen
-    assert not (first_drawn & last_drawn).any()  # 1.5 m further, they cover other pixels
-    for pictured, drawn in ((first, first_drawn), (last, last_drawn)):
-        assert drawn.sum() > 5
-        assert (pictured != drawn).sum() <= 0.1 * drawn.sum()
-
-
 def test_maps_do_not_depend_on_whether_colours_are_asked_for(make_street):
     alone, with_colours = (
         make_street("three_way_junction", sensors=sensors)
@@ -122,11 +73,3 @@ def test_maps_do_not_depend_on_whether_colours_are_asked_for(make_street):
     a, b = (env.step(1)[0] for env in (alone, with_colours))
     for name in ("depth", "instance"):
         np.testing.assert_array_equal(a[name], b[name])
-
-
-def test_pybullet_draws_everything_where_it_is_asked_to(make_street):
-    env = make_street(renderer="pybullet")
-    assert isinstance(env, StreetEnv)
-    env.sensing.look = None  # the one way to a picture
-    with pytest.raises(TypeError):
-        env.reset(seed=0)

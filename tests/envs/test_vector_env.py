@@ -1,32 +1,27 @@
-"""Streets that are seen all at once are the streets of gymnasium's own vector, bit for bit."""
+"""Streets that are drawn all at once are the streets alone, bit for bit."""
 
 from functools import partial
 
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from flowrep.envs import StreetEnv
+from flowrep.envs import Outcome, StreetEnv
+from flowrep.envs.episode import hit_name
 from flowrep.envs.sensing import SENSORS
-from flowrep.envs.vector_env import SensorObservation, StreetVectorEnv
+from flowrep.envs.vector_env import StreetVectorEnv
 
 NUM_ENVS = 3
 
 
-def sensed(**arguments):
-    return SensorObservation(StreetEnv("h_shaped_pathways", **arguments))
-
-
 @pytest.fixture
-def both():
-    """Makes one vector of either kind; they are closed when the test ends."""
+def make():
+    """Makes vector envs that are closed when the test ends."""
     made = []
 
     def make(**arguments):
-        factories = [partial(sensed, **arguments)] * NUM_ENVS
-        one_by_one = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.DISABLED)
-        made.extend([StreetVectorEnv(factories), one_by_one])
-        return made[-2:]
+        factories = [partial(StreetEnv, "h_shaped_pathways", **arguments)] * NUM_ENVS
+        made.append(StreetVectorEnv(factories))
+        return made[-1]
 
     yield make
     for vector in made:
@@ -47,39 +42,51 @@ def assert_same(a, b):
 @pytest.mark.parametrize(
     "arguments",
     [
-        {},
-        {"sensors": ()},
-        {"sensors": ("depth", "prev_from_curr")},
         {"sensors": SENSORS},
+        {"sensors": ("depth", "prev_from_curr")},
         {"renderer": "pybullet"},
     ],
     ids=str,
 )
-def test_steps_and_partial_resets_are_those_of_gymnasiums_vector(both, arguments):
-    ours, theirs = both(**arguments)
-    assert_same(ours.reset(seed=5)[0], theirs.reset(seed=5)[0])
+def test_steps_and_partial_resets_are_those_of_streets_alone(make, make_street, arguments):
+    vector = make(**arguments)
+    streets = [make_street("h_shaped_pathways", **arguments) for _ in range(NUM_ENVS)]
+    paths = [path.name for path in streets[0].scene.paths]
+
+    def assert_seen(observation, alone):
+        assert observation in vector.observation_space
+        for i, (seen, info) in enumerate(alone):
+            assert_same({key: value[i] for key, value in observation["sensor"].items()}, seen)
+            status = {key: observation[key][i].tolist() for key in ("outcome", "hit", "path")}
+            assert Outcome(status["outcome"][0]).label == info["outcome"]
+            assert hit_name(status["hit"][0]) == info["hit"]
+            assert paths[status["path"][0]] == info["path"]
+            assert observation["episode_seed"][i] == info["episode_seed"]
+
     rng, resets = np.random.default_rng(0), 0
-    for _ in range(25):
+    alone = [street.reset(seed=5 + i) for i, street in enumerate(streets)]
+    assert_seen(vector.reset(seed=5)[0], alone)
+    for _ in range(12):
         actions = rng.integers(3, size=NUM_ENVS)
-        steps = [vector.step(actions)[:4] for vector in (ours, theirs)]
-        assert_same(steps[0][0], steps[1][0])
-        for a, b in zip(steps[0][1:], steps[1][1:]):
-            assert a.dtype == b.dtype
-            np.testing.assert_array_equal(a, b)
-        ended = steps[0][2] | (rng.random(NUM_ENVS) < 0.1)
-        if ended.any():
+        steps = [street.step(action) for street, action in zip(streets, actions)]
+        observation, rewards, ended, truncated, _ = vector.step(actions)
+        alone = [(seen, info) for seen, *_, info in steps]
+        assert_seen(observation, alone)
+        assert rewards.tolist() == [step[1] for step in steps]
+        assert ended.tolist() == [step[2] for step in steps]
+        assert not truncated.any()
+        due = ended | (rng.random(NUM_ENVS) < 0.1)
+        if due.any():
             resets += 1
-            options = [{"reset_mask": ended.copy()} for _ in range(2)]
-            seeds = [int(rng.integers(100)) if due else None for due in ended]
-            assert_same(
-                ours.reset(seed=seeds, options=options[0])[0],
-                theirs.reset(seed=seeds, options=options[1])[0],
-            )
-    assert resets > 3
+            seeds = [int(rng.integers(100)) if each else None for each in due]
+            for i in np.flatnonzero(due):
+                alone[i] = streets[i].reset(seed=seeds[i])
+            assert_seen(vector.reset(seed=seeds, options={"reset_mask": due})[0], alone)
+    assert resets > 1
 
 
-def test_what_was_given_away_stays_as_it_is(both):
-    ours, _ = both(sensors=("depth",))
+def test_what_was_given_away_stays_as_it_is(make):
+    ours = make(sensors=("depth",))
     first, _ = ours.reset(seed=1)
     kept = first["sensor"]["depth"].copy()
     ours.step(np.array([0, 1, 2]))
@@ -90,8 +97,8 @@ def test_what_was_given_away_stays_as_it_is(both):
     assert ours.step(np.zeros(NUM_ENVS, dtype=int))[0]["sensor"]["depth"].any()
 
 
-def test_a_reset_of_no_street_returns_what_was_last_seen(both):
-    ours, _ = both(sensors=("depth",))
+def test_a_reset_of_no_street_returns_what_was_last_seen(make):
+    ours = make(sensors=("depth",))
     none = {"reset_mask": np.zeros(NUM_ENVS, dtype=bool)}
     before, _ = ours.reset(options=dict(none))
     assert not before["sensor"]["depth"].any()  # nothing has been seen: zeros, as workers have
@@ -103,8 +110,8 @@ def test_a_reset_of_no_street_returns_what_was_last_seen(both):
     assert last["sensor"]["depth"].any()
 
 
-def test_a_street_whose_episode_has_ended_is_not_driven_on(both):
-    ours, _ = both(sensors=())
+def test_a_street_whose_episode_has_ended_is_not_driven_on(make):
+    ours = make(sensors=())
     ours.reset(seed=1)
     straight_on, ended = np.zeros(NUM_ENVS, dtype=int), np.zeros(NUM_ENVS, dtype=bool)
     while not ended.any():

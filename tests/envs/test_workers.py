@@ -87,29 +87,22 @@ def assert_same(left, right):
             np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("num_workers", [1, 2, 3])
-def test_it_is_the_vector_env_of_one_process(make, num_workers):
-    ours, theirs = make(5, num_workers), in_process(5)
-    assert ours.num_workers == num_workers
+def test_it_is_the_vector_env_of_one_process(make):
+    ours, theirs = make(5, 3), in_process(5)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     assert ours.metadata["autoreset_mode"] is AutoresetMode.DISABLED
     both = (ours, theirs)
-    assert_same(*(env.reset(seed=3) for env in both))
+    begun, other = (env.reset(seed=3) for env in both)
+    kept = [array.copy() for array in leaves(begun[0])]
+    assert_same(begun, other)
     assert_same(*(env.step(np.array([9, 1, 2, 8, 3])) for env in both))
     masked = {"reset_mask": np.array([True, False, False, True, False]), "add": 5}
     assert_same(*(env.reset(options=dict(masked)) for env in both))
     assert_same(*(env.step(np.arange(5)) for env in both))
     assert_same(*(env.reset(seed=[7, 7, 1, 2, 3]) for env in both))
     assert_same(*(env.reset() for env in both))
-
-
-def test_what_was_returned_stays(make):
-    env = make(3, 2)
-    before, _ = env.reset(seed=0)
-    kept = [array.copy() for array in leaves(before)]
-    env.step(np.array([1, 2, 3]))
-    assert_same(leaves(before), kept)
+    assert_same(leaves(begun[0]), kept)  # what was returned belongs to the caller
 
 
 def test_a_step_can_be_begun_and_asked_for_later(make):
@@ -184,20 +177,9 @@ def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make)
     assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
 
 
-def test_signals_of_terminals_and_schedulers_are_the_callers_business(make):
-    env, other = make(3, 2), in_process(3)
-    for each in (env, other):
-        each.reset(seed=0)
-    for worker in env._workers:
-        os.kill(worker.process.pid, signal.SIGINT)
-        os.kill(worker.process.pid, signal.SIGTERM)
-    assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
-
-
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks into /proc")
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_such_signals_reach_no_worker_from_its_first_moment_on(make, num_workers):
-    worker = make(2, num_workers)._workers[0]
+def test_signals_of_terminals_and_schedulers_reach_no_worker_from_its_first_moment_on(make):
+    worker = make(2, 2)._workers[0]
     with open(f"/proc/{worker.process.pid}/status") as file:
         blocked = int(dict(line.split(":") for line in file)["SigBlk"], 16)
     assert all(blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM))
@@ -206,12 +188,11 @@ def test_such_signals_reach_no_worker_from_its_first_moment_on(make, num_workers
 
 HOLDER = """
 import sys
-from functools import partial
 from tests.envs.test_workers import Counter
 from flowrep.envs import WorkerVectorEnv
 
 if __name__ == "__main__":
-    env = WorkerVectorEnv([Counter, Counter, Counter], int(sys.argv[1]))
+    env = WorkerVectorEnv([Counter, Counter, Counter], 2)
     env.reset(seed=0)
     print(*(worker.process.pid for worker in env._workers), flush=True)
     if "wait" in sys.argv:
@@ -229,12 +210,11 @@ def is_running(pid):
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks into /proc")
 @pytest.mark.parametrize("how", ["left open at the end", "killed"])
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_no_worker_outlives_its_caller(tmp_path, num_workers, how):
+def test_no_worker_outlives_its_caller(tmp_path, how):
     script = tmp_path / "holder.py"
     script.write_text(HOLDER)
     how_it_ends = "wait" if how == "killed" else "end"
-    command = [sys.executable, str(script), str(num_workers), how_it_ends]
+    command = [sys.executable, str(script), how_it_ends]
     paths = {"PYTHONPATH": os.pathsep.join([".", *sys.path]), "TMPDIR": str(tmp_path)}
     environment = os.environ | paths
     with subprocess.Popen(
@@ -242,7 +222,7 @@ def test_no_worker_outlives_its_caller(tmp_path, num_workers, how):
     ) as holder:
         try:
             workers = [int(pid) for pid in holder.stdout.readline().split()]
-            assert len(workers) == num_workers
+            assert len(workers) == 2
             if how == "killed":
                 assert all(is_running(pid) for pid in workers)
                 holder.kill()

@@ -10,7 +10,7 @@ import shapely
 import yaml
 
 from flowrep.scenes import load_scene
-from flowrep.scenes.layout import Layout, parallel, without_repeats
+from flowrep.scenes.layout import Layout, parallel
 from flowrep.scenes.scene import BuildingRow, Crosswalk, ObstacleRow
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
@@ -158,8 +158,3 @@ def test_a_line_moved_aside_is_parallel_stretch_by_stretch():
     np.testing.assert_allclose(parallel(CORNER, 1.0), [(0, 1), (3, 1), (3, 3)])
     np.testing.assert_allclose(parallel(CORNER, -1.0), [(0, -1), (5, -1), (5, 3)])
     np.testing.assert_array_equal(parallel(CORNER, 0.0), CORNER)
-
-
-def test_points_on_top_of_each_other_are_one():
-    repeated = np.array([(0.0, 0.0), (0.0, 1e-5), (4.0, 0.0), (4.0, 0.0), (4.0, 3.0)])
-    np.testing.assert_array_equal(without_repeats(repeated), CORNER)

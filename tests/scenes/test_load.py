@@ -1,13 +1,11 @@
 """Scenes from names, files and data; files that can't be read; the schema for editors."""
 
-import json
 from pathlib import Path
 
 import pytest
 import yaml
 
 from flowrep.baselines import Planner
-from flowrep.config import CONF_DIR
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.load import json_schema
 
@@ -28,23 +26,13 @@ def test_name_file_mapping_and_scene_give_the_same_scene(data):
     assert scene.time_limit_s == pytest.approx(12.5)
 
 
-def test_each_path_is_drawn_and_the_others_arm_is_closed(make_street):
-    env = make_street(CROSSROADS, sensors=("semantic",))
+def test_each_path_is_drawn_as_often(make_street):
+    env = make_street(CROSSROADS, sensors=())
     drawn = []
     for _ in range(40):
         _, info = env.reset(seed=0 if not drawn else None)
         drawn.append(info["path"])
     assert 10 <= drawn.count("left") <= 30
-    # Seen from the fork's mouth, the closed arm shows a house and the open one does not.
-    house, halves = 3, {}
-    for path in ("left", "right"):
-        env.reset(options={"path": path, "episode_seed": 1})
-        for _ in range(30):
-            observation = env.step(0)[0]
-        middle = observation["semantic"][0, 10:20]
-        halves[path] = [(middle[:, part] == house).mean() for part in (slice(30), slice(30, 60))]
-    assert halves["left"][0] < 0.05 < halves["left"][1]
-    assert halves["right"][1] < 0.05 < halves["right"][0]
 
 
 def test_a_closure_is_hit_where_it_stands(make_street):
@@ -108,14 +96,3 @@ def test_merge_keys_and_anchors_of_yaml_may_be_used(tmp_path, data):
 
 def test_the_schema_for_editors_is_that_of_the_code():
     assert SCHEMA.read_text(encoding="utf-8") == json_schema(), "make schema"
-
-
-def test_the_schema_for_editors_knows_every_key_of_our_scenes():
-    schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
-    for file in (CONF_DIR / "scene").glob("*.yaml"):
-        data = yaml.safe_load(file.read_text(encoding="utf-8"))
-        assert set(data) <= set(schema["properties"])
-        assert set(schema["required"]) <= set(data)
-    assert schema["additionalProperties"] is False
-    camera = schema["$defs"]["CameraConfig"]["properties"]
-    assert (camera["fov_deg"]["minimum"], camera["fov_deg"]["maximum"]) == (1.0, 179.0)

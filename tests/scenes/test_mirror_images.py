@@ -5,8 +5,6 @@ are if a reflection takes its ground, paths (with their closed exits), walks and
 themselves. House fronts differ from side to side everywhere and are left out: nobody reaches them.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import shapely
@@ -15,7 +13,6 @@ from shapely.affinity import affine_transform
 
 from flowrep.scenes import load_scene
 from flowrep.scenes.layout import Layout
-from flowrep.scenes.scene import Walk
 
 APART_M = 0.01  # what lies closer is at the same place
 
@@ -90,17 +87,3 @@ def differences(layout):
 )
 def test_what_differs_between_a_scene_and_its_mirror_image(scene, different):
     assert differences(Layout(load_scene(scene))) == different
-
-
-@pytest.mark.parametrize(("sides", "different"), [((1,), {"walks"}), ((1, -1), set())])
-def test_a_walk_beside_the_road_needs_one_on_the_other_side(sides, different):
-    scene = load_scene("straight_road")
-    groups = [
-        replace(
-            scene.pedestrian_groups[0],
-            name=f"side {side}",
-            walk=Walk(kind="along", road="main", from_m=50.0, to_m=60.0, offset_m=1.5 * side),
-        )
-        for side in sides
-    ]
-    assert differences(Layout(replace(scene, pedestrian_groups=tuple(groups)))) == different

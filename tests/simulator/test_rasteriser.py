@@ -157,13 +157,6 @@ def test_many_views_are_each_the_one_alone():
             np.testing.assert_array_equal(one[0], all_of_them[n])
 
 
-def test_a_world_without_bodies_is_sky():
-    depth, semantic, instance = see()
-    assert np.isinf(depth).all()
-    assert not semantic.any()
-    assert not instance.any()
-
-
 def test_chunks_hold_every_triangle_once():
     rng = np.random.default_rng(0)
     vertices, corners = rng.normal(size=(300, 3)), rng.integers(300, size=(200, 3))
