@@ -29,7 +29,6 @@ from flowrep.scenes.scene import (
     Scene,
     VehicleState,
     Walk,
-    Zone,
     footprint_corners,
 )
 
@@ -185,7 +184,9 @@ class Layout:
         self.sidewalks = self._paved.difference(self.drivable) if has_sidewalks else Polygon()
         self.terrain = self._terrain(scene.terrain_m)
         self.crosswalks = tuple(self._crosswalk_area(crosswalk) for crosswalk in scene.crosswalks)
-        self.zones = {zone.name: self._zone_polygon(zone) for zone in scene.zones}
+        self.zones = {
+            zone.name: self._road_between(zone.road, zone.from_m, zone.to_m) for zone in scene.zones
+        }
         self.closures = {closure.name: self._closure_box(closure) for closure in scene.closures}
         self.buildings = self._buildings()
         single = [
@@ -243,9 +244,8 @@ class Layout:
         ends = [self.pose_at(walk.road, walk.at_m, side * reach) for side in (-1, 1)]
         return np.array([end[:2] for end in ends])
 
-    def _zone_polygon(self, zone: Zone) -> Polygon:
-        part = stretch(self.lines[zone.road], zone.from_m, zone.to_m)
-        return ribbon(part, self._roads[zone.road].width_m / 2)
+    def _road_between(self, road: str, from_m: float, to_m: float) -> Polygon:
+        return ribbon(stretch(self.lines[road], from_m, to_m), self.width_m(road) / 2)
 
     def _closure_box(self, closure: Closure) -> Box:
         road = self._roads[closure.road]
@@ -261,9 +261,8 @@ class Layout:
 
     def _crosswalk_area(self, crosswalk: Crosswalk) -> CrosswalkArea:
         first, last = (crosswalk.at_m + side * crosswalk.depth_m / 2 for side in (-1, 1))
-        part = stretch(self.lines[crosswalk.road], first, last)
         _, _, heading = self.pose_at(crosswalk.road, crosswalk.at_m)
-        return CrosswalkArea(ribbon(part, self._roads[crosswalk.road].width_m / 2), heading)
+        return CrosswalkArea(self._road_between(crosswalk.road, first, last), heading)
 
     def _buildings(self) -> tuple[Box, ...]:
         rng = np.random.default_rng(self.scene.layout_seed)

@@ -104,7 +104,7 @@ def totals(name, change=lambda frame: frame):
     env = street(name, WALKING)
     K = torch.from_numpy(env.unwrapped.K)
     counts, before = torch.zeros(2, 3), None
-    for frame in frames(env, ACTIONS[:12]):
+    for frame in frames(env, ACTIONS):
         if before is not None:
             counts += torch.tensor(agreement(before, change(frame), K))
         before = frame

@@ -63,7 +63,7 @@ def test_streets_that_share_a_client_keep_their_exits_and_people_apart():
 
 def test_a_forgotten_street_gives_its_client_back(own_scene):
     before = clients()
-    env = StreetEnv(own_scene, sensors=())
+    env = StreetEnv(own_scene)
     env.reset(seed=0)
     alive = weakref.ref(env)
     del env
