@@ -45,7 +45,7 @@ def pose(index: int) -> np.ndarray:
     return rigid((0.4 + 0.01 * index, -0.7 + 0.02 * index, 1.1 - 0.015 * index), place).numpy()
 
 
-def make_moments(*, unit_m: float, K=K, backwards=False, body=True, poses=pose) -> list[Moment]:
+def make_moments(*, unit_m: float, K=K, backwards=False, body=True) -> list[Moment]:
     """Returns frames whose depth is a whole number of units, as a 16-bit file keeps it."""
     random = np.random.default_rng(3)
     moments = []
@@ -54,9 +54,9 @@ def make_moments(*, unit_m: float, K=K, backwards=False, body=True, poses=pose) 
         depth = (np.rint(depth / unit_m) * unit_m).astype(np.float32)
         rgb = random.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
         other = index + 1 if backwards else index - 1
-        motion = relative_motion(*map(torch.from_numpy, (poses(other), poses(index))))
+        motion = relative_motion(*map(torch.from_numpy, (pose(other), pose(index))))
         raw, obj = flow_of(depth, K, motion, body)
-        moments.append(Moment(rgb, depth, poses(index), raw, obj))
+        moments.append(Moment(rgb, depth, pose(index), raw, obj))
     return moments
 
 
@@ -107,19 +107,13 @@ def write_flo(path: Path, flow: np.ndarray) -> None:
     assert cv2.writeOpticalFlow(str(path), np.ascontiguousarray(flow.transpose(1, 2, 0)))
 
 
-def camera_json(K=K, size=(HEIGHT, WIDTH)) -> dict:
-    height, width = size
-    return {
-        "width": width, "height": height, "fx": K[0, 0], "fy": K[1, 1],
-        "cx": K[0, 2], "cy": K[1, 2], "first_pixel_centre": 0.5,
-    }  # fmt: skip
+def camera_json() -> dict:
+    size = {"width": WIDTH, "height": HEIGHT, "first_pixel_centre": 0.5}
+    return size | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
 
 
-# Each writer takes moments of any size in the order of its files, or makes its own.
-
-
-def write_frames(folder: Path, moments=None, K=K) -> list[Moment]:
-    moments = moments or make_moments(unit_m=0.001)
+def write_frames(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.001)
     for i, moment in enumerate(moments):
         png(folder / f"rgb/{i:04d}.png", moment.rgb)
         png(folder / f"depth/{i:04d}.png", stored(moment.depth, 0.001))
@@ -127,13 +121,12 @@ def write_frames(folder: Path, moments=None, K=K) -> list[Moment]:
             write_flo(folder / f"flow/{i:04d}.flo", moment.raw)
     text(folder / "poses.txt", [numbers(m.world_from_cam) for m in moments])
     text(folder / "timestamps.txt", [f"{0.1 * i}" for i in range(len(moments))])
-    camera = camera_json(K, moments[0].depth.shape)
-    text(folder / "intrinsics.json", [json.dumps(camera)])
+    text(folder / "intrinsics.json", [json.dumps(camera_json())])
     return moments
 
 
-def write_tum(folder: Path, moments=None) -> list[Moment]:
-    moments = moments or make_moments(unit_m=1 / 5000)
+def write_tum(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=1 / 5000)
     index: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for i, moment in enumerate(moments):
         rgb_s, depth_s, pose_s = 100 + 0.1 * i, 100 + 0.1 * i + 0.012, 100 + 0.1 * i - 0.004
@@ -147,16 +140,11 @@ def write_tum(folder: Path, moments=None) -> list[Moment]:
     return moments
 
 
-TUM_INTRINSICS = (31.0, 27.0, 18.0, 12.5)  # K, with pixel (0, 0)'s centre at (0, 0)
+OPENCV_INTRINSICS = (31.0, 27.0, 18.0, 12.5)  # K, with pixel (0, 0)'s centre at (0, 0)
 
 
-def from_first_pixel(K) -> tuple[float, ...]:
-    """Returns fx, fy, cx, cy with pixel (0, 0)'s centre at (0, 0)."""
-    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2] - 0.5), float(K[1, 2] - 0.5)
-
-
-def write_sevenscenes(folder: Path, moments=None) -> list[Moment]:
-    moments = moments or make_moments(unit_m=0.001)
+def write_sevenscenes(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.001)
     for i, moment in enumerate(moments):
         png(folder / f"frame-{i:06d}.color.png", moment.rgb)
         png(folder / f"frame-{i:06d}.depth.png", stored(moment.depth, 0.001))
@@ -164,8 +152,8 @@ def write_sevenscenes(folder: Path, moments=None) -> list[Moment]:
     return moments
 
 
-def write_vkitti2(folder: Path, moments=None, K=K) -> list[Moment]:
-    moments = moments or make_moments(unit_m=0.01)
+def write_vkitti2(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.01)
     extrinsics = ["frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"]
     intrinsics = ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
     for i, moment in enumerate(moments):
@@ -180,7 +168,7 @@ def write_vkitti2(folder: Path, moments=None, K=K) -> list[Moment]:
             other = cam_from_world.copy()
             other[0, 3] += shift
             extrinsics.append(f"{i} {camera} {numbers(other)}")
-            intrinsics.append(f"{i} {camera} {numbers(from_first_pixel(K))}")
+            intrinsics.append(f"{i} {camera} {numbers(OPENCV_INTRINSICS)}")
     text(folder / "extrinsic.txt", extrinsics)
     text(folder / "intrinsic.txt", intrinsics)
     return moments
@@ -193,8 +181,8 @@ def vkitti_flow(flow: np.ndarray) -> np.ndarray:
     return np.stack([red, green, np.full_like(red, 65535)], -1).astype(np.uint16)
 
 
-def write_sintel(folder: Path, moments=None, K=K) -> list[Moment]:
-    moments = moments or make_moments(unit_m=1e-6, backwards=True)
+def write_sintel(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=1e-6, backwards=True)
     for i, moment in enumerate(moments):
         stem = f"cave/frame_{i + 1:04d}"
         png(folder / f"final/{stem}.png", moment.rgb)
@@ -234,8 +222,8 @@ def write_tartanair(folder: Path) -> list[Moment]:
     return moments
 
 
-def write_zed(folder: Path, moments=None, K=K) -> list[Moment]:
-    moments = moments or make_moments(unit_m=0.001)
+def write_zed(folder: Path) -> list[Moment]:
+    moments = make_moments(unit_m=0.001)
     folder.mkdir(parents=True, exist_ok=True)
     for i, moment in enumerate(moments):
         png(folder / f"left{i:06d}.png", moment.rgb)
@@ -244,8 +232,7 @@ def write_zed(folder: Path, moments=None, K=K) -> list[Moment]:
         else:
             png(folder / f"depth{i:06d}.png", stored(moment.depth, 0.001))
     text(folder / "poses.txt", [quaternion_line(m.world_from_cam) for m in moments])
-    camera = camera_json(K, moments[0].depth.shape)
-    text(folder / "intrinsics.json", [json.dumps(camera)])
+    text(folder / "intrinsics.json", [json.dumps(camera_json())])
     return moments
 
 

@@ -23,7 +23,7 @@ from flowrep.sequences import (
     recorded_flow,
 )
 from tests.sequences import synthetic
-from tests.sequences.synthetic import HEIGHT, TUM_INTRINSICS, WIDTH
+from tests.sequences.synthetic import HEIGHT, OPENCV_INTRINSICS, WIDTH
 
 
 def open_kitti(folder):
@@ -39,7 +39,7 @@ def open_sevenscenes(folder):
 # backwards in it, and how far flow may be from the truth: half a step of the format's own.
 FORMATS = {
     "frames": (synthetic.write_frames, Frames, True, False, 0),
-    "tum": (synthetic.write_tum, lambda f: Tum(f, intrinsics=TUM_INTRINSICS), False, False, 0),
+    "tum": (synthetic.write_tum, lambda f: Tum(f, intrinsics=OPENCV_INTRINSICS), False, False, 0),
     "sevenscenes": (synthetic.write_sevenscenes, open_sevenscenes, False, False, 0),
     "vkitti2": (synthetic.write_vkitti2, VKitti2, True, False, (WIDTH - 1) / 65535),
     "sintel": (
@@ -96,7 +96,7 @@ def test_intrinsics_are_brought_to_pixel_centres_at_halves(tmp_path):
     expected = [[31.0, 0.0, 18.5], [0.0, 27.0, 13.0], [0.0, 0.0, 1.0]]
     assert VKitti2(tmp_path / "v")[0].K.tolist() == expected
     assert Sintel(tmp_path / "s", scene="cave")[0].K.tolist() == expected
-    assert Tum(tmp_path / "t", intrinsics=TUM_INTRINSICS)[0].K.tolist() == expected
+    assert Tum(tmp_path / "t", intrinsics=OPENCV_INTRINSICS)[0].K.tolist() == expected
     # A right angle across the width of TartanAir's.
     assert TartanAir(tmp_path / "a")[0].K.tolist() == [[20, 0, 20], [0, 20, 12], [0, 0, 1]]
 
