@@ -60,9 +60,12 @@ class Kitti(Recording):
             raise SequenceError(raw_data, "is of no use without format.mapping=train_mapping.txt")
         self._oxts = {}  # the folder of GPS and IMU packets and the frame number, by pair
         for pair, line in enumerate(Path(mapping).read_text("utf-8").splitlines()):
-            if line.strip():  # a blank line is a pair without a raw recording
-                date, drive, frame = line.split()
-                self._oxts[pair] = Path(raw_data) / date / drive / "oxts" / "data", int(frame)
+            if not line.strip():  # a pair without a raw recording
+                continue
+            if len(words := line.split()) != 3 or not words[2].isdecimal():
+                raise SequenceError(mapping, f"{line[:60]!r} is not a date, recording and frame")
+            date, drive, frame = words
+            self._oxts[pair] = Path(raw_data) / date / drive / "oxts" / "data", int(frame)
         posed = [name for name in self._pairs if int(name) in self._oxts]
         if not posed:
             raise SequenceError(mapping, f"names no raw recording of the pictures in {folder}")
