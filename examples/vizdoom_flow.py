@@ -52,13 +52,8 @@ class Doom(gym.Env):
         self.game.set_screen_format(vizdoom.ScreenFormat.CRCGCB)  # channels first
         for enable in ("depth_buffer", "labels_buffer"):
             getattr(self.game, f"set_{enable}_enabled")(True)
-        for hide in (
-            "hud",
-            "weapon",
-            "crosshair",
-            "particles",
-            "decals",
-        ):  # they have no place in depth
+        # These have no place in depth.
+        for hide in ("hud", "weapon", "crosshair", "particles", "decals"):
             getattr(self.game, f"set_render_{hide}")(False)
         variables = [getattr(vizdoom.GameVariable, name) for name in CAMERA]
         self.game.set_available_game_variables(variables)

@@ -117,27 +117,25 @@ def check_flow(
     if (known := frames.get(f"{raw_key}_valid", None)) is not None:
         raw = torch.where(known, raw, torch.nan)
 
-    def agreement(flow: Tensor, z: Tensor, K: Tensor, motions: Tensor) -> tuple[float, float]:
-        return _agreement(flow, z, ids, _depth_before(z, ids, K, motions), tolerance)
-
-    share, hidden = agreement(raw, depth, K, motions)
+    before = _depth_before(depth, ids, K, motions)
+    share, hidden = _agreement(raw, depth, ids, before, tolerance)
     ego = geometry.ego_flow(depth, K, motions[..., 0, :, :]).flow
     flows = {"no flow": torch.zeros_like(raw), "-raw": -raw, "ego flow alone": ego}
     if not (ids > 0).any():
         del flows["ego flow alone"]  # the same in a static world
+    suspects = {}
+    for name, change in _SUSPECTS.items():
+        z, k, m = change(depth, K, motions)
+        flow = geometry.rigid_flow(z, ids, k, m).flow
+        suspects[name], _ = _agreement(flow, z, ids, _depth_before(z, ids, k, m), tolerance)
     moving = raw[..., 1:, :, :, :].norm(dim=-3)
     moving = moving[moving.isfinite() & depth[..., 1:, 0, :, :].isfinite()]
     return FlowCheck(
         share,
         hidden,
         moving.median().item() if len(moving) else 0.0,
-        {name: agreement(flow, depth, K, motions)[0] for name, flow in flows.items()},
-        {
-            name: agreement(geometry.rigid_flow(z, ids, k, m).flow, z, k, m)[0]
-            for name, (z, k, m) in (
-                (n, change(depth, K, motions)) for n, change in _SUSPECTS.items()
-            )
-        },
+        {n: _agreement(flow, depth, ids, before, tolerance)[0] for n, flow in flows.items()},
+        suspects,
     )
 
 

@@ -14,7 +14,7 @@ def frames(tmp_path_factory):
         patch.chdir(tmp_path_factory.mktemp("doom"))  # ViZDoom writes a file where it runs
         env = make_env()
         env.set_seed(2)
-        frames = env.rollout(30)["next"]
+        frames = env.rollout(14)["next"]
         env.close()
     return frames
 

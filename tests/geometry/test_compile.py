@@ -55,7 +55,7 @@ def test_camera_is_one_graph():
 
 
 @pytest.mark.slow_after_first
-@pytest.mark.parametrize("dt", [1.0, 0.25, torch.tensor([0.5, 2.0])])
+@pytest.mark.parametrize("dt", [0.25, torch.tensor([0.5, 2.0])])
 def test_flow_is_one_graph(dt):
     compiled = torch.compile(everything, fullgraph=True, backend="eager")
     assert_same(compiled(*inputs(2), dt), everything(*inputs(2), dt))

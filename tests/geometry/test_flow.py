@@ -115,21 +115,6 @@ def test_flow_is_per_step_unless_told_seconds():
     torch.testing.assert_close(per_second, 8 * per_step, rtol=1e-14, atol=0)
 
 
-def test_each_frame_may_have_its_own_dt():
-    depth = depth_map(2)
-    flow, _ = ego_flow(depth, K, MOTION, dt=torch.tensor([0.5, 4.0]))
-    torch.testing.assert_close(flow[0], 2 * ego_flow(depth[0], K, MOTION).flow)
-    torch.testing.assert_close(flow[1], ego_flow(depth[1], K, MOTION).flow / 4)
-
-
-def test_one_depth_under_many_motions():
-    motions = torch.stack([MOTION, torch.eye(4, dtype=torch.float64)])
-    flow, valid = ego_flow(depth_map(), K, motions)
-    assert flow.shape == (2, 2, HEIGHT, WIDTH)
-    assert valid.shape == (2, 1, HEIGHT, WIDTH)
-    assert torch.equal(flow[0], ego_flow(depth_map(), K, MOTION).flow)
-
-
 def test_inputs_stay_as_they_were():
     given = [depth_map(), K.clone(), MOTION.clone()]
     given[0][..., 0, 0] = NAN
