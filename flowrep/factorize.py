@@ -14,7 +14,7 @@ import cv2
 from hydra.utils import get_class
 
 from flowrep.config import UsageError
-from flowrep.config.cli import exit_with, run_command
+from flowrep.config.cli import run_command
 from flowrep.config.schema import FactorizeConfig, check_options
 from flowrep.sequences import (
     EstimatedFlowSource,
@@ -29,18 +29,12 @@ from flowrep.sequences.factorization import FlowSource, MotionSource
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output, OutputOptions
 
-MISTAKES = (SequenceError, ValueError, ImportError, OSError)
-
 
 def run(config: FactorizeConfig) -> None:
     """Writes raw, ego and object flow of a recording."""
     # OpenCV's messages about broken files would clutter the one-line error.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        code = factorize_recording(config)
-    except MISTAKES as error:
-        exit_with(" ".join(str(error).split()))
-    sys.exit(code)
+    sys.exit(factorize_recording(config))
 
 
 def factorize_recording(config: FactorizeConfig) -> int:
@@ -64,10 +58,9 @@ def factorize_recording(config: FactorizeConfig) -> int:
         video_fps=config.video_fps if config.video else None,
         rerun=config.rerun,
     )
-    output = Output(config.output, options, config.plain())
     start, stop, stride = config.start, config.stop, config.stride
-    job = Job(stream, flow_source, motion_source, output, start=start, stop=stop, stride=stride)
-    with closing(output):
+    with closing(Output(config.output, options, config.plain())) as output:
+        job = Job(stream, flow_source, motion_source, output, start=start, stop=stop, stride=stride)
         diagnosis = job.examine()
         if diagnosis is not None:
             print(f"{'warning: ' if diagnosis.suspects else ''}{diagnosis.words}")

@@ -9,20 +9,18 @@ SLURM, Ray) call `job` in their workers, which therefore import no torch here.
 from __future__ import annotations
 
 import ctypes
-import json
 import multiprocessing
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
 import time
-import traceback
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
@@ -30,17 +28,15 @@ from omegaconf import DictConfig
 
 from flowrep.config import UsageError
 from flowrep.config.cli import (
-    EXIT_USAGE,
     OF_THE_MACHINE,
     exit_with,
     override,
     plain_config,
     register_resolvers,
     run_hydra,
-    shell_line,
     value_of,
 )
-from flowrep.config.schema import TrainConfig, validated
+from flowrep.config.schema import TrainConfig, validated, validated_run
 from flowrep.progress import StopRequest
 from flowrep.tables import read_rows
 
@@ -81,19 +77,24 @@ def run_sweep() -> NoReturn:
 
     The exit code is 0 if all runs have finished, that of a signal that stopped it, else 1.
     """
-    typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
-    keys = {text.partition("=")[0] for text in typed}
+    keys = {text.partition("=")[0] for text in sys.argv[1:]}
     if "resume" in keys:
         exit_with(
             "resume= continues one run; continue a sweep with its own command and "
             "hydra.sweep.dir=<its folder>"
         )
-    folder = _folder(sys.argv[1:])
+    folder = Path(f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep").absolute()
+    typed = []
+    for text in sys.argv[1:]:
+        if text.startswith("hydra.sweep.dir="):
+            folder = Path(value_of(text)).absolute()
+        else:
+            typed.append(text)
     (folder / STOP).unlink(missing_ok=True)
     given = override("hydra.sweep.dir", str(folder))
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
     sys.argv[1:] = [*typed, given, *(o for o in needed if o.partition("=")[0] not in keys)]
-    begun, failure = time.time(), 0
+    begun, is_whole = time.time(), True
 
     def mark() -> None:
         if folder.is_dir():
@@ -102,27 +103,17 @@ def run_sweep() -> NoReturn:
     with StopRequest(then=mark) as stop:
         try:
             run_hydra("train", job, TrainConfig)
-        except SystemExit as end:
+        except SystemExit:
             if not _states(folder, since=begun):
                 raise  # a mistake on the command line, which has been printed
-            failure = end.code if isinstance(end.code, int) and end.code != EXIT_USAGE else 1
-        except Exception:  # of the launcher or the sweeper
-            traceback.print_exc()
-            failure = 1
+            is_whole = False
     states = _states(folder)
-    is_whole = not (stop or failure) and all(s.startswith(FINISHED) for s in states.values())
     _sum_up(folder, states)
-    if not is_whole:
-        again = shell_line("python", "-m", "flowrep.train", *typed, given)
+    if stop or not is_whole or not all(state.startswith(FINISHED) for state in states.values()):
+        again = shlex.join(["python", "-m", "flowrep.train", *typed, given])
         print(f"Continue the remaining runs with\n  {again}")
-    sys.exit(stop.exit_code if stop else failure or int(not is_whole))
-
-
-def _folder(arguments: list[str]) -> Path:
-    """Returns the sweep's folder: the one that is given, or a new one."""
-    given = [text for text in arguments if text.startswith("hydra.sweep.dir=")]
-    name = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
-    return Path(value_of(given[-1]) if given else name).absolute()
+        sys.exit(stop.exit_code or 1)
+    sys.exit(0)
 
 
 def _states(sweep: Path, since: float = 0.0) -> dict[str, str]:
@@ -148,7 +139,7 @@ def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
         if state.startswith(FAILED):
             print(f"    log: {folder / name / LOG}")
     if finished:
-        print(f"Compare them with\n  {shell_line('python', '-m', 'flowrep.report', str(folder))}")
+        print(f"Compare them with\n  {shlex.join(['python', '-m', 'flowrep.report', str(folder)])}")
 
 
 def job(config: DictConfig) -> float:
@@ -171,12 +162,11 @@ def job(config: DictConfig) -> float:
         return (sweep / STOP).exists() or (is_worker and os.getppid() != PARENT)
 
     try:
-        state = attempted(
-            folder, plain_config(config), _line(folder, config, is_worker), should_stop
-        )
+        line = _line(folder, config, is_worker)
+        asked = validated(TrainConfig, plain_config(config))
+        state = attempted(folder, asked, line, should_stop)
     except Exception as error:  # the other runs go on
-        state = f"{FAILED}: error: {' '.join(str(error).split())}"
-        _say(folder, state)
+        state = _say(folder, f"{FAILED}: error: {' '.join(str(error).split())}")
     print(f"{folder.name}: {state}", flush=True)
     if is_worker and os.getppid() != PARENT:
         os._exit(1)  # nobody waits for its result
@@ -196,7 +186,7 @@ def _line(folder: Path, config: DictConfig, is_worker: bool) -> list[str]:
         machine = [*(text for text in machine if "device" in text), "num_workers=0"]
     if (folder / "config.yaml").is_file():
         return [override("resume", str(folder)), *machine]
-    line = [f"hydra.run.dir={override('', str(folder))[1:]}", *typed, *machine]
+    line = [override("hydra.run.dir", str(folder)), *typed, *machine]
     line += [text for text in hydra.overrides.hydra if text.startswith("hydra.searchpath=")]
     for source in hydra.runtime.config_sources:
         if source.provider == "command-line":
@@ -204,64 +194,56 @@ def _line(folder: Path, config: DictConfig, is_worker: bool) -> list[str]:
     return [*line, "--config-name", str(hydra.job.config_name)]
 
 
-def attempted(folder: Path, asked: dict[str, Any], line: list[str], should_stop: Any) -> str:
+def attempted(
+    folder: Path, config: TrainConfig, line: list[str], should_stop: Callable[[], bool]
+) -> str:
     """Returns how a run stands after what remains of it was done: "failed: error: no space".
 
-    Args:
-        folder: of the run.
-        asked: its config, as the sweep composes it.
-        line: the arguments of `flowrep.train`.
-        should_stop: polled; once it returns true, the run saves and ends.
+    `line` are the arguments of `flowrep.train`. Once `should_stop` is true, the run saves and ends.
 
     Raises:
-        UsageError: the config is invalid, or the folder holds a run with another one.
+        UsageError: the folder holds a run with another config.
     """
-    own = asked.keys() - {*TrainConfig.key_names()}
-    config = validated(TrainConfig, asked, own)
-    folder.mkdir(parents=True, exist_ok=True)
-    _check_is_same(folder, config.plain())
+    _check_is_same(folder, config)
+    code = begin = 0
+    if not is_finished(folder, config):
+        if should_stop():
+            return STOPPED
+        print(f"{folder.name}: running", flush=True)
+        _say(folder, f"{datetime.now():%Y-%m-%d %H:%M:%S}")
+        begin = (folder / LOG).stat().st_size
+        code = _exit_code(line, folder / LOG, should_stop)
     if is_finished(folder, config):
         return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
-    if should_stop():
-        return STOPPED
-    print(f"{folder.name}: running", flush=True)
-    _say(folder, f"{datetime.now():%Y-%m-%d %H:%M:%S}")
-    begin = (folder / LOG).stat().st_size
-    with (folder / LOG).open("ab", buffering=0) as log, _process(line, log) as run:
-        while run.poll() is None:
-            if should_stop():
-                run.terminate()
-                break
-            time.sleep(POLL_S)
-        code = run.wait()
-    if is_finished(folder, config):
-        return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
-    if code in (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGTERM, -signal.SIGINT):
+    if code in (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM):
         return _say(folder, STOPPED)
     return _say(folder, f"{FAILED}: {_reason(folder / LOG, begin, code)}")
 
 
-@contextmanager
-def _process(line: list[str], log: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """Runs `flowrep.train`; it saves and ends when this process ends, however it does."""
-
-    def prepare() -> None:
-        for number in (signal.SIGUSR1, signal.SIGUSR2):  # SLURM's, meant for its launcher
-            signal.signal(number, signal.SIG_IGN)
-        if sys.platform == "linux":
-            ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
-
+def _exit_code(line: list[str], log: Path, should_stop: Callable[[], bool]) -> int:
+    """Runs `flowrep.train` to its end and returns its exit code, minus the signal that ended it."""
     environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
-    run = subprocess.Popen(
-        [*TRAIN, *line], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment,
-        preexec_fn=prepare,
-    )  # fmt: skip
-    try:
-        yield run
-    finally:
-        if run.poll() is None:
-            run.terminate()
-        run.wait()
+    with log.open("ab", buffering=0) as file:
+        run = subprocess.Popen(
+            [*TRAIN, *line], stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=environment,
+            preexec_fn=_end_with_parent,
+        )  # fmt: skip
+        try:
+            while run.poll() is None and not should_stop():
+                time.sleep(POLL_S)
+        finally:  # a launcher may end its worker by an exception
+            if run.poll() is None:
+                run.terminate()
+            run.wait()
+    return run.returncode
+
+
+def _end_with_parent() -> None:
+    """Has a process save and end when its parent ends, however it does, and at no other signal."""
+    for number in (signal.SIGUSR1, signal.SIGUSR2):  # SLURM's, meant for its launcher
+        signal.signal(number, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def _say(folder: Path, state: str) -> str:
@@ -282,17 +264,17 @@ def _reason(log: Path, begin: int, code: int) -> str:
     return (errors or [x for x in lines if x] or [f"exit code {code}"])[-1]
 
 
-def _check_is_same(folder: Path, asked: Mapping[str, Any]) -> None:
+def _check_is_same(folder: Path, config: TrainConfig) -> None:
     """Checks that a folder holds no other run than the one that a sweep asks for."""
-    if not (folder / "config.yaml").is_file():
+    path = folder / "config.yaml"
+    if not path.is_file():
         return
-    stored = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-    there, here = (json.loads(json.dumps(each, default=str)) for each in (stored or {}, asked))
-    for key in here.keys() - {*OF_THE_MACHINE, "resume"}:
-        if there.get(key) != here[key]:
+    stored = validated_run(yaml.safe_load(path.read_text(encoding="utf-8")), str(path)).plain()
+    for key, value in config.plain().items():
+        if key not in (*OF_THE_MACHINE, "resume") and stored.get(key) != value:
             raise UsageError(
-                f"'{folder}' holds a run with {key}={there.get(key)}, the sweep asks for "
-                f"{here[key]}: give the sweep another folder with hydra.sweep.dir=, or move it away"
+                f"'{folder}' holds a run with {key}={stored.get(key)}, the sweep asks for {value}: "
+                "give the sweep another folder with hydra.sweep.dir=, or move it away"
             )
 
 

@@ -54,16 +54,11 @@ def run(config: TrainConfig) -> float:
 def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainConfig:
     """Returns the config of the run to resume.
 
-    What belongs to the machine may be given anew, and a larger `total_frames`, which the folder
+    What belongs to the machine may be typed anew, and a larger `total_frames`, which the folder
     then keeps.
 
-    Args:
-        config: the composed config.
-        folder: the run's folder.
-        typed: the overrides.
-
     Raises:
-        UsageError: others were typed, or the run's config is damaged.
+        UsageError: other keys were typed, or the run's config is damaged.
     """
     own = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
     given = [text.partition("=")[0] for text in typed if not text.startswith("resume=")]
@@ -73,16 +68,16 @@ def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainCo
             f"resume= continues a run with its own config, so '{others[0]}=' would be ignored: "
             f"leave it out ({', '.join(allowed)} may be given)"
         )
-    if config.total_frames < own.total_frames and "total_frames" in given:
+    frames = config.total_frames if "total_frames" in given else own.total_frames
+    if frames < own.total_frames:
         raise UsageError(
-            f"total_frames={config.total_frames} is less than the run's {own.total_frames}: a run "
-            "can be made longer, not shorter"
+            f"total_frames={frames} is less than the run's {own.total_frames}: a run can be made "
+            "longer, not shorter"
         )
-    changed = own.plain() | {key: getattr(config, key) for key in given if key != "resume"}
-    longer = validated_run(changed, f"{folder.path}/config.yaml")
-    if longer.total_frames > own.total_frames:
-        folder.write_config(own.plain() | {"total_frames": longer.total_frames})
-    return longer.model_copy(update={"resume": str(folder.path)})
+    if frames > own.total_frames:
+        folder.write_config(own.plain() | {"total_frames": frames})
+    changes = {key: getattr(config, key) for key in given}
+    return own.model_copy(update=changes | {"resume": str(folder.path)})
 
 
 def announce(config: TrainConfig, preset: str) -> None:

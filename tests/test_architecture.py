@@ -119,9 +119,8 @@ def test_no_modules_import_each_other():
     TopologicalSorter(graph).prepare()  # its CycleError names them
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_modules_have_a_noun_for_a_name(path):
-    assert path.stem not in {"utils", "common", "helpers", "misc"}
+def test_modules_have_a_noun_for_a_name():
+    assert not {path.stem for path in MODULES} & {"utils", "common", "helpers", "misc"}
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ pytest.importorskip("pybullet", reason="agents are evaluated in the simulated st
 
 from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
-from flowrep.config.schema import EvaluateConfig, TrainConfig, validated
+from flowrep.config.schema import EvaluateConfig, validated
 from flowrep.envs import WorkerError
 from flowrep.evaluate import run as evaluate
 from flowrep.evaluate import targets_of
@@ -25,7 +25,7 @@ from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
 from flowrep.export import export
 from flowrep.tables import TableError
-from tests.test_configs import composed
+from tests.config.composing import composed, plain
 
 pytestmark = pytest.mark.slow
 
@@ -36,7 +36,7 @@ SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=24"]
 
 def saved(path, *overrides):
     """A run that saved its checkpoint before the first frame; its episodes are short."""
-    config = validated(TrainConfig, composed("debug=smoke", "device=cpu", SHORT, *overrides))
+    config = composed("debug=smoke", "device=cpu", SHORT, *overrides)
     folder = RunFolder(path)
     folder.write_config(config.plain())
     runner = Runner(config, folder)
@@ -48,7 +48,7 @@ def saved(path, *overrides):
 
 def asked(*overrides):
     quick = ["episodes=2", "baselines=[]", *QUICK]
-    return validated(EvaluateConfig, composed(*quick, *overrides, name="evaluate"))
+    return validated(EvaluateConfig, plain("evaluate", *quick, *overrides))
 
 
 def rows_of(folder):
@@ -135,7 +135,7 @@ def straight_on(tensordict):
 def some(tmp_path, monkeypatch):
     """Makes runs, and the config that evaluates them."""
     tiny = ["representations=[obj]", "scene.camera.height_px=12", "scene.camera.width_px=20", SHORT]
-    config = validated(TrainConfig, composed(*tiny, "device=cpu", "num_envs=2", "num_workers=0"))
+    config = composed(*tiny, "device=cpu", "num_envs=2", "num_workers=0")
 
     def load(folder, *, scene=None, **machine):
         if not folder.path.name.startswith("good"):

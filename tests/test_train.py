@@ -1,6 +1,5 @@
 """The commands as a person runs them: in an empty folder, from start to table, or interrupted."""
 
-import csv
 import os
 import signal
 import subprocess
@@ -11,31 +10,33 @@ import pytest
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
+from flowrep.tables import read_rows
+
 pytestmark = pytest.mark.slow
 
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+def command(name, *arguments, cwd):
+    line = [sys.executable, "-m", f"flowrep.{name}", *map(str, arguments)]
+    result = subprocess.run(line, cwd=cwd, capture_output=True, text=True, env=ENVIRONMENT)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 @pytest.fixture(scope="module")
 def smoke_run(tmp_path_factory):
     """One `debug=smoke` run in a folder of its own; gives the run folder and what was printed."""
     folder = tmp_path_factory.mktemp("empty")
-    command = [sys.executable, "-m", "flowrep.train", "debug=smoke", "seed=3"]
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=ENVIRONMENT)
-    assert result.returncode == 0, result.stderr
+    printed = command("train", "debug=smoke", "seed=3", cwd=folder)
     (run,) = folder.glob("outputs/*/*_straight_road_ego+obj_s3")
-    return run, result
+    return run, printed
 
 
 def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
     run, _ = smoke_run
     assert (run / "config.yaml").read_text().startswith("seed: 3")
-    assert [row["frames"] for row in rows_of(run / "metrics.csv")] == ["64", "128", "192", "256"]
+    assert [row["frames"] for row in read_rows(run / "metrics.csv")] == ["64", "128", "192", "256"]
     assert list(run.glob("tensorboard/events.out.tfevents.*"))
     assert (run / "checkpoint" / "latest.safetensors").stat().st_size > 1e6
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
@@ -47,26 +48,17 @@ def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
 
 
 def test_a_run_is_evaluated_beside_baselines_at_every_speed(smoke_run):
-    run, result = smoke_run
-    final = [row for row in rows_of(run / "evaluation.csv") if row["frames"] == "256"]
+    run, _ = smoke_run
+    final = [row for row in read_rows(run / "evaluation.csv") if row["frames"] == "256"]
     episodes = {(row["speed"], row["policy"]) for row in final}
     policies = ("greedy", "sampled", "never_turn", "random")
     assert episodes >= {(s, p) for s in ("low", "normal", "high") for p in policies}
-    for word in (*policies, "low", "normal", "high", "out of bounds"):
-        assert word in result.stdout
 
 
-def test_a_run_says_what_it_is_where_it_runs_and_where_its_time_went(smoke_run):
-    printed = smoke_run[1].stdout
-    for word in (
-        "DiscreteSAC",
-        "[ego,obj]",
-        "straight_road",
-        "preset=paper",
-        "device: ",
-        "wall time: ",
-    ):
-        assert word in printed
+def test_a_run_says_what_it_is_where_it_runs_and_how_it_went(smoke_run):
+    what = ["DiscreteSAC", "[ego,obj]", "straight_road", "preset=paper", "device: "]
+    how = ["greedy", "never_turn", "normal", "out of bounds", "wall time: "]
+    assert [word for word in what + how if word not in smoke_run[1]] == []
 
 
 def test_a_complete_run_is_not_evaluated_twice(smoke_run):
@@ -75,30 +67,37 @@ def test_a_complete_run_is_not_evaluated_twice(smoke_run):
     before = [table.read_text() for table in tables]
     tables[1].unlink()  # a full disk, say, left out what comes after the evaluation
     (run / "learning_curve.png").unlink()
-    command = [sys.executable, "-m", "flowrep.train", f"resume={run}"]
-    result = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, cwd=run)
-    assert result.returncode == 0, result.stderr
-    assert "this run is complete" in result.stdout
+    assert "this run is complete" in command("train", f"resume={run}", cwd=run)
     assert [table.read_text() for table in tables] == before
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_evaluate_adds_rows_for_what_was_asked(smoke_run):
     run, _ = smoke_run
-    command = [
-        sys.executable, "-m", "flowrep.evaluate", f"run={run}", "speed=high", "fps=[6,12]",
-        "episodes=2", "num_envs=2", "num_workers=2", "policy=sampled", "baselines=[never_turn]",
-        "seed=77",
-    ]  # fmt: skip
-    before = rows_of(run / "evaluation.csv")
-    result = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, cwd=run)
-    assert result.returncode == 0, result.stderr
-    added = rows_of(run / "evaluation.csv")[len(before) :]
+    asked = ["speed=high", "fps=[6,12]", "episodes=2", "num_envs=2", "num_workers=2", "seed=77"]
+    asked += ["policy=sampled", "baselines=[never_turn]"]
+    before = read_rows(run / "evaluation.csv")
+    command("evaluate", f"run={run}", *asked, cwd=run)
+    added = read_rows(run / "evaluation.csv")[len(before) :]
     kinds = [(row["speed"], float(row["fps"]), row["policy"]) for row in added]
     assert sorted(set(kinds)) == [
         ("high", fps, policy) for fps in (6.0, 12.0) for policy in ("never_turn", "sampled")
     ]
     assert len(kinds) == 8
+
+
+def test_a_run_on_estimated_flow_is_trained_and_evaluated(tmp_path):
+    pytest.importorskip("cv2", reason="flow is estimated by OpenCV")
+    run = tmp_path / "run"
+    estimated = ["flow=estimated", "flow.preset=ultrafast", "motion=estimated"]
+    quick = ["total_frames=64", "evaluation.final_episodes=1", "evaluation.every_frames=0"]
+    quick += ["evaluation.speeds=[normal]", "evaluation.baselines=[]", "evaluation.video=false"]
+    command("train", "debug=smoke", *estimated, *quick, f"hydra.run.dir={run}", cwd=tmp_path)
+    assert "motion: estimated" in (run / "config.yaml").read_text()
+    asked = ["speed=high", "episodes=1", "num_envs=1", "baselines=[]", "video=1"]
+    command("evaluate", f"run={run}", *asked, cwd=tmp_path)
+    assert read_rows(run / "evaluation.csv")[-1]["speed"] == "high"
+    assert (run / "videos" / "high_12fps_2000000.mp4").stat().st_size > 1e4
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -31,7 +31,7 @@ from flowrep.view import (
     moments,
     moving_pixels,
 )
-from tests.test_configs import composed
+from tests.config.composing import plain
 
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
 NO_OP, LEFT, RIGHT = 0, 1, 2
@@ -51,7 +51,7 @@ def driven(config, is_scene_given=True):
 
 
 def asked(*overrides):
-    return validated(ViewConfig, composed(*overrides, name="view"))
+    return validated(ViewConfig, plain("view", *overrides))
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ValueType
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import env_override
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
@@ -33,47 +33,25 @@ from flowrep.config.schema import Section, validated
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output")
 """Keys whose values are folders, which may have any name."""
-CAMERAS = ("input",)
-"""Those of them that may also be a camera's number."""
 OF_THE_MACHINE = ("device", "num_workers")
 """Keys that don't define a run and may change when it is resumed."""
-_IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
-_VALUE_FOLLOWS = (
-    "-c", "-p", "-cp", "-cn", "-cd", "-i", "-sc", "--cfg", "--package", "--config-path",
-    "--config-name", "--config-dir", "--info", "--shell-completion",
-)  # fmt: skip
-"""Hydra's flags that may be followed by a value."""
+IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
 
 
 def run_command(config_name: str, command: Callable[[Any], Any], schema: type[Section]) -> None:
-    """Composes the config of `sys.argv`, checks it and runs the command.
-
-    Args:
-        config_name: a file of conf/, without its ending.
-        command: takes the config as its model.
-        schema: the model.
-    """
+    """Composes the config of `sys.argv` from conf/, and runs the command on its model."""
 
     def job(config: DictConfig) -> Any:
         try:
             return command(checked(config, schema))
-        except Exception as error:
-            if _IS_DEBUGGING or not is_a_mistake(error):
-                traceback.print_exc()
-                sys.exit(1)
-            exit_with(explained(error, schema))
+        except Exception as error:  # here, since Hydra would print a line of its own
+            end_with(error, schema)
 
     run_hydra(config_name, job, schema)
 
 
 def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[Section]) -> None:
-    """Runs a Hydra job; what Hydra refuses ends the process in an `error:` line.
-
-    Args:
-        config_name: a file of conf/, without its ending.
-        job: takes the composed config.
-        schema: the model of the config.
-    """
+    """Runs a Hydra job; what Hydra refuses ends the process in an `error:` line."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace", line_buffering=True)
@@ -87,25 +65,25 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[S
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
-        if _IS_DEBUGGING or not is_a_mistake(error):
-            raise
         if isinstance(error, OSError) and not isinstance(error, HydraException):
-            exit_with(
-                f"the output folder can't be made ({error}): give another with hydra.run.dir="
-            )
-        exit_with(explained(error, schema))
+            problem = f"the output folder can't be made ({error}): give another with hydra.run.dir="
+            error = UsageError(problem)
+        end_with(error, schema)
 
 
-def is_a_mistake(error: Exception) -> bool:
-    """Returns whether an error is about something that a user can change.
+def end_with(error: Exception, schema: type[Section]) -> NoReturn:
+    """Ends the process with the line of a mistake, or the traceback of a bug.
 
-    These are flowrep's and Hydra's own errors, refused values, missing packages, and what the disk
-    reports.
+    Mistakes are what a user can change: flowrep's and Hydra's own errors, refused values, missing
+    packages, and what the disk reports.
     """
-    of_hydra = HydraException, OmegaConfBaseException
+    own = HydraException, OmegaConfBaseException, ValueError, ImportError, OSError
     is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
-    is_own = type(error).__module__.startswith("flowrep.")
-    return is_own or is_plugin or isinstance(error, (*of_hydra, ValueError, ImportError, OSError))
+    is_mistake = isinstance(error, own) or is_plugin or type(error).__module__.startswith("flowrep")
+    if IS_DEBUGGING or not is_mistake:
+        traceback.print_exception(error)
+        sys.exit(1)
+    exit_with(explained(error, schema))
 
 
 def checked(config: DictConfig, schema: type[Section]) -> Any:
@@ -117,10 +95,14 @@ def checked(config: DictConfig, schema: type[Section]) -> Any:
         UsageError: a key or a value is wrong, or a copied scene file kept the name of its original.
     """
     plain, job = plain_config(config), HydraConfig.get()
-    model = validated(schema, plain, own_keys())
+    model = validated(schema, plain)
+    typed = job.overrides.task
+    added = {re.split(r"[.=]", text.rpartition("@")[2].lstrip("+"))[0] for text in typed}
+    for key in (model.model_extra or {}).keys() - added:
+        raise UsageError(_unknown_key(key, schema))
     choice = str(job.runtime.choices.get("scene") or "").rpartition("/")[2]
     name = (plain.get("scene") or {}).get("name")
-    is_typed = any(text.startswith("scene.name=") for text in job.overrides.task)
+    is_typed = any(text.startswith("scene.name=") for text in typed)
     if name in group_choices("scene") and choice not in ("", name) and not is_typed:
         raise UsageError(
             f"scene={choice} has the name '{name}', under which its results would be filed: write "
@@ -135,19 +117,10 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
     return plain
 
 
-def own_keys() -> set[str]:
-    """Returns the top-level keys that were added to the running job's config (`+note=pilot`)."""
-    added = [text.lstrip("+") for text in HydraConfig.get().overrides.task if text[0] == "+"]
-    keys = (text.partition("=")[0].rpartition("@")[2] for text in added)  # +group@key=choice
-    return {key.partition(".")[0] for key in keys}
-
-
 def exit_with(problem: str | Exception, remedy: str = "") -> NoReturn:
     """Ends the process with the exit code of a usage error, printing each line of the problem.
 
-    Args:
-        problem: what is wrong.
-        remedy: a line to print after it; the last `error:` line of a sweep's job is its reason.
+    The remedy is no `error:` line, since a sweep takes the last of those for a run's failure.
     """
     print_error(problem)
     if remedy:
@@ -192,7 +165,8 @@ def explained(error: Exception, schema: type[Section]) -> str:
     if text.startswith("Unknown plugin class"):
         package = text.partition("'")[2].split(".")[1].replace("_", "-")
         return f"{text.partition('.')[0]}...: pip install {package}"
-    value = re.match(r"(?:Missing mandatory value: |Interpolation key ')([\w.]+)", text)
+    value = re.match(r"Missing mandatory value(?s:.*)full_key: (\S+)", text)
+    value = value or re.match(r"Interpolation key '(\S+)'", text)
     if value:
         return f"{value[1]} needs a value: {value[1]}=..."
     if not isinstance(error, HydraException | OmegaConfBaseException):
@@ -211,7 +185,7 @@ def _unreadable(typed: str) -> str:
         return f"can't read '{typed}': write a list without spaces, {key}=[a,b], or in quotes"
     if value.startswith(("[", "{", "(")):
         return f"can't read '{typed}'"
-    return f"can't read '{typed}'; quoted it is {shell_line(override(key, value))}"
+    return f"can't read '{typed}'; quoted it is {shlex.join([override(key, value)])}"
 
 
 def _unknown_key(key: str, schema: type[Section]) -> str:
@@ -223,7 +197,8 @@ def _unknown_key(key: str, schema: type[Section]) -> str:
     places = sorted({f"{group}.{key}" for group, path in files if key in OmegaConf.load(path)})
     if places:
         return f"unknown key '{key}': do you mean {' or '.join(places)}?"
-    return f"unknown key '{key}'; there are: {', '.join([*schema.key_names(), 'preset', 'debug'])}"
+    keys = [*schema.key_names(), *(("preset", "debug") if "resume" in schema.model_fields else ())]
+    return f"unknown key '{key}'; there are: {', '.join(keys)}"
 
 
 def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
@@ -250,42 +225,36 @@ def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
 def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
     """Returns a command line as Hydra reads it: folders quoted, those without a key named `run`.
 
-    A folder is quoted if it exists, or if Hydra would take its name for a number or the like.
+    A folder is quoted if it exists, or if Hydra would take its name for a number.
 
     Raises:
         UsageError: a flag is a key, or folders are given in two ways.
     """
-    bare, others, may_be_value = [], [], False
+    keys, folders, others, previous = schema.key_names(), [], [], ""
     for text in arguments:
-        key = text.removeprefix("--").partition("=")[0]
-        if text.startswith("--") and key in {*schema.key_names(), *config_groups()}:
-            raise UsageError(f"'{text}': write {key}=<value>, without --")
-        is_folder = "=" not in text or Path(text).exists()
-        if is_folder and "run" in schema.key_names() and text[0] not in "-~+" and not may_be_value:
-            bare.append(text)
+        key, _, value = text.partition("=")
+        if text.startswith("--") and key[2:] in {*keys, *config_groups()}:
+            raise UsageError(f"'{text}': write {key[2:]}=<value>, without --")
+        may_be_bare = "run" in keys and text[:1] not in "-~+" and not previous.startswith("-")
+        if may_be_bare and (text == key or Path(text).exists()):
+            folders.append(text)
         else:
-            others.append(_as_typed(text))
-        may_be_value = text in _VALUE_FOLLOWS
-    if not bare:
+            is_name = key in FOLDERS and value and _is_misread(key, value)
+            others.append(override(key, value) if is_name else text)
+        previous = text
+    if not folders:
         return others
     if any(text.startswith("run=") for text in others):
-        raise UsageError(f"'{bare[0]}' and run= name folders in two ways: write the names alone")
-    quoted = [override("run", text).removeprefix("run=") for text in bare]
-    return [f"run=[{','.join(quoted)}]" if bare[1:] else f"run={quoted[0]}", *others]
+        raise UsageError(f"'{folders[0]}' and run= name folders in two ways: write the names alone")
+    quoted = [override("run", text).removeprefix("run=") for text in folders]
+    return [f"run=[{','.join(quoted)}]" if quoted[1:] else f"run={quoted[0]}", *others]
 
 
-def _as_typed(argument: str) -> str:
-    key, _, text = argument.partition("=")
-    if key not in FOLDERS or not text:
-        return argument
-    parsed = _parsed(argument)
-    is_misread = (
-        key not in CAMERAS
-        and parsed is not None
-        and parsed.value_type is ValueType.ELEMENT
-        and isinstance(parsed.value(), int | float)  # a bool is an int
-    )
-    return override(key, text) if is_misread or Path(text).exists() else argument
+def _is_misread(key: str, text: str) -> bool:
+    """Returns whether a folder's name means something else to Hydra, or might."""
+    parsed = _parsed(f"{key}={text}")
+    is_number = parsed is not None and isinstance(parsed.value(), int | float)  # true is one, too
+    return Path(text).exists() or (is_number and key != "input")  # that may be a camera's number
 
 
 def value_of(text: str) -> str:
@@ -308,66 +277,45 @@ def override(key: str, text: str) -> str:
     >>> print(override("resume", "outputs/a"), override("resume", "a=b, c"))
     resume=outputs/a resume='a=b, c'
     """
-    plain = f"{key}={text}"
-    parsed = None if "${" in text else _parsed(plain)  # OmegaConf would replace an interpolation
-    if parsed is not None and parsed.value_type is ValueType.ELEMENT and parsed.value() == text:
-        return plain
+    parsed = None if "${" in text else _parsed(f"{key}={text}")
+    if parsed is not None and parsed.value() == text:
+        return f"{key}={text}"
+    # OmegaConf would replace an interpolation, and takes backslashes before one for escapes
     text = re.sub(r"(\\*)\$\{", lambda found: found[1] * 2 + r"\${", text)
-    # backslashes escape only before a quote, including the closing one
-    text = re.sub(r"(\\*)(')", lambda found: found[1] * 2 + r"\'", text)
-    text = re.sub(r"(\\+)$", lambda found: found[1] * 2, text)
-    return f"{key}='{text}'"
-
-
-def shell_line(*words: str) -> str:
-    """Returns words as a line to paste into a shell.
-
-    >>> print(shell_line("flowrep-train", override("resume", "a=b")))
-    flowrep-train 'resume='"'"'a=b'"'"''
-    """
-    return shlex.join(words)
+    return f"{key}={QuotedString(text, Quote.single).with_quotes()}"
 
 
 def line_for(command: str, **values: str) -> str:
-    """Returns a shell line for a flowrep command, called in the same way as this one.
+    """Returns a shell line for a command, called in the same way as this one: as script or module.
 
-    Args:
-        command: the command's name, e.g. "train".
-        values: the values of its keys, with any characters.
+    The values of its keys may have any characters.
     """
     is_script = Path(sys.argv[0]).name.startswith("flowrep-")
     program = [f"flowrep-{command}"] if is_script else ["python", "-m", f"flowrep.{command}"]
-    return shell_line(*program, *(override(key, text) for key, text in values.items()))
+    return shlex.join([*program, *(override(key, text) for key, text in values.items())])
 
 
 # Names of folders.
 
 
 def register_resolvers() -> None:
-    """Adds the resolvers for paths of run folders in conf/run_folder.yaml and conf/view.yaml.
-
-    `${run_name:scene,representations,flow,noise,seed}` names a run; `${folder_name:text}` makes any
-    text the name of a single folder; `${run_of_sweep:overrides}` names a run of a sweep;
-    `${unless_resumed:resume,folder}` is the folder of a new run.
-    """
-
-    def run_name(
-        scene: str,
-        representations: Iterable[str],
-        flow: str,
-        noise: Mapping[str, float],
-        seed: int,
-    ) -> str:
-        source = "" if flow == "exact" else f"_{flow}"
-        source += "_noisy" if any(noise.values()) else ""
-        return folder_name(f"{scene}_{'+'.join(representations)}{source}_s{seed}")
-
-    def unless_resumed(resume: str | None, folder: str) -> str:
-        return folder if resume is None else "."  # Hydra makes no folder then
-
-    resolvers: list[Callable[..., str]] = [run_name, folder_name, run_of_sweep, unless_resumed]
-    for resolver in resolvers:
+    """Adds what conf/ calls to name folders: `${run_name:scene,...}` and the like."""
+    for resolver in (run_name, folder_name, run_of_sweep, unless_resumed):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
+
+
+def run_name(
+    scene: str, representations: Iterable[str], flow: str, noise: Mapping[str, float], seed: int
+) -> str:
+    """Returns the name of a run's folder."""
+    source = "" if flow == "exact" else f"_{flow}"
+    source += "_noisy" if any(noise.values()) else ""
+    return folder_name(f"{scene}_{'+'.join(representations)}{source}_s{seed}")
+
+
+def unless_resumed(resume: str | None, folder: str) -> str:
+    """Returns the folder of a new run; Hydra makes none for the current one, a resumed run's."""
+    return folder if resume is None else "."
 
 
 def folder_name(text: str) -> str:
@@ -378,11 +326,6 @@ def folder_name(text: str) -> str:
     """
     name = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in str(text))[:200]
     return "_" if name in ("", ".", "..") else name
-
-
-_BY_VALUE = (
-    "experiment", "preset", "debug", "scene", "representations", "flow", "algorithm", "speed",
-)  # fmt: skip
 
 
 def run_of_sweep(overrides: Iterable[str]) -> str:
@@ -404,9 +347,11 @@ def run_of_sweep(overrides: Iterable[str]) -> str:
     values = dict(sorted(text.partition("=")[::2] for text in overrides))
     for key in OF_THE_MACHINE:
         values.pop(key, None)
-    seed = values.pop("seed", None)
-    words = [plain(values.pop(key)) for key in _BY_VALUE if key in values]
-    words += [] if seed is None else [f"s{plain(seed)}"]
-    words += [plain(f"{key}-{value}" if value else key) for key, value in values.items()]
-    name = "_".join(words) or "run"
+    by_value = (
+        "experiment", "preset", "debug", "scene", "representations", "flow", "algorithm", "speed",
+    )  # fmt: skip
+    words = [values.pop(key) for key in by_value if key in values]
+    words += [f"s{values.pop('seed')}"] if "seed" in values else []
+    words += [f"{key}-{value}" if value else key for key, value in values.items()]
+    name = "_".join(map(plain, words)) or "run"
     return name if len(name) <= 100 else f"{name[:100]}_{sha1(name.encode()).hexdigest()[:8]}"

@@ -8,7 +8,7 @@ tests/config/test_schema.py holds them equal to the code and to conf/.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
 
 from pydantic import (
@@ -18,7 +18,6 @@ from pydantic import (
     Discriminator,
     Field,
     PlainSerializer,
-    PrivateAttr,
     Tag,
     ValidationError,
     WrapValidator,
@@ -28,7 +27,7 @@ from pydantic import (
 
 from flowrep.config import UsageError
 
-Model = TypeVar("Model", bound="Section")
+Model = TypeVar("Model", bound=BaseModel)
 
 # Larger whole numbers are not exact as floats, larger seeds are more than numpy takes.
 Count = Annotated[int, Field(ge=1, le=2**53)]
@@ -67,75 +66,53 @@ OneOrMore = BeforeValidator(_listed)
 class Section(BaseModel):
     """Keys of a config: none is unknown, none is missing, and types are strict."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, populate_by_name=True
-    )
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
     @classmethod
     def key_names(cls) -> list[str]:
-        """Returns the keys as they are written in a config."""
-        return [field.alias or name for name, field in cls.model_fields.items()]
+        """Returns the names of the keys."""
+        return list(cls.model_fields)
 
     def plain(self) -> dict[str, Any]:
         """Returns the keys and values as they are written in a config."""
-        return self.model_dump(by_alias=True) | self._own
+        return self.model_dump(by_alias=True)
 
-    _own: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+class Command(Section):
+    """The whole config of a command; it keeps keys that it doesn't know, such as `+note=pilot`."""
+
+    model_config = ConfigDict(extra="allow")
 
 
 # What the agent sees.
 
-
-class Rgb(Section):
-    """The picture, which has no options."""
-
-
-class Segmentation(Section):
-    """A class id per pixel."""
-
-    encoding: Literal["ids", "onehot"]
-
-
-class Depth(Section):
-    """Distances."""
-
-    range_m: Positive
-    missing: Share
+_SEGMENTATION = {"encoding": Literal["ids", "onehot"]}
+_DEPTH = {"range_m": Positive, "missing": Share}
+_FLOW = {"scale": float, "unit": Literal["px_per_step", "px_per_s"]}
+REPRESENTATIONS: dict[str, dict[str, Any]] = {
+    "rgb": {},
+    "seg": _SEGMENTATION,
+    "depth": _DEPTH,
+    "raw": _FLOW,
+    "ego": _FLOW,
+    "obj": _FLOW,
+    "seg2": _SEGMENTATION | {"k": Count},
+    "depth2": _DEPTH | {"k": Count},
+}
+"""The options of each representation and their types."""
 
 
-class FlowMap(Section):
-    """Raw, ego or object flow."""
-
-    scale: float
-    unit: Literal["px_per_step", "px_per_s"]
+def _section(name: str, **fields: Any) -> Any:
+    return create_model(name, __base__=Section, **fields)
 
 
-class SegmentationStack(Segmentation):
-    """The same maps of the last `k` frames."""
-
-    k: Count
+def _options(name: str) -> Any:
+    return _section(name, **{key: (kind, ...) for key, kind in REPRESENTATIONS[name].items()})
 
 
-class DepthStack(Depth):
-    """The same maps of the last `k` frames."""
-
-    k: Count
-
-
-NOT_CHOSEN: Any = None
-
-
-class Representations(Section):
-    """The options of each representation, by its name."""
-
-    rgb: Rgb = NOT_CHOSEN
-    seg: Segmentation = NOT_CHOSEN
-    depth: Depth = NOT_CHOSEN
-    raw: FlowMap = NOT_CHOSEN
-    ego: FlowMap = NOT_CHOSEN
-    obj: FlowMap = NOT_CHOSEN
-    seg2: SegmentationStack = NOT_CHOSEN
-    depth2: DepthStack = NOT_CHOSEN
+Representations: Any = _section(
+    "Representations", **{name: (_options(name), None) for name in REPRESENTATIONS}
+)
 
 
 def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
@@ -199,12 +176,13 @@ class Target(Section):
 class AnyAlgorithm(Target):
     """A user's own algorithm."""
 
-    def check_length(self, total_frames: int, num_envs: int) -> None:
-        """Checks that something is learnt in a run.
+    def first_update(self, num_envs: int) -> tuple[str, int]:
+        """Returns the frames until something is learnt, after the option that says so.
 
         Raises:
-            ValueError: names the key to change.
+            ValueError: nothing would be; names the key to change.
         """
+        return "", 0
 
 
 class _Learner(AnyAlgorithm):
@@ -230,13 +208,8 @@ class _OffPolicy(_Learner):
     mirror: bool = False  # not in runs before it
     persistent_exploration: Share = 0.0  # nor this one
 
-    def check_length(self, total_frames: int, num_envs: int) -> None:
-        """Checks that the memory holds a batch and the run is long enough for an update."""
-        if self.replay_capacity < self.batch_size:
-            raise ValueError(
-                f"algorithm.replay_capacity={self.replay_capacity} is less than "
-                f"algorithm.batch_size={self.batch_size}: raise it, or lower batch_size"
-            )
+    def first_update(self, num_envs: int) -> tuple[str, int]:
+        """Returns the frames until the memory holds enough for an update."""
         key = "batch_size" if self.learning_starts is None else "learning_starts"
         starts = getattr(self, key)
         if starts < num_envs:
@@ -244,18 +217,12 @@ class _OffPolicy(_Learner):
                 f"algorithm.{key}={starts} is less than num_envs={num_envs}: before their second "
                 "step there is nothing to learn from; raise learning_starts, or lower num_envs"
             )
-        first = starts + self.frames_per_update
-        if first > total_frames:
-            raise ValueError(
-                f"algorithm.{key}={starts}: the first update would come after {first} frames, and "
-                f"total_frames is {total_frames}: raise total_frames, or lower algorithm.{key}"
-            )
+        return key, starts + self.frames_per_update
 
 
 class DiscreteSAC(_OffPolicy):
     """`algorithm=dsac`."""
 
-    target: Literal["flowrep.agent.DiscreteSAC"] = Field(alias="_target_")
     encoder: Literal["shared", "separate"]
     initial_alpha: Positive
     target_entropy_weight: Share
@@ -266,7 +233,6 @@ class DiscreteSAC(_OffPolicy):
 class DiscreteSACWithValue(_OffPolicy):
     """`algorithm=dsac_v`."""
 
-    target: Literal["flowrep.agent.DiscreteSACWithValue"] = Field(alias="_target_")
     initial_alpha: Positive
     target_entropy_weight: Share
     alpha_rate_factor: NotNegative
@@ -275,25 +241,14 @@ class DiscreteSACWithValue(_OffPolicy):
 class DoubleDQN(_OffPolicy):
     """`algorithm=dqn`."""
 
-    target: Literal["flowrep.agent.DoubleDQN"] = Field(alias="_target_")
     initial_epsilon: Share
     final_epsilon: Share
     exploration_share: Share
-
-    @model_validator(mode="after")
-    def _exploration_falls(self) -> DoubleDQN:
-        if self.final_epsilon > self.initial_epsilon:
-            raise ValueError(
-                f"final_epsilon={self.final_epsilon} is more than "
-                f"initial_epsilon={self.initial_epsilon}"
-            )
-        return self
 
 
 class PPO(_Learner):
     """`algorithm=ppo`."""
 
-    target: Literal["flowrep.agent.PPO"] = Field(alias="_target_")
     rollout_length: Count
     epochs: Count
     gae_lambda: Share
@@ -302,19 +257,9 @@ class PPO(_Learner):
     entropy_weight: NotNegative
     max_grad_norm: Positive
 
-    def check_length(self, total_frames: int, num_envs: int) -> None:
-        """Checks that a rollout fills a batch, and that the run is long enough for one."""
-        frames = self.rollout_length * num_envs
-        if self.batch_size > frames:
-            raise ValueError(
-                f"algorithm.batch_size={self.batch_size} is more than the {frames} frames of a "
-                "rollout: lower it, or raise algorithm.rollout_length or num_envs"
-            )
-        if frames > total_frames:
-            raise ValueError(
-                f"algorithm.rollout_length={self.rollout_length} makes {frames} frames, and "
-                f"total_frames is {total_frames}: lower it, or raise total_frames"
-            )
+    def first_update(self, num_envs: int) -> tuple[str, int]:
+        """Returns the frames of a rollout."""
+        return "rollout_length", self.rollout_length * num_envs
 
 
 ALGORITHMS: dict[str, type[AnyAlgorithm]] = {
@@ -326,25 +271,30 @@ ALGORITHMS: dict[str, type[AnyAlgorithm]] = {
 
 def _algorithm_tag(value: Any) -> str:
     target = value.get("_target_") if isinstance(value, Mapping) else value.target
-    return target if target in ALGORITHMS else "own"
+    return ALGORITHMS[target].__name__ if target in ALGORITHMS else "AnyAlgorithm"
 
 
 Algorithm = Annotated[
-    Annotated[DiscreteSAC, Tag("flowrep.agent.DiscreteSAC")]
-    | Annotated[DiscreteSACWithValue, Tag("flowrep.agent.DiscreteSACWithValue")]
-    | Annotated[DoubleDQN, Tag("flowrep.agent.DoubleDQN")]
-    | Annotated[PPO, Tag("flowrep.agent.PPO")]
-    | Annotated[AnyAlgorithm, Tag("own")],
+    Annotated[DiscreteSAC, Tag("DiscreteSAC")]
+    | Annotated[DiscreteSACWithValue, Tag("DiscreteSACWithValue")]
+    | Annotated[DoubleDQN, Tag("DoubleDQN")]
+    | Annotated[PPO, Tag("PPO")]
+    | Annotated[AnyAlgorithm, Tag("AnyAlgorithm")],
     Discriminator(_algorithm_tag),
 ]
-_TAGS = {*ALGORITHMS, "own", "exact", "estimated"}
-"""Names of a union's members, which pydantic puts between the keys in an error's place."""
+# pydantic puts the member of a union between the keys in an error's place
+_TAGS = {
+    "exact",
+    "estimated",
+    "AnyAlgorithm",
+    *(section.__name__ for section in ALGORITHMS.values()),
+}
 
 
 # The commands.
 
 
-class EnvConfig(Section):
+class EnvConfig(Command):
     """What an environment is made of, on this machine."""
 
     seed: Seed
@@ -358,22 +308,6 @@ class EnvConfig(Section):
     motion: MotionSource = "exact"  # not in runs before it
     noise: Noise
     scene: dict[str, Any]  # flowrep.scenes.load_scene checks it
-
-    @model_validator(mode="after")
-    def _each_worker_has_an_env(self) -> EnvConfig:
-        if getattr(self, "resume", None) is None:  # the run's own num_envs counts then
-            check_workers(self.num_workers, self.num_envs)
-        return self
-
-
-def check_workers(num_workers: int | str, num_envs: int) -> None:
-    """Checks that each process has an environment to step.
-
-    Raises:
-        ValueError: there are more processes than environments.
-    """
-    if isinstance(num_workers, int) and num_workers > num_envs:
-        raise ValueError(f"num_workers={num_workers} is more than num_envs={num_envs}: lower it")
 
 
 FINAL_POLICIES = ("greedy", "sampled")
@@ -414,11 +348,17 @@ class TrainConfig(EnvConfig):
     @model_validator(mode="after")
     def _learns_something(self) -> TrainConfig:
         if self.resume is None:  # the run's own algorithm counts then
-            self.algorithm.check_length(self.total_frames, self.num_envs)
+            key, frames = self.algorithm.first_update(self.num_envs)
+            if frames > self.total_frames:
+                value = getattr(self.algorithm, key)
+                raise ValueError(
+                    f"algorithm.{key}={value}: the first update would come after {frames} frames, "
+                    f"and total_frames is {self.total_frames}: raise it, or lower algorithm.{key}"
+                )
         return self
 
 
-class EvaluateConfig(Section):
+class EvaluateConfig(Command):
     """The whole config of `flowrep.evaluate`."""
 
     run: Annotated[list[Text] | None, OneOrMore]
@@ -446,7 +386,6 @@ class EvaluateConfig(Section):
 
     @model_validator(mode="after")
     def _fits_together(self) -> EvaluateConfig:
-        check_workers(self.num_workers, self.num_envs)
         own = self.own_policies
         for name in own:
             if ":" not in name and not name.endswith(".pt2") and name != "pretrained":
@@ -460,24 +399,24 @@ class EvaluateConfig(Section):
             raise ValueError(f"run= and policy={own[0]} can't be combined: give one of them")
         if not own and self.run is None:
             raise ValueError("run needs a value: run=<a run's or a sweep's folder>")
-        needed = ("scene", "representations") if own else ()
-        for key in needed[:1] if own == ["pretrained"] else needed:
+        needed = ("scene",) if own == ["pretrained"] else ("scene", "representations")
+        for key in needed if own else ():
             if getattr(self, key) is None:
                 raise ValueError(f"{key} needs a value for policy={own[0]}")
-        for key in () if own else ("representations", "flow", "motion", "noise", "output"):
-            if getattr(self, key) is not None:
+        for key in ("representations", "flow", "motion", "noise", "output"):
+            if not own and getattr(self, key) is not None:
                 raise ValueError(f"{key}= is for a policy of your own; a run's is in its config")
         return self
 
 
-class ExportConfig(Section):
+class ExportConfig(Command):
     """The whole config of `flowrep.export`."""
 
     run: Text
     output: Text | None
 
 
-class ViewConfig(Section):
+class ViewConfig(Command):
     """The whole config of `flowrep.view`."""
 
     scene: dict[str, Any]
@@ -493,7 +432,7 @@ class ViewConfig(Section):
     interactive: bool
 
 
-class ReportConfig(Section):
+class ReportConfig(Command):
     """The whole config of `flowrep.report`."""
 
     run: Annotated[list[Text], Field(min_length=1), OneOrMore]
@@ -518,7 +457,7 @@ class FlowScale(Section):
     obj: Positive
 
 
-class FactorizeConfig(Section):
+class FactorizeConfig(Command):
     """The whole config of `flowrep.factorize`."""
 
     input: Text | int
@@ -547,28 +486,17 @@ class FactorizeConfig(Section):
         return self
 
 
-def validated(
-    schema: type[Model], plain: Mapping[str, Any], own_keys: Iterable[str] = (), source: str = ""
-) -> Model:
-    """Returns a resolved config as its model.
-
-    Args:
-        schema: the model of the whole config.
-        plain: the config as plain data.
-        own_keys: top-level keys that the user added (`+note=pilot`); they are kept as they are.
-        source: the file that the config comes from, for messages.
+def validated(schema: type[Model], plain: Mapping[str, Any], source: str = "") -> Model:
+    """Returns a resolved config as its model; `source`, a file, begins the lines of an error.
 
     Raises:
         UsageError: a line for each key that is unknown, missing or invalid.
     """
-    own = {key: plain[key] for key in own_keys if key not in schema.key_names()}
     try:
-        model = schema.model_validate({k: v for k, v in plain.items() if k not in own})
+        return schema.model_validate(plain)
     except ValidationError as error:
         lines = [_line(details) for details in error.errors(include_url=False)]
         raise UsageError("\n".join(f"{source}: {x}" if source else x for x in lines)) from None
-    model._own = own
-    return model
 
 
 def validated_run(plain: Any, source: str) -> TrainConfig:
@@ -579,16 +507,11 @@ def validated_run(plain: Any, source: str) -> TrainConfig:
     """
     if not isinstance(plain, Mapping):
         raise UsageError(f"{source} holds no run's config: restore the file")
-    return validated(TrainConfig, plain, plain.keys() - {*TrainConfig.key_names()}, source)
+    return validated(TrainConfig, plain, source)
 
 
 def check_options(maker: type, options: Mapping[str, Any], section: str) -> None:
-    """Checks options against the signature of the class that they are for.
-
-    Args:
-        maker: its constructor's first argument is not an option.
-        options: by name.
-        section: their place in the config, for messages.
+    """Checks a section's options against the signature of a class, beyond its first argument.
 
     Raises:
         UsageError: a line for each option that is unknown, missing or of another type.
@@ -598,17 +521,13 @@ def check_options(maker: type, options: Mapping[str, Any], section: str) -> None
     fields: dict[str, Any] = {
         p.name: (hints[p.name], ... if p.default is p.empty else p.default) for p in parameters
     }
-    rules = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-    try:
-        create_model("Options", __config__=rules, **fields).model_validate(options)
-    except ValidationError as error:
-        lines = [_line(details, section) for details in error.errors(include_url=False)]
-        raise UsageError("\n".join(lines)) from None
+    place = _section("Place", **{section: (_section("Options", **fields), ...)})
+    validated(place, {section: options})
 
 
-def _line(details: Any, *section: str) -> str:
+def _line(details: Any) -> str:
     """Returns pydantic's error in a line that begins with the key."""
-    key = ".".join(str(part) for part in (*section, *details["loc"]) if part not in _TAGS)
+    key = ".".join(str(part) for part in details["loc"] if part not in _TAGS)
     kind, value = details["type"], details["input"]
     message = details["msg"].removeprefix("Value error, ")
     if kind == "extra_forbidden":

@@ -5,7 +5,7 @@ from typing import get_args
 import pytest
 from omegaconf import OmegaConf
 
-from flowrep.config import CONF_DIR, UsageError, config_groups, group_choices, schema
+from flowrep.config import CONF_DIR, UsageError, group_choices, schema
 from flowrep.config.schema import (
     ALGORITHMS,
     EvaluateConfig,
@@ -19,9 +19,6 @@ from flowrep.config.schema import (
 )
 from tests.config.composing import composed, plain
 
-OF_TRAINING = [group for group in config_groups() if group != "format"]
-GROUP_FILES = [(group, name) for group in OF_TRAINING for name in group_choices(group)]
-
 
 def refusal(command, model, line):
     with pytest.raises(UsageError) as caught:
@@ -32,6 +29,7 @@ def refusal(command, model, line):
 @pytest.mark.parametrize(
     "line",
     [
+        # types and ranges
         "algorithm.gamma=2",
         "algorithm.gamma=true",
         "algorithm.gamma=nan",
@@ -39,85 +37,57 @@ def refusal(command, model, line):
         "algorithm.layer_norm=1",
         "algorithm.tau=0",
         "algorithm.learning_rate=inf",
-        "algorithm.learning_rate=abc",
         "algorithm.learning_rate=null",
-        "algorithm.frames_per_update=-1",
-        "algorithm.target_entropy_weight=50",
-        "algorithm.initial_alpha=-1",
         "algorithm.batch_size=1.5",
         "algorithm.encoder=none",
         "algorithm.initial_epsilon=3 algorithm=dqn",
         "algorithm.epochs=0 algorithm=ppo",
-        "algorithm.clip=-1 algorithm=ppo",
         "evaluation.every_frames=-1",
-        "evaluation.every_frames=null",
         "evaluation.speeds=[]",
         "evaluation.speeds=normal",
         "evaluation.speeds=[low,low]",
         "evaluation.speeds=[low,hgih]",
         "evaluation.fps=[12,0.1]",
-        "evaluation.video=maybe",
         "evaluation=null",
-        "speed=norml",
-        "total_frames=true",
         "total_frames=2e6",
         "seed=-1",
         "device=meta",
         "num_workers=-1",
-        "num_workers=33",
         "wandb=true",
         "representations.ego.scale=nan",
         "representations=[]",
         "noise.depth_dropout=1.5",
         "flow.estimator=abc flow=estimated",
+        # keys
         "~seed",
         "~algorithm.gamma",
-        "total_frames=???",
-        # what does not go together
-        "algorithm.replay_capacity=1023",
+        "+algorithm.gama=0.9",
+        "+algorithm.tau=0.1 algorithm=ppo",
+        "+representations.ego.k=2",
+        # what leaves nothing to learn
         "algorithm.learning_starts=4991 total_frames=5000",
         "algorithm.batch_size=31",
-        "algorithm.final_epsilon=0.2 algorithm=dqn algorithm.initial_epsilon=0.1",
-        "algorithm.batch_size=225 algorithm=ppo algorithm.rollout_length=7",
         "algorithm.rollout_length=64 algorithm=ppo total_frames=2047",
     ],
 )
 def test_a_value_that_can_not_be_is_named(line):
-    key = line.split()[0].split("=")[0].lstrip("~").split(".")[-1]
+    key = line.split()[0].split("=")[0].lstrip("~+").split(".")[-1]
     assert key in refusal("train", TrainConfig, line)
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "algorithm.replay_capacity=1024",
         "total_frames=5000 algorithm.learning_starts=4990",
         "algorithm.batch_size=32",
-        "algorithm=ppo algorithm.rollout_length=8",
         "algorithm=ppo total_frames=2048",
-        "num_workers=32",
-        "seed=2147483647",
-        "algorithm.gamma=1 algorithm.tau=1 evaluation.baselines=[]",
+        "seed=2147483647 algorithm.gamma=1 algorithm.tau=1 evaluation.baselines=[]",
         "resume=there total_frames=512",  # the run's own algorithm decides whether that is enough
+        "algorithm._target_=my.Own +algorithm.mine=3",
     ],
 )
 def test_what_just_can_be_passes(line):
     assert composed(*line.split()).seed >= 0
-
-
-def test_a_key_that_an_algorithm_does_not_have_is_named():
-    assert "gama" in refusal("train", TrainConfig, "+algorithm.gama=0.9")
-    assert "tau" in refusal("train", TrainConfig, "algorithm=ppo +algorithm.tau=0.1")
-    assert (
-        composed("+algorithm.mine=3", "algorithm._target_=my.Own").algorithm.options()["mine"] == 3
-    )
-
-
-def test_a_key_of_one_s_own_passes_where_it_was_added():
-    config = plain("train", "+note=pilot")
-    assert validated(TrainConfig, config, own_keys={"note"}).plain() == config
-    with pytest.raises(UsageError, match="note"):
-        validated(TrainConfig, config)
 
 
 def test_everything_that_is_wrong_is_said_at_once():
@@ -128,11 +98,8 @@ def test_everything_that_is_wrong_is_said_at_once():
 
 
 def test_representations_keep_the_order_of_the_command_line():
-    assert list(composed("representations=[seg2,ego,obj]").representations) == [
-        "seg2",
-        "ego",
-        "obj",
-    ]
+    config = composed("representations=[seg2,ego,obj]")
+    assert list(config.plain()["representations"]) == ["seg2", "ego", "obj"]
 
 
 @pytest.mark.parametrize(
@@ -144,16 +111,11 @@ def test_representations_keep_the_order_of_the_command_line():
         ("run=here output=out", "output"),
         ("run=here speed=[]", "speed"),
         ("run=here speed=hihg", "speed"),
-        ("run=here fps=nan", "fps"),
         ("run=here fps=[12,12.0]", "fps"),
-        ("run=here fps=[12,0]", "fps"),
-        ("run=here policy=[]", "policy"),
         ("run=here policy=gredy", "policy"),
         ("policy=[greedy,mine.py:make]", "policy"),
         ("policy=mine.py:make representations=[ego]", "scene"),
         ("policy=mine.py:make scene=s_turn", "representations"),
-        ("run=here episodes=0", "episodes"),
-        ("run=here video=true", "video"),
     ],
 )
 def test_an_evaluation_that_can_not_be_is_refused(line, key):
@@ -168,22 +130,11 @@ def test_an_evaluation_takes_one_value_or_a_list():
     assert (more.run, more.fps) == (["a", "b"], [6, 7.5])
 
 
-@pytest.mark.parametrize(
-    "line",
-    ["speed=fast", "episodes=0", "sheet_rows=true", "seed=-1", "frame_rate_hz=0"],
-)
-def test_a_look_that_can_not_be_is_refused(line):
-    assert line.partition("=")[0] in refusal("view", ViewConfig, line)
-
-
 def test_what_is_wrong_in_a_run_folder_is_named_with_the_file():
     config = plain("train", "+note=pilot") | {"of_an_older_version": None}
     assert validated_run(config, "config.yaml").plain() == config
     config["algorithm"]["n_steps"] = 0
     with pytest.raises(UsageError, match=r"^config.yaml: algorithm.n_steps"):
-        validated_run(config, "config.yaml")
-    config = plain("train") | {"device": "${oc.env:HOME}"}  # it is text there
-    with pytest.raises(UsageError, match="device"):
         validated_run(config, "config.yaml")
     with pytest.raises(UsageError, match=r"config.yaml"):
         validated_run(None, "config.yaml")
@@ -231,17 +182,10 @@ def test_a_command_has_the_keys_of_its_schema(name, model, given):
     validated(model, config)
 
 
-@pytest.mark.slow_after_first
-@pytest.mark.parametrize(("group", "name"), GROUP_FILES, ids="/".join)
-def test_every_choice_of_every_group_is_valid_and_comes_back_as_it_is(group, name):
-    choice = f"representations=[{name}]" if group == "representations" else f"{group}={name}"
-    assert composed(choice).plain() == plain("train", choice)
-
-
 def test_every_section_has_its_file():
     targets = {
         OmegaConf.load(CONF_DIR / "algorithm" / f"{name}.yaml")["_target_"]
         for name in group_choices("algorithm")
     }
     assert targets == set(ALGORITHMS)
-    assert group_choices("representations") == sorted(schema.Representations.key_names())
+    assert group_choices("representations") == sorted(schema.REPRESENTATIONS)

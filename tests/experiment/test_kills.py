@@ -14,8 +14,8 @@ pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.agent import load_checkpoint
 from flowrep.experiment.run import RunFolder
+from tests.config.composing import plain
 from tests.experiment.test_runner import differing
-from tests.test_configs import composed
 
 pytestmark = pytest.mark.slow
 
@@ -32,7 +32,7 @@ SMALL = [
 def new_run(path, algorithm="dsac"):
     """A run folder in which nothing was done yet."""
     often = "rollout_length=16" if algorithm == "ppo" else "frames_per_update=4"
-    config = composed(*SMALL, f"algorithm={algorithm}", f"algorithm.{often}")
+    config = plain("train", *SMALL, f"algorithm={algorithm}", f"algorithm.{often}")
     run = RunFolder(path)
     run.write_config(config)
     return run

@@ -25,7 +25,7 @@ from flowrep.experiment.run import (
     origin_of,
 )
 from flowrep.tables import TableError
-from tests.test_configs import composed
+from tests.config.composing import plain
 
 HOLD = """
 import sys, time
@@ -78,7 +78,7 @@ PATH = Path("run/checkpoint/latest.safetensors")
 
 @pytest.fixture(scope="module")
 def config():
-    return composed("debug=smoke")
+    return plain("train", "debug=smoke")
 
 
 def test_the_same_run_on_another_machine_is_the_same(config):

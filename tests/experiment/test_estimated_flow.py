@@ -1,0 +1,42 @@
+"""What an agent that lives on estimated flow is given."""
+
+import pytest
+import torch
+
+pytest.importorskip("pybullet", reason="training drives the simulated street")
+pytest.importorskip("cv2", reason="flow is estimated by OpenCV: pip install 'flowrep-rl[flow]'")
+
+from flowrep.envs import make_env, street_envs
+from flowrep.experiment import build
+from flowrep.experiment.film import maps_of
+from flowrep.geometry import rigid_flow
+from flowrep.transforms import EstimateCameraMotion
+from tests.config.composing import composed
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("motion", ["exact", "estimated"])
+def test_a_config_says_where_the_cameras_motion_is_from(motion):
+    env = build.env(composed("debug=smoke", f"motion={motion}", "num_workers=0", "device=cpu"))
+    estimators = [each for each in env.transform if isinstance(each, EstimateCameraMotion)]
+    env.close()
+    assert len(estimators) == (motion == "estimated")
+
+
+def test_the_agent_and_the_film_see_one_estimate():
+    env = make_env("straight_road", ["raw", "rgb"], keep_sensor=True, seed=0, flow="estimated")
+    tensordict = env.reset()
+    assert not tensordict["raw"].any()  # after a reset nothing has moved
+    action = torch.zeros(1, dtype=torch.long)
+    for _ in range(2):
+        tensordict = env.step(tensordict.set("action", action))["next"]
+    K = torch.as_tensor(street_envs(env)[0].K).float()
+    maps = maps_of(tensordict["sensor"][0], K)
+    env.close()
+    sensor = tensordict["sensor"][0]
+    exact, _ = rigid_flow(sensor["depth"], sensor["instance"], K, sensor["instance_motion"])
+    assert torch.equal(maps["raw"], tensordict["raw"][0])
+    assert not torch.allclose(maps["raw"], exact, atol=0.1)
+    known = torch.isfinite(sensor["depth"])[0]
+    torch.testing.assert_close((maps["ego"] + maps["obj"])[:, known], maps["raw"][:, known])
