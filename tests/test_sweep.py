@@ -23,11 +23,9 @@ from tests.config.composing import composed, plain
     ("line", "expected"),
     [
         ("-m seed=0,1", True),
-        ("seed=0 --multirun", True),
         ("hydra.mode=MULTIRUN seed=0,1", True),
         ("seed=0", False),
         ("-m seed=0,1 --cfg job", False),
-        ("", False),
     ],
 )
 def test_several_runs_are_asked_for_in_hydras_ways(line, expected):

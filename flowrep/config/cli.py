@@ -72,18 +72,22 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[S
 
 
 def end_with(error: Exception, schema: type[Section]) -> NoReturn:
-    """Ends the process with the line of a mistake, or the traceback of a bug.
-
-    Mistakes are what a user can change: flowrep's and Hydra's own errors, refused values, missing
-    packages, and what the disk reports.
-    """
-    own = HydraException, OmegaConfBaseException, ValueError, ImportError, OSError
-    is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
-    is_mistake = isinstance(error, own) or is_plugin or type(error).__module__.startswith("flowrep")
-    if IS_DEBUGGING or not is_mistake:
+    """Ends the process with the line of a mistake, or the traceback of a bug."""
+    if IS_DEBUGGING or not is_a_mistake(error):
         traceback.print_exception(error)
         sys.exit(1)
     exit_with(explained(error, schema))
+
+
+def is_a_mistake(error: Exception) -> bool:
+    """Returns whether an error is about something that a user can change.
+
+    These are flowrep's and Hydra's own errors, refused values, missing packages, and what the disk
+    reports.
+    """
+    kinds = HydraException, OmegaConfBaseException, ValueError, ImportError, OSError
+    is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
+    return isinstance(error, kinds) or is_plugin or type(error).__module__.startswith("flowrep.")
 
 
 def checked(config: DictConfig, schema: type[Section]) -> Any:
@@ -97,8 +101,8 @@ def checked(config: DictConfig, schema: type[Section]) -> Any:
     plain, job = plain_config(config), HydraConfig.get()
     model = validated(schema, plain)
     typed = job.overrides.task
-    added = {re.split(r"[.=]", text.rpartition("@")[2].lstrip("+"))[0] for text in typed}
-    for key in (model.model_extra or {}).keys() - added:
+    keys = [text.partition("=")[0].rpartition("@")[2] for text in typed]  # +group@key=choice
+    for key in (model.model_extra or {}).keys() - {key.lstrip("+").split(".")[0] for key in keys}:
         raise UsageError(_unknown_key(key, schema))
     choice = str(job.runtime.choices.get("scene") or "").rpartition("/")[2]
     name = (plain.get("scene") or {}).get("name")
@@ -137,6 +141,18 @@ def print_error(problem: str | Exception) -> None:
 # What Hydra says in several lines, and what a newcomer types.
 
 
+_ANSWERS = {
+    r"Ambiguous value for argument '(([^=]+)=(.*))'":
+        "'{0}' is several values: add -m to run each, or write {1}=[{2}]",
+    r"Config group override must be":
+        "a group can't be null: write the name of a choice, --help lists them",
+    r"Missing mandatory value(?s:.*)full_key: (\S+)": "{0} needs a value: {0}=...",
+    r"Interpolation key '(\S+)'": "{0} needs a value: {0}=...",
+    r"(Unknown plugin class : 'hydra_plugins\.(\w+))": "{0}...': pip install {1}",
+}  # fmt: skip
+"""Beginnings of Hydra's errors, and what to do about them."""
+
+
 def explained(error: Exception, schema: type[Section]) -> str:
     """Returns an error of Hydra's in one line, with what exists instead; others as they are."""
     text = str(error)
@@ -153,22 +169,12 @@ def explained(error: Exception, schema: type[Section]) -> str:
             )
         there = ", ".join(sorted(error.options or group_choices(group)))
         return f"unknown {group} '{name}'; there are: {there}"
-    several = re.match(r"Ambiguous value for argument '(([^=]+)=(.*))'", text)
-    if several:
-        typed, key, values = several.groups()
-        return f"'{typed}' is several values: add -m to run each, or write {key}=[{values}]"
     unknown = re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text)
     if unknown:
         return _unknown_key(unknown[1], schema)
-    if text.startswith("Config group override must be"):
-        return "a group can't be null: write the name of a choice, --help lists them"
-    if text.startswith("Unknown plugin class"):
-        package = text.partition("'")[2].split(".")[1].replace("_", "-")
-        return f"{text.partition('.')[0]}...: pip install {package}"
-    value = re.match(r"Missing mandatory value(?s:.*)full_key: (\S+)", text)
-    value = value or re.match(r"Interpolation key '(\S+)'", text)
-    if value:
-        return f"{value[1]} needs a value: {value[1]}=..."
+    for beginning, answer in _ANSWERS.items():
+        if found := re.match(beginning, text):
+            return answer.format(*found.groups())
     if not isinstance(error, HydraException | OmegaConfBaseException):
         return text
     lines = [line.strip() for line in text.splitlines() if line.strip()]

@@ -75,7 +75,7 @@ MISTAKES = [
     ("train -m --cfg job", ["--multirun", "--cfg"]),
     # values
     ("train algorithm.gamma=2 evaluation.episodes=0 seed=x", ["gamma", "episodes", "seed"]),
-    ("train -m seed=0 hydra/launcher=ray_jobs", ["pip install hydra-ray-launcher"]),
+    ("train -m seed=0 hydra/launcher=ray_jobs", ["pip install hydra_ray_launcher"]),
 ]
 
 
@@ -97,7 +97,7 @@ def test_a_mistake_ends_in_lines_that_name_it_and_what_exists(run, line, names):
 @pytest.mark.parametrize(
     "line",
     [
-        "train +note=pilot ++seed=4 +mine.deep=1 +algorithm@beside=dqn +hydra.job.env_set.A=1",
+        "train +note=me@home ++seed=4 +mine.deep=1 +algorithm@beside=dqn +hydra.job.env_set.A=1",
         "train representations.ego.scale=0.5 scene.camera.height_px=64 debug=smoke",
         "train hydra/job_logging=default hydra/hydra_logging=none ~debug",
         "train --config-path pkg://flowrep.conf",
@@ -114,7 +114,7 @@ def test_what_hydra_accepts_passes(run, line):
     assert (code, said.err) == (0, "")
     assert isinstance(config, SCHEMAS[command])
     if "+note" in line:
-        assert config.plain()["note"] == "pilot"
+        assert config.plain()["note"] == "me@home"
 
 
 def test_errors_of_the_command_are_lines_too_unless_they_are_bugs(monkeypatch, capsys, tmp_path):
