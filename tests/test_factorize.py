@@ -284,6 +284,16 @@ def test_the_command_ends_with_one_line_and_code_2(tmp_path, monkeypatch, capsys
     assert list(tmp_path.iterdir()) == []
 
 
+def test_help_lists_the_formats_and_no_group_of_training(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["flowrep-factorize", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    said = capsys.readouterr().out
+    assert "format: frames, kitti" in said
+    assert "algorithm" not in said
+
+
 def test_a_still_camera_needs_neither_poses_nor_depth(tmp_path):
     # A texture before which another goes 2 px to the right each frame.
     random = np.random.default_rng(0)

@@ -17,13 +17,16 @@ from flowrep.sequences import (
     EstimatedFlowSource,
     Frame,
     Frames,
+    Recording,
     SequenceError,
     estimated_motion,
     factorize_frames,
     factorize_pair,
     recorded_flow,
+    recorded_motion,
 )
 from flowrep.sequences.factorization import consistent
+from flowrep.sequences.job import Job
 from flowrep.sequences.output import known, score
 from flowrep.transforms import DIS
 
@@ -131,6 +134,30 @@ def test_a_motion_that_nothing_tells_leaves_flow_unknown():
     motion = estimated_motion(frame("a"), frame("b"), nothing)
     assert not motion.known
     assert not factorize_pair(frame("a"), frame("b"), nothing, motion).ego_valid.any()
+
+
+class Walk(Recording):
+    """41 frames, 0.1 m apart."""
+
+    count = 41
+
+    def _read(self, index):
+        return frame(str(index), world_from_cam=moved(0.1 * index), rgb=None)
+
+
+def test_the_doctor_looks_at_pairs_spread_over_the_recording_that_move():
+    looked_at = []
+
+    def flow_source(previous, current):
+        looked_at.append(current.name)
+        length_px = 0.0 if current.name in ("5", "6", "7", "9") else 3.0
+        return np.full((2, 40, 60), length_px, np.float32)
+
+    diagnosis = Job(Walk(), flow_source, recorded_motion, output=None).examine()
+    # A tenth of 40 pairs apart; where nothing moves, up to two more are tried.
+    expected = [1, 5, 6, 7, 9, 10, 13, 17, 21, 25, 29, 33, 37]
+    assert looked_at == [str(number) for number in expected]
+    assert diagnosis.pairs == 9
 
 
 def test_what_moves_stands_out_of_the_frames_own_error():
