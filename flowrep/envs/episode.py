@@ -121,6 +121,7 @@ class Rules:
         self.ticks_per_step = ticks_per_step  # checks of the footprint in a step
         self.tick_s = self.dt_s / self.ticks_per_step
         self.tick_times_s = [(1 + i) * self.tick_s for i in range(self.ticks_per_step)]
+        # Rounding must not add a step: 200 / 12 · 15 is 250.00000000000003.
         self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
 
     def is_out_of_bounds(self, state: VehicleState) -> bool:
@@ -147,6 +148,7 @@ class Episode:
         if path is not None and path not in paths:
             raise ValueError(f"unknown path {path!r}; the scene has {[*paths]}")
         rng = np.random.default_rng(episode_seed)
+        # Drawn even where a path is given, so that a seed has the same people on every path.
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
         self.rules = rules
         self.seed, self.speed_mps = episode_seed, speed_mps
@@ -177,6 +179,7 @@ class Episode:
         poses = self._poses_ahead()
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
+            # PyBullet and shapely are asked only where something can have happened.
             if is_near[i] or not street.is_safe(vehicle.x_m, vehicle.y_m):
                 self._end_where_due(vehicle, poses[i], street)
             if self.outcome:

@@ -67,6 +67,7 @@ class CameraPose:
 def relative_camera(before: CameraPose, now: CameraPose) -> Array:
     """Returns prev_from_curr [..., 4, 4]; exactly the identity if the camera did not move."""
     motion = before.cam_from_world @ now.world_from_cam
+    # The product of a matrix and its inverse is off by rounding, and flow by a little more than 0.
     motion[(before.planar == now.planar).all(axis=-1)] = np.eye(4)
     return motion
 
@@ -81,6 +82,7 @@ def instance_motion(
     numbers of row 0, so that its object flow is exactly zero.
     """
     static = relative_camera(before, now)[..., None, :, :]
+    # now: body ← world ← camera; then: camera ← world ← body, in which the point has stayed
     body_from_cam = rigid_inverse(world_from_body) @ now.world_from_cam[..., None, :, :]
     carried = before.cam_from_world[..., None, :, :] @ prev_world_from_body @ body_from_cam
     moved = (world_from_body != prev_world_from_body).any(axis=(-2, -1))
@@ -200,7 +202,7 @@ class Sensing:
     def _rasteriser(self, scale: int) -> Any:
         """Returns a rasteriser of pictures so many times the maps' size."""
         if scale not in self._rasterisers:
-            from flowrep.simulator.rasteriser import Rasteriser
+            from flowrep.simulator.rasteriser import Rasteriser  # which imports numba
 
             camera = self._camera
             size = scale * camera.height_px, scale * camera.width_px

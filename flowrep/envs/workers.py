@@ -83,6 +83,8 @@ class WorkerVectorEnv(VectorEnv):
         self._workers: list[_Worker] = []
         # At exit, multiprocessing would wait for ever for processes that SIGTERM does not reach.
         self._end = util.Finalize(self, _end, args=(self._workers,), exitpriority=10)
+        # fork would copy the locks of PyTorch's threads as they are; spawn would import gymnasium,
+        # numpy and PyBullet anew in each worker.
         context: Any = get_context("forkserver")
         context.set_forkserver_preload([_PRELOADED])
         with sheltered():
@@ -250,7 +252,7 @@ def _work(
     except Exception:
         pipe.send((None, traceback.format_exc()))
     finally:
-        if vector is not None:
+        if vector is not None:  # its environments may have failed to build
             vector.close()
 
 

@@ -177,6 +177,7 @@ def _ground(layout: Layout, group: PedestrianGroup) -> list[BaseGeometry]:
     line = layout.walk_line(group.walk)
     if len(line) < 2:
         raise SceneError(f"{key}.walk: has no length; give two places apart from each other")
+    # Only one person may walk across their own walk: two could meet where lanes cross.
     is_walkable = all(keeps_its_stretches(line, side * spread / 2) for side in (-1, 1))
     if not is_walkable or (group.count > 1 and not keeps_lanes_apart(line, spread)):
         raise SceneError(

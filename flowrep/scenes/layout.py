@@ -51,6 +51,7 @@ def centreline(road: Road) -> LineString:
             assert piece.arc_deg is not None
             count = max(1, math.ceil(abs(piece.arc_deg) / _ARC_STEP_DEG))
             turn = math.radians(piece.arc_deg) / count
+            # Chords: the points lie on the arc.
             lengths = [2 * piece.arc_radius_m * math.sin(abs(turn) / 2)] * count
         for length in lengths:
             x += length * math.cos(heading + turn / 2)
@@ -71,6 +72,7 @@ def pose_along(line: LineString, at_m: float) -> tuple[float, float, float]:
     >>> pose_along(LineString([(0, 0), (9, 0)]), -2.0)
     (-2.0, 0.0, 0.0)
     """
+    # The heading is that of the chord around a place, also where two pieces meet.
     step = min(0.05, line.length / 4)
     middle = min(max(at_m, step), line.length - step)
     behind, ahead = (line.interpolate(middle + sign * step) for sign in (-1, 1))
@@ -265,6 +267,7 @@ class Layout:
         return CrosswalkArea(self._road_between(crosswalk.road, first, last), heading)
 
     def _buildings(self) -> tuple[Box, ...]:
+        # Every house takes its draws in turn, so rows added at the end leave the others alone.
         rng = np.random.default_rng(self.scene.layout_seed)
         boxes: list[Box] = []
         for row in self.scene.building_rows:

@@ -72,6 +72,7 @@ class Street:
         self._numbers: list[int] = []  # PyBullet's, of the bodies
         vehicle, count = layout.scene.vehicle, layout.scene.num_pedestrians
         self._vehicle = self.simulator.add_box(vehicle.length_m, vehicle.width_m, vehicle.height_m)
+        # One cylinder for everyone: it is placed where the vehicle may touch someone.
         self._person = self.simulator.add_cylinder(pedestrians.RADIUS_M, pedestrians.HEIGHT_M)
         self._boxes: list[tuple[Box, int]] = []  # all that can be hit, each with its body
         self._add_ground(layout)
@@ -95,7 +96,7 @@ class Street:
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
         """Returns the street shared by all environments of the process with this scene."""
-        key = pickle.dumps(scene)
+        key = pickle.dumps(scene)  # a scene holds mappings, so it has no hash
         street = _STREETS.get(key)
         if street is None:
             street = _STREETS[key] = cls(Layout(scene))
