@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -89,21 +90,14 @@ class AdaptDepth(CameraTransform):
         reads = Reads(shape, "float" if scale_m is None else "any")
         super().__init__(intrinsics, [reads], in_keys, out_keys)
         check_own_keys(self)
-        self.kind, self.near_m, self.far_m = kind, near_m, far_m
-        self.scale_m, self.nothing, self.channels_last = scale_m, nothing, channels_last
+        self.options: dict[str, Any] = {"kind": kind, "near_m": near_m, "far_m": far_m}
+        self.options |= {"scale_m": scale_m, "nothing": nothing}
+        self.channels_last = channels_last
 
     def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:
         """Returns depth along the optical axis."""
-        z = geometry.adapt_depth(
-            depth.movedim(-1, -3) if self.channels_last else depth,
-            self.kind,
-            K=self.K if K is None else K,
-            near_m=self.near_m,
-            far_m=self.far_m,
-            scale_m=self.scale_m,
-            nothing=self.nothing,
-        )
-        return (z,)
+        depth = depth.movedim(-1, -3) if self.channels_last else depth
+        return (geometry.adapt_depth(depth, K=self.K if K is None else K, **self.options),)
 
     def output_specs(self, depth: TensorSpec, *camera: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded spec of depth's size."""
@@ -163,17 +157,12 @@ class AdaptPose(MapTransform):
         check_pose_options(layout, axes)
         super().__init__([_POSES[layout]], in_keys, out_keys)
         check_own_keys(self)
-        self.layout, self.direction, self.axes = layout, direction, axes
+        self.options: dict[str, Any] = {"layout": layout, "direction": direction, "axes": axes}
         self.check = bool(check)
 
     def compute(self, pose: Tensor) -> tuple[Tensor]:
         """Returns the pose, unchecked."""
-        return (self._adapted(pose, check=False),)
-
-    def _adapted(self, pose: Tensor, check: bool) -> Tensor:
-        return geometry.adapt_pose(
-            pose, layout=self.layout, direction=self.direction, axes=self.axes, check=check
-        )
+        return (geometry.adapt_pose(pose, check=False, **self.options),)
 
     def _refuse_ill_formed(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> None:
         """Raises ValueError for an ill-formed pose, in the given rows `[*B]` or in all."""
@@ -186,7 +175,7 @@ class AdaptPose(MapTransform):
             still = torch.eye(pose.shape[-1], dtype=pose.dtype, device=pose.device)
             still = still[: pose.shape[-2]] if rank == 2 else still[-1]
             pose = torch.where(expand_as_right(rows, pose), pose, still)
-        self._adapted(pose, check=True)
+        geometry.adapt_pose(pose, check=True, **self.options)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -252,18 +241,13 @@ class AdaptFlow(MapTransform):
         reads = Reads(("H", "W", 2), "float") if channels_last else FLOW
         super().__init__([reads], in_keys, out_keys)
         check_own_keys(self)
-        self.direction, self.grid, self.channels = direction, grid, channels
+        self.options: dict[str, Any] = {"direction": direction, "grid": grid, "channels": channels}
         self.channels_last = channels_last
 
     def compute(self, flow: Tensor) -> tuple[Tensor]:
         """Returns flow in flowrep's convention."""
-        adapted = geometry.adapt_flow(
-            flow.movedim(-1, -3) if self.channels_last else flow,
-            direction=self.direction,
-            grid=self.grid,
-            channels=self.channels,
-        )
-        return (adapted,)
+        flow = flow.movedim(-1, -3) if self.channels_last else flow
+        return (geometry.adapt_flow(flow, **self.options),)
 
     def output_specs(self, flow: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded spec of flow's size."""

@@ -136,6 +136,7 @@ class MapTransform(Transform):
         if self.missing_tolerance and any(lacks):
             return next_tensordict
         maps = self._read(next_tensordict)
+        # The class's function: compiled once for all instances, which stay picklable.
         compute = type(self).compute
         if self.compiled:
             compute = _compiled(compute)
@@ -146,7 +147,7 @@ class MapTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return self._call(tensordict_reset)
+        return self._call(tensordict_reset)  # TorchRL's own doesn't call the transform
 
     @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -261,6 +262,7 @@ class RecurrentTransform(MapTransform):
                 f"{missing!r}, or give a trajectory with ('next', 'done') and a dimension named "
                 f"'time' (td.refine_names(..., 'time')); names are {tensordict.names}"
             )
+        # Step by step, as the env does it: equal to the last bit, whatever a subclass computes.
         time = tensordict.names.index("time")
         ended = flags_of_batch(done, tensordict).unbind(time)
         steps: list[tuple[Tensor, ...]] = []

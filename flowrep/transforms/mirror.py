@@ -51,7 +51,6 @@ class Mirror(Transform):
             named "time") as a whole; "both" appends the images along the first dimension, which
             doubles it; "all" replaces all.
         action_key: the key of the action.
-        generator: of the draws for "half", on the batch's device; None for PyTorch's own.
 
     Raises:
         ValueError: for a flow that is not among `in_keys`, actions that exchanging twice doesn't
@@ -79,7 +78,6 @@ class Mirror(Transform):
         intrinsics: Tensor | Sequence[Sequence[float]] | None = None,
         images: Images = "half",
         action_key: NestedKey = "action",
-        generator: torch.Generator | None = None,
     ) -> None:
         keys = as_keys(in_keys)
         super().__init__(in_keys=keys, out_keys=keys)
@@ -97,7 +95,7 @@ class Mirror(Transform):
         check_name("images", images, Images)
         self.register_buffer("swapped_actions", swapped, persistent=False)
         self.twice_cx = None if intrinsics is None else _twice_cx(intrinsics)
-        self.images, self.generator = images, generator
+        self.images = images
         self.action_key: NestedKey = as_keys([action_key])[0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -113,7 +111,7 @@ class Mirror(Transform):
         if self.images == "all":
             return torch.ones(shape, dtype=torch.bool, device=device)
         drawn = [1 if name == "time" else n for name, n in zip(tensordict.names, shape)]
-        chance = torch.rand(drawn, generator=self.generator, device=device)
+        chance = torch.rand(drawn, device=device)
         return (chance < 0.5).expand(shape)
 
     def _mirror(self, tensordict: TensorDictBase, chosen: Tensor) -> TensorDictBase:
@@ -143,6 +141,7 @@ class Mirror(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        # TorchRL's own doesn't call the transform: an env would refuse its first step only.
         return self._call(tensordict_reset)
 
     def __repr__(self) -> str:

@@ -167,6 +167,8 @@ class SensorNoise(MapTransform):
             stream = list(SENSORS).index(sensor)
             bits = frame_bits(frame, shape, seed=self.seed or 0, stream=stream)
             return normal(bits), uniform(bits) if sensor == "depth" else uniforms
+        # A generator of each call's own, whose state is replaced and never changed in place: copies
+        # of the transform, TorchRL's shallow clones among them, go on independently.
         generator = torch.Generator(device)
         if self._state is None:
             generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
@@ -258,7 +260,7 @@ def split_mix(state: Tensor) -> Tensor:
     >>> split_mix(torch.tensor([1234567]))
     tensor([6457827717110365317])
     """
-    z = state + _GAMMA
+    z = state + _GAMMA  # the constants are those of Steele, Lea and Flood, 2014
     for places, factor in ((30, _FIRST), (27, _SECOND)):
         z ^= _shifted(z, places)
         z *= factor

@@ -142,15 +142,6 @@ def test_half_of_a_batch_is_replaced_whole_transitions_at_a_time():
     assert same(mirror("half")(td.clone()), got)
 
 
-def test_draws_come_from_the_generator_that_is_given():
-    td, rng = transitions(50), torch.Generator().manual_seed(5)
-    first = mirror("half", generator=rng)(td.clone())
-    before = torch.get_rng_state()
-    again = mirror("half", generator=torch.Generator().manual_seed(5))(td.clone())
-    assert same(first, again)
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_a_trajectory_is_mirrored_as_a_whole():
     td = transitions(64, 3)
     td.names = [None, "time"]
