@@ -110,17 +110,17 @@ def test_the_policy_sees_the_busy_places_and_which_of_them_have_just_begun(scene
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("greedy", [True, False])
-def test_an_episode_does_not_depend_on_what_else_is_in_the_batch(scene, greedy):
-    names = ["obj", "seg2", "depth2"]
-    made = partial(make_env, scene, names, noise=NOISE)
+def test_an_episode_does_not_depend_on_what_else_is_in_the_batch(scene):
+    names, ways = ["obj", "seg2", "depth2"], (True, False)
     runs = []
     for num_envs, num_workers in ((1, 0), (3, 0), (5, 2)):
-        env = made(num_envs=num_envs, num_workers=num_workers)
-        runs.append(outcomes(evaluate(env, weigher(*names), episodes(7), greedy=greedy)))
+        env = make_env(scene, names, noise=NOISE, num_envs=num_envs, num_workers=num_workers)
+        driven = (evaluate(env, weigher(*names), episodes(6), greedy=greedy) for greedy in ways)
+        runs.append([outcomes(found) for found in driven])
         env.close()
     assert runs[0] == runs[1] == runs[2]
-    assert len({(outcome, length) for _, _, outcome, _, _, length in runs[0]}) > 3
+    for found in runs[0]:
+        assert len({(outcome, length) for _, _, outcome, _, _, length in found}) > 2
 
 
 def test_a_baseline_and_its_agent_twin_live_through_the_same_episodes(scene):

@@ -36,10 +36,9 @@ def pool():
 def test_several_processes_give_the_rows_of_one(scene, pool):
     make = partial(make_env, scene, representations=["obj"])
     rows = []
+    few = ASKED | {"fps": [12], "episodes": 2}
     for where in (pool, None):
-        asked = Comparison(
-            **ASKED | {"fps": [12]}, policies=["greedy", "sampled"], baselines=["random"]
-        )
+        asked = Comparison(**few, policies=["greedy", "sampled"], baselines=["random"])
         asked.run(make, weigher("obj"), num_envs=4, pool=where)
         assert asked.done == asked.total
         rows.append(asked.rows())
