@@ -106,7 +106,7 @@ def main() -> None:
         rest = parts[0] - sum(parts[1:])
         rate = args.episodes / (best["run"] + best["make"])
         cells = " | ".join(f"{part:.3f}" for part in (*parts, rest))
-        print(f"| {num_envs} | {rate:.1f} | {cells} | {best['pool']:.2f} |")
+        print(f"| {num_envs} | {rate:.1f} | {cells} | {best['make']:.2f} |")
 
 
 if __name__ == "__main__":

@@ -7,9 +7,9 @@ import argparse
 import time
 from collections import Counter
 
-from flowrep.baselines import BASELINES, drives
-from flowrep.envs import StreetEnv
-from flowrep.experiment.evaluation import wilson_interval
+from flowrep.baselines import BASELINES
+from flowrep.envs import make_env
+from flowrep.experiment.evaluation import evaluate, wilson_interval
 from flowrep.scenes import load_scene, scene_names
 
 OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
@@ -31,9 +31,10 @@ def main() -> None:
         for speed in scene.pedestrian_speed_mps:
             for baseline in args.baselines:
                 started = time.perf_counter()
-                env = StreetEnv(scene, speed=speed, sensors=())
-                ended = drives(env, BASELINES[baseline](), args.episodes, seed=args.seed)
-                counts = Counter(drive.outcome for drive in ended)
+                env = make_env(scene, speed=speed, num_envs=16)
+                seeds = range(args.seed, args.seed + args.episodes)
+                ended = evaluate(env, baseline, [{"episode_seed": seed} for seed in seeds])
+                counts = Counter(episode.outcome for episode in ended)
                 env.close()
                 cells = [cell(counts[outcome], args.episodes) for outcome in OUTCOMES]
                 low, high = BOUNDS[baseline]

@@ -43,7 +43,7 @@ _DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode
 """The columns in drives.npz."""
 
 _IDENTITY = (
-    "scene", "representations", "flow", "noise", "algorithm", "speed", "seed", "num_envs",
+    "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
 )  # fmt: skip
 """The parts of a config that determine the weights after some number of frames."""
 
@@ -114,7 +114,7 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
             "install that version, or start a new run"
         )
-    there = _flat({**saved, "algorithm": _without_defaults(saved["algorithm"])})
+    there = _flat({"motion": "exact", **saved, "algorithm": _without_defaults(saved["algorithm"])})
     here = _flat(expected)
     for key in {**there, **here}:
         was, now = there.get(key, "absent"), here.get(key, "absent")
