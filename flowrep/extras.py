@@ -1,8 +1,11 @@
-"""Which packages are installed, and the error for missing ones of an extra."""
+"""Optional packages: which are installed, the error for missing ones, and what numba compiles."""
 
 import sys
+from collections.abc import Callable
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 
 def is_installed(package: str) -> bool:
@@ -31,3 +34,26 @@ def require(what: str, extra: str, *packages: str, module: str = "") -> None:
             if module == "__main__" or Path(sys.argv[0]).name.startswith("flowrep-"):
                 sys.exit(f"error: {message}")
             raise ImportError(message)
+
+
+@cache
+def numba_is_installed() -> bool:
+    """Returns whether numba can be imported, without importing it."""
+    return is_installed("numba")
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Returns a decorator; `options` are those of `numba.njit`, the machine code is cached.
+
+    Raises:
+        ImportError: numba is not installed.
+    """
+    from numba import njit  # here, as it takes half a second and is an extra
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return njit(cache=True, nogil=True, **options)(function)
+        except RuntimeError:  # no writable cache folder: each process compiles again
+            return njit(nogil=True, **options)(function)
+
+    return decorate

@@ -13,13 +13,13 @@ import flowrep
 PACKAGE = Path(flowrep.__file__).parent
 
 FLOWREP_IMPORTS_ALLOWED = {
-    "geometry": {"geometry", "jit"},
+    "geometry": {"geometry", "extras"},
     "transforms": {"transforms", "geometry", "extras"},
     "testing": {"geometry"},
-    "agent": {"agent", "extras", "jit"},
+    "agent": {"agent", "extras"},
     "palette": set(),
     "scenes": {"scenes", "config", "extras", "palette"},
-    "simulator": {"simulator", "scenes", "palette", "jit"},
+    "simulator": {"simulator", "scenes", "palette", "extras"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
@@ -38,7 +38,7 @@ FLOWREP_IMPORTS_ALLOWED = {
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py"},
-    "numba": {"jit.py"},
+    "numba": {"extras.py"},
     "hydra": {
         "train.py",
         "view.py",

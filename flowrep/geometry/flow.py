@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from flowrep.extras import numba_is_installed
 from flowrep.geometry import closed_form
 from flowrep.geometry.camera import centred_pixels
 from flowrep.geometry.checks import broadcast_batch, check_name, check_rows, check_shape
 from flowrep.geometry.closed_form import Planes, flow_planes, known_camera, motion_coefficients
-from flowrep.jit import numba_is_installed
 
 Direction: TypeAlias = Literal["forward", "backward"]
 Grid: TypeAlias = Literal["current", "previous"]

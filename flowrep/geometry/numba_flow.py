@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flowrep.extras import compiled
 from flowrep.geometry.checks import check_rows
 from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, Planes, largest_raw
-from flowrep.jit import compiled
 
 _LEAST_DEPTH, _LEAST_RATIO = np.float32(SMALLEST), np.float32(MIN_DEPTH_RATIO)
 _LARGEST_RAW = np.float32(largest_raw(torch.float32))

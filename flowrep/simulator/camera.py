@@ -10,7 +10,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.jit import numba_is_installed
+from flowrep.extras import numba_is_installed
 from flowrep.scenes.scene import CameraConfig
 
 Matrix = NDArray[np.float64]

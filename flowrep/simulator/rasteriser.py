@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.jit import compiled
+from flowrep.extras import compiled
 from flowrep.palette import CLASS_COLOURS
 from flowrep.simulator.meshes import Triangles
 from flowrep.simulator.paint import (

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
+from flowrep.extras import compiled
 from flowrep.geometry import closed_form, ego_flow, factorize, numba_flow, rigid_flow
 from flowrep.geometry import flow as flow_module
-from flowrep.jit import compiled
 from tests.geometry.scenes import HEIGHT, MOTION, OTHER_MOTION, WIDTH, K, depth_map, rigid
 
 pytest.importorskip("numba")
