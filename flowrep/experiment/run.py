@@ -83,7 +83,8 @@ def _holder(lock: str) -> str:
 
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the identity of a run: flowrep's version, and the config keys that define it."""
-    parts = json.loads(json.dumps({key: config[key] for key in _IDENTITY}))
+    whole = {"motion": "exact", **config}  # earlier runs have no motion
+    parts = json.loads(json.dumps({key: whole[key] for key in _IDENTITY}))
     parts["algorithm"] = _without_defaults(parts["algorithm"])
     return {"flowrep": __version__} | parts
 
