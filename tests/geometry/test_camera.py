@@ -8,12 +8,7 @@ from itertools import product
 import pytest
 import torch
 
-from flowrep.geometry import (
-    check_intrinsics,
-    intrinsics_from_fov,
-    project,
-    unproject,
-)
+from flowrep.geometry import check_intrinsics, intrinsics_from_fov, project, unproject
 from tests.geometry.scenes import HEIGHT, WIDTH, K, depth_map
 
 
@@ -21,28 +16,19 @@ def camera(fx=100.0, skew=0.0, cx=32.0, fy=50.0, cy=24.0) -> torch.Tensor:
     return torch.tensor([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def test_project_by_hand():
-    # u = 100 * 1/4 + 32, v = 50 * 2/4 + 24. With fx and fy swapped: (44.5, 74).
-    pixel = project(torch.tensor([1.0, 2.0, 4.0]), camera())
-    assert pixel.tolist() == [57.0, 49.0]
+@pytest.mark.parametrize(("skew", "u"), [(0.0, 57.0), (8.0, 61.0)])
+def test_project_skew_by_hand(skew, u):
+    # u = 100 * 1/4 + skew * 2/4 + 32, v = 50 * 2/4 + 24. With fx and fy swapped: (44.5, 74); were
+    # skew applied to v: (57, 53).
+    assert project(torch.tensor([1.0, 2.0, 4.0]), camera(skew=skew)).tolist() == [u, 49.0]
 
 
-def test_project_skew_by_hand():
-    # u gains skew * y/z = 8 * 0.5. Were skew ignored, 57; were it applied to v, (57, 53).
-    pixel = project(torch.tensor([1.0, 2.0, 4.0]), camera(skew=8.0))
-    assert pixel.tolist() == [61.0, 49.0]
-
-
-def test_unproject_by_hand():
-    # Column 1, row 0: u = 1.5, v = 0.5. y = (0.5 - 0.25) / 0.5 * 2, x = (1.5 - 1) / 4 * 2.
-    point = unproject(torch.full((1, 1, 2), 2.0), camera(fx=4.0, cx=1.0, fy=0.5, cy=0.25))[0, 1]
-    assert point.tolist() == [0.25, 1.0, 2.0]
-
-
-def test_unproject_skew_by_hand():
-    # y/z = (0.5 - 0.25) / 0.5 = 0.5, so x/z = (1.5 - 1 - 3 * 0.5) / 4 = -0.25.
-    K_skew = camera(fx=4.0, skew=3.0, cx=1.0, fy=0.5, cy=0.25)
-    assert unproject(torch.full((1, 1, 2), 2.0), K_skew)[0, 1].tolist() == [-0.5, 1.0, 2.0]
+@pytest.mark.parametrize(("skew", "x"), [(0.0, 0.25), (3.0, -0.5)])
+def test_unproject_skew_by_hand(skew, x):
+    # Column 1, row 0 at 2 m: u = 1.5, v = 0.5, so y/z = (0.5 - 0.25) / 0.5 = 0.5 and
+    # x/z = (1.5 - 1 - skew * 0.5) / 4.
+    K = camera(fx=4.0, skew=skew, cx=1.0, fy=0.5, cy=0.25)
+    assert unproject(torch.full((1, 1, 2), 2.0), K)[0, 1].tolist() == [x, 1.0, 2.0]
 
 
 def test_pixel_to_camera_to_pixel_comes_back():
@@ -106,10 +92,6 @@ def test_gradients():
     )
 
 
-# 1 x 3 pixels whose rays lead through (-0.75, 0.5), (0, 0.5) and (0.75, 0.5) at z = 1.
-CAMERA = torch.tensor([[4.0, 0.0, 3.5], [0.0, 8.0, -3.5], [0.0, 0.0, 1.0]])
-
-
 def test_field_of_view_across_the_width_or_the_height():
     # tan(45 deg) = 1: half of the picture, 3 or 2 px, lies as far out as the focal length.
     across_width = intrinsics_from_fov(90.0, axis="horizontal", height=4, width=6)
@@ -130,7 +112,7 @@ def test_pixels_that_are_not_square():
 
 
 def test_intrinsics_that_are_none_are_refused_by_name_and_place():
-    cameras = CAMERA.repeat(2, 3, 1, 1)
+    cameras = camera(fx=4.0, cx=3.5).repeat(2, 3, 1, 1)
     check_intrinsics("K", cameras)
     cameras[1, 2, 2, 0] = 3.5  # and so (3.5, 0, 1) as the last row
     with pytest.raises(ValueError, match=r"^K\[1, 2\] should .*got \[\[4.0, 0.0, 3.5\], .*, \[3.5"):

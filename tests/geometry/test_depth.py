@@ -6,10 +6,7 @@ import math
 
 import torch
 
-from flowrep.geometry import (
-    adapt_depth,
-    unproject,
-)
+from flowrep.geometry import adapt_depth, unproject
 from tests.geometry.scenes import K, depth_map
 
 # 1 x 3 pixels whose rays lead through (-0.75, 0.5), (0, 0.5) and (0.75, 0.5) at z = 1.
@@ -49,12 +46,9 @@ def test_an_opengl_z_buffer_becomes_metres():
     torch.testing.assert_close(z[:2], torch.tensor([0.5, 2.0]))
     assert z[2] == math.inf  # nothing was drawn
     assert z[3:].isnan().all()
-
-
-def test_a_z_buffer_without_far_plane():
-    # b = 1 - near / z: 0.75 at four times the near plane.
-    z = adapt_depth(depth_of(0.75), "z_buffer", near_m=0.5, far_m=math.inf)
-    assert z.item() == 2.0
+    # Without a far plane b = 1 - near / z: 0.75 at four times the near plane.
+    endless = adapt_depth(depth_of(0.75), "z_buffer", near_m=0.5, far_m=math.inf)
+    assert endless.item() == 2.0
 
 
 def test_whole_numbers_become_metres_and_nothing_becomes_nan():

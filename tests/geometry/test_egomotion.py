@@ -47,17 +47,11 @@ def motions(count: int = 16, seed: int = 1) -> torch.Tensor:
 def errors(got, motion, depth, camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Returns errors of rotation in degrees, translation in metres, ego flow in px (medians)."""
     turn = got[..., :3, :3].double().mT @ motion[..., :3, :3].double()
-    off = torch.stack(
-        [
-            turn[:, 2, 1] - turn[:, 1, 2],
-            turn[:, 0, 2] - turn[:, 2, 0],
-            turn[:, 1, 0] - turn[:, 0, 1],
-        ],
-        -1,
-    )
+    # R - R^T is 2 sin(angle) [axis], whose norm is sqrt(8) sin(angle).
+    sine = (turn - turn.mT).flatten(1).norm(dim=-1) / math.sqrt(8)
     miss = ego_flow(depth, camera, got).flow - ego_flow(depth, camera, motion).flow
     return (
-        torch.rad2deg(off.norm(dim=-1) / 2),
+        torch.rad2deg(sine),
         (got - motion)[..., :3, 3].norm(dim=-1),
         miss.norm(dim=-3).flatten(1).median(-1).values,
     )
