@@ -108,18 +108,12 @@ def test_frames_come_in_flowreps_conventions_and_lost_tracking_starts_a_clip(sdk
     assert frame.timestamp_s == 2.5
 
 
-def test_a_camera_that_is_not_there_is_named(sdk, monkeypatch):
+def test_what_is_not_there_is_named(sdk, monkeypatch, tmp_path):
     monkeypatch.setattr(Camera, "opens", FAILED)
     with pytest.raises(SequenceError, match=r"^live: can't be opened: the ZED SDK says CAMERA_NOT"):
         list(ZedLive("live"))
-
-
-def test_a_file_that_is_not_there_is_named(sdk, tmp_path):
     with pytest.raises(SequenceError, match=r"a\.svo: no such file"):
         ZedLive(tmp_path / "a.svo")
-
-
-def test_without_the_sdk_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyzed", None)
     with pytest.raises(ImportError, match="pyzed"):
         ZedLive("live")
