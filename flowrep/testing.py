@@ -7,7 +7,7 @@ wrong ones look plausible. `check_flow` needs nothing but recorded frames, and t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,13 +18,14 @@ from torch.nn import functional
 from flowrep import geometry
 
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+_TWICE = torch.diag(torch.tensor([2.0, 2.0, 1.0]))  # K of a picture twice as large: _TWICE @ K
 # (depth, K, motions) under another convention, by what the user's data would then be.
 _SUSPECTS: dict[str, Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]] = {
     "depth is the ray's length": lambda z, K, m: (geometry.z_from_ray_length(z, K), K, m),
     "motions are curr_from_prev": lambda z, K, m: (z, K, geometry.invert_rigid(m)),
     "poses have OpenGL's axes": lambda z, K, m: (z, K, _OPENGL.to(m) @ m @ _OPENGL.to(m)),
-    "K is of a picture twice this size": lambda z, K, m: (z, _scaled(K, 0.5), m),
-    "K is of a picture half this size": lambda z, K, m: (z, _scaled(K, 2.0), m),
+    "K is of a picture twice this size": lambda z, K, m: (z, _TWICE.inverse().to(K) @ K, m),
+    "K is of a picture half this size": lambda z, K, m: (z, _TWICE.to(K) @ K, m),
 }
 
 
@@ -45,8 +46,8 @@ class FlowCheck:
     agreement: float
     hidden: float
     movement_px: float
-    flows: dict[str, float] = field(default_factory=dict)
-    suspects: dict[str, float] = field(default_factory=dict)
+    flows: dict[str, float]
+    suspects: dict[str, float]
 
     @property
     def is_right(self) -> bool:
@@ -137,11 +138,6 @@ def check_flow(
         {n: _agreement(flow, depth, ids, before, tolerance)[0] for n, flow in flows.items()},
         suspects,
     )
-
-
-def _scaled(K: Tensor, factor: float) -> Tensor:
-    """Returns K of a picture that is `factor` times as large."""
-    return torch.cat([K[..., :2, :] * factor, K[..., 2:, :]], dim=-2)
 
 
 def _depth_before(depth: Tensor, ids: Tensor, K: Tensor, motions: Tensor) -> Tensor:

@@ -109,10 +109,8 @@ def intrinsics_from_fov(
     Args:
         fov_deg: the whole angle, degrees, between 0 and 180.
         axis: `"horizontal"` or `"vertical"`.
-        height: of the picture, pixels.
-        width: of the picture, pixels.
+        height: of the picture, pixels; as `width`.
         pixel_aspect: a pixel's width over its height, fy / fx; 1 for square pixels.
-        dtype: of the result.
 
     Raises:
         ValueError: an unknown axis, or an angle or a size out of range.

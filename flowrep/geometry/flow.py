@@ -157,7 +157,8 @@ def factorize(
     batch = _check(depth, K, prev_from_curr, dt, raw=raw)
     # Ego flow is rounded regardless of raw's dtype, so that static pixels have exactly 0 obj.
     u, v, valid = _planes(batch, depth, None, K, prev_from_curr.unsqueeze(-3), dt)
-    dtype, compute = torch.promote_types(u.dtype, raw.dtype), _computed_in(u.dtype)
+    dtype = torch.promote_types(u.dtype, raw.dtype)
+    compute = torch.promote_types(u.dtype, torch.float32)
     raw = raw.to(dtype).expand(*batch, -1, -1, -1)
     if _suits_numba(depth, u, v, raw):
         from flowrep.geometry import numba_flow  # needs numba
@@ -254,10 +255,6 @@ def _check(
     return broadcast_batch(**batches)
 
 
-def _computed_in(dtype: torch.dtype) -> torch.dtype:
-    return torch.promote_types(dtype, torch.float32)
-
-
 def _planes(
     batch: torch.Size,
     depth: Tensor,
@@ -272,7 +269,7 @@ def _planes(
     """
     height, width = depth.shape[-2:]
     dtype = torch.promote_types(torch.promote_types(depth.dtype, K.dtype), motions.dtype)
-    compute = _computed_in(dtype)
+    compute = torch.promote_types(dtype, torch.float32)
     K, dt, known = known_camera(K.to(compute), dt)
     motions = motions.to(compute)
     by_motion = motion_coefficients(K.unsqueeze(-3), motions, known.unsqueeze(-1))  # [*B, N, 12]

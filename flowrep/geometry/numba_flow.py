@@ -34,14 +34,13 @@ def planes_of_motions(
     y: Tensor,
     dt: float | Tensor,
 ) -> Planes:
-    """Returns the flow planes of N motions per map.
+    """Returns the flow planes of N motions per map; floats are float32.
 
     Args:
-        depth: `[*B, H, W]`, float32, like all other floats.
+        depth: `[*B, H, W]`.
         instance: `[*B, H, W]`, integers, the motion of each pixel; None if all have motion 0.
         coefficients: A and e of each motion, `[*B, N, 12]`.
-        x: pixel centres relative to the principal point, `[*B, 1, W]`.
-        y: the same, `[*B, H, 1]`.
+        x: pixel centres relative to the principal point, `[*B, 1, W]`; y is `[*B, H, 1]`.
         dt: time between the frames, a number or `[*B]`.
     """
     *batch, height, width = depth.shape
@@ -75,11 +74,7 @@ def planes_of_motions(
 def object_flow(raw: Tensor, u: Tensor, v: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """Returns raw − ego, 0 where it isn't known, `[*B, 2, H, W]`, and where it is, `[*B, H, W]`.
 
-    Args:
-        raw: `[*B, 2, H, W]`, float32.
-        u: ego flow to the right, `[*B, H, W]`, float32.
-        v: ego flow downwards, likewise.
-        valid: where ego flow is known, bool `[*B, H, W]`.
+    Raw flow is `[*B, 2, H, W]`, float32; ego flow's u, v and bool valid are `[*B, H, W]`.
     """
     *batch, height, width = valid.shape
     maps = math.prod(batch)

@@ -104,11 +104,9 @@ def instance_motion(
     of a body's axes and origin doesn't matter, as long as they are fixed to it.
 
     Args:
-        world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world).
-        world_from_curr: `[*B, 4, 4]`, pose of the current camera.
+        world_from_prev: see `relative_motion`, as for `world_from_curr` and `dtype`.
         world_from_prev_body: `[*B, N, 4, 4]`, poses of the bodies at the previous frame.
         world_from_curr_body: `[*B, N, 4, 4]`, poses of the same bodies, in the same order, now.
-        dtype: of the result.
 
     >>> camera, before, now = torch.eye(4), torch.eye(4), torch.eye(4)
     >>> now[0, 3] = 0.5  # the body moved half a metre along x
@@ -275,8 +273,7 @@ def adapt_pose(
     >>> world_from_cam @ torch.tensor([0.0, 0.0, 1.0, 1.0]).double()  # a metre ahead: along x
     tensor([6., 6., 7., 1.], dtype=torch.float64)
     """
-    check_pose_options(layout, axes)
-    check_name("direction", direction, PoseDirection)
+    check_pose_options(layout, direction, axes)
     if layout == "matrix":
         check_shape("pose", pose, (4, 4))
         matrix = pose.double()
@@ -297,9 +294,10 @@ def adapt_pose(
     return torch.cat([*columns, matrix[..., 3:]], -1)
 
 
-def check_pose_options(layout: str, axes: str) -> None:
-    """Raises ValueError for an unknown layout or axes, and for angles of a camera along its z."""
+def check_pose_options(layout: str, direction: str, axes: str) -> None:
+    """Raises ValueError for an unknown name, and for angles of a camera that looks along its z."""
     check_name("layout", layout, PoseLayout)
+    check_name("direction", direction, PoseDirection)
     check_name("axes", axes, CameraAxes)
     if layout.startswith("xyz_yaw") and axes != "x_forward_z_up":
         raise ValueError(

@@ -8,11 +8,7 @@ from flowrep.transforms.maps import Depth, InstanceIds, Rgb, Segmentation
 from flowrep.transforms.mirror import Mirror
 from flowrep.transforms.motion import CameraMotion, EstimateCameraMotion, InstanceMotion
 from flowrep.transforms.noise import SensorNoise
-from flowrep.transforms.stack import (
-    REPRESENTATIONS,
-    representation_options,
-    representation_stack,
-)
+from flowrep.transforms.stack import REPRESENTATIONS, representation_options, representation_stack
 
 __all__ = [
     "DIS",

@@ -8,12 +8,10 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.geometry import checks
 from flowrep.geometry.depth import check_depth_options
 from flowrep.geometry.flow import check_flow_options
 from flowrep.geometry.pose import check_pose_options
@@ -52,13 +50,11 @@ class AdaptDepth(CameraTransform):
     Args:
         kind: `"z"`, `"ray_length"` or `"z_buffer"` (OpenGL's, in [0, 1]).
         intrinsics: K `[3, 3]` in pixels or its key; only for `"ray_length"`.
-        near_m: the near plane; only for `"z_buffer"`.
-        far_m: the far plane; only for `"z_buffer"`.
+        near_m: the near plane, as `far_m` the far plane only for `"z_buffer"`.
         scale_m: metres per unit; whole numbers need it, e.g. 0.001 for millimetres.
         nothing: a value, before scaling, that means no measurement; it becomes nan.
         channels_last: whether the env's depth is `[*B, H, W, 1]`.
-        in_keys: key of the env's depth.
-        out_keys: key of depth in metres; must differ, so that nothing is adapted twice.
+        out_keys: must differ from `in_keys`, so that nothing is adapted twice.
 
     Raises:
         ValueError: for an unknown kind, an argument that it lacks or doesn't use, or a K that can't
@@ -126,8 +122,7 @@ class AdaptPose(MapTransform):
         check: whether ill-formed poses raise ValueError at resets, in the envs that are reset, and
             at the root of batches; steps aren't checked. A check waits for a GPU: switch it off if
             resets or replay samples have to be fast there.
-        in_keys: key of the env's pose.
-        out_keys: key of the result; must differ, so that nothing is adapted twice.
+        out_keys: must differ from `in_keys`, so that nothing is adapted twice.
 
     Raises:
         ValueError: for an unknown name, and at resets for a pose that is not rigid.
@@ -153,8 +148,7 @@ class AdaptPose(MapTransform):
         in_keys: Keys = "pose",
         out_keys: Keys = ("sensor", "world_from_cam"),
     ) -> None:
-        checks.check_name("direction", direction, geometry.PoseDirection)
-        check_pose_options(layout, axes)
+        check_pose_options(layout, direction, axes)
         super().__init__([_POSES[layout]], in_keys, out_keys)
         check_own_keys(self)
         self.options: dict[str, Any] = {"layout": layout, "direction": direction, "axes": axes}
@@ -169,13 +163,7 @@ class AdaptPose(MapTransform):
         if not self.check or tensordict.get(self.in_keys[0], None) is None:
             return
         (pose,) = self._inputs(tensordict)
-        if rows is not None:
-            # A stand-in for the others; a quaternion has length 1 with either end as its real part.
-            rank = len(self.reads[0].shape)
-            still = torch.eye(pose.shape[-1], dtype=pose.dtype, device=pose.device)
-            still = still[: pose.shape[-2]] if rank == 2 else still[-1]
-            pose = torch.where(expand_as_right(rows, pose), pose, still)
-        geometry.adapt_pose(pose, check=True, **self.options)
+        geometry.adapt_pose(pose if rows is None else pose[rows], check=True, **self.options)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -212,8 +200,7 @@ class AdaptFlow(MapTransform):
         grid: `"current"`; `"previous"` raises an error that names the remedy.
         channels: `"uv"` or `"row_column"`.
         channels_last: whether the env's flow is `[*B, H, W, 2]`.
-        in_keys: key of the env's flow.
-        out_keys: key of raw flow; must differ, so that nothing is adapted twice.
+        out_keys: must differ from `in_keys`, so that nothing is adapted twice.
 
     Raises:
         ValueError: for an unknown name, and for flow on the previous frame's grid.

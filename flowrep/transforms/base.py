@@ -171,7 +171,6 @@ class MapTransform(Transform):
         return observation_spec
 
     def __repr__(self) -> str:
-        """Returns the class name with the input and output keys."""
         return f"{type(self).__name__}({self.in_keys} -> {self.out_keys})"
 
 
@@ -243,7 +242,15 @@ class RecurrentTransform(MapTransform):
             return tensordict
         # What is stored there is right even if the next frame is several steps ahead.
         if missing := [key for key in self.out_keys if following.get(key, None) is None]:
-            _refuse_n_step(tensordict, missing[0])
+            # TorchRL's MultiStep and MultiStepTransform write the number of steps to this key.
+            steps = tensordict.get("steps_to_next_obs", None)
+            if steps is not None and bool((steps != 1).any()):
+                lost = ("next", missing[0])
+                raise MissingKey(
+                    f"{lost} is not in the batch, and can't be computed: its next frames lie up to "
+                    f"{int(steps.max())} steps ahead ('steps_to_next_obs'). Store {lost} as the "
+                    "env gave it, before MultiStepTransform moves it"
+                )
             later = self.advance(self._carried(tensordict), self._read(following))
             for key, value in zip(self.out_keys, later):
                 if key in missing:
@@ -318,18 +325,6 @@ def flags_of_batch(flags: Tensor, tensordict: TensorDictBase) -> Tensor:
     """Returns flags such as `done`, `[*B]` or `[*B, 1]`, as `[*B]`, the TensorDict's batch."""
     batch_dims = tensordict.ndim
     return flags.flatten(batch_dims).any(-1) if flags.ndim > batch_dims else flags
-
-
-def _refuse_n_step(tensordict: TensorDictBase, key: NestedKey) -> None:
-    """Raises MissingKey if the next frames of a batch are more than one step after its root's."""
-    # TorchRL's MultiStep and MultiStepTransform write the number of steps to this key.
-    steps = tensordict.get("steps_to_next_obs", None)
-    if steps is not None and bool((steps != 1).any()):
-        raise MissingKey(
-            f"('next', {key!r}) is not in the batch, and can't be computed: its next frames lie up "
-            f"to {int(steps.max())} steps ahead ('steps_to_next_obs'). Store ('next', {key!r}) as "
-            f"the env gave it, before MultiStepTransform moves it"
-        )
 
 
 @functools.cache

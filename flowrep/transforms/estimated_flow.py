@@ -62,7 +62,6 @@ class DIS:
     min_side_px: int = 160
 
     def __post_init__(self) -> None:
-        """Raises ValueError for invalid options, and ImportError without OpenCV."""
         check_name("preset", self.preset, Preset)
         if self.min_side_px < 1:
             raise ValueError(f"min_side_px must be at least 1, got {self.min_side_px}")
@@ -128,8 +127,7 @@ class RAFT(nn.Module):
             unpickling objects. The weights published by torchvision fit.
         network: `"raft_small"` or `"raft_large"`, matching the weights.
         updates: number of refinements of the flow; more are slower and more accurate.
-        min_side_px: pictures with a shorter side below this are enlarged to at least this; not
-            below 128.
+        min_side_px: as `DIS`'s, at least 128.
 
     Raises:
         ImportError: torchvision is missing or was built for another torch.
@@ -156,7 +154,7 @@ class RAFT(nn.Module):
         self.network = getattr(_optical_flow(), network)(weights=None)
         try:
             self.network.load_state_dict(state)
-        except RuntimeError as error:
+        except (RuntimeError, TypeError) as error:
             raise ValueError(
                 f"{weights} does not hold the weights of {network}: {str(error)[:200]}"
             ) from error
@@ -177,7 +175,6 @@ class RAFT(nn.Module):
         return super().train(False)
 
     def _prepared(self, pictures: Tensor, factor: int) -> Tensor:
-        """Returns pictures in [-1, 1], enlarged, with sides that are multiples of 8."""
         scaled = pictures.float() / 127.5 - 1.0
         if factor > 1:
             scaled = functional.interpolate(
@@ -188,30 +185,21 @@ class RAFT(nn.Module):
 
 
 def _read_weights(path: Path) -> dict[str, Tensor]:
-    """Returns a file's state dict; torch's and safetensors' errors advise trusting the file."""
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no RAFT weights at '{path}': give weights= the state dict of a torchvision RAFT, "
-            "a .safetensors or .pth file; none come with flowrep"
-        )
     try:
         if path.suffix == ".safetensors":
             require(f"'{path}'", "raft", "safetensors")
             from safetensors.torch import load_file
 
-            state = load_file(path)
-        else:
-            state = torch.load(path, map_location="cpu", weights_only=True)
+            return load_file(path)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except (ImportError, OSError):
         raise
     except Exception:  # readers fail on garbage in as many ways as there is garbage
-        state = None
-    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        # Not "from error": torch's own text advises trusting the file.
         raise ValueError(
             f"'{path}' is not a readable weights file: it is damaged, or holds more than a state "
             "dict. Save the network's state_dict() again, preferably as .safetensors"
-        )
-    return state
+        ) from None
 
 
 def _optical_flow() -> Any:
@@ -254,11 +242,8 @@ class EstimatedFlow(FlowTransform):
         preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
         min_side_px: smaller pictures are enlarged to this; for RAFT to at least 128.
         outputs: which of `"raw"` and `"unscaled"` to write.
-        scale: factor on raw.
-        unit: of raw, `"px_per_step"` or `"px_per_s"`.
-        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
+        scale: factor on raw; for raw's `unit` and for `dt_s` and `out_keys` see `RawFlow`.
         in_keys: the pair of pictures.
-        out_keys: one key per output; their names by default.
 
     Raises:
         ValueError: for an unknown estimator, output or unit, `weights` for another estimator than
@@ -295,17 +280,9 @@ class EstimatedFlow(FlowTransform):
         in_keys: Keys = "rgb2",
         out_keys: Keys | None = None,
     ) -> None:
-        super().__init__(
-            None,
-            [PICTURE_PAIR],
-            outputs=outputs,
-            scale={name: scale if name == "raw" else 1.0 for name in outputs},
-            unit={name: unit if name == "raw" else "px_per_step" for name in outputs},
-            dt_s=dt_s,
-            compiled=False,
-            in_keys=in_keys,
-            out_keys=out_keys,
-        )
+        scales = {name: scale if name == "raw" else 1.0 for name in outputs}
+        units = {name: unit if name == "raw" else "px_per_step" for name in outputs}
+        super().__init__(None, [PICTURE_PAIR], in_keys, out_keys, outputs, scales, units, dt_s)
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
 
     def compute(self, pair: Tensor) -> tuple[Tensor, ...]:

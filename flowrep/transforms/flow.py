@@ -8,7 +8,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -34,12 +34,9 @@ from flowrep.transforms.base import (
 Unit = Literal["px_per_step", "px_per_s"]
 
 CAMERA = Reads((3, 3), "float")
-_RAW_KEYS: list[NestedKey] = [
-    ("sensor", "depth"),
-    ("sensor", "instance"),
-    ("sensor", "instance_motion"),
-]
-_EGO_KEYS: list[NestedKey] = [("sensor", "depth"), ("sensor", "prev_from_curr")]
+_DEPTH: NestedKey = ("sensor", "depth")
+_RAW_KEYS: Keys = [_DEPTH, ("sensor", "instance"), ("sensor", "instance_motion")]
+_EGO_KEYS: list[NestedKey] = [_DEPTH, ("sensor", "prev_from_curr")]
 
 # K itself, or the key under which the env gives it.
 Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
@@ -47,6 +44,8 @@ Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 
 class CameraTransform(MapTransform):
     """Holds K in its original float type, even if the transform is cast to another.
+
+    Raw flow, where it is the first input, becomes nan where the mask under `mask_key` is False.
 
     Args:
         intrinsics: K `[3, 3]`, its key in the TensorDict, where it is `[*B, 3, 3]`, or None if K
@@ -76,6 +75,19 @@ class CameraTransform(MapTransform):
         super().__init__(reads, in_keys, out_keys, writes)
         self.register_buffer("K", K, persistent=False)
 
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        maps = super()._read(tensordict)
+        key = mask_key(self.in_keys[0])
+        if self.reads[0] != FLOW or (known := tensordict.get(key, None)) is None:
+            return maps
+        like = maps[0][..., :1, :, :]
+        if known.dtype != torch.bool or known.shape != like.shape:
+            raise ValueError(
+                f"representation {self.label}: key {key!r}, where {self.in_keys[0]!r} is known, "
+                f"should be bool {list(like.shape)}; got {known.dtype} {list(known.shape)}"
+            )
+        return [torch.where(known, maps[0], math.nan), *maps[1:]]
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CameraTransform:
         """Moves K between devices but keeps its type, as bfloat16 would round 319.5 px to 320."""
         exact = self.K
@@ -99,14 +111,13 @@ class FlowTransform(CameraTransform):
         self,
         intrinsics: Intrinsics | None,
         reads: Sequence[Reads],
-        *,
+        in_keys: Keys,
+        out_keys: Keys | None,
         outputs: Sequence[str],
         scale: float | Mapping[str, float],
         unit: str | Mapping[str, str],
         dt_s: float | None,
-        compiled: bool,
-        in_keys: Keys,
-        out_keys: Keys | None,
+        compiled: bool = False,
     ) -> None:
         check_choice("outputs", outputs, self.known)
         keys = as_keys(list(outputs) if out_keys is None else out_keys)
@@ -148,9 +159,7 @@ class FlowTransform(CameraTransform):
         batch, size, device = like.shape[:-3], like.shape[-2:], like.device
         self._warn_of_foreign_camera(size)
         flow = Unbounded(
-            (*batch, 2, *size),
-            device=device,
-            dtype=torch.promote_types(like.dtype, torch.float32),
+            (*batch, 2, *size), device=device, dtype=torch.promote_types(like.dtype, torch.float32)
         )
         valid = Categorical(2, shape=(*batch, 1, *size), device=device, dtype=torch.bool)
         names = (*self.outputs, *["valid"] * len(self.masks))
@@ -238,17 +247,8 @@ class RawFlow(FlowTransform):
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        super().__init__(
-            intrinsics,
-            [DEPTH, IDS, MOTIONS],
-            outputs=outputs,
-            scale=scale,
-            unit=unit,
-            dt_s=dt_s,
-            compiled=compiled,
-            in_keys=_RAW_KEYS if in_keys is None else in_keys,
-            out_keys=out_keys,
-        )
+        reads, keys = [DEPTH, IDS, MOTIONS], _RAW_KEYS if in_keys is None else in_keys
+        super().__init__(intrinsics, reads, keys, out_keys, outputs, scale, unit, dt_s, compiled)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from depth, instance ids and motions (and K)."""
@@ -292,9 +292,8 @@ class FlowFactorize(FlowTransform):
         outputs: which of `"ego"`, `"obj"`, `"raw"` (the raw flow itself, in the chosen unit, 0
             where it isn't finite) and `"valid"` to write. With ego alone, raw flow isn't read.
         scale: factor on the flows, or a mapping from output to factor.
-        unit: `"px_per_step"` or `"px_per_s"`, or a mapping from output to unit.
-        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
-        compiled: whether `compute` runs through `torch.compile`, see `RawFlow`.
+        unit: `"px_per_step"` or `"px_per_s"`, or a mapping from output to unit; for `dt_s` and
+            `compiled` see `RawFlow`.
         in_keys: raw flow (in px/step, unscaled), depth and camera motion; without raw flow for ego
             alone.
         out_keys: one key per output; their names by default.
@@ -333,27 +332,12 @@ class FlowFactorize(FlowTransform):
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        reads, keys = [DEPTH, MOTION], _EGO_KEYS
+        reads: list[Reads] = [DEPTH, MOTION]
+        keys: Keys = _EGO_KEYS
         if {"obj", "raw"} & set(outputs):
-            reads, keys = [FLOW, *reads], ["raw", *keys]
-        super().__init__(
-            intrinsics,
-            reads,
-            outputs=outputs,
-            scale=scale,
-            unit=unit,
-            dt_s=dt_s,
-            compiled=compiled,
-            in_keys=keys if in_keys is None else in_keys,
-            out_keys=out_keys,
-        )
-
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Returns the inputs, with nan in raw flow where its mask says that it isn't known."""
-        maps = super()._read(tensordict)
-        if self.reads[0] == FLOW:
-            maps[0] = unknown_as_nan(self, tensordict, maps[0])
-        return maps
+            reads, keys = [FLOW, *reads], ["raw", *_EGO_KEYS]
+        keys = keys if in_keys is None else in_keys
+        super().__init__(intrinsics, reads, keys, out_keys, outputs, scale, unit, dt_s, compiled)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""
@@ -374,26 +358,7 @@ def mask_key(flow: NestedKey) -> NestedKey:
     return (*path, f"{name}_valid") if path else f"{name}_valid"
 
 
-def unknown_as_nan(transform: MapTransform, tensordict: TensorDictBase, raw: Tensor) -> Tensor:
-    """Returns raw flow, a transform's first input, with nan where the mask beside it is False.
-
-    Raises:
-        ValueError: for a mask of another layout.
-    """
-    key = mask_key(transform.in_keys[0])
-    known = tensordict.get(key, None)
-    if known is None:
-        return raw
-    if known.dtype != torch.bool or known.shape != raw[..., :1, :, :].shape:
-        raise ValueError(
-            f"representation {transform.label}: key {key!r}, where {transform.in_keys[0]!r} is "
-            f"known, should be bool {list(raw[..., :1, :, :].shape)}; "
-            f"got {known.dtype} {list(known.shape)}"
-        )
-    return torch.where(known, raw, math.nan)
-
-
-def _per_output(option: str, value: object, flows: Sequence[str]) -> dict[str, object]:
+def _per_output(option: str, value: object, flows: Sequence[str]) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         return dict.fromkeys(flows, value)
     if set(value) != set(flows):
@@ -401,16 +366,15 @@ def _per_output(option: str, value: object, flows: Sequence[str]) -> dict[str, o
     return dict(value)
 
 
-def _factor(scale: object, unit: object, dt_s: float | None) -> float:
+def _factor(scale: float, unit: str, dt_s: float | None) -> float:
     check_name("unit", unit, Unit)
-    factor = float(scale)  # type: ignore[arg-type]
-    if not math.isfinite(factor) or factor == 0.0:
+    if not math.isfinite(scale) or scale == 0.0:
         raise ValueError(f"scale must be a finite number other than 0, got {scale}")
     if unit == "px_per_step":
-        return factor
+        return float(scale)
     if dt_s is None or not dt_s > 0:
         raise ValueError(f"unit 'px_per_s' needs dt_s, the seconds that a step lasts; got {dt_s}")
-    return factor / dt_s
+    return scale / dt_s
 
 
 def as_intrinsics(intrinsics: Tensor | Sequence[Sequence[float]]) -> Tensor:

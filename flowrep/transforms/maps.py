@@ -1,4 +1,7 @@
-"""One map a sensor: picture, segmentation, depth, and the rows of bodies."""
+"""One map a sensor: picture, segmentation, depth, and the rows of bodies.
+
+`in_keys` and `out_keys` of each are by default those that its table reads and writes.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,6 @@ class Rgb(MapTransform):
     It stays uint8, which takes a quarter of the memory of float32 in a replay buffer. A network can
     read the divisor from the spec's bounds.
 
-    Args:
-        in_keys: key of the picture.
-        out_keys: key of the representation.
-
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -40,12 +39,7 @@ class Rgb(MapTransform):
         torch.Size([3, 2, 4])
     """
 
-    def __init__(
-        self,
-        *,
-        in_keys: Keys = ("sensor", "rgb"),
-        out_keys: Keys = "rgb",
-    ) -> None:
+    def __init__(self, *, in_keys: Keys = ("sensor", "rgb"), out_keys: Keys = "rgb") -> None:
         super().__init__([RGB], in_keys, out_keys)
 
     def compute(self, rgb: Tensor) -> tuple[Tensor]:
@@ -75,8 +69,6 @@ class Segmentation(MapTransform):
     Args:
         num_classes: number n of classes, 1 to 256.
         encoding: `"ids"` or `"onehot"`.
-        in_keys: key of the ids.
-        out_keys: key of the representation.
 
     Raises:
         ValueError: for an unknown encoding or a number of classes that uint8 can't hold, and in
@@ -149,8 +141,6 @@ class Depth(MapTransform):
     Args:
         range_m: depth in metres that becomes 1.
         missing: value for `nan`, in [0, 1].
-        in_keys: key of metric depth.
-        out_keys: key of the representation.
 
     Raises:
         ValueError: for a range that is not positive and finite, or `missing` outside [0, 1].
@@ -200,8 +190,7 @@ class InstanceIds(MapTransform):
     Args:
         body_ids: the ids of the bodies, in the order of their poses: the first becomes 1. Every
             other id, also a negative one, becomes 0, the static world.
-        in_keys: key of the env's ids.
-        out_keys: key of the rows; must differ, so that nothing is adapted twice.
+        out_keys: must differ from `in_keys`, so that nothing is adapted twice.
 
     Raises:
         ValueError: for a repeated id.

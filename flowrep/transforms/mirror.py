@@ -100,23 +100,22 @@ class Mirror(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns a batch of transitions with the images in their place, or behind them."""
-        if self.images == "both":
-            seen = torch.ones(tensordict.batch_size, dtype=torch.bool, device=tensordict.device)
-            return torch.cat([tensordict, self._mirror(tensordict.copy(), seen)])
-        return self._mirror(tensordict, self._draw(tensordict))
-
-    def _draw(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns which transitions are to be mirrored, `[*B]`."""
         shape, device = tensordict.batch_size, tensordict[self.in_keys[0]].device
+        if self.images == "half":
+            drawn = [1 if name == "time" else n for name, n in zip(tensordict.names, shape)]
+            chosen = (torch.rand(drawn, device=device) < 0.5).expand(shape)
+            return self._mirror(tensordict, chosen)
+        chosen = torch.ones(shape, dtype=torch.bool, device=device)
         if self.images == "all":
-            return torch.ones(shape, dtype=torch.bool, device=device)
-        drawn = [1 if name == "time" else n for name, n in zip(tensordict.names, shape)]
-        chance = torch.rand(drawn, device=device)
-        return (chance < 0.5).expand(shape)
+            return self._mirror(tensordict, chosen)
+        return torch.cat([tensordict, self._mirror(tensordict.copy(), chosen)])
 
     def _mirror(self, tensordict: TensorDictBase, chosen: Tensor) -> TensorDictBase:
         """Writes the images of the `chosen` [*B] transitions over them."""
-        tensordict[self.action_key] = self._exchange(tensordict[self.action_key], chosen)
+        action, swapped = tensordict[self.action_key], self.swapped_actions.to(chosen.device)
+        is_one_hot = action.ndim > chosen.ndim and action.shape[-1] == len(swapped)
+        image = action[..., swapped] if is_one_hot else swapped[action.long()].to(action.dtype)
+        tensordict[self.action_key] = torch.where(expand_as_right(chosen, action), image, action)
         following = tensordict.get("next", None)
         for key in self.in_keys:
             is_flow = key in self.flow_keys
@@ -129,23 +128,10 @@ class Mirror(Transform):
                     place[key] = mirror_map(x, chosen, self.twice_cx, is_flow=is_flow)
         return tensordict
 
-    def _exchange(self, action: Tensor, chosen: Tensor) -> Tensor:
-        swapped = self.swapped_actions.to(action.device)
-        is_one_hot = action.ndim > chosen.ndim and action.shape[-1] == len(swapped)
-        image = action[..., swapped] if is_one_hot else swapped[action.long()].to(action.dtype)
-        return torch.where(expand_as_right(chosen, action), image, action)
-
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         raise RuntimeError("Mirror is for replay: append it to a replay buffer, not to an env")
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        # TorchRL's own doesn't call the transform: an env would refuse its first step only.
-        return self._call(tensordict_reset)
-
     def __repr__(self) -> str:
-        """Returns the class name with the keys and which images it makes."""
         return f"{type(self).__name__}({self.in_keys}, images={self.images!r})"
 
 

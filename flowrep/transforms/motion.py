@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
@@ -22,10 +21,9 @@ from flowrep.transforms.base import (
     as_keys,
     check_choice,
 )
-from flowrep.transforms.flow import CameraTransform, Intrinsics, unknown_as_nan
+from flowrep.transforms.flow import CameraTransform, Intrinsics
 
-_CAMERA: NestedKey = ("sensor", "world_from_cam")
-_BODIES: NestedKey = ("sensor", "world_from_body")
+_POSES: Keys = [("sensor", "world_from_cam"), ("sensor", "world_from_body")]
 _DEPTH: NestedKey = ("sensor", "depth")
 # EstimateCameraMotion's outputs, with their keys.
 _ESTIMATES: dict[str, NestedKey] = {
@@ -53,10 +51,6 @@ class CameraMotion(RecurrentTransform):
     shuffled or not; n-step returns need it stored. A batch without a stored root motion has to be a
     trajectory, with a dimension named "time" and `("next", "done")`; its first frame counts as an
     episode's first.
-
-    Args:
-        in_keys: key of the pose.
-        out_keys: key of the motion.
 
     Example:
         >>> import torch
@@ -106,7 +100,6 @@ class InstanceMotion(RecurrentTransform):
     Args:
         in_keys: keys of the camera's pose `[*B, 4, 4]` and the bodies' poses `[*B, N, 4, 4]`,
             metres.
-        out_keys: key of the motions.
 
     Example:
         >>> import torch
@@ -124,9 +117,7 @@ class InstanceMotion(RecurrentTransform):
     def __init__(
         self, *, in_keys: Keys | None = None, out_keys: Keys = ("sensor", "instance_motion")
     ) -> None:
-        super().__init__(
-            [MOTION, MOTIONS], [_CAMERA, _BODIES] if in_keys is None else in_keys, out_keys
-        )
+        super().__init__([MOTION, MOTIONS], _POSES if in_keys is None else in_keys, out_keys)
 
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
         """Returns `instance_motion`."""
@@ -208,11 +199,6 @@ class EstimateCameraMotion(CameraTransform):
         super().__init__(intrinsics, reads, keys, written, writes=len(outputs))
         self.outputs = tuple(outputs)
         self.has_picture, self.has_prior = picture is not None, prior is not None
-
-    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        maps = super()._read(tensordict)
-        maps[0] = unknown_as_nan(self, tensordict, maps[0])
-        return maps
 
     def compute(self, raw: Tensor, depth: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs."""

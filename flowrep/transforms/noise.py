@@ -194,11 +194,8 @@ class SensorNoise(MapTransform):
 
 
 def _drawn_seed() -> int:
-    """Returns a seed that differs between envs in one process and between worker processes.
-
-    Forked workers share the state of torch's generator and spawned ones its default seed, so the
-    seed also depends on the name of the process.
-    """
+    """Returns a seed that differs between envs in one process and between worker processes."""
+    # Forked workers share the state of torch's generator and spawned ones its default seed.
     drawn = int(torch.randint(2**62, ()))
     return drawn ^ zlib.crc32(multiprocessing.current_process().name.encode())
 
@@ -206,14 +203,10 @@ def _drawn_seed() -> int:
 def noisy_depth(
     depth: Tensor, normal: Tensor, uniform: Tensor, *, sigma_per_m: float, dropout: float
 ) -> Tensor:
-    """Returns depth with an error of sigma_per_m · z², and holes (nan).
+    """Returns depth `[*B, 1, H, W]` with an error of sigma_per_m · z², and holes (nan).
 
-    Args:
-        depth: `[*B, 1, H, W]`, metres; inf stays inf unless it drops out.
-        normal: standard normal numbers of depth's shape.
-        uniform: uniform numbers in [0, 1) of depth's shape.
-        sigma_per_m: standard deviation over z², 1/m.
-        dropout: probability of a hole.
+    `normal` and `uniform` hold standard normal numbers and ones in [0, 1), of depth's shape. Depth
+    inf stays inf unless it drops out.
     """
     near = torch.where(depth.isinf(), 0.0, depth)
     noisy = torch.where(depth.isinf(), depth, near + sigma_per_m * near.square() * normal)
@@ -223,13 +216,9 @@ def noisy_depth(
 def drifted_motion(
     prev_from_curr: Tensor, normal: Tensor, *, drift_m: float, drift_rad: float
 ) -> Tensor:
-    """Returns the motion from a slightly displaced current camera, which is still rigid.
+    """Returns the motion `[*B, 4, 4]` from a slightly displaced current camera, still rigid.
 
-    Args:
-        prev_from_curr: `[*B, 4, 4]`.
-        normal: standard normal numbers `[*B, 6]`: translation, then rotation vector.
-        drift_m: standard deviation of the translation along each axis.
-        drift_rad: standard deviation of the rotation about each axis.
+    `normal` holds standard normal numbers `[*B, 6]`: translation, then rotation vector.
     """
     shift, turn = normal.double().split([3, 3], -1)
     rotation = rotation_from_vector(drift_rad * turn)
@@ -252,10 +241,7 @@ def _check_options(sensors: Sequence[str], options: dict[str, float]) -> None:
 
 
 def split_mix(state: Tensor) -> Tensor:
-    """Returns the number that SplitMix64 generates from a state, element by element.
-
-    Args:
-        state: int64; the next state is this plus the generator's gamma.
+    """Returns the number that SplitMix64 generates from a state, int64, element by element.
 
     >>> split_mix(torch.tensor([1234567]))
     tensor([6457827717110365317])

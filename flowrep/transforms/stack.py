@@ -199,14 +199,14 @@ def _noise_transforms(
         "depth": [name for name in chosen if name in ("depth", "depth2", "ego", "obj")],
         "motion": [name for name in chosen if name in ("ego", "obj") and reads_motion],
     }
-    options = {name: {o: given[o] for o in SENSORS[name].options} for name in _NOISY_KEYS}
-    noisy = [name for name in _NOISY_KEYS if readers[name] and any(options[name].values())]
-    keys = {name: SENSORS[name].key for name in _NOISY_KEYS}
+    options = {name: {o: given[o] for o in SENSORS[name].options} for name in readers}
+    noisy = [name for name in readers if readers[name] and any(options[name].values())]
+    keys = {name: SENSORS[name].key for name in readers}
     if not noisy:
         return [], keys
     transform = SensorNoise(
         sensors=noisy,
-        **{option: value for name in noisy for option, value in options[name].items()},
+        **{o: given[o] for name in noisy for o in options[name]},
         frame_key=("sensor", "frame"),
         out_keys=[_NOISY_KEYS[name] for name in noisy],
     )

@@ -51,17 +51,8 @@ def valid(sensor: dict[str, Tensor]) -> Tensor:
     return ~sensor["depth"].isnan()
 
 
-def seg(sensor: dict[str, Tensor]) -> Tensor:
-    return sensor["semantic"]
-
-
 def onehot(sensor: dict[str, Tensor]) -> Tensor:
-    ids = sensor["semantic"][0]
-    out = torch.zeros(NUM_CLASSES, *ids.shape)
-    for j in range(ids.shape[0]):
-        for i in range(ids.shape[1]):
-            out[ids[j, i].item(), j, i] = 1.0
-    return out
+    return torch.cat([sensor["semantic"] == c for c in range(NUM_CLASSES)]).float()
 
 
 def depth(sensor: dict[str, Tensor], range_m: float = 100.0) -> Tensor:
@@ -69,10 +60,6 @@ def depth(sensor: dict[str, Tensor], range_m: float = 100.0) -> Tensor:
     for index, z in enumerate(sensor["depth"].flatten().tolist()):
         out.view(-1)[index] = 0.0 if math.isnan(z) else min(z / range_m, 1.0)
     return out
-
-
-def rgb(sensor: dict[str, Tensor]) -> Tensor:
-    return sensor["rgb"]
 
 
 def stacked(of: str, sensor: dict[str, Tensor], k: int) -> Tensor:
@@ -95,10 +82,7 @@ def ray_length_to_z(sensor: dict[str, Tensor]) -> Tensor:
 
 def opengl_pose(sensor: dict[str, Tensor]) -> Tensor:
     """Returns the pose with OpenCV's axes, were the env's pose one with OpenGL's."""
-    flipped = sensor["world_from_cam"].clone()
-    flipped[:, 1] *= -1
-    flipped[:, 2] *= -1
-    return flipped
+    return sensor["world_from_cam"] * torch.tensor([1, -1, -1, 1])
 
 
 def rows_backward(sensor: dict[str, Tensor]) -> Tensor:

@@ -43,9 +43,8 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
     K = torch.tensor([[3.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
     K[1, 0, 0] = 4.0
     td = TensorDict({"ray": torch.full((2, 1, 1, 1), 5.0), "K": K}, [2])
-    for key in ("K", ["K"]):
-        z = AdaptDepth("ray_length", intrinsics=key, in_keys="ray")(td.clone())["sensor", "depth"]
-        torch.testing.assert_close(z.flatten(), torch.tensor([5.0 / math.sqrt(2), 4.0]))
+    z = AdaptDepth("ray_length", intrinsics="K", in_keys="ray")(td)["sensor", "depth"]
+    torch.testing.assert_close(z.flatten(), torch.tensor([5.0 / math.sqrt(2), 4.0]))
 
 
 @pytest.mark.parametrize(
@@ -54,11 +53,8 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
         (lambda: AdaptDepth("ray_length"), "needs K"),
         (lambda: AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
         (lambda: AdaptPose(axes="gl"), r"'x_forward_z_up'\], got 'gl'"),
-        (lambda: AdaptPose(layout="rpy"), "layout must be one of"),
         (lambda: AdaptPose(direction="inverse"), "direction must be one of"),
-        (lambda: AdaptPose(in_keys=POSE), "reads and writes"),
         (lambda: AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
-        (lambda: AdaptFlow(direction="forward", grid="current", out_keys="flow"), "second pass"),
         (lambda: InstanceIds([3, 1, 3]), r"must name each body once, got \[3, 1, 3\]"),
     ],
 )
@@ -102,15 +98,6 @@ def test_poses_of_several_bodies_at_once():
         AdaptPose(layout="xyz_wxyz", in_keys="matrices")(TensorDict({"matrices": matrices}, [2]))
 
 
-def test_rows_of_instances_are_categories():
-    env = TransformedEnv(
-        FakeSensorEnv((2,)), InstanceIds([1, 2, 3], in_keys=("sensor", "semantic"), out_keys="rows")
-    )
-    spec = env.observation_spec["rows"]
-    assert isinstance(spec, Categorical)
-    assert (spec.space.n, spec.dtype) == (4, torch.uint8)
-
-
 def test_a_simulator_that_knows_poses_alone_gets_the_flow_of_one_that_knows_motions():
     keys = [("sensor", "depth"), ("sensor", "instance"), "motions"]
     own = Compose(
@@ -136,14 +123,9 @@ def test_flow_with_channels_last_is_turned():
     raw = adapt(TensorDict(flow=vectors, batch_size=[1]))["raw"]
     assert raw.shape == (1, 2, 2, 3)
     assert raw[0, :, 1, 2].tolist() == [3.0, 1.0]
-    spec = adapt.transform_observation_spec(Composite(flow=Unbounded((2, 3, 2))))
-    assert spec["raw"].shape == (2, 2, 3)
-
-
-def test_adapted_flow_has_the_precision_of_the_env_s():
-    measured = Unbounded((2, 5, 7), dtype=torch.float64)
-    adapt = AdaptFlow(direction="backward", grid="current")
-    assert adapt.transform_observation_spec(Composite(flow=measured))["raw"] == measured
+    spec = Composite(flow=Unbounded((2, 3, 2), dtype=torch.float64))  # the env's precision stays
+    want = Unbounded((2, 2, 3), dtype=torch.float64)
+    assert adapt.transform_observation_spec(spec)["raw"] == want
 
 
 @pytest.mark.parametrize("ids", [[7], [7, 12, 31]])
@@ -154,6 +136,8 @@ def test_a_number_of_ids_that_is_not_that_of_the_bodies_is_refused(ids):
         ),
         segmentation=Unbounded((1, 5, 7), dtype=torch.int32),
     )
+    rows = InstanceIds(ids).transform_observation_spec(spec)["sensor", "instance"]
+    assert rows == Categorical(1 + len(ids), shape=(1, 5, 7), dtype=torch.uint8)
     stack = Compose(InstanceIds(ids), RawFlow(INTRINSICS))
     with pytest.raises(ValueError, match="InstanceIds"):
         stack.transform_observation_spec(spec)

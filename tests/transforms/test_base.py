@@ -33,11 +33,9 @@ from tests.transforms.fake_env import (
     SelfResettingEnv,
     frame,
 )
-from tests.transforms.oracles import same_bits
+from tests.transforms.oracles import brightening, same_bits
 
 COMPILE = torch.compile
-
-
 TRANSFORMS = {
     "seg": lambda: Segmentation(NUM_CLASSES),
     "onehot": lambda: Segmentation(NUM_CLASSES, encoding="onehot"),
@@ -48,8 +46,6 @@ TRANSFORMS = {
     "ego, obj": lambda: FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
     "stack": lambda: FrameStack(k=3, in_keys=[("sensor", "rgb")], out_keys=["rgb3"]),
 }
-
-
 each_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=list(TRANSFORMS))
 
 
@@ -139,12 +135,9 @@ def test_float64_maps_give_float64_flow_as_the_spec_says():
 
 def test_missing_key_is_named_with_what_the_env_offers_before_the_first_step():
     env = TransformedEnv(FakeSensorEnv(), Depth(in_keys=["range"]))
-    with pytest.raises(KeyError) as error:
+    # KeyError would quote the sentence.
+    with pytest.raises(KeyError, match=r"^representation 'depth' needs key 'range'.*'depth'\)"):
         env.observation_spec  # noqa: B018
-    message = str(error.value)
-    assert "representation 'depth' needs key 'range'" in message
-    assert "('sensor', 'depth')" in message
-    assert "\\" not in message  # KeyError would quote the sentence
 
 
 def test_missing_key_is_named_on_a_batch_with_all_that_need_it():
@@ -159,15 +152,11 @@ def test_missing_key_is_tolerated_when_torchrl_asks_for_it():
     assert "depth" not in transform(TensorDict({"reward": torch.zeros(3, 1)}, [3]))
 
 
-def test_next_without_any_input_is_left_alone():
+def test_next_without_any_input_is_left_alone_and_with_some_an_error():
     td = moments(2)
     td["next"] = TensorDict({"reward": torch.ones(2, 1)}, [2])
-    assert list(Depth()(td)["next"].keys()) == ["reward"]
-
-
-def test_next_with_some_inputs_is_an_error():
-    td = moments(2)
-    td["next"] = TensorDict({"sensor": {"depth": td["sensor", "depth"]}}, [2])
+    assert list(Depth()(td.clone())["next"].keys()) == ["reward"]
+    td["next", "sensor"] = {"depth": td["sensor", "depth"]}
     with pytest.raises(KeyError, match="prev_from_curr"):
         FlowFactorize(INTRINSICS, outputs=["ego"])(td)
 
@@ -194,24 +183,12 @@ def test_wrong_layout_is_refused_on_a_batch(key, value, expected):
         RawFlow(INTRINSICS)(td)
 
 
-def test_wrong_layout_is_refused_before_the_first_step():
-    env = TransformedEnv(FakeSensorEnv((3,)), Depth(in_keys=[("sensor", "rgb")]))
-    with pytest.raises(ValueError, match=r"'depth'.*float \[\*B, 1, H, W\].*\[3, 3, 5, 7\]"):
-        env.observation_spec  # noqa: B018
-
-
-@pytest.mark.parametrize(
-    ("batch", "got"),
-    [([], "[5, 7]"), ([4], "[4, 5, 7]"), ([2, 3], "[2, 3, 5, 7]"), ([1], "[1, 5, 7]")],
-)
-def test_a_map_without_channels_is_refused(batch, got):
+@pytest.mark.parametrize("batch", [[], [4], [2, 3], [1]])
+def test_a_map_without_channels_is_refused(batch):
     stack = FrameStack(k=2, in_keys=["grey"], out_keys=["grey2"])
     expected = re.escape(f"key 'grey' should be [*B, C0, H0, W0] with *B = {batch}; ") + ".*"
-    td = TensorDict({"grey": torch.zeros(*batch, 5, 7)}, batch)
-    with pytest.raises(ValueError, match=expected + re.escape(got)):
-        stack._reset(td, td)
     spec = Composite(grey=Unbounded((*batch, 5, 7)), shape=batch)
-    with pytest.raises(ValueError, match=expected + re.escape(got)):
+    with pytest.raises(ValueError, match=expected + re.escape(str([*batch, 5, 7]))):
         stack.transform_observation_spec(spec)
 
 
@@ -227,28 +204,21 @@ def test_wrong_number_of_keys_is_refused():
         FlowFactorize(INTRINSICS, out_keys=["ego"])
 
 
-DEPTH, RGB = ("sensor", "depth"), ("sensor", "rgb")
-
-
-def one_pixel(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """An estimator whose flow is 1 px everywhere."""
-    return torch.ones_like(first[:, :2], dtype=torch.float32)
-
-
-def opening() -> Compose:
-    return Compose(
-        CameraMotion(out_keys="motion"),
-        FlowFactorize(INTRINSICS, outputs=["ego"], in_keys=[DEPTH, "motion"]),
-        FrameStack(k=2, in_keys=[RGB], out_keys=["rgb2"]),
-        EstimatedFlow(one_pixel),
-        DropKeys("motion"),
-    )
-
-
 def test_all_that_is_computed_from_a_first_frame_is_what_a_reset_would_give():
-    own = TransformedEnv(SelfResettingEnv((2,)), opening()).rollout(9, break_when_any_done=False)
-    reset = TransformedEnv(FakeSensorEnv((2,)), opening()).rollout(9, break_when_any_done=False)
-    for key in (DEPTH, "ego", "rgb2", "raw"):
+    depth, rgb = ("sensor", "depth"), ("sensor", "rgb")
+
+    def rollout(env: FakeSensorEnv) -> TensorDict:
+        stack = Compose(
+            CameraMotion(out_keys="motion"),
+            FlowFactorize(INTRINSICS, outputs=["ego"], in_keys=[depth, "motion"]),
+            FrameStack(k=2, in_keys=[rgb], out_keys=["rgb2"]),
+            EstimatedFlow(brightening),
+            DropKeys("motion"),
+        )
+        return TransformedEnv(env, stack).rollout(9, break_when_any_done=False)
+
+    own, reset = rollout(SelfResettingEnv((2,))), rollout(FakeSensorEnv((2,)))
+    for key in (depth, "ego", "rgb2", "raw"):
         assert same_bits(own[key], reset[key]), key
     for flow in ("ego", "raw"):  # of an episode's first frame, and of no other, is 0
         still = (own[flow] == 0).flatten(2).all(-1)

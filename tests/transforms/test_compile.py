@@ -24,6 +24,7 @@ from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES
 from tests.transforms.test_base import inputs, moments
 
 POSE = ("sensor", "world_from_cam")
+POSES = "world_from_cam", "world_from_body"
 
 
 def camera_step(before: torch.Tensor, now: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -38,6 +39,7 @@ def next_stack(stack: torch.Tensor, frame: torch.Tensor) -> tuple[torch.Tensor, 
     return FrameStack(k=3, in_keys=["x"], out_keys=["x3"]).advance([stack], [frame])
 
 
+NOISE = {"depth_sigma_per_m": 0.1, "depth_dropout": 0.2, "drift_m": 0.1, "drift_rad": 0.2}
 TRANSFORMS = {
     "onehot": lambda: Segmentation(NUM_CLASSES, encoding="onehot"),
     "depth": Depth,
@@ -53,16 +55,14 @@ TRANSFORMS = {
         direction="backward", grid="current", channels="row_column", in_keys="raw", out_keys="own"
     ),
     "ids": lambda: InstanceIds([3, 1], in_keys=("sensor", "semantic")),
-    "noise by frame": lambda: SensorNoise(
-        depth_sigma_per_m=0.1, depth_dropout=0.2, drift_m=0.1, drift_rad=0.2, frame_key="frame"
-    ),
+    "noise by frame": lambda: SensorNoise(**NOISE, frame_key="frame"),
 }
 # What runs once a step beside `compute`, with its maps of two moments.
 STEPS = {
     "camera step": lambda td: (camera_step, [td[POSE].flip(0), td[POSE]]),
     "bodies step": lambda td: (
         bodies_step,
-        [poses for sensor in (td["sensor"].flip(0), td["sensor"]) for poses in poses_of(sensor)],
+        [sensor[key] for sensor in (td["sensor"].flip(0), td["sensor"]) for key in POSES],
     ),
     "next stack": lambda td: (
         next_stack,
@@ -71,29 +71,18 @@ STEPS = {
 }
 
 
-def poses_of(sensor):
-    return sensor["world_from_cam"], sensor["world_from_body"]
+def of(make):
+    return lambda td: ((transform := make()).compute, inputs(transform, td))
 
 
-def cases() -> dict[str, object]:
-    """Returns functions from a batch of moments to (a function, its tensors)."""
-
-    def of(make):
-        return lambda td: ((transform := make()).compute, inputs(transform, td))
-
-    return {**{name: of(make) for name, make in TRANSFORMS.items()}, **STEPS}
-
-
-each_case = pytest.mark.parametrize("case", cases().values(), ids=list(cases()))
+# Functions from a batch of moments to (a function, its tensors).
+CASES = {name: of(make) for name, make in TRANSFORMS.items()} | STEPS
+each_case = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 
 
 def framed(count: int):
     """Moments with names of frames: numbers of episodes and steps."""
     return moments(count).set("frame", torch.arange(2 * count).reshape(-1, 2))
-
-
-def outputs(result) -> list[torch.Tensor]:
-    return [result] if isinstance(result, torch.Tensor) else [*result]
 
 
 @pytest.mark.slow_after_first
@@ -105,7 +94,7 @@ def test_one_graph_for_all_batches(case):
     compiled = torch.compile(function, fullgraph=True, dynamic=True, backend=counter)
     for batch in (11, 2, 8):  # first one that equals no other size: torch would tie the two
         _, given = case(framed(batch))
-        for got, want in zip(outputs(compiled(*given)), outputs(function(*given))):
+        for got, want in zip(compiled(*given), function(*given)):
             assert torch.equal(got.nan_to_num(), want.nan_to_num())
     assert counter.frame_count == 1
     compiled(*case(framed(1))[1])  # torch makes a graph of its own for size 1
@@ -120,10 +109,10 @@ def test_nothing_waits_for_the_gpu(case):
     function, given = case(td)
     if (owner := getattr(function, "__self__", None)) is not None:
         owner.to("cuda")
-    want = outputs(function(*given))  # what is set up once may wait
+    want = function(*given)  # what is set up once may wait
     torch.cuda.set_sync_debug_mode("error")
     try:
-        got = outputs(function(*given))
+        got = function(*given)
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert all(a.is_cuda and a.shape == b.shape for a, b in zip(got, want))
@@ -131,8 +120,7 @@ def test_nothing_waits_for_the_gpu(case):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_noise_is_drawn_on_the_gpu_without_waiting():
-    options = {"depth_sigma_per_m": 0.1, "depth_dropout": 0.1, "drift_m": 0.1, "drift_rad": 0.1}
-    noise = SensorNoise(**options)
+    noise = SensorNoise(**NOISE)
     td = moments(3).to("cuda")
     noise.compute(*inputs(noise, td))
     torch.cuda.set_sync_debug_mode("error")

@@ -5,20 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import MultiStep
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from flowrep.transforms import (
-    CameraMotion,
-    EstimateCameraMotion,
-    FlowFactorize,
-    InstanceMotion,
-    RawFlow,
-)
+from flowrep.transforms import CameraMotion, EstimateCameraMotion, FlowFactorize, RawFlow
 from tests.transforms.fake_env import FakeSensorEnv, frame_motions
 
-POSE, MOTION = ("sensor", "world_from_cam"), "motion"
+MOTION = "motion"
 WANT = ("sensor", "prev_from_curr")  # what the env itself says, written down independently
 
 
@@ -50,53 +43,6 @@ def test_a_step_from_an_earlier_tensordict_moves_from_its_pose():
     once = [second[MOTION][i, :3, :3].trace().item() for i in (0, 1)]
     assert all(far < near - 1e-4 for far, near in zip(turned, once))
     assert not camera_motion().state_dict()
-
-
-def test_time_may_be_any_dimension_of_a_trajectory():
-    env = TransformedEnv(FakeSensorEnv((2,)), camera_motion())
-    online = env.rollout(8, break_when_any_done=False)
-    time_first = online.exclude(MOTION, ("next", MOTION)).transpose(0, 1)
-    assert time_first.names == ["time", None]
-    assert torch.equal(camera_motion()(time_first)[MOTION], online[MOTION].transpose(0, 1))
-
-
-@pytest.mark.parametrize("transform", [CameraMotion, InstanceMotion])
-def test_n_step_returns_keep_the_motion_that_was_stored(transform):
-    env = TransformedEnv(FakeSensorEnv((2,)), transform(out_keys=[MOTION]))
-    online = env.rollout(9, break_when_any_done=False)
-    td = MultiStep(gamma=0.9, n_steps=3)(online.clone()).reshape(-1)
-    assert (td["steps_to_next_obs"] == 3).any()
-    stored = td["next", MOTION].clone()
-    assert torch.equal(transform(out_keys=[MOTION])(td)["next", MOTION], stored)
-    with pytest.raises(KeyError, match=r"up to 3 steps ahead.*Store \('next', 'motion'\)"):
-        transform(out_keys=[MOTION])(td.exclude(("next", MOTION)))
-
-
-def test_transitions_without_past_are_refused():
-    td = FakeSensorEnv((2,)).rollout(4, break_when_any_done=False).reshape(-1)
-    with pytest.raises(KeyError, match=r"'motion' is not in the batch.*named 'time'"):
-        camera_motion()(td)
-
-
-def test_stepping_without_the_pose_of_the_step_before_is_refused():
-    env = TransformedEnv(FakeSensorEnv(), camera_motion())
-    td = env.reset().set("action", torch.tensor(0))
-    del td[POSE]
-    with pytest.raises(KeyError, match=r"needs .* of the previous step"):
-        env.step(td)
-
-
-def test_a_missing_pose_is_named_before_the_first_step():
-    env = TransformedEnv(FakeSensorEnv(), CameraMotion(in_keys="pose"))
-    with pytest.raises(KeyError, match=r"'prev_from_curr'\) needs key 'pose'"):
-        env.observation_spec  # noqa: B018
-    with pytest.raises(KeyError, match="needs key 'pose'"):
-        CameraMotion(in_keys="pose", out_keys=MOTION)(FakeSensorEnv((2,)).rollout(2))
-
-
-def test_one_output_is_written():
-    with pytest.raises(ValueError, match=r"CameraMotion writes 1 keys, out_keys has \['a', 'b'\]"):
-        CameraMotion(out_keys=["a", "b"])
 
 
 def wide_frames(count: int = 3) -> TensorDict:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import math
 import pickle
 
@@ -65,32 +66,18 @@ def test_drift_follows_the_motion_by_hand():
     torch.testing.assert_close(ahead, torch.tensor([0.0, -1.0, 0.0, 0.0]), atol=1e-6, rtol=0)
     origin = drifted @ torch.tensor([0.0, 0.0, 0.0, 1.0])
     torch.testing.assert_close(origin, torch.tensor([3.0, 0.0, 0.5, 1.0]))
-
-
-@pytest.mark.parametrize("size", [1e-9, 0.02, 3.0])
-def test_drifted_motion_stays_rigid(size):
-    motion = drifted_motion(
-        torch.eye(4).double().repeat(50, 1, 1),
-        torch.randn(50, 6, generator=torch.manual_seed(0)),
-        drift_m=size,
-        drift_rad=size,
-    )
-    check_rigid("motion", motion, tolerance=1e-12)
-    assert not torch.equal(motion[0], torch.eye(4).double())
+    far = drifted_motion(motion.double(), 3 * normal + 1, drift_m=3.0, drift_rad=1.0)
+    check_rigid("motion", far, tolerance=1e-12)
 
 
 def test_noise_has_the_size_that_was_asked_for():
-    depth = torch.full((1, 200, 200), 10.0)
-    motion, flow = torch.eye(4).repeat(1, 1), torch.zeros(2, 200, 200)
-    noisy_z, _, noisy_flow = SensorNoise(**ALL).compute(depth, motion, flow)
+    depth, motion, flow = maps(20_000)
+    noisy_z, motions, noisy_flow = SensorNoise(**ALL).compute(0 * depth + 10.0, motion, flow)
     error = noisy_z[~noisy_z.isnan()] - 10.0
-    assert abs(noisy_z.isnan().float().mean() - 0.1) < 0.01  # 40,000 pixels: 6 sigma
-    assert abs(error.std() - 1.0) < 0.03
-    assert abs(error.mean()) < 0.04
+    assert abs(noisy_z.isnan().float().mean() - 0.1) < 0.004  # 240,000 pixels: 6 sigma
+    assert abs(error.std() - 1.0) < 0.02
+    assert abs(error.mean()) < 0.02
     assert abs(noisy_flow.std() - 0.5) < 0.01
-    motions = SensorNoise(**ALL).compute(
-        maps(20_000)[0], torch.eye(4).repeat(20_000, 1, 1), maps(20_000)[2]
-    )[1]
     assert abs(motions[:, :3, 3].std() - 0.02) < 0.001
     assert abs(motions[:, 2, 1].std() - 0.03) < 0.001  # about x
 
@@ -148,13 +135,9 @@ def frames(count: int) -> torch.Tensor:
     return torch.stack([2_000_000 + torch.arange(count) // 7, torch.arange(count) % 7], -1)
 
 
-def noisy_by_frame(frame: torch.Tensor, **options) -> tuple[torch.Tensor, ...]:
-    noise = SensorNoise(**ALL, frame_key=("sensor", "frame"), **options)
-    depth, motion, flow = maps()
-    batch = frame.shape[:-1]
-    motion = motion[0].clone()
-    motion[:3, 3] = torch.tensor([0.1, -0.02, 0.8])
-    given = (value.expand(*batch, *value.shape) for value in (depth[0], motion, flow[0]))
+def noisy_by_frame(frame: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    noise = SensorNoise(**ALL, frame_key=("sensor", "frame"))
+    given = (value[0].expand(*frame.shape[:-1], *value.shape[1:]) for value in maps())
     return noise.compute(*given, frame)
 
 
@@ -166,12 +149,8 @@ def test_a_frame_has_its_noise_in_any_batch_bit_for_bit():
     for whole, mixed, folded in zip(many, shuffled, square):
         assert torch.equal(mixed.nan_to_num(), whole[order].nan_to_num())
         assert torch.equal(folded.flatten(0, 1).nan_to_num(), whole.nan_to_num())
-    for place in (0, 1, 7, 333):
-        alone = noisy_by_frame(frames(500)[place])
-        row = noisy_by_frame(frames(500)[place : place + 1])
-        for whole, single, first in zip(many, alone, row):
-            assert torch.equal(single.nan_to_num(), whole[place].nan_to_num())
-            assert torch.equal(first[0].nan_to_num(), whole[place].nan_to_num())
+    for whole, single in zip(many, noisy_by_frame(frames(500)[333])):
+        assert torch.equal(single.nan_to_num(), whole[333].nan_to_num())
 
 
 def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next():
@@ -194,8 +173,6 @@ def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next()
     ("options", "expected"),
     [
         ({"sensors": ["deep"]}, r"some of \['depth', 'motion', 'flow'\], each once"),
-        ({"sensors": "depth"}, "must be a list"),
-        ({"sensors": ["depth", "depth"]}, "each once"),
         ({"depth_sigma_per_m": -0.1}, "depth_sigma_per_m must be a finite number of at least 0"),
         ({"drift_m": math.inf}, "drift_m must be a finite number"),
         ({"depth_dropout": 1.5}, r"depth_dropout must be a probability, got 1\.5"),
@@ -233,20 +210,11 @@ def test_noise_by_frame_needs_the_frame_s_name():
 
 
 # The first outputs of the generator's reference implementation for seed 1234567.
-REFERENCE = [
-    6457827717110365317,
-    3203168211198807973,
-    9817491932198370423,
-    4593380528125082431,
-    16408922859458223821,
-]
-
-
-GAMMA = 0x9E3779B97F4A7C15
+REFERENCE = [6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431]
 
 
 def test_split_mix_gives_the_numbers_of_its_reference():
-    states = [(1234567 + step * GAMMA) % 2**64 for step in range(5)]
+    states = [(1234567 + step * 0x9E3779B97F4A7C15) % 2**64 for step in range(4)]
     signed = torch.tensor([state - 2**64 * (state >= 2**63) for state in states])
     assert [int(number) % 2**64 for number in split_mix(signed)] == REFERENCE
 
@@ -265,48 +233,27 @@ def test_numbers_of_known_bits_by_hand():
     assert uniform(bits).tolist() == [0.0, 1.0 - 2.0**-24, 0.5]
 
 
-@pytest.fixture(scope="module")
-def bits():
-    """A million numbers: 100 frames of 100 episodes, 100 of each."""
-    episode, step = torch.meshgrid(torch.arange(100), torch.arange(100), indexing="ij")
-    return frame_bits(torch.stack([episode, step], -1), (100,), seed=0, stream=0)
-
-
 @pytest.mark.slow
-def test_normal_and_uniform_numbers_are_spread_as_they_should_be(bits):
-    x, u = normal(bits).double().flatten(), uniform(bits).double().flatten()
-    million = len(x)  # limits are five standard errors
-    assert abs(x.var() - 1) < 5 * (2 / million) ** 0.5
-    assert abs(x.pow(4).mean() - 3) < 5 * (96 / million) ** 0.5
+def test_numbers_by_frame_are_spread_as_they_should_be_and_neighbours_have_nothing_in_common():
+    # A million numbers: 100 frames of 100 episodes, 100 of each. Limits are five standard errors.
+    million, frame = 1_000_000, torch.cartesian_prod(torch.arange(100), torch.arange(100))
+    bits = frame_bits(frame.reshape(100, 100, 2), (100,), seed=0, stream=0)
+    x, u = normal(bits), uniform(bits)
     steps = torch.linspace(0, 1, million, dtype=torch.float64)
-    of_normal = 0.5 * (1 + torch.erf(x.sort().values / math.sqrt(2)))
-    for shares in (u.sort().values, of_normal):  # Kolmogorov and Smirnov's distance
-        assert (shares - steps).abs().max() < 2.2 / million**0.5
+    of_normal = 0.5 * (1 + torch.erf(x.double() / math.sqrt(2)))
+    for shares in (u.double(), of_normal):  # Kolmogorov and Smirnov's distance
+        assert (shares.flatten().sort().values - steps).abs().max() < 2.2 / million**0.5
     assert abs((x * (u - 0.5)).mean()) < 5 * (1 / 12 / million) ** 0.5
-
-
-@pytest.mark.slow
-def test_neighbours_have_nothing_in_common(bits):
-    x = normal(bits)  # [episodes, steps, places]
-    for dim in range(3):
-        for lag in (1, 2, 7):
-            pairs = x.narrow(dim, lag, 100 - lag) * x.narrow(dim, 0, 100 - lag)
-            assert abs(pairs.mean()) < 5 / pairs.numel() ** 0.5, (dim, lag)
-    swapped = x * x.transpose(0, 1)  # (3, 5) and (5, 3); the diagonal is a frame with itself
-    assert abs(swapped[~torch.eye(100, dtype=torch.bool)].mean()) < 0.01
+    for dim, lag in itertools.product(range(3), (1, 7)):  # episodes, steps and places
+        pairs = x.narrow(dim, lag, 100 - lag) * x.narrow(dim, 0, 100 - lag)
+        assert abs(pairs.mean()) < 5 / pairs.numel() ** 0.5, (dim, lag)
     assert len(bits.unique()) == bits.numel()
 
 
 def test_every_part_of_the_name_counts():
-    assert torch.equal(noisy_by_frame(frames(4), seed=0)[2], noisy_by_frame(frames(4))[2])
-    frame = torch.tensor([[12, 0]])
-    same = frame_bits(frame, (50,), seed=3, stream=1)
-    assert torch.equal(frame_bits(frame.to(torch.int32), (50,), seed=3, stream=1), same)
-    for other in (
-        frame_bits(frame, (50,), seed=4, stream=1),
-        frame_bits(frame, (50,), seed=3, stream=2),
-        frame_bits(torch.tensor([[12, 1]]), (50,), seed=3, stream=1),
-        frame_bits(torch.tensor([[0, 12]]), (50,), seed=3, stream=1),
-        frame_bits(torch.tensor([[12]]), (50,), seed=3, stream=1),
-    ):
-        assert not (other == same).any()
+    same = frame_bits(torch.tensor([[12, 0]]), (50,), seed=3, stream=1)
+    for name, seed, stream in [
+        *(([12, 0], 4, 1), ([12, 0], 3, 2)),
+        *(([12, 1], 3, 1), ([0, 12], 3, 1), ([12], 3, 1)),
+    ]:
+        assert not (frame_bits(torch.tensor([name]), (50,), seed=seed, stream=stream) == same).any()
