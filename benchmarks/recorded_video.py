@@ -21,7 +21,7 @@ import torch
 
 from flowrep.sequences import EstimatedFlowSource, Frames, SevenScenes, recorded_motion
 from flowrep.sequences.job import Job
-from flowrep.sequences.output import Output, OutputOptions
+from flowrep.sequences.output import Output
 from flowrep.transforms import DIS
 
 FRAMES = 60
@@ -73,7 +73,7 @@ def measure(
             as_seven_scenes(folder / "in")
         stream = SevenScenes(folder / "in") if register else Frames(folder / "in")
         source = EstimatedFlowSource(DIS(preset), check_consistency=check_consistency)
-        out = Output(folder / "out", OutputOptions(flow_files=flow_files), {})
+        out = Output(folder / "out", {}, flow_files=flow_files)
         job = Job(stream, source, recorded_motion, out)
         cpu, wall = time.process_time(), time.perf_counter()
         job.run()
@@ -104,7 +104,7 @@ def memory(frames: int = 10_000) -> None:
                 )
             lines.append(lines[i % 20])
         (folder / "in/poses.txt").write_text("\n".join(lines))
-        out = WatchedOutput(folder / "out", OutputOptions(flow_files=(), pictures_every=0), {})
+        out = WatchedOutput(folder / "out", {}, flow_files=(), pictures_every=0)
         source = EstimatedFlowSource(DIS("fast"))
         Job(Frames(folder / "in"), source, recorded_motion, out).run()
 

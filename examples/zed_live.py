@@ -19,7 +19,7 @@ from flowrep.sequences import EstimatedFlowSource, Frame, SequenceError, recorde
 from flowrep.sequences.calibration import opencv_intrinsics
 from flowrep.sequences.frames import measured
 from flowrep.sequences.job import Job
-from flowrep.sequences.output import Output, OutputOptions
+from flowrep.sequences.output import Output
 from flowrep.transforms import DIS
 
 
@@ -102,8 +102,7 @@ class ZedLive:
 
 def main(source: str, folder: str) -> None:
     stream = ZedLive(source)
-    options = OutputOptions(flow_files=(), video_fps=15)
-    with closing(Output(folder, options, {"input": source})) as output:
+    with closing(Output(folder, {"input": source}, flow_files=(), video_fps=15)) as output:
         job = Job(stream, EstimatedFlowSource(DIS("fast")), recorded_motion, output)
         job.run()
     output.finish(job.summary(None))

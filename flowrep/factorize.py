@@ -27,18 +27,11 @@ from flowrep.sequences import (
 )
 from flowrep.sequences.factorization import FlowSource, MotionSource
 from flowrep.sequences.job import Job
-from flowrep.sequences.output import Output, OutputOptions
-
-
-def run(config: FactorizeConfig) -> None:
-    """Writes raw, ego and object flow of a recording."""
-    # OpenCV's messages about broken files would clutter the one-line error.
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    sys.exit(factorize_recording(config))
+from flowrep.sequences.output import Output
 
 
 def factorize_recording(config: FactorizeConfig) -> int:
-    """Runs the job that a config asks for; returns the exit code.
+    """Writes raw, ego and object flow of a recording; returns the exit code.
 
     Raises:
         UsageError: a value is invalid.
@@ -49,7 +42,9 @@ def factorize_recording(config: FactorizeConfig) -> int:
     motion_source = open_motion_source(config, stream)
     for note in stream.notes:
         print(f"note: {note}")
-    options = OutputOptions(
+    output = Output(
+        config.output,
+        config.plain(),
         flow_files=config.flow_files,
         pictures_every=config.pictures_every,
         scale_px=config.scale_px.model_dump(),
@@ -59,7 +54,7 @@ def factorize_recording(config: FactorizeConfig) -> int:
         rerun=config.rerun,
     )
     start, stop, stride = config.start, config.stop, config.stride
-    with closing(Output(config.output, options, config.plain())) as output:
+    with closing(output):
         job = Job(stream, flow_source, motion_source, output, start=start, stop=stop, stride=stride)
         diagnosis = job.examine()
         if diagnosis is not None:
@@ -113,7 +108,9 @@ def open_motion_source(config: FactorizeConfig, stream: Stream) -> MotionSource:
 
 def main() -> None:
     """Entry point; a mistake on the command line ends in one line that lists the choices."""
-    run_command("factorize", run, FactorizeConfig)
+    # OpenCV's messages about broken files would clutter the one-line error.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    run_command("factorize", lambda config: sys.exit(factorize_recording(config)), FactorizeConfig)
 
 
 if __name__ == "__main__":

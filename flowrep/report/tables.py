@@ -1,4 +1,4 @@
-"""Tables of a report, as LaTeX (booktabs), CSV and Markdown, and numbers as text."""
+"""Tables of a report, as LaTeX (booktabs) and CSV, and numbers as text."""
 
 import csv
 import io

@@ -132,19 +132,16 @@ def as_pose(
 def read_poses(path: Path, frames: int, *, layout: PoseLayout = "xyz_xyzw", **options: Any) -> Pose:
     """Returns `world_from_cam` `[N, 4, 4]` of a file with a pose per line and frame.
 
-    Args:
-        path: the file.
-        frames: the number of frames.
-        layout: of a line; a matrix has 12 or 16 numbers.
-        options: see `as_pose`.
+    A matrix has 12 or 16 numbers. For the other options see `as_pose`.
     """
-    columns, remedies = [7], dict.fromkeys((12, 16), "matrices are format.pose_layout=matrix")
-    if layout == "matrix":
-        quaternions = "a position and a quaternion are format.pose_layout=xyz_xyzw (or xyz_wxyz)"
-        columns, remedies = [12, 16], {7: quaternions}
-    numbers = read_table(path, columns, remedies=remedies)
+    numbers = read_table(path, 7, 12, 16)
     if len(numbers) != frames:
         raise SequenceError(path, f"has {len(numbers)} poses for {frames} frames")
+    width = numbers.shape[1]
+    fitting = ("xyz_xyzw", "xyz_wxyz") if width == 7 else ("matrix",)
+    if layout not in fitting:
+        remedy = " or ".join(f"format.pose_layout={name}" for name in fitting)
+        raise SequenceError(path, f"has {width} numbers in a line, as {remedy}")
     return as_pose(numbers, path, layout=layout, **options)
 
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -28,9 +27,8 @@ _FLO_UNKNOWN, _FLO_LARGEST = 1e10, 1e9  # what is written for unknown flow, and 
 Flow = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
 
-def list_files(folder: Path, suffixes: Iterable[str], prefix: str = "") -> list[Path]:
+def list_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Path]:
     """Returns a folder's files with one of the suffixes, sorted by number, then by name."""
-    suffixes = tuple(suffixes)
     found = [
         path
         for path in folder.iterdir()
@@ -57,20 +55,12 @@ def read_lines(path: Path) -> list[str]:
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def read_table(
-    path: Path,
-    columns: Sequence[int],
-    *,
-    header: bool = False,
-    remedies: Mapping[int, str] = MappingProxyType({}),
-) -> NDArray[np.float64]:
+def read_table(path: Path, *columns: int, header: bool = False) -> NDArray[np.float64]:
     """Returns the numbers of a text file, separated by blanks or commas, `[N, columns]`.
 
     Args:
-        path: the file.
         columns: the permitted numbers of columns.
         header: whether the first line has names.
-        remedies: what to do about some other number of columns.
     """
     lines = [line.replace(",", " ") for line in read_lines(path)[int(header) :]]
     if not lines:
@@ -81,9 +71,8 @@ def read_table(
         raise SequenceError(path, str(error)) from None
     width = table.shape[1]
     if width not in columns:
-        remedy = f"; {remedies[width]}" if width in remedies else ""
         expected = " or ".join(map(str, columns))
-        raise SequenceError(path, f"has {width} numbers in a line, expected {expected}{remedy}")
+        raise SequenceError(path, f"has {width} numbers in a line, expected {expected}")
     return table
 
 

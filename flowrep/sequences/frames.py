@@ -45,7 +45,6 @@ class Frames(Recording):
     optional. docs/factorize.md shows every file.
 
     Args:
-        folder: the recording's folder.
         pose_layout, pose_direction, pose_axes: of a line, see `flowrep.geometry.adapt_pose`; a
             matrix has 12 or 16 numbers.
         depth_unit_m: the length of a stored 1, metres; None is 0.001 in a .png and 1 in a .npy.
@@ -90,7 +89,7 @@ class Frames(Recording):
         if self.has_poses:
             options: Any = {"layout": pose_layout, "direction": pose_direction, "axes": pose_axes}
             self._poses = read_poses(path, len(self), **options)
-        self._times = read_table(times, [1])[:, 0] if times.is_file() else None
+        self._times = read_table(times, 1)[:, 0] if times.is_file() else None
         if self._times is not None and len(self._times) != len(self):
             raise SequenceError(times, f"has {len(self._times)} times for {len(self)} frames")
         path = self.folder / "intrinsics.json"
@@ -160,7 +159,6 @@ class Zed(Recording):
     `Frames`.
 
     Args:
-        folder: the exported folder.
         pose_axes: the coordinate system of the exported poses: `"opencv"` for the SDK's
             IMAGE, `"opengl"` for RIGHT_HANDED_Y_UP, `"x_forward_z_up"` for RIGHT_HANDED_Z_UP_X_FWD.
     """

@@ -62,16 +62,13 @@ class Job:
             for first, end in zip(places, [*places[1:], len(used)]):
                 # A pair that hardly moves, or repeats a picture, is passed over for the next one.
                 for place in range(first, min(end, first + DOCTOR_TRIES)):
-                    if self._show(doctor, [self.stream[i] for i in used[place - 1 : place + 1]]):
+                    both = (self.stream[i] for i in used[place - 1 : place + 1])
+                    _, (previous, current) = pairs(both)
+                    if previous is None or repeats(previous, current):
+                        continue
+                    if doctor.look(previous, current, self.flow_source(previous, current)):
                         break
         return doctor.diagnosis()
-
-    def _show(self, doctor: Doctor, frames: list[Frame]) -> bool:
-        """Shows the doctor a pair of frames; returns whether it moves enough."""
-        _, (previous, current) = pairs(frames)
-        if previous is None or repeats(previous, current):
-            return False
-        return doctor.look(previous, current, self.flow_source(previous, current))
 
     def run(self) -> bool:
         """Factorises all frames; returns whether it came to the end.

@@ -92,8 +92,8 @@ class Kitti(Recording):
             packets, first = self._oxts[int(pair)]
             # The map is true to scale at the latitude of the pair's first frame in time.
             before, path = (packets / f"{first + later:010d}.txt" for later in (0, not is_current))
-            latitude_deg = read_table(before, [_OXTS_NUMBERS])[0, 0]
-            packet = read_table(path, [_OXTS_NUMBERS])[0]
+            latitude_deg = read_table(before, _OXTS_NUMBERS)[0, 0]
+            packet = read_table(path, _OXTS_NUMBERS)[0]
             world_from_imu = _pose_from_oxts(packet, latitude_deg)
             world_from_cam = world_from_imu @ np.linalg.inv(cam_from_imu)
         # Given is p_11 - p_10. Here 11 is the frame before, so that p_t - p_t' is the opposite.

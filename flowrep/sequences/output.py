@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,64 +34,58 @@ _JPEG_QUALITY = 80
 _TILE_PX = 480  # the most of a tile of the video, so that two rows of three fit a screen
 
 
-@dataclass(frozen=True)
-class OutputOptions:
-    """The outputs to write.
+class Output:
+    """The folder of a job: `<path>.partial` while it runs, `<path>` once it is complete.
 
-    Attributes:
+    Args:
+        path: the final folder, which may not exist yet.
+        settings: the job's settings, kept in `job.json`.
         flow_files: formats of flow files, of "flo", "kitti" and "npz".
         pictures_every: the number of frames from one set of flow pictures to the next; 0 for none.
-        scale_px: the flow of full colour by name, pixels.
+        scale_px: the flow of full colour by name, pixels; None for 20 each.
         depth_range_m: the depth at which the video's colours end, metres.
         moving_px: the least object flow from which a pixel counts as moving by itself, pixels.
         video_fps: the video's frames per second, None for no video.
         rerun: whether a rerun recording is written.
     """
 
-    flow_files: Sequence[str] = ("flo",)
-    pictures_every: int = 10
-    scale_px: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(FLOW_NAMES, 20.0))
-    depth_range_m: float = 10.0
-    moving_px: float = 1.0
-    video_fps: float | None = None
-    rerun: bool = False
-
-
-class Output:
-    """The folder of a job: `<path>.partial` while it runs, `<path>` once it is complete.
-
-    Args:
-        path: the final folder, which may not exist yet.
-        options: what is written.
-        settings: the job's settings, kept in `job.json`.
-    """
-
     def __init__(
-        self, path: str | Path, options: OutputOptions, settings: Mapping[str, Any]
+        self,
+        path: str | Path,
+        settings: Mapping[str, Any],
+        *,
+        flow_files: Sequence[str] = ("flo",),
+        pictures_every: int = 10,
+        scale_px: Mapping[str, float] | None = None,
+        depth_range_m: float = 10.0,
+        moving_px: float = 1.0,
+        video_fps: float | None = None,
+        rerun: bool = False,
     ) -> None:
-        self.path, self.options = Path(path), options
+        self.path = Path(path)
         self.partial = Path(f"{self.path}.partial")
         for folder in (self.path, self.partial):
             if folder.exists():
                 raise SequenceError(folder, "exists already; remove it, or give another output")
-        self._rerun = RerunExport(self.path.name, options.scale_px) if options.rerun else None
+        if rerun:  # told before there is a folder
+            require("rerun=true", "rerun", "rerun")
+        self.flow_files, self.pictures_every, self.moving_px = flow_files, pictures_every, moving_px
+        self.scale_px = scale_px or dict.fromkeys(FLOW_NAMES, 20.0)
+        self.depth_range_m, self.rows = depth_range_m, list[dict[str, Any]]()
         self.partial.mkdir(parents=True)
         self._write_json("job.json", settings)
-        self.rows: list[dict[str, Any]] = []
-        self._video: Video | None = None
-        if options.video_fps is not None:
-            self._video = Video(self.partial / "strip.mp4", fps=options.video_fps)
-        if self._rerun is not None:
-            self._rerun.save(self.partial / "scene.rrd")
+        self._video = Video(self.partial / "strip.mp4", fps=video_fps) if video_fps else None
+        self._rerun = RerunExport(self.partial / "scene.rrd", self.scale_px) if rerun else None
 
     def append(self, index: int, made: FactorizedFrame) -> None:
         """Writes a frame's files, then its row."""
-        write_frame(self.partial, index, made, self.options)
+        self._write_flow(index, made)
         if self._video is not None:
-            self._video.append(video_frame(made, self.options))
+            scales: Any = {"flow_scale_px": self.scale_px, "depth_range_m": self.depth_range_m}
+            self._video.append(video_frame(made, **scales))
         if self._rerun is not None:
             self._rerun.append(index, made)
-        self.rows.append(score(index, made, moving_px=self.options.moving_px))
+        self.rows.append(score(index, made, moving_px=self.moving_px))
         # Opened anew for each frame, so that a killed job leaves the rows that are done.
         with (self.partial / "frames.csv").open("a", newline="", encoding="utf-8") as file:
             table = csv.DictWriter(file, self.rows[-1].keys())
@@ -122,6 +115,30 @@ class Output:
             medians[name] = float(np.median(values)) if values else None
         return medians
 
+    def _write_flow(self, index: int, made: FactorizedFrame) -> None:
+        """Writes the flow files and, every so often, the pictures of one frame."""
+        name = made.frame.name
+        for kind in FLOW_NAMES:
+            flow = shown(kind, made)
+            if "flo" in self.flow_files:
+                write_flo(self._place(f"flow/{kind}/{name}.flo"), flow)
+            if "kitti" in self.flow_files:
+                write_kitti_flow(self._place(f"flow/{kind}/{name}.png"), flow)
+            if self.pictures_every and index % self.pictures_every == 0:
+                label, scale_px = f"{kind} flow", self.scale_px[kind]
+                colours, notes = flow_to_rgb(flow, scale_px), {label: flow_note(scale_px)}
+                picture = strip({label: colours}, wheel_for=[label], notes=notes)
+                write_picture(self._place(f"pictures/{kind}/{name}.png"), picture)
+        if "npz" in self.flow_files:
+            contents: Any = {key: getattr(made, key) for key in (*FLOW_NAMES, "valid", "ego_valid")}
+            contents |= {"K": made.frame.K, "prev_from_curr": made.motion.prev_from_curr}
+            np.savez(self._place(f"flow/{name}.npz"), **contents)
+
+    def _place(self, name: str) -> Path:
+        path = self.partial / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
     def _write_json(self, name: str, content: Mapping[str, Any]) -> None:
         (self.partial / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
@@ -146,10 +163,23 @@ def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, A
         "moving_share": float(moves.mean()) if len(moves) else math.nan,
         "epe_px": math.nan,
         "inlier_share": made.motion.inlier_share,
-        **_beside_the_recorded_motion(made),
+        "recorded_obj_median_px": math.nan,
+        "rotation_off_deg": math.nan,
+        "translation_off_m": math.nan,
     }
     if truth is not None and frame.raw_since == made.previous.name:
-        row["epe_px"] = end_point_error(made.raw, truth)
+        error_px = np.hypot(*(made.raw - truth))
+        known_px = error_px[np.isfinite(error_px)]
+        row["epe_px"] = float(known_px.mean()) if len(known_px) else math.nan
+    has_poses = not any(f.world_from_cam is None for f in (made.previous, frame))
+    is_estimated = made.motion.known and not math.isnan(made.motion.inlier_share)
+    if has_poses and is_estimated:  # beside the recorded motion
+        recorded = factorize_pair(made.previous, frame, made.raw)
+        off = np.linalg.inv(recorded.motion.prev_from_curr) @ made.motion.prev_from_curr
+        turn_rad = float(np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]))
+        row["recorded_obj_median_px"] = _median(np.hypot(*recorded.obj)[recorded.valid])
+        row["rotation_off_deg"] = math.degrees(turn_rad)
+        row["translation_off_m"] = float(np.linalg.norm(off[:3, 3]))
     for name, value in row.items():
         if isinstance(value, float):  # six digits; nothing for what is unknown
             row[name] = f"{value:.6g}" if math.isfinite(value) else ""
@@ -160,104 +190,47 @@ def _median(values: NDArray[np.float32]) -> float:
     return float(np.median(values)) if len(values) else math.nan
 
 
-def end_point_error(flow: Flow, truth: Flow) -> float:
-    """Returns the mean distance in pixels from the truth where both are known; nan if nowhere."""
-    error = np.hypot(*(flow - truth))
-    known = error[np.isfinite(error)]
-    return float(known.mean()) if len(known) else math.nan
-
-
-def _beside_the_recorded_motion(made: FactorizedFrame) -> dict[str, float]:
-    """Returns how an estimated motion compares with the recorded one, nan without either."""
-    has_poses = not any(f.world_from_cam is None for f in (made.previous, made.frame))
-    obj_px = turn_rad = shift_m = math.nan
-    is_estimated = not math.isnan(made.motion.inlier_share)
-    if has_poses and made.motion.known and is_estimated:
-        recorded = factorize_pair(made.previous, made.frame, made.raw)
-        off = np.linalg.inv(recorded.motion.prev_from_curr) @ made.motion.prev_from_curr
-        obj_px = _median(np.hypot(*recorded.obj)[recorded.valid])
-        turn_rad = float(np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]))
-        shift_m = float(np.linalg.norm(off[:3, 3]))
-    return {
-        "recorded_obj_median_px": obj_px,
-        "rotation_off_deg": math.degrees(turn_rad),
-        "translation_off_m": shift_m,
-    }
-
-
-def write_frame(folder: Path, index: int, made: FactorizedFrame, options: OutputOptions) -> None:
-    """Writes the flow files and, every so often, the pictures of one frame."""
-    name = made.frame.name
-    for kind in FLOW_NAMES:
-        flow, valid = getattr(made, kind), known(kind, made)
-        if "flo" in options.flow_files:
-            write_flo(_place(folder, f"flow/{kind}", f"{name}.flo"), flow, valid)
-        if "kitti" in options.flow_files:
-            write_kitti_flow(_place(folder, f"flow/{kind}", f"{name}.png"), flow, valid)
-        if options.pictures_every and index % options.pictures_every == 0:
-            label, scale_px = f"{kind} flow", options.scale_px[kind]
-            colours = {label: flow_to_rgb(shown(kind, made), scale_px)}
-            picture = strip(colours, wheel_for=[label], notes={label: flow_note(scale_px)})
-            write_picture(_place(folder, f"pictures/{kind}", f"{name}.png"), picture)
-    if "npz" in options.flow_files:
-        contents: Any = {key: getattr(made, key) for key in (*FLOW_NAMES, "valid", "ego_valid")}
-        contents |= {"K": made.frame.K, "prev_from_curr": made.motion.prev_from_curr}
-        np.savez(_place(folder, "flow", f"{name}.npz"), **contents)
-
-
-def _place(folder: Path, kind: str, name: str) -> Path:
-    (folder / kind).mkdir(parents=True, exist_ok=True)
-    return folder / kind / name
-
-
-def known(kind: str, made: FactorizedFrame) -> NDArray[np.bool_]:
-    """Returns where a flow is known: obj needs raw and ego."""
+def shown(kind: str, made: FactorizedFrame) -> Flow:
+    """Returns a flow with nan, which is drawn in grey, where it is unknown."""
     if kind == "raw":
-        return np.isfinite(made.raw[0]) & np.isfinite(made.raw[1])
-    return made.ego_valid if kind == "ego" else made.valid
+        return made.raw
+    known = made.ego_valid if kind == "ego" else made.valid
+    return np.where(known, getattr(made, kind), np.float32(np.nan))
 
 
-def shown(kind: str, made: FactorizedFrame, places: Any = ...) -> Flow:
-    """Returns a flow, or places of it, with nan, which is drawn in grey, where it is unknown."""
-    flow = getattr(made, kind)
-    u, v = (np.where(known(kind, made)[places], plane[places], np.nan) for plane in flow)
-    return np.stack([u, v])
+def video_frame(made: FactorizedFrame, **scales: Any) -> Image:
+    """Returns RGB and depth above raw, ego and obj, each sampled to at most 480 pixels.
 
-
-def video_frame(made: FactorizedFrame, options: OutputOptions) -> Image:
-    """Returns RGB and depth above raw, ego and obj, each sampled to at most 480 pixels."""
+    For the scales see `flowrep.viz.representation_strip`.
+    """
     frame = made.frame
     height, width = frame.size
     shrink = min(1.0, _TILE_PX / max(height, width))
     size = round(height * shrink), round(width * shrink)
     # Maps are sampled before they are coloured, which halves the time: pixel centres, as resize.
-    places: Any = np.ix_(
-        *(((np.arange(n) + 0.5) * full / n).astype(int) for n, full in zip(size, frame.size))
+    rows, columns = (
+        ((np.arange(n) + 0.5) * full / n).astype(int) for n, full in zip(size, frame.size)
     )
-    above: dict[str, Any] = {"depth": frame.depth[places][None]}
+    places: Any = (..., rows[:, None], columns)
+    above: dict[str, Any] = {"depth": frame.depth[None][places]}
     if frame.rgb is not None:
         small = cv2.resize(frame.rgb, size[::-1], interpolation=cv2.INTER_AREA)
         above["rgb"] = np.moveaxis(small, -1, 0)
-    below = {kind: shown(kind, made, places) for kind in FLOW_NAMES}
-    scales: Any = {"flow_scale_px": options.scale_px, "depth_range_m": options.depth_range_m}
+    below = {kind: shown(kind, made)[places] for kind in FLOW_NAMES}
     return contact_sheet([representation_strip(maps, **scales) for maps in (above, below)])
 
 
 class RerunExport:
     """Writes the camera, picture, depth and flow of each frame, to scrub through in 3-D."""
 
-    def __init__(self, recording: str, scale_px: Mapping[str, float]) -> None:
-        require("rerun=true", "rerun", "rerun")
+    def __init__(self, path: Path, scale_px: Mapping[str, float]) -> None:
         import rerun
 
         self._rerun: Any = rerun
-        self._stream = rerun.RecordingStream("flowrep", recording_id=recording)
+        self._stream = rerun.RecordingStream("flowrep", recording_id=path.parent.stem)
+        self._stream.save(str(path))
         self._scale_px = scale_px
         self._poses: dict[str, Pose] = {}
-
-    def save(self, path: Path) -> None:
-        """Chooses the .rrd file; before the first frame."""
-        self._stream.save(str(path))
 
     def append(self, index: int, made: FactorizedFrame) -> None:
         """Logs one frame."""

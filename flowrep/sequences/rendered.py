@@ -186,7 +186,7 @@ class VKitti2(Recording):
         return self.folder / "frames" / kind / f"Camera_{self.camera}"
 
     def _of_camera(self, path: Path, columns: int) -> dict[int, NDArray[np.float64]]:
-        table = read_table(path, [columns], header=True)
+        table = read_table(path, columns, header=True)
         rows = table[table[:, 1] == self.camera]
         if not len(rows):
             raise SequenceError(path, f"says nothing of camera {self.camera}")

@@ -63,7 +63,7 @@ class SevenScenes(Recording):
         world_from_cam = None
         if self.has_poses:
             path = self.folder / f"{name}.pose.txt"
-            pose = as_pose(read_table(path, [4]).ravel(), path)
+            pose = as_pose(read_table(path, 4).ravel(), path)
             world_from_cam = pose @ register.depth_from_colour
         return Frame(
             name=name,

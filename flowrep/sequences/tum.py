@@ -21,7 +21,6 @@ class Tum(Recording):
     are near enough; a picture that lacks either is left out.
 
     Args:
-        folder: the folder of one recording.
         intrinsics: fx, fy, cx, cy in OpenCV's convention.
         tolerance_s: the largest time difference of a depth map or a pose from its picture.
         interpolate: whether the pose is interpolated to the picture's time between the poses before
@@ -50,7 +49,7 @@ class Tum(Recording):
         self.has_poses = self.trajectory.is_file()
         if self.has_poses:
             needed = "depth map or pose"
-            poses = read_table(self.trajectory, [8])
+            poses = read_table(self.trajectory, 8)
             _check_ascending(self.trajectory, poses[:, 0])
             self._poses = as_pose(poses[:, 1:], self.trajectory, layout="xyz_xyzw")
             self._before, self._after, self._share = self._between(poses[:, 0], rgb_times)
@@ -73,10 +72,14 @@ class Tum(Recording):
     def _read(self, index: int) -> Frame:
         place = int(self._kept[index])
         rgb, stored = self._rgbs[place], read_png(self._depths[place], np.uint16)
+        world_from_cam = None
+        if self.has_poses:
+            before, after = (self._poses[of[place]] for of in (self._before, self._after))
+            world_from_cam = interpolated_pose(before, after, float(self._share[place]))
         return Frame(
             name=rgb.stem,
             source=rgb,
-            world_from_cam=self._pose(place) if self.has_poses else None,
+            world_from_cam=world_from_cam,
             K=self.K,
             depth=depth_from_integers(stored, 1 / 5000, missing=(0,)),  # 5000 is a metre
             rgb=read_rgb(rgb),
@@ -108,12 +111,6 @@ class Tum(Recording):
         inside = (before >= 0) & (np.minimum(*gaps) >= 0) & (np.maximum(*gaps) <= self.tolerance_s)
         span = np.maximum(pose_times[after] - pose_times[before], 1e-9)
         return np.where(inside, before, -1), after, gaps[0] / span
-
-    def _pose(self, place: int) -> Pose:
-        before, share = self._poses[self._before[place]], float(self._share[place])
-        if not share:
-            return before
-        return interpolated_pose(before, self._poses[self._after[place]], share)
 
 
 def _check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:

@@ -1,10 +1,9 @@
 """Run folders without a training: configs and tables, with as many successes as a test asks for."""
 
-import csv
-
 import yaml
 
 from flowrep.experiment.run import EVALUATION_COLUMNS
+from flowrep.tables import write_rows
 
 EPISODES = 8
 
@@ -38,7 +37,7 @@ def config_of(scene="straight_road", stack="ego+obj", seed=0, **changes):
 
 
 def rows_of(config, outcomes, *, speed="normal", fps=12.0, policy="greedy", **changes):
-    """Rows of evaluation.csv: episode k is that of seed 100 + k.
+    """Rows of evaluation.csv, what a report reads of it: episode k is that of seed 100 + k.
 
     Args:
         outcomes: a letter an episode: s(uccess), c(ollision), o(ut of bounds), t(ime-out).
@@ -47,9 +46,6 @@ def rows_of(config, outcomes, *, speed="normal", fps=12.0, policy="greedy", **ch
     return [
         {
             "scene": config["scene"]["name"],
-            "representations": "+".join(config["representations"]),
-            "flow": config["flow"]["source"],
-            "seed": config["seed"],
             "frames": config["total_frames"],
             "evaluation": "evaluate",
             "policy": policy,
@@ -58,7 +54,6 @@ def rows_of(config, outcomes, *, speed="normal", fps=12.0, policy="greedy", **ch
             "episode_seed": 100 + k,
             "outcome": names[letter],
             "hit": "pedestrian" if letter == "c" else "",
-            "return": 5.0 if letter == "s" else -5.0,
             "length": 150,
         }
         | changes
@@ -70,21 +65,14 @@ def write_run(path, config, rows, metrics=()):
     """Writes a run's folder."""
     path.mkdir(parents=True)
     (path / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
-    for name, columns, lines in (
-        ("evaluation.csv", EVALUATION_COLUMNS, rows),
-        ("metrics.csv", ("frames", "success"), metrics),
-    ):
-        if lines:
-            with (path / name).open("w", newline="") as file:
-                writer = csv.DictWriter(file, columns)
-                writer.writeheader()
-                writer.writerows(lines)
+    write_rows(path / "evaluation.csv", rows, EVALUATION_COLUMNS)
+    write_rows(path / "metrics.csv", metrics)
     return path
 
 
-def run_in(folder, name, outcomes=4, *, scene="straight_road", stack="ego+obj", seed=0, **changes):
+def run_in(folder, name, outcomes=4, **changes):
     """A run whose episodes end as the letters say, by speed or at normal speed, or so many well."""
-    config = config_of(scene, stack, seed, **changes)
+    config = config_of(**changes)
     if isinstance(outcomes, int):
         outcomes = letters(outcomes)
     of = outcomes if isinstance(outcomes, dict) else {"normal": outcomes}

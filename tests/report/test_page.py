@@ -88,19 +88,15 @@ def test_a_figure_drawn_again_is_the_same_byte_for_byte(tmp_path):
 # The command.
 
 
-def ended(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["flowrep-report", *map(str, arguments)])
-    with pytest.raises(SystemExit) as caught:
-        main()
-    return caught.value.code, capsys.readouterr()
-
-
 @pytest.mark.parametrize("damaged", [False, True])
 def test_nothing_to_report_on_is_one_line(tmp_path, monkeypatch, capsys, damaged):
     if damaged:
         (run_in(tmp_path, "run") / "config.yaml").write_text("[")
-    code, said = ended(monkeypatch, capsys, tmp_path)
-    assert code == 2
+    monkeypatch.setattr(sys, "argv", ["flowrep-report", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr()
+    assert ended.value.code == 2
     assert said.err.startswith("error: ")
     assert said.err.count("\n") == 1
     assert (f"left out: {tmp_path}/run/config.yaml" in said.out) == damaged
@@ -150,18 +146,14 @@ def test_tracks_are_those_of_the_first_episodes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("key", "value"),
     [
-        {"evaluation": np.array(["training"] * 3)},
-        {"policy": np.array(["sampled"] * 3)},
-        {"speed": np.array(["low"] * 3)},
-        {"fps": np.full(3, 6.0)},
-        {"frames": np.full(3, 500)},
+        ("evaluation", "training"), ("policy", "sampled"), ("speed", "low"), ("fps", 6.0),
+        ("frames", 500),
     ],
-    ids=str,
-)
-def test_only_greedy_drives_of_the_finished_agent_as_it_was_trained_are_drawn(tmp_path, changes):
-    write_drives(run_in(tmp_path, "run", "sco"), **changes)
+)  # fmt: skip
+def test_only_greedy_drives_of_the_finished_agent_as_it_was_trained_are_drawn(tmp_path, key, value):
+    write_drives(run_in(tmp_path, "run", "sco"), **{key: np.full(3, value)})
     assert tracks_of(read_run(tmp_path / "run"), 2) == []
 
 

@@ -15,17 +15,9 @@ def labels(folder):
 
 
 def test_what_a_run_is_comes_from_its_config(tmp_path):
-    run = read_run(
-        run_in(tmp_path, "misnamed_ego_s7", stack="obj+seg2+ego", seed=3, scene="s_turn")
-    )
+    path = run_in(tmp_path, "misnamed_ego_s7", stack="obj+seg2+ego", seed=3, scene="s_turn")
+    run = read_run(path)
     assert (run.scene, run.stack, run.seed, run.fps) == ("s_turn", "ego+obj+seg2", 3, 12.0)
-
-
-def test_an_unfinished_run_has_no_tested_episodes(tmp_path):
-    config = config_of()
-    rows = [row | {"frames": 400} for row in rows_of(config, "ss")]
-    run = read_run(write_run(tmp_path / "half", config, rows))
-    assert (run.is_finished, run.frames, run.tested.tolist()) == (False, 400, [False, False])
 
 
 def test_episodes_of_training_and_of_other_scenes_are_not_tests(tmp_path):

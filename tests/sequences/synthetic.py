@@ -73,21 +73,23 @@ def flow_of(depth, K, prev_from_curr, body):
     return raw.numpy(), (raw - ego).numpy()
 
 
-def png(path: Path, picture: np.ndarray) -> None:
+def put(path: Path, content) -> None:
+    """Writes bytes, or an array or lines as the file's name says."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    turned = picture[..., ::-1] if picture.ndim == 3 else picture
-    assert cv2.imwrite(str(path), turned)
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif path.suffix == ".npy":
+        np.save(path, content)
+    elif path.suffix == ".png":
+        assert cv2.imwrite(str(path), content[..., ::-1] if content.ndim == 3 else content)
+    elif path.suffix == ".flo":
+        assert cv2.writeOpticalFlow(str(path), np.ascontiguousarray(content.transpose(1, 2, 0)))
+    else:
+        path.write_text("".join(f"{line}\n" for line in content))
 
 
-def stored(depth: np.ndarray, unit_m: float, *, beyond: int = 0) -> np.ndarray:
-    """Returns 16-bit depth; `beyond` stands for what is too far for 16 bits."""
-    counts = np.rint(depth / unit_m)
-    return np.where(counts < 65535, counts, beyond).astype(np.uint16)
-
-
-def text(path: Path, lines) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("".join(f"{line}\n" for line in lines))
+def stored(depth: np.ndarray, unit_m: float) -> np.ndarray:
+    return np.rint(depth / unit_m).astype(np.uint16)
 
 
 def numbers(values) -> str:
@@ -98,30 +100,25 @@ def quaternion_line(world_from_cam: np.ndarray) -> str:
     """Returns tx ty tz qx qy qz qw."""
     axis_angle = cv2.Rodrigues(world_from_cam[:3, :3])[0].ravel()
     angle = np.linalg.norm(axis_angle)
-    xyz = np.sin(angle / 2) * axis_angle / angle if angle else np.zeros(3)
+    xyz = np.sin(angle / 2) * axis_angle / angle
     return numbers([*world_from_cam[:3, 3], *xyz, np.cos(angle / 2)])
 
 
-def write_flo(path: Path, flow: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.writeOpticalFlow(str(path), np.ascontiguousarray(flow.transpose(1, 2, 0)))
-
-
-def camera_json() -> dict:
+def camera_json(**changes) -> list[str]:
     size = {"width": WIDTH, "height": HEIGHT, "first_pixel_centre": 0.5}
-    return size | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return [json.dumps(size | {"fx": 31.0, "fy": 27.0, "cx": 18.5, "cy": 13.0} | changes)]
 
 
 def write_frames(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=0.001)
     for i, moment in enumerate(moments):
-        png(folder / f"rgb/{i:04d}.png", moment.rgb)
-        png(folder / f"depth/{i:04d}.png", stored(moment.depth, 0.001))
+        put(folder / f"rgb/{i:04d}.png", moment.rgb)
+        put(folder / f"depth/{i:04d}.png", stored(moment.depth, 0.001))
         if i > 0:
-            write_flo(folder / f"flow/{i:04d}.flo", moment.raw)
-    text(folder / "poses.txt", [numbers(m.world_from_cam) for m in moments])
-    text(folder / "timestamps.txt", [f"{0.1 * i}" for i in range(len(moments))])
-    text(folder / "intrinsics.json", [json.dumps(camera_json())])
+            put(folder / f"flow/{i:04d}.flo", moment.raw)
+    put(folder / "poses.txt", [numbers(m.world_from_cam) for m in moments])
+    put(folder / "timestamps.txt", [f"{0.1 * i}" for i in range(len(moments))])
+    put(folder / "intrinsics.json", camera_json())
     return moments
 
 
@@ -130,13 +127,13 @@ def write_tum(folder: Path) -> list[Moment]:
     index: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for i, moment in enumerate(moments):
         rgb_s, depth_s, pose_s = 100 + 0.1 * i, 100 + 0.1 * i + 0.012, 100 + 0.1 * i - 0.004
-        png(folder / f"rgb/{rgb_s:.6f}.png", moment.rgb)
-        png(folder / f"depth/{depth_s:.6f}.png", stored(moment.depth, 1 / 5000))
+        put(folder / f"rgb/{rgb_s:.6f}.png", moment.rgb)
+        put(folder / f"depth/{depth_s:.6f}.png", stored(moment.depth, 1 / 5000))
         index["rgb"].append(f"{rgb_s:.6f} rgb/{rgb_s:.6f}.png")
         index["depth"].append(f"{depth_s:.6f} depth/{depth_s:.6f}.png")
         index["groundtruth"].append(f"{pose_s:.6f} {quaternion_line(moment.world_from_cam)}")
     for name, lines in index.items():
-        text(folder / f"{name}.txt", ["# a comment", *lines])
+        put(folder / f"{name}.txt", ["# a comment", *lines])
     return moments
 
 
@@ -146,9 +143,9 @@ OPENCV_INTRINSICS = (31.0, 27.0, 18.0, 12.5)  # K, with pixel (0, 0)'s centre at
 def write_sevenscenes(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=0.001)
     for i, moment in enumerate(moments):
-        png(folder / f"frame-{i:06d}.color.png", moment.rgb)
-        png(folder / f"frame-{i:06d}.depth.png", stored(moment.depth, 0.001))
-        text(folder / f"frame-{i:06d}.pose.txt", map(numbers, moment.world_from_cam))
+        put(folder / f"frame-{i:06d}.color.png", moment.rgb)
+        put(folder / f"frame-{i:06d}.depth.png", stored(moment.depth, 0.001))
+        put(folder / f"frame-{i:06d}.pose.txt", map(numbers, moment.world_from_cam))
     return moments
 
 
@@ -158,19 +155,19 @@ def write_vkitti2(folder: Path) -> list[Moment]:
     intrinsics = ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
     for i, moment in enumerate(moments):
         frames = folder / "frames"
-        png(frames / f"rgb/Camera_0/rgb_{i:05d}.png", moment.rgb)
-        png(frames / f"depth/Camera_0/depth_{i:05d}.png", stored(moment.depth, 0.01, beyond=65535))
+        put(frames / f"rgb/Camera_0/rgb_{i:05d}.png", moment.rgb)
+        put(frames / f"depth/Camera_0/depth_{i:05d}.png", stored(moment.depth, 0.01))
         if i > 0:
             flow = vkitti_flow(-moment.raw)
-            png(frames / f"backwardFlow/Camera_0/backwardFlow_{i:05d}.png", flow)
+            put(frames / f"backwardFlow/Camera_0/backwardFlow_{i:05d}.png", flow)
         cam_from_world = np.linalg.inv(moment.world_from_cam)
         for camera, shift in ((0, 0.0), (1, -0.5)):
             other = cam_from_world.copy()
             other[0, 3] += shift
             extrinsics.append(f"{i} {camera} {numbers(other)}")
             intrinsics.append(f"{i} {camera} {numbers(OPENCV_INTRINSICS)}")
-    text(folder / "extrinsic.txt", extrinsics)
-    text(folder / "intrinsic.txt", intrinsics)
+    put(folder / "extrinsic.txt", extrinsics)
+    put(folder / "intrinsic.txt", intrinsics)
     return moments
 
 
@@ -185,19 +182,16 @@ def write_sintel(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=1e-6, backwards=True)
     for i, moment in enumerate(moments):
         stem = f"cave/frame_{i + 1:04d}"
-        png(folder / f"final/{stem}.png", moment.rgb)
-        for kind in ("depth", "camdata_left"):
-            (folder / kind / "cave").mkdir(parents=True, exist_ok=True)
-        height, width = moment.depth.shape
-        head = struct.pack("<fii", 202021.25, width, height)
-        (folder / f"depth/{stem}.dpt").write_bytes(head + moment.depth.astype("<f4").tobytes())
+        put(folder / f"final/{stem}.png", moment.rgb)
+        head = struct.pack("<fii", 202021.25, WIDTH, HEIGHT)
+        put(folder / f"depth/{stem}.dpt", head + moment.depth.astype("<f4").tobytes())
         opencv = K.copy()
         opencv[:2, 2] -= 0.5
         cam_from_world = np.linalg.inv(moment.world_from_cam)[:3]
         cam = struct.pack("<f", 202021.25) + opencv.tobytes() + cam_from_world.tobytes()
-        (folder / f"camdata_left/{stem}.cam").write_bytes(cam)
+        put(folder / f"camdata_left/{stem}.cam", cam)
         if i + 1 < len(moments):
-            write_flo(folder / f"flow/{stem}.flo", -moment.raw)
+            put(folder / f"flow/{stem}.flo", -moment.raw)
     return moments
 
 
@@ -208,31 +202,26 @@ NED_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0
 
 def write_tartanair(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=1e-6, K=TARTANAIR_K, backwards=True, body=False)
-    for kind in ("depth_left", "flow"):
-        (folder / kind).mkdir(parents=True, exist_ok=True)
     for i, moment in enumerate(moments):
-        png(folder / f"image_left/{i:06d}_left.png", moment.rgb)
-        np.save(folder / f"depth_left/{i:06d}_left_depth.npy", moment.depth)
+        put(folder / f"image_left/{i:06d}_left.png", moment.rgb)
+        put(folder / f"depth_left/{i:06d}_left_depth.npy", moment.depth)
         if i + 1 < FRAMES:
             pair = f"{i:06d}_{i + 1:06d}"
-            np.save(folder / f"flow/{pair}_flow.npy", -moment.raw.transpose(1, 2, 0))
-            np.save(folder / f"flow/{pair}_mask.npy", np.zeros((HEIGHT, WIDTH), np.uint8))
+            put(folder / f"flow/{pair}_flow.npy", -moment.raw.transpose(1, 2, 0))
+            put(folder / f"flow/{pair}_mask.npy", np.zeros((HEIGHT, WIDTH), np.uint8))
     poses = [moment.world_from_cam @ NED_FROM_OPENCV.T for moment in moments]
-    text(folder / "pose_left.txt", map(quaternion_line, poses))
+    put(folder / "pose_left.txt", map(quaternion_line, poses))
     return moments
 
 
 def write_zed(folder: Path) -> list[Moment]:
     moments = make_moments(unit_m=0.001)
-    folder.mkdir(parents=True, exist_ok=True)
     for i, moment in enumerate(moments):
-        png(folder / f"left{i:06d}.png", moment.rgb)
-        if i % 2:
-            np.save(folder / f"depth{i:06d}.npy", moment.depth)
-        else:
-            png(folder / f"depth{i:06d}.png", stored(moment.depth, 0.001))
-    text(folder / "poses.txt", [quaternion_line(m.world_from_cam) for m in moments])
-    text(folder / "intrinsics.json", [json.dumps(camera_json())])
+        put(folder / f"left{i:06d}.png", moment.rgb)
+        suffix, depth = ("npy", moment.depth) if i % 2 else ("png", stored(moment.depth, 0.001))
+        put(folder / f"depth{i:06d}.{suffix}", depth)
+    put(folder / "poses.txt", [quaternion_line(m.world_from_cam) for m in moments])
+    put(folder / "intrinsics.json", camera_json())
     return moments
 
 
@@ -268,25 +257,25 @@ def write_kitti(folder: Path) -> list[Moment]:
     camera = np.array([[31.0, 0.0, 18.5], [0.0, 31.0, 13.0], [0.0, 0.0, 1.0]])
     raw_flow, obj = flow_of(depth, camera, motion, body=True)
     for i, name in enumerate(("10", "11")):
-        png(training / f"image_2/000000_{name}.png", rgb[i])
-    png(training / "disp_occ_0/000000_10.png", disparity)
+        put(training / f"image_2/000000_{name}.png", rgb[i])
+    put(training / "disp_occ_0/000000_10.png", disparity)
     u, v = np.rint(-raw_flow * 64) + 2**15
-    png(training / "flow_occ/000000_10.png", np.stack([u, v, u * 0 + 1], -1).astype(np.uint16))
+    put(training / "flow_occ/000000_10.png", np.stack([u, v, u * 0 + 1], -1).astype(np.uint16))
     projection = np.hstack([camera - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros((3, 1))])
     left, right = projection.copy(), projection.copy()
     left[0, 3], right[0, 3] = 31.0 * 0.06, 31.0 * (0.06 - KITTI_BASELINE_M)
     lines = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {numbers(np.eye(3))}"]
     lines += [f"P_rect_02: {numbers(left)}", f"P_rect_03: {numbers(right)}"]
-    text(training / "calib_cam_to_cam/000000.txt", lines)
+    put(training / "calib_cam_to_cam/000000.txt", lines)
     for kind, transform in (
         ("velo_to_cam", KITTI_CAM_FROM_VELO), ("imu_to_velo", KITTI_VELO_FROM_IMU)
     ):  # fmt: skip
         rows = [f"R: {numbers(transform[:3, :3])}", f"T: {numbers(transform[:3, 3])}"]
-        text(training / f"calib_{kind}/000000.txt", rows)
+        put(training / f"calib_{kind}/000000.txt", rows)
     drive = "2011_09_26/2011_09_26_drive_0005_sync"
-    text(folder / "train_mapping.txt", [drive.replace("/", " ") + " 0000000059"])
+    put(folder / "train_mapping.txt", [drive.replace("/", " ") + " 0000000059"])
     for i in range(2):
-        text(raw / f"{drive}/oxts/data/{59 + i:010d}.txt", [numbers(kitti_pose(i)[1])])
+        put(raw / f"{drive}/oxts/data/{59 + i:010d}.txt", [numbers(kitti_pose(i)[1])])
     nothing = np.zeros_like(obj)
     later = Moment(rgb[1], np.full_like(depth, np.nan), poses[1], nothing, nothing)
     return [later, Moment(rgb[0], depth, poses[0], raw_flow, obj)]

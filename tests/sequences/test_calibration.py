@@ -79,18 +79,3 @@ def test_a_turned_camera_sees_each_point_where_it_projects_to():
     seen = Registration(K_DEPTH, K_COLOUR, colour_from_depth, SIZE)(depth)
     assert np.argwhere(np.isfinite(seen)).tolist() == [[row, column]]
     assert seen[row, column] == pytest.approx(z, rel=1e-6)
-
-
-@pytest.mark.skipif(not hasattr(cv2, "registerDepth"), reason="this OpenCV has no registerDepth")
-def test_it_agrees_with_opencv():
-    depth = np.random.default_rng(1).uniform(2, 3, SIZE).astype(np.float32)
-    depth = cv2.GaussianBlur(depth, (0, 0), 4)
-    extrinsics = shifted(x=0.05, z=0.01)
-    ours = Registration(K_DEPTH, K_COLOUR, extrinsics, SIZE)(depth)
-    half = np.array([[0.0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    theirs = cv2.registerDepth(
-        K_DEPTH - half, K_COLOUR - half, None, extrinsics, depth, SIZE[::-1], depthDilation=False
-    )
-    both = np.isfinite(ours) & np.isfinite(theirs) & (theirs > 0)
-    assert both.mean() > 0.5
-    assert np.quantile(np.abs(ours - theirs)[both], 0.99) < 0.02

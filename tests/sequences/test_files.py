@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 
@@ -26,7 +25,7 @@ from flowrep.sequences import (
 )
 from flowrep.sequences.factorization import pairs
 from tests.sequences import synthetic
-from tests.sequences.synthetic import camera_json, png, text
+from tests.sequences.synthetic import camera_json, put
 from tests.sequences.test_readers import FORMATS
 
 
@@ -114,7 +113,7 @@ def test_every_format_names_a_file_that_is_missing_or_empty(name, tmp_path):
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     optional = ("timestamps.txt", "mask.npy", "poses.txt", "groundtruth.txt", "000000.pose.txt")
     # Where the pictures themselves are the list of frames, a missing one is a shorter recording.
-    counted = [frame.source for frame in open_it(tmp_path)]
+    counted = [] if name == "frames" else [frame.source for frame in open_it(tmp_path)]
     for path in files:
         content = path.read_bytes()
         path.write_bytes(b"")
@@ -123,23 +122,6 @@ def test_every_format_names_a_file_that_is_missing_or_empty(name, tmp_path):
         if path not in counted and not path.name.endswith(optional):
             refusal(lambda: open_it(tmp_path), str(tmp_path))
         path.write_bytes(content)
-
-
-def put(path, content) -> None:
-    """Writes bytes, lines, or an array as the file's name says; None removes the file."""
-    path.unlink(missing_ok=True)
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    elif isinstance(content, list):
-        text(path, content)
-    elif content is not None and path.suffix == ".npy":
-        np.save(path, content)
-    elif content is not None:
-        png(path, content)
-
-
-def camera(**changes):
-    return [json.dumps(camera_json() | changes)]
 
 
 def flo(width, height, size) -> bytes:
@@ -152,35 +134,27 @@ MISTAKES = [
     ("frames", "rgb/0001.png", PICTURE.astype(np.uint16), "16 bits"),
     ("frames", "rgb/0001.png", PICTURE[:, :-1], "depth 40 x 24, colour 39 x 24"),
     ("frames", "rgb/0001.png", b"GIF89a" + bytes(50), "no PNG or JPEG"),
-    ("frames", "rgb/0001.png", None, "0001"),
     ("frames", "depth/0001.png", PICTURE[..., 0], "expected 1 of 16"),
-    ("frames", "depth/0001.png", PICTURE.astype(np.uint16), "expected 1 of 16"),
     ("frames", "depth/0001.png", np.zeros((23, 40), np.uint16), "intrinsics.json says 40 x 24"),
-    ("frames", "depth/0001.png", None, "0001"),
     ("frames", "depth/0001.npy", np.zeros((24, 40), np.float32), "remove one"),
     ("zed", "depth000001.npy", np.zeros((24, 40), np.int32), "expected floats"),
     ("zed", "depth000001.npy", np.zeros((24, 40, 2), np.float32), "expected 2 dimensions"),
     ("zed", "depth000001.npy", b"\x93NUMPY\x01\x00", "no whole .npy"),
     ("frames", "flow/0001.flo", flo(40, 12, 3840), "flow 40 x 12"),
     ("frames", "flow/0001.flo", flo(40, 24, 3840), "202021"),
-    ("frames", "flow/0001.flo", b"PIEH", "202021"),
-    ("frames", "flow/0001.flo", None, "0001"),
     ("frames", "poses.txt", [3 * "nan nan nan 0 " + "0 0 0 1"] * 3, "nan"),
     ("frames", "poses.txt", ["2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1"] * 3, "not rigid"),
     ("frames", "poses.txt", ["1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1"] * 3, "left-handed"),
-    ("frames", "poses.txt", ["1 0 0"] * 3, "expected 12 or 16"),
+    ("frames", "poses.txt", ["1 0 0"] * 3, "expected 7 or 12"),
     ("frames", "poses.txt", ["0 0 0 0 0 0 1"] * 3, "pose_layout=xyz_xyzw"),
-    ("frames", "poses.txt", ["one"] * 3, "one"),
     ("frames", "poses.txt", ["# nothing"], "no numbers"),
     ("frames", "poses.txt", [POSE] * 2, "2 poses for 3 frames"),
     ("zed", "poses.txt", ["0 0 0 0 0 0 0"] * 3, "quaternion"),
-    ("frames", "intrinsics.json", camera(fx=-31.0), "fx"),
-    ("frames", "intrinsics.json", camera(fy=-27.0), "left-handed"),  # no camera axes turn it
-    ("frames", "intrinsics.json", camera(width=40.9), "width"),
-    ("frames", "intrinsics.json", camera(first_pixel_centre=1), "first_pixel_centre"),
-    ("frames", "intrinsics.json", camera(colour={}), "colour_from_depth"),
+    ("frames", "intrinsics.json", camera_json(fx=-31.0), "fx"),
+    ("frames", "intrinsics.json", camera_json(fy=-27.0), "left-handed"),  # no camera axes turn it
+    ("frames", "intrinsics.json", camera_json(first_pixel_centre=1), "first_pixel_centre"),
+    ("frames", "intrinsics.json", camera_json(colour={}), "colour_from_depth"),
     ("frames", "intrinsics.json", ["{"], "JSON"),
-    ("frames", "intrinsics.json", None, "first_pixel_centre"),
     ("tum", "rgb.txt", ["2.0 rgb/b.png", "1.0 rgb/a.png"], "backwards"),
     ("tum", "groundtruth.txt", ["2 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], "backwards"),
     ("tum", "groundtruth.txt", ["1.0 0 0 0"], "expected 8"),
@@ -198,8 +172,8 @@ def test_a_mistake_ends_in_a_line_that_names_the_file(name, file, content, says,
     write, open_it, *_ = FORMATS[name]
     write(tmp_path)
     put(tmp_path / file, content)
-    named = file.split("/")[0] if content is None else file.split("/")[-1]
-    named = "0001.png" if "colour 39" in says or "flow 40" in says else named  # their frame's
+    # Where sizes differ, it is the frame's.
+    named = "0001.png" if "colour 39" in says or "flow 40" in says else file.split("/")[-1]
     assert says in refusal(lambda: open_it(tmp_path), named)
 
 
@@ -213,7 +187,7 @@ def test_a_frame_that_a_table_lacks_is_named(tmp_path):
 def test_frames_of_differing_sizes_are_refused(tmp_path):
     synthetic.write_tum(tmp_path)
     for kind, dtype, shape in (("rgb", np.uint8, (12, 20, 3)), ("depth", np.uint16, (12, 20))):
-        png(sorted((tmp_path / kind).iterdir())[2], np.zeros(shape, dtype))
+        put(sorted((tmp_path / kind).iterdir())[2], np.zeros(shape, dtype))
     says = refusal(lambda: Tum(tmp_path), "rgb/100.200000.png")
     assert "20 x 12, the frame before 40 x 24" in says
 
