@@ -1,6 +1,6 @@
 """Checks of a scene as a whole: its parts agree, paths are open, people keep apart.
 
-Pydantic has checked each part for itself by then.
+Pydantic has checked each part for itself by then. A `SceneError` names the key and the remedy.
 """
 
 from collections.abc import Iterable, Iterator
@@ -12,13 +12,12 @@ from shapely.geometry import Point
 from shapely.geometry.base import BaseGeometry
 
 from flowrep.palette import CATEGORY_ID
-from flowrep.scenes.layout import Layout, centrelines, free_ground
+from flowrep.scenes.layout import Layout, centreline, free_ground
 from flowrep.scenes.pedestrians import (
     APART_M,
     PARTS,
     RADIUS_M,
     covered_ground,
-    gap_m,
     keeps_its_stretches,
     keeps_lanes_apart,
     least_spread_m,
@@ -37,11 +36,7 @@ _LEAST_END_M = 1.0  # of an ending zone; the vehicle's place is checked at least
 
 
 def check_references(scene: Scene) -> None:
-    """Checks that what is named exists, and that places are on their roads.
-
-    Raises:
-        SceneError: names the key and the remedy.
-    """
+    """Checks that what is named exists, and that places are on their roads."""
     if scene.num_pedestrians > 255 // len(PARTS):  # their parts have 8-bit ids
         raise SceneError(
             f"pedestrian_groups: {scene.num_pedestrians} people; keep to {255 // len(PARTS)}"
@@ -49,12 +44,12 @@ def check_references(scene: Scene) -> None:
     _check_known("categories", scene.categories, CATEGORY_ID)
     for key, names in _categories_used(scene).items():
         _check_known(key, names, scene.categories)
-    lines = centrelines(scene)
+    lengths_m = {road.name: centreline(road).length for road in scene.roads}
     for key, item in _on_roads(scene):
-        _check_known(f"{key}.road", [item.road], lines)
+        _check_known(f"{key}.road", [item.road], lengths_m)
         given = (getattr(item, name, None) for name in ("at_m", "from_m", "to_m"))
         places = [at for at in given if at is not None]
-        length = lines[item.road].length
+        length = lengths_m[item.road]
         may_extend = isinstance(item, BuildingRow | ObstacleRow)
         if not may_extend and not all(0.0 <= at <= length + 1e-6 for at in places):
             there = " to ".join(f"{at:g}" for at in places)
@@ -103,11 +98,7 @@ def _check_known(key: str, names: Iterable[str], known: Iterable[str]) -> None:
 
 
 def check_path(layout: Layout, path: Path) -> None:
-    """Checks that a path begins on free road and leads to its ending zone.
-
-    Raises:
-        SceneError: names the path and the remedy.
-    """
+    """Checks that a path begins on free road and leads to its ending zone."""
     key = f"paths.{path.name}"
     footprint, end = layout.start_footprint(path.start), layout.zones[path.end]
     blocks = [box.footprint for box in layout.boxes(path)]
@@ -132,13 +123,7 @@ def check_path(layout: Layout, path: Path) -> None:
 
 
 def check_walks(layout: Layout) -> None:
-    """Checks that no draw of an episode lets anyone walk into a box or another person.
-
-    Nor may it put anyone where the vehicle starts.
-
-    Raises:
-        SceneError: names the group and the remedy.
-    """
+    """Checks that no draw of an episode puts anyone into a box, a person or the vehicle."""
     grounds = {group.name: _ground(layout, group) for group in layout.scene.pedestrian_groups}
     boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
     tree = shapely.STRtree([box.footprint for box in boxes])
@@ -158,7 +143,8 @@ def check_walks(layout: Layout) -> None:
                     f"walk or zone {path.start!r}, or narrow spread_m"
                 )
     for (one, ground), (other, other_ground) in combinations(grounds.items(), 2):
-        gap = gap_m(ground, other_ground)
+        nearest = shapely.STRtree(other_ground).query_nearest
+        gap = nearest(ground, all_matches=False, return_distance=True)[1].min()
         if gap < APART_M:
             raise SceneError(
                 f"pedestrian_groups.{one}: people of {other!r} come within {gap:.2f} m of those of "

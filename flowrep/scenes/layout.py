@@ -61,34 +61,8 @@ def centreline(road: Road) -> LineString:
     return LineString(points)
 
 
-def centrelines(scene: Scene) -> dict[str, LineString]:
-    """Returns the centreline of every road, by name."""
-    return {road.name: centreline(road) for road in scene.roads}
-
-
-def pose_along(line: LineString, at_m: float) -> tuple[float, float, float]:
-    """Returns x, y and heading at a distance along a centreline or its continuation.
-
-    >>> pose_along(LineString([(0, 0), (9, 0)]), -2.0)
-    (-2.0, 0.0, 0.0)
-    """
-    # The heading is that of the chord around a place, also where two pieces meet.
-    step = min(0.05, line.length / 4)
-    middle = min(max(at_m, step), line.length - step)
-    behind, ahead = (line.interpolate(middle + sign * step) for sign in (-1, 1))
-    heading = math.atan2(ahead.y - behind.y, ahead.x - behind.x)
-    # shapely would count negative distances from the far end, and stop at either
-    on_road = min(max(at_m, 0.0), line.length)
-    point, beyond = line.interpolate(on_road), at_m - on_road
-    return point.x + beyond * math.cos(heading), point.y + beyond * math.sin(heading), heading
-
-
 def stretch(line: LineString, from_m: float, to_m: float) -> LineString:
-    """Returns the part of a centreline between two distances along it.
-
-    >>> stretch(LineString([(0, 0), (9, 0)]), -1.0, 3.0).wkt
-    'LINESTRING (0 0, 3 0)'
-    """
+    """Returns the part of a centreline between two distances along it, none beyond its ends."""
     first, last = (min(max(at_m, 0.0), line.length) for at_m in (from_m, to_m))
     return shapely.ops.substring(line, first, last)
 
@@ -167,8 +141,8 @@ class Layout:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self.lines = centrelines(scene)
-        self._roads = {road.name: road for road in scene.roads}
+        self.roads = {road.name: road for road in scene.roads}
+        self.lines = {name: centreline(road) for name, road in self.roads.items()}
         self._walks: dict[Walk, Array] = {}
         self.ribbons = {
             road.name: ribbon(self.lines[road.name], road.width_m / 2) for road in scene.roads
@@ -184,7 +158,8 @@ class Layout:
         has_sidewalks = any(road.sidewalk_m > 0 for road in scene.roads)
         # without any, rounding of corners leaves slivers
         self.sidewalks = self._paved.difference(self.drivable) if has_sidewalks else Polygon()
-        self.terrain = self._terrain(scene.terrain_m)
+        reached = shapely.box(*self._paved.bounds).buffer(scene.terrain_m)
+        self.terrain = reached.difference(self._paved) if scene.terrain_m > 0 else Polygon()
         self.crosswalks = tuple(self._crosswalk_area(crosswalk) for crosswalk in scene.crosswalks)
         self.zones = {
             zone.name: self._road_between(zone.road, zone.from_m, zone.to_m) for zone in scene.zones
@@ -201,12 +176,17 @@ class Layout:
 
     def pose_at(self, road: str, at_m: float, offset_m: float = 0.0) -> tuple[float, float, float]:
         """Returns x, y and heading at a distance along a road, `offset_m` to its left."""
-        x, y, heading = pose_along(self.lines[road], at_m)
+        line = self.lines[road]
+        # The heading is that of the chord around a place, also where two pieces meet.
+        step = min(0.05, line.length / 4)
+        middle = min(max(at_m, step), line.length - step)
+        behind, ahead = (line.interpolate(middle + sign * step) for sign in (-1, 1))
+        heading = math.atan2(ahead.y - behind.y, ahead.x - behind.x)
+        # shapely would count negative distances from the far end, and stop at either
+        on_road = min(max(at_m, 0.0), line.length)
+        point, beyond = line.interpolate(on_road), at_m - on_road
+        x, y = point.x + beyond * math.cos(heading), point.y + beyond * math.sin(heading)
         return x - offset_m * math.sin(heading), y + offset_m * math.cos(heading), heading
-
-    def width_m(self, road: str) -> float:
-        """Returns the width of a road without its sidewalks."""
-        return self._roads[road].width_m
 
     def start_state(self, zone_name: str) -> VehicleState:
         """Returns the vehicle in the middle of a start zone, with zero yaw rate."""
@@ -239,7 +219,7 @@ class Layout:
             part = stretch(self.lines[walk.road], walk.from_m, walk.to_m)
             return parallel(without_repeats(np.array(part.coords)), walk.offset_m)
         assert walk.at_m is not None
-        road = self._roads[walk.road]
+        road = self.roads[walk.road]
         # Keep a stride away from the house fronts.
         reach = road.width_m / 2 + road.sidewalk_m - 0.5
         # From right to left across the road; the walk's own left points back along the road.
@@ -247,19 +227,14 @@ class Layout:
         return np.array([end[:2] for end in ends])
 
     def _road_between(self, road: str, from_m: float, to_m: float) -> Polygon:
-        return ribbon(stretch(self.lines[road], from_m, to_m), self.width_m(road) / 2)
+        return ribbon(stretch(self.lines[road], from_m, to_m), self.roads[road].width_m / 2)
 
     def _closure_box(self, closure: Closure) -> Box:
-        road = self._roads[closure.road]
+        road = self.roads[closure.road]
         x, y, heading = self.pose_at(closure.road, closure.at_m)
         width = road.width_m + 2 * road.sidewalk_m
         size = (width, closure.depth_m, closure.height_m)
         return Box("house", x, y, heading - math.pi / 2, size)
-
-    def _terrain(self, reach_m: float) -> BaseGeometry:
-        if reach_m <= 0:
-            return Polygon()
-        return shapely.box(*self._paved.bounds).buffer(reach_m).difference(self._paved)
 
     def _crosswalk_area(self, crosswalk: Crosswalk) -> CrosswalkArea:
         first, last = (crosswalk.at_m + side * crosswalk.depth_m / 2 for side in (-1, 1))
@@ -296,7 +271,7 @@ class Layout:
         self, row: BuildingRow, rng: np.random.Generator, houses: list[Box]
     ) -> None:
         side = 1.0 if row.side == "left" else -1.0
-        edge = self._roads[row.road].width_m / 2 + row.setback_m
+        edge = self.roads[row.road].width_m / 2 + row.setback_m
         # The last house may stand beyond to_m, but then not beyond the road too.
         last_middle = max(row.to_m, self.lines[row.road].length)
         at = row.from_m

@@ -71,8 +71,7 @@ LANE_M = APART_M + 0.01
 def keeps_its_stretches(points: Array, aside_m: float) -> bool:
     """Returns whether a line moved aside keeps every stretch, with none reversed.
 
-    The length of a stretch is linear in `aside_m`, so if this holds at two distances, it holds
-    between them.
+    A stretch's length is linear in `aside_m`: what holds at two distances holds between them.
     """
     steps = np.diff(points, axis=0)
     moved = np.diff(parallel(points, aside_m), axis=0)
@@ -107,13 +106,6 @@ def covered_ground(points: Array, spread_m: float) -> list[BaseGeometry]:
     return list(shapely.convex_hull(shapely.multipoints(corners)))
 
 
-def gap_m(ground: list[BaseGeometry], other: list[BaseGeometry]) -> float:
-    """Returns the distance in metres between two lists of shapes."""
-    tree = shapely.STRtree(other)
-    _, distances = tree.query_nearest(ground, all_matches=False, return_distance=True)
-    return float(distances.min())
-
-
 def least_spread_m(count: int) -> float:
     """Returns the least width in metres that the lanes of `count` people take."""
     return round((count - 1) * LANE_M, 6)
@@ -140,13 +132,7 @@ class Crowd:
     """All people of one episode."""
 
     def __init__(self, lines: list[Array], speeds_mps: Array, phases: Array) -> None:
-        """Places people on their lines.
-
-        Args:
-            lines: each person's walk, points [M, 2].
-            speeds_mps: each person's speed [P]; 0 for people standing still.
-            phases: positions at time 0 [P], as a fraction of the round trip, in [0, 1).
-        """
+        """Places people on their lines [M, 2], at fractions [P] of the way there and back."""
         most = max((len(line) for line in lines), default=2)
         # Shorter lines are padded with copies of their last point, which add no length.
         padded = [line[np.minimum(np.arange(most), len(line) - 1)] for line in lines]
@@ -164,10 +150,6 @@ class Crowd:
         self._start = np.asarray(phases, dtype=np.float64) * self._there_and_back
         self._people = np.arange(len(lines))
         self._out_of_step = _OUT_OF_STEP_RAD * self._people
-
-    def __len__(self) -> int:
-        """Returns the number of people."""
-        return len(self._people)
 
     def positions(self, time_s: float | Array) -> Array:
         """Returns everyone's position [P, 2] at a time since the episode's start.

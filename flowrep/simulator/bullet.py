@@ -75,9 +75,7 @@ class Simulator:
     ) -> int:
         """Returns PyBullet's number of a new body at the origin.
 
-        Args:
-            mesh: its visible geometry.
-            boxes_m: collision boxes (x, y, yaw, length, width, height), standing on the ground.
+        Its collision boxes (x, y, yaw, length, width, height) stand on the ground.
         """
         arrays = {
             "vertices": [_shared(tuple(row)) for row in mesh.vertices],
@@ -142,20 +140,11 @@ class Simulator:
         self, body: int, x_m: float, y_m: float, yaw_rad: float, height_m: float = 0.0
     ) -> None:
         """Places a body at a planar pose, on the ground unless a height is given."""
-        pybullet.resetBasePositionAndOrientation(
-            body, (x_m, y_m, height_m), _about_z(yaw_rad), physicsClientId=self._client
-        )
+        self.place_at(body, (x_m, y_m, height_m), _about_z(yaw_rad))
 
-    def place_all(
-        self,
-        bodies: list[int],
-        positions: NDArray[np.float64],
-        quaternions_xyzw: NDArray[np.float64],
-    ) -> None:
-        """Places N bodies at positions [N, 3] and orientations [N, 4]."""
-        put, client = pybullet.resetBasePositionAndOrientation, self._client
-        for pose in zip(bodies, positions.tolist(), quaternions_xyzw.tolist()):
-            put(*pose, client)
+    def place_at(self, body: int, xyz_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
+        """Places a body at a position and an orientation as a quaternion."""
+        pybullet.resetBasePositionAndOrientation(body, xyz_m, rotation_xyzw, self._client)
 
     def touch(self, body: int, other: int) -> bool:
         """Returns whether two bodies overlap at their current poses."""

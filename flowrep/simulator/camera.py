@@ -74,10 +74,8 @@ def depth_from_zbuffer(
 ) -> NDArray[np.float32]:
     """Returns depth along z in metres from OpenGL depth-buffer values in [0, 1]."""
     # far - (far - near)·z would cancel near z = 1, where 1 - z is exact in float32.
-    gap = np.float32(1.0) - zbuffer
-    gap *= np.float32(far_m - near_m)
-    gap += np.float32(near_m)
-    return np.divide(np.float32(far_m * near_m), gap, out=gap)
+    gap = (np.float32(1.0) - zbuffer) * np.float32(far_m - near_m) + np.float32(near_m)
+    return np.float32(far_m * near_m) / gap
 
 
 RENDERERS = ("auto", "rasteriser", "pybullet")

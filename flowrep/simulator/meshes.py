@@ -30,23 +30,13 @@ _CHUNK_TRIANGLES = 24
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body.
+    """A rigid body, with its ids in the maps; instance 0 is the static world."""
 
-    Args:
-        vertices: [V, 3], metres, in the body's own frame.
-        triangles: [T, 3], indices of vertices, counter-clockwise seen from outside.
-        semantic: its id in the semantic map.
-        instance: its id in the instance map.
-        moves: whether it has a pose of its own; if not, its frame is the world's.
-        uvs: [V, 2], places in the texture; without them it is plain asphalt.
-    """
-
-    vertices: NDArray[np.float64]
-    triangles: NDArray[np.int64]
+    vertices: NDArray[np.float64]  # [V, 3], metres, in its own frame, or the world's if static
+    triangles: NDArray[np.int64]  # [T, 3], vertices, counter-clockwise seen from outside
     semantic: int
     instance: int
-    moves: bool = False
-    uvs: NDArray[np.float64] | None = None
+    uvs: NDArray[np.float64] | None = None  # [V, 2], in the texture; plain asphalt without
 
 
 class Triangles(NamedTuple):
@@ -70,7 +60,7 @@ def gather(bodies: Sequence[Body]) -> Triangles:
     chunks = []
     movers = iter(range(len(bodies)))
     for number, body in enumerate(bodies):
-        pose = next(movers) if body.moves else -1
+        pose = next(movers) if body.instance else -1
         uvs = np.zeros((len(body.vertices), 2)) if body.uvs is None else body.uvs
         triangles, places = body.vertices[body.triangles], uvs[body.triangles]
         for chunk in _chunks(triangles.mean(axis=1), np.arange(len(triangles))):
@@ -160,9 +150,8 @@ class Mesh:
         """Adds a box without its floor; `lid` adds its top."""
         self.walls(low, high, (side,) * 4)
         if lid:
-            (x0, y0, _), (x1, y1, z1) = low, high
-            ring = [(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)]
-            self.quad(np.array(ring), side)
+            (x0, y0, _), (x1, y1, z) = low, high
+            self.quad(np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]), side)
 
     def walls(self, low: Point3, high: Point3, sides: Sequence[Patch | None]) -> None:
         """Adds the upright faces of a box for which a patch is given: -y, +x, +y, -x."""
@@ -175,19 +164,9 @@ class Mesh:
                 self.quad(np.array(corners), patch)
 
     def frustum(
-        self,
-        bottom: Array,
-        bottom_m: float,
-        top: Array,
-        top_m: float,
-        side: Patch,
-        lid: Patch,
-        *,
-        floor: Patch | None = None,
+        self, low: Array, high: Array, side: Patch, lid: Patch, *, floor: Patch | None = None
     ) -> None:
-        """Adds the sides and top between two level rings [M, 2], counter-clockwise from above."""
-        low = np.column_stack([bottom, np.full(len(bottom), bottom_m)])
-        high = np.column_stack([top, np.full(len(top), top_m)])
+        """Adds the sides and top between two level rings [M, 3], counter-clockwise from above."""
         for i in range(len(low)):
             j = (i + 1) % len(low)
             self.quad(np.array([low[i], low[j], high[j], high[i]]), side)
@@ -235,12 +214,7 @@ class Mesh:
 
 
 def lane_marks(line: LineString, clear_of: BaseGeometry) -> Mesh:
-    """Returns dashes along the middle of a road, slightly above it.
-
-    Args:
-        line: the road's centreline.
-        clear_of: ground without dashes, such as crosswalks and junctions.
-    """
+    """Returns dashes along a centreline, slightly above it, but for some ground."""
     mesh = Mesh()
     for at in np.arange(0.0, line.length - _DASH_M, _DASH_PERIOD_M):
         dash = shapely.ops.substring(line, at, at + _DASH_M)
@@ -310,9 +284,9 @@ def car(box: Box) -> Mesh:
     mesh.box((-x, -y, 0.28), (x, y, belt), paint)
     # The underside, in the shade.
     mesh.walls((-0.9 * x, -0.8 * y, 0.0), (0.9 * x, 0.8 * y, 0.28), (swatch("tyre"),) * 4)
-    sill = _rectangle(-0.68 * x, 0.46 * x, 0.94 * y)
-    roof = _rectangle(-0.52 * x, 0.14 * x, 0.76 * y)
-    mesh.frustum(sill, belt, roof, height, swatch("glass"), paint)
+    sill = _rectangle(-0.68 * x, 0.46 * x, 0.94 * y, belt)
+    roof = _rectangle(-0.52 * x, 0.14 * x, 0.76 * y, height)
+    mesh.frustum(sill, roof, swatch("glass"), paint)
     for side in (-1, 1):
         for axle in (-0.62 * x, 0.62 * x):
             mesh.disc((axle, side * (y + 0.01), 0.33), (0.0, side, 0.0), 0.33, swatch("tyre"))
@@ -338,8 +312,9 @@ def tree(box: Box) -> Mesh:
     else:
         tiers = ((0.38, 0.56, 0.55, 1.0), (0.56, 0.8, 1.0, 0.85), (0.8, 1.0, 0.85, 0.3))
     for low, high, bottom, top in tiers:
-        ring, upper = (_ring(_CROWN_SIDES, reach * share) for share in (bottom, max(top, 0.02)))
-        mesh.frustum(ring, low * height, upper, high * height, leaf, leaf, floor=leaf)
+        lower = _ring(_CROWN_SIDES, reach * bottom, low * height)
+        upper = _ring(_CROWN_SIDES, reach * max(top, 0.02), high * height)
+        mesh.frustum(lower, upper, leaf, leaf, floor=leaf)
     return mesh
 
 
@@ -391,13 +366,14 @@ _SHAPES: dict[Kind, Callable[[Box], Mesh]] = {
 }
 
 
-def _rectangle(x0: float, x1: float, y: float) -> np.ndarray:
-    return np.array([(x0, -y), (x1, -y), (x1, y), (x0, y)])
+def _rectangle(x0: float, x1: float, y: float, z: float) -> Array:
+    return np.array([(x0, -y, z), (x1, -y, z), (x1, y, z), (x0, y, z)])
 
 
-def _ring(sides: int, radius_m: float) -> np.ndarray:
+def _ring(sides: int, radius_m: float, z: float) -> Array:
     angles = np.arange(sides) * (2 * math.pi / sides)
-    return radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    x, y = radius_m * np.cos(angles), radius_m * np.sin(angles)
+    return np.stack([x, y, np.full(sides, z)], axis=-1)
 
 
 def person_meshes(variant: int) -> tuple[Mesh, ...]:

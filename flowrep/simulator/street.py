@@ -9,7 +9,6 @@ from weakref import WeakValueDictionary
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry.base import BaseGeometry
 
 from flowrep.palette import CATEGORY_ID, CLASS_COLOURS
 from flowrep.scenes import pedestrians
@@ -127,15 +126,12 @@ class Street:
         """Places people at poses [P, 4], for a picture."""
         positions = pedestrians.world_from_parts(poses)[:, :3, 3]
         parts = self._numbers[len(self._numbers) - len(positions) :]  # the bodies added last
-        self.simulator.place_all(parts, positions, pedestrians.quaternions_of_parts(poses))
+        rotations = pedestrians.quaternions_of_parts(poses)
+        for part, position, rotation in zip(parts, positions.tolist(), rotations.tolist()):
+            self.simulator.place_at(part, position, rotation)
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
-        """Returns at which times someone is near enough to be touched [T].
-
-        Args:
-            track: states of the vehicle at T times.
-            poses: everyone's poses [T, P, 4] at those times.
-        """
+        """Returns at which of T times someone's pose [T, P, 4] is near enough to be touched."""
         centres = np.array([state[:2] for state in track])
         gaps = poses[..., :2] - centres[:, None]
         return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)
@@ -144,11 +140,6 @@ class Street:
         """Returns the category of the body that the vehicle overlaps, or "".
 
         Only bodies near enough to be touched are passed to PyBullet's collision test.
-
-        Args:
-            state: the vehicle's state.
-            poses: everyone's poses [P, 4].
-            closures: names of the closures in place.
         """
         simulator, at = self.simulator, state[:2]
         simulator.place(self._vehicle, *state[:3])
@@ -169,8 +160,10 @@ class Street:
         striped = shapely.union_all([area.polygon for area in layout.crosswalks])
         road, crosswalks = meshes.Mesh(), meshes.Mesh()
         road.ground(layout.drivable.difference(striped), 0.0, "asphalt")
-        for name in layout.lines:
-            road.add(self._lane_marks(layout, name, striped))
+        for name, line in layout.lines.items():
+            if layout.roads[name].width_m >= _TWO_LANES_M:
+                others = [ground for other, ground in layout.ribbons.items() if other != name]
+                road.add(meshes.lane_marks(line, shapely.union_all([*others, striped])))
         for area in layout.crosswalks:
             crosswalks.add(meshes.crosswalk(*area))
         paved = layout.sidewalks
@@ -189,12 +182,6 @@ class Street:
         ):
             if mesh.indices:
                 self._add_body(mesh, category)
-
-    def _lane_marks(self, layout: Layout, name: str, striped: BaseGeometry) -> meshes.Mesh:
-        if layout.width_m(name) < _TWO_LANES_M:
-            return meshes.Mesh()
-        others = [ground for other, ground in layout.ribbons.items() if other != name]
-        return meshes.lane_marks(layout.lines[name], shapely.union_all([*others, striped]))
 
     def _add_solids(self, boxes: list[Box]) -> None:
         by_category: dict[str, list[Box]] = {}
@@ -220,7 +207,7 @@ class Street:
         triangles = np.array(mesh.indices).reshape(-1, 3)
         seen_as = CATEGORY_ID[category], instance
         uvs = np.array(mesh.uvs).reshape(-1, 2)
-        self.bodies.append(Body(vertices, triangles, *seen_as, moves=instance > 0, uvs=uvs))
+        self.bodies.append(Body(vertices, triangles, *seen_as, uvs))
         self._numbers.append(self.simulator.add_body(mesh, boxes_m))
         return len(self.bodies) - 1
 

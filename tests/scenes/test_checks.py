@@ -2,16 +2,13 @@
 
 import copy
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
-import yaml
 
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.scene import PedestrianGroup, Walk
 
 MISSING = object()
-CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 ALL = ["sky", "road", "sidewalk", "building", "pedestrian", "car", "crosswalk"]
 CROSSWALK = {"road": "stem", "at_m": 20.0, "depth_m": 3.0}
 BUILDING_ROW = {"road": "stem", "side": "left", "from_m": 0.0, "to_m": 40.0, "setback_m": 2.0}
@@ -21,11 +18,6 @@ OBSTACLE_ROW |= {"every_m": 9.0, "size_m": [1.0, 1.0, 1.0]}
 POINTS = {"kind": "points", "road": "stem", "points_m": [[25.0, -5.0], [25.0, 5.0]]}
 ON_STEM = {"name": "west", "road": "stem", "from_m": 2.0, "to_m": 9.0}
 CAR_BESIDE = {"kind": "car", "center_m": [22.8, 2.0], "yaw_deg": 0.0, "size_m": [4.0, 1.8, 1.5]}
-
-
-@pytest.fixture
-def data():
-    return yaml.safe_load(CROSSROADS.read_text())
 
 
 def refusal(data, changes):

@@ -2,24 +2,16 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
-import yaml
 
 from flowrep.scenes import load_scene
 from flowrep.scenes.layout import Layout, parallel
 from flowrep.scenes.scene import BuildingRow, Crosswalk, ObstacleRow
 
-CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 CORNER = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 3.0)])
-
-
-@pytest.fixture
-def data():
-    return yaml.safe_load(CROSSROADS.read_text())
 
 
 def test_an_arc_ends_where_its_radius_says(data):

@@ -5,17 +5,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flowrep.baselines import Planner
 from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.load import json_schema
 
 CROSSROADS = Path(__file__).parent / "crossroads.yaml"
 SCHEMA = Path(__file__).parents[2] / "docs" / "scene.schema.json"
-
-
-@pytest.fixture
-def data():
-    return yaml.safe_load(CROSSROADS.read_text())
 
 
 def test_name_file_mapping_and_scene_give_the_same_scene(data):
@@ -24,28 +18,6 @@ def test_name_file_mapping_and_scene_give_the_same_scene(data):
     assert load_scene("straight_road").name == "straight_road"
     assert scene.num_pedestrians == 5
     assert scene.time_limit_s == pytest.approx(12.5)
-
-
-def test_each_path_is_drawn_as_often(make_street):
-    env = make_street(CROSSROADS, sensors=())
-    drawn = []
-    for _ in range(40):
-        _, info = env.reset(seed=0 if not drawn else None)
-        drawn.append(info["path"])
-    assert 10 <= drawn.count("left") <= 30
-
-
-def test_a_closure_is_hit_where_it_stands(make_street):
-    env = make_street(CROSSROADS, sensors=())
-    # Someone who plans for the left arm and drives it while it is closed.
-    env.reset(seed=0, options={"path": "left", "episode_seed": 3})
-    actions = Planner().search(env.episode)
-    env.reset(options={"path": "right", "episode_seed": 3})
-    for action in actions:
-        _, _, ended, _, info = env.step(action)
-        if ended:
-            break
-    assert (info["outcome"], info["hit"]) == ("collision", "building")
 
 
 def test_the_planner_drives_a_scene_it_was_not_made_for(drive):

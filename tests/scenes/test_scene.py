@@ -21,22 +21,16 @@ CAR = VehicleConfig(4.0, 2.0, 1.4, 10.0, 30.0, 40.0)
 STATE = VehicleState(1.0, 2.0, 0.5, 0.1)
 
 
-def test_turning_changes_the_yaw_rate_by_alpha_times_dt():
+def test_turning_changes_the_yaw_rate_by_alpha_times_dt_up_to_a_limit():
     # 30°/s² for half a second: 15°/s, counter-clockwise to the left.
     step = math.radians(15.0)
     assert turn(STATE, YAW_SIGN[TURN_LEFT], 0.5, CAR) == pytest.approx((1.0, 2.0, 0.5, 0.1 + step))
     assert turn(STATE, YAW_SIGN[TURN_RIGHT], 0.5, CAR) == pytest.approx((1.0, 2.0, 0.5, 0.1 - step))
     assert turn(STATE, YAW_SIGN[NO_OP], 0.5, CAR) == STATE
-
-
-def test_the_yaw_rate_stays_within_its_limit():
-    # 30°/s² for 2 s would be 60°/s; the limit is 40.
-    assert turn(STATE, YAW_SIGN[TURN_LEFT], 2.0, CAR).yaw_rate_rps == pytest.approx(
-        math.radians(40)
-    )
-    assert turn(STATE, YAW_SIGN[TURN_RIGHT], 9.0, CAR).yaw_rate_rps == pytest.approx(
-        -math.radians(40)
-    )
+    # for 2 s would be 60°/s; the limit is 40
+    left, right = (turn(STATE, YAW_SIGN[action], 2.0, CAR) for action in (TURN_LEFT, TURN_RIGHT))
+    limit = math.radians(40.0)
+    assert (left.yaw_rate_rps, right.yaw_rate_rps) == pytest.approx((limit, -limit))
 
 
 def test_a_turning_vehicle_stays_on_its_circle():
@@ -48,14 +42,11 @@ def test_a_turning_vehicle_stays_on_its_circle():
     assert right == pytest.approx((20.0, -20.0, -math.pi / 2, -0.5))
 
 
-def test_many_short_rolls_are_one_long_one():
+def test_many_short_rolls_are_one_long_one_and_who_stands_keeps_the_very_numbers():
     state = STATE
     for _ in range(24):
         state = roll(state, 1 / 24, 10.0)
     assert state == pytest.approx(roll(STATE, 1.0, 10.0), abs=1e-12)
-
-
-def test_a_vehicle_that_stands_keeps_its_very_numbers():
     state = VehicleState(0.1, 0.2, 0.3, 0.0)
     assert roll(state, 1 / 24, 0.0) == state
 

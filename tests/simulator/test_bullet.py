@@ -72,27 +72,13 @@ def test_a_forgotten_street_gives_its_client_back(own_scene):
     assert clients() == before
 
 
-def test_memory_stays_flat_over_resets():
-    env = StreetEnv(sensors=("depth",))
-    env.reset(seed=0)
-
-    def some(count):
-        for _ in range(count):
-            env.reset()
-            env.step(0)
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-    first = some(20)
-    grown_kib = some(80) - first
-    env.close()
-    assert grown_kib < 4096
-
-
 @pytest.mark.slow
 def test_memory_stays_flat_over_streets():
     def some(count):
         for _ in range(count):
-            StreetEnv(sensors=()).close()
+            env = StreetEnv(sensors=())
+            env.reset(seed=0)
+            env.close()
         gc.collect()
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 

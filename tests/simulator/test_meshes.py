@@ -6,6 +6,7 @@ import pytest
 from flowrep.scenes.layout import Box
 from flowrep.scenes.scene import LEAST_HEIGHT_M
 from flowrep.simulator.meshes import mesh_of
+from flowrep.simulator.paint import swatch
 
 SIZES = {
     "car": (4.2, 1.8, 1.45),
@@ -56,8 +57,6 @@ def test_a_shape_stands_where_its_box_does_and_faces_its_way():
 def test_one_lamp_of_a_traffic_light_is_lit_for_those_who_drive_its_way():
     mesh = mesh_of(Box("traffic_light", 0.0, 0.0, 0.0, SIZES["traffic_light"]))
     normals, uvs = np.array(mesh.normals), np.array(mesh.uvs)
-    from flowrep.simulator.paint import swatch
-
     lit = np.isclose(uvs, swatch("lamp_green")[:2]).all(axis=-1)
     assert lit.sum() == 8  # the corners of one disc
     np.testing.assert_allclose(normals[lit], [[-1.0, 0.0, 0.0]] * 8, atol=1e-12)

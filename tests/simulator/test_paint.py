@@ -19,8 +19,7 @@ def rectangle(paint, semantic, x, y, z=0.0, *, instance=0):
     corners = [(x[0], y[0], z), (x[1], y[0], z), (x[1], y[1], z), (x[0], y[1], z)]
     uvs = np.array([swatch(paint)[:2]] * 4)
     triangles = np.array([(0, 1, 2), (0, 2, 3)])
-    moves = instance > 0
-    return Body(np.array(corners), triangles, semantic, instance, moves=moves, uvs=uvs)
+    return Body(np.array(corners), triangles, semantic, instance, uvs)
 
 
 def seen_from_above(*bodies, x=0.0, y=0.0, height_m=2.0, size=(40, 60), focal_px=40.0, poses=()):
