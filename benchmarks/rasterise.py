@@ -89,7 +89,7 @@ def viewpoint(env: StreetEnv, rng: np.random.Generator, *, before_a_person: bool
         distance, bearing = rng.uniform(0.2, 8.0), rng.uniform(-math.pi, math.pi)
         x, y = x - distance * math.cos(bearing), y - distance * math.sin(bearing)
         return VehicleState(x, y, bearing + rng.uniform(-0.7, 0.7), 0.0)
-    road = episode.rules.layout.drivable
+    road = episode.layout.drivable
     x0, y0, x1, y1 = road.bounds
     while True:
         x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)

@@ -173,13 +173,13 @@ def test_frame_rates_are_compared_on_the_same_episodes():
 
 
 def test_an_episodes_path_is_the_one_that_it_draws():
-    from flowrep.envs.episode import Episode, Rules
+    from flowrep.envs.episode import Episode
     from flowrep.scenes import load_scene
     from flowrep.scenes.layout import Layout
 
     scene = load_scene("h_shaped_pathways")
-    rules = Rules(Layout(scene), 12.0, 2)
-    driven = [Episode(rules, seed, (1.2, 1.8), 10.0).path for seed in range(8)]
+    layout = Layout(scene)
+    driven = [Episode(layout, 12.0, seed, (1.2, 1.8), 10.0).path for seed in range(8)]
     drawn = results.drawn_paths(np.arange(8), len(scene.paths))
     assert [scene.paths[place] for place in drawn] == driven
     assert len(set(drawn.tolist())) > 1

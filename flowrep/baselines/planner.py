@@ -60,8 +60,7 @@ class Planner:
             actions = self.search(episode)
             self._plan = {episode.steps + i: action for i, action in enumerate(actions)}
         action = self._plan.get(episode.steps, NO_OP)
-        rules = episode.rules
-        turned = turn(state, YAW_SIGN[action], rules.dt_s, rules.layout.scene.vehicle)
+        turned = turn(state, YAW_SIGN[action], episode.dt_s, episode.layout.scene.vehicle)
         self._expected = (episode.steps + 1, turned.yaw_rate_rps)
         return action
 
@@ -128,9 +127,8 @@ class _Search:
     """Simulates one episode for many vehicles at once."""
 
     def __init__(self, episode: Episode) -> None:
-        self.episode = episode
-        self.rules, self.vehicle = episode.rules, episode.rules.layout.scene.vehicle
-        self.free, self.way = _ground(self.rules.layout, episode.path)
+        self.episode, self.vehicle = episode, episode.layout.scene.vehicle
+        self.free, self.way = _ground(episode.layout, episode.path)
 
     def run(self, beam: int) -> tuple[list[int], bool]:
         """Returns the actions of the best drive found, and whether it arrives."""
@@ -138,12 +136,12 @@ class _Search:
         state = VehicleState(*(np.array([value]) for value in episode.now.vehicle))
         steps, ticks = episode.steps, episode.now.ticks
         history: list[tuple[Array, Array]] = []
-        while steps < episode.rules.limit_steps:
+        while steps < episode.limit_steps:
             parents = np.repeat(np.arange(state.x_m.size), len(_ACTIONS))
             actions = np.tile(_ACTIONS, state.x_m.size)
             state = VehicleState(*(value[parents] for value in state))
             state, alive, arrived = self.drive(state, actions, ticks)
-            steps, ticks = steps + _HOLD_STEPS, ticks + _HOLD_STEPS * episode.rules.ticks_per_step
+            steps, ticks = steps + _HOLD_STEPS, ticks + _HOLD_STEPS * episode.ticks_per_step
             kept = np.flatnonzero(arrived)[:1] if arrived.any() else self.best(state, alive, beam)
             if not kept.size:
                 break
@@ -161,9 +159,9 @@ class _Search:
         arrived = np.zeros(actions.size, dtype=bool)
         signs = np.array(YAW_SIGN)[actions]
         for _ in range(_HOLD_STEPS):
-            state = turn(state, signs, self.rules.dt_s, self.vehicle)
-            for _ in range(self.rules.ticks_per_step):
-                state = roll(state, self.rules.tick_s, self.episode.vehicle_speed_mps)
+            state = turn(state, signs, self.episode.dt_s, self.vehicle)
+            for _ in range(self.episode.ticks_per_step):
+                state = roll(state, self.episode.tick_s, self.episode.vehicle_speed_mps)
                 ticks += 1
                 alive &= arrived | ~self._touches(state, ticks)
                 corners = footprint_corners(state, self.vehicle, _MARGIN_M)
@@ -185,7 +183,7 @@ class _Search:
         return index[order[np.sort(first)[:most]]]
 
     def _touches(self, state: VehicleState, ticks: int) -> Array:
-        people = self.episode.crowd.positions(ticks * self.rules.tick_s)
+        people = self.episode.crowd.positions(ticks * self.episode.tick_s)
         reach = self.vehicle.length_m + self.vehicle.width_m
         low = np.array([state.x_m.min(), state.y_m.min()]) - reach
         high = np.array([state.x_m.max(), state.y_m.max()]) + reach

@@ -46,17 +46,6 @@ class Outcome(IntEnum):
 NOTHING_HIT = 255
 """The code of `hit` if nothing was hit; no class has this id."""
 
-_CATEGORIES = tuple(CATEGORY_ID)
-
-STEP_REWARD = 0.01
-END_REWARD = {
-    Outcome.RUNNING: 0.0,
-    Outcome.SUCCESS: 5.0,
-    Outcome.COLLISION: -5.0,
-    Outcome.OUT_OF_BOUNDS: -5.0,
-    Outcome.TIMEOUT: -5.0,
-}
-
 
 def reward(outcome: Outcome) -> float:
     """Returns the reward of a step that leads to `outcome`.
@@ -64,25 +53,18 @@ def reward(outcome: Outcome) -> float:
     >>> reward(Outcome.SUCCESS), reward(Outcome.RUNNING)
     (5.01, 0.01)
     """
-    return STEP_REWARD + END_REWARD[outcome]
+    at_end = {Outcome.RUNNING: 0.0, Outcome.SUCCESS: 5.0}
+    return 0.01 + at_end.get(outcome, -5.0)
 
 
 def hit_code(category: str) -> int:
-    """Returns the TensorDict's code for the category hit: its class id, or `NOTHING_HIT` for "".
-
-    >>> hit_code("pedestrian"), hit_code("")
-    (4, 255)
-    """
+    """Returns the TensorDict's code for the category hit: its class id, or 255 for ""."""
     return CATEGORY_ID[category] if category else NOTHING_HIT
 
 
 def hit_name(code: int) -> str:
-    """Returns the category of a code of `hit_code`, or "" for nothing.
-
-    >>> hit_name(4), hit_name(255)
-    ('pedestrian', '')
-    """
-    return "" if code == NOTHING_HIT else _CATEGORIES[code]
+    """Returns the category of a code of `hit_code`, or "" for nothing."""
+    return "" if code == NOTHING_HIT else [*CATEGORY_ID][code]
 
 
 Array = NDArray[Any]
@@ -112,30 +94,13 @@ def ticks_for(
     return math.ceil(checks_hz / frame_rate_hz - 1e-9)
 
 
-class Rules:
-    """The constants of a scene's episodes: ground plan, clock and limits."""
-
-    def __init__(self, layout: Layout, frame_rate_hz: float, ticks_per_step: int) -> None:
-        self.layout, self.frame_rate_hz = layout, frame_rate_hz
-        self.dt_s = 1.0 / frame_rate_hz
-        self.ticks_per_step = ticks_per_step  # checks of the footprint in a step
-        self.tick_s = self.dt_s / self.ticks_per_step
-        self.tick_times_s = [(1 + i) * self.tick_s for i in range(self.ticks_per_step)]
-        # Rounding must not add a step: 200 / 12 · 15 is 250.00000000000003.
-        self.limit_steps = math.ceil(layout.scene.time_limit_s * frame_rate_hz - 1e-9)
-
-    def is_out_of_bounds(self, state: VehicleState) -> bool:
-        """Returns whether any part of the footprint is off the road."""
-        corners = footprint_corners(state, self.layout.scene.vehicle)
-        return not self.layout.drivable.covers(Polygon(corners))
-
-
 class Episode:
-    """The state of one drive."""
+    """The constants and the state of one drive."""
 
     def __init__(
         self,
-        rules: Rules,
+        layout: Layout,
+        frame_rate_hz: float,
         episode_seed: int,
         speed_mps: Range,
         vehicle_speed_mps: float,
@@ -143,20 +108,24 @@ class Episode:
         path: str | None = None,
     ) -> None:
         """Draws the path and the pedestrians from the seed; the vehicle is at its start."""
-        scene = rules.layout.scene
+        scene = layout.scene
         paths = {each.name: each for each in scene.paths}
         if path is not None and path not in paths:
             raise ValueError(f"unknown path {path!r}; the scene has {[*paths]}")
         rng = np.random.default_rng(episode_seed)
         # Drawn even where a path is given, so that a seed has the same people on every path.
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
-        self.rules = rules
-        self.seed, self.speed_mps = episode_seed, speed_mps
-        self.vehicle_speed_mps = vehicle_speed_mps
+        self.layout, self.seed = layout, episode_seed
+        self.speed_mps, self.vehicle_speed_mps = speed_mps, vehicle_speed_mps
+        self.frame_rate_hz, self.dt_s = frame_rate_hz, 1.0 / frame_rate_hz
+        self.ticks_per_step = ticks_for(scene, frame_rate_hz, speed_mps, vehicle_speed_mps)
+        self.tick_s = self.dt_s / self.ticks_per_step
+        # Rounding must not add a step: 200 / 12 · 15 is 250.00000000000003.
+        self.limit_steps = math.ceil(scene.time_limit_s * frame_rate_hz - 1e-9)
         self.path = drawn if path is None else paths[path]
-        self.crowd: Crowd = draw_crowd(rules.layout, scene.pedestrian_groups, speed_mps, rng)
-        self.goal = rules.layout.zones[self.path.end]
-        self.now = Moment(rules.layout.start_state(self.path.start), 0)
+        self.crowd: Crowd = draw_crowd(layout, scene.pedestrian_groups, speed_mps, rng)
+        self.goal = layout.zones[self.path.end]
+        self.now = Moment(layout.start_state(self.path.start), 0)
         self.before = self.now
         self.steps = 0
         self.outcome = Outcome.RUNNING
@@ -168,14 +137,14 @@ class Episode:
     def resume(self, before: Moment, now: Moment) -> None:
         """Jumps to a later step, given its moment and the one before it."""
         self.before, self.now = before, now
-        self.poses_before = self.crowd.poses(before.ticks * self.rules.tick_s)
-        self.poses = self.crowd.poses(now.ticks * self.rules.tick_s)
+        self.poses_before = self.crowd.poses(before.ticks * self.tick_s)
+        self.poses = self.crowd.poses(now.ticks * self.tick_s)
 
     def step(self, action: int, street: Street) -> None:
         """Drives one step, or part of it if the episode ends."""
-        rules = self.rules
-        turned = turn(self.now.vehicle, YAW_SIGN[action], rules.dt_s, rules.layout.scene.vehicle)
-        track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in rules.tick_times_s]
+        turned = turn(self.now.vehicle, YAW_SIGN[action], self.dt_s, self.layout.scene.vehicle)
+        times_s = [(1 + i) * self.tick_s for i in range(self.ticks_per_step)]
+        track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in times_s]
         poses = self._poses_ahead()
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
@@ -187,23 +156,24 @@ class Episode:
         self.before, self.now = self.now, Moment(vehicle, self.now.ticks + i + 1)
         self.poses_before, self.poses = self.poses, poses[i]
         self.steps += 1
-        if not self.outcome and self.steps >= rules.limit_steps:
+        if not self.outcome and self.steps >= self.limit_steps:
             self.outcome = Outcome.TIMEOUT
 
     def _poses_ahead(self) -> Array:  # at the checks of the next step, [T, P, 4]
-        count, first = self.rules.ticks_per_step, self.now.ticks + 1
+        count, first = self.ticks_per_step, self.now.ticks + 1
         at = first - self._foreseen_from
         if not 0 <= at <= len(self._foreseen) - count:
             ticks = first + np.arange(count * _STEPS_FORESEEN)
-            self._foreseen = self.crowd.poses(ticks[:, None] * self.rules.tick_s)
+            self._foreseen = self.crowd.poses(ticks[:, None] * self.tick_s)
             self._foreseen_from, at = first, 0
         return self._foreseen[at : at + count]
 
     def _end_where_due(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
         self.hit = street.hit(vehicle, poses, self.path.closures)
+        footprint = Polygon(footprint_corners(vehicle, self.layout.scene.vehicle))
         if self.hit:
             self.outcome = Outcome.COLLISION
-        elif self.rules.is_out_of_bounds(vehicle):
+        elif not self.layout.drivable.covers(footprint):
             self.outcome = Outcome.OUT_OF_BOUNDS
         elif shapely.contains_xy(self.goal, vehicle.x_m, vehicle.y_m):
             self.outcome = Outcome.SUCCESS

@@ -32,12 +32,9 @@ class RepresentationObservation(gym.Wrapper):
     they stay uint8. If not joined, it is a `Dict` of maps by name, as `make_env` gives them.
 
     Args:
-        env: gives a dict of sensor maps and motions, as `StreetEnv` does.
+        env: gives a dict of sensor maps and motions, as `StreetEnv` does; its `K` `[3, 3]`,
+            `num_classes` and `frame_rate_hz`, where it has them, are the defaults of what follows.
         representations: names, or a mapping from name to options.
-        joined: whether the maps are joined along their channels.
-        intrinsics: K `[3, 3]` of the maps in pixels; the environment's own `K` if None.
-        num_classes: number of classes in `semantic`; the environment's own if None.
-        dt_s: seconds a step; from the environment's `frame_rate_hz` if None and known.
 
     Raises:
         ValueError: if a representation is unknown or lacks an input.
@@ -112,17 +109,8 @@ class RepresentationObservation(gym.Wrapper):
 class NumericInfo(gym.Wrapper):
     """Reduces `info` to numbers, and optionally reports time-outs as truncations.
 
-    | key | meaning |
-    | --- | --- |
-    | `outcome` | code of `flowrep.envs.Outcome`; 0 while the episode runs |
-    | `hit` | class id of what was hit; 255 for nothing |
-    | `episode_seed` | identifies the episode, see `StreetEnv.reset` |
-    | `path` | index of the episode's path in the scene |
-    | `is_success` | whether the episode succeeded, as Stable-Baselines3 reads it |
-
-    Args:
-        env: a `StreetEnv`, wrapped or not.
-        truncate_timeouts: whether a time-out is `truncated` instead of `terminated`.
+    `outcome` is a code of `Outcome`, `hit` a class id or 255, `path` an index into the scene's
+    paths; `is_success` is what Stable-Baselines3 reads.
     """
 
     def __init__(self, env: gym.Env, *, truncate_timeouts: bool = False) -> None:
@@ -138,7 +126,7 @@ class NumericInfo(gym.Wrapper):
         return observation, self._numbers(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Drives one step."""
+        """Drives one step; a time-out is `truncated` or, by default, `terminated`."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         numbers = self._numbers(info)
         if self.truncate_timeouts and numbers["outcome"] == Outcome.TIMEOUT:
@@ -164,10 +152,9 @@ def make_street(
     truncate_timeouts: bool = False,
     **options: Any,
 ) -> gym.Env:
-    """Returns the environment for `gymnasium.make`: a `StreetEnv`, or its representations.
+    """Returns a `StreetEnv` of the options, or its representations, for `gymnasium.make`.
 
-    With neither representations nor `truncate_timeouts` (see `RepresentationObservation` and
-    `NumericInfo`) it is the plain `StreetEnv` of the `options`, with strings in `info`.
+    With representations or `truncate_timeouts` its `info` holds numbers, see `NumericInfo`.
     """
     if representations and "sensors" not in options:
         # which sensors are read doesn't depend on K and classes
@@ -207,9 +194,7 @@ def _joined(maps: Iterable[NDArray[Any]]) -> NDArray[Any]:
     return np.concatenate(maps)
 
 
-def _spec(box: spaces.Space) -> Bounded | Unbounded:
-    if not isinstance(box, spaces.Box):
-        raise ValueError(f"representations need sensor maps in a Box, got {box}")
+def _spec(box: Any) -> Bounded | Unbounded:
     dtype = torch.as_tensor(np.empty(0, box.dtype)).dtype
     if dtype.is_floating_point:
         return Unbounded(box.shape, dtype=dtype)

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium import spaces
 
-from flowrep.envs.episode import Episode, Moment, Outcome, Rules, reward, ticks_for
+from flowrep.envs.episode import Episode, Moment, Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
 from flowrep.scenes.load import load_scene
@@ -127,18 +127,14 @@ class StreetEnv(gym.Env):
         return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
 
     def drive(self, action: int) -> Outcome:
-        """Drives one step as `step` does, without an observation.
-
-        Raises:
-            ValueError: the action is not 0, 1 or 2.
-        """
+        """Drives one step as `step` does, without an observation."""
         if action not in range(len(YAW_SIGN)):
             raise ValueError(
                 f"action is {action!r}; give 0 (keep the yaw rate), 1 (turn left) or 2 (turn right)"
             )
         if self.episode.outcome:
-            label = self.episode.outcome.label
-            raise RuntimeError(f"the episode has ended ({label}): call reset() first")
+            ended = self.episode.outcome.label
+            raise RuntimeError(f"the episode has ended ({ended}): call reset() first")
         self.episode.step(int(action), self._street)
         return self.episode.outcome
 
@@ -149,7 +145,7 @@ class StreetEnv(gym.Env):
         return self.sensing.rgb(self.episode)
 
     def close(self) -> None:
-        """Leaves the street, whose simulator is gone when the last environment has left it."""
+        """Leaves the street, whose simulator is gone with the last environment."""
         self.sensing = self._street = None  # type: ignore[assignment]
 
     def get_state(self) -> dict[str, Any]:
@@ -161,7 +157,7 @@ class StreetEnv(gym.Env):
             "path": episode.path.name,
             "vehicle_speed_mps": episode.vehicle_speed_mps,
             "speed": list(episode.speed_mps),
-            "frame_rate_hz": episode.rules.frame_rate_hz,
+            "frame_rate_hz": episode.frame_rate_hz,
             "steps": episode.steps,
             "outcome": episode.outcome.label,
             "hit": episode.hit,
@@ -179,7 +175,11 @@ class StreetEnv(gym.Env):
         episode = self.episode
         episode.steps, episode.hit = state["steps"], state["hit"]
         episode.outcome = Outcome[state["outcome"].upper()]
-        episode.resume(*(_moment(state[name]) for name in ("before", "now")))
+        before, now = (
+            Moment(VehicleState(*moment["vehicle"]), moment["ticks"])
+            for moment in (state["before"], state["now"])
+        )
+        episode.resume(before, now)
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         if unknown := sorted(options.keys() - set(_OPTIONS)):
@@ -191,9 +191,9 @@ class StreetEnv(gym.Env):
             vehicle_speed_mps = self.scene.vehicle.speed_mps
         if not 0 <= vehicle_speed_mps < math.inf:
             raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 to stand")
-        ticks = ticks_for(self.scene, rate, speed_mps, vehicle_speed_mps)
         self._episode = Episode(
-            Rules(self._street.layout, rate, ticks),
+            self._street.layout,
+            rate,
             operator.index(options["episode_seed"]),
             speed_mps,
             float(vehicle_speed_mps),
@@ -232,7 +232,3 @@ def _frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
 
 def _plain(moment: Moment) -> dict[str, Any]:
     return {"vehicle": [float(value) for value in moment.vehicle], "ticks": moment.ticks}
-
-
-def _moment(plain: Mapping[str, Any]) -> Moment:
-    return Moment(VehicleState(*plain["vehicle"]), plain["ticks"])

@@ -25,7 +25,7 @@ from flowrep.transforms.stack import FLOWS
 
 
 def sensors_read(transforms: Iterable[Any]) -> list[str]:
-    """Returns the sensors that transforms read, in the order of `SENSORS`."""
+    """Returns the sensors that transforms read."""
     keys = {key for transform in transforms for key in transform.in_keys}
     return [name for name in SENSORS if ("sensor", name) in keys]
 
@@ -33,11 +33,7 @@ def sensors_read(transforms: Iterable[Any]) -> list[str]:
 def check_rate(
     transforms: Iterable[Any], options: Mapping[str, Any] | None, frame_rate_hz: float
 ) -> None:
-    """Checks that a reset's options leave the steps as long as flow in px/s takes them to be.
-
-    Raises:
-        ValueError: flow is in px/s and the options ask for another rate than `frame_rate_hz`.
-    """
+    """Refuses a reset to another frame rate than that for which flow in px/s was set up."""
     asked = (options or {}).get("frame_rate_hz")
     if asked is None or not any(getattr(t, "is_per_second", False) for t in transforms):
         return
@@ -124,10 +120,8 @@ def make_env(
         scene: see `StreetEnv`, as for `speed`, `frame_rate_hz`, `renderer` and `picture_scale`.
         representations: names, or a mapping from name to options; only the sensors that they need
             are rendered, none for an empty list.
-        num_envs: number of environments.
         num_workers: number of processes that step them, see `WorkerVectorEnv`; 0 steps them in this
             process. The results are the same.
-        device: device of the TensorDicts.
         seed: seeds the envs, which draw their episodes from it; None leaves that to `set_seed`.
         keep_sensor: whether the ("sensor", ...) keys are kept; rgb and frame are kept only if a
             representation needs them.
@@ -135,8 +129,8 @@ def make_env(
             `flowrep.transforms.representation_stack`.
         motion: "exact" or "estimated" from flow and depth, the source of the camera's motion behind
             ego and obj.
-        noise: errors of the depth camera and of odometry, see `representation_stack`. They are
-            drawn by frame, so that a repeated episode looks the same.
+        noise: errors of the depth camera and of odometry, see `representation_stack`; a
+            repeated episode has the same.
         compiled: whether flow is computed through `torch.compile`: up to two and a half times as
             fast on a CPU and equal up to rounding, after up to a minute of compilation.
 
@@ -182,13 +176,10 @@ def make_env(
     elif sensors:
         transforms.append(DropSensor())
     factories = [partial(street, sensors=sensors)] * num_envs
-    vector: VectorEnv
-    if num_workers:
-        vector = WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)
-    else:
-        vector = StreetVectorEnv(factories)
     base = VectorWrapper(
-        vector,
+        WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)
+        if num_workers
+        else StreetVectorEnv(factories),
         loaded,
         probe.frame_rate_hz,
         transforms,
@@ -213,8 +204,7 @@ def make_mirror(
     >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
     tensor([0, 2, 1])
     """
-    camera = load_scene(scene).camera
-    names = list(representations)
+    camera, names = load_scene(scene).camera, list(representations)
     focal = camera.focal_px
     return Mirror(
         names,
@@ -225,14 +215,9 @@ def make_mirror(
 
 
 def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
-    """Starts `env.step(acted)` in the workers; does nothing without workers.
-
-    Args:
-        env: made by `make_env`.
-        acted: holds `action`.
-    """
+    """Starts `env.step(acted)` in the workers of an env; does nothing without workers."""
     vector = _vector(env)
-    if isinstance(vector, WorkerVectorEnv):
+    if vector.num_workers:
         vector.step_async(env.base_env.read_action(acted[env.action_key]))
 
 
@@ -242,9 +227,7 @@ def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
     If not, running both at once is slower than one after the other: threads that synchronise at
     every operation all wait when one of them loses its core.
     """
-    vector = _vector(env)
-    workers = vector.num_workers if isinstance(vector, WorkerVectorEnv) else 0
-    return workers + threads <= available_cores()
+    return _vector(env).num_workers + threads <= available_cores()
 
 
 def street_envs(env: TransformedEnv) -> list[StreetEnv]:
@@ -254,7 +237,7 @@ def street_envs(env: TransformedEnv) -> list[StreetEnv]:
         ValueError: if they are in worker processes.
     """
     vector = _vector(env)
-    if isinstance(vector, WorkerVectorEnv):
+    if vector.num_workers:
         raise ValueError(
             "the environments are in worker processes: make the env with num_workers=0"
         )
@@ -267,11 +250,7 @@ def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
 
 
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
-    """Restores states from `get_states`; continue with the TensorDict of the same time.
-
-    Raises:
-        ValueError: if the number of states is not the number of environments.
-    """
+    """Restores states from `get_states`; continue with the TensorDict of the same time."""
     vector = _vector(env)
     if len(states) != vector.num_envs:
         raise ValueError(

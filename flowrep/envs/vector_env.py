@@ -36,10 +36,9 @@ class StreetVectorEnv(SyncVectorEnv):
 
     Observations are identical, bit for bit, to those of the environments alone, and belong to the
     caller. There are no infos.
-
-    Args:
-        env_fns: make `StreetEnv`s of one scene with the same sensors.
     """
+
+    num_workers = 0
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
         super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
@@ -107,20 +106,15 @@ class StreetVectorEnv(SyncVectorEnv):
 
 
 def _status(episodes: Sequence[Episode]) -> dict[str, NDArray[Any]]:
-    """Returns the status of N episodes, `[N, ...]` each."""
-    numbers = np.array(
-        [
-            (e.outcome, hit_code(e.hit), e.seed, e.rules.layout.scene.paths.index(e.path))
-            for e in episodes
-        ]
-    )
-    return {
-        "outcome": numbers[:, 0:1].astype(np.uint8),
-        "hit": numbers[:, 1:2].astype(np.uint8),
-        "episode_seed": numbers[:, 2:3],
-        "path": numbers[:, 3:4],
-        "vehicle": np.array([e.now.vehicle[:3] for e in episodes], dtype=np.float32),
+    paths = episodes[0].layout.scene.paths
+    values = {
+        "outcome": [[e.outcome] for e in episodes],
+        "hit": [[hit_code(e.hit)] for e in episodes],
+        "episode_seed": [[e.seed] for e in episodes],
+        "path": [[paths.index(e.path)] for e in episodes],
+        "vehicle": [e.now.vehicle[:3] for e in episodes],
     }
+    return {name: np.array(rows, _STATUS[name].dtype) for name, rows in values.items()}
 
 
 def _replaced(

@@ -91,8 +91,8 @@ class WorkerVectorEnv(VectorEnv):
             forkserver.ensure_running()
             memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
             for rows in self._rows:
-                made_of = env_factories[rows], rows, memory, self.num_envs, in_each
-                self._workers.append(_Worker(context, made_of, rows))
+                own = _Worker(context, rows, env_factories[rows], memory, self.num_envs, in_each)
+                self._workers.append(own)
         self._shared: Any = read_from_shared_memory(
             self.single_observation_space, memory, self.num_envs
         )
@@ -105,14 +105,10 @@ class WorkerVectorEnv(VectorEnv):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Arrays, dict[str, Any]]:
-        """Begins episodes in all environments, or in those marked by `options["reset_mask"]`.
+        """Begins episodes as `SyncVectorEnv` does; the outcome of a step under way is dropped.
 
-        The outcome of a step under way is dropped.
-
-        Args:
-            seed: of the first environment, with consecutive seeds for the others; or one for each.
-            options: passed to every worker's `reset`, except `reset_mask`, bool [num_envs], and
-                `episodes` of `StreetVectorEnv`, of which each gets its own part.
+        Of the options each worker gets its own part of `reset_mask`, bool [num_envs], and of
+        `episodes`, see `StreetVectorEnv.reset`.
         """
         options = dict(options or {})
         mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
@@ -174,23 +170,21 @@ class WorkerVectorEnv(VectorEnv):
 class _Worker:
     """The caller's side of a process that steps environments."""
 
-    def __init__(self, context: Any, made_of: tuple[Any, ...], rows: slice) -> None:
+    def __init__(self, context: Any, rows: slice, *made_of: Any) -> None:
         self.name = f"environments {rows.start} to {rows.stop - 1}"
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, *made_of), daemon=True)
+        self.process = context.Process(target=_work, args=(theirs, rows, *made_of), daemon=True)
         self.process.start()
         theirs.close()
         self._owes_answer = True  # that its environments are made
 
     def send(self, method: str, arguments: dict[str, Any]) -> None:
-        """Calls a method of the worker's vector env."""
         if self._owes_answer:  # that of a step which was dropped, or of a call that was interrupted
             self.receive()
         self._talk(self.pipe.send, (method, arguments))
         self._owes_answer = True
 
     def receive(self) -> Any:
-        """Waits for what the method returned."""
         result, failure = self._talk(self.pipe.recv)
         self._owes_answer = False
         if failure:
@@ -222,8 +216,8 @@ def _end(workers: list[_Worker]) -> None:
 
 def _work(
     pipe: Connection,
-    env_factories: Sequence[EnvFactory],
     rows: slice,
+    env_factories: Sequence[EnvFactory],
     memory: Any,
     num_envs: int,
     in_each: VectorFactory,

@@ -19,7 +19,7 @@ from flowrep.simulator.paint import swatch, texture
 
 NEAR_M, FAR_M = 0.2, 300.0
 # Columns: height, width, fx, fy. Nothing is square, so that no two numbers can be swapped.
-CAMERAS = [(36, 60, 40.0, 31.0), (84, 84, 42.0, 42.0), (61, 48, 30.0, 55.0), (120, 90, 50.0, 70.0)]
+CAMERAS = [(36, 60, 40.0, 31.0), (84, 84, 42.0, 42.0), (61, 48, 30.0, 55.0)]
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +55,6 @@ def test_the_sampled_intrinsics_put_unprojected_points_on_the_surface(slanted_pl
     height, width, fx, fy = size
     K = sampled_intrinsics(fx, fy, height, width)
     assert relative_depth_error(slanted_plane, size, (K[0, 2], K[1, 2])) < 3e-6
-
-
-@pytest.mark.parametrize("size", CAMERAS)
-def test_the_naive_principal_point_misses_the_surface(slanted_plane, size):
-    height, width, *_ = size
     # Rivals: the centred camera gives about 1e-2, the shift taken the other way twice that.
     for cx, cy in ((width / 2, height / 2), (width / 2 - 0.5, height / 2 + 0.5)):
         assert relative_depth_error(slanted_plane, size, (cx, cy)) > 5e-3

@@ -1,49 +1,48 @@
 """Flow against pictures alone: where a pixel is said to come from, the frame before shows it."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
-from flowrep.envs import StreetEnv
 from flowrep.geometry import ego_flow, factorize, rigid_flow, unproject
 from flowrep.scenes import load_scene, scene_names
 
-STILL, WALKING = (0.0, 0.0), (1.2, 1.8)
 LEFT, RIGHT, NO_OP = 1, 2, 0
 # A drive that keeps to the road and turns both ways.
 ACTIONS = [LEFT, RIGHT, RIGHT, LEFT, NO_OP, RIGHT, LEFT, LEFT, RIGHT, NO_OP] * 3
 
 
-def street(name, speed):
-    scene = load_scene(name)
-    # H and W differ, and the view is narrow, so that legs too are many pixels wide.
-    camera = replace(scene.camera, height_px=210, width_px=280, fov_deg=45.0)
-    return StreetEnv(replace(scene, camera=camera), speed=speed)
+@pytest.fixture
+def drive(make_street):
+    def drive(actions, name="straight_road", speed=(1.2, 1.8), **options):
+        """Yields what is seen, as tensors, in an episode in which someone walks close by."""
+        scene = load_scene(name)
+        # H and W differ, and the view is narrow, so that legs too are many pixels wide.
+        camera = replace(scene.camera, height_px=210, width_px=280, fov_deg=45.0)
+        env = make_street(replace(scene, camera=camera), speed=speed)
+        observation, ended = env.reset(options={"episode_seed": 11, **options})[0], False
+        for action in [*actions, NO_OP]:
+            observation["K"] = env.K
+            yield {key: torch.from_numpy(value) for key, value in observation.items()}
+            if ended:
+                return
+            observation, _, ended, *_ = env.step(action)
+
+    return drive
 
 
-def frames(env, actions, options=None):
-    """Yields the observations, as tensors, of an episode in which someone walks close by."""
-    observation, _ = env.reset(seed=0, options={"episode_seed": 11, **(options or {})})
-    yield tensors(observation)
-    for action in actions:
-        observation, _, ended, _, _ = env.step(action)
-        yield tensors(observation)
-        if ended:
-            return
+def centres(image):
+    """Returns u and v of the pixels' centres."""
+    v, u = (torch.arange(side) + 0.5 for side in image.shape[-2:])
+    return torch.meshgrid(u, v, indexing="xy")
 
 
-def tensors(observation):
-    return {key: torch.from_numpy(value) for key, value in observation.items()}
-
-
-def came_from(frame, K):
+def came_from(frame):
     """Returns where pixels were (u, v) and their depth there, predicted from this frame alone."""
-    depth, instance = frame["depth"], frame["instance"].long()
-    height, width = depth.shape[-2:]
+    depth, instance, K = frame["depth"], frame["instance"].long(), frame["K"]
     flow, valid = rigid_flow(depth, instance, K, frame["instance_motion"])
-    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    u, v = centres(depth)
     motion = frame["instance_motion"][instance[0]]  # [H, W, 4, 4]
     points = unproject(depth, K.float())[..., None]
     z = (motion[..., 2:3, :3] @ points)[..., 0, 0] + motion[..., 2, 3]
@@ -66,29 +65,23 @@ def look_up(frame, u, v):
     one = torch.stack([ids[top + j, left + i] == ids[top, left] for j in around for i in around])
     inverse = 1.0 / frame["depth"][0].double()
     corner = [inverse[top + j, left + i] for j in (0, 1) for i in (0, 1)]
-    value = (1 - b) * ((1 - a) * corner[0] + a * corner[1]) + b * (
-        (1 - a) * corner[2] + a * corner[3]
-    )
+    upper, lower = (1 - a) * corner[0] + a * corner[1], (1 - a) * corner[2] + a * corner[3]
+    value = (1 - b) * upper + b * lower
     bends = [
-        sum(c * inverse[top + j + c_v, left + i + c_u] for c, c_u, c_v in second_difference)
-        for second_difference in (
-            ((1, 1, 0), (-2, 0, 0), (1, -1, 0)),
-            ((1, 0, 1), (-2, 0, 0), (1, 0, -1)),
-        )
-        for j in (0, 1)
-        for i in (0, 1)
+        inverse[y - dv, x - du] - 2 * inverse[y, x] + inverse[y + dv, x + du]
+        for y in (top, top + 1)
+        for x in (left, left + 1)
+        for du, dv in ((1, 0), (0, 1))
     ]
     flat = torch.stack(bends).abs().amax(0) <= 2e-4 * value + 1e-12
     return frame["instance"][0][top, left], 1.0 / value, inside & one.all(0) & flat
 
 
-def agreement(before, now, K):
+def agreement(before, now):
     """Returns, of static and of walking pixels, how many agree and how many were asked."""
-    u, v, z, valid = came_from(now, K)
+    u, v, z, valid = came_from(now)
     instance, depth, certain = look_up(before, u, v)
-    own_certain = look_up(now, *reversed(torch.meshgrid(
-        torch.arange(z.shape[0]) + 0.5, torch.arange(z.shape[1]) + 0.5, indexing="ij"
-    )))[2]  # fmt: skip
+    own_certain = look_up(now, *centres(z))[2]
     occluded = depth < 0.98 * z
     asked = valid & certain & own_certain & ~occluded
     same_depth = (depth == z) | ((depth - z).abs() < 1e-3 * z)
@@ -100,94 +93,77 @@ def agreement(before, now, K):
     ]
 
 
-def totals(name, change=lambda frame: frame):
-    env = street(name, WALKING)
-    K = torch.from_numpy(env.unwrapped.K)
-    counts, before = torch.zeros(2, 3), None
-    for number, frame in enumerate(frames(env, ACTIONS)):
-        if number % 2:
-            counts += torch.tensor(agreement(before, change(frame), K))
-        before = frame
-    env.close()
-    return counts
+def totals(frames, change=lambda frame: frame):
+    frames = list(frames)
+    pairs = zip(frames[::2], frames[1::2])
+    return sum(torch.tensor(agreement(before, change(now))) for before, now in pairs)
 
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", scene_names())
-def test_each_pixel_is_found_where_its_flow_says_it_was(name):
-    for agree, asked, seen in totals(name):
+def test_each_pixel_is_found_where_its_flow_says_it_was(drive, name):
+    for agree, asked, seen in totals(drive(ACTIONS, name)):
         assert asked > 500
         assert asked / seen > 0.3  # what is certain is no mere remnant
         assert agree / asked >= 0.99
 
 
 @pytest.mark.slow
-def test_without_the_peoples_own_motion_people_are_not_found():
+def test_without_the_peoples_own_motion_people_are_not_found(drive):
     def without_own_motion(frame):
         rows = frame["prev_from_curr"].expand_as(frame["instance_motion"])
         return frame | {"instance_motion": rows}
 
-    (still, asked, _), (walking, asked_walking, _) = totals("straight_road", without_own_motion)
+    (still, asked, _), (walking, asked_walking, _) = totals(drive(ACTIONS), without_own_motion)
     assert still / asked >= 0.99
     assert walking / asked_walking < 0.9
 
 
-def flows(frame, K):
-    raw = rigid_flow(frame["depth"], frame["instance"].long(), K, frame["instance_motion"]).flow
+def flows(frame):
+    instance, K = frame["instance"].long(), frame["K"]
+    raw = rigid_flow(frame["depth"], instance, K, frame["instance_motion"]).flow
     factors = factorize(raw, frame["depth"], K, frame["prev_from_curr"])
     return raw, factors.ego, factors.obj
 
 
-def test_a_camera_that_stands_has_no_ego_flow():
-    env = street("straight_road", WALKING)
-    K = torch.from_numpy(env.unwrapped.K)
+def test_a_camera_that_stands_has_no_ego_flow(drive):
     moved = False
-    for frame in frames(env, [NO_OP] * 10, {"vehicle_speed_mps": 0.0}):
-        raw, ego, obj = flows(frame, K)
+    for frame in drive([NO_OP] * 10, vehicle_speed_mps=0.0):
+        raw, ego, obj = flows(frame)
         assert not ego.any()
         torch.testing.assert_close(obj, raw, rtol=0, atol=0)
         assert not raw[:, frame["instance"][0] == 0].any()
         moved |= bool(raw.any())
     assert moved
-    env.close()
 
 
-def test_people_who_stand_have_no_object_flow():
-    env = street("straight_road", STILL)
-    K = torch.from_numpy(env.unwrapped.K)
+def test_people_who_stand_have_no_object_flow(drive):
     moved, seen = False, 0
-    for frame in frames(env, ACTIONS[:20]):
-        raw, _, obj = flows(frame, K)
+    for frame in drive(ACTIONS[:20], speed=(0.0, 0.0)):
+        raw, _, obj = flows(frame)
         assert not obj.any()
         moved |= bool(raw.any())
         seen += int((frame["instance"] > 0).sum())
     assert moved
     assert seen > 100
-    env.close()
 
 
-def test_at_reset_nothing_has_moved():
-    env = street("straight_road", WALKING)
-    frame = next(frames(env, []))
+def test_at_reset_nothing_has_moved(drive):
+    frame = next(drive([]))
     assert torch.equal(frame["prev_from_curr"], torch.eye(4))
     assert torch.equal(frame["instance_motion"], torch.eye(4).expand_as(frame["instance_motion"]))
-    K = torch.from_numpy(env.unwrapped.K)
-    ego = partial(ego_flow, frame["depth"], K)
-    assert not ego(frame["prev_from_curr"]).flow.any()
-    env.close()
+    assert not ego_flow(frame["depth"], frame["K"], frame["prev_from_curr"]).flow.any()
 
 
-def test_legs_have_a_motion_of_their_own():
-    env = street("straight_road", WALKING)
-    K, differ = torch.from_numpy(env.unwrapped.K), 0
-    for frame in frames(env, ACTIONS[:20]):
-        obj = flows(frame, K)[2][0]
+def test_legs_have_a_motion_of_their_own(drive):
+    differ = 0
+    for frame in drive(ACTIONS[:20]):
+        obj = flows(frame)[2][0]
         instance = frame["instance"][0].long()
-        for person in range(env.scene.num_pedestrians):
+        for person in range(int(instance.max()) // 3):
             body, left, right = (obj[instance == 3 * person + part] for part in (1, 2, 3))
             if min(len(body), len(left), len(right)) > 60:
                 means = torch.stack([left.mean(), right.mean()]) - body.mean()
                 # One leg swings forwards while the other swings back.
                 differ += bool((means.sign().prod() < 0) & (means.abs() > 0.05).all())
     assert differ > 3
-    env.close()

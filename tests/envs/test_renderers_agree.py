@@ -51,18 +51,6 @@ def test_views_between_near_and_far_planes_that_cut_through_everything(Pair, nam
     assert {CATEGORY_ID["sky"], CATEGORY_ID["pedestrian"]} <= seen
 
 
-@pytest.mark.parametrize("renderer", ["rasteriser", "pybullet"])
-@pytest.mark.parametrize(("path", "is_closed_left"), [("left", False), ("right", True)])
-def test_the_exits_that_an_episode_closes_are_seen(make_street, renderer, path, is_closed_left):
-    env = make_street(CROSSROADS, renderer=renderer)
-    env.reset(options={"path": path, "episode_seed": 1})
-    building = env.step(0)[0]["semantic"][0] == CATEGORY_ID["building"]
-    left, right = int(building[:, :30].sum()), int(building[:, 30:].sum())
-    closed_side, open_side = (left, right) if is_closed_left else (right, left)
-    assert closed_side > 5
-    assert open_side == 0
-
-
 def test_maps_do_not_depend_on_whether_colours_are_asked_for(make_street):
     alone, with_colours = (
         make_street("three_way_junction", sensors=sensors)

