@@ -57,13 +57,8 @@ def reward(outcome: Outcome) -> float:
     return 0.01 + at_end.get(outcome, -5.0)
 
 
-def hit_code(category: str) -> int:
-    """Returns the TensorDict's code for the category hit: its class id, or 255 for ""."""
-    return CATEGORY_ID[category] if category else NOTHING_HIT
-
-
 def hit_name(code: int) -> str:
-    """Returns the category of a code of `hit_code`, or "" for nothing."""
+    """Returns the category of a code of `hit`, or "" for nothing."""
     return "" if code == NOTHING_HIT else [*CATEGORY_ID][code]
 
 
@@ -133,6 +128,15 @@ class Episode:
         self.poses = self.poses_before = self.crowd.poses(0.0)
         self._foreseen = self.poses[:0, None]  # poses at the ticks from `_foreseen_from` on
         self._foreseen_from = 0
+
+    def status(self) -> dict[str, int]:
+        """Returns outcome, hit, seed and path as numbers, as TensorDicts hold them."""
+        return {
+            "outcome": int(self.outcome),
+            "hit": CATEGORY_ID[self.hit] if self.hit else NOTHING_HIT,
+            "episode_seed": self.seed,
+            "path": self.layout.scene.paths.index(self.path),
+        }
 
     def resume(self, before: Moment, now: Moment) -> None:
         """Jumps to a later step, given its moment and the one before it."""

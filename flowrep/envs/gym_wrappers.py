@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from flowrep.envs.episode import Outcome, hit_code
+from flowrep.envs.episode import Outcome
 from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.torchrl_env import check_rate, sensors_read
 from flowrep.scenes.scene import Scene
@@ -116,32 +116,25 @@ class NumericInfo(gym.Wrapper):
     def __init__(self, env: gym.Env, *, truncate_timeouts: bool = False) -> None:
         super().__init__(env)
         self.truncate_timeouts = truncate_timeouts
-        self._paths = [path.name for path in cast(StreetEnv, env.unwrapped).scene.paths]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begins an episode."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        return observation, self._numbers(info)
+        observation, _ = self.env.reset(seed=seed, options=options)
+        return observation, self._numbers()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drives one step; a time-out is `truncated` or, by default, `terminated`."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        numbers = self._numbers(info)
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        numbers = self._numbers()
         if self.truncate_timeouts and numbers["outcome"] == Outcome.TIMEOUT:
             terminated, truncated = False, True
         return observation, float(reward), terminated, truncated, numbers
 
-    def _numbers(self, info: Mapping[str, Any]) -> dict[str, Any]:
-        outcome = Outcome[info["outcome"].upper()]
-        return {
-            "outcome": int(outcome),
-            "hit": hit_code(info["hit"]),
-            "episode_seed": info["episode_seed"],
-            "path": self._paths.index(info["path"]),
-            "is_success": outcome == Outcome.SUCCESS,
-        }
+    def _numbers(self) -> dict[str, Any]:
+        episode = cast(StreetEnv, self.unwrapped).episode
+        return episode.status() | {"is_success": episode.outcome == Outcome.SUCCESS}
 
 
 def make_street(

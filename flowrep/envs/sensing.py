@@ -221,8 +221,8 @@ class Sensing:
         semantic, instance = np.moveaxis(self._ids_by_number[picture.body], -1, 0)
         rgb = picture.rgba[..., :3].transpose(2, 0, 1).copy()
         rgb[:, is_sky] = np.array(CLASS_COLOURS["sky"])[:, None]
-        maps = {"depth": depth, "semantic": semantic, "instance": instance}
-        return {name: array[None] for name, array in maps.items()} | {"rgb": rgb}
+        maps = {"depth": depth[None], "semantic": semantic[None], "instance": instance[None]}
+        return maps | {"rgb": rgb}
 
     def _camera_poses(self, moments: Sequence[Moment]) -> CameraPose:
         x_m, y_m, yaw_rad, _ = np.array([moment.vehicle for moment in moments]).T

@@ -11,9 +11,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
-from flowrep.envs.episode import NOTHING_HIT, Episode, Outcome, hit_code, reward
+from flowrep.envs.episode import NOTHING_HIT, Episode, Outcome, reward
 
-_STATUS: dict[str, spaces.Space] = {
+_STATUS: dict[str, Any] = {
     "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
     "hit": spaces.Box(0, NOTHING_HIT, (1,), np.uint8),
     "episode_seed": spaces.Box(0, (1 << 31) - 1, (1,), np.int64),
@@ -106,15 +106,11 @@ class StreetVectorEnv(SyncVectorEnv):
 
 
 def _status(episodes: Sequence[Episode]) -> dict[str, NDArray[Any]]:
-    paths = episodes[0].layout.scene.paths
-    values = {
-        "outcome": [[e.outcome] for e in episodes],
-        "hit": [[hit_code(e.hit)] for e in episodes],
-        "episode_seed": [[e.seed] for e in episodes],
-        "path": [[paths.index(e.path)] for e in episodes],
-        "vehicle": [e.now.vehicle[:3] for e in episodes],
+    all_of_them = [e.status() | {"vehicle": e.now.vehicle[:3]} for e in episodes]
+    return {
+        name: np.array([each[name] for each in all_of_them], space.dtype).reshape(-1, *space.shape)
+        for name, space in _STATUS.items()
     }
-    return {name: np.array(rows, _STATUS[name].dtype) for name, rows in values.items()}
 
 
 def _replaced(
