@@ -41,9 +41,7 @@ def run(config: ExportConfig) -> None:
 def export(run: RunFolder, output: str | None = None) -> Path:
     """Writes a run's agent, which computes in float32 on any machine; returns the folder.
 
-    Args:
-        run: the run's folder.
-        output: the folder to write; `export` in the run's own if None.
+    This is `output`, or `export` in the run's folder if None.
 
     Raises:
         UsageError: its config is damaged.
@@ -103,11 +101,8 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
     """Returns a policy's traced network, from maps `[N, C, H, W]` to one score per action.
 
     The maps are arguments in the policy's order, with the dtypes of the specs, for any N. The
-    greedy action has the largest score. For stochastic policies, the scores are logits.
-
-    Args:
-        policy: of one of flowrep's algorithms; it is left as it is.
-        observation_spec: of the env that the policy was built for.
+    greedy action has the largest score. For stochastic policies, the scores are logits. The policy
+    is left as it is.
 
     Raises:
         ExportError: if the policy doesn't contain exactly one `PolicyNetwork`.
@@ -119,17 +114,12 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
             f"{type(policy).__name__} has {len(networks)}; build it with acting_network()"
         )
     (network,) = networks
-    maps = []
-    for codec in network.codecs:
-        size = (2, codec.channels, codec.height, codec.width)
-        maps.append(torch.zeros(size, dtype=observation_spec[codec.key].dtype))
-    any_number = {0: Dim("batch")}
+    specs = [observation_spec[codec.key] for codec in network.codecs]
+    maps = tuple(torch.zeros(2, *spec.shape[-3:], dtype=spec.dtype) for spec in specs)
+    any_number = ({0: Dim("batch")},) * len(maps)
     with torch.no_grad():
-        return torch.export.export(
-            copy.deepcopy(network).cpu().eval(),
-            tuple(maps),
-            dynamic_shapes=((any_number,) * len(maps),),
-        )
+        own = copy.deepcopy(network).cpu().eval()
+        return torch.export.export(own, maps, dynamic_shapes=(any_number,))
 
 
 def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any]) -> None:
@@ -138,14 +128,9 @@ def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any])
     ```
     agent.pt2            the program, for torch.export.load
     agent.safetensors    only its weights, those of ordinary convolutions and linear layers
-    agent.json           its inputs and actions
+    agent.json           its inputs and actions, the `card`
     load_agent.py        loads agent.pt2 and agent.json; needs only torch
     ```
-
-    Args:
-        folder: created if it does not exist.
-        program: from `acting_program`.
-        card: contents of agent.json.
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.export.save(program, folder / PROGRAM)

@@ -108,18 +108,14 @@ class Algorithm(ABC):
         self._capture()
 
     def _parameter_groups(self, rate_factors: Mapping[str, float]) -> list[dict[str, Any]]:
-        groups: dict[float, list[Tensor]] = {}
+        groups: dict[float, dict[str, Any]] = {}
         for name, weight in self.trained.items():
-            groups.setdefault(rate_factors.get(name, 1.0), []).append(weight)
-        # rates are tensors, so that a captured step reads their current values
-        return [
-            {
-                "params": weights,
-                "factor": factor,
-                "lr": torch.tensor(self.learning_rate * factor, device=self.device),
-            }
-            for factor, weights in groups.items()
-        ]
+            factor = rate_factors.get(name, 1.0)
+            # a tensor, so that a captured step reads its current value
+            rate = torch.tensor(self.learning_rate * factor, device=self.device)
+            group = groups.setdefault(factor, {"params": [], "factor": factor, "lr": rate})
+            group["params"].append(weight)
+        return list(groups.values())
 
     @classmethod
     def make_policy(
@@ -280,10 +276,8 @@ class Algorithm(ABC):
             weight.copy_(saved[name])
         self.optimizer.state.clear()  # a state of no updates has no moments
         for name, moments in state["moments"].items():
-            weight = self.trained[name]
-            self.optimizer.state[weight] = {
-                key: value.to(weight.device, copy=True) for key, value in moments.items()
-            }
+            own = {key: value.to(self.device, copy=True) for key, value in moments.items()}
+            self.optimizer.state[self.trained[name]] = own
         self.updates = state["updates"]
         self.divergence.reset(self.updates)
         self._capture()  # Adam's moments are at new addresses
@@ -302,14 +296,9 @@ class DivergenceError(ArithmeticError):
 
 
 class DivergenceWatch:
-    """Keeps, on the device, the metrics of the first update that diverged.
+    """Keeps, on the device, the metrics of the first update with a `watched` one that isn't finite.
 
     Its tensors change in place, so that a CUDA graph can record.
-
-    Args:
-        watched: the metrics that have to be finite.
-        others: further metrics to report with them.
-        device: where the metrics are.
 
     >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
     >>> for q_loss in (0.5, float("nan"), 0.25):
@@ -328,11 +317,10 @@ class DivergenceWatch:
         self.watched, self.names = tuple(watched), (*watched, *others)
         self._values = torch.zeros(len(self.names), device=device)
         self._good_updates = torch.zeros((), dtype=torch.long, device=device)
-        self.is_bad = torch.zeros((), device=device)
-        """0.0 before the first bad update and 1.0 from then on, on the device."""
+        self.is_bad = torch.zeros((), device=device)  # 1.0 from the first bad update on
 
     def reset(self, good_updates: int = 0) -> None:
-        """Forgets what it has seen; `good_updates` have been taken before the next one."""
+        """Forgets what it has seen; the next update follows `good_updates` others."""
         self._values.zero_()
         self._good_updates.fill_(good_updates)
         self.is_bad.zero_()
@@ -346,12 +334,7 @@ class DivergenceWatch:
         self.is_bad.copy_(~is_good)
 
     def check(self) -> None:
-        """Waits for the device and raises if an update has diverged.
-
-        Raises:
-            DivergenceError: names the first metric that is not finite, and lists all of that
-                update.
-        """
+        """Waits for the device and raises a `DivergenceError` if an update has diverged."""
         values = dict(zip(self.names, self._values.tolist()))
         bad = [name for name in self.watched if not math.isfinite(values[name])]
         if bad:
@@ -366,13 +349,13 @@ def as_cuda_graph(step: Step, device: torch.device) -> Step:
 
     The graph replays the same kernels on the same memory. Values that change between calls must
     therefore reach `step` through its argument or through tensors changed in place, and `step`
-    must not copy numbers between host and device. On any device but CUDA, `step` itself is
-    returned.
+    must not copy numbers between host and device. On any device but CUDA it is `step` itself.
     """
     if device.type != "cuda":
         return step
-    graph = CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device)
-    return of_one_shape(graph)
+    return of_one_shape(
+        CudaGraphModule(step, warmup=WARM_UP, in_keys=[], out_keys=[], device=device)
+    )
 
 
 def of_one_shape(step: Step) -> Step:

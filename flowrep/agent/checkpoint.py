@@ -36,8 +36,7 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
 
     Raises:
         TypeError: if `state` holds anything else; the message names the place.
-        CheckpointError: if the file cannot be written (disk full, read-only). A previous file is
-            left untouched.
+        CheckpointError: if it can't be written (disk full, read-only). A previous file stays.
     """
     path = Path(path)
     tensors: dict[str, Tensor] = {}
@@ -69,9 +68,7 @@ def load_checkpoint(
 ) -> dict[str, Any]:
     """Returns the state that `save_checkpoint` wrote, tensors on the CPU.
 
-    Args:
-        path: the file.
-        parts: the keys of the outermost dict to read; None for all.
+    With `parts`, only these keys of the outermost dict are read.
 
     Raises:
         CheckpointError: if the file is missing, damaged or not a checkpoint of this version.

@@ -44,9 +44,6 @@ class FasterThreads:
 
     Sums over threads are rounded differently, so only `most=1` (as with `OMP_NUM_THREADS=1`) gives
     two runs of a seed the same bits.
-
-    Args:
-        most: threads to compare with one.
     """
 
     def __init__(self, most: int) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
+import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
@@ -38,10 +39,9 @@ class EpsilonGreedyPolicy(TensorDictSequential):
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
         """Returns the distribution that actions are drawn from, as other policies do."""
-        acting, _, exploration = self
-        values = acting(tensordict.copy())["action_value"]
-        best = torch.nn.functional.one_hot(values.argmax(-1), values.shape[-1])
-        epsilon = exploration.eps
+        values = self[0](tensordict.copy())["action_value"]
+        best = F.one_hot(values.argmax(-1), values.shape[-1])
+        epsilon = self[2].eps
         return self.distribution_class(probs=epsilon / values.shape[-1] + (1 - epsilon) * best)
 
 
@@ -152,9 +152,6 @@ class DoubleDQN(OffPolicy):
     def losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Returns the loss, with gradients, and the TD error and ε, without."""
         out = self.loss(batch)
-        squared_error = batch["td_error"]  # the loss leaves it there
-        return {
-            "q_loss": out["loss"],
-            "td_error": squared_error.sqrt().mean(),
-            "epsilon": self.exploration.eps.clone(),
-        }
+        td_error = batch["td_error"].sqrt().mean()  # the loss leaves its square there
+        epsilon = self.exploration.eps.clone()
+        return {"q_loss": out["loss"], "td_error": td_error, "epsilon": epsilon}

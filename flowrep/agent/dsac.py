@@ -78,7 +78,9 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
             raise ValueError(f"encoder={encoder!r}: expected one of {', '.join(ENCODERS)}")
         shared = encoder == "shared"
         with next(actor.parameters()).device:
-            critic_encoder = actor.encoder if shared else actor.another_encoder()
+            critic_encoder = actor.encoder
+            if not shared:
+                critic_encoder = Encoder(actor.codecs, layer_norm=actor.encoder.layer_norm)
             critic_head = Head(critic_encoder.embedding_size, actor.hidden_size, actions.count)
         super().__init__(
             stochastic_policy(actor.head, ["actor_embedding"], actions),

@@ -39,11 +39,7 @@ class DiscreteActions:
 
     @classmethod
     def from_spec(cls, spec: TensorSpec) -> DiscreteActions:
-        """Reads a `Categorical` or `OneHot` spec.
-
-        Raises:
-            TypeError: if the spec is of any other type.
-        """
+        """Reads a `Categorical` or `OneHot` spec."""
         if type(spec) is Categorical:  # its subclasses encode several choices at once
             return cls(int(spec.space.n), "categorical", torch.distributions.Categorical)
         if type(spec) is OneHot:
@@ -70,9 +66,8 @@ class NatureEncoder(nn.Module):
         self.conv1 = nn.Conv2d(codec.network_channels, 32, 8, stride=4)
         self.conv2 = nn.Conv2d(32, 64, 4, stride=2)
         self.conv3 = nn.Conv2d(64, 64, 3)
-        rows, columns = (
-            ((size - 8) // 4 + 1 - 4) // 2 + 1 - 2 for size in (codec.height, codec.width)
-        )
+        size = (codec.height, codec.width)
+        rows, columns = (((pixels - 8) // 4 + 1 - 4) // 2 + 1 - 2 for pixels in size)
         self.linear = nn.Linear(64 * rows * columns, EMBEDDING_SIZE)
 
     def forward(self, image: Tensor) -> Tensor:
@@ -165,10 +160,6 @@ class MapNetwork(nn.Module):
         """Returns `[N, outputs]`."""
         return self.head(self.encoder(images))
 
-    def another_encoder(self) -> Encoder:
-        """Returns an encoder for the same maps with its own weights."""
-        return Encoder(self.codecs, layer_norm=self.encoder.layer_norm)
-
     def another(self, outputs: int) -> MapNetwork:
         """Returns a network for the same maps and sizes with its own weights."""
         layer_norm = self.encoder.layer_norm
@@ -220,10 +211,8 @@ def stochastic_policy(
 ) -> ProbabilisticTensorDictSequential:
     """Returns a module that writes `action`, drawn from the softmax of the network's logits.
 
-    With `writes_log_prob` it also writes `action_log_prob`.
-
-    Under TorchRL's `set_exploration_type(ExplorationType.DETERMINISTIC)` it takes the likeliest
-    action instead.
+    With `writes_log_prob` it also writes `action_log_prob`. Under TorchRL's
+    `set_exploration_type(ExplorationType.DETERMINISTIC)` it takes the likeliest action instead.
     """
     draw = ProbabilisticTensorDictModule(
         in_keys=["logits"],

@@ -29,13 +29,8 @@ _FLOAT16_MAX = torch.finfo(torch.float16).max
 def compute_dtype(precision: str, device: torch.device) -> torch.dtype:
     """Returns the dtype of activations; weights, losses and optimizer stay in float32.
 
-    Args:
-        precision: `"bf16"`, `"fp32"`, or `"auto"`: bfloat16 where the device multiplies it faster
-            than float32, float32 elsewhere.
-        device: where the networks run.
-
-    Raises:
-        ValueError: on any other `precision`.
+    `precision` is `"bf16"`, `"fp32"`, or `"auto"`: bfloat16 where the device multiplies it faster
+    than float32, float32 elsewhere.
     """
     if precision not in PRECISIONS:
         raise ValueError(f"precision={precision!r}: expected one of {', '.join(PRECISIONS)}")
@@ -79,11 +74,7 @@ class MapCodec:
         return torch.bfloat16 if self.dtype is torch.bfloat16 else torch.float16
 
     def store(self, x: Tensor) -> Tensor:
-        """Returns a raw map `[*B, C, H, W]` in `stored_dtype`; numbers beyond its range saturate.
-
-        Raises:
-            ValueError: if the last three dims are not those of the spec.
-        """
+        """Returns a raw map `[*B, C, H, W]` in `stored_dtype`, saturated to its range."""
         expected = (self.channels, self.height, self.width)
         if tuple(x.shape[-3:]) != expected:
             raise ValueError(

@@ -104,9 +104,8 @@ class OffPolicy(Algorithm):
             is 0.
         device: where networks, replay and updates live.
         precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
-        learning_rate: Adam's for all weights, falling linearly to 0.
+        learning_rate, tau, rate_factors: see `Algorithm`.
         gamma: discount per frame.
-        tau: share of the online weights in each move of the targets.
         hidden_size: width of the single hidden layer after the embeddings.
         batch_size: transitions per update.
         replay_capacity: transitions kept.
@@ -119,12 +118,8 @@ class OffPolicy(Algorithm):
         mirror_image: the transform of sampled batches that does so, such as
             `flowrep.transforms.Mirror`.
         persistent_exploration: ε of `PersistentExploration` at the start.
-        rate_factors: see `Algorithm`.
         policy_options: further arguments of `make_policy`.
         loss_options: arguments of `LOSS` besides `gamma`.
-
-    Raises:
-        ValueError: if `mirror` is set without `mirror_image`.
     """
 
     memory: ReplayMemory

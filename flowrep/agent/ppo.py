@@ -32,11 +32,10 @@ class Rollout:
         return len(self._steps)
 
     def extend(self, frames: TensorDictBase) -> None:
-        """Stores steps of N environments: `[N]`, `[N, T]`, or as a TorchRL collector returns them.
+        """Stores steps of N environments, with dims as in `time_first`.
 
-        Args:
-            frames: with the maps, `action`, `action_log_prob` and, under `next`, the maps,
-                `reward`, `done` and `terminated`; dims as in `time_first`.
+        They have the maps, `action`, `action_log_prob` and, under `next`, the maps, `reward`,
+        `done` and `terminated`.
         """
         for step in time_first(frames).unbind(0):
             kept = store_maps(self.codecs, step)
@@ -73,9 +72,6 @@ class Rollout:
 
 class ClipPPOMapLoss(ClipPPOLoss):
     """TorchRL's clipped loss on stored maps, with one encoder for policy and V; see `PPO`.
-
-    TorchRL makes the host wait to check that the entropy is finite. Here the divergence check
-    covers it, see `Algorithm.update`.
 
     Args:
         network: the policy's; V shares its encoder.
@@ -129,6 +125,7 @@ class ClipPPOMapLoss(ClipPPOLoss):
         return out.set("explained_variance", out["explained_variance"].squeeze())
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
+        # TorchRL's makes the host wait for a check; the divergence watch covers what it checks
         return dist.entropy().unsqueeze(-1)
 
 
@@ -151,11 +148,8 @@ class PPO(Algorithm):
         epochs: passes over them.
         batch_size: steps per update; an incomplete last batch is left out of its pass.
         gae_lambda: GAE's λ, from 0 (relies on V) to 1 (relies on the rewards).
-        max_grad_norm: the norm over all gradients is scaled down to this maximum.
+        max_grad_norm: see `Algorithm`.
         loss_options: further arguments of `ClipPPOMapLoss`.
-
-    Raises:
-        ValueError: if a rollout does not fill a batch.
     """
 
     WRITES_LOG_PROB = True

@@ -34,8 +34,7 @@ class ReplayMemory(TensorDictReplayBuffer):
         capacity: rows to keep; beyond that, the oldest is overwritten.
         batch_size: transitions per sample.
         device: of rows and samples.
-        n_steps: largest number of steps that a transition spans.
-        gamma: discount per step of the rewards within a transition.
+        n_steps, gamma: see `SuccessorSampler`.
     """
 
     def __init__(
@@ -48,10 +47,9 @@ class ReplayMemory(TensorDictReplayBuffer):
         n_steps: int = 1,
         gamma: float = 1.0,
     ) -> None:
+        keys = [codec.key for codec in codecs]
         super().__init__(
-            storage=RowStorage(
-                capacity, device=device, observation_keys=[codec.key for codec in codecs]
-            ),
+            storage=RowStorage(capacity, device=device, observation_keys=keys),
             sampler=SuccessorSampler(n_steps, gamma),
             writer=RoundRobinWriter(),
             transform=PackSteps(codecs),
@@ -64,9 +62,7 @@ class ReplayMemory(TensorDictReplayBuffer):
 
 
 class PackSteps(Transform):
-    """Turns steps into rows on `extend`.
-
-    Samples are returned as they are: losses decode their maps.
+    """Turns steps into rows on `extend`. Samples stay as they are: losses decode their maps.
 
     | steps, on `extend` | rows |
     | --- | --- |
@@ -75,9 +71,6 @@ class PackSteps(Transform):
     | `action`, `is_init` | unchanged |
     | `("next", name)` of `reward`, `done`, `terminated` | `name` |
     | | `env`: index of the environment, from 0 to N - 1 |
-
-    Args:
-        codecs: the maps to keep.
     """
 
     def __init__(self, codecs: Sequence[MapCodec]) -> None:
@@ -87,8 +80,7 @@ class PackSteps(Transform):
     def _inv_call(self, steps: TensorDictBase) -> TensorDictBase:
         if "is_init" not in steps:
             raise KeyError(
-                "the steps lack 'is_init', which marks restarts: append TorchRL's InitTracker to "
-                "the environment"
+                "steps lack 'is_init', a mark of restarts: append TorchRL's InitTracker to the env"
             )
         outcome = [("next", name) for name in OUTCOME]
         steps = time_first(steps.select(*self.in_keys, "action", "is_init", *outcome))
@@ -107,12 +99,8 @@ class PackSteps(Transform):
 class RowStorage(LazyTensorStorage):
     """A TorchRL storage that gathers transitions with `index_select` and saves only written rows.
 
-    Indexing a TensorDict with a tensor, as the base class does, takes 2.4 times as long.
-
-    Args:
-        max_size: rows to keep; beyond that, the oldest is overwritten.
-        observation_keys: the maps that a transition takes from both of its rows.
-        device: where the rows are kept.
+    Indexing a TensorDict with a tensor, as the base class does, takes 2.4 times as long. A
+    transition takes the maps of `observation_keys` from both of its rows.
     """
 
     _storage: Any
@@ -148,11 +136,7 @@ class RowStorage(LazyTensorStorage):
         return {"capacity": self.max_size, "rows": rows, "size": len(self)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state_dict`.
-
-        Raises:
-            ValueError: if it comes from a storage of another capacity.
-        """
+        """Continues from a `state_dict` of a storage of the same capacity."""
         if state["capacity"] != self.max_size:
             raise ValueError(
                 f"the saved replay memory has capacity {state['capacity']}, this one "
@@ -179,9 +163,6 @@ class SuccessorSampler(Sampler):
         n_steps: largest number of steps that a transition spans. It ends earlier with its episode,
             or where the next step is not stored.
         gamma: discount per step of the rewards within a transition.
-
-    Raises:
-        ValueError: if n_steps is below 1.
     """
 
     def __init__(self, n_steps: int = 1, gamma: float = 1.0) -> None:
@@ -193,14 +174,9 @@ class SuccessorSampler(Sampler):
     def _empty(self) -> None:
         self._next_row = torch.empty(0, dtype=torch.long)  # -1: the next step is not stored
         self._latest = torch.empty(0, dtype=torch.long)  # each environment's, -1: its episode ended
-        self._usable = torch.empty(0, dtype=torch.long)
 
     def mark_update(self, index: Tensor, *, storage: Storage) -> None:
-        """Links each row just written to the previous row of its environment.
-
-        Raises:
-            ValueError: if these rows and the previous step do not fit into the storage.
-        """
+        """Links each row just written to the previous row of its environment."""
         rows = storage[:]
         marks = [rows[name].flatten() for name in ("env", "done", "terminated", "is_init")]
         written = torch.stack([mark[index.to(mark.device)].long() for mark in marks]).cpu()
@@ -224,7 +200,6 @@ class SuccessorSampler(Sampler):
         follows = (before >= 0) & ~is_init[after]
         self._next_row[before[follows]] = index[after][follows]
         self._latest = ahead[-envs:].clone()
-        self._usable = (self._next_row >= 0).nonzero().squeeze(-1)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[NestedKey, Tensor]]:
         """Returns the rows `[batch_size, 2]`, with reward, end flags and step count between them.
@@ -232,11 +207,11 @@ class SuccessorSampler(Sampler):
         Raises:
             RuntimeError: if no transition is complete yet.
         """
-        if not len(self._usable):
+        usable = (self._next_row >= 0).nonzero().squeeze(-1)
+        if not len(usable):
             raise RuntimeError("nothing to sample: extend the replay memory by two steps first")
         rows = storage[:]
-        drawn = torch.randint(len(self._usable), (batch_size,), generator=self._rng)
-        first = self._usable[drawn]
+        first = usable[torch.randint(len(usable), (batch_size,), generator=self._rng)]
         last, reward, steps = self._look_ahead(rows["reward"], first)
         info: dict[NestedKey, Tensor] = {"steps_to_next_obs": steps, ("next", "reward"): reward}
         for name in ("done", "terminated"):
@@ -244,11 +219,10 @@ class SuccessorSampler(Sampler):
         return torch.stack([first, self._next_row[last]]).mT, info
 
     def _look_ahead(self, rewards: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Follows the transitions that begin in rows `first` [N] to their ends.
+        """Follows transitions from their first rows `[N]` to their ends.
 
-        Returns:
-            The rows of their last steps [N], the discounted sums of `rewards` [N, 1] and the
-            numbers of steps [N, 1].
+        Returns the rows of their last steps `[N]`, the discounted sums of `rewards` `[N, 1]` and
+        the numbers of steps `[N, 1]`.
         """
         last, steps = first, torch.ones(len(first), 1)
         reward = rewards.index_select(0, first.to(rewards.device))
@@ -270,7 +244,6 @@ class SuccessorSampler(Sampler):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a `state_dict`."""
         self._next_row, self._latest = state["next_row"].clone(), state["latest"].clone()
-        self._usable = (self._next_row >= 0).nonzero().squeeze(-1)
 
     def dumps(self, path: str | Path) -> None:
         """Writes the links to a file in the folder `path`, which is created if it is absent."""
