@@ -5,7 +5,6 @@ import sys
 
 import pytest
 import torch
-import torch.nn.functional as F
 from safetensors.torch import load_file
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
@@ -13,6 +12,7 @@ from flowrep.agent import PPO, DiscreteSAC, DoubleDQN
 from flowrep.agent.networks import PolicyNetwork
 from flowrep.experiment.agents import Task, load_policy
 from flowrep.export import ExportError, acting_program, write_agent
+from tests.agent.plain import encode, head
 
 HEIGHT, WIDTH, CLASSES = 40, 52, 5
 SPEC = Composite(
@@ -134,24 +134,9 @@ def test_the_weights_are_those_of_ordinary_layers(exported):
     policy, folder = exported
     weights, seen = load_file(folder / "agent.safetensors"), maps(4)
     ids = (seen["seg"] == torch.arange(CLASSES)[:, None, None]).float()
-    embeddings = []
     # What the maps lose where they are kept as float16, the scores may differ by.
-    for number, x in enumerate((seen["ego"].half().float(), ids, seen["rgb"].float() / 255)):
-        own = {
-            name.split(f"encoders.{number}.")[1]: weight
-            for name, weight in weights.items()
-            if f"encoders.{number}." in name
-        }
-        for layer, stride in (("conv1", 4), ("conv2", 2), ("conv3", 1)):
-            x = F.conv2d(x, own[f"{layer}.weight"], own[f"{layer}.bias"], stride)
-            x = F.leaky_relu(x, 0.01)
-        x = x.movedim(1, -1).flatten(1)
-        embeddings.append(F.leaky_relu(F.linear(x, own["linear.weight"], own["linear.bias"]), 0.01))
-    head = {
-        name.rsplit("head.", 1)[1]: weight for name, weight in weights.items() if "head." in name
-    }
-    hidden = F.silu(F.linear(torch.cat(embeddings, -1), head["hidden.weight"], head["hidden.bias"]))
-    got = F.linear(hidden, head["output.weight"], head["output.bias"])
+    images = (seen["ego"].half().float(), ids, seen["rgb"].float() / 255)
+    got = head(weights, "network.head", encode(weights, "network.encoder", images))
     with torch.no_grad():
         want = network_of(policy)(*seen.values())
     torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-4)

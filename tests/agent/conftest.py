@@ -1,3 +1,5 @@
+from functools import partial
+
 import pytest
 import torch
 import yaml
@@ -9,7 +11,10 @@ from flowrep.agent.observation import store_maps
 from flowrep.config import CONF_DIR, group_choices
 
 ALGORITHMS = group_choices("algorithm")
-SMALL = {"precision": "fp32", "hidden_size": 32, "batch_size": 16, "replay_capacity": 100}
+SMALL = {
+    "precision": "fp32", "hidden_size": 32, "batch_size": 16, "replay_capacity": 100,
+    "rollout_length": 8,
+}  # fmt: skip
 HEIGHT, WIDTH = 38, 45  # neither square nor a multiple of the first stride
 
 
@@ -37,31 +42,19 @@ def make_agent(observation_spec):
     ):  # fmt: skip
         torch.manual_seed(seed)
         action_spec = Categorical(3) if action_spec is None else action_spec
-        settings = {"total_frames": 1000} | SMALL | changes
+        small = {name: value for name, value in SMALL.items() if name in algorithm.options()}
+        settings = {"total_frames": 1000} | small | changes
         return algorithm(spec, action_spec, list(keys), **settings)
 
     return make
 
 
 @pytest.fixture(params=ALGORITHMS)
-def make_any(request, observation_spec):
-    """Builds a small float32 agent of each algorithm in turn, else as its defaults have it."""
+def make_any(request, make_agent):
+    """Builds a small float32 agent of each algorithm in turn, which is `make_any.args[0]`."""
     file = yaml.safe_load((CONF_DIR / "algorithm" / f"{request.param}.yaml").read_text())
-    algorithm = getattr(flowrep.agent, file["_target_"].removeprefix("flowrep.agent."))
-    options = {name: parameter.default for name, parameter in algorithm.options().items()}
-    small = {name: value for name, value in SMALL.items() if name in options}
-    if request.param == "ppo":
-        small["rollout_length"] = 8
-
-    def make(spec=observation_spec, keys=("flow", "seg"), action_spec=None, seed=0, **changes):
-        torch.manual_seed(seed)
-        action_spec = Categorical(3) if action_spec is None else action_spec
-        settings = {"total_frames": 1000, "device": "cpu"} | options | small
-        settings |= {name: value for name, value in changes.items() if name in settings}
-        return algorithm(spec, action_spec, list(keys), **settings)
-
-    make.options = options | small
-    return make
+    name = file["_target_"].removeprefix("flowrep.agent.")
+    return partial(make_agent, getattr(flowrep.agent, name))
 
 
 @pytest.fixture

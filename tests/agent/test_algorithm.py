@@ -9,12 +9,13 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 from torchrl.data import Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.agent import load_checkpoint, save_checkpoint
 from flowrep.agent.algorithm import WARM_UP, DivergenceError, DivergenceWatch, of_one_shape
-from tests.agent.tape import Foreign, Tape
 
 ENVS = 5
 
@@ -135,14 +136,6 @@ def test_an_agent_that_diverged_keeps_its_weights_and_can_begin_anew(make_any, r
     assert [name for name, w in weights(new).items() if not torch.equal(w, after[name])] == []
 
 
-def test_where_nothing_is_observed_nothing_is_done(make_any, random_maps):
-    agent = make_any()
-    for maps in (random_maps(4)[:0], random_maps(2, 3)[:, :0]):
-        with torch.no_grad():
-            assert agent.policy.get_dist(maps.clone()).probs.shape == (*maps.shape, 3)
-            assert agent.policy(maps)["action"].shape == maps.shape
-
-
 @pytest.mark.slow_after_first
 def test_one_hot_actions_teach_what_categorical_ones_do(make_any, random_steps):
     agents = plain, one_hot = make_any(), make_any(action_spec=OneHot(3))
@@ -158,22 +151,25 @@ def test_one_hot_actions_teach_what_categorical_ones_do(make_any, random_steps):
         torch.testing.assert_close(one_hot.weights[name], weight)
 
 
-def test_a_state_of_other_maps_is_refused_by_name(make_any):
-    saved = make_any(keys=["flow"]).state_dict()
+def test_a_state_of_other_maps_is_refused_by_name(make_agent):
+    saved = make_agent(keys=["flow"]).state_dict()
     with pytest.raises(ValueError, match=r"does not fit this one in \d+ weights, first .* here, "):
-        make_any(keys=["flow", "seg"]).load_state_dict(saved)
+        make_agent(keys=["flow", "seg"]).load_state_dict(saved)
 
 
+@pytest.mark.slow_after_first
 def test_a_policy_is_built_and_loaded_without_its_learner(
     make_any, observation_spec, random_steps, random_maps, tmp_path
 ):
     """Of one environment, too, where a rollout would be less than a batch of PPO's."""
-    agent = make_any(layer_norm=True)
+    (algorithm,) = make_any.args
+    options = {name: parameter.default for name, parameter in algorithm.options().items()}
+    changes = {"layer_norm": True} if "layer_norm" in options else {}
+    agent = make_any(**changes)
     learn(agent, random_steps, 12)
     save_checkpoint(tmp_path / "c", {"policy": dict(agent.policy.state_dict())})
-    options = make_any.options | {"total_frames": 1000}
-    options |= {"layer_norm": True} if "layer_norm" in options else {}
-    policy = type(agent).make_policy(
+    options |= {"precision": "fp32", "hidden_size": 32, "total_frames": 1000} | changes
+    policy = algorithm.make_policy(
         observation_spec[:1], Categorical(3), ["flow", "seg"], device="cpu", **options
     )
     maps = random_maps(20)
@@ -186,19 +182,10 @@ def test_a_policy_is_built_and_loaded_without_its_learner(
             greedy = agent.policy(maps.clone())["action"]
             assert torch.equal(policy(maps.clone())["action"], greedy)
         assert torch.equal(expected.argmax(-1), greedy)
-
-
-@pytest.mark.slow_after_first
-def test_actions_are_drawn_as_the_distribution_says(make_any, random_steps, random_maps):
-    agent = make_any()
-    learn(agent, random_steps, 12)
-    maps = random_maps(1)
-    with torch.no_grad():
-        expected = agent.policy.get_dist(maps.clone()).probs[0]
-        drawn = agent.policy(maps.expand(1000).contiguous())["action"]
+        drawn = policy(maps[:1].expand(1000).contiguous())["action"]
     # three standard deviations of a share are 0.047
     shares = torch.bincount(drawn, minlength=3) / 1000
-    torch.testing.assert_close(shares, expected, atol=0.05, rtol=0)
+    torch.testing.assert_close(shares, expected[0], atol=0.05, rtol=0)
 
 
 def test_the_first_bad_update_is_counted_and_told_with_its_metrics():
@@ -243,24 +230,42 @@ def state_of(agent):
     return agent.weights | moments | {"watched": watch._values, "good": watch._good_updates}
 
 
-class Taped:
-    """Stands in for a CUDA graph: some steps as they are, one on tape, the rest from the tape."""
+class Taped(TorchDispatchMode):
+    """Does what a CUDA graph does, on a CPU: takes the kernels of one step again and again.
+
+    Without any Python between, and on the same memory. The first steps are taken as they are.
+    """
 
     def __init__(self, step):
-        self.step, self.calls, self.tape = step, 0, Tape()
+        super().__init__()
+        self.step, self.steps, self.calls = step, 0, []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        if not func.is_view:  # a view of memory that is written again needs no second look
+            self.calls.append((func, args, kwargs or {}, out))
+        return out
+
+    @torch.no_grad()
+    def replay(self):
+        for func, args, kwargs, out in self.calls:
+            again = func(*args, **kwargs)
+            for old, new in zip(tree_leaves(out), tree_leaves(again), strict=True):
+                if isinstance(old, Tensor) and old is not new:
+                    old.copy_(new)
 
     def __call__(self, batch):
-        self.calls += 1
-        if self.calls < WARM_UP:
+        self.steps += 1
+        if self.steps < WARM_UP:
             return self.step(batch)
-        if self.calls == WARM_UP:
+        if self.steps == WARM_UP:
             static = batch.clone()
             self.inputs = static.copy()
-            with self.tape:
+            with self:
                 self.out = self.step(static)
         else:
             self.inputs.update_(batch)
-            self.tape.replay()
+            self.replay()
         return self.out.clone()
 
 
@@ -281,6 +286,21 @@ def test_an_update_from_the_tape_is_the_update(make_any, random_steps):
     for agent in (eager, taped):
         with pytest.raises(DivergenceError, match=f"in update {BATCHES} "):
             agent.divergence.check()
+
+
+class Foreign(TorchDispatchMode):
+    """Notes what passes between the CPU and another device, for which "meta" stands in."""
+
+    def __init__(self):
+        super().__init__()
+        self.crossings = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        tensors = [x for x in tree_leaves((args, kwargs, out)) if isinstance(x, Tensor)]
+        if {x.device.type for x in tensors} > {"meta"}:
+            self.crossings.append(str(func))
+        return out
 
 
 def on_a_device_that_cannot_be_read(make_any):

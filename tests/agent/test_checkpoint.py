@@ -2,8 +2,6 @@ import os
 import pickle
 import resource
 import signal
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -24,7 +22,7 @@ def same(a, b):
     return type(a) is type(b) and a == b
 
 
-def test_every_kind_of_value_comes_back_as_it_was(tmp_path):
+def test_every_kind_of_value_comes_back_as_it_was_in_a_file_like_others(tmp_path):
     shared, (zero, one, two) = torch.arange(12).reshape(3, 4), torch.arange(3)
     state = {
         "weights": {"conv.weight": torch.randn(2, 3), "half": torch.randn(3).half()},
@@ -45,15 +43,20 @@ def test_every_kind_of_value_comes_back_as_it_was(tmp_path):
         "a": {"b": one},
         "": {"a": {"b": two}, "empty key": []},
     }
-    save_checkpoint(tmp_path / "new folder" / "c.safetensors", state)
-    assert same(load_checkpoint(tmp_path / "new folder" / "c.safetensors"), state)
-    assert os.listdir(tmp_path / "new folder") == ["c.safetensors"]
-
-
-def test_others_may_read_it_as_any_new_file(tmp_path):
     (tmp_path / "plain").touch()
-    save_checkpoint(tmp_path / "c", {"a": torch.ones(1)})
-    assert (tmp_path / "c").stat().st_mode == (tmp_path / "plain").stat().st_mode
+    path = tmp_path / "new folder" / "c.safetensors"
+    save_checkpoint(path, state)
+    assert same(load_checkpoint(path), state)
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode  # others may read it
+    assert os.listdir(path.parent) == ["c.safetensors"]
+
+
+def test_what_a_killed_writer_left_goes_with_the_next_checkpoint(tmp_path):
+    leftover = tmp_path / ".c.safetensors.partial"
+    leftover.mkdir()
+    (leftover / "half").write_bytes(b"of a checkpoint")
+    save_checkpoint(tmp_path / "c.safetensors", {"version": 1})
+    assert os.listdir(tmp_path) == ["c.safetensors"]
 
 
 @pytest.mark.parametrize(
@@ -87,7 +90,6 @@ def with_metadata(**metadata):
     [
         pytest.param(truncated, id="truncated"),
         pytest.param(lambda path: path.write_bytes(pickle.dumps({"a": 1})), id="pickle"),
-        pytest.param(lambda path: path.write_bytes((2**42).to_bytes(8, "little")), id="terabytes"),
         pytest.param(with_metadata(), id="foreign"),
         pytest.param(with_metadata(format="flowrep checkpoint 2", state="{}"), id="other version"),
         pytest.param(
@@ -145,37 +147,3 @@ def test_a_folder_that_cannot_be_written_is_one_error(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(CheckpointError, match=r"file/c"):
         save_checkpoint(tmp_path / "file" / "c", {"a": 1})
-
-
-@pytest.mark.slow
-def test_a_writer_killed_at_any_instant_leaves_a_whole_checkpoint(tmp_path):
-    path = tmp_path / "c.safetensors"
-    save_checkpoint(path, {"version": 0, "a": torch.zeros(200_000)})
-    code = (
-        "import runpy, sys, torch\n"
-        "save_checkpoint = runpy.run_path(sys.argv[2])['save_checkpoint']\n"
-        "for i in range(1, 10**6):\n"
-        "    save_checkpoint(sys.argv[1], {'version': i, 'a': torch.full((200_000,), i)})\n"
-        "    if i == 1: print('started', flush=True)\n"
-    )
-    module = sys.modules[save_checkpoint.__module__].__file__
-    command = [sys.executable, "-c", code, path, module]
-    writer = subprocess.Popen(command, stdout=subprocess.PIPE)
-    try:
-        assert writer.stdout.readline() == b"started\n"
-        versions = []
-        for _ in range(10):  # what a reader finds at any time is what a kill would leave
-            state = load_checkpoint(path)
-            assert (state["a"] == state["version"]).all()
-            versions.append(state["version"])
-    finally:
-        writer.kill()
-        writer.wait()
-    state = load_checkpoint(path)
-    assert (state["a"] == state["version"]).all()
-    assert versions == sorted(versions)
-    leftover = tmp_path / ".c.safetensors.partial"
-    leftover.mkdir(exist_ok=True)
-    (leftover / "half").write_bytes(b"of a checkpoint")
-    save_checkpoint(path, {"version": -1})
-    assert os.listdir(tmp_path) == ["c.safetensors"]

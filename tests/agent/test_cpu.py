@@ -33,11 +33,6 @@ def test_a_freed_block_is_reused_without_page_faults():
     assert faults["keep"] < 0.1 * faults["default"]
 
 
-def test_another_c_library_is_left_alone(monkeypatch):
-    monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
-    assert cpu.keep_freed_memory() is False
-
-
 @pytest.fixture
 def clock(monkeypatch):
     """A clock on which an update takes as many seconds as `seconds` says for its threads."""

@@ -5,9 +5,11 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 
-from flowrep.agent import DiscreteSACWithValue
+from flowrep.agent import DiscreteSAC, DiscreteSACWithValue
+from tests.agent.plain import encode, head
 
 
 def test_bfloat16_stays_near_float32(make_agent, random_steps, as_batch):
@@ -29,43 +31,25 @@ def test_settings_that_do_not_exist_are_refused(make_agent):
         make_agent(action_spec=Binary(3))
 
 
-def corridor(size):
-    """Random steps in a corridor of five cells; the cell is a bright column of the image.
-
-    Action 2 goes right, 1 left, 0 stays; reaching cell 4 ends the episode with 1.
-    """
-    cell = torch.randint(4, (size,))
-    action = torch.randint(3, (size,))
-    following = (cell + torch.tensor([0, -1, 1])[action]).clamp(0)
-    return cell, action, following, following == 4
-
-
-def picture(cell):
-    image = torch.zeros(len(cell), 1, 36, 40)
-    for i, c in enumerate(cell):
-        image[i, :, :, c * 8 : c * 8 + 8] = 1.0
-    return image
-
-
 @pytest.mark.slow
 def test_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch):
+    """Action 2 goes right, 1 left, 0 stays; reaching the last of five cells is worth 1."""
     spec = Composite(view=Unbounded((1, 36, 40)))
+    # in cell c, columns 8 c to 8 c + 7 are bright
+    pictures = torch.eye(5).repeat_interleave(8, 1).view(5, 1, 1, 40).repeat(1, 1, 36, 1)
     agent = make_agent(
         spec=spec, keys=["view"], gamma=0.5, tau=0.1, learning_rate=1e-3, initial_alpha=0.01,
         total_frames=100_000,
     )  # fmt: skip
     for _ in range(100):
-        cell, action, following, reached = corridor(32)
-        steps = spec.zero([32])
-        steps.update({"view": picture(cell), "action": action})
-        steps["next"] = steps.select("view").update({"view": picture(following)})
-        steps["next", "reward"] = reached.float().unsqueeze(1)
-        steps["next", "terminated"] = steps["next", "done"] = reached.unsqueeze(1)
-        agent.update(as_batch(agent, steps))
-    seen = spec.zero([4])
-    seen["view"] = picture(torch.arange(4))
-    dist = agent.policy.get_dist(seen)
-    assert dist.probs.argmax(1).tolist() == [2, 2, 2, 2]
+        cell, action = torch.randint(4, (32,)), torch.randint(3, (32,))
+        following = (cell + torch.tensor([0, -1, 1])[action]).clamp(0)
+        end = (following == 4).unsqueeze(1)
+        later = {"view": pictures[following], "reward": end.float(), "terminated": end, "done": end}
+        steps = TensorDict({"view": pictures[cell], "action": action}, [32])
+        agent.update(as_batch(agent, steps.set("next", TensorDict(later, [32]))))
+    seen = TensorDict({"view": pictures[:4]}, [4])
+    assert agent.policy.get_dist(seen).probs.argmax(1).tolist() == [2, 2, 2, 2]
     critic = agent.loss.qvalue_network
     with torch.no_grad(), agent.loss.qvalue_network_params[0].to_module(critic):
         images = agent.codecs[0].decode(seen["view"])
@@ -88,26 +72,6 @@ def test_without_entropy_in_the_target_it_is_that_of_a_vanishing_alpha(
 
 
 LR, ALPHA, GAMMA, TAU, TARGET_ENTROPY = 3e-4, 0.5, 0.99, 0.005, 0.2 * math.log(3)
-
-
-def encode(weights, prefix, maps):
-    """Nature encoders on plain maps, concatenated."""
-    embeddings = []
-    for i, x in enumerate(maps):
-        w = {k.removeprefix(f"{prefix}.encoders.{i}."): v for k, v in weights.items()}
-        x = F.leaky_relu(F.conv2d(x, w["conv1.weight"], w["conv1.bias"], 4))
-        x = F.leaky_relu(F.conv2d(x, w["conv2.weight"], w["conv2.bias"], 2))
-        x = F.leaky_relu(F.conv2d(x, w["conv3.weight"], w["conv3.bias"]))
-        x = x.permute(0, 2, 3, 1).flatten(1)
-        embeddings.append(F.leaky_relu(F.linear(x, w["linear.weight"], w["linear.bias"])))
-    return torch.cat(embeddings, 1)
-
-
-def head(weights, prefix, x, net=...):
-    w = {k: weights[f"{prefix}.{k}"][net] for k in
-         ("hidden.weight", "hidden.bias", "output.weight", "output.bias")}  # fmt: skip
-    x = F.linear(x, w["hidden.weight"], w["hidden.bias"])
-    return F.linear(x * torch.sigmoid(x), w["output.weight"], w["output.bias"])
 
 
 def dsac_losses(weights, maps, next_maps, action, reward, terminated):
@@ -164,26 +128,21 @@ def dsac_v_losses(weights, maps, next_maps, action, reward, terminated):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("encoder", ["shared", "separate"])
-def test_three_updates_equal_the_plain_float64_ones(make_agent, random_steps, as_batch, encoder):
-    agent = make_agent(encoder=encoder, initial_alpha=ALPHA, gamma=GAMMA, tau=TAU)
-    steps = random_steps(16)
-    assert_follows(agent, as_batch(agent, steps), steps, dsac_losses)
-
-
-def test_the_papers_own_formulation_equals_the_plain_float64_one(
-    make_agent, random_steps, as_batch
+@pytest.mark.parametrize(
+    ("algorithm", "options", "reference_losses"),
+    [
+        (DiscreteSAC, {"encoder": "shared"}, dsac_losses),
+        (DiscreteSAC, {"encoder": "separate"}, dsac_losses),
+        (DiscreteSACWithValue, {}, dsac_v_losses),
+    ],
+)
+def test_three_updates_equal_the_plain_float64_ones(
+    make_agent, random_steps, as_batch, algorithm, options, reference_losses
 ):
-    agent = make_agent(DiscreteSACWithValue, initial_alpha=ALPHA, gamma=GAMMA, tau=TAU)
+    """Steps that are done without being terminated count like others, as the reference has it."""
+    agent = make_agent(algorithm, initial_alpha=ALPHA, gamma=GAMMA, tau=TAU, **options)
     steps = random_steps(16)
-    assert_follows(agent, as_batch(agent, steps), steps, dsac_v_losses)
-
-
-def assert_follows(agent, batch, steps, reference_losses):
-    """Three updates of `agent` on `batch` and of the reference on the same steps agree.
-
-    Steps that are done without being terminated count like others, as the reference has it.
-    """
+    batch = as_batch(agent, steps)
     batch["next", "done"] = torch.ones_like(batch["next", "done"])
     weights = {n: w.double().clone() for n, w in agent.state_dict()["weights"].items()}
     trained = [n for n, w in weights.items() if not n.startswith("target")]

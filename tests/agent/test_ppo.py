@@ -4,6 +4,7 @@ from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
 
 from flowrep.agent import PPO
+from tests.agent.test_replay import step as stored_step
 
 ENVS = 2
 SPEC = Composite(view=Unbounded((ENVS, 1, 36, 36)), shape=(ENVS,))
@@ -22,21 +23,9 @@ def make_ppo(**changes):
 
 def step(now, later, reward, ended="--"):
     """One step of two environments whose maps show a number; t(erminated), c(ut off) or -."""
-
-    def view(numbers):
-        return torch.tensor(numbers).view(-1, 1, 1, 1).expand(-1, 1, 36, 36).clone()
-
-    done = torch.tensor([e != "-" for e in ended]).unsqueeze(1)
-    outcome = {
-        "view": view(later),
-        "reward": torch.tensor(reward).unsqueeze(1),
-        "done": done,
-        "terminated": torch.tensor([e == "t" for e in ended]).unsqueeze(1),
-    }
-    action, log_prob = torch.tensor([1, 2]), torch.tensor([-0.5, -0.75])
-    return TensorDict(
-        {"view": view(now), "action": action, "action_log_prob": log_prob, "next": outcome}, [ENVS]
-    )
+    one = stored_step(now, later, ended, action=[1, 2])
+    one["next", "reward"] = torch.tensor(reward).unsqueeze(1)
+    return one.set("action_log_prob", torch.tensor([-0.5, -0.75]))
 
 
 STEPS = [

@@ -47,57 +47,53 @@ def step(seen, following, ended="", action=None, begun=""):
     )
 
 
-def transitions(replay, steps=False):
-    """The distinct (seen, action, reward, next, terminated) among a large sample, sorted.
-
-    With `steps`, the number of steps of each comes after its action.
-    """
+def transitions(replay):
+    """The distinct (seen, action, steps, reward, next, terminated) of a large sample, sorted."""
     batch = replay.sample()
     columns = [
         batch["view"][:, 0, 0, 0], batch["action"], batch["steps_to_next_obs"][:, 0],
         batch["next", "reward"][:, 0], batch["next", "view"][:, 0, 0, 0],
         batch["next", "terminated"][:, 0],
     ]  # fmt: skip
-    rows = torch.stack([c.double() for i, c in enumerate(columns) if steps or i != 2], 1)
+    rows = torch.stack([column.double() for column in columns], 1)
     return [tuple(row.tolist()) for row in rows.unique(dim=0)]
 
 
-def test_next_is_the_frame_that_followed_in_the_same_environment():
+@pytest.mark.parametrize(
+    ("steps", "expected"),
+    [
+        pytest.param(
+            [step([10, 20], [11, 21]), step([11, 21], [12, 22])],
+            [(10, 10, 1, 11, 11, 0), (20, 20, 1, 21, 21, 0)],
+            id="the latest step of each environment waits for its next frame",
+        ),
+        pytest.param(
+            [step([10, 20], [11, 21], ended="t-")],
+            [(10, 10, 1, 11, 10, 1)],
+            id="a terminated step is there at once with its own map as a stand-in",
+        ),
+        pytest.param(
+            [step([10, 20], [11, 21], ended="t-"), step([50, 21], [51, 22])],
+            [(10, 10, 1, 11, 10, 1), (20, 20, 1, 21, 21, 0)],
+            id="50 is a new episode: it is not what followed 10",
+        ),
+        pytest.param(
+            [step([10, 20], [11, 21], ended="c-"), step([50, 21], [51, 22])],
+            [(20, 20, 1, 21, 21, 0)],
+            id="a step that was cut off is left out",
+        ),
+        pytest.param(
+            [step([10, 20], [11, 21]), step([0, 21], [1, 22], begun="b-"), step([1, 22], [2, 23])],
+            [(0, 0, 1, 1, 1, 0), (20, 20, 1, 21, 21, 0), (21, 21, 1, 22, 22, 0)],
+            id="environment 0 began anew without being done",
+        ),
+    ],
+)
+def test_next_is_the_frame_that_followed_in_the_same_episode(steps, expected):
     replay = memory()
-    replay.extend(step([10, 20], [11, 21]))
-    replay.extend(step([11, 21], [12, 22]))
-    replay.extend(step([12, 22], [13, 23]))
-    # the latest step of each environment waits for its next frame
-    assert transitions(replay) == [
-        (10, 10, 11, 11, 0), (11, 11, 12, 12, 0), (20, 20, 21, 21, 0), (21, 21, 22, 22, 0),
-    ]  # fmt: skip
-
-
-def test_a_terminated_step_is_there_at_once_with_its_own_map_as_a_stand_in():
-    replay = memory()
-    replay.extend(step([10, 20], [11, 21], ended="t-"))
-    assert transitions(replay) == [(10, 10, 11, 10, 1)]
-    replay.extend(step([50, 21], [51, 22]))
-    # 50 is a new episode: it is not what followed 10
-    assert transitions(replay) == [(10, 10, 11, 10, 1), (20, 20, 21, 21, 0)]
-
-
-def test_a_step_that_was_cut_off_is_left_out():
-    replay = memory()
-    replay.extend(step([10, 20], [11, 21], ended="c-"))
-    replay.extend(step([50, 21], [51, 22]))
-    replay.extend(step([51, 22], [52, 23]))
-    assert transitions(replay) == [
-        (20, 20, 21, 21, 0), (21, 21, 22, 22, 0), (50, 50, 51, 51, 0),
-    ]  # fmt: skip
-
-
-def test_a_restart_between_two_calls_does_not_join_two_episodes():
-    replay = memory()
-    replay.extend(step([10, 20], [11, 21]))
-    replay.extend(step([0, 21], [1, 22], begun="b-"))  # environment 0 began anew, not done
-    replay.extend(step([1, 22], [2, 23]))
-    assert transitions(replay) == [(0, 0, 1, 1, 0), (20, 20, 21, 21, 0), (21, 21, 22, 22, 0)]
+    for each in steps:
+        replay.extend(each)
+    assert transitions(replay) == expected
 
 
 def test_an_episode_that_begins_with_what_the_last_one_ended_with_is_not_joined_to_it():
@@ -135,8 +131,8 @@ def test_steps_may_come_one_by_one_or_in_a_batch_with_its_time_last_or_named():
     time_last.names = [None, "time"]
     named.extend(time_last)
     expected = [
-        (10, 10, 11, 11, 0), (11, 11, 12, 12, 0), (12, 12, 13, 12, 1), (20, 20, 21, 21, 0),
-        (21, 21, 22, 21, 1), (40, 40, 41, 41, 0),
+        (10, 10, 1, 11, 11, 0), (11, 11, 1, 12, 12, 0), (12, 12, 1, 13, 12, 1),
+        (20, 20, 1, 21, 21, 0), (21, 21, 1, 22, 21, 1), (40, 40, 1, 41, 41, 0),
     ]  # fmt: skip
     assert transitions(one_by_one) == transitions(at_once) == transitions(named) == expected
     trajectory, single = memory(), memory()
@@ -144,7 +140,8 @@ def test_steps_may_come_one_by_one_or_in_a_batch_with_its_time_last_or_named():
     steps.names = ["time"]
     trajectory.extend(steps)
     assert [single.add(each) for each in steps.unbind(0)] == [0, 1, 2]
-    assert transitions(trajectory) == transitions(single) == [(0, 0, 1, 1, 0), (1, 1, 2, 2, 0)]
+    expected = [(0, 0, 1, 1, 1, 0), (1, 1, 1, 2, 2, 0)]
+    assert transitions(trajectory) == transitions(single) == expected
 
 
 def test_the_oldest_are_overwritten():
@@ -153,9 +150,8 @@ def test_the_oldest_are_overwritten():
         replay.extend(step([i, 100 + i], [i + 1, 101 + i]))
     assert len(replay) == 7
     # of slots for steps 5 (second half), 6, 7, 8 all but step 8 know their next frame
-    assert transitions(replay) == [
-        (i, i, i + 1, i + 1, 0) for i in (6, 7)] + [(i, i, i + 1, i + 1, 0) for i in (105, 106, 107)
-    ]  # fmt: skip
+    rows = (6, 7, 105, 106, 107)
+    assert transitions(replay) == [(i, i, 1, i + 1, i + 1, 0) for i in rows]
 
 
 def test_a_transition_of_three_steps_sums_discounted_rewards_and_looks_three_frames_ahead():
@@ -164,7 +160,7 @@ def test_a_transition_of_three_steps_sums_discounted_rewards_and_looks_three_fra
         replay.extend(step([seen], [seen + 1]))
     # from 10: 11 + 12 / 2 + 13 / 4 = 20.25 and 13; undiscounted it would be 36. From 12 on, what
     # follows the third step is not stored: transitions are shorter
-    assert transitions(replay, steps=True) == [
+    assert transitions(replay) == [
         (10, 10, 3, 20.25, 13, 0),
         (11, 11, 3, 22.0, 14, 0),
         (12, 12, 2, 20.0, 14, 0),
@@ -179,7 +175,7 @@ def test_a_transition_of_three_steps_ends_with_its_episode():
     replay.extend(step([50, 60], [51, 61]))
     replay.extend(step([51, 61], [52, 62]))
     # 10 ends at the terminal step, whose own map stands in; 20 before the one that was cut off
-    assert transitions(replay, steps=True) == [
+    assert transitions(replay) == [
         (10, 10, 2, 17.0, 11, 1),
         (11, 11, 1, 12.0, 11, 1),
         (20, 20, 1, 21.0, 21, 0),
@@ -247,7 +243,7 @@ def test_an_empty_memory_is_restored_and_one_of_another_capacity_refused():
         replay.sample()
     replay.load_state_dict(memory().state_dict())
     replay.extend(step([1], [2], ended="t"))
-    assert transitions(replay) == [(1, 1, 2, 1, 1)]
+    assert transitions(replay) == [(1, 1, 1, 2, 1, 1)]
     with pytest.raises(ValueError, match="capacity 100, this one 12; set replay_capacity=100"):
         memory(capacity=12).load_state_dict(replay.state_dict())
 
