@@ -225,6 +225,7 @@ def write_zed(folder: Path) -> list[Moment]:
     return moments
 
 
+KITTI_K = np.array([[31.0, 0.0, 18.5], [0.0, 31.0, 13.0], [0.0, 0.0, 1.0]])
 KITTI_BASELINE_M = 0.5
 KITTI_CAM_FROM_VELO = rigid((1.5, -1.6, 0.1), (0.01, -0.07, -0.3)).numpy()
 KITTI_VELO_FROM_IMU = rigid((0.01, 0.0, 0.02), (-0.8, 0.3, -0.8)).numpy()
@@ -254,14 +255,13 @@ def write_kitti(folder: Path) -> list[Moment]:
     measured = np.where(disparity == 0, np.nan, disparity / 256)
     depth = (31.0 * KITTI_BASELINE_M / measured).astype(np.float32)
     motion = relative_motion(torch.from_numpy(poses[1]), torch.from_numpy(poses[0]))
-    camera = np.array([[31.0, 0.0, 18.5], [0.0, 31.0, 13.0], [0.0, 0.0, 1.0]])
-    raw_flow, obj = flow_of(depth, camera, motion, body=True)
+    raw_flow, obj = flow_of(depth, KITTI_K, motion, body=True)
     for i, name in enumerate(("10", "11")):
         put(training / f"image_2/000000_{name}.png", rgb[i])
     put(training / "disp_occ_0/000000_10.png", disparity)
     u, v = np.rint(-raw_flow * 64) + 2**15
     put(training / "flow_occ/000000_10.png", np.stack([u, v, u * 0 + 1], -1).astype(np.uint16))
-    projection = np.hstack([camera - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros((3, 1))])
+    projection = np.hstack([KITTI_K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros((3, 1))])
     left, right = projection.copy(), projection.copy()
     left[0, 3], right[0, 3] = 31.0 * 0.06, 31.0 * (0.06 - KITTI_BASELINE_M)
     lines = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {numbers(np.eye(3))}"]

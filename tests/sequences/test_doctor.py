@@ -54,10 +54,11 @@ class Case:
         poses, z, camera = (self.before, self.now), self.depth[0].numpy(), self.K.double().numpy()
         frames = [Frame("", Path(), pose.numpy(), camera, z) for pose in poses]
         doctor.look(*frames, self.raw.numpy())
-        return doctor.diagnosis()
+        return doctor
 
-    def diagnosis(self, conventions=None, *, flow_is_recorded=True):
-        return self.shown_to(Doctor(conventions or {}, flow_is_recorded=flow_is_recorded))
+    def diagnosis(self, *conventions, flow_is_recorded=True):
+        doctor = Doctor(*conventions, flow_is_recorded=flow_is_recorded)
+        return self.shown_to(doctor).diagnosis()
 
 
 def case_of(before, now, seed=0):
@@ -164,7 +165,8 @@ def test_axes_that_have_no_name_are_found_from_the_motions():
     mount = rigid((0.5, 0.0, -0.7), (0.0, 0.0, 0.0))
     doctor = Doctor()
     for case in (case_of(BEFORE, NOW), case_of(NOW, LATER, seed=1)):
-        found = changed(case, pose=lambda pose: pose @ mount).shown_to(doctor)
+        changed(case, pose=lambda pose: pose @ mount).shown_to(doctor)
+    found = doctor.diagnosis()
     assert found.suspects[0] == "other axes"
     assert found.rivals_px["other axes"] < 0.05 < found.residual_px
 
@@ -232,7 +234,8 @@ def test_a_camera_that_stands_still_tells_nothing(right):
 def test_several_pairs_are_weighed_together(right):
     doctor = Doctor()
     for mistake in ("flow_direction=backward", "flow_direction=backward", "pose_axes=opengl"):
-        rivals_px = changed(right, **WRONG[mistake]).shown_to(doctor).rivals_px
+        changed(right, **WRONG[mistake]).shown_to(doctor)
+    rivals_px = doctor.diagnosis().rivals_px
     assert min(rivals_px, key=rivals_px.get) == "flow_direction=backward"
 
 
