@@ -19,7 +19,7 @@ def drive(make_street):
         """Yields what is seen, as tensors, in an episode in which someone walks close by."""
         scene = load_scene(name)
         # H and W differ, and the view is narrow, so that legs too are many pixels wide.
-        camera = replace(scene.camera, height_px=210, width_px=280, fov_deg=45.0)
+        camera = replace(scene.camera, height_px=150, width_px=200, fov_deg=30.0)
         env = make_street(replace(scene, camera=camera), speed=speed)
         observation, ended = env.reset(options={"episode_seed": 11, **options})[0], False
         for action in [*actions, NO_OP]:

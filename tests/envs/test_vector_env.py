@@ -66,7 +66,7 @@ def test_steps_and_partial_resets_are_those_of_streets_alone(make, make_street, 
     rng, resets = np.random.default_rng(0), 0
     alone = [street.reset(seed=5 + i) for i, street in enumerate(streets)]
     assert_seen(vector.reset(seed=5)[0], alone)
-    for _ in range(12):
+    for _ in range(8):
         actions = rng.integers(3, size=NUM_ENVS)
         steps = [street.step(action) for street, action in zip(streets, actions)]
         observation, rewards, ended, truncated, _ = vector.step(actions)
@@ -75,7 +75,7 @@ def test_steps_and_partial_resets_are_those_of_streets_alone(make, make_street, 
         assert rewards.tolist() == [step[1] for step in steps]
         assert ended.tolist() == [step[2] for step in steps]
         assert not truncated.any()
-        due = ended | (rng.random(NUM_ENVS) < 0.1)
+        due = ended | (rng.random(NUM_ENVS) < 0.15)
         if due.any():
             resets += 1
             seeds = [int(rng.integers(100)) if each else None for each in due]

@@ -49,13 +49,11 @@ def refusal(data, changes):
         ({"vehicle.speed_mps": "10"}, "vehicle.speed_mps"),
         ({"vehicle.speed_mps": float("inf")}, "vehicle.speed_mps"),
         ({"time_limit_steps": True}, "time_limit_steps"),
-        ({"camera.fov_deg": 180}, "camera.fov_deg"),
         ({"name": "../../up"}, "name"),
         ({"roads.0.start_m": [1.0]}, "roads[0].start_m[1]"),
         ({"paths": []}, "paths"),
         ({"pedestrian_groups.0.speed_mps": [2, 1]}, "pedestrian_groups[0].speed_mps"),
         ({"pedestrian_speed_mps.low": MISSING}, "pedestrian_speed_mps"),
-        ({"obstacles.0.kind": "lorry"}, "obstacles[0].kind"),
         # Parts that don't agree with themselves.
         ({"camera.far_m": 0.1}, "camera"),
         ({"pedestrian_groups.0.standing": 4}, "pedestrian_groups[0]"),
