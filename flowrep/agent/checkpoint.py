@@ -92,7 +92,7 @@ def load_checkpoint(
             items = json.loads(metadata["state"])["dict"]
             names = items if parts is None else parts
             return {name: _from_json(items[name], file.get_tensor) for name in names}
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise CheckpointError(
             f"{path} is not a readable checkpoint ({error}): it is damaged or of another kind; "
             "restore a copy of it, or start a new run"

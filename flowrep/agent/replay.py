@@ -261,9 +261,8 @@ def time_first(frames: TensorDictBase) -> TensorDictBase:
     A dim named `time` is T; without one, a single dim is N, and of several the last is T.
     """
     names = list(frames.names)
-    time = names.index("time") if "time" in names else None
-    if time is None and frames.ndim < 2:
+    if "time" not in names and frames.ndim < 2:
         return frames.reshape(1, -1)
-    time = frames.ndim - 1 if time is None else time
+    time = names.index("time") if "time" in names else frames.ndim - 1
     frames = frames.permute(time, *[dim for dim in range(frames.ndim) if dim != time])
     return frames.reshape(frames.shape[0], -1)

@@ -263,8 +263,5 @@ def test_an_agent_that_mirrors_learns_from_what_was_seen_and_from_its_image(
     # what is stored has no image
     assert torch.equal(agent.memory.storage[:]["flow"][0, 0].float(), u)
     assert torch.isfinite(agent.update(batch)["q_loss"])
-
-
-def test_mirror_needs_to_be_told_how(make_agent):
     with pytest.raises(ValueError, match="mirror_image"):
         make_agent(mirror=True)
