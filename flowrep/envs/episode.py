@@ -113,6 +113,7 @@ class Episode:
         self.layout, self.seed = layout, episode_seed
         self.speed_mps, self.vehicle_speed_mps = speed_mps, vehicle_speed_mps
         self.frame_rate_hz, self.dt_s = frame_rate_hz, 1.0 / frame_rate_hz
+        # Ticks are the checks of the footprint within a step; people's clock counts them.
         self.ticks_per_step = ticks_for(scene, frame_rate_hz, speed_mps, vehicle_speed_mps)
         self.tick_s = self.dt_s / self.ticks_per_step
         # Rounding must not add a step: 200 / 12 · 15 is 250.00000000000003.

@@ -1,5 +1,6 @@
 """Streets that are drawn all at once are the streets alone, bit for bit."""
 
+from copy import deepcopy
 from functools import partial
 
 import numpy as np
@@ -85,29 +86,22 @@ def test_steps_and_partial_resets_are_those_of_streets_alone(make, make_street, 
     assert resets > 1
 
 
-def test_what_was_given_away_stays_as_it_is(make):
+@pytest.mark.parametrize("mask", [(True, False, False), (False, False, False)])
+def test_a_reset_of_some_or_none_returns_what_was_last_seen_as_the_callers_own(make, mask):
     ours = make(sensors=("depth",))
-    first, _ = ours.reset(seed=1)
-    kept = first["sensor"]["depth"].copy()
-    ours.step(np.array([0, 1, 2]))
-    mask = np.array([True, False, False])
-    again, _ = ours.reset(options={"reset_mask": mask})
-    again["sensor"]["depth"][:] = 0.0
-    np.testing.assert_array_equal(first["sensor"]["depth"], kept)
-    assert ours.step(np.zeros(NUM_ENVS, dtype=int))[0]["sensor"]["depth"].any()
-
-
-def test_a_reset_of_no_street_returns_what_was_last_seen(make):
-    ours = make(sensors=("depth",))
-    none = {"reset_mask": np.zeros(NUM_ENVS, dtype=bool)}
-    before, _ = ours.reset(options=dict(none))
-    assert not before["sensor"]["depth"].any()  # nothing has been seen: zeros, as workers have
+    options, others = {"reset_mask": np.array(mask)}, ~np.array(mask)
+    before, _ = ours.reset(options=dict(options))
+    assert not before["sensor"]["depth"][others].any()  # not seen yet: zeros, as workers have
     ours.reset(seed=1)
     last = ours.step(np.array([0, 1, 2]))[0]
-    again, _ = ours.reset(options=dict(none))
-    assert_same(again, last)
+    kept = deepcopy(last)
+    again, _ = ours.reset(options=dict(options))
+    for seen, before in ((again, last), (again["sensor"], last["sensor"])):
+        for name in seen.keys() - {"sensor"}:
+            np.testing.assert_array_equal(seen[name][others], before[name][others])
     again["sensor"]["depth"][:] = 0.0
-    assert last["sensor"]["depth"].any()
+    assert_same(last, kept)
+    assert ours.step(np.zeros(NUM_ENVS, dtype=int))[0]["sensor"]["depth"].any()
 
 
 def test_people_who_are_foreseen_are_where_their_clock_puts_them(make_street):
