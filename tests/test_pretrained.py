@@ -9,21 +9,22 @@ from flowrep import pretrained
 from flowrep.config import UsageError, group_choices
 from flowrep.experiment.evaluation import evaluate
 
-SCENES = sorted(path.stem for path in pretrained.FOLDER.glob("*.safetensors"))
+SCENES = sorted(group_choices("scene"))
+# of 20 episodes; one that never turns drives Straight Road in one of ten, the other scenes never
+LEAST = {"straight_road": 12, "s_turn": 12, "h_shaped_pathways": 3, "three_way_junction": 18}
 
 
-def success(agent, episodes):
+def successes(agent, episodes):
     env = agent.make_env(num_envs=episodes)
     found = list(evaluate(env, agent.policy, [{"episode_seed": k} for k in range(episodes)]))
     env.close()
-    return sum(episode.outcome == "success" for episode in found) / episodes
+    return sum(episode.outcome == "success" for episode in found)
 
 
-def test_each_is_of_a_scene_and_has_at_most_a_megabyte():
-    sizes = [(pretrained.FOLDER / f"{scene}.safetensors").stat().st_size for scene in SCENES]
-    assert "straight_road" in SCENES
-    assert {*SCENES} <= {*group_choices("scene")}
-    assert max(sizes) <= 1_000_000
+def test_every_scene_has_one_of_at_most_a_megabyte():
+    sizes = {path.stem: path.stat().st_size for path in pretrained.FOLDER.glob("*.safetensors")}
+    assert sorted(sizes) == SCENES
+    assert max(sizes.values()) <= 1_000_000
 
 
 def test_rows_keep_their_largest_weight_exactly_and_others_to_half_a_step():
@@ -41,7 +42,7 @@ def test_rows_keep_their_largest_weight_exactly_and_others_to_half_a_step():
 
 @pytest.mark.parametrize("scene", [pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
 def test_it_drives_where_one_that_never_turns_does_not(scene):
-    assert success(pretrained.load(scene, device="cpu"), 20) >= 0.6
+    assert successes(pretrained.load(scene, device="cpu"), 20) >= LEAST[scene]
 
 
 def test_a_scene_with_changes_is_driven_with_the_camera_of_training():

@@ -19,7 +19,7 @@ from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.layout import Layout, free_ground
 from flowrep.scenes.scene import VehicleState
-from flowrep.simulator.meshes import kerb
+from flowrep.simulator.meshes import kerb, lane_marks
 
 PEOPLE = {"across", "along", "standing"}
 # Paper, Table I: steps, paths, lane width factor, categories, kinds of pedestrians, α in °/s².
@@ -212,13 +212,15 @@ def test_the_kerb_is_on_the_sidewalk_and_paving_is_below_it(name):
     assert (corners[..., 2] > 0).all()  # or it would flicker with the paving
 
 
-def test_lane_marks_stop_where_crosswalks_and_other_roads_are(make_street):
-    env = make_street("h_shaped_pathways", sensors=())
-    layout = Layout(env.scene)
+def test_lane_marks_stop_where_crosswalks_and_other_roads_are():
+    layout = Layout(load_scene("h_shaped_pathways"))
     striped = shapely.union_all([area.polygon for area in layout.crosswalks])
-    marks = env._street._lane_marks(layout, "bar", striped)
+    west = layout.ribbons["west"]
+    marks = lane_marks(
+        layout.lines["bar"], shapely.union_all([west, layout.ribbons["east"], striped])
+    )
     points = shapely.points(np.array(marks.vertices)[:, :2])
     # 70 m of bar less half a leg at either end and the crosswalk: ten dashes, six metres apart.
     assert len(points) > 30
     assert not shapely.intersects(points, striped).any()
-    assert not shapely.intersects(points, layout.ribbons["west"]).any()
+    assert not shapely.intersects(points, west).any()
