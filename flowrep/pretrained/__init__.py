@@ -62,8 +62,8 @@ def pack(run: str | Path, path: Path) -> None:
 def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Returns matrices and filters as int8, with a scale for each output; the rest as it is.
 
-    Rounding to 1/127 of a row's largest weight is what bfloat16, in which agents compute, does to
-    weights of a quarter of it and more; README.md has the success with and without.
+    A weight is rounded to 1/127 of the largest of its row, coarser than bfloat16, in which agents
+    compute; README.md has the success with and without.
     """
     found = {}
     for name, weight in weights.items():
