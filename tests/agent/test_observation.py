@@ -2,13 +2,16 @@ import pytest
 import torch
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
+from flowrep.agent import observation
 from flowrep.agent.observation import compute_dtype, map_codecs
 
 
 def test_auto_takes_bfloat16_where_it_is_fast(monkeypatch):
     cpu = torch.device("cpu")
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
-    assert compute_dtype("auto", cpu) is torch.bfloat16
+    for faster, dtype in ((True, torch.bfloat16), (False, torch.float32)):
+        monkeypatch.setattr(observation, "_bf16_products_are_faster", lambda faster=faster: faster)
+        assert compute_dtype("auto", cpu) is dtype
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx2": True})
     assert compute_dtype("auto", cpu) is torch.float32
     assert compute_dtype("bf16", cpu) is torch.bfloat16
