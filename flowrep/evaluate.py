@@ -59,12 +59,7 @@ def run(config: EvaluateConfig) -> None:
 
 
 def targets_of(config: EvaluateConfig) -> list[Target]:
-    """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own.
-
-    Raises:
-        RunFolderError: there is no run in one of the folders.
-        UsageError: the folder for the rows of a policy of the user's own holds a run.
-    """
+    """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own."""
     machine: dict[str, Any] = {
         "device": config.device,
         "num_envs": config.num_envs,
@@ -161,7 +156,7 @@ def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequ
 
 
 def main() -> None:
-    """Entry point; a mistake on the command line ends in one line that names the remedy."""
+    """Entry point."""
     run_command("evaluate", run, EvaluateConfig)
 
 

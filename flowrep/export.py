@@ -42,11 +42,6 @@ def export(run: RunFolder, output: str | None = None) -> Path:
     """Writes a run's agent, which computes in float32 on any machine; returns the folder.
 
     This is `output`, or `export` in the run's folder if None.
-
-    Raises:
-        UsageError: its config is damaged.
-        CheckpointError: there is no checkpoint, it is damaged, or belongs to another run.
-        ExportError: its algorithm's policy can't be exported.
     """
     own = validated_run(run.read_config(), f"{run.path}/config.yaml")
     state = load_checkpoint(run.checkpoint_path, ["origin", "frames", "policy"])
@@ -94,18 +89,14 @@ def agent_card(config: TrainConfig, env: EnvBase, frames: int) -> dict[str, Any]
 
 
 class ExportError(ValueError):
-    """A policy can't be exported; the message says why."""
+    """A policy can't be exported."""
 
 
 def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> ExportedProgram:
     """Returns a policy's traced network, from maps `[N, C, H, W]` to one score per action.
 
     The maps are arguments in the policy's order, with the dtypes of the specs, for any N. The
-    greedy action has the largest score. For stochastic policies, the scores are logits. The policy
-    is left as it is.
-
-    Raises:
-        ExportError: if the policy doesn't contain exactly one `PolicyNetwork`.
+    greedy action has the largest score. For stochastic policies, the scores are logits.
     """
     networks = [module for module in policy.modules() if isinstance(module, PolicyNetwork)]
     if len(networks) != 1:
@@ -141,7 +132,7 @@ def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any])
 
 
 def main() -> None:
-    """Entry point; a mistake on the command line ends in one line that names the remedy."""
+    """Entry point."""
     run_command("export", run, ExportConfig)
 
 

@@ -24,9 +24,6 @@ def require(what: str, extra: str, *packages: str, module: str = "") -> None:
         extra: the extra of flowrep that installs them.
         packages: their import names.
         module: `__name__` of the module; if it runs as a command, the process ends in one line.
-
-    Raises:
-        ImportError: a package is missing; names the first one and the extra.
     """
     for package in packages:
         if not is_installed(package):
@@ -43,11 +40,7 @@ def numba_is_installed() -> bool:
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Returns a decorator; `options` are those of `numba.njit`, the machine code is cached.
-
-    Raises:
-        ImportError: numba is not installed.
-    """
+    """Returns `numba.njit` of these options as a decorator, which caches the machine code."""
     from numba import njit  # here, as it takes half a second and is an extra
 
     def decorate(function: Callable[..., Any]) -> Any:

@@ -31,12 +31,7 @@ from flowrep.sequences.output import Output
 
 
 def factorize_recording(config: FactorizeConfig) -> int:
-    """Writes raw, ego and object flow of a recording; returns the exit code.
-
-    Raises:
-        UsageError: a value is invalid.
-        SequenceError: a file can't be read.
-    """
+    """Writes raw, ego and object flow of a recording; returns the exit code."""
     stream = open_stream(config)
     flow_source = open_flow_source(config, stream)
     motion_source = open_motion_source(config, stream)
@@ -107,7 +102,7 @@ def open_motion_source(config: FactorizeConfig, stream: Stream) -> MotionSource:
 
 
 def main() -> None:
-    """Entry point; a mistake on the command line ends in one line that lists the choices."""
+    """Entry point."""
     # OpenCV's messages about broken files would clutter the one-line error.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     run_command("factorize", lambda config: sys.exit(factorize_recording(config)), FactorizeConfig)

@@ -22,22 +22,11 @@ def load_agent(
     noise: Noise | None = None,
     **machine: Any,
 ) -> Agent:
-    """Returns the agent that `policy=` names.
+    """Returns the agent that `policy=` names, in a scene, or in its run's own if None.
 
-    Args:
-        name: a baseline, "pretrained", the folder of a run, or a policy of the user's own, see
-            `flowrep.experiment.agents.load_policy`.
-        scene: the scene to act in; None is the run's own.
-        representations: what a policy of the user's own sees, a mapping from name to options.
-        flow: the source of its raw and obj, a section of a config; exact if None.
-        motion: the source of its camera's motion; exact if None.
-        noise: errors of its depth and motion; none if None.
-        machine: `device`, `num_envs` and `num_workers`.
-
-    Raises:
-        UsageError: it is nothing of this kind, or no agent for the scene comes with flowrep.
-        CheckpointError: a run's agent can't be loaded.
-        PolicyError: a policy of the user's own can't be used.
+    It is a baseline, "pretrained", the folder of a run, or a policy of the user's own, for which
+    `representations` are needed; None is exact flow and motion, and no noise. `machine` is
+    `device`, `num_envs` and `num_workers`.
     """
     is_baseline, is_own = name in BASELINES, ":" in name or name.endswith(".pt2")
     if name == "pretrained":

@@ -12,12 +12,9 @@ from typing import Any
 class StopRequest:
     """Turns SIGINT and SIGTERM into a flag that the loop checks between two steps.
 
-    The first signal sets `received`. Another Ctrl-C ends the process at once; another SIGTERM
-    doesn't, since schedulers send it to each process of a job and more than once. Use it as a
-    context manager; the previous handlers are restored on exit.
-
-    Args:
-        then: called once, by the first signal.
+    The first signal sets `received` and calls `then`. Another Ctrl-C ends the process at once;
+    another SIGTERM doesn't, since schedulers send it to each process of a job and more than once.
+    The previous handlers are restored when its context ends.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -29,20 +26,17 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """The exit code that shells expect of a process ended by the received signal."""
+        """The exit code that shells expect of a process ended by the signal."""
         return 0 if self.received is None else 128 + self.received
 
     def __bool__(self) -> bool:
-        """Returns whether a stop was requested."""
         return self.received is not None
 
     def __enter__(self) -> "StopRequest":
-        """Installs the handlers."""
         self._previous = {number: signal.signal(number, self._receive) for number in self.SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Restores the previous handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
@@ -55,10 +49,7 @@ class StopRequest:
 
 @dataclass
 class Every:
-    """True once each time a step counter passes a multiple of `interval`.
-
-    The counter may advance by more than one (vectorised environments); a multiple that was jumped
-    over counts when it is passed. `interval=0` never fires.
+    """True once each time a step counter passes a multiple of `interval`, 0 for never.
 
     >>> should_log = Every(10)
     >>> [should_log(step) for step in (4, 8, 12, 16, 20, 24)]
@@ -69,7 +60,7 @@ class Every:
     last: int = 0
 
     def __call__(self, step: int) -> bool:
-        """Returns whether `step` passed a new multiple since the last call."""
+        """Returns whether `step` reached or jumped over a multiple since the last call."""
         if not self.interval or step // self.interval <= self.last // self.interval:
             return False
         self.last = step
@@ -87,7 +78,6 @@ class Stopwatch:
     """
 
     def __init__(self) -> None:
-        """Starts with no sections."""
         self.seconds: dict[str, float] = {}
 
     @contextmanager

@@ -73,10 +73,7 @@ def is_sweep(arguments: list[str]) -> bool:
 
 
 def run_sweep() -> NoReturn:
-    """Runs the sweep of `sys.argv`, prints how it ended, and ends the process.
-
-    The exit code is 0 if all runs have finished, that of a signal that stopped it, else 1.
-    """
+    """Runs the sweep of `sys.argv`, prints how it ended, and ends the process."""
     keys = {text.partition("=")[0] for text in sys.argv[1:]}
     if "resume" in keys:
         exit_with(
@@ -145,12 +142,7 @@ def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
 def job(config: DictConfig) -> float:
     """Does what remains of one run in a process of its own; called by Hydra's launchers.
 
-    Returns:
-        Its share of final greedy episodes that succeed; nan if a run of a grid has none, so that
-        the other runs go on.
-
-    Raises:
-        RunFailedError: the run has no result, and its sweeper needs one.
+    Returns its final greedy success; nan if a run of a grid has none, so that the others go on.
     """
     hydra = HydraConfig.get()
     folder, sweep = Path(hydra.runtime.output_dir), Path(hydra.sweep.dir)
@@ -200,9 +192,6 @@ def attempted(
     """Returns how a run stands after what remains of it was done: "failed: error: no space".
 
     `line` are the arguments of `flowrep.train`. Once `should_stop` is true, the run saves and ends.
-
-    Raises:
-        UsageError: the folder holds a run with another config.
     """
     _check_is_same(folder, config)
     code = begin = 0

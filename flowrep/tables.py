@@ -15,12 +15,7 @@ class TableError(ValueError):
 def read_rows(path: Path, columns: Iterable[str] = ()) -> list[dict[str, str]]:
     """Returns a table's rows, none if there is no file; an incomplete last line is left out.
 
-    Args:
-        path: the table, as `append_rows` writes it.
-        columns: those that it must have, among others.
-
-    Raises:
-        TableError: it lacks one, as after a spreadsheet saved it with semicolons.
+    A table without one of `columns` is refused, as after a spreadsheet saved it with semicolons.
     """
     if not path.is_file():
         return []
@@ -45,10 +40,7 @@ def is_whole(path: Path) -> bool:
 def write_rows(
     path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:
-    """Replaces a whole table; without rows, the file is removed.
-
-    If it is interrupted, the file is the old table or the new one.
-    """
+    """Replaces a whole table, or leaves the old one; without rows, the file is removed."""
     rows = list(rows)
     if not rows:
         path.unlink(missing_ok=True)
@@ -70,9 +62,6 @@ def append_rows(
     """Appends rows to a table, writing its header first if the file is new.
 
     They are written in one call, so that a killed process leaves all of them or none.
-
-    Raises:
-        ValueError: a row's columns are not those of the table.
     """
     rows = list(rows)
     if not rows:

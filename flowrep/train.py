@@ -32,9 +32,8 @@ PATIENCE_S = 60.0  # for the process of a run that was stopped and still saves
 def run(config: TrainConfig) -> float:
     """Trains, evaluates and films one agent, or continues a run with `resume=`.
 
-    Returns:
-        The share of greedy episodes in the final evaluation that succeed, over all its speeds and
-        frame rates. A sweeper such as Optuna maximises it.
+    Returns its final success at all speeds and frame rates, which a sweeper such as Optuna
+    maximises.
     """
     job = HydraConfig.get()
     typed = list(job.overrides.task)
@@ -52,14 +51,7 @@ def run(config: TrainConfig) -> float:
 
 
 def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainConfig:
-    """Returns the config of the run to resume.
-
-    What belongs to the machine may be typed anew, and a larger `total_frames`, which the folder
-    then keeps.
-
-    Raises:
-        UsageError: other keys were typed, or the run's config is damaged.
-    """
+    """Returns the config of the run to resume, which keeps a larger `total_frames`."""
     own = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
     given = [text.partition("=")[0] for text in typed if not text.startswith("resume=")]
     allowed = (*OF_THE_MACHINE, "total_frames")
@@ -142,7 +134,7 @@ def complete(runner: Runner, stop: StopRequest) -> bool:
 
 
 def main() -> None:
-    """Entry point; a mistake on the command line ends in one line that names the remedy."""
+    """Entry point."""
     if sweep.is_sweep(sys.argv[1:]):
         sweep.run_sweep()
     run_command("train", run, TrainConfig)

@@ -74,11 +74,7 @@ def make_env_of(config: ViewConfig, agent: Agent) -> Callable[..., EnvBase]:
 
 
 def episodes_of(config: ViewConfig, scene: Scene) -> list[dict[str, Any]]:
-    """Returns the options of the episodes to view.
-
-    Raises:
-        UsageError: the scene has no such path.
-    """
+    """Returns the options of the episodes to view."""
     paths = [path.name for path in scene.paths]
     if config.path not in (*paths, None):
         raise UsageError(f"path should be {', '.join(paths)} or null, not '{config.path}'")
@@ -213,16 +209,8 @@ def drive_by_hand(
 ) -> None:
     """Opens a window and drives one episode after the other until it is closed.
 
-    A finished episode stays in view until R begins the next, which has the next seed.
-
-    Args:
-        keyboard: what drives.
-        env: made by `make_filmed`.
-        options: of the first episode.
-        pause: draws, and handles keys for some seconds; by default in a window on the screen.
-
-    Raises:
-        UsageError: there is no screen, or no GUI toolkit.
+    A finished episode stays in view until R begins the next, which has the next seed. `pause`
+    draws, and handles keys for some seconds; by default in a window on the screen.
     """
     import matplotlib.pyplot as plt
 
@@ -283,7 +271,7 @@ def drive_in_window(
 
 
 def main() -> None:
-    """Entry point; a mistake on the command line ends in one line that names the remedy."""
+    """Entry point."""
     run_command("view", run, ViewConfig)
 
 

@@ -18,7 +18,7 @@ class UsageError(ValueError):
 
 
 def group_choices(group: str) -> list[str]:
-    """Returns the names that a config group offers, sorted, e.g. `group_choices("scene")`."""
+    """Returns the names that a config group offers, sorted."""
     return sorted(path.stem for path in (CONF_DIR / group).glob("*.yaml"))
 
 

@@ -80,24 +80,14 @@ def end_with(error: Exception, schema: type[Section]) -> NoReturn:
 
 
 def is_a_mistake(error: Exception) -> bool:
-    """Returns whether an error is about something that a user can change.
-
-    These are flowrep's and Hydra's own errors, refused values, missing packages, and what the disk
-    reports.
-    """
+    """Returns whether an error is about something that a user can change."""
     kinds = HydraException, OmegaConfBaseException, ValueError, ImportError, OSError
     is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
     return isinstance(error, kinds) or is_plugin or type(error).__module__.startswith("flowrep.")
 
 
 def checked(config: DictConfig, schema: type[Section]) -> Any:
-    """Returns a composed config as its model.
-
-    Top-level keys that the user added (`+note=pilot`) are not checked.
-
-    Raises:
-        UsageError: a key or a value is wrong, or a copied scene file kept the name of its original.
-    """
+    """Returns a composed config as its model; keys that the user added (`+note=pilot`) pass."""
     plain, job = plain_config(config), HydraConfig.get()
     model = validated(schema, plain)
     typed = job.overrides.task
@@ -122,18 +112,15 @@ def plain_config(config: DictConfig) -> dict[str, Any]:
 
 
 def exit_with(problem: str | Exception, remedy: str = "") -> NoReturn:
-    """Ends the process with the exit code of a usage error, printing each line of the problem.
-
-    The remedy is no `error:` line, since a sweep takes the last of those for a run's failure.
-    """
+    """Ends the process with the exit code of a usage error, printing each line of the problem."""
     print_error(problem)
-    if remedy:
+    if remedy:  # no `error:` line, as a sweep takes the last of those for a run's failure
         print(remedy, file=sys.stderr)
     sys.exit(EXIT_USAGE)
 
 
 def print_error(problem: str | Exception) -> None:
-    """Prints each line of a problem, without ending the process."""
+    """Prints each line of a problem."""
     for line in str(problem).splitlines():
         print(f"error: {line}", file=sys.stderr)
 
@@ -229,13 +216,8 @@ def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
 
 
 def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
-    """Returns a command line as Hydra reads it: folders quoted, those without a key named `run`.
-
-    A folder is quoted if it exists, or if Hydra would take its name for a number.
-
-    Raises:
-        UsageError: a flag is a key, or folders are given in two ways.
-    """
+    """Returns a command line as Hydra reads it: folders quoted, those without a key named `run`."""
+    # quoted are folders that exist, and those that Hydra would take for a number
     keys, folders, others, previous = schema.key_names(), [], [], ""
     for text in arguments:
         key, _, value = text.partition("=")
@@ -292,10 +274,7 @@ def override(key: str, text: str) -> str:
 
 
 def line_for(command: str, **values: str) -> str:
-    """Returns a shell line for a command, called in the same way as this one: as script or module.
-
-    The values of its keys may have any characters.
-    """
+    """Returns a shell line for a command, called as this one: as script or module."""
     is_script = Path(sys.argv[0]).name.startswith("flowrep-")
     program = [f"flowrep-{command}"] if is_script else ["python", "-m", f"flowrep.{command}"]
     return shlex.join([*program, *(override(key, text) for key, text in values.items())])

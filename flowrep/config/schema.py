@@ -177,11 +177,7 @@ class AnyAlgorithm(Target):
     """A user's own algorithm."""
 
     def first_update(self, num_envs: int) -> tuple[str, int]:
-        """Returns the frames until something is learnt, after the option that says so.
-
-        Raises:
-            ValueError: nothing would be; names the key to change.
-        """
+        """Returns the option that delays learning, and the frames until something is learnt."""
         return "", 0
 
 
@@ -487,11 +483,7 @@ class FactorizeConfig(Command):
 
 
 def validated(schema: type[Model], plain: Mapping[str, Any], source: str = "") -> Model:
-    """Returns a resolved config as its model; `source`, a file, begins the lines of an error.
-
-    Raises:
-        UsageError: a line for each key that is unknown, missing or invalid.
-    """
+    """Returns a resolved config as its model; `source`, a file, begins the lines of an error."""
     try:
         return schema.model_validate(plain)
     except ValidationError as error:
@@ -500,22 +492,14 @@ def validated(schema: type[Model], plain: Mapping[str, Any], source: str = "") -
 
 
 def validated_run(plain: Any, source: str) -> TrainConfig:
-    """Returns the config of a run's folder.
-
-    Raises:
-        UsageError: it is not a run's config; has a line for each invalid key.
-    """
+    """Returns the config of a run's folder."""
     if not isinstance(plain, Mapping):
         raise UsageError(f"{source} holds no run's config: restore the file")
     return validated(TrainConfig, plain, source)
 
 
 def check_options(maker: type, options: Mapping[str, Any], section: str) -> None:
-    """Checks a section's options against the signature of a class, beyond its first argument.
-
-    Raises:
-        UsageError: a line for each option that is unknown, missing or of another type.
-    """
+    """Checks a section's options against the signature of a class, beyond its first argument."""
     hints = get_type_hints(maker.__init__)  # type: ignore[misc]
     _, *parameters = inspect.signature(maker).parameters.values()
     fields: dict[str, Any] = {

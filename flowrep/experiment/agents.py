@@ -41,19 +41,12 @@ _NOT_THE_USERS = (
 
 @dataclass(frozen=True)
 class Agent:
-    """A policy and the env in which it acts.
+    """A policy and the env in which it acts."""
 
-    Args:
-        policy: writes `action`; or the name of a baseline.
-        config: of the env.
-        frames: the frames that the policy was trained for; 0 if unknown.
-        trained_in: the name of the scene in which it was trained, None if unknown.
-    """
-
-    policy: Policy | str
+    policy: Policy | str  # writes `action`; or a baseline's name
     config: EnvConfig
-    frames: int = 0
-    trained_in: str | None = None
+    frames: int = 0  # that it was trained for; 0 if unknown
+    trained_in: str | None = None  # the name of a scene, None if unknown
 
     @property
     def make_env(self) -> Callable[..., EnvBase]:
@@ -77,17 +70,9 @@ class Agent:
 def load_trained(
     run: RunFolder, *, scene: Mapping[str, Any] | None = None, **machine: Any
 ) -> Agent:
-    """Returns a run's agent.
+    """Returns a run's agent, to act in the given scene, or in its own if None.
 
-    Args:
-        run: the run's folder.
-        scene: the scene to act in, seen with the agent's own camera; by default the run's own.
-        machine: `device`, `num_envs` and `num_workers`, in place of the run's.
-
-    Raises:
-        UsageError: its config is damaged.
-        CheckpointError: there is no checkpoint, it is damaged or belongs to another run, or the
-            agent can't see all classes of the scene.
+    `machine` is `device`, `num_envs` and `num_workers`, in place of the run's.
     """
     own = validated_run(run.read_config(), f"{run.path}/config.yaml")
     path = run.checkpoint_path
@@ -107,19 +92,7 @@ def with_weights(
     scene: Mapping[str, Any] | None = None,
     **machine: Any,
 ) -> Agent:
-    """Returns the agent of a run's config with the given weights.
-
-    Args:
-        own: the run's config.
-        weights: the policy's state.
-        frames: the frames that it was trained for.
-        name: for messages, "the agent of ...".
-        scene: see `load_trained`.
-        machine: see `load_trained`.
-
-    Raises:
-        CheckpointError: the agent can't see all classes of the scene.
-    """
+    """Returns the agent of a run's config with these weights; `name` is for messages."""
     if scene is not None:
         machine["scene"] = {**scene, "camera": own.scene["camera"]}
     config = own.model_copy(update=machine)
@@ -138,11 +111,7 @@ def with_weights(
 
 
 def load_external(reference: str, config: EnvConfig) -> Agent:
-    """Returns a policy of the user's own, in the env of the config.
-
-    Raises:
-        PolicyError: as `check_card` and `load_policy`.
-    """
+    """Returns a policy of the user's own, in the env of the config."""
     env = build.env(config, num_envs=1, num_workers=0)
     task = Task(
         scene=config.scene["name"],
@@ -165,23 +134,14 @@ class PolicyError(Exception):
 
 @dataclass(frozen=True)
 class Task:
-    """The task, as described to the function that makes an external policy.
-
-    Args:
-        scene: its name.
-        representations: the maps' names, in the requested order, with their options.
-        observation_spec: of the maps of one environment, `[C, H, W]` each.
-        action_spec: of one environment: 0 goes straight on, 1 turns left, 2 turns right.
-        intrinsics: K `[3, 3]` of the maps, pixels.
-        device: of the maps.
-    """
+    """The task, as described to the function that makes an external policy."""
 
     scene: str
-    representations: Mapping[str, Any]
-    observation_spec: Composite
-    action_spec: TensorSpec
-    intrinsics: Tensor
-    device: torch.device
+    representations: Mapping[str, Any]  # options by name, in the requested order
+    observation_spec: Composite  # of the maps of one environment, `[C, H, W]` each
+    action_spec: TensorSpec  # of one environment: 0 goes straight on, 1 turns left, 2 turns right
+    intrinsics: Tensor  # K `[3, 3]` of the maps, pixels
+    device: torch.device  # of the maps
 
 
 class ExternalPolicy:
@@ -191,22 +151,13 @@ class ExternalPolicy:
     `env_id` int64 `[N]` and `is_init` bool `[N, 1]`, for policies that remember: each row's
     environment, and whether its episode just began. It returns N integers (a tensor, an array or a
     list), or the TensorDict with `action`.
-
-    Args:
-        name: of the policy, for error messages.
-        act: the function.
-        task: the policy's task.
     """
 
     def __init__(self, name: str, act: Callable[[TensorDictBase], Any], task: Task) -> None:
         self.name, self._act, self._task = name, act, task
 
     def __call__(self, maps: TensorDictBase) -> TensorDictBase:
-        """Returns the maps with `action`.
-
-        Raises:
-            PolicyError: if the function fails or returns anything but actions.
-        """
+        """Returns the maps with `action`."""
         seen = maps.select(*self._task.representations, "env_id", "is_init")
         with _named(self.name):
             given = self._act(seen)
@@ -234,17 +185,12 @@ class ExternalPolicy:
 
 
 def load_policy(reference: str, task: Task) -> ExternalPolicy:
-    """Returns an external policy.
+    """Returns the policy that a reference names.
 
-    Args:
-        reference: `path.py:make` or `package.module:make`, a function that is called with the task
-            and returns the policy's function; or `path.pt2`, a program saved by `torch.export.save`
-            that takes the maps as arguments, in the task's order (that of flowrep's export in the
-            order of its agent.json), and returns a score per action.
-        task: the policy's task.
-
-    Raises:
-        PolicyError: if the file, module or function doesn't exist or fails.
+    It is `path.py:make` or `package.module:make`, a function that is called with the task and
+    returns the policy's function; or `path.pt2`, a program saved by `torch.export.save` that takes
+    the maps as arguments, in the task's order (that of flowrep's export in the order of its
+    agent.json), and returns a score per action.
     """
     with _named(reference):
         if reference.endswith(".pt2"):
@@ -302,15 +248,7 @@ def _named(name: str) -> Iterator[None]:
 def check_card(reference: str, task: Task) -> None:
     """Checks that an exported agent gets maps like those that it was trained on.
 
-    A policy that isn't `agent.pt2` or `load_agent.py` with an `agent.json` beside it passes.
-
-    Args:
-        reference: of the policy, see `load_policy`.
-        task: the policy's task.
-
-    Raises:
-        PolicyError: the maps differ in what they are, in size, field of view, options or classes;
-            the message has the overrides that give the right ones. Or agent.json is damaged.
+    What has no agent.json beside it passes. The error has the overrides that give the right maps.
     """
     with _named(reference):
         card = _card(reference)

@@ -18,15 +18,11 @@ from flowrep.envs.workers import available_cores
 from flowrep.experiment.evaluation_pool import EvaluationPool, can_travel
 from flowrep.simulator.camera import choose_renderer
 
-ENVS_PER_PROCESS = 24  # of an evaluation
+ENVS_PER_PROCESS = 24  # of an evaluation: a step of few costs as much as one of many
 
 
 def device(name: str) -> torch.device:
-    """Returns the named device; "auto" is a CUDA device if there is one, else the CPU.
-
-    Raises:
-        UsageError: torch does not know the device, or this machine lacks it.
-    """
+    """Returns the named device; "auto" is a CUDA device if there is one, else the CPU."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -37,13 +33,9 @@ def device(name: str) -> torch.device:
 
 
 def env(config: EnvConfig, **changes: Any) -> EnvBase:
-    """Returns the env that the config describes.
+    """Returns the env that the config describes, with changes of `make_env`'s arguments.
 
     Observations include `is_init`, which marks the beginning of an episode for the replay memory.
-
-    Args:
-        config: of the run.
-        changes: arguments of `make_env` that take precedence.
     """
     arguments: dict[str, Any] = {
         "scene": config.scene,
@@ -65,33 +57,25 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
 
 
 def worker_count(num_workers: int | str, num_envs: int) -> int:
-    """Returns the number of worker processes; for "auto" one per core, if there are several.
-
-    In a process of a pool, such as that of `hydra/launcher=joblib`, "auto" is 0, since other jobs
-    use the other cores.
-    """
+    """Returns the number of worker processes; for "auto" one per core, if there are several."""
     if isinstance(num_workers, int):
         return num_workers
     cores = available_cores()
+    # in a process of a pool, such as that of hydra/launcher=joblib, others use the other cores
     is_in_pool = multiprocessing.current_process().name != "MainProcess"
     return 0 if is_in_pool or min(cores, num_envs) < 2 else min(cores, num_envs)
 
 
 def _workers_help(config: EnvConfig) -> bool:
-    """Returns whether training is faster if other processes step the environments.
-
-    A learner on a CPU of two cores needs both, and the rasteriser makes steps cheap.
-    """
+    """Returns whether training is faster if other processes step the environments."""
+    # A learner on a CPU of two cores needs both, and the rasteriser makes steps cheap.
     if available_cores() > 2 or device(config.device).type != "cpu":
         return True
     return config.flow.source != "exact" or choose_renderer(config.renderer) == "pybullet"
 
 
 def evaluation_pool(config: EnvConfig, policy: Any, num_envs: int) -> EvaluationPool | None:
-    """Returns processes that evaluate a policy; None if this one alone does, with its workers.
-
-    A process needs some environments to be worth it: a step of few costs as much as one of many.
-    """
+    """Returns processes that evaluate a policy; None if this one alone does, with its workers."""
     if device(config.device).type != "cpu" or not can_travel(policy):
         return None
     count = min(worker_count(config.num_workers, config.num_envs), num_envs // ENVS_PER_PROCESS)
@@ -120,11 +104,7 @@ def _arguments(config: TrainConfig, env: EnvBase) -> tuple[tuple[Any, ...], dict
 
 
 def algorithm_class(section: AnyAlgorithm) -> Any:
-    """Returns the class that a config names, after checking that it is one of an algorithm.
-
-    Raises:
-        UsageError: it can't be imported, is no `Algorithm`, or has other options.
-    """
+    """Returns the class that a config names, after checking that it is one of an algorithm."""
     target = section.target
     try:
         found = resolve_name(target)

@@ -48,28 +48,17 @@ _DRAWS = 1  # separates a policy's draws from other draws of an episode's seed
 
 @dataclass(frozen=True)
 class Episode:
-    """One finished episode.
+    """One finished episode."""
 
-    Args:
-        seed: identifies it, see `StreetEnv.reset`.
-        path: the name of its path.
-        speed: the pedestrians' speed, as asked for; "" for the env's own.
-        fps: frames per second.
-        outcome: its name, one of `OUTCOMES`.
-        hit: the category that was hit, or "".
-        total_reward: undiscounted.
-        length: number of steps T.
-        positions: of the vehicle, x and y in metres, float32 `[T + 1, 2]`.
-    """
-
-    seed: int
+    seed: int  # identifies it, see `StreetEnv.reset`
     path: str
-    speed: Any
+    speed: Any  # the pedestrians', as asked for; "" for the env's own
     fps: float
-    outcome: str
-    hit: str
-    total_reward: float
-    length: int
+    outcome: str  # one of `OUTCOMES`
+    hit: str  # the category that was hit, or ""
+    total_reward: float  # undiscounted
+    length: int  # the number of steps T
+    # of the vehicle, x and y in metres, `[T + 1, 2]`
     positions: NDArray[np.float32] = field(repr=False, compare=False)
 
     def row(self) -> Row:
@@ -118,8 +107,7 @@ def evaluate(
         env: made by `make_env`; without workers for a baseline.
         policy: writes `action` `[N]`, and has `get_dist` if it isn't greedy; or a baseline's name.
         episodes: options of `StreetEnv.reset`, `episode_seed` among them.
-        greedy: whether the policy's likeliest action is taken. If not, it is drawn from the
-            episode's own generator, so that an episode repeats whatever else is in the batch.
+        greedy: whether the likeliest action is taken, or one is drawn.
         on_frame: called with the env's TensorDict after each reset and each step.
     """
     if isinstance(policy, str):
@@ -204,6 +192,7 @@ def _act(
             actions[busy] = policy(seen)["action"].to(device)
     else:
         shares = policy.get_dist(seen).probs.double().cumsum(-1).cpu().numpy()
+        # from the episode's own generator, so that it repeats whatever else is in the batch
         drawn = np.array([running[i].rng.random() for i in busy])[:, None]
         # the least action whose cumulated share exceeds the draw; the last share is 1 but for
         # rounding
@@ -246,20 +235,13 @@ class Comparison:
     """The same episodes for an agent and baselines: which to run, and the results so far.
 
     Episode k of each policy, speed and frame rate has the seed `seed + k`.
-
-    Args:
-        speeds: pedestrians' speed modes.
-        fps: frame rates in Hz.
-        episodes: their number for each policy, speed and frame rate.
-        seed: the seed of the first episode.
-        policies: "greedy", "sampled" or both; or the name of a policy with only one way to act.
-        baselines: names in `flowrep.baselines.BASELINES`.
     """
 
     speeds: Sequence[str]
     fps: Sequence[float]
-    episodes: int
+    episodes: int  # for each policy, speed and frame rate
     seed: int
+    # "greedy", "sampled" or both; or the name of a policy with only one way to act
     policies: Sequence[str] = ("greedy",)
     baselines: Sequence[str] = ()
 
@@ -291,15 +273,9 @@ class Comparison:
     ) -> None:
         """Runs the episodes; finished ones are kept even if it is interrupted.
 
-        A second run, of another agent in the same scene, keeps the baselines' episodes.
-
-        Args:
-            make_env: called with changes of `make_env`'s arguments for each frame rate.
-            policy: the agent's.
-            num_envs: the number of environments side by side, at most.
-            stop: checked after each episode.
-            save: called when all episodes of a policy at one speed and frame rate have been run.
-            pool: an `EvaluationPool`, whose processes run the episodes; this one does if None.
+        A second run, of another agent in the same scene, keeps the baselines' episodes. `save` is
+        called when all of a policy at one speed and frame rate have been run. The processes of
+        `pool`, an `EvaluationPool`, drive if there is one.
         """
         for (_, _, name), episodes in self._found.items():
             if name in self.policies:
@@ -359,11 +335,9 @@ class Comparison:
         return {"policy": driver, "episodes": missing, "greedy": name != "sampled"}
 
     def results(self) -> list[tuple[str, Episode]]:
-        """Returns each episode with its policy's name, by speed, frame rate, policy and seed.
-
-        Of an incomplete group, only the episodes before the first gap are returned: short episodes
-        finish first, so taking all that are done would bias the result.
-        """
+        """Returns each episode with its policy's name, by speed, frame rate, policy and seed."""
+        # Of an incomplete group, only those before the first gap: short episodes finish first, so
+        # taking all that are done would bias the result.
         return [
             (name, found[seed])
             for (_, _, name), found in self._found.items()
@@ -399,9 +373,6 @@ def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     Shares are of the failures, as in the paper's Table III, and empty where nothing failed.
     Evaluations after different numbers of training frames are kept apart.
-
-    Args:
-        rows: rows of evaluation.csv.
     """
     groups: dict[tuple[str, ...], list[str | None]] = defaultdict(list)
     for row in rows:
@@ -427,12 +398,7 @@ def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def print_results(rows: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
-    """Prints the share of each outcome, and the causes of failure, by policy and speed.
-
-    Args:
-        rows: rows of evaluation.csv.
-        console: where to.
-    """
+    """Prints the share of each outcome, and the causes of failure, by policy and speed."""
     by_policy: dict[tuple[Any, ...], list[str]] = defaultdict(list)
     for row in rows:
         by_policy[row["speed"], f"{float(row['fps']):g}", row["policy"]].append(row["outcome"])

@@ -28,9 +28,6 @@ class EvaluationPool:
 
     An episode is the same wherever it is driven. Ctrl-C does not reach the processes, and they end
     with the caller.
-
-    Args:
-        num_processes: their number.
     """
 
     def __init__(self, num_processes: int) -> None:
@@ -53,9 +50,6 @@ class EvaluationPool:
             num_envs: the number of environments side by side, in all processes together.
             jobs: for each name, arguments of `flowrep.experiment.evaluation.evaluate`.
             stop: ends what is under way.
-
-        Raises:
-            WorkerError: a process has died.
         """
         each = -(-num_envs // self.num_processes)
         # Sent as they are, tensors would be moved to shared memory, the caller's weights included.

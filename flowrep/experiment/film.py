@@ -26,10 +26,6 @@ def make_filmed(make_env: Callable[..., EnvBase], representations: Mapping[str, 
     """Returns an env of one street for `film_episode`: it keeps every sensor, rgb included.
 
     Unless the agent or an estimator sees it too, rgb is as large as the tiles of a film.
-
-    Args:
-        make_env: takes changes of `make_env`'s arguments.
-        representations: the policy's inputs, a mapping from name to options.
     """
     seen = {**representations, "rgb": {}}
     make = partial(make_env, representations=seen, keep_sensor=True, num_envs=1, num_workers=0)
@@ -54,11 +50,7 @@ def film_episode(
 ) -> tuple[list[Maps], Episode]:
     """Returns the maps of every frame of one greedy episode, and the episode.
 
-    Args:
-        env: see `make_filmed`.
-        policy: see `evaluate`.
-        options: of `StreetEnv.reset`; `episode_seed` identifies the episode.
-        on_frame: called with the sensors of each frame.
+    `env` is of `make_filmed`, `options` are of `StreetEnv.reset`, and `on_frame` gets the sensors.
     """
     intrinsics = torch.as_tensor(street_envs(env)[0].K)
     frames: list[Maps] = []
@@ -98,14 +90,7 @@ def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> M
 
 
 def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: Any) -> Episode:
-    """Writes the video of one greedy episode to `path` and returns the episode.
-
-    Args:
-        agent: what drives.
-        path: the mp4 file.
-        episode_seed: identifies the episode, as in evaluation.csv.
-        changes: arguments of `make_env`, in place of the agent's.
-    """
+    """Writes the video of one greedy episode; `changes` are of the arguments of `make_env`."""
     env = make_filmed(partial(agent.make_env, **changes), agent.config.representations)
     frames, episode = film_episode(env, agent.policy, {"episode_seed": episode_seed})
     env.close()
@@ -122,17 +107,10 @@ def draw_learning_curve(
     speed: str,
     fps: float,
 ) -> None:
-    """Draws a run's success over frames.
+    """Draws a run's success over frames, from the rows of metrics.csv and evaluation.csv.
 
     The line is the success rate over the last training episodes (sampled actions); the points are
     the run's own greedy evaluations at its speed and frame rate, with 95 % Wilson intervals.
-
-    Args:
-        path: the png file.
-        metrics: rows of metrics.csv.
-        episodes: rows of evaluation.csv.
-        speed: the pedestrians' speed in training.
-        fps: the frame rate in training.
     """
     from matplotlib.figure import Figure  # a tenth of the time that a command takes to start
 

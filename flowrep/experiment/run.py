@@ -90,26 +90,15 @@ def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _without_defaults(algorithm: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns an algorithm's options without those at the schema's default.
-
-    Only options that earlier runs did not have yet have a default there.
-    """
+    """Returns an algorithm's options without those at the schema's default."""
+    # only options that earlier runs did not have yet have a default there
     section = ALGORITHMS.get(algorithm["_target_"])
     fields = section.model_fields if section else {}
     return {k: v for k, v in algorithm.items() if k not in fields or fields[k].default != v}
 
 
 def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Checks that a checkpoint belongs to a run.
-
-    Args:
-        saved: the origin stored in the checkpoint.
-        expected: the origin of the config in its folder.
-        path: the checkpoint, for the message.
-
-    Raises:
-        CheckpointError: if it belongs to another; names the first difference.
-    """
+    """Checks that a checkpoint belongs to a run; the error names the first difference."""
     if saved.get("flowrep") != expected["flowrep"]:
         raise CheckpointError(
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
@@ -195,7 +184,6 @@ class RunFolder:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Creates the folder if it is missing."""
         self.path = Path(path)
         self.path.mkdir(parents=True, exist_ok=True)
         self.config_path = self.path / "config.yaml"
@@ -209,11 +197,7 @@ class RunFolder:
 
     @classmethod
     def existing(cls, path: str | Path) -> "RunFolder":
-        """Opens the folder of an existing run.
-
-        Raises:
-            RunFolderError: there is no run at `path`.
-        """
+        """Opens the folder of an existing run."""
         if not (Path(path) / "config.yaml").is_file():
             raise RunFolderError(
                 f"'{path}' holds no run: it has no config.yaml. Give the folder that a training "
@@ -223,21 +207,13 @@ class RunFolder:
 
     @classmethod
     def all_in(cls, path: str | Path) -> list["RunFolder"]:
-        """Opens a run's folder, or all run folders in a sweep's folder.
-
-        Raises:
-            RunFolderError: there is no run at `path` or directly below it.
-        """
+        """Opens a run's folder, or all run folders in a sweep's folder."""
         runs = sorted(config.parent for config in Path(path).glob("*/config.yaml"))
         is_sweep = runs and not (Path(path) / "config.yaml").is_file()
         return [cls(run) for run in runs] if is_sweep else [cls.existing(path)]
 
     def check_is_new(self) -> None:
-        """Checks that a run can begin here.
-
-        Raises:
-            RunFolderError: the folder holds a run, or remains of one.
-        """
+        """Checks that a run can begin here."""
         files = (self.config_path, self.metrics_path, self.evaluation_path, self.checkpoint_path)
         found = [file for file in files if file.exists()]
         if found:
@@ -250,15 +226,7 @@ class RunFolder:
 
     @contextmanager
     def held(self, doing: str, patience_s: float = 0.0) -> Iterator[None]:
-        """Locks the folder against other processes, until the process ends in whatever way.
-
-        Args:
-            doing: the activity, for the error that other processes get, e.g. "training".
-            patience_s: how long to wait for a process that still saves.
-
-        Raises:
-            FolderInUseError: another process holds the folder; gives its id, host and start time.
-        """
+        """Locks the folder against other processes, until the process ends in whatever way."""
         with (self.path / ".lock").open("a+", encoding="utf-8") as file:
             until = time.monotonic() + patience_s
             while not _locked(file):
@@ -291,11 +259,7 @@ class RunFolder:
         _write_text(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:
-        """Returns the resolved config as plain data, see `flowrep.config.schema.validated_run`.
-
-        Raises:
-            RunFolderError: the file is damaged.
-        """
+        """Returns the resolved config as plain data, see `flowrep.config.schema.validated_run`."""
         problem: object = "it holds no config"
         try:
             config = yaml.safe_load(self.config_path.read_text(encoding="utf-8"))
@@ -327,13 +291,6 @@ class RunFolder:
         """Sends everything logged from now on to Weights & Biases too, unless `mode` is "off".
 
         A resumed run continues its own wandb run, whose id is kept in the folder.
-
-        Args:
-            mode: "offline" keeps the files in `wandb/` for `wandb sync`, "online" sends them.
-            config: shown beside the run.
-
-        Raises:
-            ImportError: wandb is not installed.
         """
         if mode == "off":
             return
@@ -367,11 +324,7 @@ class RunFolder:
     def start_again(self, first_save: int) -> None:
         """Drops all rows of a run that was killed before its first checkpoint, to start it again.
 
-        Args:
-            first_save: the frames after which the first checkpoint is written, at the latest.
-
-        Raises:
-            RunFolderError: it had a checkpoint, as its results show; nothing is dropped then.
+        Rows of more frames than `first_save`, when the first one is due, show that there was one.
         """
         episodes = self.read_episodes()
         rows = [*self.read_metrics(), *episodes]
@@ -402,10 +355,7 @@ class RunFolder:
     ) -> None:
         """Saves evaluated episodes and logs their means to TensorBoard and wandb.
 
-        Args:
-            rows: of evaluation.csv.
-            positions: where the vehicle was in each episode, `[T + 1, 2]`; not kept if empty.
-            table: see `save_episodes`.
+        `positions` are where the vehicle was in each, `[T + 1, 2]`; not kept if empty.
         """
         # first, as a final evaluation whose rows are in the table is not run again
         if positions:
@@ -415,15 +365,11 @@ class RunFolder:
             self._plot(frames, scalars)
 
     def save_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
-        """Adds evaluated episodes to evaluation.csv.
+        """Adds evaluated episodes to evaluation.csv, or to a table that replaces it.
 
         An episode that the table already has, with the same policy, frames, speed and frame rate,
-        is replaced in place, so that evaluating it again leaves the table unchanged.
-
-        Args:
-            rows: the episodes.
-            table: the rows to add them to, those of the file if None. With the rows from before an
-                evaluation, episodes can be saved as they end and still stand in order.
+        is replaced in place, so that evaluating it again leaves the table unchanged. With the rows
+        from before an evaluation, episodes can be saved as they end and still stand in order.
         """
         before = self.read_episodes() if table is None else table
         new = [{name: str(row[name]) for name in EVALUATION_COLUMNS} for row in rows]

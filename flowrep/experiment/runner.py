@@ -40,18 +40,6 @@ class Runner:
     """Holds the env, the agent, the folder and the clock of a run; `train` is its loop.
 
     `state` and `load` are its checkpoint: all that the rest of the run depends on.
-
-    Args:
-        config: of the run.
-        folder: the folder that it writes to.
-
-    Attributes:
-        frames: environment frames so far.
-        observation: what the policy acts on next; None before the first reset.
-        evaluation_pending: whether the last evaluation was interrupted and has to be run again.
-        metrics: means over the updates since the last row of metrics.csv.
-        recent: the latest episodes that ended.
-        clock: the wall time by activity.
     """
 
     def __init__(self, config: TrainConfig, folder: RunFolder) -> None:
@@ -63,24 +51,21 @@ class Runner:
         self.env.set_seed(config.seed * config.num_envs)
         self.agent = build.agent(config, self.env)
         self.agent.threads = threads
-        self.frames = 0
-        self.observation: TensorDictBase | None = None
-        self.evaluation_pending = False
+        self.frames = 0  # of the environment, so far
+        self.observation: TensorDictBase | None = None  # what is acted on next
+        self.evaluation_pending = False  # the last one was interrupted and has to be run again
         self.metrics, self.recent = Means(), RecentEpisodes()
         self._pool: EvaluationPool | None = None
 
     def train(self, stop: StopRequest) -> None:
-        """Trains until `total_frames` or until a stop is requested, and saves the last state.
-
-        The updates that the previous frames allow are taken between choosing an action and waiting
-        for its step. Environments that have processes and cores of their own step meanwhile, which
-        TorchRL's sequential `Trainer` does not support. The order of operations, and so the result,
-        is the same where they do not.
-        """
+        """Trains until `total_frames` or until a stop is requested, and saves the last state."""
         total = self.config.total_frames
         log = Every(self.config.log_every_frames, self.frames)
         evaluate = Every(self.config.evaluation.every_frames, self.frames)
         save = Every(self.config.checkpoint_every_frames, self.frames)
+        # Updates are taken between choosing an action and waiting for its step. Environments with
+        # processes and cores of their own step meanwhile, which TorchRL's sequential `Trainer` does
+        # not support. The order of operations, and so the result, is the same where they don't.
         is_on_gpu = self.agent.device.type == "cuda"
         steps_meanwhile = is_on_gpu or has_spare_cores(self.env, torch.get_num_threads())
         if self.observation is None:
@@ -114,11 +99,7 @@ class Runner:
         self.save()
 
     def act(self) -> TensorDictBase:
-        """Returns the current observation with the policy's actions.
-
-        Raises:
-            DivergenceError: the policy's outputs are nan or infinite.
-        """
+        """Returns the current observation with the policy's actions."""
         assert self.observation is not None
         try:
             with torch.no_grad():
@@ -144,16 +125,7 @@ class Runner:
                 self.metrics.add(self.agent.update(batch))
 
     def log(self, rate: float | None) -> dict[str, float]:
-        """Adds a row to metrics.csv and returns it; missing values are nan.
-
-        docs/metrics.md explains the columns.
-
-        Args:
-            rate: frames per second.
-
-        Raises:
-            DivergenceError: see `check`.
-        """
+        """Adds a row to metrics.csv, see docs/metrics.md, and returns it; missing is nan."""
         self.check()
         means = self.metrics.take()
         row = self.recent.summary()
@@ -170,10 +142,8 @@ class Runner:
     def evaluate(self, kind: str, stop: StopRequest) -> bool:
         """Adds episodes to evaluation.csv; returns whether all were run before a stop.
 
-        Args:
-            kind: "training": greedy ones at the training speed; "final": at each speed and frame
-                rate, beside the baselines.
-            stop: checked after each episode.
+        The kind is "training", greedy ones at the training speed, or "final", at each speed and
+        frame rate, beside the baselines.
         """
         config, asked, fps = self.config, self.config.evaluation, self.env.base_env.frame_rate_hz
         if kind == "final":
@@ -207,14 +177,11 @@ class Runner:
         return True
 
     def film(self) -> None:
-        """Writes causes of failure and learning curve, and films an episode unless it is there.
-
-        The processes of environments and evaluation end first, as filming takes memory as well.
-        """
+        """Writes causes of failure and learning curve, and films an episode unless it is there."""
         # drawing takes seconds to import
         from flowrep.experiment.film import draw_learning_curve, record_episode
 
-        self.close()
+        self.close()  # its processes take memory, and so does filming
         metrics, episodes = self.folder.read_metrics(), self.folder.read_episodes()
         self.folder.write_failures()
         fps = self.env.base_env.frame_rate_hz
@@ -234,11 +201,7 @@ class Runner:
             self.env.close()
 
     def check(self) -> None:
-        """Checks that losses and metrics are finite.
-
-        Raises:
-            DivergenceError: one is not; names the last good checkpoint.
-        """
+        """Checks that losses and metrics are finite; the error names the last good checkpoint."""
         try:
             self.agent.divergence.check()
         except DivergenceError as error:
@@ -250,26 +213,15 @@ class Runner:
         return DivergenceError(f"{what}; {good}")
 
     def save(self) -> None:
-        """Writes the checkpoint; the previous one stays intact until the new one is complete.
-
-        Raises:
-            DivergenceError: see `check`; nothing is written.
-        """
+        """Writes the checkpoint; the previous one stays intact until the new one is complete."""
         self.check()
         with self.clock("checkpoint"):
             save_checkpoint(self.folder.checkpoint_path, self.state())
 
     def load(self) -> None:
-        """Continues from the checkpoint and drops what was logged after it.
-
-        Without one, a run that was killed before the first begins again.
-
-        Raises:
-            CheckpointError: it can't be read, or belongs to another run.
-            RunFolderError: it is gone.
-        """
+        """Continues from the checkpoint and drops what was logged after it."""
         path, config = self.folder.checkpoint_path, self.config
-        if not path.exists():
+        if not path.exists():  # killed before the first, or the file is gone
             due = min(config.checkpoint_every_frames, config.total_frames)
             self.folder.start_again(first_save=due + config.num_envs - 1)
             return
@@ -315,14 +267,11 @@ class Runner:
 
 
 def share_cores(config: TrainConfig) -> AbstractContextManager[None]:
-    """Returns the context of the updates, which may use as many threads as PyTorch would.
-
-    Everything else is small and gets one thread, except estimated flow.
-    """
+    """Returns the context of the updates, which may use as many threads as PyTorch would."""
     if build.device(config.device).type != "cpu":
         return nullcontext()
     most = min(torch.get_num_threads(), available_cores())
-    if config.flow.source == "exact":
+    if config.flow.source == "exact":  # all but updates and estimated flow is small
         torch.set_num_threads(1)
     return FasterThreads(most)
 
@@ -348,7 +297,6 @@ class RecentEpisodes:
     """Outcomes, returns and lengths of the latest finished episodes of all environments."""
 
     def __init__(self) -> None:
-        """Starts without episodes."""
         self._running: Tensor | None = None  # [2, num_envs]: return and length so far
         self._ended: deque[tuple[int, float, int]] = deque(maxlen=RECENT_EPISODES)
 
@@ -391,7 +339,6 @@ class Means:
     """Means of the updates' metrics since the last row, without waiting for a device."""
 
     def __init__(self) -> None:
-        """Starts without updates."""
         self._sums: dict[str, Tensor] = {}
         self._count = 0
 
