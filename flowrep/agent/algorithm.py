@@ -309,10 +309,7 @@ class DivergenceWatch:
     """
 
     def __init__(
-        self,
-        watched: Sequence[str],
-        others: Sequence[str] = (),
-        device: torch.device | str = "cpu",
+        self, watched: Sequence[str], others: Sequence[str] = (), device: torch.device | str = "cpu"
     ) -> None:
         self.watched, self.names = tuple(watched), (*watched, *others)
         self._values = torch.zeros(len(self.names), device=device)

@@ -24,14 +24,9 @@ from flowrep.agent.off_policy import OffPolicy, td_target, transition_keys
 
 ENCODERS = ("shared", "separate")
 METRICS = {
-    "q_loss": "loss_qvalue",
-    "actor_loss": "loss_actor",
-    "alpha_loss": "loss_alpha",
-    "alpha": "alpha",
-    "entropy": "entropy",
-    "q_mean": "q_mean",
-    "td_error": "td_error",
-}
+    "q_loss": "loss_qvalue", "actor_loss": "loss_actor", "alpha_loss": "loss_alpha",
+    "alpha": "alpha", "entropy": "entropy", "q_mean": "q_mean", "td_error": "td_error",
+}  # fmt: skip
 
 
 class DiscreteSACMapLoss(DiscreteSACLoss):
@@ -39,20 +34,16 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
 
     TorchRL's loss evaluates Q1 and Q2 one after the other (or by vmap), and twice at `s`: for L_Q
     with gradients, for L_π without. Here both share one hidden layer of twice the width and are
-    evaluated once. TorchRL keeps the networks, the targets and α. The sum of the losses that it
-    returns is to be minimised. Its target parameters are those of the Q-functions and their
-    encoder.
+    evaluated once. TorchRL keeps the networks, the targets and α. Its target parameters are those
+    of the Q-functions and their encoder.
 
     Args:
-        actor: the policy's network.
-        actions: the policy's action space.
         encoder: with `"shared"`, policy and Q-functions read one set of encoders, trained by L_Q
             alone, and in y both read its target, so that each observation is encoded once. With
             `"separate"`, each has its own, and π(·|s') in y reads the policy's.
         initial_alpha: α before the first update.
         target_entropy_weight: target entropy as a share of the largest, log n.
         entropy_in_target: with False, y lacks the bonus α H(π(·|s')): Q values reward alone.
-        gamma: discount per frame.
     """
 
     critic_encoder: Encoder

@@ -17,15 +17,10 @@ from flowrep.agent.observation import decode_maps
 from flowrep.agent.off_policy import td_target, transition_keys
 
 METRICS = {
-    "q_loss": "loss_qvalue",
-    "value_loss": "loss_value",
-    "actor_loss": "loss_actor",
-    "alpha_loss": "loss_alpha",
-    "alpha": "alpha",
-    "entropy": "entropy",
-    "q_mean": "q_mean",
+    "q_loss": "loss_qvalue", "value_loss": "loss_value", "actor_loss": "loss_actor",
+    "alpha_loss": "loss_alpha", "alpha": "alpha", "entropy": "entropy", "q_mean": "q_mean",
     "value_mean": "value_mean",
-}
+}  # fmt: skip
 
 
 class DiscreteSACValueLoss(LossModule):
@@ -62,9 +57,8 @@ class DiscreteSACValueLoss(LossModule):
             q1, q2 = (actor.another(actions.count) for _ in range(2))
             value = actor.another(1)
             log_alpha = torch.nn.Parameter(torch.tensor(math.log(initial_alpha)))
-        self.convert_to_functional(actor, "actor")
-        self.convert_to_functional(q1, "q1")
-        self.convert_to_functional(q2, "q2")
+        for name, network in {"actor": actor, "q1": q1, "q2": q2}.items():
+            self.convert_to_functional(network, name)
         self.convert_to_functional(value, "value", create_target_params=True)
         self.log_alpha = log_alpha
         self.codecs, self.actions, self.gamma = actor.codecs, actions, gamma

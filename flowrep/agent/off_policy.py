@@ -24,11 +24,8 @@ class PersistentExploration:
 
     With probability ε an environment begins to repeat an action that is drawn uniformly, for n
     steps, P(n) ∝ n⁻², at most 24 (two seconds of driving). Single random actions cancel each other;
-    repeated ones take a turn that the policy avoids. ε falls linearly to 0.
-
-    Args:
-        epsilon: ε at the first frame.
-        total_frames: frames of all `num_envs` environments over which ε falls.
+    repeated ones take a turn that the policy avoids. ε falls linearly from `epsilon` to 0 over the
+    `total_frames` of all environments.
     """
 
     LONGEST = 24
@@ -45,11 +42,9 @@ class PersistentExploration:
         self._length_weights = torch.arange(1.0, self.LONGEST + 1, device=device) ** -2
         # the longest stands for all that would be longer
         self._length_weights[-1] = math.pi**2 / 6 - self._length_weights[:-1].sum()
-        number = torch.zeros(num_envs, dtype=torch.long, device=device)
+        sizes = {"steps_left": num_envs, "repeated_action": num_envs, "frames_acted": ()}
         self.state = {
-            "steps_left": number,
-            "repeated_action": number.clone(),
-            "frames_acted": torch.zeros((), dtype=torch.long, device=device),
+            name: torch.zeros(size, dtype=torch.long, device=device) for name, size in sizes.items()
         }
 
     def __call__(self, acted: TensorDictBase) -> TensorDictBase:
@@ -79,13 +74,7 @@ def transition_keys(codecs: Sequence[MapCodec]) -> list[NestedKey]:
 
 
 def td_target(batch: TensorDictBase, next_value: Tensor, gamma: float) -> Tensor:
-    """Returns r + γⁿ (1 - terminated) V(s') `[N]` of transitions of n steps.
-
-    Args:
-        batch: of `ReplayMemory.sample`; its reward is the discounted sum over the n steps.
-        next_value: V(s') `[N, 1]`.
-        gamma: discount per step.
-    """
+    """Returns r + γⁿ (1 - terminated) V(s') `[N]` of sampled transitions, given V(s') `[N, 1]`."""
     outcome = batch["next"]
     # masked instead of multiplied: the value after an end may even be nan
     next_value = next_value.masked_fill(outcome["terminated"], 0.0)
@@ -97,26 +86,22 @@ class OffPolicy(Algorithm):
     """Takes one update every `frames_per_update` frames, on a uniform sample of recent frames.
 
     Args:
-        observation_spec: the environment's; the last three dims of each map are C, H, W.
+        observation_spec: the last three dims of each map are C, H, W.
         action_spec: `Categorical` or `OneHot`.
         keys: the observation maps to read, in order.
-        total_frames: environment frames over the whole training, after which the learning rate
-            is 0.
+        total_frames: environment frames over the training, at whose end the learning rate is 0.
         device: where networks, replay and updates live.
         precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
         learning_rate, tau, rate_factors: see `Algorithm`.
         gamma: discount per frame.
         hidden_size: width of the single hidden layer after the embeddings.
-        batch_size: transitions per update.
-        replay_capacity: transitions kept.
         frames_per_update: environment frames per gradient step.
         learning_starts: frames before the first update; None for one batch.
         n_steps: frames that a transition spans: r becomes the discounted sum of its rewards, and γ
             becomes γ to that power.
         layer_norm: normalise each map's embedding, see `Encoder`.
-        mirror: replace half of each batch by its left-right images, with `mirror_image`.
-        mirror_image: the transform of sampled batches that does so, such as
-            `flowrep.transforms.Mirror`.
+        mirror: replace half of each batch by its left-right images, with `mirror_image`, a
+            transform of sampled batches such as `flowrep.transforms.Mirror`.
         persistent_exploration: ε of `PersistentExploration` at the start.
         policy_options: further arguments of `make_policy`.
         loss_options: arguments of `LOSS` besides `gamma`.
