@@ -193,8 +193,9 @@ def grain() -> NDArray[np.float32]:
     """Returns a periodic random pattern of mean 0 and deviation 1, and its coarser levels.
 
     Level l, of `GRAIN_SIZE / 2^l` texels a side, is the pattern behind a Gaussian of half its own
-    texel, which no more aliases at that size: [texels of all levels, 2]. Beside each texel stands
-    the next level's value at the same place, so that one look-up blends the two.
+    texel, which no more aliases at that size: `[2 * GRAIN_SIZE, GRAIN_SIZE, 2]`, see
+    `_below_each_other`. Beside each texel stands the next level's value at the same place, so that
+    one look-up blends the two.
     """
     frequency = np.fft.fftfreq(GRAIN_SIZE)  # cycles a texel
     radius = np.hypot(frequency[:, None], frequency)
@@ -211,19 +212,19 @@ def grain() -> NDArray[np.float32]:
             np.fft.ifft2(spectrum[kept] * np.exp(-2 * (np.pi * sigma * radius[kept]) ** 2)).real
             for sigma in (texel / 2, texel)
         ]
-        levels.append(np.stack(pair, axis=-1).reshape(-1, 2) / texel**2)
+        levels.append(np.stack(pair, axis=-1) / texel**2)
         size //= 2
-    return np.concatenate(levels).astype(np.float32)
+    return _below_each_other(levels)
 
 
 @cache
 def front_levels() -> NDArray[np.float32]:
-    """Returns the house fronts, each with its coarser levels: [texels of all, 3], grain included.
+    """Returns the house fronts with grain, each with its coarser levels.
 
-    Level l has `FRONT_SIZE / 2^l` texels a side.
+    Level l has `FRONT_SIZE / 2^l` texels a side: `[fronts, 2 * FRONT_SIZE, FRONT_SIZE, 3]`.
     """
-    image, levels = texture().astype(np.float32), []
-    pattern = grain()[: GRAIN_SIZE**2, 0].reshape(GRAIN_SIZE, GRAIN_SIZE)
+    image, fronts = texture().astype(np.float32), []
+    pattern = grain()[:GRAIN_SIZE, :, 0]
     height, width = _FRONT_PX
     rows = ((np.arange(FRONT_SIZE) + 0.5) * height / FRONT_SIZE).astype(int)
     for number in range(NUM_FRONTS):
@@ -231,11 +232,18 @@ def front_levels() -> NDArray[np.float32]:
         level = image[_SWATCH_PX + row * height + rows, column * width : (column + 1) * width]
         # Every fourth texel of the grain, so that its waves are as long as on the ground.
         own = pattern[row * 16 :: 4, column * 16 :: 4][:FRONT_SIZE, :FRONT_SIZE, None]
-        level = level * (1.0 + _CONTRAST[CATEGORY_ID["building"]] * own)
-        while True:
-            levels.append(level.reshape(-1, 3))
-            half = len(level) // 2
-            if not half:
-                break
-            level = level.reshape(half, 2, half, 2, 3).mean(axis=(1, 3))
-    return np.concatenate(levels).astype(np.float32)
+        levels = [level * (1.0 + _CONTRAST[CATEGORY_ID["building"]] * own)]
+        while half := len(levels[-1]) // 2:
+            levels.append(levels[-1].reshape(half, 2, half, 2, 3).mean(axis=(1, 3)))
+        fronts.append(_below_each_other(levels))
+    return np.stack(fronts)
+
+
+def _below_each_other(levels: list[NDArray[np.float64]]) -> NDArray[np.float32]:
+    """Returns square levels of halved sizes in one array; one of n texels begins 2 (size - n)."""
+    size = len(levels[0])
+    together = np.zeros((2 * size, *levels[0].shape[1:]), dtype=np.float32)
+    for level in levels:
+        top = 2 * (size - len(level))
+        together[top : top + len(level), : len(level)] = level
+    return together

@@ -34,11 +34,7 @@ _LEAST_AREA_PX = 0.01  # twice the area below which PyBullet's renderer omits tr
 _SKY = CLASS_COLOURS["sky"]
 _GRAIN_LEVELS = GRAIN_SIZE.bit_length() - 1
 _FRONT_LEVELS = FRONT_SIZE.bit_length()
-# Where levels of halved sizes begin, one after another, and how large their texels are.
-_GRAIN_STARTS = np.cumsum([0, *((GRAIN_SIZE >> i) ** 2 for i in range(_GRAIN_LEVELS))])
-_FRONT_STARTS = np.cumsum([0, *((FRONT_SIZE >> i) ** 2 for i in range(_FRONT_LEVELS))])
-_SCALES = 0.5 ** np.arange(_GRAIN_LEVELS)
-_NO_TABLES = np.empty((0, 2), np.float32), np.empty((0, 3), np.float32)
+_NO_TABLES = np.empty((0, 0, 2), np.float32), np.empty((0, 0, 0, 3), np.float32)
 
 
 # numpy's error model saves a branch at each division: a tenth of the time of large scenes
@@ -270,111 +266,148 @@ def _look_up(inverse, number, classes, instances, depth, semantic, instance):
 def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
     """Colours the visible triangles: paint times grain times light, filtered to a pixel's size.
 
-    No array is handed to a function within the loop: numba would count its references at every
-    pixel, which takes a third of the time.
+    A row consists of runs of pixels of one triangle. `_find_texels` goes through a run first, so
+    that the compiler can use vector instructions, which the look-ups after it rule out.
     """
     poses, normals, colours, contrast, grain_axes, front_of, front_axes, grain, fronts = look
     height, width = number.shape
-    m, g, f = np.empty((3, 4)), np.empty((2, 4)), np.empty((2, 4))
+    moving = len(world_from_body)
+    cam_from_body = np.empty((moving + 1, 3, 4))  # the last, for pose -1, is the world's
+    for k in range(-1, moving):
+        _compose(cam_from_world, world_from_body, k, cam_from_body[k])
+    lx, ly, lz = _turned(cam_from_body, -1, LIGHT[0], LIGHT[1], LIGHT[2])
+    axes = np.empty((2, 4))
+    texels = np.empty((3, width), dtype=np.float32)
+    us, vs, levels = texels[0], texels[1], texels[2]
     last, front = -1, -1
-    nx = ny = per_d = shade = rough = red = green = blue = 0.0
+    nx = ny = nz = 0.0
+    shade = np.float32(0.0)
     du, dv = 1.0 / K[0, 0], 1.0 / K[1, 1]
     for y in range(height):
         b = (y - K[1, 2]) * dv
-        for x in range(width):
-            t = number[y, x]
+        end = 0
+        while end < width:
+            begin, t = end, number[y, end]
+            while end < width and number[y, end] == t:
+                end += 1
             if t < 0:
-                rgb[0, y, x], rgb[1, y, x], rgb[2, y, x] = _SKY
+                for x in range(begin, end):
+                    rgb[0, y, x], rgb[1, y, x], rgb[2, y, x] = _SKY
                 continue
-            a = (x - K[0, 2]) * du
-            w = inverse[y, x]
             if t != last:
-                last = t
-                _compose(cam_from_world, world_from_body, poses[t], m)
-                nx, ny, nz = _turned(m, normals[t, 0], normals[t, 1], normals[t, 2])
-                # The plane n · p = d has inverse depth w = n · r / d on the ray r.
-                per_d = w / (nx * a + ny * b + nz)
-                lx, ly, lz = _turned(cam_from_world, LIGHT[0], LIGHT[1], LIGHT[2])
-                shade = AMBIENT + DIFFUSE * max(0.0, nx * lx + ny * ly + nz * lz)
-                red, green, blue = colours[t, 0], colours[t, 1], colours[t, 2]
-                rough, front = contrast[t], front_of[t]
-                _seen_from_cam(grain_axes, t, m, g)
-                if front >= 0:
-                    _seen_from_cam(front_axes, t, m, f)
-            z = 1.0 / w
-            tilt_u, tilt_v = nx * per_d * z * du, ny * per_d * z * dv
-            if front >= 0:
-                u, v, level = _texel(f, a, b, z, tilt_u, tilt_v, du, dv)
-                n = int(min(max(level + 0.5, 0.0), _FRONT_LEVELS - 1.0))
-                half = 0.5 / _SCALES[n]  # of a texel: here the centre of texel 0 is at 0.5
-                start = front * _FRONT_STARTS[-1] + _FRONT_STARTS[n]
-                p, q, r, s, right, down = _around(
-                    u - half, v - half, FRONT_SIZE >> n, _SCALES[n], start
-                )
-                light = shade
-                red = _mixed(fronts[p, 0], fronts[q, 0], fronts[r, 0], fronts[s, 0], right, down)
-                green = _mixed(fronts[p, 1], fronts[q, 1], fronts[r, 1], fronts[s, 1], right, down)
-                blue = _mixed(fronts[p, 2], fronts[q, 2], fronts[r, 2], fronts[s, 2], right, down)
+                last, k, front = t, poses[t], front_of[t]
+                nx, ny, nz = _turned(cam_from_body, k, normals[t, 0], normals[t, 1], normals[t, 2])
+                shade = np.float32(AMBIENT + DIFFUSE * max(0.0, nx * lx + ny * ly + nz * lz))
+                if front < 0:
+                    _seen_from_cam(grain_axes, t, cam_from_body, k, axes)
+                else:
+                    _seen_from_cam(front_axes, t, cam_from_body, k, axes)
+            a = (begin - K[0, 2]) * du
+            # The plane n · p = d has inverse depth w = n · r / d on the ray r.
+            w = inverse[y, begin]
+            per_d = w / (nx * a + ny * b + nz)
+            wu, wv = nx * per_d * du, ny * per_d * dv
+            _find_texels(end - begin, axes, a, b, du, dv, w, wu, wv, front >= 0, us, vs, levels)
+            if front < 0:
+                rough = contrast[t]
+                for x in range(begin, end):
+                    i = x - begin
+                    p, q, r, s, right, down, rest = _around(
+                        us[i], vs[i], levels[i], np.uint32(GRAIN_SIZE), np.float32(0.0)
+                    )
+                    fine = _mixed(
+                        grain[r, p, 0], grain[r, q, 0], grain[s, p, 0], grain[s, q, 0], right, down
+                    )
+                    coarse = _mixed(
+                        grain[r, p, 1], grain[r, q, 1], grain[s, p, 1], grain[s, q, 1], right, down
+                    )
+                    light = shade * (np.float32(1.0) + rough * (fine + rest * (coarse - fine)))
+                    for c in range(3):
+                        rgb[c, y, x] = _byte(colours[t, c] * light)
             else:
-                u, v, level = _texel(g, a, b, z, tilt_u, tilt_v, du, dv)
-                level = min(max(level, 0.0), _GRAIN_LEVELS - 1.001)
-                n = int(level)
-                p, q, r, s, right, down = _around(
-                    u, v, GRAIN_SIZE >> n, _SCALES[n], _GRAIN_STARTS[n]
-                )
-                fine = _mixed(grain[p, 0], grain[q, 0], grain[r, 0], grain[s, 0], right, down)
-                coarse = _mixed(grain[p, 1], grain[q, 1], grain[r, 1], grain[s, 1], right, down)
-                light = shade * (1.0 + rough * (fine + (level - n) * (coarse - fine)))
-            rgb[0, y, x] = np.uint8(min(255.0, max(0.0, red * light)))
-            rgb[1, y, x] = np.uint8(min(255.0, max(0.0, green * light)))
-            rgb[2, y, x] = np.uint8(min(255.0, max(0.0, blue * light)))
+                for x in range(begin, end):
+                    i = x - begin
+                    p, q, r, s, right, down, _ = _around(
+                        us[i], vs[i], levels[i], np.uint32(FRONT_SIZE), np.float32(0.5)
+                    )
+                    for c in range(3):
+                        paint = _mixed(
+                            fronts[front, r, p, c], fronts[front, r, q, c],
+                            fronts[front, s, p, c], fronts[front, s, q, c], right, down,
+                        )  # fmt: skip
+                        rgb[c, y, x] = _byte(paint * shade)
 
 
-@_shading
-def _turned(m, x, y, z):
+@_inlined
+def _turned(m, k, x, y, z):
     return (
-        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
-        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
-        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+        m[k, 0, 0] * x + m[k, 0, 1] * y + m[k, 0, 2] * z,
+        m[k, 1, 0] * x + m[k, 1, 1] * y + m[k, 1, 2] * z,
+        m[k, 2, 0] * x + m[k, 2, 1] * y + m[k, 2, 2] * z,
     )
 
 
-@_shading
-def _seen_from_cam(axes, n, cam_from_body, into):
+@_inlined
+def _seen_from_cam(axes, t, cam_from_body, k, into):
     # axes · (R, t)⁻¹, for a rotation R
     for i in range(2):
-        into[i, 3] = axes[n, i, 3]
+        x, y, z = _turned(cam_from_body, k, axes[t, i, 0], axes[t, i, 1], axes[t, i, 2])
+        into[i, 0], into[i, 1], into[i, 2], into[i, 3] = x, y, z, axes[t, i, 3]
         for j in range(3):
-            into[i, j] = 0.0
-            for k in range(3):
-                into[i, j] += axes[n, i, k] * cam_from_body[j, k]
-            into[i, 3] -= into[i, j] * cam_from_body[j, 3]
+            into[i, 3] -= into[i, j] * cam_from_body[k, j, 3]
+
+
+@_shading
+def _find_texels(count, axes, a, b, du, dv, w, wu, wv, is_front, us, vs, levels):
+    """Writes the texels on a run of rays, and the level whose texels have a pixel's size.
+
+    The first ray is (a, b, 1), the first inverse depth w; du, dv, wu and wv are what a pixel to the
+    right or further down adds. Levels of house fronts are to be rounded, those of the grain, which
+    blends two, are not.
+    """
+    # float32 throughout, 16 to a vector. With more than three arrays to write, LLVM would have to
+    # check more pairs for overlaps than it is willing to, and leave the loop as it is.
+    s0 = np.float32(axes[0, 0] * a + axes[0, 1] * b + axes[0, 2])
+    t0 = np.float32(axes[1, 0] * a + axes[1, 1] * b + axes[1, 2])
+    s_u, t_u = np.float32(axes[0, 0] * du), np.float32(axes[1, 0] * du)
+    s_v, t_v = np.float32(axes[0, 1] * dv), np.float32(axes[1, 1] * dv)
+    u0, v0 = np.float32(axes[0, 3]), np.float32(axes[1, 3])
+    w, wu, wv = np.float32(w), np.float32(wu), np.float32(wv)
+    extra = np.float32(0.5 if is_front else 0.0) - np.float32(63.5)
+    most = np.float32(_FRONT_LEVELS - 1.0 if is_front else _GRAIN_LEVELS - 1.001)
+    for i in range(count):
+        step = np.float32(np.int32(i))
+        z = np.float32(1.0) / (w + step * wu)
+        s, t = s0 + step * s_u, t0 + step * t_u
+        # d(z r)/du = z (e_x / fx - r w_u / w), and so for v.
+        su, tu = s_u - s * z * wu, t_u - t * z * wu
+        sv, tv = s_v - s * z * wv, t_v - t * z * wv
+        square = np.float32(z * z * max(su * su + tu * tu, sv * sv + tv * tv))
+        # Half of log2 of the square: a float's bits are its log2, linear between powers of two.
+        level = np.float32(square.view(np.int32)) * np.float32(0.5 / (1 << 23)) + extra
+        us[i], vs[i], levels[i] = z * s + u0, z * t + v0, min(max(level, np.float32(0.0)), most)
 
 
 @_inlined
-def _texel(axes, a, b, z, tilt_u, tilt_v, du, dv):
-    """Returns the texel on the ray r = (a, b, 1) and the level whose texels have a pixel's size."""
-    s = axes[0, 0] * a + axes[0, 1] * b + axes[0, 2]
-    t = axes[1, 0] * a + axes[1, 1] * b + axes[1, 2]
-    # d(z r)/du = z (e_x / fx - r · n_x / (fx n · r)), and so for v.
-    su, tu = axes[0, 0] * du - s * tilt_u, axes[1, 0] * du - t * tilt_u
-    sv, tv = axes[0, 1] * dv - s * tilt_v, axes[1, 1] * dv - t * tilt_v
-    square = np.float32(z * z * max(su * su + tu * tu, sv * sv + tv * tv))
-    # Half of log2 of the square; the bits of a float are its log2, linear between powers of two.
-    level = square.view(np.int32) * (0.5 / (1 << 23)) - 63.5
-    return z * s + axes[0, 3], z * t + axes[1, 3], level
+def _around(u, v, level, size, half):
+    """Returns columns and rows of the four texels around a place, and where it is between them.
+
+    The last value is what rounding `level` down leaves. The centre of texel 0 is at `half`.
+    """
+    n = np.uint32(level)
+    own, one = size >> n, np.uint32(1)  # numba checks unsigned indices for no sign
+    scale = np.float32(own) / np.float32(size)
+    u, v = u * scale - half, v * scale - half
+    i, j = np.floor(u), np.floor(v)
+    left, up = np.uint32(np.int32(i)) & (own - one), np.uint32(np.int32(j)) & (own - one)
+    first = np.uint32(2) * (size - own)  # levels lie below each other
+    right, down = (left + one) & (own - one), first + ((up + one) & (own - one))
+    return left, right, first + up, down, u - i, v - j, level - np.float32(n)
 
 
 @_inlined
-def _around(u, v, size, scale, start):
-    """Returns the indices of the four texels around a place, and where it is between them."""
-    u, v = u * scale, v * scale
-    i, j = math.floor(u), math.floor(v)
-    last = np.uint32(size - 1)
-    left, up = np.uint32(i) & last, np.uint32(j) & last
-    right, down = (left + np.uint32(1)) & last, (up + np.uint32(1)) & last
-    up, down = np.uint32(start) + up * np.uint32(size), np.uint32(start) + down * np.uint32(size)
-    return up + left, up + right, down + left, down + right, np.float32(u - i), np.float32(v - j)
+def _byte(x):
+    return np.uint8(min(np.float32(255.0), max(np.float32(0.0), x)))
 
 
 @_inlined
