@@ -25,7 +25,7 @@ from flowrep.sequences.recording import Pose, SequenceError
 
 
 class Camera(BaseModel):
-    """A camera in `intrinsics.json`."""
+    """A camera in `intrinsics.json`, see docs/factorize.md."""
 
     model_config = ConfigDict(allow_inf_nan=False)
 
@@ -49,7 +49,7 @@ class Camera(BaseModel):
 
     @property
     def K(self) -> NDArray[np.float64]:
-        """K `[3, 3]` in flowrep's convention."""
+        """In flowrep's convention."""
         shift = 0.5 - self.first_pixel_centre
         return intrinsics(self.fx, self.fy, self.cx + shift, self.cy + shift)
 
@@ -69,13 +69,13 @@ class ColourCamera(Camera):
 
 
 class Cameras(Camera):
-    """The content of `intrinsics.json`: depth's camera, and colour's if it is another."""
+    """Depth's camera, and colour's if it is another."""
 
     colour: ColourCamera | None = None
 
 
 def read_cameras(path: Path) -> Cameras:
-    """Returns the content of a folder's `intrinsics.json`, see docs/factorize.md."""
+    """Returns the content of an `intrinsics.json`."""
     remedy = (
         'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
         '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5}'
@@ -130,10 +130,7 @@ def as_pose(
 
 
 def read_poses(path: Path, frames: int, *, layout: PoseLayout = "xyz_xyzw", **options: Any) -> Pose:
-    """Returns `world_from_cam` `[N, 4, 4]` of a file with a pose per line and frame.
-
-    A matrix has 12 or 16 numbers. For the other options see `as_pose`.
-    """
+    """Returns `world_from_cam` `[N, 4, 4]` of a file with a pose per line, for `as_pose`."""
     numbers = read_table(path, 7, 12, 16)
     if len(numbers) != frames:
         raise SequenceError(path, f"has {len(numbers)} poses for {frames} frames")
@@ -149,18 +146,12 @@ _LARGEST_FOOTPRINT_PX = 8
 
 
 class Registration:
-    """Registers depth to the colour camera's pixels.
+    """Registers depth to the pixels of colour pictures of a size (height, width).
 
     Each depth pixel becomes a square that faces the camera, as large as the pixel is at its
     distance and at least one colour pixel; if several fall on one colour pixel, the nearest is
     visible. Colour pixels that no square reaches (hidden from the depth camera, or outside its
     picture) are missing, nan.
-
-    Args:
-        K_depth: `[3, 3]` of the depth camera, pixels.
-        K_colour: `[3, 3]` of the colour camera.
-        colour_from_depth: `[4, 4]`, takes points of the former's frame into the latter's, metres.
-        size: height and width of the colour pictures.
 
     >>> K = np.array([[4.0, 0.0, 1.0], [0.0, 4.0, 0.5], [0.0, 0.0, 1.0]])
     >>> colour_from_depth = np.eye(4)

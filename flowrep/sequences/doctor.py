@@ -24,15 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flowrep.geometry import (
-    CameraAxes,
-    PoseDirection,
-    adapt_pose,
-    ego_flow,
-    invert_rigid,
-    relative_motion,
-    z_from_ray_length,
-)
+from flowrep import geometry
 from flowrep.sequences.factorization import estimated_motion
 from flowrep.sequences.files import Flow
 from flowrep.sequences.recording import Frame
@@ -83,7 +75,8 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
     """Returns the usual mistakes by what would correct them, see `Doctor` for the arguments."""
     given = {**_ASSUMED, **given}
     found: dict[str, Mistake] = {}
-    for direction, axes in product(get_args(PoseDirection), get_args(CameraAxes)):
+    kinds = get_args(geometry.PoseDirection), get_args(geometry.CameraAxes)
+    for direction, axes in product(*kinds):
         says = {}
         if direction != given["pose_direction"]:
             says[f"pose_direction={direction}"] = f"the poses are {direction.replace('_', '-')}"
@@ -95,7 +88,7 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
     if given["depth_kind"] == "z":
         found["depth_kind=ray_length"] = Mistake(
             "depth is the length of the ray, not z",
-            lambda pair: pair._replace(depth=z_from_ray_length(pair.depth, pair.K)),
+            lambda pair: pair._replace(depth=geometry.z_from_ray_length(pair.depth, pair.K)),
         )
     elif given["depth_kind"] == "ray_length":
         found["depth_kind=z"] = Mistake("depth is z, not the length of the ray", _ray_from_z)
@@ -132,12 +125,13 @@ def _of_poses(change: Callable[[Tensor], Tensor]) -> Callable[[_Pair], _Pair]:
 def _readapted(given: Mapping[str, str], direction: str, axes: Any) -> Callable[[Tensor], Tensor]:
     """Undoes the options in force and applies others to `world_from_cam`."""
     in_force: Any = given["pose_axes"]
-    opencv_from_given = adapt_pose(torch.eye(4), axes=in_force).mT
+    opencv_from_given = geometry.adapt_pose(torch.eye(4), axes=in_force).mT
 
     def readapt(pose: Tensor) -> Tensor:
         stored = pose @ opencv_from_given
-        stored = stored if direction == given["pose_direction"] else invert_rigid(stored)
-        return adapt_pose(stored, axes=axes, check=False)
+        if direction != given["pose_direction"]:
+            stored = geometry.invert_rigid(stored)
+        return geometry.adapt_pose(stored, axes=axes, check=False)
 
     return readapt
 
@@ -149,7 +143,7 @@ def _transposed(pose: Tensor) -> Tensor:
 
 
 def _ray_from_z(pair: _Pair) -> _Pair:
-    ray = pair.depth.square() / z_from_ray_length(pair.depth, pair.K)
+    ray = pair.depth.square() / geometry.z_from_ray_length(pair.depth, pair.K)
     return pair._replace(depth=torch.where(pair.depth.isinf(), pair.depth, ray))  # sky stays there
 
 
@@ -158,18 +152,17 @@ def _scaled(factor: float, pair: _Pair) -> _Pair:
 
 
 def _times(*factors: float) -> Callable[[_Pair], _Pair]:
-    """Makes depths `[factors, 1, H, W]`."""
     return lambda pair: pair._replace(depth=torch.tensor(factors)[:, None, None, None] * pair.depth)
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The doctor's findings.
+    """The doctor's findings; numbers of pixels are medians of a pair, their mean over the pairs.
 
     Attributes:
         pairs: the number of pairs of frames that moved enough to be examined.
-        raw_px: median length of raw flow, the mean over the pairs.
-        residual_px: median of |raw - ego|, the mean over the pairs.
+        raw_px: of the length of raw flow.
+        residual_px: of |raw - ego|.
         estimated_px: the same with the motion that flow and depth give; nan if they give none.
         depth_factors: the least and the most that depth can be multiplied by without explaining the
             flow much worse than the best factor does; far apart, they leave the unit unknown.
@@ -204,13 +197,7 @@ class Doctor:
 
     @torch.no_grad()
     def look(self, previous: Frame, current: Frame, raw: Flow) -> bool:
-        """Examines a pair of frames; returns whether it moves enough to be of use.
-
-        Args:
-            previous: the frame before, assumed to be in flowrep's conventions.
-            current: the frame itself.
-            raw: its flow since then, assumed p_t - p_t' on its own grid; nan where unknown.
-        """
+        """Examines a pair of frames and its raw flow; returns whether it moves enough."""
         pair = _sampled(previous, current, raw)
         if not float(_median_px(pair.raw, pair)) >= _LEAST_RAW_PX:  # or nan
             return False
@@ -221,7 +208,7 @@ class Doctor:
 
     @torch.no_grad()
     def diagnosis(self) -> Diagnosis:
-        """Returns the diagnosis from all pairs so far."""
+        """Returns the diagnosis of all pairs so far."""
         if not self._pairs:
             return Diagnosis(0)
         rivals = mistakes(self.conventions, flow_is_recorded=self.flow_is_recorded)
@@ -282,10 +269,8 @@ def diagnose(
         raw: `[2, H, W]`, pixels per step, assumed p_t - p_t' on the current grid; nan unknown.
         depth: `[1, H, W]`, of the current frame, assumed z in metres.
         K: `[3, 3]`, pixels.
-        world_from_prev: `[4, 4]`, assumed camera-to-world with OpenCV's axes.
-        world_from_curr: `[4, 4]`, the same for the current frame.
-        static: `[1, H, W]` bool, pixels known to be static; without it most of the picture has
-            to be.
+        world_from_prev, world_from_curr: `[4, 4]`, assumed with OpenCV's axes.
+        static: `[1, H, W]`, pixels known to be static; without it most of the picture has to be.
 
     >>> K = torch.tensor([[20.0, 0.0, 5.0], [0.0, 20.0, 4.0], [0.0, 0.0, 1.0]])
     >>> before, now = torch.eye(4), torch.eye(4)
@@ -306,7 +291,7 @@ def diagnose(
 
 def _residual_px(pair: _Pair) -> Tensor:
     """Returns the median of |raw - ego|, `[*B]` for depths `[*B, 1, H, W]`."""
-    ego, valid = ego_flow(pair.depth, pair.K, relative_motion(*pair.poses))
+    ego, valid = geometry.ego_flow(pair.depth, pair.K, geometry.relative_motion(*pair.poses))
     # A convention does not explain the points that it puts behind the camera.
     return _median_px(torch.where(valid, pair.raw - ego, torch.inf), pair).clamp(max=1e6)
 
@@ -325,11 +310,8 @@ def _mean(values: Iterable[Tensor]) -> float:
 
 
 def _sampled(previous: Frame, current: Frame, flow: Flow) -> _Pair:
-    """Returns a pair with its maps and K on a coarser grid.
-
-    Pixel j of the coarser grid is pixel s j + o of the finer one. The centre of the latter,
-    s j + o + 0.5, maps to j + 0.5: u' = (u - o - 0.5) / s + 0.5. Flow is in coarse pixels.
-    """
+    # Pixel j of the coarser grid is pixel s j + o of the finer one. The centre of the latter,
+    # s j + o + 0.5, maps to j + 0.5: u' = (u - o - 0.5) / s + 0.5. Flow is in coarse pixels.
     height, width = current.size
     step = max(1, int((height * width / _SAMPLED_PIXELS) ** 0.5))
     offset = step // 2
@@ -345,18 +327,15 @@ def _sampled(previous: Frame, current: Frame, flow: Flow) -> _Pair:
 
 
 def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
-    """Returns the camera's axes by which the recorded motions become the estimated ones.
-
-    That is Kabsch's rotation between rotation vectors and translations, each in units of its
-    spread. It isn't determined if the camera always moves along and turns about one line.
-    """
-    vectors = np.array(
-        [
-            [_vectors(relative_motion(*pair.poses, dtype=torch.float64)), _vectors(pair.estimated)]
-            for pair in pairs
-            if pair.estimated is not None
-        ]
-    )
+    """Returns the camera's axes by which the recorded motions become the estimated ones."""
+    # Kabsch's rotation between rotation vectors and translations, each in units of its spread. It
+    # isn't determined if the camera always moves along and turns about one line.
+    known = [
+        (geometry.relative_motion(*pair.poses, dtype=torch.float64), pair.estimated)
+        for pair in pairs
+        if pair.estimated is not None
+    ]
+    vectors = np.array([list(map(_vectors, motions)) for motions in known])
     spread = np.sqrt(np.square(vectors).sum(-1).mean(0)) if len(vectors) > 1 else np.zeros(1)
     if not spread.all():
         return {}
@@ -367,8 +346,8 @@ def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
     given_from_opencv = torch.eye(4, dtype=torch.float64)
     handed = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
     given_from_opencv[:3, :3] = torch.from_numpy(left @ handed @ right)
-    for name in get_args(CameraAxes):
-        off = adapt_pose(torch.eye(4), axes=name)[:3, :3].mT @ given_from_opencv[:3, :3]
+    for name in get_args(geometry.CameraAxes):
+        off = geometry.adapt_pose(torch.eye(4), axes=name)[:3, :3].mT @ given_from_opencv[:3, :3]
         if off.trace() > 1 + 2 * math.cos(math.radians(_SAME_AXES_DEG)):
             return {}  # one of the usual ones
     columns = given_from_opencv[:3, :3].round(decimals=1).tolist()
@@ -377,7 +356,6 @@ def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
 
 
 def _vectors(motion: Tensor) -> NDArray[np.float64]:
-    """Returns rotation vector and translation, `[2, 3]`."""
     matrix = motion.numpy()
     return np.stack([cv2.Rodrigues(matrix[:3, :3])[0].ravel(), matrix[:3, 3]])
 
@@ -401,11 +379,8 @@ def _suspects(found: Diagnosis) -> tuple[str, ...]:
 
 
 def _words(found: Diagnosis, rivals: Mapping[str, Mistake], conventions: Mapping[str, str]) -> str:
-    """Returns a diagnosis in a sentence or two."""
-    medians = (
-        f"|raw - ego| is {found.residual_px:.2f} px, raw flow {found.raw_px:.2f} px "
-        f"(medians of {found.pairs} pairs)"
-    )
+    sizes = f"|raw - ego| is {found.residual_px:.2f} px, raw flow {found.raw_px:.2f} px"
+    medians = f"{sizes} (medians of {found.pairs} pairs)"
     if found.suspects:
         told = "; or ".join(
             f"{found.rivals_px[name]:.2f} px if {rivals[name].says}{_remedy(name, conventions)}"
@@ -425,7 +400,6 @@ def _words(found: Diagnosis, rivals: Mapping[str, Mistake], conventions: Mapping
 
 
 def _remedy(name: str, conventions: Mapping[str, str]) -> str:
-    """Returns the options that correct a mistake, as they are typed."""
     if "=" not in name:
         return ""
     typed = " ".join(f"format.{option}" for option in name.split())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -26,12 +26,9 @@ _CONSISTENT_SHARE, _CONSISTENT_PX2 = 0.01, 0.5
 
 @dataclass(frozen=True)
 class Motion:
-    """The camera's motion between two frames.
+    """The camera's motion `prev_from_curr` `[4, 4]` between two frames, the identity if not known.
 
     Attributes:
-        prev_from_curr: `[4, 4]` float64, takes a point in the current camera's frame into the
-            previous camera's.
-        known: whether it is; the identity otherwise.
         inlier_share: the share of the pixels that move as the estimate says; nan of a recorded one.
     """
 
@@ -47,15 +44,12 @@ class FactorizedFrame:
     Convention: p_t - p_t' on the frame's own grid, pixels, (u right, v down).
 
     Attributes:
-        frame: the current frame, t.
-        previous: the frame before, t'.
         raw: `[2, H, W]`, nan where unknown.
         ego: `[2, H, W]`, 0 where `ego_valid` is false.
         obj: `[2, H, W]`, raw - ego where both are known and trusted, 0 elsewhere.
         valid: `[H, W]`, where raw and ego are known and trusted.
         ego_valid: `[H, W]`, where ego is, whatever raw is: depth is known, and the point was in
             front of the previous camera.
-        motion: the camera's motion that ego flow was computed from.
     """
 
     frame: Frame
@@ -77,14 +71,13 @@ def recorded_flow(previous: Frame, current: Frame) -> Flow:
     if current.raw is None:
         raise SequenceError(current.source, "has no flow of its own: use flow=estimated")
     if current.raw_since != previous.name:
-        raise SequenceError(
-            current.source,
-            f"has flow since frame {current.raw_since}, and here follows {previous.name}: use "
-            "flow=estimated, or stride=1 and a recording without gaps",
-        )
+        cause = f"has flow since frame {current.raw_since}, and here follows {previous.name}"
+        remedy = "use flow=estimated, or stride=1 and a recording without gaps"
+        raise SequenceError(current.source, f"{cause}: {remedy}")
     return current.raw
 
 
+@dataclass
 class EstimatedFlowSource:
     """Flow estimated from the current picture back to the previous one, negated.
 
@@ -94,15 +87,13 @@ class EstimatedFlowSource:
             does not return to its place: at occlusions and at errors.
     """
 
-    def __init__(self, estimator: Estimator, *, check_consistency: bool = True) -> None:
-        self.estimator, self.check_consistency = estimator, check_consistency
+    estimator: Estimator
+    _: KW_ONLY
+    check_consistency: bool = True
 
     @torch.no_grad()
     def __call__(self, previous: Frame, current: Frame) -> Flow:
-        """Returns raw flow, nan where unknown.
-
-        If the picture repeats the previous one although the camera moved, all flow is unknown.
-        """
+        """Returns raw flow; all unknown where the picture is repeated although the camera moved."""
         if previous.rgb is None or current.rgb is None:
             cause = "has no picture to estimate flow from: use flow=exact"
             raise SequenceError(current.source, cause)
@@ -121,9 +112,7 @@ class EstimatedFlowSource:
 def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
     """Returns where a pixel that goes back and then forth returns to its place, `[H, W]`.
 
-    Args:
-        back: `[2, H, W]`, from a first picture to a second one, on the first's grid.
-        forth: `[2, H, W]`, from the second to the first, on the second's grid.
+    Each flow `[2, H, W]` is on the grid of the picture that it starts from.
     """
     height, width = back.shape[1:]
     row, column = np.indices((height, width), dtype=np.float32)
@@ -137,10 +126,8 @@ def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
 
 
 def repeats(previous: Frame, current: Frame) -> bool:
-    """Returns whether a frame only repeats the previous picture, though the camera may have moved.
-
-    Kinects do so when they miss a picture; 7-Scenes has many such frames.
-    """
+    """Returns whether a frame only repeats the previous picture although the camera moved."""
+    # Kinects do so when they miss a picture; 7-Scenes has many such frames.
     if previous.rgb is None or current.rgb is None or current.raw is not None:
         return False
     before, now = previous.world_from_cam, current.world_from_cam
@@ -149,11 +136,7 @@ def repeats(previous: Frame, current: Frame) -> bool:
 
 
 def pairs(frames: Iterable[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
-    """Yields each frame after the one that its flow is measured from, None if a clip starts.
-
-    After a repeated picture, that is the frame in which the picture first appeared: its pose is
-    the picture's own.
-    """
+    """Yields each frame after the one that its flow is measured from, None if a clip starts."""
     previous: Frame | None = None
     for current in frames:
         if previous is not None and previous.clip != current.clip:
@@ -163,6 +146,7 @@ def pairs(frames: Iterable[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
             cause = f"is {own_width} x {own_height}, the frame before {width} x {height}"
             raise SequenceError(current.source, cause)
         yield previous, current
+        # A repeated picture's own pose is that of the frame in which it first appeared.
         if previous is None or not repeats(previous, current):
             previous = current
 
@@ -199,9 +183,6 @@ def factorize_frames(
         frames: a `Recording` or any other frames in order.
         flow_source: `recorded_flow` or an `EstimatedFlowSource`.
         motion_source: `recorded_motion` or `estimated_motion`.
-
-    Raises:
-        SequenceError: a frame can't be read or lacks what a source needs.
     """
     for previous, current in pairs(frames):
         if previous is None:
@@ -225,13 +206,5 @@ def factorize_pair(
     )
     is_known = ego_valid[0].numpy() & motion.known
     valid = is_known & measured
-    return FactorizedFrame(
-        frame=current,
-        previous=previous,
-        raw=raw,
-        ego=ego.numpy(),
-        obj=np.where(valid, obj.numpy(), np.float32(0)),
-        valid=valid,
-        ego_valid=is_known,
-        motion=motion,
-    )
+    own = np.where(valid, obj.numpy(), np.float32(0))
+    return FactorizedFrame(current, previous, raw, ego.numpy(), own, valid, is_known, motion)

@@ -29,11 +29,8 @@ Flow = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
 
 def list_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Path]:
     """Returns a folder's files with one of the suffixes, sorted by number, then by name."""
-    found = [
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in suffixes and path.name.startswith(prefix)
-    ]
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes]
+    found = [path for path in found if path.name.startswith(prefix)]
     if not found:
         raise SequenceError(folder, f"holds no {prefix}*{' or '.join(suffixes)} file")
     found.sort(key=_natural)
@@ -44,8 +41,8 @@ def list_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[
 
 
 def _natural(path: Path) -> tuple[list[int | str], str]:
-    """Returns the key by which frame_9 comes before frame_10."""
-    pieces = re.split(r"([0-9]+)", path.stem)  # texts and numbers take turns, so all are comparable
+    # frame_9 comes before frame_10; texts and numbers take turns, so all are comparable
+    pieces = re.split(r"([0-9]+)", path.stem)
     return [int(piece) if piece.isdecimal() else piece for piece in pieces], path.name
 
 
@@ -56,12 +53,8 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_table(path: Path, *columns: int, header: bool = False) -> NDArray[np.float64]:
-    """Returns the numbers of a text file, separated by blanks or commas, `[N, columns]`.
-
-    Args:
-        columns: the permitted numbers of columns.
-        header: whether the first line has names.
-    """
+    """Returns the numbers of a text file, with one of the permitted numbers of `columns`."""
+    # Separated by blanks or commas.
     lines = [line.replace(",", " ") for line in read_lines(path)[int(header) :]]
     if not lines:
         raise SequenceError(path, "holds no numbers")
@@ -86,10 +79,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
 
 
 def read_png(path: Path, dtype: type, channels: int = 1) -> NDArray[Any]:
-    """Returns a picture of a given type, `[H, W]`, or `[H, W, channels]` with red first.
-
-    Depth and disparity have one channel of 16 bits, flow three of them, masks one of 8.
-    """
+    """Returns a picture of a given type, `[H, W]`, or `[H, W, channels]` with red first."""
     picture = _decode(path)
     found = 1 if picture.ndim == 2 else picture.shape[2]
     if picture.dtype != dtype or found != channels:
@@ -145,12 +135,9 @@ def depth_from_integers(
 def read_depth(
     path: Path, size: tuple[int, int], unit_m: float | None = None
 ) -> NDArray[np.float32]:
-    """Returns a depth map in metres: 16 bits (0 and 65535 missing) or floats, times a unit.
+    """Returns the depth of a .png (0 and 65535 are missing) or .npy, of the given size, in metres.
 
-    Args:
-        path: a .png, or a .npy of floats, in which nan is missing and inf no surface.
-        size: height and width of its camera's pictures, from intrinsics.json.
-        unit_m: the length of a stored 1; None is a millimetre in a .png and a metre in a .npy.
+    A stored 1 is `unit_m` long; None is a millimetre in a .png and a metre in a .npy.
     """
     if path.suffix.lower() == ".npy":
         depth = read_npy(path)
@@ -189,7 +176,8 @@ def read_tagged_floats(path: Path, channels: int) -> NDArray[np.float32]:
 def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
     """Writes flow `[2, H, W]`; invalid pixels get the format's mark for unknown."""
     _, height, width = flow.shape
-    marked = np.where(_known(flow, valid), flow, np.float32(_FLO_UNKNOWN)).transpose(1, 2, 0)
+    known = np.isfinite(flow).all(0) & (valid is None or valid)
+    marked = np.where(known, flow, np.float32(_FLO_UNKNOWN)).transpose(1, 2, 0)
     header = struct.pack("<fii", FLO_TAG, width, height)
     path.write_bytes(header + marked.astype("<f4").tobytes())
 
@@ -204,7 +192,7 @@ def read_kitti_flow(path: Path) -> Flow:
 
 def write_kitti_flow(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
     """Writes flow `[2, H, W]` in steps of 1/64 px; beyond 512 px it is marked as unknown."""
-    known = _known(flow, valid)
+    known = np.isfinite(flow).all(0) & (valid is None or valid)
     steps = np.rint(np.where(known, flow, 0.0) * 64) + 2**15
     known &= ((steps >= 0) & (steps < 2**16)).all(0)
     coded = np.where(known, steps, 0).astype(np.uint16)
@@ -216,8 +204,3 @@ def write_picture(path: Path, image: NDArray[Any]) -> None:
     # Not imwrite, which says nothing of a full disk.
     data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
     path.write_bytes(data.tobytes())
-
-
-def _known(flow: Flow, valid: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    known: NDArray[np.bool_] = np.isfinite(flow[0]) & np.isfinite(flow[1])
-    return known if valid is None else known & valid

@@ -10,46 +10,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from flowrep.geometry import (
-    CameraAxes,
-    Channels,
-    DepthKind,
-    Direction,
-    Grid,
-    PoseDirection,
-    PoseLayout,
-    adapt_depth,
-    adapt_flow,
-)
+from flowrep import geometry
+from flowrep.sequences import files
 from flowrep.sequences.calibration import Registration, as_pose, read_cameras, read_poses
-from flowrep.sequences.files import (
-    DEPTH_FILES,
-    PICTURES,
-    list_files,
-    read_depth,
-    read_flo,
-    read_kitti_flow,
-    read_rgb,
-    read_table,
-)
 from flowrep.sequences.recording import Frame, Recording, SequenceError
-
-FLOW_FILES = (".flo", ".png")
 
 
 class Frames(Recording):
     """A folder with `depth/`, `intrinsics.json`, `rgb/`, `flow/` or both, and `poses.txt`.
 
-    Files of one frame share their name up to the suffix; `poses.txt` has a line for each, in the
-    order of their numbers. Without it the camera's motion has to be estimated. `timestamps.txt` is
-    optional. docs/factorize.md shows every file.
+    Files of one frame share their name up to the suffix; docs/factorize.md shows all. Without
+    `poses.txt` the camera's motion has to be estimated.
 
     Args:
-        pose_layout, pose_direction, pose_axes: of a line, see `flowrep.geometry.adapt_pose`; a
-            matrix has 12 or 16 numbers.
+        pose_layout, pose_direction, pose_axes: see `flowrep.geometry.adapt_pose`.
         depth_unit_m: the length of a stored 1, metres; None is 0.001 in a .png and 1 in a .npy.
         depth_kind, near_m, far_m: see `flowrep.geometry.adapt_depth`.
-        flow_direction, flow_grid, flow_channels: of `flow/`, see `flowrep.geometry.adapt_flow`.
+        flow_direction, flow_grid, flow_channels: see `flowrep.geometry.adapt_flow`.
     """
 
     no_flow = "it has no folder flow/: use flow=estimated"
@@ -58,16 +35,16 @@ class Frames(Recording):
         self,
         folder: str | Path,
         *,
-        pose_layout: PoseLayout = "matrix",
-        pose_direction: PoseDirection = "camera_to_world",
-        pose_axes: CameraAxes = "opencv",
+        pose_layout: geometry.PoseLayout = "matrix",
+        pose_direction: geometry.PoseDirection = "camera_to_world",
+        pose_axes: geometry.CameraAxes = "opencv",
         depth_unit_m: float | None = None,
-        depth_kind: DepthKind = "z",
+        depth_kind: geometry.DepthKind = "z",
         near_m: float | None = None,
         far_m: float | None = None,
-        flow_direction: Direction = "forward",
-        flow_grid: Grid = "current",
-        flow_channels: Channels = "uv",
+        flow_direction: geometry.Direction = "forward",
+        flow_grid: geometry.Grid = "current",
+        flow_channels: geometry.Channels = "uv",
     ) -> None:
         if depth_unit_m is not None and not depth_unit_m > 0:
             raise ValueError(f"depth_unit_m is positive, got {depth_unit_m}")
@@ -76,11 +53,11 @@ class Frames(Recording):
         self._flow_options: dict[str, Any] = {
             "direction": flow_direction, "grid": flow_grid, "channels": flow_channels,
         }  # fmt: skip
-        self._depths = list_files(self.folder / "depth", DEPTH_FILES)
+        self._depths = files.list_files(self.folder / "depth", files.DEPTH_FILES)
         self.count, names = len(self._depths), [path.stem for path in self._depths]
-        self._rgbs = self._by_stem("rgb", PICTURES, names)
+        self._rgbs = self._by_stem("rgb", files.PICTURES, names)
         # The first frame has no flow since the frame before.
-        self._flows = self._by_stem("flow", FLOW_FILES, names[1:])
+        self._flows = self._by_stem("flow", (".flo", ".png"), names[1:])
         if not self._rgbs and not self._flows:
             raise SequenceError(self.folder, "has neither rgb/ nor flow/: one of them is needed")
         self.has_flow = bool(self._flows)
@@ -89,7 +66,7 @@ class Frames(Recording):
         if self.has_poses:
             options: Any = {"layout": pose_layout, "direction": pose_direction, "axes": pose_axes}
             self._poses = read_poses(path, len(self), **options)
-        self._times = read_table(times, 1)[:, 0] if times.is_file() else None
+        self._times = files.read_table(times, 1)[:, 0] if times.is_file() else None
         if self._times is not None and len(self._times) != len(self):
             raise SequenceError(times, f"has {len(self._times)} times for {len(self)} frames")
         path = self.folder / "intrinsics.json"
@@ -109,11 +86,9 @@ class Frames(Recording):
         }
 
     def _by_stem(self, kind: str, suffixes: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
-        """Returns the files of a folder by frame, none without the folder."""
         folder = self.folder / kind
-        found = (
-            {path.stem: path for path in list_files(folder, suffixes)} if folder.is_dir() else {}
-        )
+        there = files.list_files(folder, suffixes) if folder.is_dir() else []
+        found = {path.stem: path for path in there}
         if found and (lacking := [name for name in names if name not in found]):
             raise SequenceError(folder, f"lacks a file for frame {lacking[0]}")
         if others := found.keys() - {path.stem for path in self._depths}:
@@ -124,10 +99,11 @@ class Frames(Recording):
         depth_path = self._depths[index]
         name = depth_path.stem
         world_from_cam = self._poses[index] if self.has_poses else None
-        stored = torch.from_numpy(read_depth(depth_path, self._camera.size, self.depth_unit_m))
+        stored = files.read_depth(depth_path, self._camera.size, self.depth_unit_m)
         is_ray = self._depth_options["kind"] == "ray_length"
         K = torch.from_numpy(self._camera.K).float() if is_ray else None
-        depth = adapt_depth(stored[None], K=K, **self._depth_options)[0].numpy()
+        z = geometry.adapt_depth(torch.from_numpy(stored)[None], K=K, **self._depth_options)
+        depth = z[0].numpy()
         if self._registration is not None:
             depth = self._registration(depth)
             if world_from_cam is not None:
@@ -135,15 +111,15 @@ class Frames(Recording):
         rgb, raw = self._rgbs.get(name), None
         if self.has_flow and index > 0:
             path = self._flows[name]
-            flow = read_kitti_flow(path) if path.suffix.lower() == ".png" else read_flo(path)
-            raw = adapt_flow(torch.from_numpy(flow), **self._flow_options).numpy()
+            read = files.read_kitti_flow if path.suffix.lower() == ".png" else files.read_flo
+            raw = geometry.adapt_flow(torch.from_numpy(read(path)), **self._flow_options).numpy()
         return Frame(
             name=name,
             source=depth_path if rgb is None else rgb,
             world_from_cam=world_from_cam,
             K=self.K,
             depth=depth,
-            rgb=None if rgb is None else read_rgb(rgb),
+            rgb=None if rgb is None else files.read_rgb(rgb),
             timestamp_s=None if self._times is None else float(self._times[index]),
             raw=raw,
             raw_since=None if raw is None else self._depths[index - 1].stem,
@@ -153,20 +129,19 @@ class Frames(Recording):
 class Zed(Recording):
     """A folder exported from a ZED's SVO file.
 
-    It holds `left000000.png`, `depth000000.png` (or `.npy`), and two other files. `poses.txt` has a
-    line for each picture, `tx ty tz qx qy qz qw`, the left camera's pose in the world; without it,
-    the motion has to be estimated. `intrinsics.json` describes the rectified left camera, as in
-    `Frames`.
+    It holds `left000000.png`, `depth000000.png` (or `.npy`), the rectified left camera's
+    `intrinsics.json`, as in `Frames`, and its poses in `poses.txt`, a line `tx ty tz qx qy qz qw`
+    for each picture; without it, the motion has to be estimated.
 
     Args:
         pose_axes: the coordinate system of the exported poses: `"opencv"` for the SDK's
             IMAGE, `"opengl"` for RIGHT_HANDED_Y_UP, `"x_forward_z_up"` for RIGHT_HANDED_Z_UP_X_FWD.
     """
 
-    def __init__(self, folder: str | Path, *, pose_axes: CameraAxes = "opencv") -> None:
+    def __init__(self, folder: str | Path, *, pose_axes: geometry.CameraAxes = "opencv") -> None:
         self.folder = Path(folder)
-        self._pictures = list_files(self.folder, PICTURES, "left")
-        depths = list_files(self.folder, DEPTH_FILES, "depth")
+        self._pictures = files.list_files(self.folder, files.PICTURES, "left")
+        depths = files.list_files(self.folder, files.DEPTH_FILES, "depth")
         self._depths = {path.stem.removeprefix("depth"): path for path in depths}
         self.count = len(self._pictures)
         path, self.conventions = self.folder / "poses.txt", {"pose_axes": pose_axes}
@@ -185,14 +160,12 @@ class Zed(Recording):
             source=picture,
             world_from_cam=self._poses[index] if self.has_poses else None,
             K=self._camera.K,
-            depth=measured(read_depth(self._depths[number], self._camera.size)),
-            rgb=read_rgb(picture),
+            depth=measured(files.read_depth(self._depths[number], self._camera.size)),
+            rgb=files.read_rgb(picture),
         )
 
 
 def measured(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns a ZED's depth with nan where there is none: nan, -inf (too near), inf (too far).
-
-    Too far does not mean sky: the surface is at an unknown distance beyond the range.
-    """
+    """Returns a ZED's depth with nan where there is none: nan, -inf (too near), inf (too far)."""
+    # Too far does not mean sky: the surface is at an unknown distance beyond the range.
     return np.where(np.isfinite(depth), depth, np.float32(np.nan))

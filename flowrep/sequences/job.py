@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import KW_ONLY, dataclass
 from itertools import count, islice
 from typing import Any
 
@@ -25,6 +26,7 @@ from flowrep.sequences.recording import Frame, Recording, Stream
 DOCTOR_PAIRS, DOCTOR_TRIES = 10, 3
 
 
+@dataclass
 class Job:
     """The factorisation of a recording, or of a camera's frames, into a folder.
 
@@ -32,24 +34,20 @@ class Job:
     motion see `factorize_frames`.
     """
 
-    def __init__(
-        self,
-        stream: Stream,
-        flow_source: FlowSource,
-        motion_source: MotionSource,
-        output: Output,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-    ) -> None:
-        self.stream, self.output = stream, output
-        self.flow_source, self.motion_source = flow_source, motion_source
-        self.start, self.stop, self.stride = start, stop, stride
-        self._indices = range(0)  # of the frames that are used, of a recording
-        if isinstance(stream, Recording):
-            self._indices = range(len(stream))[start:stop:stride]
+    stream: Stream
+    flow_source: FlowSource
+    motion_source: MotionSource
+    output: Output
+    _: KW_ONLY
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+
+    def __post_init__(self) -> None:
         self.clock = Stopwatch()
+        self._indices = range(0)  # of the frames that are used, of a recording
+        if isinstance(self.stream, Recording):
+            self._indices = range(len(self.stream))[self.start : self.stop : self.stride]
 
     def examine(self) -> Diagnosis | None:
         """Returns what the doctor says of pairs spread over the recording, None without poses."""
@@ -71,10 +69,7 @@ class Job:
         return doctor.diagnosis()
 
     def run(self) -> bool:
-        """Factorises all frames; returns whether it came to the end.
-
-        Ctrl-C ends it after the current frame. That is the end of a camera, which has no last one.
-        """
+        """Factorises all frames; returns whether it came to the end, and not to a Ctrl-C."""
         is_recording = isinstance(self.stream, Recording)
         total = len(self._indices) if is_recording else None
         with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
@@ -94,10 +89,9 @@ class Job:
                     break
             bar.set_description("completing the video")
             self.output.close()
-        return not interrupted or not is_recording
+        return not interrupted or not is_recording  # Ctrl-C is the end of a camera
 
     def _frames(self) -> Iterator[Frame]:
-        """Yields the frames that are used."""
         frames: Iterator[Frame] = islice(self.stream, self.start, self.stop, self.stride)
         if isinstance(self.stream, Recording):  # those in between are not read
             frames = map(self.stream.__getitem__, self._indices)

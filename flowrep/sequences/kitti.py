@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep.sequences import files
 from flowrep.sequences.calibration import as_pose, opencv_intrinsics
-from flowrep.sequences.files import (
-    list_files,
-    read_kitti_flow,
-    read_lines,
-    read_png,
-    read_rgb,
-    read_table,
-)
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 EARTH_RADIUS_M = 6378137.0
@@ -38,7 +30,7 @@ class Kitti(Recording):
             for poses, `calib_imu_to_velo/` and `calib_velo_to_cam/`.
         raw_data: the raw recordings, `<date>/<drive>/oxts/data/*.txt`; None for no poses.
         mapping: the development kit's `train_mapping.txt`, for poses; line n names the recording
-            and frame of pair n. Pairs without one are left out.
+            and frame of pair n.
     """
 
     has_flow = True
@@ -51,7 +43,7 @@ class Kitti(Recording):
         mapping: str | Path | None = None,
     ) -> None:
         self.folder, self.has_poses = Path(folder), raw_data is not None
-        names = [path.stem for path in list_files(self.folder / "image_2", (".png",))]
+        names = [path.stem for path in files.list_files(self.folder / "image_2", (".png",))]
         self._pairs = [name[:6] for name in names if re.fullmatch(r"\d{6}_10", name)]
         self.count = 2 * len(self._pairs)
         if raw_data is None:
@@ -65,26 +57,27 @@ class Kitti(Recording):
             if len(words := line.split()) != 3 or not words[2].isdecimal():
                 raise SequenceError(mapping, f"{line[:60]!r} is not a date, recording and frame")
             date, drive, frame = words
-            self._oxts[pair] = Path(raw_data) / date / drive / "oxts" / "data", int(frame)
+            self._oxts[pair] = Path(raw_data, date, drive, "oxts", "data"), int(frame)
         posed = [name for name in self._pairs if int(name) in self._oxts]
         if not posed:
             raise SequenceError(mapping, f"names no raw recording of the pictures in {folder}")
         if left_out := len(self._pairs) - len(posed):
-            self.notes = (
-                f"{left_out} of {len(self._pairs)} pairs have no raw recording, so no poses",
-            )
+            note = f"{left_out} of {len(self._pairs)} pairs have no raw recording, so no poses"
+            self.notes = (note,)
         self._pairs, self.count = posed, 2 * len(posed)
 
     def _read(self, index: int) -> Frame:
         pair, is_current = self._pairs[index // 2], bool(index % 2)
         name = f"{pair}_{'10' if is_current else '11'}"
         picture = self.folder / "image_2" / f"{name}.png"
-        rgb = read_rgb(picture)
+        rgb = files.read_rgb(picture)
         K, focal_baseline, cam_from_cam0 = self._camera(pair)
         depth = np.full(rgb.shape[:2], np.nan, dtype=np.float32)
         if is_current:
-            disparity = read_png(self.folder / "disp_occ_0" / f"{name}.png", np.uint16)
-            depth = _depth_from_disparity(disparity, focal_baseline)
+            disparity = files.read_png(self.folder / "disp_occ_0" / f"{name}.png", np.uint16)
+            # Disparity is in 1/256 px, 0 where it is missing.
+            known = np.where(disparity == 0, np.nan, disparity / 256)
+            depth = (focal_baseline / known).astype(np.float32)
         world_from_cam = None
         if self.has_poses:
             cam0_from_velo = self._rigid("calib_velo_to_cam", pair)
@@ -92,8 +85,8 @@ class Kitti(Recording):
             packets, first = self._oxts[int(pair)]
             # The map is true to scale at the latitude of the pair's first frame in time.
             before, path = (packets / f"{first + later:010d}.txt" for later in (0, not is_current))
-            latitude_deg = read_table(before, _OXTS_NUMBERS)[0, 0]
-            packet = read_table(path, _OXTS_NUMBERS)[0]
+            latitude_deg = files.read_table(before, _OXTS_NUMBERS)[0, 0]
+            packet = files.read_table(path, _OXTS_NUMBERS)[0]
             world_from_imu = _pose_from_oxts(packet, latitude_deg)
             world_from_cam = world_from_imu @ np.linalg.inv(cam_from_imu)
         # Given is p_11 - p_10. Here 11 is the frame before, so that p_t - p_t' is the opposite.
@@ -105,7 +98,7 @@ class Kitti(Recording):
             K=K,
             depth=depth,
             rgb=rgb,
-            raw=-read_kitti_flow(flow) if is_current else None,
+            raw=-files.read_kitti_flow(flow) if is_current else None,
             raw_since=f"{pair}_11" if is_current else None,
             clip=index // 2,
         )
@@ -114,7 +107,7 @@ class Kitti(Recording):
         """Returns K, baseline times fx (px m), and `cam_from_cam0` of the left colour camera."""
         path = self.folder / "calib_cam_to_cam" / f"{pair}.txt"
         left, right, rotation = _matrices(
-            path, {"P_rect_02": (3, 4), "P_rect_03": (3, 4), "R_rect_00": (3, 3)}
+            path, P_rect_02=(3, 4), P_rect_03=(3, 4), R_rect_00=(3, 3)
         )
         rectified_from_cam0 = as_pose(np.hstack([rotation, np.zeros((3, 1))]).ravel(), path)
         # P = K [I | t], so that the left colour camera sees a rectified point at x + K^-1 p.
@@ -125,27 +118,12 @@ class Kitti(Recording):
 
     def _rigid(self, kind: str, pair: str) -> Pose:
         path = self.folder / kind / f"{pair}.txt"
-        parts = _matrices(path, {"R": (3, 3), "T": (3, 1)})
-        return as_pose(np.hstack(parts).ravel(), path)
-
-
-def _depth_from_disparity(stored: NDArray[np.uint16], focal_baseline: float) -> NDArray[np.float32]:
-    """Returns depth in metres, nan where the disparity (in 1/256 px) is 0.
-
-    >>> _depth_from_disparity(np.array([[0, 2560]], np.uint16), 400.0)  # 400 / 10 px
-    array([[nan, 40.]], dtype=float32)
-    """
-    disparity = np.where(stored == 0, np.nan, stored / 256)
-    return (focal_baseline / disparity).astype(np.float32)
+        return as_pose(np.hstack(_matrices(path, R=(3, 3), T=(3, 1))).ravel(), path)
 
 
 def _pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float) -> Pose:
-    """Returns the pose of an IMU with x forward, y left, z up; the world is a Mercator map.
-
-    Args:
-        packet: latitude, longitude (degrees), altitude (m), roll, pitch, yaw (rad), and more.
-        latitude_deg: the latitude at which the map is true to scale.
-    """
+    # The pose of an IMU with x forward, y left, z up. The world is a Mercator map that is true to
+    # scale at the given latitude. Of the packet: degrees twice, metres, radians.
     latitude, longitude, altitude, *angles = packet[:6]
     scale = math.cos(math.radians(latitude_deg)) * EARTH_RADIUS_M
     pose = np.eye(4)
@@ -159,9 +137,8 @@ def _pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float) -> Pose:
     return pose
 
 
-def _matrices(path: Path, shapes: Mapping[str, tuple[int, int]]) -> list[NDArray[np.float64]]:
-    """Returns matrices of a KITTI calibration file, given their names and shapes."""
-    found = dict(line.partition(":")[::2] for line in read_lines(path))
+def _matrices(path: Path, **shapes: tuple[int, int]) -> list[NDArray[np.float64]]:
+    found = dict(line.partition(":")[::2] for line in files.read_lines(path))
     try:
         return [np.array(found[n].split(), np.float64).reshape(s) for n, s in shapes.items()]
     except (KeyError, ValueError) as error:

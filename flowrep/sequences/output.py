@@ -14,19 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep import viz
 from flowrep.extras import require
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
 from flowrep.sequences.files import Flow, write_flo, write_kitti_flow, write_picture
 from flowrep.sequences.recording import Pose, SequenceError
-from flowrep.viz import (
-    Image,
-    Video,
-    contact_sheet,
-    flow_note,
-    flow_to_rgb,
-    representation_strip,
-    strip,
-)
 
 FLOW_NAMES = ("raw", "ego", "obj")
 _MOVING_SPREAD = 3.0
@@ -38,15 +30,13 @@ class Output:
     """The folder of a job: `<path>.partial` while it runs, `<path>` once it is complete.
 
     Args:
-        path: the final folder, which may not exist yet.
-        settings: the job's settings, kept in `job.json`.
+        settings: the job's, kept in `job.json`.
         flow_files: formats of flow files, of "flo", "kitti" and "npz".
         pictures_every: the number of frames from one set of flow pictures to the next; 0 for none.
-        scale_px: the flow of full colour by name, pixels; None for 20 each.
-        depth_range_m: the depth at which the video's colours end, metres.
-        moving_px: the least object flow from which a pixel counts as moving by itself, pixels.
-        video_fps: the video's frames per second, None for no video.
-        rerun: whether a rerun recording is written.
+        scale_px: the flow of full colour by name, None for 20 each.
+        depth_range_m: the depth at which the video's colours end.
+        moving_px: the least object flow from which a pixel counts as moving by itself.
+        video_fps: None for no video.
     """
 
     def __init__(
@@ -74,7 +64,7 @@ class Output:
         self.depth_range_m, self.rows = depth_range_m, list[dict[str, Any]]()
         self.partial.mkdir(parents=True)
         self._write_json("job.json", settings)
-        self._video = Video(self.partial / "strip.mp4", fps=video_fps) if video_fps else None
+        self._video = viz.Video(self.partial / "strip.mp4", fps=video_fps) if video_fps else None
         self._rerun = RerunExport(self.partial / "scene.rrd", self.scale_px) if rerun else None
 
     def append(self, index: int, made: FactorizedFrame) -> None:
@@ -116,7 +106,6 @@ class Output:
         return medians
 
     def _write_flow(self, index: int, made: FactorizedFrame) -> None:
-        """Writes the flow files and, every so often, the pictures of one frame."""
         name = made.frame.name
         for kind in FLOW_NAMES:
             flow = shown(kind, made)
@@ -126,8 +115,8 @@ class Output:
                 write_kitti_flow(self._place(f"flow/{kind}/{name}.png"), flow)
             if self.pictures_every and index % self.pictures_every == 0:
                 label, scale_px = f"{kind} flow", self.scale_px[kind]
-                colours, notes = flow_to_rgb(flow, scale_px), {label: flow_note(scale_px)}
-                picture = strip({label: colours}, wheel_for=[label], notes=notes)
+                colours, notes = viz.flow_to_rgb(flow, scale_px), {label: viz.flow_note(scale_px)}
+                picture = viz.strip({label: colours}, wheel_for=[label], notes=notes)
                 write_picture(self._place(f"pictures/{kind}/{name}.png"), picture)
         if "npz" in self.flow_files:
             contents: Any = {key: getattr(made, key) for key in (*FLOW_NAMES, "valid", "ego_valid")}
@@ -146,9 +135,8 @@ class Output:
 def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, Any]:
     """Returns a row of frames.csv: medians over valid pixels, shares in [0, 1]."""
     frame, truth = made.frame, made.frame.raw
-    raw_px, ego_px, obj_px = (
-        np.hypot(*flow)[made.valid] for flow in (made.raw, made.ego, made.obj)
-    )
+    flows = made.raw, made.ego, made.obj
+    raw_px, ego_px, obj_px = (np.hypot(*flow)[made.valid] for flow in flows)
     obj_median_px = _median(obj_px)
     # Where most of the picture is static, the median is the error of estimated flow and of poses.
     moves = obj_px > max(moving_px, _MOVING_SPREAD * obj_median_px)
@@ -198,11 +186,8 @@ def shown(kind: str, made: FactorizedFrame) -> Flow:
     return np.where(known, getattr(made, kind), np.float32(np.nan))
 
 
-def video_frame(made: FactorizedFrame, **scales: Any) -> Image:
-    """Returns RGB and depth above raw, ego and obj, each sampled to at most 480 pixels.
-
-    For the scales see `flowrep.viz.representation_strip`.
-    """
+def video_frame(made: FactorizedFrame, **scales: Any) -> viz.Image:
+    """Returns RGB and depth above raw, ego and obj; scales are `representation_strip`'s."""
     frame = made.frame
     height, width = frame.size
     shrink = min(1.0, _TILE_PX / max(height, width))
@@ -217,7 +202,7 @@ def video_frame(made: FactorizedFrame, **scales: Any) -> Image:
         small = cv2.resize(frame.rgb, size[::-1], interpolation=cv2.INTER_AREA)
         above["rgb"] = np.moveaxis(small, -1, 0)
     below = {kind: shown(kind, made)[places] for kind in FLOW_NAMES}
-    return contact_sheet([representation_strip(maps, **scales) for maps in (above, below)])
+    return viz.contact_sheet([viz.representation_strip(m, **scales) for m in (above, below)])
 
 
 class RerunExport:
@@ -252,7 +237,7 @@ class RerunExport:
         depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
         log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
         for name, scale_px in self._scale_px.items():
-            colours = flow_to_rgb(shown(name, made), scale_px)
+            colours = viz.flow_to_rgb(shown(name, made), scale_px)
             log(f"flow/{name}", rr.Image(colours).compress(jpeg_quality=_JPEG_QUALITY))
 
     def close(self) -> None:

@@ -27,7 +27,7 @@ class SequenceError(Exception):
 
 @dataclass(frozen=True)
 class Frame:
-    """One moment of a recording.
+    """One moment of a recording; what it does not have is None.
 
     Convention: CONVENTIONS.md's. The camera's axes are OpenCV's, K puts the centre of pixel (0, 0)
     at (0.5, 0.5), depth is z in metres (nan: missing, inf: no surface), all on one pixel grid.
@@ -35,13 +35,11 @@ class Frame:
     Attributes:
         name: unique in the recording; names the files written for the frame.
         source: the file that is named in errors about the frame.
-        world_from_cam: `[4, 4]` float64, the camera's pose; None where the recording has none.
-        K: `[3, 3]` float64, pixels.
-        depth: `[H, W]` float32, metres.
-        rgb: `[H, W, 3]` uint8, None where the recording has no pictures.
-        timestamp_s: seconds, None where the recording has no clock.
-        raw: `[2, H, W]` float32, the recording's own p_t - p_t', with t' the previous frame in the
-            recording's order; nan where unknown; None if it has none for this frame.
+        world_from_cam: `[4, 4]`.
+        K: `[3, 3]`, pixels.
+        depth: `[H, W]`, metres.
+        rgb: `[H, W, 3]`.
+        raw: `[2, H, W]`, the recording's own p_t - p_t'; nan where unknown.
         raw_since: the name of the frame t' that `raw` is measured from.
         clip: the number of its shot. There is no flow from one clip to another.
     """
@@ -80,13 +78,9 @@ class Recording(ABC):
     missing ones.
 
     Attributes:
-        count: the number of frames.
-        has_flow: whether frames may bring flow of their own.
-        has_poses: whether frames bring the camera's pose.
         no_flow: why it has no flow of its own, and what to do.
-        notes: notes for the user about this recording, a sentence each.
-        conventions: the options about conventions that it was opened with, by name, for the
-            doctor's advice.
+        notes: a sentence each, for the user.
+        conventions: the options about conventions that it was opened with, for the doctor's advice.
     """
 
     count: int

@@ -8,19 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep.sequences import files
 from flowrep.sequences.calibration import as_pose, intrinsics, opencv_intrinsics, read_poses
-from flowrep.sequences.files import (
-    FLO_TAG,
-    Flow,
-    depth_from_integers,
-    list_files,
-    read_flo,
-    read_npy,
-    read_png,
-    read_rgb,
-    read_table,
-    read_tagged_floats,
-)
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 PLAY_BACKWARDS = (
@@ -40,14 +29,13 @@ class Sintel(Recording):
         folder: `training`, with `final/`, `depth/`, `camdata_left/` and `flow/`.
         scene: e.g. `alley_1`.
         render: the pass of the pictures, `"final"` or `"clean"`.
-        backwards: whether time runs backwards.
     """
 
     def __init__(
         self, folder: str | Path, *, scene: str, render: str = "final", backwards: bool = False
     ) -> None:
         self.folder, self.scene = Path(folder), scene
-        pictures = list_files(self.folder / render / scene, (".png",), "frame_")
+        pictures = files.list_files(self.folder / render / scene, (".png",), "frame_")
         self._pictures = pictures[::-1] if backwards else pictures
         self.count = len(pictures)
         flow = self.folder / "flow" / scene
@@ -57,22 +45,23 @@ class Sintel(Recording):
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]
         K, pose = _read_cam(self._file("camdata_left", picture, ".cam"))
+        depth = self._file("depth", picture, ".dpt")
         raw = since = None
         if self.has_flow and index > 0:
             number = picture.stem.removeprefix("frame_")
             since = f"frame_{int(number) + 1:0{len(number)}d}"
             # Given is the next frame's position minus this one's, and the next was the one before.
-            raw = -read_flo(self._file("flow", picture, ".flo"))
+            raw = -files.read_flo(self._file("flow", picture, ".flo"))
             invalid = self._file("invalid", picture, ".png")
             if invalid.is_file():
-                raw[:, read_png(invalid, np.uint8) != 0] = np.nan
+                raw[:, files.read_png(invalid, np.uint8) != 0] = np.nan
         return Frame(
             name=picture.stem,
             source=picture,
             world_from_cam=pose,
             K=K,
-            depth=read_tagged_floats(self._file("depth", picture, ".dpt"), channels=1)[..., 0],
-            rgb=read_rgb(picture),
+            depth=files.read_tagged_floats(depth, channels=1)[..., 0],
+            rgb=files.read_rgb(picture),
             raw=raw,
             raw_since=since,
         )
@@ -82,10 +71,9 @@ class Sintel(Recording):
 
 
 def _read_cam(path: Path) -> tuple[NDArray[np.float64], Pose]:
-    """Returns K in flowrep's convention and `world_from_cam` of a .cam file."""
     data = path.read_bytes()
-    if len(data) != 4 + 8 * (9 + 12) or struct.unpack_from("<f", data)[0] != FLO_TAG:
-        raise SequenceError(path, f"is no .cam file: {FLO_TAG}, 9 and 12 doubles")
+    if len(data) != 4 + 8 * (9 + 12) or struct.unpack_from("<f", data)[0] != files.FLO_TAG:
+        raise SequenceError(path, f"is no .cam file: {files.FLO_TAG}, 9 and 12 doubles")
     K = np.frombuffer(data, "<f8", 9, offset=4).reshape(3, 3).copy()
     K[:2, 2] += 0.5
     extrinsics = np.frombuffer(data, "<f8", 12, offset=4 + 8 * 9)
@@ -95,17 +83,14 @@ def _read_cam(path: Path) -> tuple[NDArray[np.float64], Pose]:
 class TartanAir(Recording):
     """A trajectory's folder of TartanAir (version 1), e.g. `abandonedfactory/Easy/P000`.
 
-    Its flow leads from each frame to the next and contains only the camera's motion, even where
-    objects moved. As in `Sintel`, it is used `backwards` alone.
-
-    Args:
-        folder: the folder of `image_left/`, `depth_left/`, `pose_left.txt` and, for flow, `flow/`.
-        backwards: whether time runs backwards.
+    It holds `image_left/`, `depth_left/`, `pose_left.txt` and, for flow, `flow/`. Flow leads from
+    each frame to the next and contains only the camera's motion, even where objects moved. As in
+    `Sintel`, it is used `backwards` alone.
     """
 
     def __init__(self, folder: str | Path, *, backwards: bool = False) -> None:
         self.folder, order = Path(folder), slice(None, None, -1 if backwards else 1)
-        self._pictures = list_files(self.folder / "image_left", (".png",))[order]
+        self._pictures = files.list_files(self.folder / "image_left", (".png",))[order]
         self.count = len(self._pictures)
         self._poses = read_poses(self.folder / "pose_left.txt", len(self), axes="ned")[order]
         flow = self.folder / "flow"
@@ -114,15 +99,15 @@ class TartanAir(Recording):
 
     def _read(self, index: int) -> Frame:
         number, raw, since = self._number(index), None, None
-        depth = read_npy(self.folder / "depth_left" / f"{number}_left_depth.npy")
+        depth = files.read_npy(self.folder / "depth_left" / f"{number}_left_depth.npy")
         height, width = depth.shape
         if self.has_flow and index > 0:
             since = self._number(index - 1)  # named in the file, so a gap is a missing file
             flow = self.folder / "flow" / f"{number}_{since}_flow.npy"
-            raw = -read_npy(flow, dims=3).transpose(2, 0, 1)
+            raw = -files.read_npy(flow, dims=3).transpose(2, 0, 1)
             hidden = flow.with_name(f"{number}_{since}_mask.npy")
             if hidden.is_file():
-                raw[:, read_npy(hidden) != 0] = np.nan
+                raw[:, files.read_npy(hidden) != 0] = np.nan
         return Frame(
             name=number,
             source=self._pictures[index],
@@ -130,7 +115,7 @@ class TartanAir(Recording):
             # 90 degrees of horizontal view, a centred axis: 320, 320, 320, 240 at 640 x 480.
             K=intrinsics(width / 2, width / 2, width / 2, height / 2),
             depth=depth,
-            rgb=read_rgb(self._pictures[index]),
+            rgb=files.read_rgb(self._pictures[index]),
             raw=raw,
             raw_since=since,
         )
@@ -142,20 +127,15 @@ class TartanAir(Recording):
 class VKitti2(Recording):
     """The folder of one variation of one scene of Virtual KITTI 2, e.g. `Scene01/clone`.
 
-    Its `backwardFlow` leads from each frame to the previous one, on the frame's own grid; raw flow
-    is its negative.
-
-    Args:
-        folder: the folder of `extrinsic.txt`, `intrinsic.txt` and `frames/`.
-        camera: 0 for the left camera, 1 for the right one.
+    It holds `extrinsic.txt`, `intrinsic.txt` and `frames/`. `camera` is 0 for the left one, 1 for
+    the right one.
     """
 
     def __init__(self, folder: str | Path, *, camera: int = 0) -> None:
         self.folder, self.camera = Path(folder), camera
-        self._poses_path = self.folder / "extrinsic.txt"
-        self._poses = self._of_camera(self._poses_path, 18)
+        self._poses = self._of_camera(self.folder / "extrinsic.txt", 18)
         self._intrinsics = self._of_camera(self.folder / "intrinsic.txt", 6)
-        self._pictures = list_files(self._maps("rgb"), (".jpg", ".png"))
+        self._pictures = files.list_files(self._maps("rgb"), (".jpg", ".png"))
         self.count = len(self._pictures)
         self.has_flow = self._maps("backwardFlow").is_dir()
         self.no_flow = f"no such folder: {self._maps('backwardFlow')}"
@@ -163,21 +143,20 @@ class VKitti2(Recording):
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]
         name = picture.stem.removeprefix("rgb_")
-        number = int(name)
+        number, path = int(name), self.folder / "extrinsic.txt"
         if number not in self._poses or number not in self._intrinsics:
-            raise SequenceError(self._poses_path, f"has no pose or intrinsics of frame {number}")
-        depth = read_png(self._maps("depth") / f"depth_{name}.png", np.uint16)
+            raise SequenceError(path, f"has no pose or intrinsics of frame {number}")
+        depth = files.read_png(self._maps("depth") / f"depth_{name}.png", np.uint16)
         flow = self._maps("backwardFlow") / f"backwardFlow_{name}.png"
         has_flow = self.has_flow and index > 0
         return Frame(
             name=name,
             source=picture,
-            world_from_cam=as_pose(
-                self._poses[number], self._poses_path, direction="world_to_camera"
-            ),
+            world_from_cam=as_pose(self._poses[number], path, direction="world_to_camera"),
             K=opencv_intrinsics(self._intrinsics[number].tolist()),
-            depth=depth_from_integers(depth, 0.01, no_surface=65535),
-            rgb=read_rgb(picture),
+            depth=files.depth_from_integers(depth, 0.01, no_surface=65535),
+            rgb=files.read_rgb(picture),
+            # Stored is the flow to the previous frame, on this one's grid.
             raw=-_read_vkitti_flow(flow) if has_flow else None,
             raw_since=f"{number - 1:0{len(name)}d}" if has_flow else None,
         )
@@ -186,16 +165,16 @@ class VKitti2(Recording):
         return self.folder / "frames" / kind / f"Camera_{self.camera}"
 
     def _of_camera(self, path: Path, columns: int) -> dict[int, NDArray[np.float64]]:
-        table = read_table(path, columns, header=True)
+        table = files.read_table(path, columns, header=True)
         rows = table[table[:, 1] == self.camera]
         if not len(rows):
             raise SequenceError(path, f"says nothing of camera {self.camera}")
         return {int(row[0]): row[2:] for row in rows}
 
 
-def _read_vkitti_flow(path: Path) -> Flow:
+def _read_vkitti_flow(path: Path) -> files.Flow:
     """Returns flow `[2, H, W]`, 2 I / 65535 - 1 of the picture's size; nan where blue is 0."""
-    red, green, blue = read_png(path, np.uint16, 3).transpose(2, 0, 1)
+    red, green, blue = files.read_png(path, np.uint16, 3).transpose(2, 0, 1)
     height, width = red.shape
     share = np.stack([red, green]).astype(np.float32) * np.float32(2 / 65535) - 1
     flow = share * np.array([width - 1, height - 1], np.float32)[:, None, None]

@@ -21,10 +21,10 @@ class SevenScenes(Recording):
 
     Args:
         folder: the folder of one sequence, e.g. `chess/seq-01`.
-        depth_intrinsics: fx, fy, cx, cy of the depth camera, pixel (0, 0)'s centre at (0.5, 0.5).
+        depth_intrinsics: fx, fy, cx, cy, pixel (0, 0)'s centre at (0.5, 0.5).
         colour_intrinsics: those of the colour camera.
         colour_from_depth_m: a point's position in the colour camera's frame minus that in the depth
-            camera's: x, y, z in metres. The data set does not give it either.
+            camera's: x, y, z. The data set does not give it either.
     """
 
     def __init__(

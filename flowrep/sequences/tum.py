@@ -17,12 +17,11 @@ from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 class Tum(Recording):
     """A folder with `rgb.txt`, `depth.txt` and, for poses, `groundtruth.txt`.
 
-    The picture sets the time of a frame. It gets the nearest depth map and the nearest pose if they
-    are near enough; a picture that lacks either is left out.
+    The picture sets the time of a frame. It gets the nearest depth map and the nearest pose within
+    `tolerance_s`; a picture that lacks either is left out.
 
     Args:
         intrinsics: fx, fy, cx, cy in OpenCV's convention.
-        tolerance_s: the largest time difference of a depth map or a pose from its picture.
         interpolate: whether the pose is interpolated to the picture's time between the poses before
             and after it, each of which must be within `tolerance_s`.
     """
@@ -56,18 +55,14 @@ class Tum(Recording):
             found &= self._before >= 0
         kept = np.flatnonzero(found)
         if not len(kept):
-            raise SequenceError(
-                self.folder,
-                f"no picture has a depth map and a pose within {tolerance_s} s: raise tolerance_s, "
-                "or check that the files share a clock",
-            )
+            cause = f"no picture has a depth map and a pose within {tolerance_s} s: "
+            remedy = "raise tolerance_s, or check that the files share a clock"
+            raise SequenceError(self.folder, cause + remedy)
         self._kept, self._times, self.count = kept, rgb_times, len(kept)
         self._rgbs, self._depths = rgb_paths, [depth_paths[i] for i in depth_of]
         if left_out := len(rgb_times) - len(kept):
-            self.notes = (
-                f"{left_out} of {len(rgb_times)} pictures have no {needed} within "
-                f"{tolerance_s} s and are left out",
-            )
+            lack = f"have no {needed} within {tolerance_s} s and are left out"
+            self.notes = (f"{left_out} of {len(rgb_times)} pictures {lack}",)
 
     def _read(self, index: int) -> Frame:
         place = int(self._kept[index])
@@ -101,7 +96,7 @@ class Tum(Recording):
     def _between(
         self, pose_times: NDArray[np.float64], times_s: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Returns the poses before and after each time, -1 if too far, and the share between."""
+        # Poses before and after each time, -1 if too far, and the share of the way between them.
         if not self.interpolate:
             chosen = nearest(pose_times, times_s, self.tolerance_s)
             return chosen, chosen, np.zeros(len(times_s))
@@ -121,11 +116,7 @@ def _check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
 def nearest(
     times_s: NDArray[np.float64], wanted_s: NDArray[np.float64], tolerance_s: float
 ) -> NDArray[np.int64]:
-    """Returns the index of the time nearest to each wanted one, -1 if none is near enough.
-
-    >>> nearest(np.array([0.0, 1.0, 2.0]), np.array([0.98, 1.5, 2.03]), 0.05).tolist()
-    [1, -1, 2]
-    """
+    """Returns the index of the time nearest to each wanted one, -1 if none is near enough."""
     after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
     before = (after - 1).clip(0)
     gap_after, gap_before = (np.abs(times_s[index] - wanted_s) for index in (after, before))
@@ -134,15 +125,8 @@ def nearest(
 
 
 def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
-    """Returns the pose at a share of the way, with constant velocity and angular velocity.
-
-    >>> before, after = np.eye(4), np.eye(4)
-    >>> after[0, 3] = 2.0
-    >>> interpolated_pose(before, after, 0.25)[0, 3].item()
-    0.5
-    """
-    relative = before[:3, :3].T @ after[:3, :3]
-    axis_angle, _ = cv2.Rodrigues(relative)
+    """Returns the pose at a share of the way, with constant velocity and angular velocity."""
+    axis_angle, _ = cv2.Rodrigues(before[:3, :3].T @ after[:3, :3])
     pose = np.eye(4)
     pose[:3, :3] = before[:3, :3] @ cv2.Rodrigues(share * axis_angle)[0]
     pose[:3, 3] = (1 - share) * before[:3, 3] + share * after[:3, 3]

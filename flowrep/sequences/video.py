@@ -18,14 +18,10 @@ class StillVideo:
     """Frames of a camera that does not move, so that all flow is object flow.
 
     The flow of a moving camera can't be factorised without depth, which neither a webcam nor a
-    video file gives. The user has to declare explicitly that the camera stands still.
+    video file gives: the user has to declare that it is `still`.
 
     Args:
         source: a camera's number (`0`), or a video file that OpenCV reads.
-        still: whether the camera stands still.
-
-    Raises:
-        SequenceError: `still` is false, or there is no such file.
     """
 
     has_flow, has_poses = False, True
@@ -34,17 +30,14 @@ class StillVideo:
     def __init__(self, source: str | Path | int, *, still: bool = False) -> None:
         self.source = Path(str(source))
         if not still:
-            raise SequenceError(
-                source,
-                "a video has no depth, without which flow of a moving camera can't be split; if it "
-                "stands still say format.still=true, else bring depth too: format=frames",
-            )
+            cause = "a video has no depth, without which flow of a moving camera can't be split; "
+            remedy = "if it stands still say format.still=true, else bring depth too: format=frames"
+            raise SequenceError(source, cause + remedy)
         self._place: int | str = int(str(source)) if str(source).isdecimal() else str(source)
         if isinstance(self._place, str) and not self.source.is_file():
             raise SequenceError(source, "no such file; give a video file or a camera's number")
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields frames until the file ends, or endlessly from a camera."""
         capture: Any = cv2.VideoCapture(self._place)
         try:
             for number in count():
