@@ -1,15 +1,12 @@
-"""Bodies, collisions and pictures by PyBullet; no other module imports it.
+"""Bodies, collisions and pictures by PyBullet; no other module imports it."""
 
-Each simulator has a DIRECT client of its own, disconnected when nothing refers to it any more.
-"""
-
-import contextlib
 import functools
 import math
 import os
 import tempfile
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,22 +15,15 @@ from numpy.typing import NDArray
 from flowrep.simulator.meshes import Mesh
 from flowrep.simulator.paint import AMBIENT, DIFFUSE, LIGHT
 
-
-@contextlib.contextmanager
-def _without_greeting() -> Iterator[None]:
-    """Suppresses the build time that PyBullet prints to stderr when it is imported."""
-    stderr = os.dup(2)
-    try:
-        with open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        yield
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
-
-
-with _without_greeting():
+# PyBullet prints its build time to stderr when it is imported.
+_stderr = os.dup(2)
+try:
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
     import pybullet
+finally:
+    os.dup2(_stderr, 2)
+    os.close(_stderr)
 
 _LIGHT = {
     "lightDirection": list(LIGHT),
@@ -44,26 +34,21 @@ _LIGHT = {
     "shadow": 0,
     "renderer": pybullet.ER_TINY_RENDERER,
 }
-
-
-@functools.cache
-def _shared(value: Any) -> Any:
-    return value
+_IDENTICAL: Any = functools.cache(lambda value: value)  # the first object equal to a value
 
 
 class Picture(NamedTuple):
-    """The camera's images, all [H, W] except `rgba` [H, W, 4]."""
+    """The camera's images."""
 
-    rgba: NDArray[np.uint8]
-    zbuffer: NDArray[np.float32]
-    body: NDArray[np.int32]  # -1 for no body
+    rgba: NDArray[np.uint8]  # [H, W, 4]
+    zbuffer: NDArray[np.float32]  # [H, W], as are the numbers of bodies, -1 for none
+    body: NDArray[np.int32]
 
 
 class Simulator:
     """A world of bodies that stay where they are placed; no dynamics are simulated."""
 
-    def __init__(self, texture_rgb: NDArray[np.uint8]) -> None:
-        """Connects, and loads the texture [S, S, 3] shared by all meshes."""
+    def __init__(self, texture_rgb: NDArray[np.uint8]) -> None:  # [S, S, 3], of all meshes
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError("PyBullet gave no client: close some environments first")
@@ -73,24 +58,17 @@ class Simulator:
     def add_body(
         self, mesh: Mesh, boxes_m: Sequence[tuple[float, float, float, float, float, float]] = ()
     ) -> int:
-        """Returns PyBullet's number of a new body at the origin.
-
-        Its collision boxes (x, y, yaw, length, width, height) stand on the ground.
-        """
-        arrays = {
-            "vertices": [_shared(tuple(row)) for row in mesh.vertices],
-            "indices": [_shared(index) for index in mesh.indices],
-            "normals": [_shared(tuple(row)) for row in mesh.normals],
-            "uvs": [_shared(tuple(row)) for row in mesh.uvs],
-        }
-        visual = pybullet.createVisualShape(
-            pybullet.GEOM_MESH,
-            rgbaColor=[1.0, 1.0, 1.0, 1.0],
-            physicsClientId=self._client,
-            **arrays,
-        )
+        """Returns PyBullet's number of a body; boxes are (x, y, yaw, length, width, height)."""
         # PyBullet leaks the lists that it is given and their items. These lists end up empty, and
         # the numbers are the same objects for every client of the process.
+        arrays = {
+            name: [_IDENTICAL(tuple(row)) for row in getattr(mesh, name)]
+            for name in ("vertices", "normals", "uvs")
+        } | {"indices": [_IDENTICAL(index) for index in mesh.indices]}
+        white = [1.0, 1.0, 1.0, 1.0]
+        visual = pybullet.createVisualShape(
+            pybullet.GEOM_MESH, rgbaColor=white, physicsClientId=self._client, **arrays
+        )
         for array in arrays.values():
             array.clear()
         collision = -1
@@ -102,48 +80,38 @@ class Simulator:
                 collisionFrameOrientations=[_about_z(box[2]) for box in boxes_m],
                 physicsClientId=self._client,
             )
-        body = pybullet.createMultiBody(
-            0.0, collision, visual, [0.0, 0.0, 0.0], physicsClientId=self._client
-        )
+        body = pybullet.createMultiBody(0.0, collision, visual, physicsClientId=self._client)
         pybullet.changeVisualShape(
             body, -1, textureUniqueId=self._texture, physicsClientId=self._client
         )
         return body
 
     def add_box(self, length_m: float, width_m: float, height_m: float) -> int:
-        """Returns the number of a collision box that stands on the ground, invisible to cameras."""
+        """Returns the number of a collision box on the ground that cameras don't see."""
         half = [length_m / 2, width_m / 2, height_m / 2]
-        return self._add_unseen(height_m, shapeType=pybullet.GEOM_BOX, halfExtents=half)
+        return self._add_unseen(pybullet.GEOM_BOX, height_m, halfExtents=half)
 
     def add_cylinder(self, radius_m: float, height_m: float) -> int:
-        """Returns the number of an upright collision cylinder, invisible to cameras."""
-        shape = {"shapeType": pybullet.GEOM_CYLINDER, "radius": radius_m, "height": height_m}
-        return self._add_unseen(height_m, **shape)
+        """Returns the number of an upright collision cylinder that cameras don't see."""
+        return self._add_unseen(pybullet.GEOM_CYLINDER, height_m, radius=radius_m, height=height_m)
 
-    def _add_unseen(self, height_m: float, **shape: Any) -> int:
+    def _add_unseen(self, kind: int, height_m: float, **shape: Any) -> int:
+        client = {"physicsClientId": self._client}
         above = [0.0, 0.0, height_m / 2]
-        collision = pybullet.createCollisionShape(
-            collisionFramePosition=above, physicsClientId=self._client, **shape
-        )
+        solid = pybullet.createCollisionShape(kind, collisionFramePosition=above, **shape, **client)
         # PyBullet draws a body's collision shape if it has no visual one, so it gets a point.
-        point = pybullet.createVisualShape(
-            pybullet.GEOM_MESH,
-            vertices=[[0.0, 0.0, 0.0]] * 3,
-            indices=[0, 1, 2],
-            physicsClientId=self._client,
-        )
-        return pybullet.createMultiBody(
-            1.0, collision, point, [0.0, 0.0, 0.0], physicsClientId=self._client
-        )
+        corners = {"vertices": [[0.0, 0.0, 0.0]] * 3, "indices": [0, 1, 2]}
+        point = pybullet.createVisualShape(pybullet.GEOM_MESH, **corners, **client)
+        return pybullet.createMultiBody(1.0, solid, point, **client)
 
     def place(
         self, body: int, x_m: float, y_m: float, yaw_rad: float, height_m: float = 0.0
     ) -> None:
-        """Places a body at a planar pose, on the ground unless a height is given."""
+        """Places a body at a planar pose."""
         self.place_at(body, (x_m, y_m, height_m), _about_z(yaw_rad))
 
     def place_at(self, body: int, xyz_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
-        """Places a body at a position and an orientation as a quaternion."""
+        """Places a body anywhere."""
         pybullet.resetBasePositionAndOrientation(body, xyz_m, rotation_xyzw, self._client)
 
     def touch(self, body: int, other: int) -> bool:
@@ -170,13 +138,10 @@ class Simulator:
         height, width, _ = rgb.shape
         size = width.to_bytes(2, "little") + height.to_bytes(2, "little")
         header = bytes([0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0]) + size + bytes([24, 0x20])
-        handle, path = tempfile.mkstemp(suffix=".tga")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(header + rgb[::-1, :, ::-1].tobytes())
-            return pybullet.loadTexture(path, physicsClientId=self._client)
-        finally:
-            os.unlink(path)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "texture.tga")
+            path.write_bytes(header + rgb[::-1, :, ::-1].tobytes())
+            return pybullet.loadTexture(str(path), physicsClientId=self._client)
 
 
 def _about_z(yaw_rad: float) -> tuple[float, float, float, float]:

@@ -18,20 +18,12 @@ _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def sampled_intrinsics(fx_px: float, fy_px: float, height_px: int, width_px: int) -> Matrix:
-    """Returns the K [3, 3] at which PyBullet's software renderer takes its samples.
-
-    Convention: the centre of pixel (column i, row j) is (i + 0.5, j + 0.5). The renderer samples
-    it at (i, j + 1) of a camera with principal point (W / 2, H / 2). The K that unprojects onto
-    the true surfaces therefore has its principal point shifted by (+0.5, -0.5);
-    `tests/envs/test_camera.py` measures this.
-    """
-    return np.array(
-        [
-            [fx_px, 0.0, width_px / 2 + 0.5],
-            [0.0, fy_px, height_px / 2 - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    """Returns the K [3, 3] at which PyBullet's software renderer takes its samples."""
+    # It samples pixel (column i, row j), whose centre is (i + 0.5, j + 0.5), at (i, j + 1) of a
+    # camera with principal point (W / 2, H / 2). The K that unprojects onto the true surfaces is
+    # therefore shifted by (+0.5, -0.5); `tests/envs/test_camera.py` measures this.
+    rows = [fx_px, 0.0, width_px / 2 + 0.5], [0.0, fy_px, height_px / 2 - 0.5], [0.0, 0.0, 1.0]
+    return np.array(rows)
 
 
 def gl_projection(
@@ -39,15 +31,10 @@ def gl_projection(
 ) -> list[float]:
     """Returns the 16 numbers, column by column, of the OpenGL projection of a centred camera."""
     depth_sum, depth_gap = far_m + near_m, far_m - near_m
-    rows = np.array(
-        [
-            [2 * fx_px / width_px, 0.0, 0.0, 0.0],
-            [0.0, 2 * fy_px / height_px, 0.0, 0.0],
-            [0.0, 0.0, -depth_sum / depth_gap, -2 * far_m * near_m / depth_gap],
-            [0.0, 0.0, -1.0, 0.0],
-        ]
-    )
-    return rows.T.ravel().tolist()
+    scales = [2 * fx_px / width_px, 2 * fy_px / height_px, -depth_sum / depth_gap, 0.0]
+    projection = np.diag(scales)
+    projection[2, 3], projection[3, 2] = -2 * far_m * near_m / depth_gap, -1.0
+    return projection.T.ravel().tolist()
 
 
 def gl_view(cam_from_world: Matrix) -> list[float]:
@@ -83,12 +70,7 @@ _REMEDY = "run: pip install 'flowrep-rl[sim]'"
 
 
 def choose_renderer(name: str) -> str:
-    """Returns "rasteriser" or "pybullet"; "auto" is the rasteriser if numba is installed.
-
-    Raises:
-        ValueError: the renderer is unknown.
-        ImportError: the rasteriser is requested and numba is missing.
-    """
+    """Returns "rasteriser" or "pybullet"; "auto" is the rasteriser if numba is installed."""
     if name not in RENDERERS:
         raise ValueError(f"unknown renderer {name!r}; choose one of {', '.join(RENDERERS)}")
     if name != "pybullet" and not numba_is_installed():

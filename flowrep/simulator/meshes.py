@@ -14,15 +14,7 @@ from shapely.geometry.base import BaseGeometry
 from flowrep.scenes.layout import Box
 from flowrep.scenes.pedestrians import HIP_M, PARTS
 from flowrep.scenes.scene import Kind
-from flowrep.simulator.paint import (
-    SHIRTS,
-    Painted,
-    Patch,
-    front,
-    painted,
-    swatch,
-    upper_storeys,
-)
+from flowrep.simulator.paint import SHIRTS, Painted, Patch, front, painted, swatch, upper_storeys
 
 Array = NDArray[np.float64]
 _CHUNK_TRIANGLES = 24
@@ -30,12 +22,12 @@ _CHUNK_TRIANGLES = 24
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body, with its ids in the maps; instance 0 is the static world."""
+    """A rigid body, with its ids in the maps."""
 
     vertices: NDArray[np.float64]  # [V, 3], metres, in its own frame, or the world's if static
     triangles: NDArray[np.int64]  # [T, 3], vertices, counter-clockwise seen from outside
     semantic: int
-    instance: int
+    instance: int  # 0 for the static world
     uvs: NDArray[np.float64] | None = None  # [V, 2], in the texture; plain asphalt without
 
 
@@ -71,24 +63,21 @@ def gather(bodies: Sequence[Body]) -> Triangles:
     semantic = np.array([body.semantic for body in bodies], dtype=np.uint8)
     instance = np.array([body.instance for body in bodies], dtype=np.uint8)
     of_triangle = np.repeat(owners, [len(each) for each in indices])
-    spheres = [_sphere(own) for own in points]
+    centres = [(own.min(axis=0) + own.max(axis=0)) / 2 for own in points]
+    reaches = [np.linalg.norm(own - centre, axis=1) for own, centre in zip(points, centres)]
+    look = np.concatenate(corners_m), np.concatenate(uvs_of_all)
     return Triangles(
         points=np.concatenate(points),
         corners=np.concatenate(indices),
         point_bounds=_bounds(points),
         corner_bounds=_bounds(indices),
-        centres=np.array([centre for centre, _ in spheres]),
-        radii=np.array([radius for _, radius in spheres]),
+        centres=np.array(centres),
+        radii=np.array([distances.max() for distances in reaches]),
         bodies=np.array(owners, dtype=np.int32),
         poses=np.array(poses, dtype=np.int32),
         semantic=semantic,
         instance=instance,
-        look=painted(
-            np.concatenate(corners_m),
-            np.concatenate(uvs_of_all),
-            semantic[of_triangle],
-            instance[of_triangle],
-        ),
+        look=painted(*look, semantic[of_triangle], instance[of_triangle]),
     )
 
 
@@ -100,11 +89,6 @@ def _chunks(middles: NDArray[np.float64], triangles: NDArray[np.int64]) -> list[
     order = np.argsort(own[:, int(np.ptp(own, axis=0).argmax())], kind="stable")
     half = len(order) // 2
     return [*_chunks(middles, triangles[order[:half]]), *_chunks(middles, triangles[order[half:]])]
-
-
-def _sphere(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
 def _bounds(arrays: Sequence[NDArray]) -> NDArray[np.int32]:
@@ -147,7 +131,7 @@ class Mesh:
         self.polygon(corners, [[u0, v1], [u1, v1], [u1, v0], [u0, v0]])
 
     def box(self, low: Point3, high: Point3, side: Patch, *, lid: bool = True) -> None:
-        """Adds a box without its floor; `lid` adds its top."""
+        """Adds a box without its floor, and without its top unless `lid`."""
         self.walls(low, high, (side,) * 4)
         if lid:
             (x0, y0, _), (x1, y1, z) = low, high
@@ -167,9 +151,8 @@ class Mesh:
         self, low: Array, high: Array, side: Patch, lid: Patch, *, floor: Patch | None = None
     ) -> None:
         """Adds the sides and top between two level rings [M, 3], counter-clockwise from above."""
-        for i in range(len(low)):
-            j = (i + 1) % len(low)
-            self.quad(np.array([low[i], low[j], high[j], high[i]]), side)
+        for corners in zip(low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high):
+            self.quad(np.array(corners), side)
         self.polygon(high, [list(lid[:2])] * len(high))
         if floor is not None:
             self.polygon(low[::-1], [list(floor[:2])] * len(low))
@@ -225,11 +208,9 @@ def lane_marks(line: LineString, clear_of: BaseGeometry) -> Mesh:
 
 
 def kerb(drivable: BaseGeometry, paved: BaseGeometry) -> Mesh:
-    """Returns the kerbstones along the edge of a sidewalk, slightly above it.
-
-    The paving continues below them: the renderer omits thin triangles in the distance, where the
-    same category then shows instead.
-    """
+    """Returns the kerbstones along the edge of a sidewalk, slightly above it."""
+    # The paving continues below them: the renderer omits thin triangles in the distance, where the
+    # same category then shows instead.
     mesh = Mesh()
     edge = drivable.buffer(_KERB_M, quad_segs=4, join_style="mitre")
     mesh.ground(paved.intersection(edge), _RISE_M, "kerb")
@@ -237,7 +218,7 @@ def kerb(drivable: BaseGeometry, paved: BaseGeometry) -> Mesh:
 
 
 def crosswalk(area: Polygon, heading_rad: float) -> Mesh:
-    """Returns a crosswalk: asphalt with stripes along the heading of the road that it crosses."""
+    """Returns asphalt with stripes along the heading of the road that is crossed."""
     mesh = Mesh()
     mesh.ground(area, 0.0, "asphalt")
     along = np.array([math.cos(heading_rad), math.sin(heading_rad)])
@@ -257,33 +238,26 @@ _CROWN_SIDES = 6
 
 
 def mesh_of(box: Box, *, both_sides: bool = False) -> Mesh:
-    """Returns the mesh for a box; with `both_sides` a house has two fronts."""
-    mesh = house(box, both_sides=both_sides) if box.kind == "house" else _SHAPES[box.kind](box)
+    """Returns the mesh for a box; with `both_sides` a house has a front on its left too."""
+    mesh, (length, width, height) = Mesh(), box.size_m
+    if box.kind == "house":
+        # What is seen from a street: a front on its right, and the sides; never the roof.
+        windows, side = front(box.variant), upper_storeys(box.variant)
+        sides = (windows, side, windows if both_sides else None, side)
+        mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
+    else:
+        _SHAPES[box.kind](mesh, length / 2, width / 2, height, box.variant)
     return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
 
 
-def house(box: Box, *, both_sides: bool = False) -> Mesh:
-    """Returns the walls of a house visible from a street: a front on its right, and the sides.
-
-    With `both_sides` it has a front on its left too. Roofs are never visible and are left out.
-    """
-    length, width, height = box.size_m
-    windows, side = front(box.variant), upper_storeys(box.variant)
-    sides = (windows, side, windows if both_sides else None, side)
-    mesh = Mesh()
-    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
-    return mesh
+# Shapes that face along x are added to a mesh, `x` and `y` are half their length and width.
 
 
-def car(box: Box) -> Mesh:
-    """Returns a car facing along x: body, windows all around, roof, wheels, lights."""
-    (length, width, height), paint = box.size_m, swatch(_CAR_PAINTS[box.variant % 4])
-    x, y = length / 2, width / 2
-    belt = 0.6 * height
-    mesh = Mesh()
+def _car(mesh: Mesh, x: float, y: float, height: float, variant: int) -> None:
+    paint, belt = swatch(_CAR_PAINTS[variant % 4]), 0.6 * height
     mesh.box((-x, -y, 0.28), (x, y, belt), paint)
     # The underside, in the shade.
-    mesh.walls((-0.9 * x, -0.8 * y, 0.0), (0.9 * x, 0.8 * y, 0.28), (swatch("tyre"),) * 4)
+    mesh.box((-0.9 * x, -0.8 * y, 0.0), (0.9 * x, 0.8 * y, 0.28), swatch("tyre"), lid=False)
     sill = _rectangle(-0.68 * x, 0.46 * x, 0.94 * y, belt)
     roof = _rectangle(-0.52 * x, 0.14 * x, 0.76 * y, height)
     mesh.frustum(sill, roof, swatch("glass"), paint)
@@ -291,21 +265,15 @@ def car(box: Box) -> Mesh:
         for axle in (-0.62 * x, 0.62 * x):
             mesh.disc((axle, side * (y + 0.01), 0.33), (0.0, side, 0.0), 0.33, swatch("tyre"))
             mesh.disc((axle, side * (y + 0.02), 0.33), (0.0, side, 0.0), 0.16, swatch("metal"))
-        lamps = (("lamp_white", x + 0.01, 1.0), ("lamp_red", -x - 0.01, -1.0))
-        for name, at, ahead in lamps:
+        for name, at, ahead in (("lamp_white", x + 0.01, 1.0), ("lamp_red", -x - 0.01, -1.0)):
             mesh.disc((at, side * 0.72 * y, 0.5 * height), (ahead, 0.0, 0.0), 0.12, swatch(name))
-    return mesh
 
 
-def tree(box: Box) -> Mesh:
-    """Returns a trunk with a crown in proportion to its height, either broad or a fir's."""
-    length, width, height = box.size_m
-    mesh = Mesh()
-    is_fir = box.variant % 3 == 2
+def _tree(mesh: Mesh, x: float, y: float, height: float, variant: int) -> None:
+    is_fir = variant % 3 == 2
     below = 0.28 * height if is_fir else 0.42 * height
-    sides = (swatch("wood"),) * 4
-    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, below), sides)
-    leaf = swatch("leaf" if is_fir or box.variant % 2 else "leaf_light")
+    mesh.box((-x, -y, 0.0), (x, y, below), swatch("wood"), lid=False)
+    leaf = swatch("leaf" if is_fir or variant % 2 else "leaf_light")
     reach = (0.2 if is_fir else 0.27) * height
     if is_fir:
         tiers = ((0.28, 0.6, 1.0, 0.4), (0.5, 0.82, 0.75, 0.25), (0.72, 1.0, 0.5, 0.0))
@@ -315,54 +283,41 @@ def tree(box: Box) -> Mesh:
         lower = _ring(_CROWN_SIDES, reach * bottom, low * height)
         upper = _ring(_CROWN_SIDES, reach * max(top, 0.02), high * height)
         mesh.frustum(lower, upper, leaf, leaf, floor=leaf)
-    return mesh
 
 
-def fence(box: Box) -> Mesh:
-    """Returns a stretch of fence along x: a post at either end and two rails."""
-    length, width, height = box.size_m
-    paint, x, y = swatch("wood"), length / 2, width / 2
-    mesh = Mesh()
+def _fence(mesh: Mesh, x: float, y: float, height: float, variant: int) -> None:
+    wood = swatch("wood")
     for at in (-x + 0.06, x - 0.06):
-        mesh.box((at - 0.06, -y, 0.0), (at + 0.06, y, height), paint)
+        mesh.box((at - 0.06, -y, 0.0), (at + 0.06, y, height), wood)
     for low, high in ((0.3, 0.5), (0.72, 0.92)):
-        mesh.walls(
-            (-x, -y / 2, low * height), (x, y / 2, high * height), (paint, None, paint, None)
-        )
-    return mesh
+        rail = (-x, -y / 2, low * height), (x, y / 2, high * height)
+        mesh.walls(*rail, (wood, None, wood, None))
 
 
-def traffic_light(box: Box) -> Mesh:
-    """Returns a post with a head of three lamps, the lowest lit, facing traffic along x."""
-    length, width, height = box.size_m
+def _traffic_light(mesh: Mesh, x: float, y: float, height: float, variant: int) -> None:
     head_m, reach = 0.95, 0.17
-    mesh = Mesh()
-    post = (swatch("metal"),) * 4
-    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height - head_m), post)
+    mesh.box((-x, -y, 0.0), (x, y, height - head_m), swatch("metal"), lid=False)
     mesh.box((-reach, -reach, height - head_m), (reach, reach, height), swatch("tyre"))
+    # The lowest lamp is lit, for those who drive along x.
     for name, share in (("lamp_off", 0.83), ("lamp_off", 0.5), ("lamp_green", 0.17)):
         centre = (-reach - 0.01, 0.0, height - head_m * (1 - share))
         mesh.disc(centre, (-1.0, 0.0, 0.0), 0.12, swatch(name))
-    return mesh
 
 
-def lamp_post(box: Box) -> Mesh:
-    """Returns a post with a lamp on an arm to its left, over the road."""
-    length, width, height = box.size_m
+def _lamp_post(mesh: Mesh, x: float, y: float, height: float, variant: int) -> None:
     metal = swatch("metal")
-    mesh = Mesh()
-    mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), (metal,) * 4)
+    mesh.box((-x, -y, 0.0), (x, y, height), metal, lid=False)
+    # An arm to the left, over the road.
     mesh.box((-0.05, 0.0, height - 0.12), (0.05, 1.2, height), metal)
     mesh.box((-0.14, 0.8, height - 0.24), (0.14, 1.5, height - 0.12), swatch("lamp_white"))
-    return mesh
 
 
-_SHAPES: dict[Kind, Callable[[Box], Mesh]] = {
-    "tree": tree,
-    "fence": fence,
-    "car": car,
-    "traffic_light": traffic_light,
-    "lamp_post": lamp_post,
+_SHAPES: dict[Kind, Callable[[Mesh, float, float, float, int], None]] = {
+    "tree": _tree,
+    "fence": _fence,
+    "car": _car,
+    "traffic_light": _traffic_light,
+    "lamp_post": _lamp_post,
 }
 
 

@@ -28,9 +28,9 @@ _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
 class SafeGround:
-    """A fast, conservative test that a vehicle is on the road, clear of boxes and ending zones.
+    """A fast test that a vehicle is on the road, clear of boxes and ending zones.
 
-    Where it returns False, exact tests decide. It does not consider people.
+    It is conservative: where it returns False, exact tests decide.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -47,20 +47,18 @@ class SafeGround:
         table = shapely.contains_xy(safe, *np.meshgrid(x, y, indexing="ij"))
         # As bytes, of which Python looks up an element in half the time.
         self._columns = [column.astype(np.uint8).tobytes() for column in table]
-        self._rows = len(y)
 
     def __call__(self, x_m: float, y_m: float) -> bool:
         """Returns whether the vehicle's centre is on safe ground."""
         i, j = int((x_m - self._x0) // _SAFE_CELL_M), int((y_m - self._y0) // _SAFE_CELL_M)
-        is_on_table = 0 <= i < len(self._columns) and 0 <= j < self._rows
-        return is_on_table and self._columns[i][j] == 1
+        columns = self._columns
+        return 0 <= i < len(columns) and 0 <= j < len(columns[i]) and columns[i][j] == 1
 
 
 class Street:
     """The bodies of one scene, shared by all environments of a process with that scene.
 
-    It holds no state of an episode: callers pass the poses of the vehicle and of everyone else, and
-    the closed exits. Environments share one because a PyBullet client takes 28 MB.
+    It holds no state of an episode. Environments share one because a PyBullet client takes 28 MB.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -80,8 +78,8 @@ class Street:
             name: self._add_solid([box], meshes.mesh_of(box, both_sides=True))
             for name, box in layout.closures.items()
         }
-        meshes_of_all = [mesh for i in range(count) for mesh in person_meshes(i)]
-        for instance, mesh in enumerate(meshes_of_all, start=1):
+        parts = [mesh for i in range(count) for mesh in person_meshes(i)]
+        for instance, mesh in enumerate(parts, start=1):
             self._add_body(mesh, "pedestrian", instance=instance)
         self.triangles = gather(self.bodies)
         reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
@@ -94,7 +92,7 @@ class Street:
 
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
-        """Returns the street shared by all environments of the process with this scene."""
+        """Returns the street of all environments of the process with this scene."""
         key = pickle.dumps(scene)  # a scene holds mappings, so it has no hash
         street = _STREETS.get(key)
         if street is None:
@@ -137,10 +135,7 @@ class Street:
         return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)
 
     def hit(self, state: VehicleState, poses: Array, closures: tuple[str, ...]) -> str:
-        """Returns the category of the body that the vehicle overlaps, or "".
-
-        Only bodies near enough to be touched are passed to PyBullet's collision test.
-        """
+        """Returns the category of the body that the vehicle overlaps, or ""."""
         simulator, at = self.simulator, state[:2]
         simulator.place(self._vehicle, *state[:3])
         is_near = np.hypot(*(poses[:, :2] - at).T) <= self._person_reach_m
@@ -174,12 +169,8 @@ class Street:
         paving.ground(paved, 0.0, "paving")
         paving.add(meshes.kerb(layout.drivable, paved))
         grass.ground(layout.terrain, 0.0, "grass")
-        for mesh, category in (
-            (road, "road"),
-            (crosswalks, "crosswalk"),
-            (paving, "sidewalk"),
-            (grass, "terrain"),
-        ):
+        grounds = {"road": road, "crosswalk": crosswalks, "sidewalk": paving, "terrain": grass}
+        for category, mesh in grounds.items():
             if mesh.indices:
                 self._add_body(mesh, category)
 
@@ -203,11 +194,11 @@ class Street:
     def _add_body(
         self, mesh: meshes.Mesh, category: str, *, instance: int = 0, boxes_m: Sequence[Any] = ()
     ) -> int:
-        vertices = np.array(mesh.vertices, dtype=np.float64)
-        triangles = np.array(mesh.indices).reshape(-1, 3)
-        seen_as = CATEGORY_ID[category], instance
-        uvs = np.array(mesh.uvs).reshape(-1, 2)
-        self.bodies.append(Body(vertices, triangles, *seen_as, uvs))
+        triangles, seen_as = (
+            np.array(mesh.indices).reshape(-1, 3),
+            (CATEGORY_ID[category], instance),
+        )
+        self.bodies.append(Body(np.array(mesh.vertices), triangles, *seen_as, np.array(mesh.uvs)))
         self._numbers.append(self.simulator.add_body(mesh, boxes_m))
         return len(self.bodies) - 1
 
