@@ -1,6 +1,6 @@
 """Checks of a scene as a whole: its parts agree, paths are open, people keep apart.
 
-Pydantic has checked each part for itself by then. A `SceneError` names the key and the remedy.
+Pydantic has checked each part for itself by then.
 """
 
 from collections.abc import Iterable, Iterator
@@ -37,10 +37,9 @@ _LEAST_END_M = 1.0  # of an ending zone; the vehicle's place is checked at least
 
 def check_references(scene: Scene) -> None:
     """Checks that what is named exists, and that places are on their roads."""
-    if scene.num_pedestrians > 255 // len(PARTS):  # their parts have 8-bit ids
-        raise SceneError(
-            f"pedestrian_groups: {scene.num_pedestrians} people; keep to {255 // len(PARTS)}"
-        )
+    most = 255 // len(PARTS)  # as parts have 8-bit ids
+    if scene.num_pedestrians > most:
+        raise SceneError(f"pedestrian_groups: {scene.num_pedestrians} people; keep to {most}")
     _check_known("categories", scene.categories, CATEGORY_ID)
     for key, names in _categories_used(scene).items():
         _check_known(key, names, scene.categories)
@@ -49,8 +48,7 @@ def check_references(scene: Scene) -> None:
         _check_known(f"{key}.road", [item.road], lengths_m)
         given = (getattr(item, name, None) for name in ("at_m", "from_m", "to_m"))
         places = [at for at in given if at is not None]
-        length = lengths_m[item.road]
-        may_extend = isinstance(item, BuildingRow | ObstacleRow)
+        length, may_extend = lengths_m[item.road], isinstance(item, BuildingRow | ObstacleRow)
         if not may_extend and not all(0.0 <= at <= length + 1e-6 for at in places):
             there = " to ".join(f"{at:g}" for at in places)
             raise SceneError(
@@ -108,12 +106,11 @@ def check_path(layout: Layout, path: Path) -> None:
         raise SceneError(f"{key}: its start collides; move the start or what is in it")
     if shapely.intersects(end, blocks).any():
         raise SceneError(f"{key}: its ending zone is built over; move what is in it")
-    start = Point(layout.start_state(path.start)[:2])
+    start, vehicle = Point(layout.start_state(path.start)[:2]), layout.scene.vehicle
     if end.intersects(start):
         raise SceneError(f"{key}: starts inside its ending zone {path.end!r}; move one of them")
     # One connected piece of ground, wide enough for the vehicle's narrower side, must hold both
     # the start and the end.
-    vehicle = layout.scene.vehicle
     room = free_ground(layout, path).buffer(-min(vehicle.width_m, vehicle.length_m) / 2)
     if not any(part.covers(start) and part.intersects(end) for part in shapely.get_parts(room)):
         raise SceneError(
@@ -142,10 +139,9 @@ def check_walks(layout: Layout) -> None:
                     f"{key}: people can be where the vehicle starts path {path.name!r}; move the "
                     f"walk or zone {path.start!r}, or narrow spread_m"
                 )
-    for (one, ground), (other, other_ground) in combinations(grounds.items(), 2):
-        nearest = shapely.STRtree(other_ground).query_nearest
-        gap = nearest(ground, all_matches=False, return_distance=True)[1].min()
-        if gap < APART_M:
+    wholes = {name: shapely.geometrycollections(ground) for name, ground in grounds.items()}
+    for (one, ground), (other, other_ground) in combinations(wholes.items(), 2):
+        if (gap := ground.distance(other_ground)) < APART_M:
             raise SceneError(
                 f"pedestrian_groups.{one}: people of {other!r} come within {gap:.2f} m of those of "
                 f"this group; keep the walks {APART_M} m apart: move one, or narrow its spread_m"
@@ -153,9 +149,8 @@ def check_walks(layout: Layout) -> None:
 
 
 def _ground(layout: Layout, group: PedestrianGroup) -> list[BaseGeometry]:
-    key = f"pedestrian_groups.{group.name}"
-    spread, least = group.spread_m, least_spread_m(group.count)
-    if spread < least:
+    key, spread = f"pedestrian_groups.{group.name}", group.spread_m
+    if spread < (least := least_spread_m(group.count)):
         raise SceneError(
             f"{key}.spread_m: is {spread}, but {group.count} people need lanes {least:.2f} m wide "
             f"together; give {least:.2f} or more"

@@ -1,14 +1,14 @@
 """A scene laid out on the ground: polygons, boxes and walking lines, computed once from its data.
 
 Convention: world metres, x forward at yaw 0, yaw counter-clockwise. Distances along a road are
-metres from its start; places before it, or beyond the road's end, are on its straight continuation.
+from its start; places before it, or beyond the road's end, are on its straight continuation.
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -44,16 +44,13 @@ def centreline(road: Road) -> LineString:
     (x, y), heading = road.start_m, math.radians(road.heading_deg)
     points = [(x, y)]
     for piece in road.pieces:
-        if piece.straight_m is not None:
-            lengths, turn = [piece.straight_m], 0.0
-        else:
-            assert piece.arc_radius_m is not None
-            assert piece.arc_deg is not None
-            count = max(1, math.ceil(abs(piece.arc_deg) / _ARC_STEP_DEG))
-            turn = math.radians(piece.arc_deg) / count
-            # Chords: the points lie on the arc.
-            lengths = [2 * piece.arc_radius_m * math.sin(abs(turn) / 2)] * count
-        for length in lengths:
+        arc_deg = piece.arc_deg or 0.0
+        count = max(1, math.ceil(abs(arc_deg) / _ARC_STEP_DEG))
+        turn = math.radians(arc_deg) / count
+        # Chords: the points lie on the arc.
+        chord = 2 * (piece.arc_radius_m or 0.0) * math.sin(abs(turn) / 2)
+        length = piece.straight_m or chord
+        for _ in range(count):
             x += length * math.cos(heading + turn / 2)
             y += length * math.sin(heading + turn / 2)
             heading += turn
@@ -88,22 +85,18 @@ def parallel(points: Array, aside_m: float) -> Array:
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box on the ground that can be hit: kind, centre, heading, size, variant.
-
-    Convention: `size_m` is (length, width, height), with length along the heading. The front of a
-    house faces its right. Any integer is a valid variant; it selects the appearance.
-    """
+    """An upright box on the ground that can be hit; the front of a house faces its right."""
 
     kind: Kind
-    x_m: float
+    x_m: float  # of its centre
     y_m: float
     yaw_rad: float
-    size_m: tuple[float, float, float]
-    variant: int = 0
+    size_m: tuple[float, float, float]  # length, along the heading, width, height
+    variant: int = 0  # any integer; it selects the appearance
 
     @property
     def category(self) -> str:
-        """The box's class in the semantic map."""
+        """Its class in the semantic map."""
         return CATEGORY_OF_KIND[self.kind]
 
     @cached_property
@@ -111,12 +104,9 @@ class Box:
         """The rectangle that the box covers."""
         forward, left = self.size_m[0] / 2, self.size_m[1] / 2
         sine, cosine = math.sin(self.yaw_rad), math.cos(self.yaw_rad)
-        return Polygon(
-            [
-                (self.x_m + cosine * u - sine * v, self.y_m + sine * u + cosine * v)
-                for u, v in ((forward, left), (-forward, left), (-forward, -left), (forward, -left))
-            ]
-        )
+        corners = (forward, left), (-forward, left), (-forward, -left), (forward, -left)
+        x, y = self.x_m, self.y_m
+        return Polygon([(x + cosine * u - sine * v, y + sine * u + cosine * v) for u, v in corners])
 
 
 class CrosswalkArea(NamedTuple):
@@ -144,13 +134,9 @@ class Layout:
         self.roads = {road.name: road for road in scene.roads}
         self.lines = {name: centreline(road) for name, road in self.roads.items()}
         self._walks: dict[Walk, Array] = {}
-        self.ribbons = {
-            road.name: ribbon(self.lines[road.name], road.width_m / 2) for road in scene.roads
-        }
-        wide = [
-            ribbon(self.lines[road.name], road.width_m / 2 + road.sidewalk_m)
-            for road in scene.roads
-        ]
+        roads = [(road, self.lines[road.name]) for road in scene.roads]
+        self.ribbons = {road.name: ribbon(line, road.width_m / 2) for road, line in roads}
+        wide = [ribbon(line, road.width_m / 2 + road.sidewalk_m) for road, line in roads]
         radius = scene.corner_radius_m
         self.drivable = _with_round_corners(shapely.union_all([*self.ribbons.values()]), radius)
         paved = shapely.union_all([*wide, _with_round_corners(shapely.union_all(wide), radius)])
@@ -210,21 +196,17 @@ class Layout:
         return parallel(self._walks[walk], lateral_m)
 
     def _walk_points(self, walk: Walk) -> Array:
+        given: Any = walk  # its kind says which of its keys are not None
         if walk.kind == "points":
-            return np.array(walk.points_m)
-        assert walk.road is not None
+            return np.array(given.points_m)
         if walk.kind == "along":
-            assert walk.from_m is not None
-            assert walk.to_m is not None
-            part = stretch(self.lines[walk.road], walk.from_m, walk.to_m)
-            return parallel(without_repeats(np.array(part.coords)), walk.offset_m)
-        assert walk.at_m is not None
-        road = self.roads[walk.road]
+            part = stretch(self.lines[given.road], given.from_m, given.to_m)
+            return parallel(without_repeats(np.array(part.coords)), given.offset_m)
+        road = self.roads[given.road]
         # Keep a stride away from the house fronts.
         reach = road.width_m / 2 + road.sidewalk_m - 0.5
         # From right to left across the road; the walk's own left points back along the road.
-        ends = [self.pose_at(walk.road, walk.at_m, side * reach) for side in (-1, 1)]
-        return np.array([end[:2] for end in ends])
+        return np.array([self.pose_at(road.name, given.at_m, y)[:2] for y in (-reach, reach)])
 
     def _road_between(self, road: str, from_m: float, to_m: float) -> Polygon:
         return ribbon(stretch(self.lines[road], from_m, to_m), self.roads[road].width_m / 2)
@@ -232,8 +214,7 @@ class Layout:
     def _closure_box(self, closure: Closure) -> Box:
         road = self.roads[closure.road]
         x, y, heading = self.pose_at(closure.road, closure.at_m)
-        width = road.width_m + 2 * road.sidewalk_m
-        size = (width, closure.depth_m, closure.height_m)
+        size = (road.width_m + 2 * road.sidewalk_m, closure.depth_m, closure.height_m)
         return Box("house", x, y, heading - math.pi / 2, size)
 
     def _crosswalk_area(self, crosswalk: Crosswalk) -> CrosswalkArea:
@@ -252,19 +233,14 @@ class Layout:
                 self._add_building_row(row, rng, boxes)
         return tuple(boxes)
 
-    def _is_free(self, box: Box, houses: list[Box]) -> bool:
-        ground = box.footprint.buffer(-_TOUCH_M)
-        taken = [self._paved, *(house.footprint for house in houses)]
-        return not shapely.intersects(ground, taken).any()
-
     def _house_across(self, row: BuildingRow, rng: np.random.Generator) -> Box:
-        at = self.lines[row.road].length if row.side == "end" else 0.0
+        at, ahead = (self.lines[row.road].length, 1) if row.side == "end" else (0.0, -1)
         x, y, heading = self.pose_at(row.road, at)
         depth, front = rng.uniform(*row.depth_m), rng.uniform(*row.front_m)
-        away = (row.setback_m + depth / 2) * (1 if row.side == "end" else -1)
+        away = (row.setback_m + depth / 2) * ahead
         x, y = x + away * math.cos(heading), y + away * math.sin(heading)
         size = (front, depth, rng.uniform(*row.height_m))
-        facing = heading + math.pi / 2 * (-1 if row.side == "end" else 1)
+        facing = heading - math.pi / 2 * ahead
         return Box("house", x, y, facing, size, int(rng.integers(1 << 16)))
 
     def _add_building_row(
@@ -284,17 +260,18 @@ class Layout:
                 x, y, heading = self.pose_at(row.road, at + front / 2, offset)
                 facing = heading + (0.0 if row.side == "left" else math.pi)
                 house = Box("house", x, y, facing, size, variant)
-                if at + front / 2 <= last_middle and self._is_free(house, houses):
+                ground = house.footprint.buffer(-_TOUCH_M)
+                taken = [self._paved, *(other.footprint for other in houses)]
+                is_free = not shapely.intersects(ground, taken).any()
+                if is_free and at + front / 2 <= last_middle:
                     houses.append(house)
                     at += front
                     break
                 at += _PLOT_STEP_M
 
     def _obstacle_row(self, row: ObstacleRow) -> Iterator[Box]:
-        taken = [
-            self.drivable.difference(self.ribbons[row.road]),
-            *(box.footprint for box in self.buildings),
-        ]
+        other_roads = self.drivable.difference(self.ribbons[row.road])
+        taken = [other_roads, *(box.footprint for box in self.buildings)]
         facing = math.pi if row.offset_m > 0 else 0.0
         for i, at in enumerate(np.arange(row.from_m, row.to_m, row.every_m).tolist()):
             x, y, heading = self.pose_at(row.road, at, row.offset_m)

@@ -25,7 +25,7 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
             or a `Scene`, which is checked again.
 
     Raises:
-        SceneError: names the file, the key, what was expected and the remedy.
+        SceneError: the scene is invalid.
 
     >>> load_scene("straight_road").time_limit_steps
     200
@@ -34,8 +34,17 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
         return _checked(pickle.dumps(scene))
     if isinstance(scene, Mapping):
         return _loaded(scene, f"scene {scene.get('name', 'without a name')!r}")
-    path = _find(scene)
-    return _loaded(_read(path), str(path))
+    path = Path(scene)
+    if path.suffix not in (".yaml", ".yml"):
+        if str(scene) not in scene_names():
+            known = ", ".join(scene_names())
+            raise SceneError(f"unknown scene {str(scene)!r}; choose one of {known}, or a YAML file")
+        path = CONF_DIR / "scene" / f"{scene}.yaml"
+    try:
+        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise SceneError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
+    return _loaded(data, str(path))
 
 
 def scene_names() -> list[str]:
@@ -55,12 +64,9 @@ def _adapter() -> TypeAdapter[Scene]:
     return TypeAdapter(Scene)
 
 
+# Each of many environments is given the same one. A scene holds mappings and so has no hash.
 @lru_cache(maxsize=8)
 def _checked(pickled: bytes) -> Scene:
-    """Returns a checked scene; each of many environments is given the same one.
-
-    The key is the scene's bytes, as it holds mappings and so has no hash.
-    """
     scene = pickle.loads(pickled)
     return _loaded(dataclasses.asdict(scene), f"scene {scene.name!r}")
 
@@ -81,7 +87,6 @@ def _loaded(data: Any, source: str) -> Scene:
 
 
 def _complaint(error: ValidationError) -> str:
-    """Returns pydantic's first complaint, on one line."""
     # A misspelt key is also missing under its right name; the misspelling explains it.
     first = min(error.errors(), key=lambda each: each["type"] != "unexpected_keyword_argument")
     key = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in first["loc"])[1:]
@@ -102,20 +107,3 @@ class _Loader(yaml.SafeLoader):
                 problem = f"the key {key.value!r} is given twice"
                 raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
         return super().construct_mapping(node, deep)
-
-
-def _read(path: Path) -> Any:
-    try:
-        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise SceneError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
-
-
-def _find(scene: str | Path) -> Path:
-    path = Path(scene)
-    if path.suffix in (".yaml", ".yml"):
-        return path
-    if str(scene) not in scene_names():
-        known = ", ".join(scene_names())
-        raise SceneError(f"unknown scene {str(scene)!r}; choose one of {known}, or a YAML file")
-    return CONF_DIR / "scene" / f"{scene}.yaml"

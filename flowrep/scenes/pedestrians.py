@@ -17,21 +17,20 @@ from flowrep.scenes.scene import PedestrianGroup, Range
 
 Array = NDArray[Any]
 
-RADIUS_M, HEIGHT_M = 0.3, 1.75
-"""The collision cylinder."""
-
+RADIUS_M, HEIGHT_M = 0.3, 1.75  # of the collision cylinder
+APART_M = 2 * RADIUS_M  # between the centres of two who touch
+LANE_M = APART_M + 0.01  # between the middles of neighbouring lanes
 PARTS = ("upper body", "left leg", "right leg")
 HIP_M, _HIP_ASIDE_M = 0.82, 0.1
 _SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
 
 
 def world_from_parts(poses: Array) -> Array:
-    """Returns the parts of people at poses [P, 4] as transforms [3·P, 4, 4], person by person."""
-    x, y, yaw, swing = poses.T
-    transforms = np.zeros((len(poses), len(PARTS), 4, 4))
-    sine, cosine = np.sin(yaw)[:, None], np.cos(yaw)[:, None]
-    angle = np.zeros((len(poses), len(PARTS)))
-    angle[:, 1:] = swing[:, None] * _SIDES
+    """Returns the parts of people at poses [..., P, 4] as transforms [..., 3·P, 4, 4]."""
+    x, y, yaw, swing = np.moveaxis(poses, -1, 0)[..., None]
+    transforms = np.zeros((*poses.shape[:-1], len(PARTS), 4, 4))
+    sine, cosine = np.sin(yaw), np.cos(yaw)
+    angle = np.concatenate([np.zeros_like(swing), swing * _SIDES], axis=-1)
     sine_y, cosine_y = np.sin(angle), np.cos(angle)
     # Rz(yaw) · Ry(angle)
     transforms[..., 0, 0] = cosine * cosine_y
@@ -43,48 +42,36 @@ def world_from_parts(poses: Array) -> Array:
     transforms[..., 2, 0] = -sine_y
     transforms[..., 2, 2] = cosine_y
     aside = np.array([0.0, *(_HIP_ASIDE_M * _SIDES)])
-    transforms[..., 0, 3] = x[:, None] - sine * aside
-    transforms[..., 1, 3] = y[:, None] + cosine * aside
-    transforms[:, 1:, 2, 3] = HIP_M
+    transforms[..., 0, 3] = x - sine * aside
+    transforms[..., 1, 3] = y + cosine * aside
+    transforms[..., 1:, 2, 3] = HIP_M
     transforms[..., 3, 3] = 1.0
-    return transforms.reshape(-1, 4, 4)
+    return transforms.reshape(*poses.shape[:-2], -1, 4, 4)
 
 
 def quaternions_of_parts(poses: Array) -> Array:
     """Returns the rotations of `world_from_parts` as quaternions [3·P, 4], x, y, z, w."""
-    _, _, yaw, swing = poses.T
-    sine_z, cosine_z = np.sin(yaw / 2)[:, None], np.cos(yaw / 2)[:, None]
-    half = np.zeros((len(poses), len(PARTS)))
-    half[:, 1:] = 0.5 * swing[:, None] * _SIDES
+    _, _, yaw, swing = poses.T[..., None]
+    sine_z, cosine_z = np.sin(yaw / 2), np.cos(yaw / 2)
+    half = np.concatenate([np.zeros_like(swing), 0.5 * swing * _SIDES], axis=-1)
     sine_y, cosine_y = np.sin(half), np.cos(half)
     quaternions = [-sine_z * sine_y, cosine_z * sine_y, sine_z * cosine_y, cosine_z * cosine_y]
     return np.stack(quaternions, axis=-1).reshape(-1, 4)
 
 
-APART_M = 2 * RADIUS_M
-"""Distance between the centres of two people who touch without overlapping."""
-
-LANE_M = APART_M + 0.01
-"""Distance between the middles of neighbouring lanes."""
-
-
 def keeps_its_stretches(points: Array, aside_m: float) -> bool:
-    """Returns whether a line moved aside keeps every stretch, with none reversed.
-
-    A stretch's length is linear in `aside_m`: what holds at two distances holds between them.
-    """
+    """Returns whether a line moved aside keeps every stretch, with none reversed."""
+    # A stretch's length is linear in `aside_m`: what holds at two distances holds between them.
     steps = np.diff(points, axis=0)
     moved = np.diff(parallel(points, aside_m), axis=0)
     return bool(((steps * moved).sum(axis=-1) > SHORTEST_M * np.hypot(*steps.T)).all())
 
 
 def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
-    """Returns whether lanes up to half of `spread_m` to either side stay as far apart as drawn.
-
-    They do if the strip of all lanes, widened by half a person's room, does not overlap itself: the
-    only way from one lane to another is then across all lanes between them, or out of the strip and
-    in again.
-    """
+    """Returns whether lanes up to half of `spread_m` to either side stay as far apart as drawn."""
+    # They do if the strip of all lanes, widened by half a person's room, does not overlap itself:
+    # the only way from one lane to another is then across all lanes between them, or out of the
+    # strip and in again.
     reach, room = spread_m / 2 + APART_M / 2, APART_M / 2
     first, last = points[1] - points[0], points[-1] - points[-2]
     longer = points.astype(np.float64)
@@ -97,10 +84,7 @@ def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
 
 
 def covered_ground(points: Array, spread_m: float) -> list[BaseGeometry]:
-    """Returns the ground that the lanes of a walk can cover, one convex piece for each stretch.
-
-    The pieces are lines if `spread_m` is 0.
-    """
+    """Returns the ground that the lanes of a walk can cover, a convex piece for each stretch."""
     right, left = (parallel(points, side * spread_m / 2) for side in (-1, 1))
     corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)
     return list(shapely.convex_hull(shapely.multipoints(corners)))
@@ -112,11 +96,9 @@ def least_spread_m(count: int) -> float:
 
 
 def draw_lanes(count: int, spread_m: float, rng: np.random.Generator) -> Array:
-    """Returns each person's lane [P] as its distance in metres to the left of the walk.
-
-    All placements of lanes within `spread_m` that are at least `LANE_M` apart are equally likely,
-    and so are all orders of the people.
-    """
+    """Returns each person's lane [P] as its distance in metres to the left of the walk."""
+    # All placements within `spread_m` that are at least `LANE_M` apart are equally likely, and so
+    # are all orders of the people.
     free = max(spread_m - least_spread_m(count), 0.0)
     lanes = np.sort(rng.uniform(0.0, 1.0, count)) * free + LANE_M * np.arange(count)
     return rng.permutation(lanes - spread_m / 2)
@@ -129,10 +111,9 @@ _OUT_OF_STEP_RAD = 2.4  # offset between neighbours, so that a group does not ma
 
 
 class Crowd:
-    """All people of one episode."""
+    """All people of one episode, each begins at a phase in [0, 1) of the way there and back."""
 
     def __init__(self, lines: list[Array], speeds_mps: Array, phases: Array) -> None:
-        """Places people on their lines [M, 2], at fractions [P] of the way there and back."""
         most = max((len(line) for line in lines), default=2)
         # Shorter lines are padded with copies of their last point, which add no length.
         padded = [line[np.minimum(np.arange(most), len(line) - 1)] for line in lines]
@@ -145,25 +126,18 @@ class Crowd:
         self._last_piece = np.maximum((lengths > 0).sum(axis=1) - 1, 0)
         self._length = self._marks[:, -1]
         self._there_and_back = 2 * self._length
-        self._speeds = np.asarray(speeds_mps, dtype=np.float64)
+        self._speeds = speeds_mps
         self._turn_per_m = 1.0 / np.maximum(_TURN_S * self._speeds, 1e-9)
-        self._start = np.asarray(phases, dtype=np.float64) * self._there_and_back
+        self._start = phases * self._there_and_back
         self._people = np.arange(len(lines))
         self._out_of_step = _OUT_OF_STEP_RAD * self._people
 
     def positions(self, time_s: float | Array) -> Array:
-        """Returns everyone's position [P, 2] at a time since the episode's start.
-
-        Times [T, 1] give positions [T, P, 2].
-        """
+        """Returns everyone's position [P, 2] at a time, or [T, P, 2] at times [T, 1]."""
         return self._places(self._along(time_s))[0]
 
     def poses(self, time_s: float | Array) -> Array:
-        """Returns everyone's pose [P, 4], as defined in `flowrep.scenes.pedestrians`.
-
-        Times [T, 1] give poses [T, P, 4]. Legs swing with the distance walked; people standing
-        still have one foot in front of the other.
-        """
+        """Returns everyone's pose [P, 4] at a time, or [T, P, 4] at times [T, 1]."""
         along = self._along(time_s)
         positions, headings = self._places(along)
         poses = np.empty((*along.shape, 4))
@@ -171,6 +145,7 @@ class Crowd:
         poses[..., 2] = headings + self._facing(along)
         walked = self._start + self._speeds * time_s
         step = walked * (2 * math.pi / _STRIDE_M) + self._out_of_step
+        # Who stands has one foot in front of the other.
         poses[..., 3] = _SWING_RAD * np.where(self._speeds > 0, np.sin(step), 1.0)
         return poses
 
@@ -201,20 +176,19 @@ def draw_crowd(
 ) -> Crowd:
     """Returns a crowd with phases, directions, speeds and lanes drawn for one episode."""
     lines: list[Array] = []
-    speeds: list[float] = []
-    phases: list[float] = []
+    speeds, phases = [np.empty(0)], [np.empty(0)]
     for group in groups:
-        low, high = speed_mps if group.speed_mps is None else group.speed_mps
+        low, high = group.speed_mps or speed_mps
         draws = 1 if group.draw == "group" else group.count
         # A uniform phase over the round trip draws the direction too.
         phase = np.resize(rng.uniform(0.0, 1.0, draws), group.count)
         speed = np.resize(rng.uniform(low, high, draws), group.count)
         lateral = draw_lanes(group.count, group.spread_m, rng)
         ahead = rng.uniform(-0.5, 0.5, group.count) * group.spread_m
-        for i in range(group.count):
-            line = layout.walk_line(group.walk, float(lateral[i]))
-            there_and_back = 2 * np.hypot(*np.diff(line, axis=0).T).sum()
-            lines.append(line)
-            speeds.append(0.0 if i < group.standing else float(speed[i]))
-            phases.append(float((phase[i] + ahead[i] / there_and_back) % 1.0))
-    return Crowd(lines, np.array(speeds), np.array(phases))
+        own = [layout.walk_line(group.walk, aside) for aside in lateral.tolist()]
+        there_and_back = [2 * np.hypot(*np.diff(line, axis=0).T).sum() for line in own]
+        speed[: group.standing] = 0.0
+        lines += own
+        speeds.append(speed)
+        phases.append((phase + ahead / there_and_back) % 1.0)
+    return Crowd(lines, np.concatenate(speeds), np.concatenate(phases))

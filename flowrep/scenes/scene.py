@@ -13,25 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field, Strict, StringConstraints
 
-FRAME_RATES_HZ = (0.5, 1_000.0)
-"""Lowest and highest frame rate of an environment."""
+FRAME_RATES_HZ = (0.5, 1_000.0)  # lowest and highest
 
 SpeedMode = Literal["low", "normal", "high"]
 Kind = Literal["house", "tree", "fence", "car", "traffic_light", "lamp_post"]
 Range = tuple[float, float]
 
-CATEGORY_OF_KIND: dict[Kind, str] = {
-    "house": "building",
-    "tree": "tree",
-    "fence": "fence",
-    "car": "car",
-    "traffic_light": "traffic_light",
-    "lamp_post": "building",
-}
-"""Semantic class of each kind of box; lamp posts share the class of buildings."""
-
+# The semantic class of each kind: lamp posts share that of buildings.
+CATEGORY_OF_KIND: dict[Kind, str] = {kind: kind for kind in get_args(Kind)}
+CATEGORY_OF_KIND |= {"house": "building", "lamp_post": "building"}
+# Of kinds with wheels or lamps of a fixed size; others may have any height.
 LEAST_HEIGHT_M: dict[Kind, float] = {"car": 0.7, "traffic_light": 1.0, "lamp_post": 0.3}
-"""Least height of kinds with wheels or lamps of a fixed size; others may have any."""
 
 
 class SceneError(ValueError):
@@ -82,6 +74,9 @@ Point = tuple[Number, Number]
 Size3 = tuple[Positive, Positive, Positive]
 SpeedRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_in_order)]
 HouseRange = Annotated[tuple[HouseSide, HouseSide], AfterValidator(_in_order)]
+
+
+# The docstrings of the classes are the descriptions in the JSON schema that editors show.
 
 
 class Part:
@@ -362,16 +357,11 @@ class VehicleState(NamedTuple):
 
 
 def turn(state: VehicleState, sign: Any, dt_s: float, vehicle: VehicleConfig) -> VehicleState:
-    """Returns the state with its yaw rate changed by `sign`·α·Δt, within its limit.
-
-    `sign` is the `YAW_SIGN` of the action: a scalar or array like the state's fields.
-    """
+    """Returns the state with its yaw rate changed by α·Δt times an action's `YAW_SIGN`."""
     limit = math.radians(vehicle.max_yaw_rate_dps)
     rate = state.yaw_rate_rps + sign * (math.radians(vehicle.yaw_acceleration_dps2) * dt_s)
-    if isinstance(rate, np.ndarray):
-        rate = np.clip(rate, -limit, limit)
-    else:
-        rate = min(max(rate, -limit), limit)
+    is_array = isinstance(rate, np.ndarray)
+    rate = np.clip(rate, -limit, limit) if is_array else min(max(rate, -limit), limit)
     return state._replace(yaw_rate_rps=rate)
 
 
@@ -385,22 +375,16 @@ def roll(state: VehicleState, dt_s: float, speed_mps: float) -> VehicleState:
     half_or_tiny = half + (half == 0.0) * 1e-20
     chord = speed_mps * dt_s * (xp.sin(half_or_tiny) / half_or_tiny)
     heading = state.yaw_rad + half
-    return VehicleState(
-        state.x_m + chord * xp.cos(heading),
-        state.y_m + chord * xp.sin(heading),
-        state.yaw_rad + angle,
-        state.yaw_rate_rps,
-    )
+    x_m, y_m = state.x_m + chord * xp.cos(heading), state.y_m + chord * xp.sin(heading)
+    return VehicleState(x_m, y_m, state.yaw_rad + angle, state.yaw_rate_rps)
 
 
 def footprint_corners(
     state: VehicleState, vehicle: VehicleConfig, margin_m: float = 0.0
 ) -> NDArray[np.float64]:
     """Returns the footprint's corners [..., 4, 2], counter-clockwise, widened by `margin_m`."""
-    half_length = vehicle.length_m / 2 + margin_m
-    half_width = vehicle.width_m / 2 + margin_m
-    forward = half_length * np.array([1.0, -1.0, -1.0, 1.0])
-    left = half_width * np.array([1.0, 1.0, -1.0, -1.0])
+    forward = (vehicle.length_m / 2 + margin_m) * np.array([1.0, -1.0, -1.0, 1.0])
+    left = (vehicle.width_m / 2 + margin_m) * np.array([1.0, 1.0, -1.0, -1.0])
     sine, cosine = np.sin(state.yaw_rad)[..., None], np.cos(state.yaw_rad)[..., None]
     x = np.asarray(state.x_m)[..., None] + cosine * forward - sine * left
     y = np.asarray(state.y_m)[..., None] + sine * forward + cosine * left

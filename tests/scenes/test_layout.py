@@ -119,10 +119,7 @@ def test_rows_beyond_a_road_are_on_its_straight_continuation(straight_road):
         for first, last in ((-30.0, 0.0), (212.0, 230.0))
     ]
     scene = replace(
-        straight_road,
-        categories=categories,
-        obstacle_rows=tuple(trees),
-        building_rows=tuple(rows),
+        straight_road, categories=categories, obstacle_rows=tuple(trees), building_rows=tuple(rows)
     )
     layout = Layout(load_scene(scene))
     np.testing.assert_allclose(
