@@ -29,7 +29,6 @@ class RandomActions:
     """Draws actions uniformly; those of an episode don't depend on earlier episodes."""
 
     def __init__(self, seed: int = 0) -> None:
-        """Takes a seed; other seeds give other actions."""
         self._seed = seed
         self._rng = np.random.default_rng(seed)
 

@@ -41,60 +41,48 @@ class Planner:
     """
 
     def __init__(self, beams: Sequence[int] = (100, 600)) -> None:
-        """Starts without a plan."""
         self.beams = tuple(beams)
-        self._plan: dict[int, int] = {}
-        self._episode: Episode | None = None
-        self._expected = (0, 0.0)  # steps and yaw rate if the action is taken
+        self._plan: dict[int, int] = {}  # actions by step
+        self._expected: Any = None  # episode, steps and yaw rate if the action is taken
 
     def __call__(self, env: StreetEnv) -> int:
         """Returns the next action in the env's current episode."""
         episode = env.episode
-        state = episode.now.vehicle
-        is_followed = episode is self._episode and self._expected == (
-            episode.steps,
-            state.yaw_rate_rps,
-        )
-        if not (is_followed and episode.steps in self._plan):
-            self._episode = episode
-            actions = self.search(episode)
-            self._plan = {episode.steps + i: action for i, action in enumerate(actions)}
-        action = self._plan.get(episode.steps, NO_OP)
+        state, steps = episode.now.vehicle, episode.steps
+        if self._expected != (episode, steps, state.yaw_rate_rps) or steps not in self._plan:
+            self._plan = dict(enumerate(self.search(episode), start=steps))
+        action = self._plan.get(steps, NO_OP)
         turned = turn(state, YAW_SIGN[action], episode.dt_s, episode.layout.scene.vehicle)
-        self._expected = (episode.steps + 1, turned.yaw_rate_rps)
+        self._expected = (episode, steps + 1, turned.yaw_rate_rps)
         return action
 
     def search(self, episode: Episode) -> list[int]:
         """Returns the actions of a drive to the ending zone, or of the longest drive found."""
-        search = _Search(episode)
-        actions: list[int] = []
+        search, longest = _Search(episode), list[int]()
         for beam in self.beams:
-            found, is_complete = search.run(beam)
-            actions = max(actions, found, key=len)
+            actions, is_complete = search.run(beam)
             if is_complete:
-                return found
-        return actions
+                return actions
+            longest = max(longest, actions, key=len)
+        return longest
 
 
 class GoalDistance:
     """A grid of shortest distances from the free ground to the ending zone."""
 
     def __init__(self, free: BaseGeometry, goal: BaseGeometry) -> None:
-        """Fills the grid outwards from the ending zone (Dijkstra, eight neighbours)."""
         x0, y0, x1, y1 = free.bounds
         self._origin = np.array([x0, y0])
         columns, rows = (math.ceil(size / _GRID_M) for size in (x1 - x0, y1 - y0))
         x = x0 + (np.arange(columns) + 0.5) * _GRID_M
         y = y0 + (np.arange(rows) + 0.5) * _GRID_M
-        grid_x, grid_y = np.meshgrid(x, y, indexing="ij")
-        is_free = shapely.contains_xy(free, grid_x, grid_y)
-        is_goal = is_free & shapely.contains_xy(goal, grid_x, grid_y)
+        grid = np.meshgrid(x, y, indexing="ij")
         # A margin of cells at infinity represents everything outside the grid.
-        self._way = np.full((columns + 2, rows + 2), np.inf)
-        is_open = np.pad(is_free, 1)
-        queue = [(0.0, int(i) + 1, int(j) + 1) for i, j in np.argwhere(is_goal)]
-        for _, i, j in queue:
-            self._way[i, j] = 0.0
+        is_open = np.pad(shapely.contains_xy(free, *grid), 1)
+        is_goal = is_open & np.pad(shapely.contains_xy(goal, *grid), 1)
+        self._way = np.where(is_goal, 0.0, np.inf)
+        # Dijkstra's algorithm, outwards from the ending zone.
+        queue = [(0.0, i, j) for i, j in np.argwhere(is_goal).tolist()]
         while queue:
             way, i, j = heapq.heappop(queue)
             if way > self._way[i, j]:
@@ -106,25 +94,20 @@ class GoalDistance:
                     heapq.heappush(queue, (longer, i + di, j + dj))
 
     def __call__(self, x_m: Array, y_m: Array) -> Array:
-        """Returns the distance to the ending zone in metres, inf off the free ground.
-
-        `x_m` and `y_m` have the same shape, as has the result.
-        """
+        """Returns the distances to the ending zone in metres, inf off the free ground."""
         cell = np.floor((np.stack([x_m, y_m], -1) - self._origin) / _GRID_M).astype(np.int64) + 1
-        limit = np.array(self._way.shape) - 1
-        cell = np.clip(cell, 0, limit)
+        cell = np.clip(cell, 0, np.array(self._way.shape) - 1)
         return self._way[cell[..., 0], cell[..., 1]]
 
 
 @lru_cache(maxsize=16)  # it takes a second, and planners of one scene share it
 def _ground(layout: Layout, path: Path) -> tuple[BaseGeometry, GoalDistance]:
-    """Returns the free ground of a path's episodes, and the distances on it."""
     free = free_ground(layout, path)
     return free, GoalDistance(free, layout.zones[path.end])
 
 
 class _Search:
-    """Simulates one episode for many vehicles at once."""
+    # It simulates one episode for many vehicles at once.
 
     def __init__(self, episode: Episode) -> None:
         self.episode, self.vehicle = episode, episode.layout.scene.vehicle
@@ -155,8 +138,7 @@ class _Search:
         self, state: VehicleState, actions: Array, ticks: int
     ) -> tuple[VehicleState, Array, Array]:
         """Returns the states after one decision, and which are unharmed and which have arrived."""
-        alive = np.ones(actions.size, dtype=bool)
-        arrived = np.zeros(actions.size, dtype=bool)
+        alive, arrived = np.ones(actions.size, dtype=bool), np.zeros(actions.size, dtype=bool)
         signs = np.array(YAW_SIGN)[actions]
         for _ in range(_HOLD_STEPS):
             state = turn(state, signs, self.episode.dt_s, self.vehicle)
@@ -200,8 +182,7 @@ class _Search:
 
 def _trace(history: list[tuple[Array, Array]]) -> list[int]:
     """Returns the actions that lead to the first state of the last level, step by step."""
-    actions: list[int] = []
-    at = 0
+    actions, at = list[int](), 0
     for parents, chosen in reversed(history):
         actions += [int(chosen[at])] * _HOLD_STEPS
         at = int(parents[at])

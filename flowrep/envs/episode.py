@@ -4,9 +4,8 @@ An episode is a function of the scene, the speed range, the frame rate, its seed
 """
 
 import math
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -16,15 +15,7 @@ from shapely.geometry import Polygon
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.pedestrians import Crowd, draw_crowd
-from flowrep.scenes.scene import (
-    YAW_SIGN,
-    Range,
-    Scene,
-    VehicleState,
-    footprint_corners,
-    roll,
-    turn,
-)
+from flowrep.scenes.scene import YAW_SIGN, Range, Scene, VehicleState, footprint_corners, roll, turn
 from flowrep.simulator.street import Street
 
 
@@ -43,18 +34,12 @@ class Outcome(IntEnum):
         return self.name.lower()
 
 
-NOTHING_HIT = 255
-"""The code of `hit` if nothing was hit; no class has this id."""
+NOTHING_HIT = 255  # the code of `hit` if nothing was hit; no class has this id
 
 
 def reward(outcome: Outcome) -> float:
-    """Returns the reward of a step that leads to `outcome`.
-
-    >>> reward(Outcome.SUCCESS), reward(Outcome.RUNNING)
-    (5.01, 0.01)
-    """
-    at_end = {Outcome.RUNNING: 0.0, Outcome.SUCCESS: 5.0}
-    return 0.01 + at_end.get(outcome, -5.0)
+    """Returns the reward of a step that leads to `outcome`."""
+    return 0.01 + {Outcome.RUNNING: 0.0, Outcome.SUCCESS: 5.0}.get(outcome, -5.0)
 
 
 def hit_name(code: int) -> str:
@@ -70,8 +55,7 @@ _CHECKS_PER_M = 2.4
 _STEPS_FORESEEN = 16  # people ignore the vehicle, so their positions are computed in batches
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """The vehicle's state and the pedestrians' clock; ticks count the footprint's checks."""
 
     vehicle: VehicleState
@@ -99,10 +83,8 @@ class Episode:
         episode_seed: int,
         speed_mps: Range,
         vehicle_speed_mps: float,
-        *,
         path: str | None = None,
     ) -> None:
-        """Draws the path and the pedestrians from the seed; the vehicle is at its start."""
         scene = layout.scene
         paths = {each.name: each for each in scene.paths}
         if path is not None and path not in paths:
@@ -121,11 +103,8 @@ class Episode:
         self.path = drawn if path is None else paths[path]
         self.crowd: Crowd = draw_crowd(layout, scene.pedestrian_groups, speed_mps, rng)
         self.goal = layout.zones[self.path.end]
-        self.now = Moment(layout.start_state(self.path.start), 0)
-        self.before = self.now
-        self.steps = 0
-        self.outcome = Outcome.RUNNING
-        self.hit = ""
+        self.now = self.before = Moment(layout.start_state(self.path.start), 0)
+        self.steps, self.outcome, self.hit = 0, Outcome.RUNNING, ""
         self.poses = self.poses_before = self.crowd.poses(0.0)
         self._foreseen = self.poses[:0, None]  # poses at the ticks from `_foreseen_from` on
         self._foreseen_from = 0

@@ -28,8 +28,8 @@ class RepresentationObservation(gym.Wrapper):
     """Turns an environment's sensor maps into representations, channels first and finite.
 
     If joined, the observation is one `Box` `[C, H, W]`: float32, with the representations' channels
-    in the given order, ids one-hot and colours divided by 255. If all maps are uint8 (rgb alone),
-    they stay uint8. If not joined, it is a `Dict` of maps by name, as `make_env` gives them.
+    in the given order, ids one-hot and colours divided by 255; rgb alone stays uint8. If not
+    joined, it is a `Dict` of maps by name, as `make_env` gives them.
 
     Args:
         env: gives a dict of sensor maps and motions, as `StreetEnv` does; its `K` `[3, 3]`,
@@ -77,7 +77,7 @@ class RepresentationObservation(gym.Wrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Maps, dict[str, Any]]:
-        """Begins an episode; the options may not change the seconds a step of flow in px/s."""
+        """Begins an episode, with a frame rate of its own unless flow is in px/s."""
         check_rate(self._stack, options, self._frame_rate_hz)
         observation, info = self.env.reset(seed=seed, options=options)
         sensed = _sensed(observation)
@@ -166,10 +166,9 @@ def make_street(
 def _onehot(representations: Representations) -> dict[str, dict[str, Any]]:
     """Returns the representations with one-hot ids: a class id is not an intensity."""
     given = representations if isinstance(representations, Mapping) else {}
+    onehot = {"encoding": "onehot"}
     return {
-        name: {"encoding": "onehot", **(given.get(name) or {})}
-        if name in ("seg", "seg2")
-        else dict(given.get(name) or {})
+        name: (onehot if name in ("seg", "seg2") else {}) | dict(given.get(name) or {})
         for name in representations
     }
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from flowrep.envs.episode import Episode, Moment
 from flowrep.palette import CLASS_COLOURS, num_classes
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
-from flowrep.scenes.scene import Scene
 from flowrep.simulator.bullet import Picture
 from flowrep.simulator.camera import (
     choose_renderer,
@@ -57,8 +56,7 @@ class CameraPose:
 
     def __init__(
         self, x_m: float | Array, y_m: float | Array, yaw_rad: float | Array, mount: Array
-    ) -> None:
-        """Applies the mount, vehicle_from_cam [4, 4], to vehicles at planar poses."""
+    ) -> None:  # mount: vehicle_from_cam [4, 4]
         self.planar = np.stack([x_m, y_m, yaw_rad], axis=-1)
         self.world_from_cam = planar(x_m, y_m, yaw_rad) @ mount
         self.cam_from_world = rigid_inverse(self.world_from_cam)
@@ -75,16 +73,16 @@ def relative_camera(before: CameraPose, now: CameraPose) -> Array:
 def instance_motion(
     before: CameraPose, now: CameraPose, prev_world_from_body: Array, world_from_body: Array
 ) -> Array:
-    """Returns prev_from_curr by instance [..., 1 + M, 4, 4] for bodies [..., M, 4, 4].
+    """Returns prev_from_curr by instance [..., 1 + M, 4, 4]; row 0 is the static world's.
 
-    Row 0 is the static world's. Row i maps a point fixed to body i from the current camera's frame
-    to its position in the previous camera's frame. A body that kept its pose has exactly the
-    numbers of row 0, so that its object flow is exactly zero.
+    Row i maps a point fixed to body i from the current camera's frame to its position in the
+    previous camera's frame.
     """
     static = relative_camera(before, now)[..., None, :, :]
     # now: body ← world ← camera; then: camera ← world ← body, in which the point has stayed
     body_from_cam = rigid_inverse(world_from_body) @ now.world_from_cam[..., None, :, :]
     carried = before.cam_from_world[..., None, :, :] @ prev_world_from_body @ body_from_cam
+    # Who kept their pose has exactly the numbers of row 0, so that their object flow is exactly 0.
     moved = (world_from_body != prev_world_from_body).any(axis=(-2, -1))
     return np.concatenate([static, np.where(moved[..., None, None], carried, static)], axis=-3)
 
@@ -99,20 +97,14 @@ class Sensing:
     """The camera of one environment and the requested sensors."""
 
     def __init__(
-        self,
-        scene: Scene,
-        street: Street,
-        sensors: Sequence[str],
-        renderer: str = "auto",
-        picture_scale: int = 1,
+        self, street: Street, sensors: Sequence[str], renderer: str, picture_scale: int
     ) -> None:
-        unknown = [name for name in sensors if name not in SENSORS]
-        if unknown:
+        if unknown := [name for name in sensors if name not in SENSORS]:
             raise ValueError(f"unknown sensors {unknown}; they are: {', '.join(SENSORS)}")
         self.names = tuple(sensors)
-        self._scene, self._street, self._camera = scene, street, scene.camera
-        camera, focal = scene.camera, scene.camera.focal_px
-        size = (camera.height_px, camera.width_px)
+        self._street, self._scene = street, street.layout.scene
+        self._camera = camera = self._scene.camera
+        focal, size = camera.focal_px, (camera.height_px, camera.width_px)
         self.K = sampled_intrinsics(focal, focal, *size)
         self._projection = gl_projection(focal, focal, *size, camera.near_m, camera.far_m)
         self._vehicle_from_cam = vehicle_from_camera(camera)
@@ -125,22 +117,19 @@ class Sensing:
             self._rasteriser(1)  # compiled before the first step
 
     def observe(self, episode: Episode) -> dict[str, Any]:
-        """Returns an episode's current observation; renders only if a map is requested."""
+        """Returns an episode's current observation."""
         return {name: stack[0] for name, stack in self.observe_all([episode]).items()}
 
     def observe_all(self, episodes: Sequence[Episode]) -> Arrays:
-        """Returns the current observations of N episodes of the scene, [N, ...].
-
-        Each is identical, bit for bit, to the observation of the episode alone.
-        """
+        """Returns the current observations of N episodes of the scene, [N, ...]."""
         names = _DRAWN.intersection(self.names)
         observation = self._draw(episodes, names) if names else {}
         if not {"prev_from_curr", "instance_motion"}.isdisjoint(self.names):
             now = self._camera_poses([episode.now for episode in episodes])
             before = self._camera_poses([episode.before for episode in episodes])
             if "instance_motion" in self.names:
-                parts_before = _parts([episode.poses_before for episode in episodes])
-                parts = _parts([episode.poses for episode in episodes])
+                parts_before = world_from_parts(np.stack([e.poses_before for e in episodes]))
+                parts = world_from_parts(np.stack([e.poses for e in episodes]))
                 rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
                 observation |= {"instance_motion": rows, "prev_from_curr": rows[:, 0].copy()}
             else:
@@ -156,10 +145,9 @@ class Sensing:
 
     def look(self, episode: Episode) -> Picture:
         """Returns PyBullet's picture from an episode's camera, of the bodies as last placed."""
-        camera, pose = self._camera, self._camera_poses([episode.now])
-        return self._street.simulator.look(
-            gl_view(pose.cam_from_world[0]), self._projection, camera.height_px, camera.width_px
-        )
+        view = gl_view(self._camera_poses([episode.now]).cam_from_world[0])
+        size = self._camera.height_px, self._camera.width_px
+        return self._street.simulator.look(view, self._projection, *size)
 
     def space(self) -> spaces.Dict:
         """Returns the observation space."""
@@ -195,7 +183,7 @@ class Sensing:
         """Returns the poses of cameras and people's parts and what is shown, of N episodes."""
         return (
             self._camera_poses([episode.now for episode in episodes]).cam_from_world,
-            _parts([episode.poses for episode in episodes]),
+            world_from_parts(np.stack([episode.poses for episode in episodes])),
             np.stack([self._street.is_shown(episode.path.closures) for episode in episodes]),
         )
 
@@ -206,8 +194,7 @@ class Sensing:
 
             camera = self._camera
             size = scale * camera.height_px, scale * camera.width_px
-            K = np.diag([scale, scale, 1.0]) @ self.K
-            range_m = camera.near_m, camera.far_m
+            K, range_m = np.diag([scale, scale, 1.0]) @ self.K, (camera.near_m, camera.far_m)
             self._rasterisers[scale] = Rasteriser(self._street.triangles, K, size, range_m)
         return self._rasterisers[scale]
 
@@ -221,15 +208,9 @@ class Sensing:
         semantic, instance = np.moveaxis(self._ids_by_number[picture.body], -1, 0)
         rgb = picture.rgba[..., :3].transpose(2, 0, 1).copy()
         rgb[:, is_sky] = np.array(CLASS_COLOURS["sky"])[:, None]
-        maps = {"depth": depth[None], "semantic": semantic[None], "instance": instance[None]}
-        return maps | {"rgb": rgb}
+        maps = {"depth": depth, "semantic": semantic, "instance": instance}
+        return {name: array[None] for name, array in maps.items()} | {"rgb": rgb}
 
     def _camera_poses(self, moments: Sequence[Moment]) -> CameraPose:
         x_m, y_m, yaw_rad, _ = np.array([moment.vehicle for moment in moments]).T
         return CameraPose(x_m, y_m, yaw_rad, self._vehicle_from_cam)
-
-
-def _parts(poses: Sequence[Array]) -> Array:
-    """Returns the transforms [N, M, 4, 4] of people's parts for N arrays of poses [P, 4]."""
-    stacked = np.stack(poses)
-    return world_from_parts(stacked.reshape(-1, 4)).reshape(len(poses), -1, 4, 4)

@@ -13,14 +13,7 @@ from flowrep.envs.episode import Episode, Moment, Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import (
-    FRAME_RATES_HZ,
-    YAW_SIGN,
-    Range,
-    Scene,
-    SpeedMode,
-    VehicleState,
-)
+from flowrep.scenes.scene import FRAME_RATES_HZ, YAW_SIGN, Range, Scene, SpeedMode, VehicleState
 from flowrep.simulator.street import Street
 
 _OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz")
@@ -58,10 +51,7 @@ class StreetEnv(gym.Env):
             from larger pictures and averaged down is more accurate.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 - gymnasium declares it so
-        "render_modes": ["rgb_array"],
-        "render_fps": 12,
-    }
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012
 
     def __init__(
         self,
@@ -80,10 +70,10 @@ class StreetEnv(gym.Env):
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
         self._street = Street.shared(self.scene)
-        self.sensing = Sensing(self.scene, self._street, sensors, renderer, picture_scale)
+        self.sensing = Sensing(self._street, sensors, renderer, picture_scale)
         self.K = self.sensing.K
         self._episode: Episode | None = None
-        self.action_space = spaces.Discrete(3)
+        self.action_space = spaces.Discrete(len(YAW_SIGN))
         self.observation_space = self.sensing.space()
 
     @property
@@ -104,9 +94,6 @@ class StreetEnv(gym.Env):
                 `vehicle_speed_mps` (float) replaces the scene's speed, with 0 for a still camera;
                 `speed` and `frame_rate_hz` replace the env's for this episode. Or `state` alone, of
                 `get_state`, with which an episode goes on.
-
-        Raises:
-            ValueError: an option is unknown or out of range.
         """
         self.begin(seed=seed, options=options)
         return self.sensing.observe(self.episode), self._info()
@@ -121,28 +108,26 @@ class StreetEnv(gym.Env):
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drives one step. Every end of an episode is `terminated`, including the time-out."""
+        """Drives one step; every end of an episode is `terminated`, including the time-out."""
         outcome = self.drive(action)
         observation = self.sensing.observe(self.episode)
         return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
 
     def drive(self, action: int) -> Outcome:
         """Drives one step as `step` does, without an observation."""
+        episode = self.episode
         if action not in range(len(YAW_SIGN)):
             raise ValueError(
                 f"action is {action!r}; give 0 (keep the yaw rate), 1 (turn left) or 2 (turn right)"
             )
-        if self.episode.outcome:
-            ended = self.episode.outcome.label
-            raise RuntimeError(f"the episode has ended ({ended}): call reset() first")
-        self.episode.step(int(action), self._street)
-        return self.episode.outcome
+        if ended := episode.outcome:
+            raise RuntimeError(f"the episode has ended ({ended.label}): call reset() first")
+        episode.step(int(action), self._street)
+        return episode.outcome
 
     def render(self) -> Any:
         """Returns the camera's picture, [H, W, 3] uint8, if the render mode is "rgb_array"."""
-        if self.render_mode is None:
-            return None
-        return self.sensing.rgb(self.episode)
+        return None if self.render_mode is None else self.sensing.rgb(self.episode)
 
     def close(self) -> None:
         """Leaves the street, whose simulator is gone with the last environment."""
@@ -151,16 +136,12 @@ class StreetEnv(gym.Env):
     def get_state(self) -> dict[str, Any]:
         """Returns the complete state as JSON-serialisable data."""
         episode = self.episode
-        return {
+        return self._info() | {
             "np_random": self.np_random.bit_generator.state,
-            "episode_seed": episode.seed,
-            "path": episode.path.name,
             "vehicle_speed_mps": episode.vehicle_speed_mps,
             "speed": list(episode.speed_mps),
             "frame_rate_hz": episode.frame_rate_hz,
             "steps": episode.steps,
-            "outcome": episode.outcome.label,
-            "hit": episode.hit,
             "now": _plain(episode.now),
             "before": _plain(episode.before),
         }
@@ -175,17 +156,12 @@ class StreetEnv(gym.Env):
         episode = self.episode
         episode.steps, episode.hit = state["steps"], state["hit"]
         episode.outcome = Outcome[state["outcome"].upper()]
-        before, now = (
-            Moment(VehicleState(*moment["vehicle"]), moment["ticks"])
-            for moment in (state["before"], state["now"])
-        )
-        episode.resume(before, now)
+        both = state["before"], state["now"]
+        episode.resume(*(Moment(VehicleState(*m["vehicle"]), m["ticks"]) for m in both))
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         if unknown := sorted(options.keys() - set(_OPTIONS)):
             raise ValueError(f"unknown reset options {unknown}; they are: {', '.join(_OPTIONS)}")
-        rate = _frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz))
-        speed_mps = _speed_range(self.scene, options.get("speed", self.speed_mps))
         vehicle_speed_mps = options.get("vehicle_speed_mps")
         if vehicle_speed_mps is None:
             vehicle_speed_mps = self.scene.vehicle.speed_mps
@@ -193,11 +169,11 @@ class StreetEnv(gym.Env):
             raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 to stand")
         self._episode = Episode(
             self._street.layout,
-            rate,
+            _frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),
             operator.index(options["episode_seed"]),
-            speed_mps,
+            _speed_range(self.scene, options.get("speed", self.speed_mps)),
             float(vehicle_speed_mps),
-            path=options.get("path"),
+            options.get("path"),
         )
 
     def _info(self) -> dict[str, Any]:

@@ -48,11 +48,7 @@ _SELDOM = ("rgb", "frame")  # sensors that are kept only if something reads them
 
 
 class VectorWrapper(GymWrapper):
-    """TorchRL's wrapper, with reset masks moved to the CPU and optional, and options checked.
-
-    TorchRL 0.14 passes them on from the TensorDict's device, which fails on CUDA, and requires them
-    in every TensorDict; here, all environments are reset if they are missing.
-    """
+    """TorchRL's wrapper, with reset masks moved to the CPU and optional, and options checked."""
 
     def __init__(
         self,
@@ -71,6 +67,8 @@ class VectorWrapper(GymWrapper):
         return super()._reset(tensordict, **kwargs)
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
+        # TorchRL 0.14 passes masks on from the TensorDict's device, which fails on CUDA, and
+        # requires them in every TensorDict; here, all environments are reset if they are missing.
         if reset is None:
             return kwargs
         mask = {"reset_mask": reset.view(self.batch_size).cpu().numpy()}
@@ -78,16 +76,13 @@ class VectorWrapper(GymWrapper):
 
 
 class DropSensor(ExcludeTransform):
-    """Drops all ("sensor", ...) keys after the representations have been computed from them.
-
-    TorchRL's own transform looks for "sensor" among the leaves of the specs, and finds none.
-    """
+    """Drops all ("sensor", ...) keys after the representations have been computed from them."""
 
     def __init__(self) -> None:
         super().__init__("sensor")
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Returns the specs without "sensor"."""
+        """Returns the specs without "sensor", which TorchRL's own looks for among their leaves."""
         del output_spec["full_observation_spec"]["sensor"]
         return output_spec
 
@@ -136,8 +131,7 @@ def make_env(
 
     Raises:
         SceneError: if the scene is invalid.
-        ValueError: if there are no environments or more workers than environments, or if
-            `compiled=True` and no C++ compiler is found.
+        ValueError: if `compiled=True` and no C++ compiler is found.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -205,13 +199,10 @@ def make_mirror(
     tensor([0, 2, 1])
     """
     camera, names = load_scene(scene).camera, list(representations)
-    focal = camera.focal_px
-    return Mirror(
-        names,
-        flow_keys=[name for name in names if name in FLOWS],
-        swapped_actions=[YAW_SIGN.index(-sign) for sign in YAW_SIGN],
-        intrinsics=sampled_intrinsics(focal, focal, camera.height_px, camera.width_px).tolist(),
-    )
+    K = sampled_intrinsics(camera.focal_px, camera.focal_px, camera.height_px, camera.width_px)
+    flows = [name for name in names if name in FLOWS]
+    swapped = [YAW_SIGN.index(-sign) for sign in YAW_SIGN]
+    return Mirror(names, flow_keys=flows, swapped_actions=swapped, intrinsics=K.tolist())
 
 
 def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
@@ -238,9 +229,7 @@ def street_envs(env: TransformedEnv) -> list[StreetEnv]:
     """
     vector = _vector(env)
     if vector.num_workers:
-        raise ValueError(
-            "the environments are in worker processes: make the env with num_workers=0"
-        )
+        raise ValueError("the environments are in worker processes: give num_workers=0")
     return [street.unwrapped for street in vector.envs]
 
 
@@ -252,10 +241,8 @@ def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
     """Restores states from `get_states`; continue with the TensorDict of the same time."""
     vector = _vector(env)
-    if len(states) != vector.num_envs:
-        raise ValueError(
-            f"{len(states)} states for {vector.num_envs} environments; give one for each"
-        )
+    if len(states) != (count := vector.num_envs):
+        raise ValueError(f"{len(states)} states for {count} environments; give one for each")
     env.reset()
     vector.reset(options={"episodes": [{"state": state} for state in states]})
 

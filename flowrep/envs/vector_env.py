@@ -1,6 +1,6 @@
 """Environments of one scene in one process, stepped one by one and rendered together."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from flowrep.envs.episode import NOTHING_HIT, Episode, Outcome, reward
+from flowrep.envs.workers import write_rows
 
 _STATUS: dict[str, Any] = {
     "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
@@ -35,7 +36,7 @@ class StreetVectorEnv(SyncVectorEnv):
     | `vehicle` | [3] | float32 | x and y in metres and yaw in radians, in the world |
 
     Observations are identical, bit for bit, to those of the environments alone, and belong to the
-    caller. There are no infos.
+    caller.
     """
 
     num_workers = 0
@@ -48,15 +49,11 @@ class StreetVectorEnv(SyncVectorEnv):
         self.single_observation_space = spaces.Dict(nested | _STATUS)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._is_idle = [False] * self.num_envs
-        self._latest: Any = create_empty_array(
-            self.single_observation_space, self.num_envs, np.zeros
-        )
+        nothing = create_empty_array(self.single_observation_space, self.num_envs, np.zeros)
+        self._latest: Any = nothing
 
     def reset(
-        self,
-        *,
-        seed: int | list[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begins episodes in all environments, or in those marked by `options["reset_mask"]`.
 
@@ -93,30 +90,21 @@ class StreetVectorEnv(SyncVectorEnv):
         """Renders some environments; the others keep their last observation, at first zeros."""
         if not rows:
             return deepcopy(self._latest)
-        streets = [self._streets[row] for row in rows]
-        episodes = [street.episode for street in streets]
-        seen = streets[0].sensing.observe_all(episodes)
-        status = _status(episodes)
+        episodes = [self._streets[row].episode for row in rows]
+        sensor = self._streets[rows[0]].sensing.observe_all(episodes)
+        observation = ({"sensor": sensor} if sensor else {}) | _status(episodes)
         if len(rows) < self.num_envs:
             # Arrays returned before belong to the caller: copy them instead of writing to them.
-            seen = _replaced(self._latest.get("sensor", {}), seen, rows)
-            status = _replaced(self._latest, status, rows)
-        self._latest = ({"sensor": seen} if seen else {}) | status
+            self._latest = deepcopy(self._latest)
+            write_rows(observation, self._latest, rows)
+        else:
+            self._latest = observation
         return dict(self._latest)
 
 
 def _status(episodes: Sequence[Episode]) -> dict[str, NDArray[Any]]:
-    all_of_them = [e.status() | {"vehicle": e.now.vehicle[:3]} for e in episodes]
+    numbers = [each.status() | {"vehicle": each.now.vehicle[:3]} for each in episodes]
     return {
-        name: np.array([each[name] for each in all_of_them], space.dtype).reshape(-1, *space.shape)
+        name: np.array([each[name] for each in numbers], space.dtype).reshape(-1, *space.shape)
         for name, space in _STATUS.items()
     }
-
-
-def _replaced(
-    before: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]], rows: list[int]
-) -> dict[str, NDArray[Any]]:
-    merged = {name: before[name].copy() for name in new}
-    for name, values in new.items():
-        merged[name][rows] = values
-    return merged

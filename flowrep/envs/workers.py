@@ -40,11 +40,9 @@ class WorkerVectorEnv(VectorEnv):
     `AsyncVectorEnv` made 386 to 403 frames/s where this one made 464 to 524, and Ctrl-C kills its
     workers.
 
-    Observations come back through shared memory, everything else through pipes. `step_async` begins
-    a step, so that the caller can do other work until it calls `step` for the outcome.
-
-    Workers don't react to SIGINT and SIGTERM, which terminals and schedulers send to whole process
-    groups, and end when the caller closes them or dies.
+    Observations come back through shared memory, everything else through pipes. Workers don't react
+    to SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, and end when
+    the caller closes them or dies.
 
     Args:
         env_factories: one picklable factory for each environment, from a module that can be
@@ -53,7 +51,6 @@ class WorkerVectorEnv(VectorEnv):
         in_each: makes a vector env without autoreset from the environments of one worker.
 
     Raises:
-        ValueError: if there are fewer environments than workers.
         WorkerError: if a worker could not start; any method raises it if a worker has stopped.
     """
 
@@ -110,17 +107,15 @@ class WorkerVectorEnv(VectorEnv):
         Of the options each worker gets its own part of `reset_mask`, bool [num_envs], and of
         `episodes`, see `StreetVectorEnv.reset`.
         """
-        options = dict(options or {})
-        mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
-        episodes = options.pop("episodes", None)
+        each = {"reset_mask": np.ones(self.num_envs, dtype=bool), **(options or {})}
+        apart = [name for name in ("reset_mask", "episodes") if each.get(name) is not None]
         if isinstance(seed, int):
             seed = range(seed, seed + self.num_envs)
         seeds = [None] * self.num_envs if seed is None else list(seed)
 
         def arguments(rows: slice) -> dict[str, Any]:
-            own = {"reset_mask": mask[rows]}
-            own |= {} if episodes is None else {"episodes": episodes[rows]}
-            return {"seed": seeds[rows], "options": options | own}
+            own = {name: each[name][rows] for name in apart}
+            return {"seed": seeds[rows], "options": each | own}
 
         self._call("reset", arguments)
         return deepcopy(self._shared), {}
@@ -222,10 +217,7 @@ def _work(
     num_envs: int,
     in_each: VectorFactory,
 ) -> None:
-    """Calls methods of a vector env until the other end of the pipe is closed.
-
-    Observations are written into their rows of the shared memory, what else is returned is sent.
-    """
+    """Calls methods of a vector env until the other end of the pipe is closed."""
     vector: Any = None
     try:
         vector = in_each(env_factories)
@@ -239,7 +231,7 @@ def _work(
                 result = ()  # which gymnasium's vector env refuses
             else:
                 observation, *result = getattr(vector, method)(**arguments)
-                _copy(observation, shared, rows)
+                write_rows(observation, shared, rows)
             pipe.send((result, None))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the caller has closed, or is gone
@@ -250,24 +242,23 @@ def _work(
             vector.close()
 
 
-def _copy(source: Mapping[str, Any], target: Mapping[str, Any], rows: slice) -> None:
+def write_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: Any) -> None:
+    """Writes arrays nested in mappings into some rows of those in `target`."""
     for name, value in source.items():
         if isinstance(value, Mapping):
-            _copy(value, target[name], rows)
+            write_rows(value, target[name], rows)
         else:
             target[name][rows] = value
 
 
 @contextmanager
 def sheltered() -> Iterator[None]:
-    """Starts processes that signals don't reach and that do not run the main module again.
-
-    A process inherits the mask of blocked signals, so there is no moment at which Ctrl-C could
-    print a traceback from each worker. Running `python -m flowrep.train` again, as multiprocessing
-    does, would import PyTorch in each.
-    """
+    """Starts processes that signals don't reach and that do not run the main module again."""
     resource_tracker.ensure_running()  # which unblocks signals when it starts
+    # A process inherits the mask of blocked signals, so there is no moment at which Ctrl-C could
+    # print a traceback from each worker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    # Running the main module again, as multiprocessing does, would import PyTorch in each.
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -278,5 +269,5 @@ def sheltered() -> Iterator[None]:
 
 
 def available_cores() -> int:
-    """Returns the number of cores that this process may use."""
+    """Returns how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -42,11 +42,7 @@ def assert_same(a, b):
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize(
     "arguments",
-    [
-        {"sensors": SENSORS},
-        {"sensors": ("depth", "prev_from_curr")},
-        {"renderer": "pybullet"},
-    ],
+    [{"sensors": SENSORS}, {"sensors": ("depth", "prev_from_curr")}, {"renderer": "pybullet"}],
     ids=str,
 )
 def test_steps_and_partial_resets_are_those_of_streets_alone(make, make_street, arguments):

@@ -154,10 +154,7 @@ def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make)
     def interrupted():
         raise KeyboardInterrupt
 
-    with (
-        patch.object(env._workers[1], "receive", interrupted),
-        pytest.raises(KeyboardInterrupt),
-    ):
+    with patch.object(env._workers[1], "receive", interrupted), pytest.raises(KeyboardInterrupt):
         env.step(np.array([1, 2, 3]))
     assert_same(env.reset(seed=1), other.reset(seed=1))
     assert_same(env.step(np.array([1, 2, 3])), other.step(np.array([1, 2, 3])))
