@@ -194,11 +194,9 @@ class Street:
     def _add_body(
         self, mesh: meshes.Mesh, category: str, *, instance: int = 0, boxes_m: Sequence[Any] = ()
     ) -> int:
-        triangles, seen_as = (
-            np.array(mesh.indices).reshape(-1, 3),
-            (CATEGORY_ID[category], instance),
-        )
-        self.bodies.append(Body(np.array(mesh.vertices), triangles, *seen_as, np.array(mesh.uvs)))
+        vertices, uvs = np.array(mesh.vertices), np.array(mesh.uvs)
+        triangles, semantic = np.array(mesh.indices).reshape(-1, 3), CATEGORY_ID[category]
+        self.bodies.append(Body(vertices, triangles, semantic, instance, uvs))
         self._numbers.append(self.simulator.add_body(mesh, boxes_m))
         return len(self.bodies) - 1
 
