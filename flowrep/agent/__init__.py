@@ -14,16 +14,7 @@ from flowrep.agent.ppo import PPO
 from flowrep.agent.replay import ReplayMemory
 
 __all__ = [
-    "PPO",
-    "Algorithm",
-    "CheckpointError",
-    "DiscreteSAC",
-    "DiscreteSACWithValue",
-    "DivergenceError",
-    "DoubleDQN",
-    "FasterThreads",
-    "ReplayMemory",
-    "keep_freed_memory",
-    "load_checkpoint",
+    "PPO", "Algorithm", "CheckpointError", "DiscreteSAC", "DiscreteSACWithValue", "DivergenceError",
+    "DoubleDQN", "FasterThreads", "ReplayMemory", "keep_freed_memory", "load_checkpoint",
     "save_checkpoint",
-]
+]  # fmt: skip

@@ -46,13 +46,7 @@ class EpsilonGreedyPolicy(TensorDictSequential):
 
 
 class DoubleDQNMapLoss(DQNLoss):
-    """TorchRL's double Q-learning loss on stored maps, with a target; see `DoubleDQN`.
-
-    Args:
-        network: the policy's.
-        actions: the policy's action space.
-        gamma: discount per frame.
-    """
+    """TorchRL's double Q-learning loss on stored maps, with a target; see `DoubleDQN`."""
 
     def __init__(
         self, network: MapNetwork, actions: DiscreteActions, *, gamma: float = 0.99
@@ -89,11 +83,7 @@ class DoubleDQN(OffPolicy):
     """
 
     LOSS = DoubleDQNMapLoss
-    METRICS: ClassVar[Mapping[str, str]] = {
-        "q_loss": "loss",
-        "td_error": "td_error",
-        "epsilon": "epsilon",
-    }
+    METRICS: ClassVar = {"q_loss": "loss", "td_error": "td_error", "epsilon": "epsilon"}
 
     def __init__(
         self,
@@ -129,7 +119,7 @@ class DoubleDQN(OffPolicy):
         keys: Sequence[NestedKey],
         **options: Any,
     ) -> EpsilonGreedyPolicy:
-        """Returns an untrained policy, see `Algorithm.make_policy`; its state includes ε."""
+        """See `Algorithm.make_policy`; the policy's state includes ε."""
         stochastic = super().make_policy(observation_spec, action_spec, keys, **options)
         exploration = EGreedyModule(
             action_spec,

@@ -83,10 +83,8 @@ class NatureEncoder(nn.Module):
 class Encoder(nn.Module):
     """Returns the concatenated embeddings of several maps, each through its own `NatureEncoder`.
 
-    Args:
-        codecs: the maps.
-        layer_norm: normalise each embedding to mean 0 and variance 1 (without learnt weights), so
-            that all maps have the same scale and the head's input keeps it.
+    With `layer_norm` each embedding has mean 0 and variance 1 (without learnt weights), so that all
+    maps have the same scale and the head's input keeps it.
     """
 
     def __init__(self, codecs: Sequence[MapCodec], *, layer_norm: bool = False) -> None:
@@ -124,15 +122,12 @@ class Head(nn.Module):
 
 
 def heads_together(embedding: Tensor, weights: Mapping[str, Any]) -> Tensor:
-    """Returns the outputs `[heads, N, outputs]` of several heads on one embedding.
+    """Returns the outputs `[heads, N, outputs]` of several heads on one embedding `[N, size]`.
 
-    Their hidden layers are one product, where TorchRL would use vmap.
-
-    Args:
-        embedding: `[N, embedding]`, the input of all heads.
-        weights: those of `Head` by module and name, stacked along a first dim of heads.
+    `weights` are those of `Head` by module and name, stacked along a first dim of heads.
     """
     hidden, output = weights["hidden"], weights["output"]
+    # the hidden layers are one product, where TorchRL would use vmap
     with _autocast_like(embedding):
         x = F.silu(F.linear(embedding, hidden["weight"].flatten(0, 1), hidden["bias"].flatten()))
     # [N, heads * hidden] to [heads, N, hidden]

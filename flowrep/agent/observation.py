@@ -113,12 +113,7 @@ class MapCodec:
 def map_codecs(
     observation_spec: Composite, keys: Sequence[NestedKey], dtype: torch.dtype
 ) -> tuple[MapCodec, ...]:
-    """Returns one codec per key, in order, from the specs, whose last three dims are C, H, W.
-
-    Raises:
-        ValueError: if `keys` is empty, or a map has the wrong rank, type or size.
-        KeyError: if the spec lacks a key.
-    """
+    """Returns one codec per key, in order, from the specs, whose last three dims are C, H, W."""
     if not keys:
         raise ValueError("the agent needs at least one observation key, got none")
     offered = observation_spec.keys(include_nested=True, leaves_only=True)

@@ -17,7 +17,7 @@ from torchrl.objectives.value import GAE
 from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork, stochastic_policy
 from flowrep.agent.observation import MapCodec, decode_maps, store_maps
-from flowrep.agent.replay import time_first
+from flowrep.agent.replay import OUTCOME, time_first
 
 
 class Rollout:
@@ -32,16 +32,12 @@ class Rollout:
         return len(self._steps)
 
     def extend(self, frames: TensorDictBase) -> None:
-        """Stores steps of N environments, with dims as in `time_first`.
-
-        They have the maps, `action`, `action_log_prob` and, under `next`, the maps, `reward`,
-        `done` and `terminated`.
-        """
+        """Stores steps of N environments, with dims as in `time_first`."""
         for step in time_first(frames).unbind(0):
             kept = store_maps(self.codecs, step)
             kept.update(step.select("action", "action_log_prob").detach())
             # with the next maps, since after a truncated step the next row is another episode's
-            outcome = step["next"].select("reward", "done", "terminated")
+            outcome = step["next"].select(*OUTCOME)
             kept["next"] = store_maps(self.codecs, step["next"]).update(outcome)
             self._steps.append(kept.to(self.device))
 
@@ -74,8 +70,6 @@ class ClipPPOMapLoss(ClipPPOLoss):
     """TorchRL's clipped loss on stored maps, with one encoder for policy and V; see `PPO`.
 
     Args:
-        network: the policy's; V shares its encoder.
-        actions: the policy's action space.
         clip: distance of ρ from 1 beyond which the objective no longer rewards moving it.
         value_weight: weight of L_V.
         entropy_weight: weight of L_H.
@@ -154,15 +148,11 @@ class PPO(Algorithm):
 
     WRITES_LOG_PROB = True
     LOSS = ClipPPOMapLoss
-    METRICS: ClassVar[Mapping[str, str]] = {
-        "policy_loss": "loss_objective",
-        "value_loss": "loss_critic",
-        "entropy_loss": "loss_entropy",
-        "entropy": "entropy",
-        "kl": "kl_approx",
-        "clip_share": "clip_fraction",
-        "explained_variance": "explained_variance",
-    }
+    METRICS: ClassVar = {
+        "policy_loss": "loss_objective", "value_loss": "loss_critic",
+        "entropy_loss": "loss_entropy", "entropy": "entropy", "kl": "kl_approx",
+        "clip_share": "clip_fraction", "explained_variance": "explained_variance",
+    }  # fmt: skip
     memory: Rollout
 
     def __init__(

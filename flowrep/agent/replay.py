@@ -100,7 +100,11 @@ class RowStorage(LazyTensorStorage):
     _storage: Any
 
     def __init__(
-        self, max_size: int, *, observation_keys: Sequence[NestedKey], device: torch.device | str
+        self,
+        max_size: int,
+        *,
+        observation_keys: Sequence[NestedKey],
+        device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(max_size, device=device)
         self.observation_keys = tuple(observation_keys)

@@ -25,6 +25,11 @@ PoseLayout: TypeAlias = Literal[
 PoseDirection: TypeAlias = Literal["camera_to_world", "world_to_camera"]
 CameraAxes: TypeAlias = Literal["opencv", "opengl", "ned", "x_forward_z_up"]
 
+POSE_SHAPES: dict[str, tuple[int, ...]] = {
+    "matrix": (4, 4), "matrix_3x4": (3, 4), "xyz_xyzw": (7,), "xyz_wxyz": (7,),
+    "xyz_yaw": (4,), "xyz_yaw_pitch": (5,),
+}  # fmt: skip
+
 # OpenCV's right, down and forward as (axis, sign) of the other convention.
 _OPENCV_AXES = {
     "opencv": ((0, 1), (1, 1), (2, 1)),
@@ -274,14 +279,11 @@ def adapt_pose(
     tensor([6., 6., 7., 1.], dtype=torch.float64)
     """
     check_pose_options(layout, direction, axes)
-    if layout == "matrix":
-        check_shape("pose", pose, (4, 4))
-        matrix = pose.double()
-    elif layout == "matrix_3x4":
-        check_shape("pose", pose, (3, 4))
-        matrix = _with_last_row(pose.double())
+    check_shape("pose", pose, POSE_SHAPES[layout])
+    if layout.startswith("matrix"):
+        matrix = pose.double() if layout == "matrix" else _with_last_row(pose.double())
     elif layout.startswith("xyz_yaw"):
-        matrix = _pose_from_angles(pose, has_pitch=layout == "xyz_yaw_pitch")
+        matrix = _pose_from_angles(pose.double())
     else:
         matrix = pose_from_quaternion(pose, layout, check=check)
     if check:
@@ -306,10 +308,9 @@ def check_pose_options(layout: str, direction: str, axes: str) -> None:
         )
 
 
-def _pose_from_angles(pose: Tensor, has_pitch: bool) -> Tensor:
-    """Returns Rz(yaw) · Ry(−pitch) with the translation, `[*B, 4, 4]`, float64."""
-    check_shape("pose", pose, (5 if has_pitch else 4,))
-    x, y, z, yaw, *rest = pose.double().unbind(-1)
+def _pose_from_angles(pose: Tensor) -> Tensor:
+    """Returns Rz(yaw) · Ry(−pitch) with the translation, `[*B, 4, 4]`."""
+    x, y, z, yaw, *rest = pose.unbind(-1)
     pitch = rest[0] if rest else torch.zeros_like(yaw)
     cos, sin, up, ahead = yaw.cos(), yaw.sin(), pitch.sin(), pitch.cos()
     rows = [

@@ -1,4 +1,8 @@
-"""TorchRL transforms that turn sensor maps into mid-level representations."""
+"""TorchRL transforms that turn sensor maps into mid-level representations.
+
+A constructor raises ValueError, which names the argument, for a value that can't be used. In calls,
+ValueError names an input of another layout, and `MissingKey`, a KeyError, one that isn't there.
+"""
 
 from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose, BodyRows
 from flowrep.transforms.estimated_flow import DIS, RAFT, EstimatedFlow
@@ -11,26 +15,8 @@ from flowrep.transforms.noise import SensorNoise
 from flowrep.transforms.stack import REPRESENTATIONS, representation_options, representation_stack
 
 __all__ = [
-    "DIS",
-    "RAFT",
-    "REPRESENTATIONS",
-    "AdaptDepth",
-    "AdaptFlow",
-    "AdaptPose",
-    "BodyRows",
-    "CameraMotion",
-    "Depth",
-    "EstimateCameraMotion",
-    "EstimatedFlow",
-    "FlowFactorize",
-    "FrameStack",
-    "InstanceIds",
-    "InstanceMotion",
-    "Mirror",
-    "RawFlow",
-    "Rgb",
-    "Segmentation",
-    "SensorNoise",
-    "representation_options",
-    "representation_stack",
-]
+    "DIS", "RAFT", "REPRESENTATIONS", "AdaptDepth", "AdaptFlow", "AdaptPose", "BodyRows",
+    "CameraMotion", "Depth", "EstimateCameraMotion", "EstimatedFlow", "FlowFactorize", "FrameStack",
+    "InstanceIds", "InstanceMotion", "Mirror", "RawFlow", "Rgb", "Segmentation", "SensorNoise",
+    "representation_options", "representation_stack",
+]  # fmt: skip

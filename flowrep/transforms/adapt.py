@@ -1,4 +1,7 @@
-"""Conversion of other simulators' and robots' sensor data to the inputs of flowrep's transforms."""
+"""Conversion of other simulators' and robots' sensor data to the inputs of flowrep's transforms.
+
+What they write has keys of its own, so that nothing is adapted twice.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,10 @@ from torchrl.data import TensorSpec, Unbounded
 from flowrep import geometry
 from flowrep.geometry.depth import check_depth_options
 from flowrep.geometry.flow import check_flow_options
-from flowrep.geometry.pose import check_pose_options
+from flowrep.geometry.pose import POSE_SHAPES, check_pose_options
 from flowrep.transforms.base import (
     DEPTH,
     FLOW,
-    MOTION,
     Keys,
     MapTransform,
     Reads,
@@ -26,15 +28,6 @@ from flowrep.transforms.base import (
     flags_of_batch,
 )
 from flowrep.transforms.flow import CameraTransform, Intrinsics
-
-_POSES = {
-    "matrix": MOTION,
-    "matrix_3x4": Reads((3, 4), "float"),
-    "xyz_xyzw": Reads((7,), "float"),
-    "xyz_wxyz": Reads((7,), "float"),
-    "xyz_yaw": Reads((4,), "float"),
-    "xyz_yaw_pitch": Reads((5,), "float"),
-}
 
 
 class AdaptDepth(CameraTransform):
@@ -45,23 +38,13 @@ class AdaptDepth(CameraTransform):
     | depth of some `kind` | `("sensor", "depth")` | float `[*B, 1, H, W]` | > 0, inf, nan | m |
     | K, if `intrinsics` names a key | | | | |
 
-    Convention: see `flowrep.geometry.adapt_depth`.
+    Convention and further arguments: see `flowrep.geometry.adapt_depth`.
 
     Args:
-        kind: `"z"`, `"ray_length"` or `"z_buffer"` (OpenGL's, in [0, 1]).
         intrinsics: K `[3, 3]` in pixels or its key; only for `"ray_length"`.
-        near_m: the near plane, as `far_m` the far plane only for `"z_buffer"`.
-        scale_m: metres per unit; whole numbers need it, e.g. 0.001 for millimetres.
-        nothing: a value, before scaling, that means no measurement; it becomes nan.
         channels_last: whether the env's depth is `[*B, H, W, 1]`.
-        out_keys: must differ from `in_keys`, so that nothing is adapted twice.
-
-    Raises:
-        ValueError: for an unknown kind, an argument that it lacks or doesn't use, or a K that can't
-            be one.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> metres = AdaptDepth("z_buffer", near_m=0.5, far_m=8.0, in_keys="zbuffer")
         >>> metres(TensorDict(zbuffer=torch.tensor([[[0.0, 0.8]]])))["sensor", "depth"]
@@ -110,25 +93,15 @@ class AdaptPose(MapTransform):
     | --- | --- | --- | --- | --- |
     | a pose | `("sensor", "world_from_cam")` | float64 `[*B, 4, 4]` | rigid | m |
 
-    Convention: see `flowrep.geometry.adapt_pose`, also for the input's shape by layout. It also
-    converts poses of bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, as a body's own axes do not
-    matter.
+    Convention and further arguments: see `flowrep.geometry.adapt_pose`. It also converts poses of
+    bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, as a body's own axes do not matter.
 
     Args:
-        layout: `"matrix"`, `"matrix_3x4"`, `"xyz_xyzw"`, `"xyz_wxyz"`, `"xyz_yaw"` or
-            `"xyz_yaw_pitch"`.
-        direction: `"camera_to_world"` or `"world_to_camera"`.
-        axes: `"opencv"`, `"opengl"` (Blender's), `"ned"` or `"x_forward_z_up"`.
         check: whether ill-formed poses raise ValueError at resets, in the envs that are reset, and
             at the root of batches; steps aren't checked. A check waits for a GPU: switch it off if
             resets or replay samples have to be fast there.
-        out_keys: must differ from `in_keys`, so that nothing is adapted twice.
-
-    Raises:
-        ValueError: for an unknown name, and at resets for a pose that is not rigid.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> adapt = AdaptPose(layout="xyz_wxyz", axes="x_forward_z_up", in_keys="pose")
         >>> td = adapt(TensorDict(pose=torch.tensor([5.0, 6.0, 7.0, 1.0, 0.0, 0.0, 0.0])))
@@ -149,7 +122,7 @@ class AdaptPose(MapTransform):
         out_keys: Keys = ("sensor", "world_from_cam"),
     ) -> None:
         check_pose_options(layout, direction, axes)
-        super().__init__([_POSES[layout]], in_keys, out_keys)
+        super().__init__([Reads(POSE_SHAPES[layout], "float")], in_keys, out_keys)
         check_own_keys(self)
         self.options: dict[str, Any] = {"layout": layout, "direction": direction, "axes": axes}
         self.check = bool(check)
@@ -192,21 +165,13 @@ class AdaptFlow(MapTransform):
     | --- | --- | --- | --- | --- |
     | flow | `"raw"` | float `[*B, 2, H, W]` | any | px/step |
 
-    Convention: see `flowrep.geometry.adapt_flow`. Flow on the previous frame's grid raises
-    ValueError, as it can't be converted to the current grid exactly.
+    Convention and further arguments: see `flowrep.geometry.adapt_flow`. Flow on the previous
+    frame's grid raises ValueError, which names the remedy.
 
     Args:
-        direction: `"forward"` (p_t − p_t') or `"backward"` (p_t' − p_t).
-        grid: `"current"`; `"previous"` raises an error that names the remedy.
-        channels: `"uv"` or `"row_column"`.
         channels_last: whether the env's flow is `[*B, H, W, 2]`.
-        out_keys: must differ from `in_keys`, so that nothing is adapted twice.
-
-    Raises:
-        ValueError: for an unknown name, and for flow on the previous frame's grid.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> backward = torch.tensor([-3.0, 1.0]).reshape(2, 1, 1)
         >>> adapt = AdaptFlow(direction="backward", grid="current", in_keys="flow")
@@ -254,7 +219,6 @@ class BodyRows:
         count: the number of rows: bodies there at once, and those that have just left.
 
     Example:
-        >>> import torch
         >>> rows = BodyRows(3)
         >>> imp, demon = torch.eye(4), torch.eye(4)
         >>> rows({"imp": imp, "demon": demon})[:, 0, 0]
@@ -275,11 +239,7 @@ class BodyRows:
         self._row_of: dict[Hashable, int] = {}
 
     def __call__(self, poses: Mapping[Hashable, Tensor]) -> Tensor:
-        """Returns the poses `[count, 4, 4]`, float64, of this step's bodies by id.
-
-        Raises:
-            ValueError: there are more bodies than free rows.
-        """
+        """Returns the poses `[count, 4, 4]`, float64; ValueError if rows are too few."""
         free = sorted(set(range(self.count)) - set(self._row_of.values()))
         arrived = [body for body in poses if body not in self._row_of]
         if len(arrived) > len(free):
@@ -297,9 +257,7 @@ class BodyRows:
     def instance(self, labels: Tensor, body_of: Mapping[int, Hashable]) -> Tensor:
         """Returns `("sensor", "instance")`: 1 + the row of each pixel's body, 0 without one.
 
-        Args:
-            labels: a label per pixel, any shape; an integer type.
-            body_of: the bodies' ids by label, of this step. Labels may change every step.
+        `body_of` has the bodies' ids by label, which may change every step.
         """
         out = torch.zeros_like(labels)
         for label, body in body_of.items():

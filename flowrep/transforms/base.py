@@ -60,8 +60,6 @@ class MapTransform(Transform):
 
     Args:
         reads: the expected layout of each input, in the order of `in_keys`.
-        in_keys: keys to read.
-        out_keys: keys to write.
         writes: the number of outputs, each of which needs a key.
 
     Attributes:
@@ -91,12 +89,7 @@ class MapTransform(Transform):
         self.label = " and ".join(repr(key) for key in self.out_keys)
 
     def _inputs(self, source: TensorDictBase | Composite) -> list[Any]:
-        """Returns the tensors or the specs under `in_keys`.
-
-        Raises:
-            MissingKey: one is not there; names the others.
-            ValueError: the layout of one is wrong, or contradicts that of those before it.
-        """
+        """Returns the tensors or the specs under `in_keys`, of the layouts that `reads` says."""
         maps = [source.get(key, None) for key in self.in_keys]
         for key, value in zip(self.in_keys, maps):
             if value is None:

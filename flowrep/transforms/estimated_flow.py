@@ -47,12 +47,7 @@ class DIS:
         min_side_px: pictures with a shorter side below this are enlarged to at least this; 1
             enlarges none.
 
-    Raises:
-        ValueError: for an unknown preset or a size below 1.
-        ImportError: OpenCV is not installed.
-
     Example:
-        >>> import torch
         >>> ramp = torch.linspace(0, 255, 40).to(torch.uint8).expand(1, 3, 40, 40)
         >>> DIS()(ramp, ramp).abs().max()  # nothing moved
         tensor(0.)
@@ -70,11 +65,8 @@ class DIS:
     def __call__(self, first: Tensor, second: Tensor) -> Tensor:
         """Returns the displacement of each pixel from the first picture to the second.
 
-        Convention: `[N, 2, H, W]` float32, (u right, v down), pixels, on the first picture's grid.
-
-        Args:
-            first: uint8 `[N, 3, H, W]`, RGB.
-            second: as `first`.
+        Convention: `[N, 2, H, W]` float32, (u right, v down), pixels, on the first picture's grid;
+        pictures are RGB, uint8 `[N, 3, H, W]`.
         """
         arrays = (x.movedim(-3, -1).contiguous().cpu().numpy() for x in (first, second))
         pairs = list(zip(*arrays))
@@ -128,11 +120,6 @@ class RAFT(nn.Module):
         network: `"raft_small"` or `"raft_large"`, matching the weights.
         updates: number of refinements of the flow; more are slower and more accurate.
         min_side_px: as `DIS`'s, at least 128.
-
-    Raises:
-        ImportError: torchvision is missing or was built for another torch.
-        FileNotFoundError: there is no file at that path.
-        ValueError: for an unknown network, a size that is too small, or weights that do not fit.
     """
 
     def __init__(
@@ -222,16 +209,14 @@ class EstimatedFlow(FlowTransform):
     | | `"unscaled"` if chosen | as above | any | px/step |
     | | `"raw_valid"`, `"unscaled_valid"` | bool `[*B, 1, H, W]` | | |
 
-    Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
-    step, as in `RawFlow`. The estimator therefore runs from the current picture to the previous one
-    and its flow is negated; from the previous to the current one it would lie on the wrong grid.
+    Convention: as in `RawFlow`, on the current frame's grid. The estimator therefore runs from the
+    current picture to the previous one and its flow is negated; from the previous to the current
+    one it would lie on the wrong grid.
 
     The input is the previous picture and, after it on the channels, the current one.
     `FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])` writes them, correctly across
     resets and in a replay buffer. After a reset the current picture comes twice and flow is
-    exactly 0. This transform itself keeps no state.
-
-    Where the estimator's flow isn't finite, flow is 0 and the mask beside it False, as `RawFlow`'s.
+    exactly 0. Where the estimator's flow isn't finite, it is 0 and the mask beside it False.
 
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
@@ -245,15 +230,9 @@ class EstimatedFlow(FlowTransform):
         scale: factor on raw; for raw's `unit` and for `dt_s` and `out_keys` see `RawFlow`.
         in_keys: the pair of pictures.
 
-    Raises:
-        ValueError: for an unknown estimator, output or unit, `weights` for another estimator than
-            RAFT, options for a function, and in each call for flow of another shape.
-        ImportError: if a library that the estimator needs is not installed.
-
     Example:
         A texture that moved 2 px to the right since the previous picture.
 
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> noise = torch.rand(1, 3, 8, 12, generator=torch.Generator().manual_seed(0))
         >>> texture = torch.nn.functional.interpolate(255 * noise, scale_factor=8.0)

@@ -45,15 +45,8 @@ Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 class CameraTransform(MapTransform):
     """Holds K in its original float type, even if the transform is cast to another.
 
-    Raw flow, where it is the first input, becomes nan where the mask under `mask_key` is False.
-
-    Args:
-        intrinsics: K `[3, 3]`, its key in the TensorDict, where it is `[*B, 3, 3]`, or None if K
-            isn't needed. A key is read after all other keys.
-        reads: see `MapTransform`, as for the other arguments.
-
-    Raises:
-        ValueError: for a K that is not finite, not positive in fx and fy, or transposed.
+    Raw flow, where it is the first input, becomes nan where the mask under `mask_key` is False. A
+    key of K, `[*B, 3, 3]`, is read after all other keys.
     """
 
     K: Tensor | None
@@ -135,11 +128,8 @@ class FlowTransform(CameraTransform):
         self.compiled = bool(compiled)
 
     def _at_one_precision(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """Returns the inputs and K, the last, in depth's float type, at least float32.
-
-        Raw and ego flow have to round alike; otherwise obj would be rounding noise on static
-        pixels.
-        """
+        """Returns the inputs and K, the last, in depth's float type, at least float32."""
+        # Raw and ego flow have to round alike, or obj is rounding noise on static pixels.
         (depth,) = (x for x, reads in zip(maps, self.reads) if reads == DEPTH)
         dtype = torch.promote_types(depth.dtype, torch.float32)
         maps = [*maps] if self.K is None else [*maps, self.K]
@@ -211,14 +201,9 @@ class RawFlow(FlowTransform):
         out_keys: one key per output; their names by default. The mask's key follows raw's:
             `("sensor", "flow_valid")` for `("sensor", "flow")`.
 
-    Raises:
-        ValueError: for a K that can't be one, an unknown output or unit, or `"px_per_s"` without
-            `dt_s`.
-
     Example:
         A body a metre away was 0.1 m further left: fx · 0.1 m / 1 m = 5 px to the right.
 
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> motions = torch.eye(4).repeat(2, 1, 1)
         >>> motions[1, 0, 3] = -0.1
@@ -278,14 +263,12 @@ class FlowFactorize(FlowTransform):
     | `("sensor", "prev_from_curr")` | `"raw"` if chosen | as above | any | as above |
     | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
 
-    Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the
-    paper), obj = raw − ego is the objects' own flow (Eq. 6), both p_t − p_t' on the current frame's
-    grid, channels (u right, v down). `prev_from_curr` `[*B, 4, 4]` maps a point from the current
-    camera's frame to the previous camera's. Flow is 0 where it isn't known: where depth is `nan`,
-    the point was not in front of the previous camera, or the motion, K or raw flow isn't finite.
-    Raw flow isn't known either where the mask beside it, bool `"raw_valid"` (`RawFlow` and
-    `EstimatedFlow` write it; its key follows raw's), is False: a store of raw flow keeps both.
-    With the simulator's raw flow, obj is exactly 0 on everything static.
+    Convention: ego is the flow that the camera's motion alone would cause, obj = raw − ego is the
+    objects' own flow, on `RawFlow`'s grid and channels; see `flowrep.geometry.factorize`, also for
+    `prev_from_curr` and where flow isn't known and 0. Raw flow isn't known either where the mask
+    beside it, bool `"raw_valid"` (`RawFlow` and `EstimatedFlow` write it; its key follows raw's),
+    is False: a store of raw flow keeps both. With the simulator's raw flow, obj is exactly 0 on
+    everything static.
 
     Args:
         intrinsics: K `[3, 3]` of the maps, or its key, see `RawFlow`.
@@ -298,15 +281,10 @@ class FlowFactorize(FlowTransform):
             alone.
         out_keys: one key per output; their names by default.
 
-    Raises:
-        ValueError: for a K that can't be one, an unknown output or unit, or `"px_per_s"` without
-            `dt_s`.
-
     Example:
         The camera moved 0.1 m to the right, so a wall a metre away moves by fx · 0.1 = 5 px to the
         left; a pixel with a measured flow of 0 has an object flow of +5 px.
 
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> motion = torch.eye(4)
         >>> motion[0, 3] = 0.1

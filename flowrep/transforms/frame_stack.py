@@ -34,16 +34,9 @@ class FrameStack(RecurrentTransform):
     frames (two per transition, or one if `next` is looked up) and sample slices of an episode.
     Stacks are exact from the k-th step of a slice on, `batch[:, k - 1:]`.
 
-    Args:
-        k: number of frames, at least 1.
-        in_keys: maps to stack.
-        out_keys: keys of the stacks; must differ from the maps' keys.
-
-    Raises:
-        ValueError: for k < 1 or an output key that is also an input key.
+    The stacks' keys (`out_keys`) must differ from the maps' keys.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> frames = torch.arange(3.0).reshape(3, 1, 1, 1)
         >>> done = torch.tensor([[False], [True], [False]])  # the third frame begins an episode
@@ -95,6 +88,4 @@ def _stacked(spec: TensorSpec, k: int) -> TensorSpec:
         return Bounded(low, high, shape=shape, device=spec.device, dtype=spec.dtype)
     if isinstance(spec, Unbounded):
         return Unbounded(shape, device=spec.device, dtype=spec.dtype)
-    raise TypeError(
-        f"FrameStack stacks maps with a Categorical, Bounded or Unbounded spec, got {spec}"
-    )
+    raise TypeError(f"FrameStack stacks Categorical, Bounded or Unbounded maps, got {spec}")

@@ -43,10 +43,8 @@ def config_class(
 ) -> Any:
     """Returns the config of a class or function: a dataclass with a field for each parameter.
 
-    Args:
-        target: the class or function that Hydra instantiates.
-        base: TorchRL's config class of the group.
-        partial: whether Hydra returns a function of the arguments that are still missing.
+    `base` is TorchRL's config class of the group; with `partial`, Hydra returns a function of the
+    arguments that are still missing.
 
     >>> config_class(transforms.Depth)().range_m
     100.0
@@ -70,7 +68,6 @@ def config_class(
 
 
 def _field(name: str, default: Any) -> Any:
-    """Returns a dataclass field for a parameter's default."""
     if default is inspect.Parameter.empty:
         return MISSING
     if name in ("in_keys", "out_keys") and default is not None:

@@ -32,7 +32,6 @@ class Rgb(MapTransform):
     read the divisor from the spec's bounds.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> picture = torch.full((3, 2, 4), 7, dtype=torch.uint8)
         >>> Rgb()(TensorDict({"sensor": {"rgb": picture}}))["rgb"].shape
@@ -64,18 +63,13 @@ class Segmentation(MapTransform):
     pixel without a class, all zeros in the one-hot encoding.
 
     In each call, ids of a wider or signed type are checked before conversion to uint8, which waits
-    for a GPU. Pass uint8 to avoid that.
+    for a GPU, and those that it can't hold raise ValueError. Pass uint8 to avoid that.
 
     Args:
-        num_classes: number n of classes, 1 to 256.
+        num_classes: n, 1 to 256.
         encoding: `"ids"` or `"onehot"`.
 
-    Raises:
-        ValueError: for an unknown encoding or a number of classes that uint8 can't hold, and in
-            each call for ids that it can't hold.
-
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> sensor = {"semantic": torch.tensor([[[0, 2, 1]]], dtype=torch.uint8)}
         >>> td = TensorDict({"sensor": sensor})
@@ -97,12 +91,11 @@ class Segmentation(MapTransform):
         check_name("encoding", encoding, Encoding)
         if not 1 <= num_classes <= 256:
             raise ValueError(f"num_classes must be 1 to 256 (ids are uint8), got {num_classes}")
-        self.num_classes = int(num_classes)
-        self.encoding = encoding
+        self.num_classes, self.encoding = int(num_classes), encoding
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Returns the ids; raises ValueError for ids that wrap in uint8: 300 would become 44."""
         (ids,) = super()._read(tensordict)
+        # ids would wrap in uint8: 300 would become 44
         if self.encoding == "ids" and ids.dtype is not torch.uint8 and ids.numel():
             least, most = (int(bound) for bound in ids.aminmax())
             if least < 0 or most > 255:
@@ -136,17 +129,10 @@ class Depth(MapTransform):
     | --- | --- | --- | --- | --- |
     | `("sensor", "depth")`, m | `"depth"` | float32 `[*B, 1, H, W]` | 0 … 1 | `range_m` |
 
-    Sky (`inf`) and everything beyond `range_m` becomes 1, a hole (`nan`) becomes `missing`.
-
-    Args:
-        range_m: depth in metres that becomes 1.
-        missing: value for `nan`, in [0, 1].
-
-    Raises:
-        ValueError: for a range that is not positive and finite, or `missing` outside [0, 1].
+    Sky (`inf`) and everything beyond `range_m` becomes 1, a hole (`nan`) becomes `missing`, a
+    number in [0, 1].
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> depth = torch.tensor([[[25.0, 400.0, torch.inf, torch.nan]]])
         >>> Depth(range_m=100.0)(TensorDict({"sensor": {"depth": depth}}))["depth"]
@@ -166,8 +152,7 @@ class Depth(MapTransform):
             raise ValueError(f"range_m must be a positive number of metres, got {range_m}")
         if not 0 <= missing <= 1:
             raise ValueError(f"missing must be in [0, 1], the value for nan, got {missing}")
-        self.range_m = float(range_m)
-        self.missing = float(missing)
+        self.range_m, self.missing = float(range_m), float(missing)
 
     def compute(self, depth: Tensor) -> tuple[Tensor]:
         """Returns depth / range_m in [0, 1]."""
@@ -176,8 +161,7 @@ class Depth(MapTransform):
 
     def output_specs(self, depth: TensorSpec) -> tuple[TensorSpec]:
         """Returns a spec bounded to [0, 1]."""
-        spec = Bounded(0.0, 1.0, shape=depth.shape, device=depth.device, dtype=torch.float32)
-        return (spec,)
+        return (Bounded(0.0, 1.0, shape=depth.shape, device=depth.device, dtype=torch.float32),)
 
 
 class InstanceIds(MapTransform):
@@ -192,11 +176,7 @@ class InstanceIds(MapTransform):
             other id, also a negative one, becomes 0, the static world.
         out_keys: must differ from `in_keys`, so that nothing is adapted twice.
 
-    Raises:
-        ValueError: for a repeated id.
-
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> rows = InstanceIds([17, 3], in_keys="segmentation")
         >>> td = rows(TensorDict(segmentation=torch.tensor([[[0, 3, 17, -1]]])))

@@ -50,14 +50,8 @@ class Mirror(Transform):
         images: "half" replaces each transition with probability 1/2, a trajectory (with a dimension
             named "time") as a whole; "both" appends the images along the first dimension, which
             doubles it; "all" replaces all.
-        action_key: the key of the action.
-
-    Raises:
-        ValueError: for a flow that is not among `in_keys`, actions that exchanging twice doesn't
-            bring back, or intrinsics without an exact image.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> flow = torch.tensor([[[1.0, 2.0, 3.0]], [[4.0, 5.0, 6.0]]])  # u and v of one row
         >>> td = TensorDict({"raw": flow, "action": torch.tensor(1)})

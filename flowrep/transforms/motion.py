@@ -46,14 +46,10 @@ class CameraMotion(RecurrentTransform):
     `AdaptPose`), of any float type; use float64 for large worlds. The motion is composed in float64
     and returned in float32. After a reset it is exactly the identity.
 
-    The previous step's pose is read from the TensorDict passed to `step`; no state is kept between
-    calls. In a replay buffer the poses at the root and under `"next"` give the next motion,
-    shuffled or not; n-step returns need it stored. A batch without a stored root motion has to be a
-    trajectory, with a dimension named "time" and `("next", "done")`; its first frame counts as an
-    episode's first.
+    The previous step's pose is read where `FrameStack` reads its stack, and a replay buffer without
+    stored motions has to meet the same conditions.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> poses = torch.eye(4).repeat(3, 1, 1)
         >>> poses[:, 0, 3] = torch.tensor([0.0, 2.0, 7.0])  # the third begins a new episode
@@ -89,20 +85,15 @@ class InstanceMotion(RecurrentTransform):
     | `("sensor", "world_from_cam")` | `("sensor", "instance_motion")` | float32 | | m |
     | `("sensor", "world_from_body")` | | `[*B, 1 + N, 4, 4]` | | |
 
-    Convention: row 0 is the static world's, the camera's own motion; row 1 + i maps a point fixed
-    to body i from the current camera's frame to its place in the previous camera's. A static body's
-    row is bitwise equal to row 0. `InstanceIds` converts a simulator's segmentation ids to these
-    rows, and `RawFlow` reads both.
-
-    The choice of a body's own origin and axes doesn't matter. Like `CameraMotion`, it reads the
-    previous step's poses from the TensorDict passed to `step` and keeps no state.
+    Convention: see `flowrep.geometry.instance_motion`. `InstanceIds` converts a simulator's
+    segmentation ids to its rows, and `RawFlow` reads both. The previous step's poses are read as
+    `CameraMotion`'s.
 
     Args:
         in_keys: keys of the camera's pose `[*B, 4, 4]` and the bodies' poses `[*B, N, 4, 4]`,
             metres.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> camera, body = torch.eye(4).repeat(2, 1, 1), torch.eye(4).repeat(2, 1, 1, 1)
         >>> body[1, 0, 0, 3] = 0.5  # the only body moved half a metre along x
@@ -142,12 +133,9 @@ class EstimateCameraMotion(CameraTransform):
     | `prior`, if given | `("sensor", "motion_valid")` | bool `[*B, 1]` | |
     | `"raw_valid"`, if there | | | |
 
-    Convention: see `flowrep.geometry.camera_motion`. The result depends on the frame alone, so it
-    is the same in an env, in any batch and on replay samples; no state is kept. Without a prior, a
+    Convention and where it fails: see `flowrep.geometry.camera_motion`. The result depends on the
+    frame alone, so it is the same in an env, in any batch and on replay samples. Without a prior, a
     frame that tells no motion (`motion_valid` False) has the identity.
-
-    It takes the camera to move against most of what it sees. Where one body fills more than half
-    of the picture, the motion is relative to that body; `inlier_share` doesn't tell. A prior helps.
 
     Put it after the transform that writes raw flow and before `FlowFactorize`, whose ego and object
     flow then need no pose.
@@ -161,11 +149,7 @@ class EstimateCameraMotion(CameraTransform):
         in_keys: raw flow (px/step, unscaled) and depth.
         out_keys: one key per output; the table's by default.
 
-    Raises:
-        ValueError: for a K that can't be one or an unknown output.
-
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from flowrep.geometry import ego_flow
         >>> K = torch.tensor([[40.0, 0.0, 10.0], [0.0, 50.0, 8.0], [0.0, 0.0, 1.0]])

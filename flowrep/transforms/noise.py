@@ -90,11 +90,7 @@ class SensorNoise(MapTransform):
         in_keys: one key per sensor; the table's by default.
         out_keys: one key per sensor; `in_keys` by default.
 
-    Raises:
-        ValueError: for an unknown sensor, an option of a sensor that isn't read, or a negative one.
-
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> depth = torch.tensor([[[1.0, 10.0, torch.inf]]])
         >>> noise = SensorNoise(sensors=["depth"], depth_sigma_per_m=0.01)
@@ -134,8 +130,7 @@ class SensorNoise(MapTransform):
             read if out_keys is None else out_keys,
             writes=len(sensors),
         )
-        self.sensors = tuple(sensors)
-        self.options = options
+        self.sensors, self.options = tuple(sensors), options
         self.seed = None if seed is None else int(seed)
         self.has_frames = bool(frame)
         self._state: Tensor | None = None  # of the generator, after what has been drawn
@@ -255,13 +250,9 @@ def split_mix(state: Tensor) -> Tensor:
 
 
 def frame_bits(frame: Tensor, shape: Sequence[int], *, seed: int, stream: int) -> Tensor:
-    """Returns 64 random bits for each element of a frame, int64 `[*B, *shape]`.
+    """Returns 64 random bits for each element of frames named by integers `[*B, N]`, int64.
 
-    Args:
-        frame: integers `[*B, N]` that name a frame.
-        shape: shape of the elements of one frame.
-        seed: a different seed gives different numbers for all frames.
-        stream: a small number that distinguishes the uses of one frame's numbers.
+    The result is `[*B, *shape]`; `stream`, a small number, tells apart the uses of one frame's.
     """
     start = torch.full_like(frame[..., 0], seed, dtype=torch.int64)
     for number in (torch.full_like(start, stream), *frame.long().unbind(-1)):

@@ -17,8 +17,7 @@ from flowrep.transforms.maps import Depth, Rgb, Segmentation
 from flowrep.transforms.motion import EstimateCameraMotion
 from flowrep.transforms.noise import SENSORS, SensorNoise
 
-FLOW_SOURCES = ("exact", "estimated")
-MOTION_SOURCES = ("exact", "estimated")
+FLOW_SOURCES = MOTION_SOURCES = ("exact", "estimated")
 NOISE_OPTIONS = SENSORS["depth"].options + SENSORS["motion"].options
 _ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px")
 _FLOW_OPTIONS = ("scale", "unit")
@@ -61,14 +60,10 @@ _KEPT = (_PICTURES_KEY, _ESTIMATED_FLOW_KEY, _ESTIMATED_MOTION_KEY, *_NOISY_KEYS
 
 
 def representation_options(name: str) -> dict[str, Any]:
-    """Returns a representation's options with their defaults, e.g. `range_m` of depth.
+    """Returns a representation's options with their defaults.
 
-    Raises:
-        ValueError: for an unknown name.
-
-    Example:
-        >>> representation_options("depth2")
-        {'k': 2, 'range_m': 100.0, 'missing': 0.0}
+    >>> representation_options("depth2")
+    {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
     _check_known("representation", [name], REPRESENTATIONS)
     entry = _REPRESENTATIONS[name]
@@ -120,9 +115,6 @@ def representation_stack(
             computed from the noisy values; raw flow and classes don't use these sensors. The noise
             depends on the frame that `("sensor", "frame")` names.
 
-    Raises:
-        ValueError: for an unknown or repeated name, an unknown option, or a missing argument.
-
     Example:
         >>> K = [[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]]
         >>> representation_stack(["ego"], intrinsics=K)
@@ -153,9 +145,8 @@ class DropKeys(ExcludeTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns a batch without the keys."""
-        return tensordict.exclude(
-            *self.excluded_keys, *(("next", key) for key in self.excluded_keys)
-        )
+        keys = self.excluded_keys
+        return tensordict.exclude(*keys, *(("next", key) for key in keys))
 
 
 def _check_known(what: str, names: Iterable[object], known: Collection[str]) -> None:
