@@ -1,8 +1,8 @@
 """Cameras, rigid motions and the flow they cause, as pure batched functions on torch tensors.
 
 `*B` is any leading batch; those of several arguments broadcast. Every function raises ValueError
-for a shape that does not fit and TypeError for an argument that holds no floats (or no integers,
-where ids are wanted), and names it.
+for a shape, a name or a number that does not fit and TypeError for an argument that holds no floats
+(or no integers, where ids are wanted), and names it.
 """
 
 from flowrep.geometry.camera import (
@@ -41,36 +41,10 @@ from flowrep.geometry.pose import (
 )
 
 __all__ = [
-    "CameraAxes",
-    "Channels",
-    "DepthKind",
-    "Direction",
-    "Factors",
-    "Flow",
-    "FovAxis",
-    "Grid",
-    "MotionEstimate",
-    "PoseDirection",
-    "PoseLayout",
-    "adapt_depth",
-    "adapt_flow",
-    "adapt_pose",
-    "camera_motion",
-    "check_intrinsics",
-    "check_rigid",
-    "ego_flow",
-    "factorize",
-    "instance_motion",
-    "instance_rows",
-    "intrinsics_from_fov",
-    "intrinsics_from_opencv",
-    "invert_rigid",
-    "pose_from_quaternion",
-    "project",
-    "relative_motion",
-    "rigid_flow",
-    "transform_points",
-    "unproject",
-    "z_from_ray_length",
-    "z_from_z_buffer",
-]
+    "CameraAxes", "Channels", "DepthKind", "Direction", "Factors", "Flow", "FovAxis", "Grid",
+    "MotionEstimate", "PoseDirection", "PoseLayout", "adapt_depth", "adapt_flow", "adapt_pose",
+    "camera_motion", "check_intrinsics", "check_rigid", "ego_flow", "factorize", "instance_motion",
+    "instance_rows", "intrinsics_from_fov", "intrinsics_from_opencv", "invert_rigid",
+    "pose_from_quaternion", "project", "relative_motion", "rigid_flow", "transform_points",
+    "unproject", "z_from_ray_length", "z_from_z_buffer",
+]  # fmt: skip

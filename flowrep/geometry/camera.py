@@ -8,13 +8,7 @@ from typing import Literal, TypeAlias
 import torch
 from torch import Tensor
 
-from flowrep.geometry.checks import (
-    broadcast_batch,
-    check_name,
-    check_shape,
-    first_wrong,
-    over_points,
-)
+from flowrep.geometry.checks import check_name, check_shape, common_batch, first_wrong, over_points
 
 FovAxis: TypeAlias = Literal["horizontal", "vertical"]
 
@@ -52,9 +46,9 @@ def project(points_cam: Tensor, K: Tensor) -> Tensor:
 def unproject(depth: Tensor, K: Tensor) -> Tensor:
     """Returns the point that each pixel shows, in the camera's frame, `[*B, H, W, 3]`.
 
-    Convention: OpenCV camera (x right, y down, z forward), metres; depth is z along the optical
-    axis (not the ray's length); pixel (column i, row j) is seen through its centre
-    (i + 0.5, j + 0.5). Where depth is inf or nan the point is not finite.
+    Convention: as in `project`; depth is z along the optical axis (not the ray's length), and pixel
+    (column i, row j) is seen through its centre (i + 0.5, j + 0.5). Where depth is inf or nan the
+    point is not finite.
 
     Equation 10 of the paper, with separate focal lengths and skew.
 
@@ -68,7 +62,7 @@ def unproject(depth: Tensor, K: Tensor) -> Tensor:
     """
     check_shape("depth", depth, (1, "H", "W"))
     check_shape("K", K, (3, 3))
-    broadcast_batch(depth=depth.shape[:-3], K=K.shape[:-2])
+    common_batch(depth=depth.shape[:-3], K=K.shape[:-2])
     dtype = torch.promote_types(depth.dtype, K.dtype)
     z = depth.squeeze(-3).to(dtype)
     x, y = pixel_rays(z.shape[-2], z.shape[-1], K.to(dtype))
@@ -107,13 +101,8 @@ def intrinsics_from_fov(
     perspective).
 
     Args:
-        fov_deg: the whole angle, degrees, between 0 and 180.
-        axis: `"horizontal"` or `"vertical"`.
         height: of the picture, pixels; as `width`.
         pixel_aspect: a pixel's width over its height, fy / fx; 1 for square pixels.
-
-    Raises:
-        ValueError: an unknown axis, or an angle or a size out of range.
 
     >>> intrinsics_from_fov(90.0, axis="vertical", height=4, width=6)
     tensor([[2., 0., 3.],
@@ -125,10 +114,9 @@ def intrinsics_from_fov(
         raise ValueError(f"fov_deg must lie between 0 and 180 degrees, got {fov_deg}")
     if height < 1 or width < 1:
         raise ValueError(f"height and width must be at least 1 pixel, got {height} and {width}")
-    half_size = (width if axis == "horizontal" else height) / 2
     if not 0 < pixel_aspect < math.inf:
         raise ValueError(f"pixel_aspect must be positive, got {pixel_aspect}")
-    focal = half_size / math.tan(math.radians(fov_deg) / 2)
+    focal = (width if axis == "horizontal" else height) / 2 / math.tan(math.radians(fov_deg) / 2)
     fx, fy = focal, focal * pixel_aspect
     if axis == "vertical":
         fx, fy = focal / pixel_aspect, focal
@@ -139,8 +127,7 @@ def intrinsics_from_fov(
 def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
     """Returns K with pixel (0, 0)'s centre at (0.5, 0.5), given one with it at (0, 0).
 
-    Args:
-        K_opencv: `[*B, 3, 3]`, in the convention of OpenCV's calibration and most data sets.
+    The latter, `[*B, 3, 3]`, is the convention of OpenCV's calibration and most data sets.
 
     >>> intrinsics_from_opencv(torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 2.0], [0.0, 0.0, 1.0]]))
     tensor([[4.0000, 0.0000, 1.5000],
@@ -154,17 +141,10 @@ def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
 
 
 def check_intrinsics(name: str, K: Tensor) -> None:
-    """Checks that every K has the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1).
+    """Checks that every K `[*B, 3, 3]` has the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1).
 
-    The check waits for a GPU.
-
-    Args:
-        name: the argument's name, for the message.
-        K: `[*B, 3, 3]`, pixels.
-
-    Raises:
-        ValueError: for nan or inf, other rows, or a focal length that is not positive; names the
-            index of the first such K in the batch.
+    ValueError says which K, the argument called `name`, is the first that has other rows, nan or
+    inf, or a focal length that is not positive. The check waits for a GPU.
 
     >>> check_intrinsics("K", torch.tensor([[4.0, 0.0, 0.0], [0.0, 8.0, 0.0], [1.5, 2.5, 1.0]]))
     Traceback (most recent call last):
@@ -182,6 +162,5 @@ def check_intrinsics(name: str, K: Tensor) -> None:
         where, index = first_wrong(name, ~right)
         raise ValueError(
             f"{where} should have the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, "
-            f"finite, fx and fy positive; got {K[index].tolist()}. Pass K.T if it is "
-            "transposed"
+            f"finite, fx and fy positive; got {K[index].tolist()}. Pass K.T if it is transposed"
         )

@@ -36,7 +36,7 @@ def check_shape(
         raise ValueError(f"{name} must be [{wanted}], got {list(tensor.shape)}")
 
 
-def broadcast_batch(**batches: torch.Size) -> torch.Size:
+def common_batch(**batches: torch.Size) -> torch.Size:
     """Returns the common leading batch of several arguments; ValueError lists each one's."""
     try:
         return torch.broadcast_shapes(*batches.values())
@@ -56,7 +56,7 @@ def over_points(name: str, matrix: Tensor, points_name: str, points: Tensor) -> 
             f"{name} has batch {list(batch)}, which {points_name} {list(points.shape)} lacks; "
             f"its batch dims are the leading dims of {points_name}"
         )
-    broadcast_batch(**{name: batch, points_name: points.shape[: len(batch)]})
+    common_batch(**{name: batch, points_name: points.shape[: len(batch)]})
     return matrix.reshape(*batch, *[1] * point_dims, *matrix.shape[-2:])
 
 

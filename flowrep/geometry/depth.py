@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from flowrep.geometry.camera import pixel_rays
-from flowrep.geometry.checks import broadcast_batch, check_name, check_shape
+from flowrep.geometry.checks import check_name, check_shape, common_batch
 
 DepthKind: TypeAlias = Literal["z", "ray_length", "z_buffer"]
 
@@ -32,18 +32,13 @@ def adapt_depth(
     was drawn. Pass `1 - depth` for a reversed buffer. inf stays inf and nan stays nan.
 
     Args:
-        depth: `[*B, 1, H, W]`, of that kind.
-        kind: `"z"`, `"ray_length"` or `"z_buffer"`.
+        depth: `[*B, 1, H, W]`, of that `kind`.
         K: `[*B, 3, 3]`, pixels; only for `"ray_length"`.
         near_m: the near plane; only for `"z_buffer"`.
         far_m: the far plane, `math.inf` if the projection has none; only for `"z_buffer"`.
         scale_m: metres per unit of `depth`, 1 if it is float; whole numbers, such as uint16
             millimetres (0.001), need it. Not for `"z_buffer"`.
         nothing: a value, before scaling, that means no measurement; it becomes nan.
-
-    Raises:
-        ValueError: an unknown kind, or an argument that it needs and lacks or does not use.
-        TypeError: whole numbers without `scale_m`.
 
     >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
     tensor([[[1., 2., inf]]])
@@ -66,11 +61,7 @@ def adapt_depth(
 
 
 def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
-    """Returns depth along the optical axis from the length of each pixel's ray.
-
-    Args:
-        ray_length: `[*B, 1, H, W]`, metres from the camera's centre.
-        K: `[*B, 3, 3]`, pixels.
+    """Returns depth along the optical axis from the length of each pixel's ray, see `adapt_depth`.
 
     >>> K = torch.tensor([[4.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]])
     >>> z_from_ray_length(torch.full((1, 1, 1), 5.0), K)  # it looks along (0.75, 0, 1)
@@ -78,7 +69,7 @@ def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
     """
     check_shape("ray_length", ray_length, (1, "H", "W"))
     check_shape("K", K, (3, 3))
-    broadcast_batch(ray_length=ray_length.shape[:-3], K=K.shape[:-2])
+    common_batch(ray_length=ray_length.shape[:-3], K=K.shape[:-2])
     K = K.to(torch.promote_types(ray_length.dtype, torch.float32))
     x, y = pixel_rays(ray_length.shape[-2], ray_length.shape[-1], K)
     per_z = (1.0 + x.square() + y.square()).sqrt()  # length of the ray per metre of z
@@ -88,15 +79,8 @@ def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
 def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
     """Returns depth along the optical axis from OpenGL's depth buffer of a perspective camera.
 
-    The result is inf where the buffer is 1 (nothing was drawn) and nan where it is outside [0, 1].
-
-    Args:
-        z_buffer: `[*B, 1, H, W]`, 0 at the near plane, 1 at the far plane.
-        near_m: the near plane, metres.
-        far_m: the far plane, metres; may be inf.
-
-    Raises:
-        ValueError: not 0 < near_m < far_m.
+    The result is inf where the buffer is 1 (nothing was drawn) and nan where it is outside [0, 1];
+    see `adapt_depth`.
 
     >>> z_from_z_buffer(torch.tensor([[[0.5]]]), near_m=0.5, far_m=torch.inf)
     tensor([[[1.]]])

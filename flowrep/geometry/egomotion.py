@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from flowrep.geometry.checks import broadcast_batch, check_shape
+from flowrep.geometry.checks import check_shape, common_batch
 from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST
 from flowrep.geometry.pose import rotation_from_vector
 
@@ -141,7 +141,7 @@ def camera_motion(
     sizes = {tuple(image.shape[-2:]) for image in (flow, depth, picture) if image is not None}
     if len(sizes) > 1:
         raise ValueError(f"flow, depth and picture must have one (height, width), got {sizes}")
-    batch = broadcast_batch(
+    batch = common_batch(
         **{name: tensor.shape[: -len(trailing)] for name, (tensor, trailing) in given.items()}
     )
     dtype = torch.promote_types(torch.promote_types(flow.dtype, depth.dtype), torch.float32)
@@ -251,14 +251,12 @@ def _best_hypothesis(samples: _Samples, expected: Tensor, *, has_prior: bool) ->
 
 
 def _costs(samples: _Samples, motions: Tensor) -> Tensor:
-    """Returns the truncated costs `[B, M]` of motions `[B, M, 4, 4]` of each frame.
-
-    They are truncated at a few standard deviations of the residuals of the motion that fits best.
-    """
+    """Returns the truncated costs `[B, M]` of motions `[B, M, 4, 4]` of each frame."""
     ru, rv, in_front, *_ = _residuals(samples, motions)
     known = in_front & samples.known.unsqueeze(1)
     squared = torch.where(known, _squared(samples, ru, rv), torch.inf)
     number = samples.known.sum(-1, keepdim=True)
+    # truncated at a few standard deviations of the residuals of the motion that fits best
     scale = (_SCORE_SCALES * _scale(squared, number).amin(-1)).clamp(min=_LEAST_SCORE_PX)
     return -(1 + squared / scale.square()[:, None, None]).reciprocal().sum(-1)
 
@@ -295,11 +293,8 @@ def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
 
 
 def _scale(squared: Tensor, number: Tensor) -> Tensor:
-    """Returns a robust standard deviation of residuals per channel, px, from `[..., N]` squares.
-
-    Unknown ones are inf, so that they come last. Every fourth pixel is enough.
-    """
-    squared = squared[..., ::4]
+    """Returns a robust standard deviation of residuals per channel, px, from `[..., N]` squares."""
+    squared = squared[..., ::4]  # enough; unknown ones are inf and come last
     rank = (number * (_QUANTILE / 4)).long().unsqueeze(-1).expand(*squared.shape[:-1], 1)
     return squared.sort(-1).values.gather(-1, rank).squeeze(-1).sqrt() / _RAYLEIGH
 

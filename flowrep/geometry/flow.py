@@ -1,8 +1,4 @@
-"""Flow caused by rigid motion: of a static world, of moving bodies, and the difference.
-
-Every function uses the closed form of `flowrep.geometry.closed_form`, which takes one pass over
-the pixels and stores no point cloud.
-"""
+"""Flow caused by rigid motion: of a static world, of moving bodies, and the difference."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from torch.autograd import forward_ad
 from flowrep.extras import numba_is_installed
 from flowrep.geometry import closed_form
 from flowrep.geometry.camera import centred_pixels
-from flowrep.geometry.checks import broadcast_batch, check_name, check_rows, check_shape
+from flowrep.geometry.checks import check_name, check_rows, check_shape, common_batch
 from flowrep.geometry.closed_form import Planes, flow_planes, known_camera, motion_coefficients
 
 Direction: TypeAlias = Literal["forward", "backward"]
@@ -97,11 +93,9 @@ def rigid_flow(
 
     Args:
         depth: see `ego_flow`, as for `K` and `dt`.
-        instance: `[*B, 1, H, W]`, integers in [0, N), 0 for the static world.
+        instance: `[*B, 1, H, W]`, integers in [0, N), 0 for the static world; others raise
+            RuntimeError.
         prev_from_curr_by_instance: `[*B, N, 4, 4]`.
-
-    Raises:
-        RuntimeError: an id in `instance` without a row.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> motions = torch.eye(4).repeat(2, 1, 1)
@@ -189,20 +183,15 @@ def adapt_flow(
 
     Convention: `direction` is that of the vectors: `"forward"` is p_t - p_t', from a point's
     previous to its current position; `"backward"` is p_t' - p_t. `grid` is the frame whose pixels
-    they belong to. An estimator called with (current, previous) gives backward flow on the current
-    grid.
+    they belong to, `"current"` or `"previous"`. An estimator called with (current, previous) gives
+    backward flow on the current grid.
 
     Flow on the previous frame's grid raises ValueError: its pixels have moved, several of them to
     the same pixel and none to others, so flow on the current grid would be a guess.
 
     Args:
         flow: `[*B, 2, H, W]`, pixels.
-        direction: `"forward"` or `"backward"`.
-        grid: `"current"` or `"previous"`.
         channels: `"uv"` (column first) or `"row_column"`.
-
-    Raises:
-        ValueError: an unknown name, or flow on the previous grid.
 
     >>> flow = torch.tensor([3.0, -2.0]).reshape(2, 1, 1)  # 3 rows up, 2 columns right it was
     >>> adapt_flow(flow, direction="backward", grid="current", channels="row_column").flatten()
@@ -252,7 +241,7 @@ def _check(
             "dt must be positive (current time minus previous time), at least "
             f"{closed_form.SMALLEST:g} and finite; got {dt}"
         )
-    return broadcast_batch(**batches)
+    return common_batch(**batches)
 
 
 def _planes(
@@ -263,16 +252,13 @@ def _planes(
     motions: Tensor,
     dt: float | Tensor,
 ) -> Planes:
-    """Returns the flow planes of a motion per instance, `[*B, N, 4, 4]`; without ids, of the first.
-
-    Their type is the widest of the arguments'.
-    """
+    """Returns the flow of a motion per instance, `[*B, N, 4, 4]`; without ids, of the first."""
     height, width = depth.shape[-2:]
     dtype = torch.promote_types(torch.promote_types(depth.dtype, K.dtype), motions.dtype)
     compute = torch.promote_types(dtype, torch.float32)
     K, dt, known = known_camera(K.to(compute), dt)
-    motions = motions.to(compute)
-    by_motion = motion_coefficients(K.unsqueeze(-3), motions, known.unsqueeze(-1))  # [*B, N, 12]
+    known = known.unsqueeze(-1)
+    by_motion = motion_coefficients(K.unsqueeze(-3), motions.to(compute), known)  # [*B, N, 12]
     x, y = centred_pixels(height, width, K)
     depth = depth.squeeze(-3).expand(*batch, -1, -1)
     if instance is not None:

@@ -34,14 +34,10 @@ def planes_of_motions(
     y: Tensor,
     dt: float | Tensor,
 ) -> Planes:
-    """Returns the flow planes of N motions per map; floats are float32.
+    """Returns the flow planes of N motions per map, whose coefficients are A and e `[*B, N, 12]`.
 
-    Args:
-        depth: `[*B, H, W]`.
-        instance: `[*B, H, W]`, integers, the motion of each pixel; None if all have motion 0.
-        coefficients: A and e of each motion, `[*B, N, 12]`.
-        x: pixel centres relative to the principal point, `[*B, 1, W]`; y is `[*B, H, 1]`.
-        dt: time between the frames, a number or `[*B]`.
+    Depth and the number of each pixel's motion, None if all have motion 0, are `[*B, H, W]`; x
+    `[*B, 1, W]` and y `[*B, H, 1]` are `centred_pixels`, dt is a number or `[*B]`.
     """
     *batch, height, width = depth.shape
     maps, motions = math.prod(batch), coefficients.shape[-2]

@@ -11,13 +11,7 @@ from typing import Literal, TypeAlias
 import torch
 from torch import Tensor
 
-from flowrep.geometry.checks import (
-    broadcast_batch,
-    check_name,
-    check_shape,
-    first_wrong,
-    over_points,
-)
+from flowrep.geometry.checks import check_name, check_shape, common_batch, first_wrong, over_points
 
 PoseLayout: TypeAlias = Literal[
     "matrix", "matrix_3x4", "xyz_xyzw", "xyz_wxyz", "xyz_yaw", "xyz_yaw_pitch"
@@ -40,10 +34,7 @@ _OPENCV_AXES = {
 
 
 def invert_rigid(a_from_b: Tensor) -> Tensor:
-    """Returns `b_from_a`, the inverse `[*B, 4, 4]` of a rigid transform.
-
-    Args:
-        a_from_b: `[*B, 4, 4]`, a rotation and a translation (no scale, no shear).
+    """Returns `b_from_a`, the inverse `[*B, 4, 4]` of a rotation and translation `[*B, 4, 4]`.
 
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
@@ -68,7 +59,6 @@ def relative_motion(
     Args:
         world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world).
         world_from_curr: `[*B, 4, 4]`, pose of the current camera.
-        dtype: of the result.
 
     >>> prev, curr = torch.eye(4), torch.eye(4)
     >>> curr[2, 3] = 0.5  # half a metre forward along the camera's z
@@ -77,7 +67,7 @@ def relative_motion(
     """
     check_shape("world_from_prev", world_from_prev, (4, 4))
     check_shape("world_from_curr", world_from_curr, (4, 4))
-    broadcast_batch(
+    common_batch(
         world_from_prev=world_from_prev.shape[:-2], world_from_curr=world_from_curr.shape[:-2]
     )
     # prev_from_world * world_from_curr, with the translations subtracted first.
@@ -169,18 +159,11 @@ def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
 
 
 def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None:
-    """Checks that every transform is a rotation and a translation.
+    """Checks that every transform `[*B, 4, 4]` is a rotation and a translation.
 
-    The check waits for a GPU.
-
-    Args:
-        name: the argument's name, for the message.
-        a_from_b: `[*B, 4, 4]`.
-        tolerance: on each element of R R^T - I and on the last row.
-
-    Raises:
-        ValueError: for nan or inf, a last row other than (0, 0, 0, 1), scale or shear, or a
-            left-handed frame; names the index of the first such transform in the batch.
+    ValueError says which one, of the argument called `name`, is the first with nan or inf, a last
+    row other than (0, 0, 0, 1), scale or shear, or a left-handed frame. `tolerance` is on each
+    element of R R^T - I and on the last row. The check waits for a GPU.
 
     >>> check_rigid("pose", torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])))
     Traceback (most recent call last):
@@ -208,9 +191,7 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
 def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
     """Returns points `[*B, ..., 3]` expressed in frame a, in the wider float type.
 
-    Args:
-        a_from_b: `[*B, 4, 4]`; its batch dims are the leading dims of `points_b`.
-        points_b: `[*B, ..., 3]`, in frame b.
+    The batch dims of `a_from_b` `[*B, 4, 4]` are the leading dims of `points_b`.
 
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
@@ -267,11 +248,7 @@ def adapt_pose(
             upwards, of a camera that looks along its own x (`axes="x_forward_z_up"`).
         direction: `"camera_to_world"` maps points in the camera's frame to the world's;
             `"world_to_camera"` (extrinsics) is the inverse.
-        axes: the camera's.
-        check: whether an ill-formed pose raises ValueError. The check waits for a GPU.
-
-    Raises:
-        ValueError: an unknown name, or a pose that is not rigid.
+        check: whether a pose that is not rigid raises ValueError. The check waits for a GPU.
 
     >>> pose = torch.tensor([5.0, 6.0, 7.0, 0.0, 0.0, 0.0, 1.0])
     >>> world_from_cam = adapt_pose(pose, layout="xyz_xyzw", axes="x_forward_z_up")
@@ -337,9 +314,6 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
         check: whether a quaternion whose length is not 1 raises ValueError. Rounding errors are
             normalised away in either case.
 
-    Raises:
-        ValueError: a quaternion that is not of unit length.
-
     >>> half_turn_about_z = torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0])
     >>> pose_from_quaternion(half_turn_about_z, "xyz_xyzw")[0]
     tensor([-1.,  0.,  0.,  1.], dtype=torch.float64)
@@ -353,10 +327,7 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
             f"layout {layout!r} reads x, y, z and then the quaternion"
         )
     quaternion = quaternion / norm
-    if layout == "xyz_wxyz":
-        w, x, y, z = quaternion.unbind(-1)
-    else:
-        x, y, z, w = quaternion.unbind(-1)
+    x, y, z, w = (quaternion.roll(-1, -1) if layout == "xyz_wxyz" else quaternion).unbind(-1)
     tx, ty, tz = translation.unbind(-1)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx),
