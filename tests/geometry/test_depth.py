@@ -49,9 +49,3 @@ def test_an_opengl_z_buffer_becomes_metres():
     # Without a far plane b = 1 - near / z: 0.75 at four times the near plane.
     endless = adapt_depth(depth_of(0.75), "z_buffer", near_m=0.5, far_m=math.inf)
     assert endless.item() == 2.0
-
-
-def test_whole_numbers_become_metres_and_nothing_becomes_nan():
-    millimetres = torch.tensor([[[0, 2500, 31000]]], dtype=torch.int16)
-    z = adapt_depth(millimetres, "z", scale_m=1e-3, nothing=0)
-    torch.testing.assert_close(z, torch.tensor([[[torch.nan, 2.5, 31.0]]]), equal_nan=True)

@@ -53,7 +53,6 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
         (lambda: AdaptDepth("ray_length"), "needs K"),
         (lambda: AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
         (lambda: AdaptPose(axes="gl"), r"'x_forward_z_up'\], got 'gl'"),
-        (lambda: AdaptPose(direction="inverse"), "direction must be one of"),
         (lambda: AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
         (lambda: InstanceIds([3, 1, 3]), r"must name each body once, got \[3, 1, 3\]"),
     ],

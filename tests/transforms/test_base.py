@@ -125,14 +125,6 @@ def test_moves_to_another_device_and_type(make):
     assert all(output.device.type == "meta" for output in outputs)
 
 
-def test_float64_maps_give_float64_flow_as_the_spec_says():
-    td = moments(2)
-    td["sensor", "depth"] = td["sensor", "depth"].double()
-    env = TransformedEnv(FakeSensorEnv((2,)), RawFlow(INTRINSICS))
-    assert env.observation_spec["raw"].dtype == torch.float32
-    assert RawFlow(INTRINSICS)(td)["raw"].dtype == torch.float64
-
-
 def test_missing_key_is_named_with_what_the_env_offers_before_the_first_step():
     env = TransformedEnv(FakeSensorEnv(), Depth(in_keys=["range"]))
     # KeyError would quote the sentence.

@@ -12,24 +12,10 @@ from flowrep.transforms import CameraMotion, EstimateCameraMotion, FlowFactorize
 from tests.transforms.fake_env import FakeSensorEnv, frame_motions
 
 MOTION = "motion"
-WANT = ("sensor", "prev_from_curr")  # what the env itself says, written down independently
 
 
 def camera_motion() -> CameraMotion:
     return CameraMotion(out_keys=[MOTION])
-
-
-def test_each_env_moves_from_its_own_step_before_and_not_across_resets():
-    # Env 0 has episodes of 3 steps, env 1 of 4: most resets are one env's alone.
-    env = TransformedEnv(FakeSensorEnv((2,)), camera_motion())
-    env.rollout(3)
-    td = env.rollout(9, break_when_any_done=False)
-    for part in (td, td["next"]):
-        torch.testing.assert_close(part[MOTION], part[WANT], atol=1e-6, rtol=0)
-    begins = torch.zeros(2, 9, dtype=torch.bool)
-    begins[0, ::3] = begins[1, ::4] = True
-    still = (td[MOTION] == torch.eye(4)).flatten(-2).all(-1)
-    assert torch.equal(still, begins)
 
 
 def test_a_step_from_an_earlier_tensordict_moves_from_its_pose():

@@ -27,13 +27,9 @@ from flowrep.transforms.noise import (
 from tests.transforms.fake_env import FakeSensorEnv
 
 ALL = {
-    "sensors": ["depth", "motion", "flow"],
-    "depth_sigma_per_m": 0.01,
-    "depth_dropout": 0.1,
-    "drift_m": 0.02,
-    "drift_rad": 0.03,
-    "flow_sigma_px": 0.5,
-}
+    "sensors": ["depth", "motion", "flow"], "depth_sigma_per_m": 0.01, "depth_dropout": 0.1,
+    "drift_m": 0.02, "drift_rad": 0.03, "flow_sigma_px": 0.5,
+}  # fmt: skip
 
 
 def maps(count: int = 2) -> list[torch.Tensor]:
@@ -83,13 +79,8 @@ def test_noise_has_the_size_that_was_asked_for():
 
 
 def test_each_option_changes_its_own_sensor_alone():
-    for option, changed in [
-        ("depth_sigma_per_m", 0),
-        ("depth_dropout", 0),
-        ("drift_m", 1),
-        ("drift_rad", 1),
-        ("flow_sigma_px", 2),
-    ]:
+    depth = dict.fromkeys(("depth_sigma_per_m", "depth_dropout"), 0)
+    for option, changed in (depth | {"drift_m": 1, "drift_rad": 1, "flow_sigma_px": 2}).items():
         noise = SensorNoise(sensors=ALL["sensors"], **{option: 0.3})
         same = [torch.equal(got, want) for got, want in zip(noise.compute(*maps()), maps())]
         assert [i for i, equal in enumerate(same) if not equal] == [changed], option

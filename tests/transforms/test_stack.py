@@ -89,17 +89,9 @@ def test_all_at_once_are_what_each_is_alone():
 
 
 def test_options_reach_the_transforms():
-    td = rollout(
-        {
-            "raw": {"scale": 2.0},
-            "ego": {"unit": "px_per_s"},
-            "obj": None,
-            "depth": {"range_m": 20.0},
-            "depth2": {"k": 3},
-            "seg": {"encoding": "onehot"},
-            "seg2": {},
-        }
-    )
+    flows = {"raw": {"scale": 2.0}, "ego": {"unit": "px_per_s"}, "obj": None}
+    depths = {"depth": {"range_m": 20.0}, "depth2": {"k": 3}}
+    td = rollout({**flows, **depths, "seg": {"encoding": "onehot"}, "seg2": {}})
     plain = rollout(["raw", "ego", "obj", "depth", "seg", "seg2"])
     assert torch.equal(td["raw"], 2 * plain["raw"])
     assert torch.equal(td["ego"], 2 * plain["ego"])  # 0.5 s a step
