@@ -42,7 +42,7 @@ class PersistentExploration:
         self._length_weights = torch.arange(1.0, self.LONGEST + 1, device=device) ** -2
         # the longest stands for all that would be longer
         self._length_weights[-1] = math.pi**2 / 6 - self._length_weights[:-1].sum()
-        sizes = {"steps_left": num_envs, "repeated_action": num_envs, "frames_acted": ()}
+        sizes = {"steps_left": (num_envs,), "repeated_action": (num_envs,), "frames_acted": ()}
         self.state = {
             name: torch.zeros(size, dtype=torch.long, device=device) for name, size in sizes.items()
         }
