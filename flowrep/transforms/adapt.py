@@ -1,6 +1,6 @@
 """Conversion of other simulators' and robots' sensor data to the inputs of flowrep's transforms.
 
-What they write has keys of its own, so that nothing is adapted twice.
+Adapters write under keys of their own, so that nothing is adapted twice.
 """
 
 from __future__ import annotations

@@ -263,12 +263,12 @@ class FlowFactorize(FlowTransform):
     | `("sensor", "prev_from_curr")` | `"raw"` if chosen | as above | any | as above |
     | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
 
-    Convention: ego is the flow that the camera's motion alone would cause, obj = raw − ego is the
-    objects' own flow, on `RawFlow`'s grid and channels; see `flowrep.geometry.factorize`, also for
-    `prev_from_curr` and where flow isn't known and 0. Raw flow isn't known either where the mask
-    beside it, bool `"raw_valid"` (`RawFlow` and `EstimatedFlow` write it; its key follows raw's),
-    is False: a store of raw flow keeps both. With the simulator's raw flow, obj is exactly 0 on
-    everything static.
+    Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the paper),
+    obj = raw − ego is the objects' own flow (Eq. 6), on `RawFlow`'s grid and channels. See
+    `flowrep.geometry.factorize`, also for `prev_from_curr` and where flow isn't known and 0. Raw
+    flow isn't known either where the mask beside it, bool `"raw_valid"` (`RawFlow` and
+    `EstimatedFlow` write it; its key follows raw's), is False: a store of raw flow keeps both. With
+    the simulator's raw flow, obj is exactly 0 on everything static.
 
     Args:
         intrinsics: K `[3, 3]` of the maps, or its key, see `RawFlow`.
