@@ -217,7 +217,7 @@ def drive_by_hand(
     # Disable Matplotlib's own shortcuts for the driver's keys (left: back, r: home, q: quit).
     shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
     with plt.rc_context(shortcuts):
-        figure = plt.figure(figsize=(15, 3.2))
+        figure = plt.figure(figsize=(12.5, 2.7))
         if pause is None and type(figure.canvas).required_interactive_framework is None:
             plt.close(figure)
             raise UsageError(
