@@ -60,11 +60,7 @@ def run(config: EvaluateConfig) -> None:
 
 def targets_of(config: EvaluateConfig) -> list[Target]:
     """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own."""
-    machine: dict[str, Any] = {
-        "device": config.device,
-        "num_envs": config.num_envs,
-        "num_workers": config.num_workers,
-    }
+    machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.own_policies:
         runs: dict[Path, RunFolder] = {}  # each once, under whatever names
         for path in config.run or []:
@@ -72,21 +68,14 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
                 runs.setdefault(run.path.resolve(), run)
         load = partial(load_trained, scene=config.scene, **machine)
         return [Target(run, partial(load, run), config.policy) for run in runs.values()]
+    keys = ("scene", "representations", "flow", "motion", "noise")
+    seen = {key: getattr(config, key) for key in keys}
     targets = []
     for name in config.own_policies:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
-        load = partial(
-            load_agent,
-            name,
-            scene=config.scene,
-            representations=config.representations,
-            flow=config.flow,
-            motion=config.motion,
-            noise=config.noise,
-            **machine,
-        )
+        load = partial(load_agent, name, **seen, **machine)
         targets.append(Target(RunFolder(folder), load, [name]))
     return targets
 
@@ -98,16 +87,10 @@ def evaluate_one(
     agent, folder = target.load(), target.folder
     origin = agent.origin("evaluate")
     # agents of one scene share the baselines' episodes
+    episodes = config.speed, config.fps, config.episodes, config.seed
     comparison = comparisons.setdefault(
         f"{origin['scene_id']} {target.policies}",
-        Comparison(
-            speeds=config.speed,
-            fps=config.fps,
-            episodes=config.episodes,
-            seed=config.seed,
-            policies=target.policies,
-            baselines=config.baselines,
-        ),
+        Comparison(*episodes, target.policies, config.baselines),
     )
     table = folder.read_episodes()
     num_envs = min(agent.config.num_envs, comparison.total)

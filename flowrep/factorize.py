@@ -13,18 +13,10 @@ require("factorising", "factorize", "cv2", "hydra", "imageio", "pydantic", "tqdm
 import cv2
 from hydra.utils import get_class
 
+from flowrep import sequences
 from flowrep.config import UsageError
 from flowrep.config.cli import run_command
 from flowrep.config.schema import FactorizeConfig, check_options
-from flowrep.sequences import (
-    EstimatedFlowSource,
-    Recording,
-    SequenceError,
-    Stream,
-    estimated_motion,
-    recorded_flow,
-    recorded_motion,
-)
 from flowrep.sequences.factorization import FlowSource, MotionSource
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
@@ -58,47 +50,47 @@ def factorize_recording(config: FactorizeConfig) -> int:
             print(f"stopped after {len(output.rows)} frames, which are in {output.partial}")
             return 130
     if not output.rows:
-        used = f"start={start} stride={stride}"
-        raise SequenceError(config.input, f"no two frames of {used} follow each other in a clip")
+        why = f"no two frames of start={start} stride={stride} follow each other in a clip"
+        raise sequences.SequenceError(config.input, why)
     output.finish(job.summary(diagnosis))
     print(f"{len(output.rows)} frames in {output.path}; time: {job.clock.summary()}")
     return 0
 
 
-def open_stream(config: FactorizeConfig) -> Stream:
+def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
     reader, options, source = get_class(config.format.target), config.format.options(), config.input
     check_options(reader, options, "format")
-    if issubclass(reader, Recording) and not Path(str(source)).is_dir():
-        raise SequenceError(source, "no such folder")
+    if issubclass(reader, sequences.Recording) and not Path(str(source)).is_dir():
+        raise sequences.SequenceError(source, "no such folder")
     return reader(str(source), **options)
 
 
-def open_flow_source(config: FactorizeConfig, stream: Stream) -> FlowSource:
+def open_flow_source(config: FactorizeConfig, stream: sequences.Stream) -> FlowSource:
     """Returns the source of raw flow."""
     options = config.plain()["flow"]
     if options.pop("source") == "exact":
         if not stream.has_flow:
-            why = stream.no_flow if isinstance(stream, Recording) else "a video has none"
+            why = stream.no_flow if isinstance(stream, sequences.Recording) else "a video has none"
             raise UsageError(f"flow=exact: {config.input} has no flow of its own; {why}")
-        return recorded_flow
+        return sequences.recorded_flow
     # Here, since TorchRL's import takes as long as all others: a mistake is told before.
     from flowrep.transforms import EstimatedFlow
 
     estimator = EstimatedFlow(**options).estimator
-    return EstimatedFlowSource(estimator, check_consistency=config.check_consistency)
+    return sequences.EstimatedFlowSource(estimator, check_consistency=config.check_consistency)
 
 
-def open_motion_source(config: FactorizeConfig, stream: Stream) -> MotionSource:
+def open_motion_source(config: FactorizeConfig, stream: sequences.Stream) -> MotionSource:
     """Returns the source of the camera's motion: the recorded poses, if there are any."""
     if config.poses == "estimated":
-        return estimated_motion
+        return sequences.estimated_motion
     if stream.has_poses:
-        return recorded_motion
+        return sequences.recorded_motion
     if config.poses == "recorded":
         raise UsageError(f"poses=recorded: {config.input} has none; use poses=estimated")
     print("note: there are no poses, so the camera's motion is estimated from flow and depth")
-    return estimated_motion
+    return sequences.estimated_motion
 
 
 def main() -> None:

@@ -10,14 +10,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase
 
-from flowrep.transforms import (
-    AdaptDepth,
-    AdaptPose,
-    CameraMotion,
-    FlowFactorize,
-    InstanceMotion,
-    RawFlow,
-)
+from flowrep import transforms
 
 
 class ManiSkillEnv(EnvBase):
@@ -114,10 +107,12 @@ def flow_transforms() -> Compose:
     """Returns the transforms that write raw, ego and obj of a `ManiSkillEnv`."""
     millimetres, pose, K = (("sensor", name) for name in ("millimetres", "opengl_pose", "K"))
     return Compose(
-        AdaptDepth("z", scale_m=1e-3, nothing=0, channels_last=True, in_keys=[millimetres]),
-        AdaptPose(axes="opengl", in_keys=[pose]),
-        CameraMotion(),
-        InstanceMotion(),
-        RawFlow(K),
-        FlowFactorize(K),
+        transforms.AdaptDepth(
+            "z", scale_m=1e-3, nothing=0, channels_last=True, in_keys=[millimetres]
+        ),
+        transforms.AdaptPose(axes="opengl", in_keys=[pose]),
+        transforms.CameraMotion(),
+        transforms.InstanceMotion(),
+        transforms.RawFlow(K),
+        transforms.FlowFactorize(K),
     )

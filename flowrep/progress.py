@@ -17,8 +17,6 @@ class StopRequest:
     The previous handlers are restored when its context ends.
     """
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
     def __init__(self, then: Callable[[], Any] = lambda: None) -> None:
         self.received: signal.Signals | None = None
         self._then = then
@@ -33,7 +31,8 @@ class StopRequest:
         return self.received is not None
 
     def __enter__(self) -> "StopRequest":
-        self._previous = {number: signal.signal(number, self._receive) for number in self.SIGNALS}
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._receive)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -90,10 +89,9 @@ class Stopwatch:
             elapsed = time.perf_counter() - start
             self.seconds[section] = self.seconds.get(section, 0.0) + elapsed
 
-    def share(self, *sections: str) -> float:
-        """Returns the share of all counted time that the sections took; 0 at first."""
-        total = sum(self.seconds.values())
-        return sum(self.seconds.get(name, 0.0) for name in sections) / total if total else 0.0
+    def share(self, section: str) -> float:
+        """Returns the share of all counted time that a section took; 0 at first."""
+        return self.seconds.get(section, 0.0) / (sum(self.seconds.values()) or 1.0)
 
     def summary(self) -> str:
         """Returns the shares of all sections in one line, the largest first."""

@@ -26,21 +26,12 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from flowrep.config import UsageError
-from flowrep.config.cli import (
-    OF_THE_MACHINE,
-    exit_with,
-    override,
-    plain_config,
-    register_resolvers,
-    run_hydra,
-    value_of,
-)
+from flowrep.config import UsageError, cli
 from flowrep.config.schema import TrainConfig, validated, validated_run
 from flowrep.progress import StopRequest
 from flowrep.tables import read_rows
 
-register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
+cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
 
 LOG = "job.log"
 STOP = ".stop"
@@ -76,7 +67,7 @@ def run_sweep() -> NoReturn:
     """Runs the sweep of `sys.argv`, prints how it ended, and ends the process."""
     keys = {text.partition("=")[0] for text in sys.argv[1:]}
     if "resume" in keys:
-        exit_with(
+        cli.exit_with(
             "resume= continues one run; continue a sweep with its own command and "
             "hydra.sweep.dir=<its folder>"
         )
@@ -84,11 +75,11 @@ def run_sweep() -> NoReturn:
     typed = []
     for text in sys.argv[1:]:
         if text.startswith("hydra.sweep.dir="):
-            folder = Path(value_of(text)).absolute()
+            folder = Path(cli.value_of(text)).absolute()
         else:
             typed.append(text)
     (folder / STOP).unlink(missing_ok=True)
-    given = override("hydra.sweep.dir", str(folder))
+    given = cli.override("hydra.sweep.dir", str(folder))
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
     sys.argv[1:] = [*typed, given, *(o for o in needed if o.partition("=")[0] not in keys)]
     begun, is_whole = time.time(), True
@@ -99,7 +90,7 @@ def run_sweep() -> NoReturn:
 
     with StopRequest(then=mark) as stop:
         try:
-            run_hydra("train", job, TrainConfig)
+            cli.run_hydra("train", job, TrainConfig)
         except SystemExit:
             if not _states(folder, since=begun):
                 raise  # a mistake on the command line, which has been printed
@@ -155,7 +146,7 @@ def job(config: DictConfig) -> float:
 
     try:
         line = _line(folder, config, is_worker)
-        asked = validated(TrainConfig, plain_config(config))
+        asked = validated(TrainConfig, cli.plain_config(config))
         state = attempted(folder, asked, line, should_stop)
     except Exception as error:  # the other runs go on
         state = _say(folder, f"{FAILED}: error: {' '.join(str(error).split())}")
@@ -173,12 +164,12 @@ def _line(folder: Path, config: DictConfig, is_worker: bool) -> list[str]:
     """Returns the arguments of `flowrep.train` for a job's run."""
     hydra = HydraConfig.get()
     typed = list(hydra.overrides.task)
-    machine = [text for text in typed if text.partition("=")[0] in OF_THE_MACHINE]
+    machine = [text for text in typed if text.partition("=")[0] in cli.OF_THE_MACHINE]
     if is_worker and config.num_workers == "auto":  # it has only its own core
         machine = [*(text for text in machine if "device" in text), "num_workers=0"]
     if (folder / "config.yaml").is_file():
-        return [override("resume", str(folder)), *machine]
-    line = [override("hydra.run.dir", str(folder)), *typed, *machine]
+        return [cli.override("resume", str(folder)), *machine]
+    line = [cli.override("hydra.run.dir", str(folder)), *typed, *machine]
     line += [text for text in hydra.overrides.hydra if text.startswith("hydra.searchpath=")]
     for source in hydra.runtime.config_sources:
         if source.provider == "command-line":
@@ -260,7 +251,7 @@ def _check_is_same(folder: Path, config: TrainConfig) -> None:
         return
     stored = validated_run(yaml.safe_load(path.read_text(encoding="utf-8")), str(path)).plain()
     for key, value in config.plain().items():
-        if key not in (*OF_THE_MACHINE, "resume") and stored.get(key) != value:
+        if key not in (*cli.OF_THE_MACHINE, "resume") and stored.get(key) != value:
             raise UsageError(
                 f"'{folder}' holds a run with {key}={stored.get(key)}, the sweep asks for {value}: "
                 "give the sweep another folder with hydra.sweep.dir=, or move it away"

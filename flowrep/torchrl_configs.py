@@ -1,15 +1,6 @@
 """Hydra configs of the env, the losses and the replay memory, in TorchRL's own config groups.
 
-Importing this module registers them, with the transforms of `flowrep.transforms.hydra_configs`:
-
-| group | names |
-| --- | --- |
-| `env` | `street` |
-| `loss` | `discrete_sac_maps`, `discrete_sac_value_maps`, `double_dqn_maps`, `clip_ppo_maps` |
-| `sampler` | `successor` |
-| `storage` | `rows` |
-| `replay_buffer` | `packed_maps` |
-| `transform` | `pack_steps` |
+Importing this module registers `CONFIGS`, and the transforms of `flowrep.transforms.hydra_configs`.
 
 ```yaml
 defaults:
@@ -31,38 +22,32 @@ and defaults come from the signatures.
 
 from __future__ import annotations
 
+from typing import Any
+
 from flowrep.extras import require
 
 require("flowrep.torchrl_configs", "train", "hydra")
 
-from torchrl.trainers.algorithms.configs.data import (
-    ReplayBufferBaseConfig,
-    SamplerConfig,
-    StorageConfig,
-)
-from torchrl.trainers.algorithms.configs.envs import EnvConfig
-from torchrl.trainers.algorithms.configs.objectives import LossConfig
-from torchrl.trainers.algorithms.configs.transforms import TransformConfig
+from torchrl.trainers.algorithms.configs import data, envs, objectives, transforms
 
 from flowrep.agent import dqn, dsac, dsac_v, ppo, replay
 from flowrep.envs import torchrl_env
 from flowrep.transforms.hydra_configs import config_class, register
 
-# By group and name.
-CONFIGS: dict[tuple[str, str], type] = {
-    ("env", "street"): config_class(torchrl_env.make_env, EnvConfig),
-    ("loss", "discrete_sac_maps"): config_class(dsac.DiscreteSACMapLoss, LossConfig, partial=True),
-    ("loss", "discrete_sac_value_maps"): config_class(
-        dsac_v.DiscreteSACValueLoss, LossConfig, partial=True
-    ),
-    ("loss", "double_dqn_maps"): config_class(dqn.DoubleDQNMapLoss, LossConfig, partial=True),
-    ("loss", "clip_ppo_maps"): config_class(ppo.ClipPPOMapLoss, LossConfig, partial=True),
-    ("sampler", "successor"): config_class(replay.SuccessorSampler, SamplerConfig),
-    ("storage", "rows"): config_class(replay.RowStorage, StorageConfig),
-    ("replay_buffer", "packed_maps"): config_class(
-        replay.ReplayMemory, ReplayBufferBaseConfig, partial=True
-    ),
-    ("transform", "pack_steps"): config_class(replay.PackSteps, TransformConfig, partial=True),
+# group, name, what is made, TorchRL's base, and whether a network or codecs are still to be given
+_TABLE: tuple[tuple[str, str, Any, type, bool], ...] = (
+    ("env", "street", torchrl_env.make_env, envs.EnvConfig, False),
+    ("loss", "discrete_sac_maps", dsac.DiscreteSACMapLoss, objectives.LossConfig, True),
+    ("loss", "discrete_sac_value_maps", dsac_v.DiscreteSACValueLoss, objectives.LossConfig, True),
+    ("loss", "double_dqn_maps", dqn.DoubleDQNMapLoss, objectives.LossConfig, True),
+    ("loss", "clip_ppo_maps", ppo.ClipPPOMapLoss, objectives.LossConfig, True),
+    ("sampler", "successor", replay.SuccessorSampler, data.SamplerConfig, False),
+    ("storage", "rows", replay.RowStorage, data.StorageConfig, False),
+    ("replay_buffer", "packed_maps", replay.ReplayMemory, data.ReplayBufferBaseConfig, True),
+    ("transform", "pack_steps", replay.PackSteps, transforms.TransformConfig, True),
+)
+CONFIGS = {
+    (group, name): config_class(made, base, partial=partial)
+    for group, name, made, base, partial in _TABLE
 }
-
 register(CONFIGS)

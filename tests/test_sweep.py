@@ -159,7 +159,7 @@ def test_a_failed_run_stops_a_sweeper_that_needs_its_result_and_no_grid(
     )
     monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra)
     monkeypatch.setattr(sweep, "_line", lambda *_: [])
-    monkeypatch.setattr(sweep, "plain_config", lambda config: {})  # which is not valid
+    monkeypatch.setattr(cli, "plain_config", lambda config: {})  # which is not valid
     if "Basic" in sweeper:
         assert math.isnan(sweep.job({}))
     else:

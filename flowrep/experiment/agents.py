@@ -163,23 +163,20 @@ class ExternalPolicy:
             given = self._act(seen)
         if isinstance(given, TensorDictBase):
             given = given.get("action")
-        return maps.set("action", self._checked(given, len(maps)))
-
-    def _checked(self, given: Any, count: int) -> Tensor:
         n = int(self._task.action_spec.space.n)
         try:
             actions = torch.as_tensor(given).cpu()
             whole = actions.long()
-            if actions.shape != (count,):
+            if actions.shape != maps.batch_size:
                 what = f"{actions.dtype} of shape {tuple(actions.shape)}"
             elif ((whole == actions) & (whole >= 0) & (whole < n)).all():
-                return whole
+                return maps.set("action", whole)
             else:
                 what = str(actions.tolist())
         except (TypeError, ValueError, RuntimeError):
             what = f"a {type(given).__name__}"
         raise PolicyError(
-            f"policy '{self.name}' returned {what}; expected {count} whole numbers from 0 to "
+            f"policy '{self.name}' returned {what}; expected {len(maps)} whole numbers from 0 to "
             f"{n - 1}, one action per environment"
         )
 

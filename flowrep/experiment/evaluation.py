@@ -83,10 +83,6 @@ class _Running:
         self.positions: list[list[float]] = []
         self.total_reward = 0.0
 
-    @property
-    def length(self) -> int:
-        return len(self.positions) - 1
-
 
 @torch.no_grad()
 def evaluate(
@@ -153,7 +149,7 @@ def evaluate(
                 outcome=OUTCOMES[status["outcome"][place][0]],
                 hit=hit_name(status["hit"][place][0]),
                 total_reward=ended.total_reward,
-                length=ended.length,
+                length=len(ended.positions) - 1,
                 positions=np.array(ended.positions, dtype=np.float32),
             )
 
@@ -185,7 +181,7 @@ def _act(
     device = tensordict.device
     seen = tensordict.copy() if len(busy) == len(tensordict) else tensordict[busy]
     seen["env_id"] = torch.tensor(busy, device=device)
-    seen["is_init"] = torch.tensor([[not running[i].length] for i in busy], device=device)
+    seen["is_init"] = torch.tensor([[len(running[i].positions) == 1] for i in busy], device=device)
     actions = torch.zeros(len(tensordict), dtype=torch.int64, device=device)
     if greedy:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -355,33 +351,23 @@ def scene_id(scene: Scene) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
-def cause_of(outcome: str, hit: str) -> str | None:
-    """Returns why an episode failed, None if it did not.
-
-    >>> cause_of("collision", "car"), cause_of("success", "")
-    ('collision: other', None)
-    """
-    if outcome == "success":
-        return None
-    if outcome == "collision":
-        return "collision: pedestrian" if hit == "pedestrian" else "collision: other"
-    return outcome.replace("_", " ")
-
-
 def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Returns the number of failures and their causes in % for each scene, policy and speed.
 
     Shares are of the failures, as in the paper's Table III, and empty where nothing failed.
     Evaluations after different numbers of training frames are kept apart.
     """
-    groups: dict[tuple[str, ...], list[str | None]] = defaultdict(list)
+    groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for row in rows:
         key = tuple(str(row.get(name, "")) for name in _FAILURE_GROUP)
-        groups[key].append(cause_of(row["outcome"], row.get("hit", "")))
+        cause = row["outcome"].replace("_", " ")
+        if cause == "collision":
+            cause += ": pedestrian" if row.get("hit") == "pedestrian" else ": other"
+        groups[key].append(cause)
     table = []
     for key, causes in groups.items():
-        counts = Counter(cause for cause in causes if cause is not None)
-        failures = counts.total()
+        counts = Counter(causes)
+        failures = len(causes) - counts["success"]
         shares = {c: round(100 * counts[c] / failures, 1) if failures else "" for c in CAUSES}
         collisions = counts["collision: pedestrian"] + counts["collision: other"]
         ratio = round(counts["out of bounds"] / collisions, 3) if collisions else ""
@@ -397,7 +383,7 @@ def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return table
 
 
-def print_results(rows: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
+def print_results(rows: Sequence[Mapping[str, Any]]) -> None:
     """Prints the share of each outcome, and the causes of failure, by policy and speed."""
     by_policy: dict[tuple[Any, ...], list[str]] = defaultdict(list)
     for row in rows:
@@ -410,19 +396,17 @@ def print_results(rows: Sequence[Mapping[str, Any]], console: Console | None = N
         }
         for (speed, fps, policy), outcomes in by_policy.items()
     ]
-    print_table("Share of episodes in % [95 % interval]", table, console)
+    print_table("Share of episodes in % [95 % interval]", table)
     table = [
         {"speed": line["speed"], "fps": f"{float(line['fps']):g}", "policy": line["policy"]}
         | {"failures": f"{line['failures']} of {line['episodes']}"}
         | {cause: "" if line[cause] == "" else f"{line[cause]:.0f}" for cause in CAUSES}
         for line in failure_causes(rows)
     ]
-    print_table("Causes of failure in % of the failures", table, console)
+    print_table("Causes of failure in % of the failures", table)
 
 
-def print_table(
-    title: str, rows: Sequence[Mapping[str, Any]], console: Console | None = None
-) -> None:
+def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Prints rows that have the same keys, which are the headings."""
     table = Table(title=title, box=box.SIMPLE, pad_edge=False)
     for name in rows[0]:
@@ -437,4 +421,4 @@ def print_table(
         )
     for row in rows:
         table.add_row(*map(str, row.values()))
-    (console or Console(width=max(100, Console().width))).print(table)
+    Console(width=max(100, Console().width)).print(table)

@@ -79,14 +79,8 @@ def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> M
     told = sensor.get("noisy_motion", sensor["prev_from_curr"])
     motion = sensor.get("estimated_motion", told)
     ego, obj, _ = factorize(measured, depth, intrinsics, motion)
-    return {
-        "rgb": sensor["rgb"],
-        "semantic": sensor["semantic"],
-        "depth": depth,
-        "raw": raw,
-        "ego": ego,
-        "obj": obj,
-    }
+    seen = {"rgb": sensor["rgb"], "semantic": sensor["semantic"]}
+    return seen | {"depth": depth, "raw": raw, "ego": ego, "obj": obj}
 
 
 def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: Any) -> Episode:

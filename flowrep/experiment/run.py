@@ -151,20 +151,18 @@ def cpu_name() -> str:
     return next(iter(names), platform.processor() or platform.machine())
 
 
-def _scalars(rows: Iterable[Mapping[str, Any]]) -> dict[int, dict[str, float]]:
-    """Returns shares of outcomes, mean return and mean length of each evaluation, by frames."""
-    values: dict[int, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+def _scalars(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Returns shares of outcomes, mean return and mean length of each kind of episode, by title."""
+    values: dict[str, list[float]] = defaultdict(list)
     for row in rows:
         kind = row["evaluation"].replace("training", "evaluation")  # training has scalars too
         rate = f"{float(row['fps']):g}fps"
         title = "/".join((kind, row["scene"], row["speed"], rate, row["policy"]))
-        found = {name: float(row["outcome"] == name) for name in OUTCOMES[1:]}
-        for name, value in (found | {key: float(row[key]) for key in ("return", "length")}).items():
-            values[int(row["frames"])][f"{title}/{name}"].append(value)
-    return {
-        frames: {title: fmean(list_) for title, list_ in scalars.items()}
-        for frames, scalars in values.items()
-    }
+        for name in OUTCOMES[1:]:
+            values[f"{title}/{name}"].append(row["outcome"] == name)
+        for name in ("return", "length"):
+            values[f"{title}/{name}"].append(float(row[name]))
+    return {title: fmean(found) for title, found in values.items()}
 
 
 class RunFolder:
@@ -355,14 +353,14 @@ class RunFolder:
     ) -> None:
         """Saves evaluated episodes and logs their means to TensorBoard and wandb.
 
-        `positions` are where the vehicle was in each, `[T + 1, 2]`; not kept if empty.
+        They are of one agent after some frames. `positions` are where the vehicle was in each,
+        `[T + 1, 2]`; not kept if empty.
         """
         # first, as a final evaluation whose rows are in the table is not run again
         if positions:
             self._save_drives(rows, positions)
         self.save_episodes(rows, table)
-        for frames, scalars in _scalars(rows).items():
-            self._plot(frames, scalars)
+        self._plot(int(rows[0]["frames"]), _scalars(rows))
 
     def save_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
         """Adds evaluated episodes to evaluation.csv, or to a table that replaces it.

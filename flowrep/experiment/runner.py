@@ -108,7 +108,8 @@ class Runner:
             self.check()  # an update may have seen it first, and its error says more
             if "probability tensor" not in str(error):
                 raise
-            maps = [key for key in self.agent.policy.in_keys if _is_bad(self.observation[key])]
+            keys = self.agent.policy.in_keys
+            maps = [key for key in keys if not self.observation[key].isfinite().all()]
             cause = f"{maps[0]!r} is not finite: lower its scale" if maps else "weights too large"
             raise self._diverged(
                 f"the policy gives actions no probabilities after {self.agent.updates} updates "
@@ -147,18 +148,10 @@ class Runner:
         """
         config, asked, fps = self.config, self.config.evaluation, self.env.base_env.frame_rate_hz
         if kind == "final":
-            comparison = Comparison(
-                speeds=asked.speeds,
-                fps=asked.fps,
-                episodes=asked.final_episodes,
-                seed=FINAL_SEED,
-                policies=FINAL_POLICIES,
-                baselines=asked.baselines,
-            )
+            episodes = asked.speeds, asked.fps, asked.final_episodes, FINAL_SEED
+            comparison = Comparison(*episodes, FINAL_POLICIES, asked.baselines)
         else:
-            comparison = Comparison(
-                speeds=[config.speed], fps=[fps], episodes=asked.episodes, seed=EVALUATION_SEED
-            )
+            comparison = Comparison([config.speed], [fps], asked.episodes, EVALUATION_SEED)
         agent = self.trained()
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
@@ -276,10 +269,6 @@ def share_cores(config: TrainConfig) -> AbstractContextManager[None]:
     return FasterThreads(most)
 
 
-def _is_bad(values: Tensor) -> bool:
-    return values.is_floating_point() and not bool(values.isfinite().all())
-
-
 def progress_text(row: Mapping[str, float]) -> str:
     """Returns the end of the progress line; nan values are left out."""
     losses = [name for name in row if name.endswith("_loss")]
@@ -297,7 +286,7 @@ class RecentEpisodes:
     """Outcomes, returns and lengths of the latest finished episodes of all environments."""
 
     def __init__(self) -> None:
-        self._running: Tensor | None = None  # [2, num_envs]: return and length so far
+        self._running = torch.zeros(2, 1)  # then [2, num_envs]: return and length so far
         self._ended: deque[tuple[int, float, int]] = deque(maxlen=RECENT_EPISODES)
 
     def add(self, stepped: TensorDictBase) -> None:
@@ -306,7 +295,7 @@ class RecentEpisodes:
         rewards = after["reward"].flatten().double()
         step = torch.stack([rewards, torch.ones_like(rewards)])
         # not in place, as restored sums are on the CPU
-        self._running = step if self._running is None else self._running.to(step.device) + step
+        self._running = self._running.to(step.device) + step
         done = after["done"].flatten()
         outcomes = after["outcome"].flatten()[done].tolist()
         if outcomes:
@@ -325,13 +314,11 @@ class RecentEpisodes:
 
     def state(self) -> dict[str, Any]:
         """Returns the state that `restore` takes."""
-        running = torch.zeros(2, 0) if self._running is None else self._running
-        return {"running": running, "ended": [list(episode) for episode in self._ended]}
+        return {"running": self._running, "ended": [list(episode) for episode in self._ended]}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues from a `state`."""
-        running = state["running"]
-        self._running = running.clone() if running.numel() else None
+        self._running = state["running"]
         self._ended = deque(map(tuple, state["ended"]), maxlen=RECENT_EPISODES)
 
 
@@ -344,12 +331,9 @@ class Means:
 
     def add(self, metrics: Mapping[str, Tensor]) -> None:
         """Adds the metrics of one update."""
-        if not self._count:
-            self._sums = {name: value.detach().clone() for name, value in metrics.items()}
-        else:
-            for name, value in metrics.items():
-                # not in place, as restored sums are on the CPU
-                self._sums[name] = self._sums[name] + value.detach()
+        for name, value in metrics.items():
+            # not in place, as restored sums are on the CPU, and a CUDA graph reuses its tensors
+            self._sums[name] = self._sums.get(name, 0) + value.detach()
         self._count += 1
 
     def take(self) -> dict[str, float]:
@@ -364,5 +348,4 @@ class Means:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continues from a `state`."""
-        self._sums = {name: total.clone() for name, total in state["sums"].items()}
-        self._count = state["count"]
+        self._sums, self._count = dict(state["sums"]), state["count"]
