@@ -33,10 +33,10 @@ class Target(NamedTuple):
 
 
 def run(config: EvaluateConfig) -> None:
-    """Runs episodes of agents and of baselines one agent after the other, and saves the rows.
+    """Runs episodes of agents and baselines, one agent after the other, and saves the rows.
 
-    An agent whose folder is in use, or that can't be evaluated or saved, is reported and does not
-    stop the others; the exit code is then 1. Baselines drive once in each scene.
+    A folder in use, or an agent that can't be evaluated or saved, is reported and does not stop the
+    others; the exit code is then 1. Baselines drive once in each scene.
     """
     targets = targets_of(config)
     comparisons: dict[str, Comparison] = {}

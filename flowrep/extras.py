@@ -19,11 +19,8 @@ def is_installed(package: str) -> bool:
 def require(what: str, extra: str, *packages: str, module: str = "") -> None:
     """Checks that packages are installed, before a module imports them.
 
-    Args:
-        what: the feature that needs them, e.g. "training".
-        extra: the extra of flowrep that installs them.
-        packages: their import names.
-        module: `__name__` of the module; if it runs as a command, the process ends in one line.
+    `what` needs them, e.g. "training", and an extra of flowrep installs them. If `module`, its
+    `__name__`, runs as a command, the process ends in one line.
     """
     for package in packages:
         if not is_installed(package):

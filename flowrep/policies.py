@@ -46,7 +46,7 @@ def load_agent(
         representations=representations if is_own else {},
         flow=flow or ExactFlow(source="exact"),
         motion=motion or "exact",
-        noise=noise or Noise(**dict.fromkeys(Noise.key_names(), 0.0)),
+        noise=noise or Noise(**dict.fromkeys(Noise.model_fields, 0.0)),
         speed="normal",
         renderer="auto",
         seed=0,

@@ -9,7 +9,7 @@ from typing import Any
 
 
 class TableError(ValueError):
-    """A table is not what was written; the message says where, and what to do."""
+    """A table is not what was written."""
 
 
 def read_rows(path: Path, columns: Iterable[str] = ()) -> list[dict[str, str]]:
@@ -59,10 +59,7 @@ def write_rows(
 def append_rows(
     path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:
-    """Appends rows to a table, writing its header first if the file is new.
-
-    They are written in one call, so that a killed process leaves all of them or none.
-    """
+    """Appends rows to a table; a new one gets a header."""
     rows = list(rows)
     if not rows:
         return
@@ -77,6 +74,7 @@ def append_rows(
     if is_new:
         writer.writeheader()
     writer.writerows(rows)
+    # in one call, so that a killed process leaves all of them or none
     with path.open("ab", buffering=0) as raw:
         data = text.getvalue().encode("utf-8")
         written = raw.write(data)

@@ -58,14 +58,9 @@ def run(config: ViewConfig) -> None:
 def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
     """Returns what drives; a run's agent drives in its own scene unless one was given."""
     is_at_home = Path(config.policy).is_dir() and not is_scene_given
-    return load_agent(
-        config.policy,
-        scene=None if is_at_home else config.scene,
-        representations=config.representations,
-        device="cpu",
-        num_envs=1,
-        num_workers=0,
-    )
+    scene, maps = None if is_at_home else config.scene, config.representations
+    here: dict[str, Any] = {"device": "cpu", "num_envs": 1, "num_workers": 0}
+    return load_agent(config.policy, scene=scene, representations=maps, **here)
 
 
 def make_env_of(config: ViewConfig, agent: Agent) -> Callable[..., EnvBase]:
@@ -86,10 +81,7 @@ def episodes_of(config: ViewConfig, scene: Scene) -> list[dict[str, Any]]:
 def view(
     config: ViewConfig, agent: Agent, env: EnvBase, options: list[dict[str, Any]], folder: Path
 ) -> None:
-    """Drives episodes and writes their pictures, plan, video and tables into a folder.
-
-    The first is driven in `env`, which keeps every sensor.
-    """
+    """Drives episodes and writes their pictures, plan, video and tables into a folder."""
     scene, fps = env.base_env.scene, env.base_env.frame_rate_hz
     with tqdm(desc="driving", unit="frame") as bar:
         frames, episode = film_episode(env, agent.policy, options[0], lambda _: bar.update())
@@ -100,10 +92,9 @@ def view(
     write_png(folder / "sheet.png", contact_sheet(strips[i] for i in chosen))
     if config.video:
         write_video(folder / "episode.mp4", strips, fps=fps)
-    paths = {each.path for each in episodes}
-    # Closed exits belong to a path; they are drawn if all episodes took the same one.
-    path = paths.pop() if len(paths) == 1 else None
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
+    # Closed exits belong to a path; they are drawn if all episodes took the same one.
+    path = episode.path if all(each.path == episode.path for each in episodes) else None
     draw_plan(Layout(scene), tracks, path=path).savefig(folder / "plan.png", dpi=110)
     tables = {
         "episodes": [{"path": each.path, **each.row()} for each in episodes],
@@ -166,7 +157,7 @@ class NewEpisode(Exception):
 class Keyboard:
     """A policy that takes the action of the held keys, or lets another, of this name, drive.
 
-    A key acts while it is held; both together cancel out. S switches between the drivers.
+    Both keys together cancel out.
     """
 
     ACTIONS = {"left": TURN_LEFT, "right": TURN_RIGHT}  # noqa: RUF012 - never changed
@@ -209,8 +200,8 @@ def drive_by_hand(
 ) -> None:
     """Opens a window and drives one episode after the other until it is closed.
 
-    A finished episode stays in view until R begins the next, which has the next seed. `pause`
-    draws, and handles keys for some seconds; by default in a window on the screen.
+    A finished one stays in view until R begins the next, of the next seed. `pause` draws, and
+    handles keys for some seconds; by default in a window on the screen.
     """
     import matplotlib.pyplot as plt
 

@@ -1,16 +1,11 @@
-"""Configs of the commands: where their files are, their schema and their command lines.
-
-`flowrep.config.schema` holds the models, `flowrep.config.cli` runs a command; docs/configs.md is
-about both.
-"""
+"""The commands' configs: their files, their schema (`schema`) and their command lines (`cli`)."""
 
 from pathlib import Path
 
-_IN_WHEEL = Path(__file__).resolve().parents[1] / "conf"
-_IN_CHECKOUT = Path(__file__).resolve().parents[2] / "conf"
-
-# In a checkout the package's `conf` is a link to the one beside it, for `pkg://flowrep.conf`.
-CONF_DIR: Path = (_IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT).resolve()
+_OURS = Path(__file__).resolve().parents[1] / "conf"
+# In a checkout it is a link to the one beside the package, for `pkg://flowrep.conf`; git makes none
+# on Windows.
+CONF_DIR = (_OURS if _OURS.is_dir() else _OURS.parents[1] / "conf").resolve()
 
 
 class UsageError(ValueError):

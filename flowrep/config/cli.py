@@ -1,8 +1,7 @@
 """Runs a command from its command line; a mistake ends in `error:` lines and exit code 2.
 
-Hydra composes the config and `flowrep.config.schema` checks it. What either refuses is caught here,
-at the edge, and printed as a line that names the key and the remedy. `HYDRA_FULL_ERROR=1` shows the
-traceback as well.
+Hydra composes the config and `flowrep.config.schema` checks it. What either refuses is caught
+at the edge. `HYDRA_FULL_ERROR=1` shows the traceback as well.
 """
 
 from __future__ import annotations
@@ -185,12 +184,12 @@ def _unknown_key(key: str, schema: type[Section]) -> str:
     """Returns that there is no such key, and the sections that have one, or all keys."""
     if "." in key:
         return f"unknown key '{key}': --cfg job shows the keys that there are"
-    groups = [group for group in config_groups() if group in schema.key_names()]
+    groups = [group for group in config_groups() if group in schema.model_fields]
     files = [(group, path) for group in groups for path in CONF_DIR.glob(f"{group}/**/*.yaml")]
     places = sorted({f"{group}.{key}" for group, path in files if key in OmegaConf.load(path)})
     if places:
         return f"unknown key '{key}': do you mean {' or '.join(places)}?"
-    keys = [*schema.key_names(), *(("preset", "debug") if "resume" in schema.model_fields else ())]
+    keys = [*schema.model_fields, *(("preset", "debug") if "resume" in schema.model_fields else ())]
     return f"unknown key '{key}'; there are: {', '.join(keys)}"
 
 
@@ -218,7 +217,7 @@ def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
 def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
     """Returns a command line as Hydra reads it: folders quoted, those without a key named `run`."""
     # quoted are folders that exist, and those that Hydra would take for a number
-    keys, folders, others, previous = schema.key_names(), [], [], ""
+    keys, folders, others, previous = schema.model_fields, [], [], ""
     for text in arguments:
         key, _, value = text.partition("=")
         if text.startswith("--") and key[2:] in {*keys, *config_groups()}:
@@ -316,8 +315,7 @@ def folder_name(text: str) -> str:
 def run_of_sweep(overrides: Iterable[str]) -> str:
     """Returns the folder name of a sweep's run, which needs no quotes in a shell or in Hydra.
 
-    It depends on the overrides alone. Those whose value is clear by itself are shortened to it;
-    settings of the machine are left out.
+    Settings of the machine are left out.
 
     >>> run_of_sweep(["seed=0", "scene=s_turn", "representations=[ego,obj]", "device=cpu"])
     's_turn_ego+obj_s0'

@@ -68,11 +68,6 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    @classmethod
-    def key_names(cls) -> list[str]:
-        """Returns the names of the keys."""
-        return list(cls.model_fields)
-
     def plain(self) -> dict[str, Any]:
         """Returns the keys and values as they are written in a config."""
         return self.model_dump(by_alias=True)

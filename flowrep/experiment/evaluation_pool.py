@@ -26,8 +26,7 @@ _stop: Any = None  # an event that ends the shares under way; set by `_begin`
 class EvaluationPool:
     """Evaluates in several processes, which start with the first share and are kept.
 
-    An episode is the same wherever it is driven. Ctrl-C does not reach the processes, and they end
-    with the caller.
+    Ctrl-C does not reach them, and they end with the caller.
     """
 
     def __init__(self, num_processes: int) -> None:
@@ -47,7 +46,7 @@ class EvaluationPool:
 
         Args:
             make_env: picklable; takes changes of `make_env`'s arguments.
-            num_envs: the number of environments side by side, in all processes together.
+            num_envs: side by side, in all processes together.
             jobs: for each name, arguments of `flowrep.experiment.evaluation.evaluate`.
             stop: ends what is under way.
         """
@@ -89,11 +88,8 @@ class EvaluationPool:
 
 
 def can_travel(policy: Any) -> bool:
-    """Returns whether a policy can be sent to another process.
-
-    One of the user's own stays where it was made, whatever it holds.
-    """
-    if not isinstance(policy, torch.nn.Module):
+    """Returns whether a policy can be sent to another process."""
+    if not isinstance(policy, torch.nn.Module):  # one of the user's own, whatever it holds
         return False
     try:
         pickle.dumps(policy)

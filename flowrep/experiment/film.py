@@ -67,8 +67,7 @@ def film_episode(
 def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> Maps:
     """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` from one env's sensors.
 
-    Flow is in px/step, whatever the unit and scale of the agent's own representations. If the agent
-    uses estimated flow or noisy depth, so do these maps.
+    Flow is in px/step, and as estimated or noisy as the agent's own.
     """
     raw = measured = sensor.get("flow", None)
     if raw is None:

@@ -56,7 +56,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some net
 
 
 class FolderInUseError(OSError):
-    """Another process works in the folder; the message says which."""
+    """Another process works in the folder."""
 
 
 def _locked(file: IO[str]) -> bool:
@@ -365,9 +365,9 @@ class RunFolder:
     def save_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
         """Adds evaluated episodes to evaluation.csv, or to a table that replaces it.
 
-        An episode that the table already has, with the same policy, frames, speed and frame rate,
-        is replaced in place, so that evaluating it again leaves the table unchanged. With the rows
-        from before an evaluation, episodes can be saved as they end and still stand in order.
+        An episode that is there already, with the same policy, frames, speed and frame rate, is
+        replaced in place. With the rows from before an evaluation as the table, episodes can be
+        saved as they end and still stand in order.
         """
         before = self.read_episodes() if table is None else table
         new = [{name: str(row[name]) for name in EVALUATION_COLUMNS} for row in rows]
@@ -379,9 +379,8 @@ class RunFolder:
     ) -> None:
         """Adds where vehicles drove to drives.npz, in place of the same episodes' earlier drives.
 
-        The file holds `positions` [sum of T + 1, 2], x and y in metres; `starts` [N + 1], so that
-        episode n is `positions[starts[n]:starts[n + 1]]`; and for each episode the columns of
-        evaluation.csv that name it.
+        It holds `positions` [sum of T + 1, 2], x and y in metres; `starts` [N + 1], so that episode
+        n is `positions[starts[n]:starts[n + 1]]`; and the columns that name each episode.
         """
         drives: dict[tuple[Any, ...], NDArray[np.float32]] = {}
         if self.drives_path.is_file():

@@ -136,10 +136,6 @@ class Runner:
         self.folder.log_metrics(self.frames, row)
         return row
 
-    def trained(self) -> Agent:
-        """Returns the agent as it is now."""
-        return Agent(self.agent.policy, self.config, self.frames)
-
     def evaluate(self, kind: str, stop: StopRequest) -> bool:
         """Adds episodes to evaluation.csv; returns whether all were run before a stop.
 
@@ -152,7 +148,7 @@ class Runner:
             comparison = Comparison(*episodes, FINAL_POLICIES, asked.baselines)
         else:
             comparison = Comparison([config.speed], [fps], asked.episodes, EVALUATION_SEED)
-        agent = self.trained()
+        agent = Agent(self.agent.policy, config, self.frames)
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
             if self._pool is None:
@@ -162,11 +158,10 @@ class Runner:
         if comparison.done < comparison.total:
             return False
         rows = comparison.rows(**agent.origin(kind))
+        positions = [e.positions for _, e in comparison.results()] if kind == "final" else []
+        self.folder.log_episodes(rows, positions)
         if kind == "final":
-            self.folder.log_episodes(rows, [e.positions for _, e in comparison.results()])
             print_results(rows)
-        else:
-            self.folder.log_episodes(rows)
         return True
 
     def film(self) -> None:
@@ -182,14 +177,14 @@ class Runner:
         draw_learning_curve(path, metrics, episodes, speed=self.config.speed, fps=fps)
         path = self.folder.video_path(f"episode_{self.config.speed}")
         if self.config.evaluation.video and not path.exists():
-            record_episode(self.trained(), path, episode_seed=FINAL_SEED)
+            agent = Agent(self.agent.policy, self.config, self.frames)
+            record_episode(agent, path, episode_seed=FINAL_SEED)
             print(f"video: {path}")
 
     def close(self) -> None:
         """Ends the processes of environments and evaluation."""
         if self._pool is not None:
             self._pool.close()
-            self._pool = None
         if not self.env.is_closed:
             self.env.close()
 
@@ -220,7 +215,19 @@ class Runner:
             return
         state = load_checkpoint(path)
         check_origin(state["origin"], origin_of(config.plain()), path)
-        self.restore(state)
+        env = self.env
+        env.reset()
+        self.frames = state["frames"]
+        self.evaluation_pending = state["evaluation_pending"]
+        self.metrics.restore(state["metrics"])
+        self.recent.restore(state["recent"])
+        self.observation = TensorDict(state["observation"], env.batch_size, device=env.device)
+        self.agent.load_state_dict(state["agent"])
+        self.agent.memory.load_state_dict(state["memory"])
+        set_states(env, state["env"])
+        torch.set_rng_state(state["torch_rng"])
+        if len(state["cuda_rng"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state["cuda_rng"])
         self.folder.forget_after(self.frames)
 
     def state(self) -> dict[str, Any]:
@@ -240,23 +247,6 @@ class Runner:
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all(),
         }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continues from a `state`."""
-        self.env.reset()
-        self.frames = state["frames"]
-        self.evaluation_pending = state["evaluation_pending"]
-        self.metrics.restore(state["metrics"])
-        self.recent.restore(state["recent"])
-        self.observation = TensorDict(
-            state["observation"], self.env.batch_size, device=self.env.device
-        )
-        self.agent.load_state_dict(state["agent"])
-        self.agent.memory.load_state_dict(state["memory"])
-        set_states(self.env, state["env"])
-        torch.set_rng_state(state["torch_rng"])
-        if len(state["cuda_rng"]) == torch.cuda.device_count():
-            torch.cuda.set_rng_state_all(state["cuda_rng"])
 
 
 def share_cores(config: TrainConfig) -> AbstractContextManager[None]:

@@ -160,7 +160,7 @@ def test_names_in_the_schema_are_those_of_the_code():
     assert set(get_args(schema.MotionSource)) == set(MOTION_SOURCES)
     assert literal(schema.DiscreteSAC, "encoder") == set(dsac.ENCODERS)
     assert literal(schema.PPO, "precision") == set(observation.PRECISIONS)
-    assert schema.Noise.key_names() == list(NOISE_OPTIONS)
+    assert list(schema.Noise.model_fields) == list(NOISE_OPTIONS)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_names_in_the_schema_are_those_of_the_code():
 )  # fmt: skip
 def test_a_command_has_the_keys_of_its_schema(name, model, given):
     config = plain(name, *given)
-    assert sorted(config) == sorted(model.key_names())
+    assert sorted(config) == sorted(model.model_fields)
     validated(model, config)
 
 
