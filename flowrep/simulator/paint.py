@@ -19,7 +19,7 @@ _FRONT_PX = (60, 64)  # height, width of one house front in the texture
 _FLOORS = (2, 3, 4, 5)
 AMBIENT, DIFFUSE = 0.62, 0.46
 LIGHT = tuple((np.array([-4.0, 3.0, 9.0]) / np.linalg.norm([-4.0, 3.0, 9.0])).tolist())
-"""Shares of light from everywhere and from the sun, and the direction to it, in the world."""
+# Shares of light from everywhere and from the sun, and the direction to it, in the world.
 
 GRAIN_SIZE, FRONT_SIZE = 512, 64  # texels a side; of a house front as the rasteriser has it
 _TEXELS_A_M, _PEOPLE_TEXELS_A_M = 25.0, 200.0  # so the grain of roads repeats every 20 m
@@ -71,19 +71,21 @@ Patch = tuple[float, float, float, float]
 
 def swatch(name: str) -> Patch:
     """Returns the middle of a plain colour, as a patch of zero size."""
-    u = (list(PAINTS).index(name) + 0.5) * _SWATCH_PX / SIZE_PX
-    v = 0.5 * _SWATCH_PX / SIZE_PX
+    u, v = (list(PAINTS).index(name) + 0.5) * _SWATCH_PX / SIZE_PX, 0.5 * _SWATCH_PX / SIZE_PX
     return (u, v, u, v)
 
 
 def front(variant: int) -> Patch:
-    """Returns the patch of house front `variant`, modulo the number of fronts."""
+    """Returns a house front; there are `NUM_FRONTS` of them, again and again."""
     row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
-    top = _SWATCH_PX + row * _FRONT_PX[0]
-    left = column * _FRONT_PX[1]
-    pixels = np.array([left + 0.5, top + 0.5, left + _FRONT_PX[1] - 0.5, top + _FRONT_PX[0] - 0.5])
+    (height, width), (top, left) = _FRONT_PX, _corner(row, column)
+    pixels = np.array([left + 0.5, top + 0.5, left + width - 0.5, top + height - 0.5])
     u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
     return (u0, v0, u1, v1)
+
+
+def _corner(row: int, column: int) -> tuple[int, int]:
+    return _SWATCH_PX + row * _FRONT_PX[0], column * _FRONT_PX[1]
 
 
 def upper_storeys(variant: int) -> Patch:
@@ -101,24 +103,21 @@ def texture() -> NDArray[np.uint8]:
     height, width = _FRONT_PX
     for row, floors in enumerate(_FLOORS):
         for column, rgb in enumerate(_WALLS):
-            top, left = _SWATCH_PX + row * height, column * width
-            image[top : top + height, left : left + width] = _house_front(floors, rgb)
+            top, left = _corner(row, column)
+            _paint_front(image[top : top + height, left : left + width], floors, rgb)
     return image
 
 
-def _house_front(floors: int, rgb: tuple[int, int, int]) -> NDArray[np.uint8]:
-    height, width = _FRONT_PX
-    image = np.full((height, width, 3), rgb, dtype=np.uint8)
-    storey, bay = height // floors, width // 4
+def _paint_front(image: NDArray[np.uint8], floors: int, rgb: tuple[int, int, int]) -> None:
+    image[:] = rgb
+    storey, bay = len(image) // floors, image.shape[1] // 4
     for floor in range(floors):
         top = floor * storey + storey // 4
         image[floor * storey] = np.array(rgb) * 0.8
-        for column in range(4):
-            left = column * bay + bay // 4
+        for left in range(bay // 4, 4 * bay, bay):
             image[top : top + storey // 2, left : left + bay // 2] = PAINTS["glass"]
     # A door in the second bay of the ground floor, down to the street.
-    image[height - storey * 2 // 3 :, bay + bay // 4 : 2 * bay - bay // 4] = PAINTS["wood"]
-    return image
+    image[-(storey * 2 // 3) :, bay + bay // 4 : 2 * bay - bay // 4] = PAINTS["wood"]
 
 
 class Painted(NamedTuple):
@@ -133,25 +132,17 @@ class Painted(NamedTuple):
 
 
 def painted(
-    corners: NDArray[np.float64],
-    uvs: NDArray[np.float64],
-    semantic: NDArray[np.uint8],
-    instance: NDArray[np.uint8],
+    corners: NDArray[np.float64],  # [T, 3, 3], metres, counter-clockwise seen from outside
+    uvs: NDArray[np.float64],  # [T, 3, 2], the corners' places in the texture
+    semantic: NDArray[np.uint8],  # [T]
+    instance: NDArray[np.uint8],  # [T], 0 for the static world
 ) -> Painted:
-    """Returns the look of triangles.
-
-    The grain lies on level ground as a map does, so it runs on over its triangles. On other faces
-    its axes are the level direction along the face and the one across.
-
-    Args:
-        corners: [T, 3, 3], metres, counter-clockwise seen from outside.
-        uvs: [T, 3, 2], the corners' places in the texture.
-        semantic: [T], their ids in the semantic map.
-        instance: [T], 0 for the static world.
-    """
+    """Returns the look of triangles."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normals = np.cross(a, b)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    # The grain lies on level ground as a map does, so it runs on over its triangles. On other faces
+    # its axes are the level direction along the face and the one across.
     is_level = np.abs(normals[:, 2]) > 0.9
     along = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(a))], axis=1)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
@@ -173,7 +164,7 @@ def painted(
     # The affine map of a triangle's plane that takes corners to texels: [a b n] to [du dv 0].
     front_axes = np.zeros((len(a), 2, 4))
     for i in np.flatnonzero(is_front):
-        left, top = column_of_front[i] * _FRONT_PX[1], _SWATCH_PX + row_of_front[i] * _FRONT_PX[0]
+        top, left = _corner(row_of_front[i], column_of_front[i])
         texels = (uvs[i] * SIZE_PX - [left, top]) * FRONT_SIZE / np.array(_FRONT_PX[::-1])
         steps = np.column_stack([texels[1] - texels[0], texels[2] - texels[0], np.zeros(2)])
         front_axes[i, :, :3] = steps @ np.linalg.inv(np.column_stack([a[i], b[i], normals[i]]))
@@ -192,10 +183,9 @@ def painted(
 def grain() -> NDArray[np.float32]:
     """Returns a periodic random pattern of mean 0 and deviation 1, and its coarser levels.
 
-    Level l, of `GRAIN_SIZE / 2^l` texels a side, is the pattern behind a Gaussian of half its own
-    texel, which no more aliases at that size: `[2 * GRAIN_SIZE, GRAIN_SIZE, 2]`, see
-    `_below_each_other`. Beside each texel stands the next level's value at the same place, so that
-    one look-up blends the two.
+    Level l is the pattern behind a Gaussian of half its own texel, which no more aliases at that
+    size: `[2 * GRAIN_SIZE, GRAIN_SIZE, 2]`, see `_below_each_other`. Beside each texel stands the
+    next level's value at the same place, so that one look-up blends the two.
     """
     frequency = np.fft.fftfreq(GRAIN_SIZE)  # cycles a texel
     radius = np.hypot(frequency[:, None], frequency)
@@ -203,8 +193,7 @@ def grain() -> NDArray[np.float32]:
     spectrum = np.fft.fft2(noise) / np.maximum(radius, 1 / GRAIN_SIZE) ** _SLOPE
     spectrum[radius < _COARSEST_WAVES / GRAIN_SIZE] = 0.0
     spectrum /= np.fft.ifft2(spectrum).real.std()
-    levels = []
-    size = GRAIN_SIZE
+    levels, size = [], GRAIN_SIZE
     while size >= 2:
         kept = np.ix_(*[np.r_[0 : size // 2, GRAIN_SIZE - size // 2 : GRAIN_SIZE]] * 2)
         texel = GRAIN_SIZE / size
@@ -219,17 +208,14 @@ def grain() -> NDArray[np.float32]:
 
 @cache
 def front_levels() -> NDArray[np.float32]:
-    """Returns the house fronts with grain, each with its coarser levels.
-
-    Level l has `FRONT_SIZE / 2^l` texels a side: `[fronts, 2 * FRONT_SIZE, FRONT_SIZE, 3]`.
-    """
+    """Returns the house fronts with grain: `[fronts, 2 * FRONT_SIZE, FRONT_SIZE, 3]`."""
     image, fronts = texture().astype(np.float32), []
     pattern = grain()[:GRAIN_SIZE, :, 0]
-    height, width = _FRONT_PX
-    rows = ((np.arange(FRONT_SIZE) + 0.5) * height / FRONT_SIZE).astype(int)
+    rows = ((np.arange(FRONT_SIZE) + 0.5) * _FRONT_PX[0] / FRONT_SIZE).astype(int)
     for number in range(NUM_FRONTS):
         row, column = divmod(number, len(_WALLS))
-        level = image[_SWATCH_PX + row * height + rows, column * width : (column + 1) * width]
+        top, left = _corner(row, column)
+        level = image[top + rows, left : left + _FRONT_PX[1]]
         # Every fourth texel of the grain, so that its waves are as long as on the ground.
         own = pattern[row * 16 :: 4, column * 16 :: 4][:FRONT_SIZE, :FRONT_SIZE, None]
         levels = [level * (1.0 + _CONTRAST[CATEGORY_ID["building"]] * own)]

@@ -1,14 +1,9 @@
 """A fast rasteriser for depth, class and instance maps and colours, instead of PyBullet's renderer.
 
-Numba compiles it at the first call and caches the machine code. The module is imported only when
-something is drawn.
-
 A vertex becomes q = z · (u, v, 1): pixel coordinates times depth. In this frame the edges of a
 triangle are planes through the camera, e_a = q_b × q_c, and pixel r = (u, v, 1) lies inside if
 e_a · r ≥ 0 for all three. With d = q_a · e_a the inverse depth is (e_a + e_b + e_c) · r / d, affine
 in u and v. This also holds for corners behind the camera, so nothing needs to be clipped.
-
-Colours are computed after all triangles are drawn, once for each pixel (`_shade`).
 """
 
 import math
@@ -19,16 +14,9 @@ from numpy.typing import NDArray
 
 from flowrep.extras import compiled
 from flowrep.palette import CLASS_COLOURS
+from flowrep.simulator import paint
 from flowrep.simulator.meshes import Triangles
-from flowrep.simulator.paint import (
-    AMBIENT,
-    DIFFUSE,
-    FRONT_SIZE,
-    GRAIN_SIZE,
-    LIGHT,
-    front_levels,
-    grain,
-)
+from flowrep.simulator.paint import AMBIENT, DIFFUSE, FRONT_SIZE, GRAIN_SIZE, LIGHT
 
 _LEAST_AREA_PX = 0.01  # twice the area below which PyBullet's renderer omits triangles
 _SKY = CLASS_COLOURS["sky"]
@@ -53,30 +41,23 @@ class Maps(NamedTuple):
 
 
 class Rasteriser:
-    """A camera for depth, ids and colours; triangles are visible only from outside.
-
-    Args:
-        triangles: the bodies.
-        K: intrinsics [3, 3] without skew; pixel (0, 0)'s centre is (0.5, 0.5).
-        size: height and width in pixels.
-        range_m: the nearest and the farthest visible depth.
-    """
+    """A camera for depth, ids and colours; triangles are visible only from outside."""
 
     def __init__(
         self,
         triangles: Triangles,
-        K: NDArray[np.float64],
-        size: tuple[int, int],
-        range_m: tuple[float, float],
+        K: NDArray[np.float64],  # [3, 3], without skew
+        size: tuple[int, int],  # height, width
+        range_m: tuple[float, float],  # of the visible depths
     ) -> None:
         # Column i is sampled at u = i + 0.5.
         K_of_index = K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-        shape = triangles[: triangles._fields.index("bodies") + 1]
-        # The renderer numbers triangles, so classes and instances are looked up by triangle.
-        owners = np.repeat(triangles.bodies, np.diff(triangles.corner_bounds))
+        shape = triangles[: triangles._fields.index("poses") + 1]
+        # Triangles are what is drawn, so classes, instances and poses are looked up by triangle.
+        counts = np.diff(triangles.corner_bounds)
+        owners, poses = np.repeat(triangles.bodies, counts), np.repeat(triangles.poses, counts)
         ids = triangles.semantic[owners], triangles.instance[owners]
-        self._world = (*shape, triangles.poses, *ids, K_of_index, *map(float, range_m))
-        poses = np.repeat(triangles.poses, np.diff(triangles.corner_bounds))
+        self._world = (*shape, *ids, K_of_index, *map(float, range_m))
         self._look = poses, *triangles.look
         self._size = size
         moving = int(triangles.poses.max(initial=-1)) + 1
@@ -85,30 +66,19 @@ class Rasteriser:
 
     def __call__(
         self,
-        cam_from_world: NDArray[np.float64],
-        world_from_body: NDArray[np.float64],
-        is_shown: NDArray[np.bool_],
+        cam_from_world: NDArray[np.float64],  # [N, 4, 4], with OpenCV camera axes
+        world_from_body: NDArray[np.float64],  # [N, M, 4, 4], of the M moving bodies
+        is_shown: NDArray[np.bool_],  # [N, B]
         *,
         rgb: bool = False,
     ) -> Maps:
-        """Returns N views of the same bodies at poses of their own.
-
-        Args:
-            cam_from_world: [N, 4, 4], with OpenCV camera axes.
-            world_from_body: poses [N, M, 4, 4] of the M moving bodies.
-            is_shown: which bodies are present, [N, B].
-            rgb: whether to draw colours too.
-        """
+        """Returns N views of the same bodies at poses of their own."""
         # Tables of 4 MB are made when colours are first drawn.
-        look = *self._look, *((grain(), front_levels()) if rgb else _NO_TABLES)
+        look = *self._look, *((paint.grain(), paint.front_levels()) if rgb else _NO_TABLES)
         views = len(cam_from_world)
-        shape = (views, *self._size)
-        maps = Maps(
-            np.empty(shape, np.float32),
-            np.empty(shape, np.uint8),
-            np.empty(shape, np.uint8),
-            np.empty((views if rgb else 0, 3, *self._size), np.uint8),
-        )
+        depth = np.empty((views, *self._size), np.float32)
+        ids = (np.empty(depth.shape, np.uint8) for _ in range(2))
+        maps = Maps(depth, *ids, np.empty((views if rgb else 0, 3, *self._size), np.uint8))
         _draw(*self._world, look, cam_from_world, world_from_body, is_shown, *maps)
         return maps
 
@@ -149,13 +119,10 @@ def _draw(
 @_compiled
 def _side_planes(K, height, width):
     # Inward unit normals of the four planes through the outermost samples.
-    planes = np.empty((4, 3))
     left, right = -K[0, 2] / K[0, 0], (width - 1 - K[0, 2]) / K[0, 0]
     top, bottom = -K[1, 2] / K[1, 1], (height - 1 - K[1, 2]) / K[1, 1]
-    planes[0] = (1.0, 0.0, -left)
-    planes[1] = (-1.0, 0.0, right)
-    planes[2] = (0.0, 1.0, -top)
-    planes[3] = (0.0, -1.0, bottom)
+    sides = [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
+    planes = np.array(sides)
     for plane in planes:
         plane /= math.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
     return planes
@@ -206,7 +173,7 @@ def _cross(p, q):
 
 @_compiled
 def _fill(p, q, r, near_m, far_m, triangle, inverse, number):
-    """Draws the triangle with corners p, q, r, clockwise in an image whose y points down."""
+    # p, q, r are clockwise in an image whose y points down.
     e, f, g = _cross(r, q), _cross(p, r), _cross(q, p)
     det = p[0] * e[0] + p[1] * e[1] + p[2] * e[2]
     if det <= 0.0:
@@ -264,11 +231,9 @@ def _look_up(inverse, number, classes, instances, depth, semantic, instance):
 
 @_shading
 def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
-    """Colours the visible triangles: paint times grain times light, filtered to a pixel's size.
-
-    A row consists of runs of pixels of one triangle. `_find_texels` goes through a run first, so
-    that the compiler can use vector instructions, which the look-ups after it rule out.
-    """
+    # When all triangles are drawn: paint times grain times light, filtered to a pixel's size. A row
+    # consists of runs of pixels of one triangle. `_find_texels` goes through a run first, so that
+    # the compiler can use vector instructions, which the look-ups after it rule out.
     poses, normals, colours, contrast, grain_axes, front_of, front_axes, grain, fronts = look
     height, width = number.shape
     moving = len(world_from_body)
@@ -331,11 +296,11 @@ def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
                         us[i], vs[i], levels[i], np.uint32(FRONT_SIZE), np.float32(0.5)
                     )
                     for c in range(3):
-                        paint = _mixed(
+                        mixed = _mixed(
                             fronts[front, r, p, c], fronts[front, r, q, c],
                             fronts[front, s, p, c], fronts[front, s, q, c], right, down,
                         )  # fmt: skip
-                        rgb[c, y, x] = _byte(paint * shade)
+                        rgb[c, y, x] = _byte(mixed * shade)
 
 
 @_inlined
