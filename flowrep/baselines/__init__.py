@@ -1,7 +1,4 @@
-"""Baselines to compare an agent with: a privileged planner, never turning, random actions.
-
-They learn nothing and may read the env's state.
-"""
+"""Baselines to compare an agent with: a privileged planner, never turning, random actions."""
 
 from collections.abc import Callable
 

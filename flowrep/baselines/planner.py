@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry.base import BaseGeometry
 
 from flowrep.envs.episode import Episode
 from flowrep.envs.street_env import StreetEnv
@@ -70,7 +69,7 @@ class Planner:
 class GoalDistance:
     """A grid of shortest distances from the free ground to the ending zone."""
 
-    def __init__(self, free: BaseGeometry, goal: BaseGeometry) -> None:
+    def __init__(self, free: shapely.Geometry, goal: shapely.Geometry) -> None:
         x0, y0, x1, y1 = free.bounds
         self._origin = np.array([x0, y0])
         columns, rows = (math.ceil(size / _GRID_M) for size in (x1 - x0, y1 - y0))
@@ -101,7 +100,7 @@ class GoalDistance:
 
 
 @lru_cache(maxsize=16)  # it takes a second, and planners of one scene share it
-def _ground(layout: Layout, path: Path) -> tuple[BaseGeometry, GoalDistance]:
+def _ground(layout: Layout, path: Path) -> tuple[shapely.Geometry, GoalDistance]:
     free = free_ground(layout, path)
     return free, GoalDistance(free, layout.zones[path.end])
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry import Polygon
 
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes.layout import Layout
@@ -30,7 +29,7 @@ class Outcome(IntEnum):
 
     @property
     def label(self) -> str:
-        """The name in `info`, tables and files."""
+        """Its name in `info`, tables and files."""
         return self.name.lower()
 
 
@@ -106,8 +105,8 @@ class Episode:
         self.now = self.before = Moment(layout.start_state(self.path.start), 0)
         self.steps, self.outcome, self.hit = 0, Outcome.RUNNING, ""
         self.poses = self.poses_before = self.crowd.poses(0.0)
-        self._foreseen = self.poses[:0, None]  # poses at the ticks from `_foreseen_from` on
-        self._foreseen_from = 0
+        # Poses at the ticks from a first one on: [ticks, P, 4].
+        self._foreseen_from, self._foreseen = 0, self.poses[:0, None]
 
     def status(self) -> dict[str, int]:
         """Returns outcome, hit, seed and path as numbers, as TensorDicts hold them."""
@@ -154,7 +153,7 @@ class Episode:
 
     def _end_where_due(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
         self.hit = street.hit(vehicle, poses, self.path.closures)
-        footprint = Polygon(footprint_corners(vehicle, self.layout.scene.vehicle))
+        footprint = shapely.Polygon(footprint_corners(vehicle, self.layout.scene.vehicle))
         if self.hit:
             self.outcome = Outcome.COLLISION
         elif not self.layout.drivable.covers(footprint):

@@ -36,9 +36,6 @@ class RepresentationObservation(gym.Wrapper):
             `num_classes` and `frame_rate_hz`, where it has them, are the defaults of what follows.
         representations: names, or a mapping from name to options.
 
-    Raises:
-        ValueError: if a representation is unknown or lacks an input.
-
     >>> env = gym.make("flowrep/StraightRoad-v0", representations=["ego", "obj"])
     >>> observation, info = env.reset(seed=0)
     >>> observation.shape, observation.dtype
@@ -62,14 +59,14 @@ class RepresentationObservation(gym.Wrapper):
         inner = env.unwrapped
         if intrinsics is None and hasattr(inner, "K"):
             intrinsics = torch.from_numpy(inner.K)
+        if num_classes is None:
+            num_classes = getattr(inner, "num_classes", None)
         if dt_s is None and hasattr(inner, "frame_rate_hz"):
             dt_s = 1.0 / inner.frame_rate_hz
         self._frame_rate_hz = 1.0 / dt_s if dt_s else math.nan  # unknown; then no flow is in px/s
+        asked = _onehot(representations) if joined else representations
         self._stack = representation_stack(
-            _onehot(representations) if joined else representations,
-            intrinsics=intrinsics,
-            num_classes=getattr(inner, "num_classes", None) if num_classes is None else num_classes,
-            dt_s=dt_s,
+            asked, intrinsics=intrinsics, num_classes=num_classes, dt_s=dt_s
         )
         self._now = TensorDict()
         self.observation_space = self._space(env.observation_space)
@@ -151,10 +148,8 @@ def make_street(
     """
     if representations and "sensors" not in options:
         # which sensors are read doesn't depend on K and classes
-        read = representation_stack(
-            representations, intrinsics=torch.eye(3), num_classes=1, dt_s=1.0
-        )
-        options["sensors"] = sensors_read(read)
+        any_camera: dict[str, Any] = {"intrinsics": torch.eye(3), "num_classes": 1, "dt_s": 1.0}
+        options["sensors"] = sensors_read(representation_stack(representations, **any_camera))
     env: gym.Env = StreetEnv(scene, **options)
     if representations or truncate_timeouts:
         env = NumericInfo(env, truncate_timeouts=truncate_timeouts)

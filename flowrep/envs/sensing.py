@@ -1,9 +1,6 @@
 """What an env's camera senses: maps, and the motion of bodies and camera since the last step.
 
-Motions are composed in numpy and float64, since workers that step environments do without PyTorch;
-a test holds them equal to `flowrep.geometry`.
-
-Convention: `<to>_from_<from>`; a planar pose is (x, y, yaw), metres and radians, z up.
+Motions are composed in numpy and float64, since workers that step environments do without PyTorch.
 """
 
 from collections.abc import Sequence, Set

@@ -44,9 +44,6 @@ def check_rate(
         )
 
 
-_SELDOM = ("rgb", "frame")  # sensors that are kept only if something reads them
-
-
 class VectorWrapper(GymWrapper):
     """TorchRL's wrapper, with reset masks moved to the CPU and optional, and options checked."""
 
@@ -166,7 +163,7 @@ def make_env(
     probe.close()
     sensors = sensors_read(transforms)
     if keep_sensor:
-        sensors = [name for name in SENSORS if name in sensors or name not in _SELDOM]
+        sensors = [name for name in SENSORS if name in sensors or name not in ("rgb", "frame")]
     elif sensors:
         transforms.append(DropSensor())
     factories = [partial(street, sensors=sensors)] * num_envs
@@ -213,11 +210,9 @@ def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
 
 
 def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
-    """Returns whether the env's workers and `threads` threads of the caller have a core each.
-
-    If not, running both at once is slower than one after the other: threads that synchronise at
-    every operation all wait when one of them loses its core.
-    """
+    """Returns whether the env's workers and `threads` threads of the caller have a core each."""
+    # If not, running both at once is slower than one after the other: threads that synchronise at
+    # every operation all wait when one of them loses its core.
     return _vector(env).num_workers + threads <= available_cores()
 
 

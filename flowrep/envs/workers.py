@@ -60,19 +60,19 @@ class WorkerVectorEnv(VectorEnv):
         num_workers: int,
         in_each: VectorFactory = _SIDE_BY_SIDE,
     ) -> None:
-        if not 1 <= num_workers <= len(env_factories):
-            raise ValueError(
-                f"num_workers is {num_workers} for {len(env_factories)} environments; give each "
-                "worker one at least"
-            )
         self.num_envs, self.num_workers = len(env_factories), num_workers
+        if not 1 <= num_workers <= self.num_envs:
+            raise ValueError(
+                f"num_workers is {num_workers} for {self.num_envs} environments; give each worker "
+                "one at least"
+            )
         self.autoreset_mode = AutoresetMode.DISABLED
         example = in_each(env_factories[:1])
-        self.metadata = example.metadata
-        self.single_observation_space = example.single_observation_space
+        self.metadata, space = example.metadata, example.single_observation_space
+        self.single_observation_space = space
         self.single_action_space = example.single_action_space
         example.close()
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.observation_space = batch_space(space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
@@ -86,13 +86,11 @@ class WorkerVectorEnv(VectorEnv):
         context.set_forkserver_preload([_PRELOADED])
         with sheltered():
             forkserver.ensure_running()
-            memory = create_shared_memory(self.single_observation_space, self.num_envs, context)
+            memory = create_shared_memory(space, self.num_envs, context)
             for rows in self._rows:
                 own = _Worker(context, rows, env_factories[rows], memory, self.num_envs, in_each)
                 self._workers.append(own)
-        self._shared: Any = read_from_shared_memory(
-            self.single_observation_space, memory, self.num_envs
-        )
+        self._shared: Any = read_from_shared_memory(space, memory, self.num_envs)
         for worker in self._workers:
             worker.receive()
 

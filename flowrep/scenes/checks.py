@@ -8,20 +8,10 @@ from itertools import combinations
 from typing import Any
 
 import shapely
-from shapely.geometry import Point
-from shapely.geometry.base import BaseGeometry
 
 from flowrep.palette import CATEGORY_ID
+from flowrep.scenes import pedestrians
 from flowrep.scenes.layout import Layout, centreline, free_ground
-from flowrep.scenes.pedestrians import (
-    APART_M,
-    PARTS,
-    RADIUS_M,
-    covered_ground,
-    keeps_its_stretches,
-    keeps_lanes_apart,
-    least_spread_m,
-)
 from flowrep.scenes.scene import (
     CATEGORY_OF_KIND,
     BuildingRow,
@@ -37,7 +27,7 @@ _LEAST_END_M = 1.0  # of an ending zone; the vehicle's place is checked at least
 
 def check_references(scene: Scene) -> None:
     """Checks that what is named exists, and that places are on their roads."""
-    most = 255 // len(PARTS)  # as parts have 8-bit ids
+    most = 255 // len(pedestrians.PARTS)  # as parts have 8-bit ids
     if scene.num_pedestrians > most:
         raise SceneError(f"pedestrian_groups: {scene.num_pedestrians} people; keep to {most}")
     _check_known("categories", scene.categories, CATEGORY_ID)
@@ -106,7 +96,7 @@ def check_path(layout: Layout, path: Path) -> None:
         raise SceneError(f"{key}: its start collides; move the start or what is in it")
     if shapely.intersects(end, blocks).any():
         raise SceneError(f"{key}: its ending zone is built over; move what is in it")
-    start, vehicle = Point(layout.start_state(path.start)[:2]), layout.scene.vehicle
+    start, vehicle = shapely.Point(layout.start_state(path.start)[:2]), layout.scene.vehicle
     if end.intersects(start):
         raise SceneError(f"{key}: starts inside its ending zone {path.end!r}; move one of them")
     # One connected piece of ground, wide enough for the vehicle's narrower side, must hold both
@@ -121,12 +111,13 @@ def check_path(layout: Layout, path: Path) -> None:
 
 def check_walks(layout: Layout) -> None:
     """Checks that no draw of an episode puts anyone into a box, a person or the vehicle."""
+    reach, least = pedestrians.RADIUS_M, pedestrians.APART_M
     grounds = {group.name: _ground(layout, group) for group in layout.scene.pedestrian_groups}
     boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
     tree = shapely.STRtree([box.footprint for box in boxes])
     for name, ground in grounds.items():
         key = f"pedestrian_groups.{name}.walk"
-        near = tree.query(ground, predicate="dwithin", distance=RADIUS_M)[1]
+        near = tree.query(ground, predicate="dwithin", distance=reach)[1]
         if near.size:
             box = boxes[near.min()]
             raise SceneError(
@@ -134,23 +125,23 @@ def check_walks(layout: Layout) -> None:
                 "walk or that box, or narrow spread_m"
             )
         for path in layout.scene.paths:
-            if shapely.dwithin(ground, layout.start_footprint(path.start), RADIUS_M).any():
+            if shapely.dwithin(ground, layout.start_footprint(path.start), reach).any():
                 raise SceneError(
                     f"{key}: people can be where the vehicle starts path {path.name!r}; move the "
                     f"walk or zone {path.start!r}, or narrow spread_m"
                 )
     wholes = {name: shapely.geometrycollections(ground) for name, ground in grounds.items()}
     for (one, ground), (other, other_ground) in combinations(wholes.items(), 2):
-        if (gap := ground.distance(other_ground)) < APART_M:
+        if (gap := ground.distance(other_ground)) < least:
             raise SceneError(
                 f"pedestrian_groups.{one}: people of {other!r} come within {gap:.2f} m of those of "
-                f"this group; keep the walks {APART_M} m apart: move one, or narrow its spread_m"
+                f"this group; keep the walks {least} m apart: move one, or narrow its spread_m"
             )
 
 
-def _ground(layout: Layout, group: PedestrianGroup) -> list[BaseGeometry]:
+def _ground(layout: Layout, group: PedestrianGroup) -> list[shapely.Geometry]:
     key, spread = f"pedestrian_groups.{group.name}", group.spread_m
-    if spread < (least := least_spread_m(group.count)):
+    if spread < (least := pedestrians.least_spread_m(group.count)):
         raise SceneError(
             f"{key}.spread_m: is {spread}, but {group.count} people need lanes {least:.2f} m wide "
             f"together; give {least:.2f} or more"
@@ -159,10 +150,10 @@ def _ground(layout: Layout, group: PedestrianGroup) -> list[BaseGeometry]:
     if len(line) < 2:
         raise SceneError(f"{key}.walk: has no length; give two places apart from each other")
     # Only one person may walk across their own walk: two could meet where lanes cross.
-    is_walkable = all(keeps_its_stretches(line, side * spread / 2) for side in (-1, 1))
-    if not is_walkable or (group.count > 1 and not keeps_lanes_apart(line, spread)):
+    is_walkable = all(pedestrians.keeps_its_stretches(line, side * spread / 2) for side in (-1, 1))
+    if not is_walkable or (group.count > 1 and not pedestrians.keeps_lanes_apart(line, spread)):
         raise SceneError(
             f"{key}.walk: comes too near to itself, or bends too sharply, for lanes {spread} m "
             "wide; stretch or straighten the walk, or give fewer people and a smaller spread_m"
         )
-    return covered_ground(line, spread)
+    return pedestrians.covered_ground(line, spread)

@@ -8,14 +8,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 import shapely.ops
 from numpy.typing import NDArray
-from shapely.geometry import LineString, Polygon
-from shapely.geometry.base import BaseGeometry
 
 from flowrep.scenes.scene import (
     CATEGORY_OF_KIND,
@@ -39,7 +38,7 @@ _PLOT_STEP_M = 0.5
 SHORTEST_M = 1e-3  # stretch of a walk; shorter ones are left out
 
 
-def centreline(road: Road) -> LineString:
+def centreline(road: Road) -> shapely.LineString:
     """Returns a road's centreline, with arcs sampled every few degrees."""
     (x, y), heading = road.start_m, math.radians(road.heading_deg)
     points = [(x, y)]
@@ -55,10 +54,10 @@ def centreline(road: Road) -> LineString:
             y += length * math.sin(heading + turn / 2)
             heading += turn
             points.append((x, y))
-    return LineString(points)
+    return shapely.LineString(points)
 
 
-def stretch(line: LineString, from_m: float, to_m: float) -> LineString:
+def stretch(line: shapely.LineString, from_m: float, to_m: float) -> shapely.LineString:
     """Returns the part of a centreline between two distances along it, none beyond its ends."""
     first, last = (min(max(at_m, 0.0), line.length) for at_m in (from_m, to_m))
     return shapely.ops.substring(line, first, last)
@@ -100,28 +99,29 @@ class Box:
         return CATEGORY_OF_KIND[self.kind]
 
     @cached_property
-    def footprint(self) -> Polygon:
+    def footprint(self) -> shapely.Polygon:
         """The rectangle that the box covers."""
         forward, left = self.size_m[0] / 2, self.size_m[1] / 2
         sine, cosine = math.sin(self.yaw_rad), math.cos(self.yaw_rad)
         corners = (forward, left), (-forward, left), (-forward, -left), (forward, -left)
         x, y = self.x_m, self.y_m
-        return Polygon([(x + cosine * u - sine * v, y + sine * u + cosine * v) for u, v in corners])
+        turned = [(x + cosine * u - sine * v, y + sine * u + cosine * v) for u, v in corners]
+        return shapely.Polygon(turned)
 
 
 class CrosswalkArea(NamedTuple):
     """The ground of a crosswalk and the heading of the road that it crosses."""
 
-    polygon: Polygon
+    polygon: shapely.Polygon
     heading_rad: float
 
 
-def _with_round_corners(ground: BaseGeometry, radius_m: float) -> BaseGeometry:
+def _with_round_corners(ground: shapely.Geometry, radius_m: float) -> shapely.Geometry:
     # Growing and then shrinking the ground fills its inward corners.
     return ground.buffer(radius_m).buffer(-radius_m) if radius_m > 0 else ground
 
 
-def ribbon(line: LineString, half_width_m: float) -> Polygon:
+def ribbon(line: shapely.LineString, half_width_m: float) -> shapely.Polygon:
     """Returns the ground within `half_width_m` of a line, cut square at its ends."""
     return line.buffer(half_width_m, cap_style="flat", join_style="mitre")
 
@@ -141,23 +141,22 @@ class Layout:
         self.drivable = _with_round_corners(shapely.union_all([*self.ribbons.values()]), radius)
         paved = shapely.union_all([*wide, _with_round_corners(shapely.union_all(wide), radius)])
         self._paved = shapely.union(paved, self.drivable)
-        has_sidewalks = any(road.sidewalk_m > 0 for road in scene.roads)
+        self.sidewalks = self.terrain = shapely.Polygon()
         # without any, rounding of corners leaves slivers
-        self.sidewalks = self._paved.difference(self.drivable) if has_sidewalks else Polygon()
-        reached = shapely.box(*self._paved.bounds).buffer(scene.terrain_m)
-        self.terrain = reached.difference(self._paved) if scene.terrain_m > 0 else Polygon()
-        self.crosswalks = tuple(self._crosswalk_area(crosswalk) for crosswalk in scene.crosswalks)
-        self.zones = {
-            zone.name: self._road_between(zone.road, zone.from_m, zone.to_m) for zone in scene.zones
-        }
+        if any(road.sidewalk_m > 0 for road in scene.roads):
+            self.sidewalks = self._paved.difference(self.drivable)
+        if scene.terrain_m > 0:
+            reached = shapely.box(*self._paved.bounds).buffer(scene.terrain_m)
+            self.terrain = reached.difference(self._paved)
+        self.crosswalks = tuple(map(self._crosswalk_area, scene.crosswalks))
+        self.zones = {z.name: self._road_between(z.road, z.from_m, z.to_m) for z in scene.zones}
         self.closures = {closure.name: self._closure_box(closure) for closure in scene.closures}
         self.buildings = self._buildings()
         single = [
             Box(o.kind, *o.center_m, math.radians(o.yaw_deg), o.size_m, i)
             for i, o in enumerate(scene.obstacles)
         ]
-        rows = [self._obstacle_row(row) for row in scene.obstacle_rows]
-        self.obstacles = (*single, *(box for row in rows for box in row))
+        self.obstacles = (*single, *chain(*map(self._obstacle_row, scene.obstacle_rows)))
         shapely.prepare(self.drivable)
 
     def pose_at(self, road: str, at_m: float, offset_m: float = 0.0) -> tuple[float, float, float]:
@@ -180,9 +179,9 @@ class Layout:
         x, y, heading = self.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
         return VehicleState(x, y, heading + (math.pi if zone.reverse else 0.0), 0.0)
 
-    def start_footprint(self, zone_name: str) -> Polygon:
+    def start_footprint(self, zone_name: str) -> shapely.Polygon:
         """Returns the ground that the vehicle covers in the middle of a start zone."""
-        return Polygon(footprint_corners(self.start_state(zone_name), self.scene.vehicle))
+        return shapely.Polygon(footprint_corners(self.start_state(zone_name), self.scene.vehicle))
 
     def boxes(self, path: Path) -> list[Box]:
         """Returns all that stands in the episodes of a path, its closures included."""
@@ -208,7 +207,7 @@ class Layout:
         # From right to left across the road; the walk's own left points back along the road.
         return np.array([self.pose_at(road.name, given.at_m, y)[:2] for y in (-reach, reach)])
 
-    def _road_between(self, road: str, from_m: float, to_m: float) -> Polygon:
+    def _road_between(self, road: str, from_m: float, to_m: float) -> shapely.Polygon:
         return ribbon(stretch(self.lines[road], from_m, to_m), self.roads[road].width_m / 2)
 
     def _closure_box(self, closure: Closure) -> Box:
@@ -280,7 +279,7 @@ class Layout:
                 yield box
 
 
-def free_ground(layout: Layout, path: Path) -> BaseGeometry:
+def free_ground(layout: Layout, path: Path) -> shapely.Geometry:
     """Returns the road minus the buildings, obstacles and closures of a path's episodes."""
     taken = shapely.union_all([box.footprint for box in layout.boxes(path)])
     free = layout.drivable.difference(taken)

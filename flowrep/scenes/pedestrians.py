@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry.base import BaseGeometry
 
 from flowrep.scenes.layout import SHORTEST_M, Layout, parallel
 from flowrep.scenes.scene import PedestrianGroup, Range
@@ -83,7 +82,7 @@ def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
     return bool(shapely.polygons(np.vstack([right, left[::-1]])).is_valid)
 
 
-def covered_ground(points: Array, spread_m: float) -> list[BaseGeometry]:
+def covered_ground(points: Array, spread_m: float) -> list[shapely.Geometry]:
     """Returns the ground that the lanes of a walk can cover, a convex piece for each stretch."""
     right, left = (parallel(points, side * spread_m / 2) for side in (-1, 1))
     corners = np.stack([right[:-1], right[1:], left[1:], left[:-1]], axis=1)

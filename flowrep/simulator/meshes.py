@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry import LineString, Polygon
-from shapely.geometry.base import BaseGeometry
 
 from flowrep.scenes.layout import Box
 from flowrep.scenes.pedestrians import HIP_M, PARTS
@@ -69,8 +67,8 @@ def gather(bodies: Sequence[Body]) -> Triangles:
     return Triangles(
         points=np.concatenate(points),
         corners=np.concatenate(indices),
-        point_bounds=_bounds(points),
-        corner_bounds=_bounds(indices),
+        point_bounds=np.cumsum([0, *map(len, points)], dtype=np.int32),
+        corner_bounds=np.cumsum([0, *map(len, indices)], dtype=np.int32),
         centres=np.array(centres),
         radii=np.array([distances.max() for distances in reaches]),
         bodies=np.array(owners, dtype=np.int32),
@@ -89,10 +87,6 @@ def _chunks(middles: NDArray[np.float64], triangles: NDArray[np.int64]) -> list[
     order = np.argsort(own[:, int(np.ptp(own, axis=0).argmax())], kind="stable")
     half = len(order) // 2
     return [*_chunks(middles, triangles[order[:half]]), *_chunks(middles, triangles[order[half:]])]
-
-
-def _bounds(arrays: Sequence[NDArray]) -> NDArray[np.int32]:
-    return np.cumsum([0, *(len(array) for array in arrays)]).astype(np.int32)
 
 
 Point3 = tuple[float, float, float]
@@ -164,7 +158,7 @@ class Mesh:
         rim = np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * np.array([0.0, 0.0, 1.0])
         self.polygon(np.array(centre) + radius_m * rim, [list(patch[:2])] * len(rim))
 
-    def ground(self, area: BaseGeometry, height_m: float, paint: str) -> None:
+    def ground(self, area: shapely.Geometry, height_m: float, paint: str) -> None:
         """Adds an area of the ground plan as a level surface, cut into cells."""
         if area.is_empty:
             return
@@ -177,15 +171,12 @@ class Mesh:
                     ring = shapely.geometry.polygon.orient(triangle).exterior.coords[:3]
                     self.polygon(np.array([(u, v, height_m) for u, v in ring]), uv)
 
-    def moved(self, x_m: float, y_m: float, yaw_rad: float) -> "Mesh":
-        """Returns this mesh turned and moved on the ground."""
+    def move(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Turns the mesh and moves it on the ground."""
         sine, cosine = math.sin(yaw_rad), math.cos(yaw_rad)
         turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        other = Mesh()
-        other.vertices = (np.array(self.vertices) @ turn.T + [x_m, y_m, 0.0]).tolist()
-        other.normals = (np.array(self.normals) @ turn.T).tolist()
-        other.uvs, other.indices = self.uvs, self.indices
-        return other
+        self.vertices = (np.array(self.vertices) @ turn.T + [x_m, y_m, 0.0]).tolist()
+        self.normals = (np.array(self.normals) @ turn.T).tolist()
 
     def add(self, other: "Mesh") -> None:
         """Adds another mesh's triangles."""
@@ -196,7 +187,7 @@ class Mesh:
         self.indices += [base + i for i in other.indices]
 
 
-def lane_marks(line: LineString, clear_of: BaseGeometry) -> Mesh:
+def lane_marks(line: shapely.LineString, clear_of: shapely.Geometry) -> Mesh:
     """Returns dashes along a centreline, slightly above it, but for some ground."""
     mesh = Mesh()
     for at in np.arange(0.0, line.length - _DASH_M, _DASH_PERIOD_M):
@@ -207,7 +198,7 @@ def lane_marks(line: LineString, clear_of: BaseGeometry) -> Mesh:
     return mesh
 
 
-def kerb(drivable: BaseGeometry, paved: BaseGeometry) -> Mesh:
+def kerb(drivable: shapely.Geometry, paved: shapely.Geometry) -> Mesh:
     """Returns the kerbstones along the edge of a sidewalk, slightly above it."""
     # The paving continues below them: the renderer omits thin triangles in the distance, where the
     # same category then shows instead.
@@ -217,7 +208,7 @@ def kerb(drivable: BaseGeometry, paved: BaseGeometry) -> Mesh:
     return mesh
 
 
-def crosswalk(area: Polygon, heading_rad: float) -> Mesh:
+def crosswalk(area: shapely.Polygon, heading_rad: float) -> Mesh:
     """Returns asphalt with stripes along the heading of the road that is crossed."""
     mesh = Mesh()
     mesh.ground(area, 0.0, "asphalt")
@@ -228,7 +219,7 @@ def crosswalk(area: Polygon, heading_rad: float) -> Mesh:
     for at in np.arange(-reach + _STRIPE_M / 2, reach - _STRIPE_M / 2, 2 * _STRIPE_M):
         middle = area.centroid.coords[0] + (at + _STRIPE_M / 2) * left
         ends = [middle - depth * along, middle + depth * along]
-        stripe = LineString(ends).buffer(_STRIPE_M / 2, cap_style="flat").intersection(area)
+        stripe = shapely.LineString(ends).buffer(_STRIPE_M / 2, cap_style="flat").intersection(area)
         mesh.ground(stripe, _RISE_M, "lane_mark")
     return mesh
 
@@ -247,7 +238,8 @@ def mesh_of(box: Box, *, both_sides: bool = False) -> Mesh:
         mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
     else:
         _SHAPES[box.kind](mesh, length / 2, width / 2, height, box.variant)
-    return mesh.moved(box.x_m, box.y_m, box.yaw_rad)
+    mesh.move(box.x_m, box.y_m, box.yaw_rad)
+    return mesh
 
 
 # Shapes that face along x are added to a mesh, `x` and `y` are half their length and width.
@@ -332,15 +324,11 @@ def _ring(sides: int, radius_m: float, z: float) -> Array:
 
 
 def person_meshes(variant: int) -> tuple[Mesh, ...]:
-    """Returns the meshes of a person's `PARTS`, facing along x; `variant` selects the shirt.
-
-    Seen from the side, as a vehicle sees people crossing, the arms alone span 0.6 m. The origin of
-    a leg is its hip.
-    """
+    """Returns the meshes of a person's `PARTS`, facing along x; the origin of a leg is its hip."""
     shirt, skin = swatch(SHIRTS[variant % len(SHIRTS)]), swatch("skin")
     body = Mesh()
-    for side, arm in ((-1, 0.19), (1, -0.19)):
-        y = 0.26 * side
+    # Seen from the side, as a vehicle sees people crossing, the arms alone span 0.6 m.
+    for y, arm in ((-0.26, 0.19), (0.26, -0.19)):
         body.box((arm - 0.11, y - 0.05, 0.95), (arm + 0.11, y + 0.05, 1.35), shirt)
         body.box((arm - 0.05, y - 0.05, 0.85), (arm + 0.11, y + 0.05, 0.95), skin, lid=False)
     body.box((-0.14, -0.21, 0.8), (0.14, 0.21, 1.47), shirt)

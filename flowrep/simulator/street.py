@@ -28,10 +28,7 @@ _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
 class SafeGround:
-    """A fast test that a vehicle is on the road, clear of boxes and ending zones.
-
-    It is conservative: where it returns False, exact tests decide.
-    """
+    """A fast test that a vehicle is clear of edges, boxes and ending zones; if not, it may be."""
 
     def __init__(self, layout: Layout) -> None:
         vehicle = layout.scene.vehicle
@@ -56,10 +53,7 @@ class SafeGround:
 
 
 class Street:
-    """The bodies of one scene, shared by all environments of a process with that scene.
-
-    It holds no state of an episode. Environments share one because a PyBullet client takes 28 MB.
-    """
+    """The bodies of one scene, without any state of an episode."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -93,7 +87,8 @@ class Street:
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
         """Returns the street of all environments of the process with this scene."""
-        key = pickle.dumps(scene)  # a scene holds mappings, so it has no hash
+        # A PyBullet client takes 28 MB. A scene holds mappings, so it has no hash.
+        key = pickle.dumps(scene)
         street = _STREETS.get(key)
         if street is None:
             street = _STREETS[key] = cls(Layout(scene))
@@ -175,10 +170,8 @@ class Street:
                 self._add_body(mesh, category)
 
     def _add_solids(self, boxes: list[Box]) -> None:
-        by_category: dict[str, list[Box]] = {}
-        for box in boxes:
-            by_category.setdefault(box.category, []).append(box)
-        for own in by_category.values():
+        for category in dict.fromkeys(box.category for box in boxes):
+            own = [box for box in boxes if box.category == category]
             for first in range(0, len(own), _BOXES_A_BODY):
                 mesh, chunk = meshes.Mesh(), own[first : first + _BOXES_A_BODY]
                 for box in chunk:
