@@ -20,7 +20,6 @@ def test_gymnasiums_own_checks_pass(joined):
     env = gymnasium.make(ID, representations=["ego", "seg2"], joined=joined)
     check_env(env, skip_render_check=True)
     assert env.unwrapped.K.shape == (3, 3)
-    env.close()
 
 
 def test_maps_are_those_of_the_torchrl_env():
@@ -35,8 +34,6 @@ def test_maps_are_those_of_the_torchrl_env():
             np.testing.assert_array_equal(observation[name], td[name][0].numpy())
         td = same.step(td.set("action", torch.tensor([1])))["next"]
         observation, *_ = env.step(1)
-    env.close()
-    same.close()
 
 
 def test_joined_maps_are_finite_float_channels_in_the_order_of_the_names():
@@ -56,8 +53,6 @@ def test_joined_maps_are_finite_float_channels_in_the_order_of_the_names():
     np.testing.assert_array_equal(joined[1:6].argmax(0), apart["seg"][0])
     np.testing.assert_array_equal(joined[1:6].sum(0), 1.0)
     np.testing.assert_array_equal(joined[6:], apart["obj"])
-    env.close()
-    parts.close()
 
 
 def test_colours_alone_stay_bytes():
@@ -66,7 +61,6 @@ def test_colours_alone_stay_bytes():
     assert env.observation_space == spaces.Box(0, 255, (3, 84, 84), np.uint8)
     assert observation.dtype == np.uint8
     assert observation.max() > 1
-    env.close()
 
 
 @pytest.mark.parametrize("truncate", [False, True])
@@ -81,7 +75,6 @@ def test_a_time_out_may_be_a_truncation_and_info_holds_numbers(truncate):
     assert reward == pytest.approx(-4.99)
     expected = {"outcome": Outcome.TIMEOUT, "hit": 255, "episode_seed": 0, "path": 0}
     assert info == expected | {"is_success": False}
-    env.close()
 
 
 def test_vectorised_streets_give_stacked_maps():
@@ -92,7 +85,6 @@ def test_vectorised_streets_give_stacked_maps():
     assert observation in envs.observation_space
     assert info["outcome"].dtype.kind == "i"
     assert not np.array_equal(observation[0], observation[1])
-    envs.close()
 
 
 class Wall(gymnasium.Env):
@@ -138,4 +130,3 @@ def test_a_reset_cannot_change_the_seconds_of_flow_in_px_per_s():
     env.reset(options={"frame_rate_hz": 12.0})
     with pytest.raises(ValueError, match="another env, with frame_rate_hz=6"):
         env.reset(options={"frame_rate_hz": 6.0})
-    env.close()

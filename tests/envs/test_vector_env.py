@@ -14,19 +14,8 @@ from flowrep.envs.vector_env import StreetVectorEnv
 NUM_ENVS = 3
 
 
-@pytest.fixture
-def make():
-    """Makes vector envs that are closed when the test ends."""
-    made = []
-
-    def make(**arguments):
-        factories = [partial(StreetEnv, "h_shaped_pathways", **arguments)] * NUM_ENVS
-        made.append(StreetVectorEnv(factories))
-        return made[-1]
-
-    yield make
-    for vector in made:
-        vector.close()
+def make(**arguments):
+    return StreetVectorEnv([partial(StreetEnv, "h_shaped_pathways", **arguments)] * NUM_ENVS)
 
 
 def assert_same(a, b):
@@ -45,7 +34,7 @@ def assert_same(a, b):
     [{"sensors": SENSORS}, {"sensors": ("depth", "prev_from_curr")}, {"renderer": "pybullet"}],
     ids=str,
 )
-def test_steps_and_partial_resets_are_those_of_streets_alone(make, make_street, arguments):
+def test_steps_and_partial_resets_are_those_of_streets_alone(make_street, arguments):
     vector = make(**arguments)
     streets = [make_street("h_shaped_pathways", **arguments) for _ in range(NUM_ENVS)]
     paths = [path.name for path in streets[0].scene.paths]
@@ -83,7 +72,7 @@ def test_steps_and_partial_resets_are_those_of_streets_alone(make, make_street, 
 
 
 @pytest.mark.parametrize("mask", [(True, False, False), (False, False, False)])
-def test_a_reset_of_some_or_none_returns_what_was_last_seen_as_the_callers_own(make, mask):
+def test_a_reset_of_some_or_none_returns_what_was_last_seen_as_the_callers_own(mask):
     ours = make(sensors=("depth",))
     options, others = {"reset_mask": np.array(mask)}, ~np.array(mask)
     before, _ = ours.reset(options=dict(options))

@@ -36,10 +36,6 @@ def test_streets_of_one_scene_share_a_client_until_the_last_one_is_closed(own_sc
     assert clients() == before + 2
     streets[2].close()
     assert clients() == before + 1
-    again = StreetEnv(own_scene, sensors=())
-    again.reset(seed=0)
-    again.step(0)
-    again.close()
     other.close()
     assert clients() == before
 

@@ -114,11 +114,6 @@ def test_pictures_may_be_larger_than_maps(scale, make_street, straight_road):
     assert (blocks[np.isinf(observation["depth"][0])]).mean() > 0.9
 
 
-def test_pybullet_has_pictures_of_the_maps_size_alone(make_street):
-    with pytest.raises(ValueError, match="picture_scale"):
-        make_street(sensors=("rgb",), renderer="pybullet", picture_scale=2)
-
-
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("name", scene_names())
 def test_estimated_flow_follows_the_road(name, make_street):
