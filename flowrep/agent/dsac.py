@@ -11,14 +11,8 @@ from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor
 from torchrl.objectives import DiscreteSACLoss, LossModule, ValueEstimators
 
-from flowrep.agent.networks import (
-    DiscreteActions,
-    Encoder,
-    Head,
-    MapNetwork,
-    heads_together,
-    stochastic_policy,
-)
+from flowrep.agent import networks
+from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork
 from flowrep.agent.observation import decode_maps
 from flowrep.agent.off_policy import OffPolicy, td_target, transition_keys
 
@@ -74,7 +68,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
                 critic_encoder = Encoder(actor.codecs, layer_norm=actor.encoder.layer_norm)
             critic_head = Head(critic_encoder.embedding_size, actor.hidden_size, actions.count)
         super().__init__(
-            stochastic_policy(actor.head, ["actor_embedding"], actions),
+            networks.stochastic_policy(actor.head, ["actor_embedding"], actions),
             TensorDictModule(critic_head, ["critic_embedding"], ["action_value"]),
             action_space=actions.space,
             num_actions=actions.count,
@@ -110,7 +104,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         log_policy = self._log_policy(seen)
         policy = log_policy.exp()
         negative_entropy = (policy * log_policy).sum(-1)
-        q = heads_together(embedding, self.qvalue_network_params["module"])  # [2, N, n]
+        q = networks.heads_together(embedding, self.qvalue_network_params["module"])  # [2, N, n]
         action = self.actions.numbers(tensordict["action"])
         chosen = q.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
         td_error = chosen - target
@@ -139,7 +133,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
             embedding = self.critic_encoder(images)
         seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
         log_policy = self._log_policy(seen)
-        q = heads_together(embedding, self.target_qvalue_network_params["module"]).amin(0)
+        q = networks.heads_together(embedding, self.target_qvalue_network_params["module"]).amin(0)
         if self.entropy_in_target:
             q = q - alpha * log_policy
         value = (log_policy.exp() * q).sum(-1, keepdim=True)

@@ -18,15 +18,8 @@ from flowrep import geometry
 from flowrep.geometry.depth import check_depth_options
 from flowrep.geometry.flow import check_flow_options
 from flowrep.geometry.pose import POSE_SHAPES, check_pose_options
-from flowrep.transforms.base import (
-    DEPTH,
-    FLOW,
-    Keys,
-    MapTransform,
-    Reads,
-    check_own_keys,
-    flags_of_batch,
-)
+from flowrep.transforms import base
+from flowrep.transforms.base import Keys, MapTransform, Reads, check_own_keys, flags_of_batch
 from flowrep.transforms.flow import CameraTransform, Intrinsics
 
 
@@ -65,7 +58,7 @@ class AdaptDepth(CameraTransform):
         out_keys: Keys = ("sensor", "depth"),
     ) -> None:
         check_depth_options(kind, intrinsics is not None, near_m, far_m, scale_m)
-        shape = ("H", "W", 1) if channels_last else DEPTH.shape
+        shape = ("H", "W", 1) if channels_last else base.DEPTH.shape
         reads = Reads(shape, "float" if scale_m is None else "any")
         super().__init__(intrinsics, [reads], in_keys, out_keys)
         check_own_keys(self)
@@ -190,7 +183,7 @@ class AdaptFlow(MapTransform):
         out_keys: Keys = "raw",
     ) -> None:
         check_flow_options(direction, grid, channels)
-        reads = Reads(("H", "W", 2), "float") if channels_last else FLOW
+        reads = Reads(("H", "W", 2), "float") if channels_last else base.FLOW
         super().__init__([reads], in_keys, out_keys)
         check_own_keys(self)
         self.options: dict[str, Any] = {"direction": direction, "grid": grid, "channels": channels}

@@ -18,18 +18,8 @@ from torchrl.data import Categorical, TensorSpec, Unbounded
 
 from flowrep import geometry
 from flowrep.geometry.checks import check_name
-from flowrep.transforms.base import (
-    DEPTH,
-    FLOW,
-    IDS,
-    MOTION,
-    MOTIONS,
-    Keys,
-    MapTransform,
-    Reads,
-    as_keys,
-    check_choice,
-)
+from flowrep.transforms import base
+from flowrep.transforms.base import Keys, MapTransform, Reads, as_keys, check_choice
 
 Unit = Literal["px_per_step", "px_per_s"]
 
@@ -71,7 +61,7 @@ class CameraTransform(MapTransform):
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         maps = super()._read(tensordict)
         key = mask_key(self.in_keys[0])
-        if self.reads[0] != FLOW or (known := tensordict.get(key, None)) is None:
+        if self.reads[0] != base.FLOW or (known := tensordict.get(key, None)) is None:
             return maps
         like = maps[0][..., :1, :, :]
         if known.dtype != torch.bool or known.shape != like.shape:
@@ -130,7 +120,7 @@ class FlowTransform(CameraTransform):
     def _at_one_precision(self, maps: Sequence[Tensor]) -> list[Tensor]:
         """Returns the inputs and K, the last, in depth's float type, at least float32."""
         # Raw and ego flow have to round alike, or obj is rounding noise on static pixels.
-        (depth,) = (x for x, reads in zip(maps, self.reads) if reads == DEPTH)
+        (depth,) = (x for x, reads in zip(maps, self.reads) if reads == base.DEPTH)
         dtype = torch.promote_types(depth.dtype, torch.float32)
         maps = [*maps] if self.K is None else [*maps, self.K]
         return [x.to(dtype) if x.is_floating_point() else x for x in maps]
@@ -145,7 +135,7 @@ class FlowTransform(CameraTransform):
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns an unbounded spec per flow and a boolean one per mask."""
-        like = next((x for x, reads in zip(specs, self.reads) if reads == DEPTH), specs[0])
+        like = next((x for x, reads in zip(specs, self.reads) if reads == base.DEPTH), specs[0])
         batch, size, device = like.shape[:-3], like.shape[-2:], like.device
         self._warn_of_foreign_camera(size)
         flow = Unbounded(
@@ -232,7 +222,8 @@ class RawFlow(FlowTransform):
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        reads, keys = [DEPTH, IDS, MOTIONS], _RAW_KEYS if in_keys is None else in_keys
+        reads = [base.DEPTH, base.IDS, base.MOTIONS]
+        keys = _RAW_KEYS if in_keys is None else in_keys
         super().__init__(intrinsics, reads, keys, out_keys, outputs, scale, unit, dt_s, compiled)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
@@ -310,10 +301,10 @@ class FlowFactorize(FlowTransform):
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        reads: list[Reads] = [DEPTH, MOTION]
+        reads: list[Reads] = [base.DEPTH, base.MOTION]
         keys: Keys = _EGO_KEYS
         if {"obj", "raw"} & set(outputs):
-            reads, keys = [FLOW, *reads], ["raw", *_EGO_KEYS]
+            reads, keys = [base.FLOW, *reads], ["raw", *_EGO_KEYS]
         keys = keys if in_keys is None else in_keys
         super().__init__(intrinsics, reads, keys, out_keys, outputs, scale, unit, dt_s, compiled)
 

@@ -10,17 +10,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.transforms.base import (
-    DEPTH,
-    FLOW,
-    MOTION,
-    MOTIONS,
-    RGB,
-    Keys,
-    RecurrentTransform,
-    as_keys,
-    check_choice,
-)
+from flowrep.transforms import base
+from flowrep.transforms.base import Keys, RecurrentTransform, as_keys, check_choice
 from flowrep.transforms.flow import CameraTransform, Intrinsics
 
 _POSES: Keys = [("sensor", "world_from_cam"), ("sensor", "world_from_body")]
@@ -66,7 +57,7 @@ class CameraMotion(RecurrentTransform):
         in_keys: Keys = ("sensor", "world_from_cam"),
         out_keys: Keys = ("sensor", "prev_from_curr"),
     ) -> None:
-        super().__init__([MOTION], in_keys, out_keys)
+        super().__init__([base.MOTION], in_keys, out_keys)
 
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
         """Returns `prev_from_curr`."""
@@ -108,7 +99,8 @@ class InstanceMotion(RecurrentTransform):
     def __init__(
         self, *, in_keys: Keys | None = None, out_keys: Keys = ("sensor", "instance_motion")
     ) -> None:
-        super().__init__([MOTION, MOTIONS], _POSES if in_keys is None else in_keys, out_keys)
+        keys = _POSES if in_keys is None else in_keys
+        super().__init__([base.MOTION, base.MOTIONS], keys, out_keys)
 
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
         """Returns `instance_motion`."""
@@ -173,8 +165,9 @@ class EstimateCameraMotion(CameraTransform):
         out_keys: Keys | None = None,
     ) -> None:
         check_choice("outputs", outputs, _ESTIMATES)
-        reads, keys = [FLOW, DEPTH], as_keys(["raw", _DEPTH] if in_keys is None else in_keys)
-        for key, layout in ((picture, RGB), (prior, MOTION)):
+        reads = [base.FLOW, base.DEPTH]
+        keys = as_keys(["raw", _DEPTH] if in_keys is None else in_keys)
+        for key, layout in ((picture, base.RGB), (prior, base.MOTION)):
             if key is not None:
                 reads.append(layout)
                 keys += as_keys([key])

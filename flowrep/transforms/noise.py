@@ -14,16 +14,8 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 
 from flowrep.geometry.pose import rotation_from_vector
-from flowrep.transforms.base import (
-    DEPTH,
-    FLOW,
-    MOTION,
-    Keys,
-    MapTransform,
-    Reads,
-    as_keys,
-    check_choice,
-)
+from flowrep.transforms import base
+from flowrep.transforms.base import Keys, MapTransform, Reads, as_keys, check_choice
 
 FRAME = Reads(("F",), "integer")
 
@@ -35,9 +27,9 @@ class _Sensor(NamedTuple):
 
 
 SENSORS = {
-    "depth": _Sensor(DEPTH, ("sensor", "depth"), ("depth_sigma_per_m", "depth_dropout")),
-    "motion": _Sensor(MOTION, ("sensor", "prev_from_curr"), ("drift_m", "drift_rad")),
-    "flow": _Sensor(FLOW, "raw", ("flow_sigma_px",)),
+    "depth": _Sensor(base.DEPTH, ("sensor", "depth"), ("depth_sigma_per_m", "depth_dropout")),
+    "motion": _Sensor(base.MOTION, ("sensor", "prev_from_curr"), ("drift_m", "drift_rad")),
+    "flow": _Sensor(base.FLOW, "raw", ("flow_sigma_px",)),
 }
 
 # SplitMix64's constants as signed integers, torch's only 64-bit type; products wrap around.

@@ -9,14 +9,7 @@ import pytest
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
-from flowrep.geometry import (
-    camera_motion,
-    ego_flow,
-    egomotion,
-    factorize,
-    relative_motion,
-    rigid_flow,
-)
+from flowrep import geometry as g
 from flowrep.geometry.pose import rotation_from_vector
 from tests.geometry.scenes import rigid
 
@@ -49,7 +42,7 @@ def errors(got, motion, depth, camera) -> tuple[torch.Tensor, torch.Tensor, torc
     turn = got[..., :3, :3].double().mT @ motion[..., :3, :3].double()
     # R - R^T is 2 sin(angle) [axis], whose norm is sqrt(8) sin(angle).
     sine = (turn - turn.mT).flatten(1).norm(dim=-1) / math.sqrt(8)
-    miss = ego_flow(depth, camera, got).flow - ego_flow(depth, camera, motion).flow
+    miss = g.ego_flow(depth, camera, got).flow - g.ego_flow(depth, camera, motion).flow
     return (
         torch.rad2deg(sine),
         (got - motion)[..., :3, 3].norm(dim=-1),
@@ -80,7 +73,7 @@ def drive(scene: str) -> dict[str, torch.Tensor]:
 
 
 def exact_flow(seen: dict[str, torch.Tensor]) -> torch.Tensor:
-    flow, valid = rigid_flow(seen["depth"], seen["instance"], seen["K"], seen["instance_motion"])
+    flow, valid = g.rigid_flow(seen["depth"], seen["instance"], seen["K"], seen["instance_motion"])
     return torch.where(valid, flow, math.nan)
 
 
@@ -89,7 +82,7 @@ def test_the_motion_of_a_flow_is_the_one_that_caused_it():
     # rival curr_from_prev would have -0.5 and the opposite turn.
     motion = rigid((0.01, -0.04, 0.02), (0.1, -0.05, 0.5)).float()
     depth = blocks(1)[0]
-    estimate = camera_motion(ego_flow(depth, CAMERA, motion).flow, depth, CAMERA)
+    estimate = g.camera_motion(g.ego_flow(depth, CAMERA, motion).flow, depth, CAMERA)
     assert estimate.valid
     assert estimate.inlier_share == 1.0
     torch.testing.assert_close(estimate.prev_from_curr, motion, rtol=0, atol=1e-5)
@@ -98,13 +91,13 @@ def test_the_motion_of_a_flow_is_the_one_that_caused_it():
 def test_a_camera_with_skew_and_oblong_pixels_in_float64():
     camera = torch.tensor([[90.0, 4.0, 30.0], [0.0, 40.0, 51.0], [0.0, 0.0, 1.0]]).double()
     depth, motion = blocks(3).double(), motions(3).double()
-    estimate = camera_motion(ego_flow(depth, camera, motion).flow, depth, camera)
+    estimate = g.camera_motion(g.ego_flow(depth, camera, motion).flow, depth, camera)
     torch.testing.assert_close(estimate.prev_from_curr, motion, rtol=0, atol=1e-6)
     assert estimate.covariance.dtype == torch.float64
 
 
 def test_no_flow_is_exactly_no_motion():
-    estimate = camera_motion(torch.zeros(2, SIZE, SIZE), blocks(1)[0], CAMERA)
+    estimate = g.camera_motion(torch.zeros(2, SIZE, SIZE), blocks(1)[0], CAMERA)
     assert estimate.valid
     assert torch.equal(estimate.prev_from_curr, torch.eye(4))
 
@@ -113,17 +106,17 @@ def test_no_flow_is_exactly_no_motion():
 def test_a_frame_s_motion_does_not_depend_on_its_batch(batch):
     count = math.prod(batch)
     depth, motion = blocks(count), motions(count)
-    flow = ego_flow(depth, CAMERA, motion).flow
+    flow = g.ego_flow(depth, CAMERA, motion).flow
     flow += 0.2 * torch.randn(flow.shape, generator=seeded(3))
     picture = (255 * torch.rand(count, 3, SIZE, SIZE, generator=seeded(4))).to(torch.uint8)
     maps = [m.reshape(*batch, *m.shape[1:]) for m in (flow, depth, picture, motion)]
-    together = camera_motion(*maps[:2], CAMERA, picture=maps[2], prior=maps[3])
-    again = camera_motion(*maps[:2], CAMERA, picture=maps[2], prior=maps[3])
+    together = g.camera_motion(*maps[:2], CAMERA, picture=maps[2], prior=maps[3])
+    again = g.camera_motion(*maps[:2], CAMERA, picture=maps[2], prior=maps[3])
     for part, repeated in zip(together, again):
         assert part.shape[: len(batch)] == batch
         assert torch.equal(part, repeated)
     for at in product(*map(range, batch)):
-        alone = camera_motion(
+        alone = g.camera_motion(
             maps[0][at], maps[1][at], CAMERA, picture=maps[2][at], prior=maps[3][at]
         )
         torch.testing.assert_close(
@@ -135,7 +128,7 @@ def test_a_frame_s_motion_does_not_depend_on_its_batch(batch):
 @pytest.mark.parametrize("scene", SCENES)
 def test_exact_flow_of_a_street_gives_the_exact_motion(scene):
     seen = drive(scene)
-    got = camera_motion(exact_flow(seen), seen["depth"], seen["K"])
+    got = g.camera_motion(exact_flow(seen), seen["depth"], seen["K"])
     turn, shift, ego = errors(got.prev_from_curr, seen["prev_from_curr"], seen["depth"], seen["K"])
     assert got.valid.all()
     assert (ego < 0.001).float().mean() >= 0.995
@@ -148,7 +141,7 @@ def test_people_over_a_third_to_half_of_the_picture_are_outliers():
     for scene in SCENES[:2]:
         seen = drive(scene)
         flow = exact_flow(seen)
-        own = flow - ego_flow(seen["depth"], seen["K"], seen["prev_from_curr"]).flow
+        own = flow - g.ego_flow(seen["depth"], seen["K"], seen["prev_from_curr"]).flow
         moves = own.norm(dim=1) > 1e-4
         for frame, top, left in product(range(len(flow)), range(20, 56, 12), range(0, 60, 12)):
             if 0.3 <= moves[frame, top : top + 24, left : left + 24].float().mean() < 0.5:
@@ -159,15 +152,15 @@ def test_people_over_a_third_to_half_of_the_picture_are_outliers():
                 )
     flow, depth, camera, motion = map(torch.stack, zip(*crops))
     assert len(flow) >= 10
-    got = camera_motion(flow, depth, camera)
+    got = g.camera_motion(flow, depth, camera)
     assert (errors(got.prev_from_curr, motion, depth, camera)[2] < 0.05).float().mean() >= 0.97
 
 
 def test_noise_of_a_third_of_a_pixel_and_a_covariance_that_says_so():
     depth, motion = blocks(64), motions(64)
-    flow = ego_flow(depth, CAMERA, motion).flow
+    flow = g.ego_flow(depth, CAMERA, motion).flow
     flow += 0.3 * torch.randn(flow.shape, generator=seeded(5))
-    got = camera_motion(flow, depth, CAMERA)
+    got = g.camera_motion(flow, depth, CAMERA)
     turn, shift, _ = errors(got.prev_from_curr, motion, depth, CAMERA)
     assert turn.median() < 0.03
     assert shift.median() < 0.003
@@ -186,7 +179,7 @@ def test_estimated_flow_of_a_street_gives_nearly_the_motion(scene):
 
     seen = drive(scene)
     flow = -DIS()(seen["rgb"], seen["before"])
-    got = camera_motion(flow, seen["depth"], seen["K"], picture=seen["rgb"])
+    got = g.camera_motion(flow, seen["depth"], seen["K"], picture=seen["rgb"])
     turn, shift, ego = errors(got.prev_from_curr, seen["prev_from_curr"], seen["depth"], seen["K"])
     moved = seen["prev_from_curr"][:, :3, 3].norm(dim=-1)
     assert ego.median() <= 0.30
@@ -207,11 +200,11 @@ def test_recorded_pictures_tell_the_motion_better_than_the_recorded_poses(pair):
     flow = torch.as_tensor(sequences.EstimatedFlowSource(DIS("fast"))(before, now))
     depth, camera = torch.as_tensor(now.depth)[None], torch.as_tensor(now.K).float()
     picture = torch.as_tensor(now.rgb).permute(2, 0, 1)
-    got = camera_motion(flow, depth, camera, picture=picture)
-    recorded = relative_motion(*(torch.as_tensor(f.world_from_cam) for f in (before, now)))
+    got = g.camera_motion(flow, depth, camera, picture=picture)
+    recorded = g.relative_motion(*(torch.as_tensor(f.world_from_cam) for f in (before, now)))
 
     def unexplained(motion) -> float:
-        _, obj, valid = factorize(flow, depth, camera, motion)
+        _, obj, valid = g.factorize(flow, depth, camera, motion)
         return float(obj.norm(dim=0)[valid[0]].median() / flow.norm(dim=0)[valid[0]].median())
 
     assert unexplained(got.prev_from_curr) <= 0.12
@@ -240,8 +233,8 @@ TELLS_NOTHING = {
         FLAT,
         {"picture": torch.full((3, SIZE, SIZE), 90, dtype=torch.uint8)},
     ),
-    "sky alone": (ego_flow(SKY, CAMERA, TURN).flow, SKY, {}),
-    "one direction of edges": (ego_flow(FLAT, CAMERA, RISE).flow, FLAT, {"picture": edges()}),
+    "sky alone": (g.ego_flow(SKY, CAMERA, TURN).flow, SKY, {}),
+    "one direction of edges": (g.ego_flow(FLAT, CAMERA, RISE).flow, FLAT, {"picture": edges()}),
 }
 OPEN = {"sky alone": [3, 4, 5], "one direction of edges": [4], "16 pixels": None}
 
@@ -249,7 +242,7 @@ OPEN = {"sky alone": [3, 4, 5], "one direction of edges": [4], "16 pixels": None
 @pytest.mark.parametrize("case", TELLS_NOTHING)
 def test_what_tells_no_motion_gives_the_identity_and_says_so(case):
     flow, depth, options = TELLS_NOTHING[case]
-    got = camera_motion(flow, depth, CAMERA, **options)
+    got = g.camera_motion(flow, depth, CAMERA, **options)
     assert not got.valid
     assert torch.equal(got.prev_from_curr, torch.eye(4))
     assert 0 <= got.inlier_share <= 1
@@ -261,18 +254,18 @@ def test_what_tells_no_motion_gives_the_identity_and_says_so(case):
     assert off_diagonal[~torch.eye(6).bool()].isfinite().all()
     prior = rigid((0.1, 0.0, 0.0), (0.0, 0.0, 0.4)).float()
     assert torch.equal(
-        camera_motion(flow, depth, CAMERA, prior=prior, **options).prev_from_curr, prior
+        g.camera_motion(flow, depth, CAMERA, prior=prior, **options).prev_from_curr, prior
     )
 
 
 def test_a_prior_decides_for_the_world_against_a_body_that_fills_more():
     depth, motion = blocks(8), motions(8)
-    flow = ego_flow(depth, CAMERA, motion).flow
+    flow = g.ego_flow(depth, CAMERA, motion).flow
     body = motion @ rigid((0.02, 0.0, 0.01), (0.15, 0.1, 0.0)).float()
-    flow[..., 36:] = ego_flow(depth, CAMERA, body).flow[..., 36:]  # 57 % of the picture
+    flow[..., 36:] = g.ego_flow(depth, CAMERA, body).flow[..., 36:]  # 57 % of the picture
     flow += 0.05 * torch.randn(flow.shape, generator=seeded(6))
-    follows_the_body = camera_motion(flow, depth, CAMERA)
-    guided = camera_motion(
+    follows_the_body = g.camera_motion(flow, depth, CAMERA)
+    guided = g.camera_motion(
         flow, depth, CAMERA, prior=motion @ rigid((0, 0.002, 0), (0, 0, 0.01)).float()
     )
     assert errors(follows_the_body.prev_from_curr, motion, depth, CAMERA)[2].median() > 0.5
@@ -282,10 +275,10 @@ def test_a_prior_decides_for_the_world_against_a_body_that_fills_more():
 @pytest.mark.slow
 def test_it_compiles_to_one_graph_and_has_no_gradient(monkeypatch):
     for steps in ("_HYPOTHESIS_STEPS", "_REFINING_STEPS", "_STEPS"):
-        monkeypatch.setattr(egomotion, steps, 1)  # steps are unrolled: each adds seconds
+        monkeypatch.setattr(g.egomotion, steps, 1)  # steps are unrolled: each adds seconds
     depth, motion = blocks(2), motions(2)
-    flow = ego_flow(depth, CAMERA, motion).flow.requires_grad_()
-    eager = camera_motion(flow, depth, CAMERA)
+    flow = g.ego_flow(depth, CAMERA, motion).flow.requires_grad_()
+    eager = g.camera_motion(flow, depth, CAMERA)
     assert not eager.prev_from_curr.requires_grad
-    compiled = torch.compile(camera_motion, fullgraph=True, backend="eager")(flow, depth, CAMERA)
+    compiled = torch.compile(g.camera_motion, fullgraph=True, backend="eager")(flow, depth, CAMERA)
     torch.testing.assert_close(compiled.prev_from_curr, eager.prev_from_curr)

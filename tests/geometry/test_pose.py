@@ -8,14 +8,7 @@ from itertools import product
 import pytest
 import torch
 
-from flowrep.geometry import (
-    adapt_pose,
-    instance_motion,
-    instance_rows,
-    invert_rigid,
-    relative_motion,
-    transform_points,
-)
+from flowrep import geometry as g
 from tests.geometry.scenes import MOTION, OTHER_MOTION, rigid
 
 QUARTER_TURN = torch.pi / 2
@@ -24,7 +17,7 @@ QUARTER_TURN = torch.pi / 2
 def test_transform_points_by_hand():
     # About z by a quarter turn, x goes to y: (1, 0, 0) -> (0, 1, 0), then + (10, 20, 30).
     a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
-    points_a = transform_points(a_from_b, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    points_a = g.transform_points(a_from_b, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
     # The inverse rotation would give (10, 19, 30).
     torch.testing.assert_close(points_a[0].tolist(), [10.0, 21.0, 30.0])
 
@@ -35,7 +28,7 @@ def test_float_types_may_differ(transform, points):
     # Seen along z at 3 m by a camera 10.25 m along x that looks along world x.
     world_from_cam = torch.tensor([[0, 0, 1, 10.25], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     points_cam = torch.tensor([[0.5, 2.0, 3.0]], dtype=points)
-    points_world = transform_points(world_from_cam.to(transform), points_cam)
+    points_world = g.transform_points(world_from_cam.to(transform), points_cam)
     assert points_world.dtype == torch.promote_types(transform, points)
     assert points_world.tolist() == [[13.25, -0.5, -2.0]]
 
@@ -43,14 +36,14 @@ def test_float_types_may_differ(transform, points):
 def test_invert_rigid_by_hand():
     a_from_b = rigid((0.0, 0.0, QUARTER_TURN), (10.0, 20.0, 30.0))
     # b's x axis is a's y axis: a's origin lies at -(20, -10, 30) in b. -t alone: (-10, -20, -30).
-    torch.testing.assert_close(invert_rigid(a_from_b)[:3, 3].tolist(), [-20.0, 10.0, -30.0])
+    torch.testing.assert_close(g.invert_rigid(a_from_b)[:3, 3].tolist(), [-20.0, 10.0, -30.0])
 
 
 def test_relative_motion_by_hand():
     # Both cameras look along world y (their z); the current one stands 2 m further on.
     world_from_prev = rigid((-QUARTER_TURN, 0.0, 0.0), (5.0, 1.0, 0.0))
     world_from_curr = rigid((-QUARTER_TURN, 0.0, 0.0), (5.0, 3.0, 0.0))
-    prev_from_curr = relative_motion(world_from_prev, world_from_curr)
+    prev_from_curr = g.relative_motion(world_from_prev, world_from_curr)
     # What the current camera sees 0 m ahead was 2 m ahead. curr_from_prev would have -2.
     torch.testing.assert_close(prev_from_curr[:3, 3].tolist(), [0.0, 0.0, 2.0])
     torch.testing.assert_close(prev_from_curr[:3, :3], torch.eye(3))
@@ -58,7 +51,7 @@ def test_relative_motion_by_hand():
 
 def test_relative_motion_is_the_product_of_poses():
     expected = torch.linalg.inv(MOTION) @ OTHER_MOTION
-    got = relative_motion(MOTION, OTHER_MOTION, dtype=torch.float64)
+    got = g.relative_motion(MOTION, OTHER_MOTION, dtype=torch.float64)
     torch.testing.assert_close(got, expected, rtol=0, atol=1e-14)
 
 
@@ -69,13 +62,13 @@ def test_any_batch_equals_a_loop(batch):
     poses = MOTION.expand(*batch, 4, 4).clone()
     poses[..., :3, 3] += noise[..., :3, 3]
     points = torch.rand((*batch, 2, 5, 3), generator=generator, dtype=torch.float64)
-    relative = relative_motion(poses, OTHER_MOTION)
+    relative = g.relative_motion(poses, OTHER_MOTION)
     assert relative.shape == (*batch, 4, 4)
     for at in product(*map(range, batch)):
-        torch.testing.assert_close(relative[at], relative_motion(poses[at], OTHER_MOTION))
-        torch.testing.assert_close(invert_rigid(poses)[at], invert_rigid(poses[at]))
-        moved = transform_points(poses, points)[at]
-        torch.testing.assert_close(moved, transform_points(poses[at], points[at]))
+        torch.testing.assert_close(relative[at], g.relative_motion(poses[at], OTHER_MOTION))
+        torch.testing.assert_close(g.invert_rigid(poses)[at], g.invert_rigid(poses[at]))
+        moved = g.transform_points(poses, points)[at]
+        torch.testing.assert_close(moved, g.transform_points(poses[at], points[at]))
 
 
 PREV, CURR = rigid((0.1, 0.2, 0.3), (400.0, -300.0, 1.2)), rigid((0.1, 0.25, 0.3), (400.8, -300, 1))
@@ -90,38 +83,38 @@ def test_a_body_s_motion_by_hand():
     still, before = torch.eye(4), torch.eye(4)
     before[2, 3] = 5.0
     now = torch.tensor([[0.0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 5], [0, 0, 0, 1]])
-    motions = instance_motion(still, still, before[None], now[None])
+    motions = g.instance_motion(still, still, before[None], now[None])
     assert torch.equal(motions[0], torch.eye(4))
-    assert transform_points(motions[1], torch.tensor([3.0, 0.0, 5.0])).tolist() == [0.0, 0.0, 6.0]
+    assert g.transform_points(motions[1], torch.tensor([3.0, 0.0, 5.0])).tolist() == [0.0, 0.0, 6.0]
 
 
 def test_a_point_on_a_body_goes_where_it_was():
-    motions = instance_motion(PREV, CURR, BODY_BEFORE, BODY_NOW, dtype=torch.float64)
+    motions = g.instance_motion(PREV, CURR, BODY_BEFORE, BODY_NOW, dtype=torch.float64)
     point_body = torch.tensor([0.3, -0.2, 0.7], dtype=torch.float64)
-    curr_from_body = invert_rigid(CURR) @ BODY_NOW[1]
-    prev_from_body = invert_rigid(PREV) @ BODY_BEFORE[1]
-    was = transform_points(motions[2], transform_points(curr_from_body, point_body))
-    torch.testing.assert_close(was, transform_points(prev_from_body, point_body))
+    curr_from_body = g.invert_rigid(CURR) @ BODY_NOW[1]
+    prev_from_body = g.invert_rigid(PREV) @ BODY_BEFORE[1]
+    was = g.transform_points(motions[2], g.transform_points(curr_from_body, point_body))
+    torch.testing.assert_close(was, g.transform_points(prev_from_body, point_body))
 
 
 def test_a_body_that_stands_still_has_the_camera_s_motion_to_the_last_bit():
     far = BODY_NOW.clone()
     far[:, :3, 3] += 1000.0 / 3.0
-    motions = instance_motion(PREV, CURR, far, far)
+    motions = g.instance_motion(PREV, CURR, far, far)
     assert motions.dtype == torch.float32
-    assert torch.equal(motions, relative_motion(PREV, CURR).expand(3, 4, 4))
-    no_bodies = instance_motion(PREV, CURR, far[:0], far[:0])
-    assert torch.equal(no_bodies, relative_motion(PREV, CURR)[None])
+    assert torch.equal(motions, g.relative_motion(PREV, CURR).expand(3, 4, 4))
+    no_bodies = g.instance_motion(PREV, CURR, far[:0], far[:0])
+    assert torch.equal(no_bodies, g.relative_motion(PREV, CURR)[None])
     # In float64 no rounding hides that the bodies' rows went another way.
-    exact = instance_motion(PREV, CURR, far, far, dtype=torch.float64)
-    camera = relative_motion(PREV, CURR, dtype=torch.float64)
+    exact = g.instance_motion(PREV, CURR, far, far, dtype=torch.float64)
+    camera = g.relative_motion(PREV, CURR, dtype=torch.float64)
     assert torch.equal(exact, camera.expand(3, 4, 4))
 
 
 def test_equal_poses_are_exactly_no_motion():
     # R R^T of this rotation is not the identity in floats.
-    assert torch.equal(relative_motion(PREV, PREV), torch.eye(4))
-    both = relative_motion(torch.stack([PREV, PREV]), torch.stack([PREV, CURR]))
+    assert torch.equal(g.relative_motion(PREV, PREV), torch.eye(4))
+    both = g.relative_motion(torch.stack([PREV, PREV]), torch.stack([PREV, CURR]))
     assert torch.equal(both[0], torch.eye(4))
     assert not torch.equal(both[1], torch.eye(4))
 
@@ -143,24 +136,24 @@ AXES = {
 def test_axes_of_one_and_the_same_camera(axes):
     pose = LOOKING_ALONG_X.clone()
     pose[:3, :3] = torch.tensor(AXES[axes]).double()
-    assert torch.equal(adapt_pose(pose, axes=axes), LOOKING_ALONG_X)
+    assert torch.equal(g.adapt_pose(pose, axes=axes), LOOKING_ALONG_X)
     # and of world-to-camera matrices, which are given in those axes too
-    extrinsics = invert_rigid(pose)
+    extrinsics = g.invert_rigid(pose)
     assert torch.equal(
-        adapt_pose(extrinsics, direction="world_to_camera", axes=axes), LOOKING_ALONG_X
+        g.adapt_pose(extrinsics, direction="world_to_camera", axes=axes), LOOKING_ALONG_X
     )
 
 
 def test_a_pose_without_its_last_row():
     whole = torch.tensor([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1.0]])
-    assert adapt_pose(whole[:3], layout="matrix_3x4").equal(whole.double())
-    inverted = adapt_pose(whole[:3], layout="matrix_3x4", direction="world_to_camera")
+    assert g.adapt_pose(whole[:3], layout="matrix_3x4").equal(whole.double())
+    inverted = g.adapt_pose(whole[:3], layout="matrix_3x4", direction="world_to_camera")
     torch.testing.assert_close(inverted @ whole.double(), torch.eye(4).double())
 
 
 def test_angles_turn_left_and_look_up():
     pose = torch.tensor([5.0, 6.0, 7.0, math.pi / 2, math.pi / 6], dtype=torch.float64)
-    camera = adapt_pose(pose, layout="xyz_yaw_pitch", axes="x_forward_z_up")
+    camera = g.adapt_pose(pose, layout="xyz_yaw_pitch", axes="x_forward_z_up")
     ahead = camera @ torch.tensor([0.0, 0.0, 2.0, 1.0], dtype=torch.float64)
     # a quarter turn to the left of x is y; 30 degrees up: 2 sin 30 = 1, not -1
     expected = torch.tensor([5.0, 6 + math.sqrt(3), 8.0, 1.0], dtype=torch.float64)
@@ -168,13 +161,13 @@ def test_angles_turn_left_and_look_up():
     right = camera @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     torch.testing.assert_close(right[:3], torch.tensor([6.0, 6.0, 7.0], dtype=torch.float64))
     aslant = torch.tensor([5.0, 6.0, 7.0, math.pi / 3, math.pi / 6], dtype=torch.float64)
-    down = adapt_pose(aslant, layout="xyz_yaw_pitch", axes="x_forward_z_up")[:3, 1]
+    down = g.adapt_pose(aslant, layout="xyz_yaw_pitch", axes="x_forward_z_up")[:3, 1]
     # looking up by 30 degrees, the picture's down leans ahead: it is the up of
     # (-cos 60 sin 30, -sin 60 sin 30, cos 30), turned over
     half = math.sqrt(3) / 2
     expected = torch.tensor([0.25, half / 2, -half], dtype=torch.float64)
     torch.testing.assert_close(down, expected)
-    level = adapt_pose(pose[:4], layout="xyz_yaw", axes="x_forward_z_up")
+    level = g.adapt_pose(pose[:4], layout="xyz_yaw", axes="x_forward_z_up")
     torch.testing.assert_close(level[:3, 2], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
 
 
@@ -185,7 +178,7 @@ def test_a_quaternion_of_a_quarter_turn_about_each_axis(axis, moves, to, layout)
     real, first = (6, 3) if layout == "xyz_xyzw" else (3, 4)
     pose = torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0])
     pose[real] = pose[first + axis] = math.sqrt(0.5)
-    matrix = adapt_pose(pose, layout=layout)
+    matrix = g.adapt_pose(pose, layout=layout)
     unit = torch.eye(4).double()
     torch.testing.assert_close(matrix @ unit[moves], unit[to], atol=1e-6, rtol=0)
     assert matrix[:, 3].tolist() == [1.0, 2.0, 3.0, 1.0]
@@ -208,24 +201,24 @@ def test_an_ill_formed_pose_is_refused_by_name_and_place(pose, expected):
     poses = torch.eye(4).double().repeat(2, 3, 1, 1)
     poses[1, 2] = pose
     with pytest.raises(ValueError, match=rf"^pose\[1, 2\] {expected}"):
-        adapt_pose(poses)
-    assert adapt_pose(poses, check=False).shape == (2, 3, 4, 4)
+        g.adapt_pose(poses)
+    assert g.adapt_pose(poses, check=False).shape == (2, 3, 4, 4)
 
 
 def test_a_quaternion_that_is_not_of_unit_length_is_refused():
     pose = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0])
     with pytest.raises(ValueError, match=r"a quaternion must have length 1, got \[2.0\]"):
-        adapt_pose(pose, layout="xyz_xyzw")
-    normalised = adapt_pose(pose, layout="xyz_xyzw", check=False)
+        g.adapt_pose(pose, layout="xyz_xyzw")
+    normalised = g.adapt_pose(pose, layout="xyz_xyzw", check=False)
     assert torch.equal(normalised, torch.eye(4).double())
 
 
 def test_ids_of_any_simulator_become_rows():
     ids = torch.tensor([[[17, 0, 3], [-1, 4, 16_777_215]]])
-    rows = instance_rows(ids, torch.tensor([17, 3, 16_777_215]))
+    rows = g.instance_rows(ids, torch.tensor([17, 3, 16_777_215]))
     # A static world of id 0, a background of -1 and the unknown body 4 are row 0.
     assert rows.tolist() == [[[1, 0, 2], [0, 0, 3]]]
     assert rows.dtype == torch.uint8
-    assert instance_rows(ids, torch.arange(400)).dtype == torch.int32
-    assert instance_rows(ids, torch.arange(0)).tolist() == [[[0, 0, 0], [0, 0, 0]]]
-    assert instance_rows(ids.short()[..., :1].mT, torch.tensor([17])).tolist() == [[[1, 0]]]
+    assert g.instance_rows(ids, torch.arange(400)).dtype == torch.int32
+    assert g.instance_rows(ids, torch.arange(0)).tolist() == [[[0, 0, 0], [0, 0, 0]]]
+    assert g.instance_rows(ids.short()[..., :1].mT, torch.tensor([17])).tolist() == [[[1, 0]]]

@@ -11,24 +11,14 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose
 
-from flowrep.transforms import (
-    AdaptDepth,
-    AdaptFlow,
-    AdaptPose,
-    BodyRows,
-    CameraMotion,
-    FlowFactorize,
-    InstanceIds,
-    InstanceMotion,
-    RawFlow,
-)
+from flowrep import transforms as T
 from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
 
 POSE = ("sensor", "world_from_cam")
 
 
 def test_millimetres_with_channels_last_become_metres():
-    adapt = AdaptDepth("z", scale_m=1e-3, nothing=0, channels_last=True)
+    adapt = T.AdaptDepth("z", scale_m=1e-3, nothing=0, channels_last=True)
     picture = torch.tensor([[0, 1500, 2000], [2500, 3000, 3500]], dtype=torch.int16)
     z = adapt(TensorDict(depth=picture[None, ..., None], batch_size=[1]))["sensor", "depth"]
     assert z.shape == (1, 1, 2, 3)
@@ -43,18 +33,18 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
     K = torch.tensor([[3.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
     K[1, 0, 0] = 4.0
     td = TensorDict({"ray": torch.full((2, 1, 1, 1), 5.0), "K": K}, [2])
-    z = AdaptDepth("ray_length", intrinsics="K", in_keys="ray")(td)["sensor", "depth"]
+    z = T.AdaptDepth("ray_length", intrinsics="K", in_keys="ray")(td)["sensor", "depth"]
     torch.testing.assert_close(z.flatten(), torch.tensor([5.0 / math.sqrt(2), 4.0]))
 
 
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda: AdaptDepth("ray_length"), "needs K"),
-        (lambda: AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
-        (lambda: AdaptPose(axes="gl"), r"'x_forward_z_up'\], got 'gl'"),
-        (lambda: AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
-        (lambda: InstanceIds([3, 1, 3]), r"must name each body once, got \[3, 1, 3\]"),
+        (lambda: T.AdaptDepth("ray_length"), "needs K"),
+        (lambda: T.AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
+        (lambda: T.AdaptPose(axes="gl"), r"'x_forward_z_up'\], got 'gl'"),
+        (lambda: T.AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
+        (lambda: T.InstanceIds([3, 1, 3]), r"must name each body once, got \[3, 1, 3\]"),
     ],
 )
 def test_options_are_checked(make, expected):
@@ -65,18 +55,18 @@ def test_options_are_checked(make, expected):
 def test_an_ill_formed_pose_is_refused_at_a_reset_and_on_a_batch_but_not_in_a_step():
     td = TensorDict({"pose": torch.eye(4).repeat(2, 1, 1)}, [2])
     td["pose"][1, 0, 0] = -1.0
-    adapt = AdaptPose()
+    adapt = T.AdaptPose()
     with pytest.raises(ValueError, match=r"pose\[1\] is left-handed"):
         adapt(td.clone())
     with pytest.raises(ValueError, match=r"pose\[1\] is left-handed"):
         adapt._reset(td, td.clone())
     assert POSE in adapt._step(td, td.clone()).keys(True)
-    assert POSE in AdaptPose(check=False)(td.clone()).keys(True)
+    assert POSE in T.AdaptPose(check=False)(td.clone()).keys(True)
 
 
 @pytest.mark.parametrize("layout", ["matrix", "xyz_xyzw", "xyz_wxyz"])
 def test_rows_that_are_not_reset_are_not_checked(layout):
-    adapt = AdaptPose(layout=layout)
+    adapt = T.AdaptPose(layout=layout)
     good = torch.eye(4) if layout == "matrix" else torch.tensor([5.0, 6, 7, 0.5, 0.5, 0.5, 0.5])
     td = TensorDict({"pose": torch.stack([good, torch.zeros_like(good), good])}, [3])
     resets = TensorDict({"_reset": torch.tensor([[True], [False], [True]])}, [3])
@@ -89,23 +79,23 @@ def test_poses_of_several_bodies_at_once():
     poses = torch.zeros(2, 3, 7)
     poses[..., 3] = 1.0
     poses[1, 2, :3] = torch.tensor([1.0, 2.0, 3.0])
-    adapt = AdaptPose(layout="xyz_wxyz", in_keys="bodies", out_keys="matrices")
+    adapt = T.AdaptPose(layout="xyz_wxyz", in_keys="bodies", out_keys="matrices")
     matrices = adapt(TensorDict({"bodies": poses}, [2]))["matrices"]
     assert matrices.shape == (2, 3, 4, 4)
     assert matrices[1, 2, :3, 3].tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(ValueError, match=r"float \[\*B, 7\].*\[2, 3, 4, 4\]"):
-        AdaptPose(layout="xyz_wxyz", in_keys="matrices")(TensorDict({"matrices": matrices}, [2]))
+        T.AdaptPose(layout="xyz_wxyz", in_keys="matrices")(TensorDict({"matrices": matrices}, [2]))
 
 
 def test_a_simulator_that_knows_poses_alone_gets_the_flow_of_one_that_knows_motions():
     keys = [("sensor", "depth"), ("sensor", "instance"), "motions"]
     own = Compose(
-        CameraMotion(out_keys="motion"),
-        InstanceMotion(out_keys="motions"),
-        RawFlow(("sensor", "K"), in_keys=keys),
-        FlowFactorize(("sensor", "K"), in_keys=["raw", ("sensor", "depth"), "motion"]),
+        T.CameraMotion(out_keys="motion"),
+        T.InstanceMotion(out_keys="motions"),
+        T.RawFlow(("sensor", "K"), in_keys=keys),
+        T.FlowFactorize(("sensor", "K"), in_keys=["raw", ("sensor", "depth"), "motion"]),
     )
-    known = Compose(RawFlow(INTRINSICS), FlowFactorize(INTRINSICS))
+    known = Compose(T.RawFlow(INTRINSICS), T.FlowFactorize(INTRINSICS))
     got = TransformedEnv(FakeSensorEnv((3,)), own).rollout(6, break_when_any_done=False)
     want = TransformedEnv(FakeSensorEnv((3,)), known).rollout(6, break_when_any_done=False)
     for key in ("raw", "ego", "obj"):
@@ -118,7 +108,7 @@ def test_a_simulator_that_knows_poses_alone_gets_the_flow_of_one_that_knows_moti
 def test_flow_with_channels_last_is_turned():
     vectors = torch.zeros(1, 2, 3, 2)
     vectors[0, 1, 2] = torch.tensor([-3.0, -1.0])  # backward: 3 px to the right and 1 px down
-    adapt = AdaptFlow(direction="backward", grid="current", channels_last=True)
+    adapt = T.AdaptFlow(direction="backward", grid="current", channels_last=True)
     raw = adapt(TensorDict(flow=vectors, batch_size=[1]))["raw"]
     assert raw.shape == (1, 2, 2, 3)
     assert raw[0, :, 1, 2].tolist() == [3.0, 1.0]
@@ -135,9 +125,9 @@ def test_a_number_of_ids_that_is_not_that_of_the_bodies_is_refused(ids):
         ),
         segmentation=Unbounded((1, 5, 7), dtype=torch.int32),
     )
-    rows = InstanceIds(ids).transform_observation_spec(spec)["sensor", "instance"]
+    rows = T.InstanceIds(ids).transform_observation_spec(spec)["sensor", "instance"]
     assert rows == Categorical(1 + len(ids), shape=(1, 5, 7), dtype=torch.uint8)
-    stack = Compose(InstanceIds(ids), RawFlow(INTRINSICS))
+    stack = Compose(T.InstanceIds(ids), T.RawFlow(INTRINSICS))
     with pytest.raises(ValueError, match="InstanceIds"):
         stack.transform_observation_spec(spec)
 
@@ -145,7 +135,7 @@ def test_a_number_of_ids_that_is_not_that_of_the_bodies_is_refused(ids):
 def test_a_camera_of_a_larger_picture_is_noticed():
     large = [[600.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
     with pytest.warns(UserWarning, match="principal point"):
-        TransformedEnv(FakeSensorEnv(), RawFlow(large)).observation_spec  # noqa: B018
+        TransformedEnv(FakeSensorEnv(), T.RawFlow(large)).observation_spec  # noqa: B018
 
 
 def body_at(x):
@@ -155,7 +145,7 @@ def body_at(x):
 
 
 def test_a_body_keeps_its_row_and_a_row_is_empty_for_a_step_before_another_takes_it():
-    rows = BodyRows(2)
+    rows = T.BodyRows(2)
     steps = [{"a": 1, "b": 2}, {"b": 3}, {"c": 7, "b": 4}, {"d": 9, "c": 8}]
     seen = [rows({name: body_at(x) for name, x in step.items()})[:, 0, 3] for step in steps[:3]]
     assert [one.nan_to_num(-1).tolist() for one in seen] == [[1, 2], [-1, 3], [7, 4]]
@@ -167,7 +157,7 @@ def test_a_body_keeps_its_row_and_a_row_is_empty_for_a_step_before_another_takes
 
 
 def test_labels_follow_their_bodies_from_frame_to_frame():
-    rows = BodyRows(2)
+    rows = T.BodyRows(2)
     rows({"a": body_at(1), "b": body_at(2)})
     picture = torch.tensor([[[0, 200, 7]]], dtype=torch.uint8)
     assert rows.instance(picture, {200: "b", 7: "a"}).tolist() == [[[0, 2, 1]]]

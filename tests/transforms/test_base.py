@@ -14,17 +14,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose
 
-from flowrep.transforms import (
-    CameraMotion,
-    Depth,
-    EstimatedFlow,
-    FlowFactorize,
-    FrameStack,
-    RawFlow,
-    Rgb,
-    Segmentation,
-    base,
-)
+from flowrep import transforms as T
 from flowrep.transforms.stack import DropKeys
 from tests.transforms.fake_env import (
     INTRINSICS,
@@ -37,14 +27,14 @@ from tests.transforms.oracles import brightening, same_bits
 
 COMPILE = torch.compile
 TRANSFORMS = {
-    "seg": lambda: Segmentation(NUM_CLASSES),
-    "onehot": lambda: Segmentation(NUM_CLASSES, encoding="onehot"),
-    "depth": lambda: Depth(range_m=14.0),
-    "rgb": Rgb,
-    "raw": lambda: RawFlow(INTRINSICS, scale=0.5, outputs=["raw", "valid"]),
-    "ego": lambda: FlowFactorize(INTRINSICS, outputs=["ego"]),
-    "ego, obj": lambda: FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
-    "stack": lambda: FrameStack(k=3, in_keys=[("sensor", "rgb")], out_keys=["rgb3"]),
+    "seg": lambda: T.Segmentation(NUM_CLASSES),
+    "onehot": lambda: T.Segmentation(NUM_CLASSES, encoding="onehot"),
+    "depth": lambda: T.Depth(range_m=14.0),
+    "rgb": T.Rgb,
+    "raw": lambda: T.RawFlow(INTRINSICS, scale=0.5, outputs=["raw", "valid"]),
+    "ego": lambda: T.FlowFactorize(INTRINSICS, outputs=["ego"]),
+    "ego, obj": lambda: T.FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
+    "stack": lambda: T.FrameStack(k=3, in_keys=[("sensor", "rgb")], out_keys=["rgb3"]),
 }
 each_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=list(TRANSFORMS))
 
@@ -87,14 +77,14 @@ def test_compiled_flow_goes_through_torch_compile_and_stays_picklable(monkeypatc
 
     monkeypatch.setattr(torch, "compile", spy)
     monkeypatch.setattr(shutil, "which", lambda name: name)
-    base._compiled.cache_clear()
+    T.base._compiled.cache_clear()
     td = moments(2)
-    transform = RawFlow(INTRINSICS, compiled=True)
+    transform = T.RawFlow(INTRINSICS, compiled=True)
     fused = transform(td.clone())["raw"]
-    assert compiled == [(RawFlow.compute, {"fullgraph": True})]
-    assert torch.equal(fused, RawFlow(INTRINSICS)(td.clone())["raw"])
+    assert compiled == [(T.RawFlow.compute, {"fullgraph": True})]
+    assert torch.equal(fused, T.RawFlow(INTRINSICS)(td.clone())["raw"])
     assert torch.equal(fused, pickle.loads(pickle.dumps(transform))(td.clone())["raw"])
-    base._compiled.cache_clear()
+    T.base._compiled.cache_clear()
 
 
 def test_without_a_compiler_compiled_flow_is_refused(monkeypatch):
@@ -102,7 +92,7 @@ def test_without_a_compiler_compiled_flow_is_refused(monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setenv("CXX", "clang++-19")
     with pytest.raises(ValueError, match=r"needs a C\+\+ compiler, and clang\+\+-19 is not"):
-        RawFlow(INTRINSICS, compiled=True)
+        T.RawFlow(INTRINSICS, compiled=True)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -126,7 +116,7 @@ def test_moves_to_another_device_and_type(make):
 
 
 def test_missing_key_is_named_with_what_the_env_offers_before_the_first_step():
-    env = TransformedEnv(FakeSensorEnv(), Depth(in_keys=["range"]))
+    env = TransformedEnv(FakeSensorEnv(), T.Depth(in_keys=["range"]))
     # KeyError would quote the sentence.
     with pytest.raises(KeyError, match=r"^representation 'depth' needs key 'range'.*'depth'\)"):
         env.observation_spec  # noqa: B018
@@ -135,11 +125,11 @@ def test_missing_key_is_named_with_what_the_env_offers_before_the_first_step():
 def test_missing_key_is_named_on_a_batch_with_all_that_need_it():
     td = moments(2).exclude(("sensor", "depth"))
     with pytest.raises(KeyError, match=r"'ego' and 'obj' needs key \('sensor', 'depth'\)"):
-        FlowFactorize(INTRINSICS, outputs=["ego", "obj"])(td)
+        T.FlowFactorize(INTRINSICS, outputs=["ego", "obj"])(td)
 
 
 def test_missing_key_is_tolerated_when_torchrl_asks_for_it():
-    transform = Depth()
+    transform = T.Depth()
     transform.set_missing_tolerance(True)
     assert "depth" not in transform(TensorDict({"reward": torch.zeros(3, 1)}, [3]))
 
@@ -147,15 +137,15 @@ def test_missing_key_is_tolerated_when_torchrl_asks_for_it():
 def test_next_without_any_input_is_left_alone_and_with_some_an_error():
     td = moments(2)
     td["next"] = TensorDict({"reward": torch.ones(2, 1)}, [2])
-    assert list(Depth()(td.clone())["next"].keys()) == ["reward"]
+    assert list(T.Depth()(td.clone())["next"].keys()) == ["reward"]
     td["next", "sensor"] = {"depth": td["sensor", "depth"]}
     with pytest.raises(KeyError, match="prev_from_curr"):
-        FlowFactorize(INTRINSICS, outputs=["ego"])(td)
+        T.FlowFactorize(INTRINSICS, outputs=["ego"])(td)
 
 
 def test_keywords_instead_of_a_tensordict():
     depth = torch.full((1, 2, 3), 50.0)
-    assert torch.equal(Depth()(sensor_depth=depth), depth / 100)
+    assert torch.equal(T.Depth()(sensor_depth=depth), depth / 100)
 
 
 @pytest.mark.parametrize(
@@ -172,12 +162,12 @@ def test_wrong_layout_is_refused_on_a_batch(key, value, expected):
     td = moments(2)
     td["sensor", key] = value
     with pytest.raises(ValueError, match=expected):
-        RawFlow(INTRINSICS)(td)
+        T.RawFlow(INTRINSICS)(td)
 
 
 @pytest.mark.parametrize("batch", [[], [4], [2, 3], [1]])
 def test_a_map_without_channels_is_refused(batch):
-    stack = FrameStack(k=2, in_keys=["grey"], out_keys=["grey2"])
+    stack = T.FrameStack(k=2, in_keys=["grey"], out_keys=["grey2"])
     expected = re.escape(f"key 'grey' should be [*B, C0, H0, W0] with *B = {batch}; ") + ".*"
     spec = Composite(grey=Unbounded((*batch, 5, 7)), shape=batch)
     with pytest.raises(ValueError, match=expected + re.escape(str([*batch, 5, 7]))):
@@ -186,14 +176,14 @@ def test_a_map_without_channels_is_refused(batch):
 
 def test_a_map_may_have_a_batch_of_its_own():
     cameras = TensorDict({"depth": torch.ones(2, 3, 1, 5, 7)}, [2])
-    assert Depth(in_keys="depth", out_keys="near")(cameras)["near"].shape == (2, 3, 1, 5, 7)
+    assert T.Depth(in_keys="depth", out_keys="near")(cameras)["near"].shape == (2, 3, 1, 5, 7)
 
 
 def test_wrong_number_of_keys_is_refused():
     with pytest.raises(ValueError, match=r"reads 3 keys .* in_keys has 1"):
-        RawFlow(INTRINSICS, in_keys=["depth"])
+        T.RawFlow(INTRINSICS, in_keys=["depth"])
     with pytest.raises(ValueError, match=r"writes 2 keys, out_keys has \['ego'\]"):
-        FlowFactorize(INTRINSICS, out_keys=["ego"])
+        T.FlowFactorize(INTRINSICS, out_keys=["ego"])
 
 
 def test_all_that_is_computed_from_a_first_frame_is_what_a_reset_would_give():
@@ -201,10 +191,10 @@ def test_all_that_is_computed_from_a_first_frame_is_what_a_reset_would_give():
 
     def rollout(env: FakeSensorEnv) -> TensorDict:
         stack = Compose(
-            CameraMotion(out_keys="motion"),
-            FlowFactorize(INTRINSICS, outputs=["ego"], in_keys=[depth, "motion"]),
-            FrameStack(k=2, in_keys=[rgb], out_keys=["rgb2"]),
-            EstimatedFlow(brightening),
+            T.CameraMotion(out_keys="motion"),
+            T.FlowFactorize(INTRINSICS, outputs=["ego"], in_keys=[depth, "motion"]),
+            T.FrameStack(k=2, in_keys=[rgb], out_keys=["rgb2"]),
+            T.EstimatedFlow(brightening),
             DropKeys("motion"),
         )
         return TransformedEnv(env, stack).rollout(9, break_when_any_done=False)

@@ -6,20 +6,7 @@ import pytest
 import torch
 from torch._dynamo.testing import CompileCounter
 
-from flowrep.transforms import (
-    AdaptDepth,
-    AdaptFlow,
-    AdaptPose,
-    CameraMotion,
-    Depth,
-    FlowFactorize,
-    FrameStack,
-    InstanceIds,
-    InstanceMotion,
-    RawFlow,
-    Segmentation,
-    SensorNoise,
-)
+from flowrep import transforms as T
 from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES
 from tests.transforms.test_base import inputs, moments
 
@@ -28,34 +15,34 @@ POSES = "world_from_cam", "world_from_body"
 
 
 def camera_step(before: torch.Tensor, now: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return CameraMotion().advance([before], [now])
+    return T.CameraMotion().advance([before], [now])
 
 
 def bodies_step(*poses: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return InstanceMotion().advance(poses[:2], poses[2:])
+    return T.InstanceMotion().advance(poses[:2], poses[2:])
 
 
 def next_stack(stack: torch.Tensor, frame: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return FrameStack(k=3, in_keys=["x"], out_keys=["x3"]).advance([stack], [frame])
+    return T.FrameStack(k=3, in_keys=["x"], out_keys=["x3"]).advance([stack], [frame])
 
 
 NOISE = {"depth_sigma_per_m": 0.1, "depth_dropout": 0.2, "drift_m": 0.1, "drift_rad": 0.2}
 TRANSFORMS = {
-    "onehot": lambda: Segmentation(NUM_CLASSES, encoding="onehot"),
-    "depth": Depth,
-    "K under a key": lambda: RawFlow(("sensor", "K"), scale=0.5, outputs=["raw", "valid"]),
-    "ego, obj": lambda: FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
-    "ray length": lambda: AdaptDepth(
+    "onehot": lambda: T.Segmentation(NUM_CLASSES, encoding="onehot"),
+    "depth": T.Depth,
+    "K under a key": lambda: T.RawFlow(("sensor", "K"), scale=0.5, outputs=["raw", "valid"]),
+    "ego, obj": lambda: T.FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
+    "ray length": lambda: T.AdaptDepth(
         "ray_length", intrinsics=INTRINSICS, in_keys=("sensor", "depth"), out_keys="z"
     ),
-    "pose": lambda: AdaptPose(
+    "pose": lambda: T.AdaptPose(
         direction="world_to_camera", axes="ned", in_keys=POSE, out_keys="world_from_cam"
     ),
-    "flow": lambda: AdaptFlow(
+    "flow": lambda: T.AdaptFlow(
         direction="backward", grid="current", channels="row_column", in_keys="raw", out_keys="own"
     ),
-    "ids": lambda: InstanceIds([3, 1], in_keys=("sensor", "semantic")),
-    "noise by frame": lambda: SensorNoise(**NOISE, frame_key="frame"),
+    "ids": lambda: T.InstanceIds([3, 1], in_keys=("sensor", "semantic")),
+    "noise by frame": lambda: T.SensorNoise(**NOISE, frame_key="frame"),
 }
 # What runs once a step beside `compute`, with its maps of two moments.
 STEPS = {
@@ -120,7 +107,7 @@ def test_nothing_waits_for_the_gpu(case):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_noise_is_drawn_on_the_gpu_without_waiting():
-    noise = SensorNoise(**NOISE)
+    noise = T.SensorNoise(**NOISE)
     td = moments(3).to("cuda")
     noise.compute(*inputs(noise, td))
     torch.cuda.set_sync_debug_mode("error")

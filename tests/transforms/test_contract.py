@@ -21,24 +21,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 from torchrl.envs.transforms import Compose, Transform
 
-from flowrep.transforms import (
-    AdaptDepth,
-    AdaptFlow,
-    AdaptPose,
-    CameraMotion,
-    Depth,
-    EstimateCameraMotion,
-    EstimatedFlow,
-    FlowFactorize,
-    FrameStack,
-    InstanceIds,
-    InstanceMotion,
-    RawFlow,
-    Rgb,
-    Segmentation,
-    SensorNoise,
-    representation_stack,
-)
+from flowrep import transforms as T
 from tests.transforms import oracles
 from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv, frame, moment
 from tests.transforms.oracles import same_bits
@@ -66,7 +49,7 @@ def stacked(name: str, k: int) -> Oracle:
 
 
 def raw_flow() -> list[Transform]:
-    return [RawFlow(INTRINSICS)]
+    return [T.RawFlow(INTRINSICS)]
 
 
 STACK: dict[NestedKey, Oracle] = {
@@ -81,22 +64,22 @@ STACK: dict[NestedKey, Oracle] = {
 
 # Whatever two of them write under one key is the same.
 CASES = {
-    "Segmentation": Case(lambda: Segmentation(NUM_CLASSES), {"seg": the_same("semantic")}),
+    "Segmentation": Case(lambda: T.Segmentation(NUM_CLASSES), {"seg": the_same("semantic")}),
     "Segmentation, onehot": Case(
-        lambda: Segmentation(NUM_CLASSES, encoding="onehot", out_keys="onehot"),
+        lambda: T.Segmentation(NUM_CLASSES, encoding="onehot", out_keys="onehot"),
         {"onehot": oracles.onehot},
     ),
     "Depth": Case(
-        lambda: Depth(range_m=14.0, out_keys="near"),
+        lambda: T.Depth(range_m=14.0, out_keys="near"),
         {"near": functools.partial(oracles.depth, range_m=14.0)},
     ),
-    "Rgb": Case(Rgb, {"rgb": the_same("rgb")}),
+    "Rgb": Case(T.Rgb, {"rgb": the_same("rgb")}),
     "RawFlow": Case(
-        lambda: RawFlow(INTRINSICS, outputs=["raw", "valid"], out_keys=["raw", "known"]),
+        lambda: T.RawFlow(INTRINSICS, outputs=["raw", "valid"], out_keys=["raw", "known"]),
         {"raw": oracles.raw, "known": oracles.valid},
     ),
     "FlowFactorize": Case(
-        lambda: FlowFactorize(
+        lambda: T.FlowFactorize(
             INTRINSICS,
             outputs=["ego", "obj", "raw", "valid"],
             out_keys=["ego", "obj", "raw2", "valid"],
@@ -105,7 +88,7 @@ CASES = {
         before=raw_flow,
     ),
     "FrameStack": Case(
-        lambda: FrameStack(
+        lambda: T.FrameStack(
             k=3,
             in_keys=[("sensor", "rgb"), ("sensor", "semantic")],
             out_keys=[("stack", "rgb"), ("stack", "ids")],
@@ -114,22 +97,22 @@ CASES = {
         carries=True,
     ),
     "EstimatedFlow": Case(
-        lambda: EstimatedFlow(oracles.brightening, out_keys="estimated"),
+        lambda: T.EstimatedFlow(oracles.brightening, out_keys="estimated"),
         {"estimated": oracles.minus_one_but_at_resets},
-        before=lambda: [FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])],
+        before=lambda: [T.FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])],
     ),
     "AdaptDepth": Case(
-        lambda: AdaptDepth(
+        lambda: T.AdaptDepth(
             "ray_length", intrinsics=INTRINSICS, in_keys=("sensor", "depth"), out_keys="z"
         ),
         {"z": oracles.ray_length_to_z},
     ),
     "AdaptPose": Case(
-        lambda: AdaptPose(axes="opengl", in_keys=POSE, out_keys=("adapted", "pose")),
+        lambda: T.AdaptPose(axes="opengl", in_keys=POSE, out_keys=("adapted", "pose")),
         {("adapted", "pose"): oracles.opengl_pose},
     ),
     "AdaptFlow": Case(
-        lambda: AdaptFlow(
+        lambda: T.AdaptFlow(
             direction="backward",
             grid="current",
             channels="row_column",
@@ -140,34 +123,34 @@ CASES = {
         before=raw_flow,
     ),
     "InstanceIds": Case(
-        lambda: InstanceIds([3, 1], in_keys=("sensor", "semantic"), out_keys="rows"),
+        lambda: T.InstanceIds([3, 1], in_keys=("sensor", "semantic"), out_keys="rows"),
         {"rows": functools.partial(oracles.rows_of_classes, bodies=[3, 1])},
     ),
     "CameraMotion": Case(
-        lambda: CameraMotion(out_keys=[("own", "motion")]),
+        lambda: T.CameraMotion(out_keys=[("own", "motion")]),
         {("own", "motion"): the_same("prev_from_curr")},
         carries=True,
     ),
     "InstanceMotion": Case(
-        lambda: InstanceMotion(out_keys=[("own", "motions")]),
+        lambda: T.InstanceMotion(out_keys=[("own", "motions")]),
         {("own", "motions"): the_same("instance_motion")},
         carries=True,
     ),
     "EstimateCameraMotion": Case(
-        lambda: EstimateCameraMotion(INTRINSICS, outputs=["motion"], out_keys=["estimate"]),
+        lambda: T.EstimateCameraMotion(INTRINSICS, outputs=["motion"], out_keys=["estimate"]),
         {"estimate": the_same("prev_from_curr")},
         before=raw_flow,
     ),
     "SensorNoise, off": Case(
-        lambda: SensorNoise(out_keys=["noisy_depth", "noisy_motion"]),
+        lambda: T.SensorNoise(out_keys=["noisy_depth", "noisy_motion"]),
         {"noisy_depth": the_same("depth"), "noisy_motion": the_same("prev_from_curr")},
     ),
     "SensorNoise without any echo": Case(
-        lambda: SensorNoise(sensors=["depth"], depth_dropout=1.0, out_keys="holes"),
+        lambda: T.SensorNoise(sensors=["depth"], depth_dropout=1.0, out_keys="holes"),
         {"holes": oracles.hole},
     ),
     "representation_stack": Case(
-        lambda: representation_stack(list(STACK), intrinsics=INTRINSICS, num_classes=NUM_CLASSES),
+        lambda: T.representation_stack(list(STACK), intrinsics=INTRINSICS, num_classes=NUM_CLASSES),
         STACK,
         carries=True,
     ),
@@ -307,7 +290,7 @@ def test_in_several_envs(make):
 
 @pytest.mark.parametrize("intrinsics", [INTRINSICS, ("sensor", "K")])
 def test_a_copied_env_has_the_specs_of_its_original(intrinsics):
-    stack = Compose(RawFlow(intrinsics), FlowFactorize(intrinsics, outputs=["valid", "obj"]))
+    stack = Compose(T.RawFlow(intrinsics), T.FlowFactorize(intrinsics, outputs=["valid", "obj"]))
     env = TransformedEnv(FakeSensorEnv((3,)), stack)
     copied = copy.deepcopy(env)
     assert copied.observation_spec == env.observation_spec
