@@ -15,16 +15,8 @@ from torch.nn import functional
 from torchrl.envs import ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
+from flowrep import transforms as T
 from flowrep.geometry import ego_flow
-from flowrep.transforms import (
-    DIS,
-    RAFT,
-    EstimatedFlow,
-    FlowFactorize,
-    FrameStack,
-    estimated_flow,
-    representation_stack,
-)
 from tests.transforms.fake_env import INTRINSICS, FakeSensorEnv
 from tests.transforms.oracles import brightening
 
@@ -50,7 +42,7 @@ pytest.importorskip("cv2", reason="DIS is OpenCV's: pip install 'flowrep-rl[flow
 @pytest.mark.parametrize(("height", "width"), [(48, 64), (84, 60), (180, 200)])
 def test_flow_is_now_minus_before_u_right_and_v_down(height, width):
     pair = shifted_pair(height, width, right=3, down=-2)
-    flow = EstimatedFlow()(TensorDict({"rgb2": pair}))["raw"]
+    flow = T.EstimatedFlow()(TensorDict({"rgb2": pair}))["raw"]
     u, v = flow[:, 8:-8, 8:-8].flatten(1).median(-1).values
     # Rivals: sign (-3, 2), channel order (-2, 3), flow of the enlarged picture (12, -8).
     torch.testing.assert_close(torch.stack([u, v]), torch.tensor([3.0, -2.0]), atol=0.1, rtol=0)
@@ -62,7 +54,7 @@ def test_the_estimator_runs_from_the_current_picture_to_the_previous_one():
     def of_the_first_grid(first, second):
         return 1000.0 * first[:, :2] + second[:, :2]
 
-    flow = EstimatedFlow(of_the_first_grid)(TensorDict({"rgb2": pair}))["raw"]
+    flow = T.EstimatedFlow(of_the_first_grid)(TensorDict({"rgb2": pair}))["raw"]
     previous, current = pair.float().chunk(2)
     # Rival: the flow from the previous to the current picture lies on the previous one's grid.
     assert torch.equal(flow, -(1000.0 * current[:2] + previous[:2]))
@@ -74,7 +66,7 @@ def test_flow_lies_where_a_body_is_now_not_where_it_was():
     body = texture(100, 100, seed=1)
     previous[:, 50:150, 50:150] = body
     current[:, 50:150, 60:160] = body  # 10 px to the right
-    u, v = EstimatedFlow()(TensorDict({"rgb2": torch.cat([previous, current])}))["raw"]
+    u, v = T.EstimatedFlow()(TensorDict({"rgb2": torch.cat([previous, current])}))["raw"]
     # These columns are the body's now, the background's before: on the wrong grid they stand still.
     assert u[60:140, 151:157].median() == pytest.approx(10.0, abs=0.3)
     assert v[60:140, 151:157].median() == pytest.approx(0.0, abs=0.3)
@@ -86,7 +78,7 @@ def test_a_picture_that_stayed_the_same_has_exactly_no_flow():
         return torch.ones(len(first), 2, *first.shape[-2:])
 
     same, moved = texture(6, 8).repeat(2, 1, 1), shifted_pair(6, 8, 1, 0)
-    flow = EstimatedFlow(noisy)(TensorDict({"rgb2": torch.stack([same, moved])}, [2]))["raw"]
+    flow = T.EstimatedFlow(noisy)(TensorDict({"rgb2": torch.stack([same, moved])}, [2]))["raw"]
     assert flow.flatten(1).tolist() == [[0.0] * 96, [-1.0] * 96]
 
 
@@ -94,7 +86,7 @@ def test_a_picture_that_stayed_the_same_has_exactly_no_flow():
 def test_a_batch_of_any_shape_equals_a_loop_whatever_the_number_of_threads(batch):
     count = torch.Size(batch).numel()
     pairs = torch.stack([shifted_pair(24, 40, i, 1 - i, seed=i) for i in range(max(1, count))])
-    transform, threads = EstimatedFlow(), torch.get_num_threads()
+    transform, threads = T.EstimatedFlow(), torch.get_num_threads()
     want = torch.stack([transform.compute(pair)[0] for pair in pairs])[:count]
     try:
         torch.set_num_threads(3)
@@ -107,15 +99,15 @@ def test_a_batch_of_any_shape_equals_a_loop_whatever_the_number_of_threads(batch
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_pictures_on_a_gpu_have_their_flow_there():
     pair = shifted_pair(48, 64, 3, -2)
-    flow = EstimatedFlow().compute(pair.cuda())[0]
+    flow = T.EstimatedFlow().compute(pair.cuda())[0]
     assert flow.device.type == "cuda"
-    torch.testing.assert_close(flow.cpu(), EstimatedFlow().compute(pair)[0])
+    torch.testing.assert_close(flow.cpu(), T.EstimatedFlow().compute(pair)[0])
 
 
 @pytest.mark.slow
 def test_workers_forked_after_it_ran_here_estimate_too():
     def estimating():
-        stack = representation_stack(["raw"], flow="estimated")
+        stack = T.representation_stack(["raw"], flow="estimated")
         return TransformedEnv(FakeSensorEnv(), stack)
 
     here = estimating().rollout(3)["next", "raw"]
@@ -128,7 +120,7 @@ def test_workers_forked_after_it_ran_here_estimate_too():
 
 
 def test_estimated_raw_alone_reads_pictures_alone():
-    stack = representation_stack(["raw"], flow="estimated")
+    stack = T.representation_stack(["raw"], flow="estimated")
     assert {key for transform in stack for key in transform.in_keys} == {("sensor", "rgb"), "_rgb2"}
 
 
@@ -138,9 +130,9 @@ def test_pixels_that_an_estimator_does_not_know_have_flow_0_and_no_object_flow()
         flow[..., 4:] = math.nan
         return flow
 
-    pictures = FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])
-    factors = FlowFactorize(INTRINSICS, outputs=["obj", "valid"])
-    stack = Compose(pictures, EstimatedFlow(knows_the_left_half), factors)
+    pictures = T.FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])
+    factors = T.FlowFactorize(INTRINSICS, outputs=["obj", "valid"])
+    stack = Compose(pictures, T.EstimatedFlow(knows_the_left_half), factors)
     td = TransformedEnv(FakeSensorEnv((2,)), stack).rollout(2)[:, 1]
     assert (td["raw"][..., :4] == -1.0).all()
     assert (td["raw"][..., 4:] == 0.0).all()
@@ -152,7 +144,7 @@ def test_pixels_that_an_estimator_does_not_know_have_flow_0_and_no_object_flow()
 def test_object_flow_is_the_estimate_less_ego_flow():
     options = {"raw": {"scale": 4.0}, "ego": {"scale": 2.0}, "obj": {"scale": 8.0}}
     flow = {"source": "estimated", "estimator": brightening}
-    stack = representation_stack(options, intrinsics=INTRINSICS, flow=flow)
+    stack = T.representation_stack(options, intrinsics=INTRINSICS, flow=flow)
     td = TransformedEnv(FakeSensorEnv((2,)), stack).rollout(2)[:, 1]
     sensor = td["sensor"]
     K, motion = torch.tensor(INTRINSICS), sensor["prev_from_curr"]
@@ -166,7 +158,7 @@ def test_object_flow_is_the_estimate_less_ego_flow():
 def test_without_opencv_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ImportError, match=r"cv2.*'flowrep-rl\[flow\]'"):
-        EstimatedFlow()
+        T.EstimatedFlow()
 
 
 @pytest.mark.parametrize(
@@ -178,13 +170,13 @@ def test_without_opencv_one_line_says_what_to_install(monkeypatch):
         ({"preset": "slow"}, r"preset must be one of .*'medium'\], got 'slow'"),
         ({"min_side_px": 0}, "min_side_px must be at least 1, got 0"),
         ({"estimator": brightening, "preset": "slow"}, "preset='slow' .* not read .* function"),
-        ({"estimator": DIS(), "min_side_px": 96}, r"min_side_px=96 are not read .*DIS\(preset"),
+        ({"estimator": T.DIS(), "min_side_px": 96}, r"min_side_px=96 are not read .*DIS\(preset"),
         ({"outputs": ["valid"]}, r"some of \['raw', 'unscaled'\]"),
     ],
 )
 def test_options_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        EstimatedFlow(**options)
+        T.EstimatedFlow(**options)
 
 
 @pytest.mark.parametrize(
@@ -198,7 +190,7 @@ def test_an_estimator_s_flow_of_another_shape_is_refused(shape):
     pairs = TensorDict({"rgb2": torch.zeros(3, 6, 5, 7, dtype=torch.uint8)}, [3])
     got = re.escape(f"[3, 2, 5, 7], got {[*shape]}")
     with pytest.raises(ValueError, match=rf"'raw'.* \[N, 2, H, W\], {got}"):
-        EstimatedFlow(lambda first, second: torch.ones(shape))(pairs)
+        T.EstimatedFlow(lambda first, second: torch.ones(shape))(pairs)
 
 
 class KnownNetwork(nn.Module):
@@ -219,7 +211,7 @@ class KnownNetwork(nn.Module):
 @pytest.fixture
 def weights(tmp_path, monkeypatch):
     network = types.SimpleNamespace(raft_small=lambda weights: KnownNetwork())
-    monkeypatch.setattr(estimated_flow, "_optical_flow", lambda: network)
+    monkeypatch.setattr(T.estimated_flow, "_optical_flow", lambda: network)
     path = tmp_path / "weights.pth"
     torch.save({"factor": torch.tensor(1.0)}, path)
     return path
@@ -237,7 +229,7 @@ def test_small_pictures_are_enlarged_then_padded_and_their_flow_scaled_back(
 ):
     first = torch.zeros(2, 3, *size, dtype=torch.uint8)
     first[..., 0, 0] = 255  # padding on the right and below: the first corner stays where it is
-    estimator = RAFT(weights)
+    estimator = T.RAFT(weights)
     got = estimator(first, first)
     assert got.shape == (2, 2, *size)
     assert got[0, :, 7, 9].tolist() == flow
@@ -249,7 +241,7 @@ def test_small_pictures_are_enlarged_then_padded_and_their_flow_scaled_back(
 def test_raw_flow_is_its_answer_negated(weights):
     pair = torch.zeros(6, 40, 50, dtype=torch.uint8)
     pair[3:] = 1
-    transform = EstimatedFlow("raft_small", weights=weights).train()
+    transform = T.EstimatedFlow("raft_small", weights=weights).train()
     assert transform.compute(pair)[0][:, 0, 0].tolist() == [-3.0, 1.5]  # a factor of 4: 160 px
     assert not any(module.training for module in transform.estimator.modules())
 
@@ -259,24 +251,24 @@ def test_safetensors_are_read_too(weights):
     path = weights.with_suffix(".safetensors")
     safetensors.save_file({"factor": torch.tensor(2.0)}, path)
     pictures = torch.zeros(1, 3, 128, 128, dtype=torch.uint8)
-    assert RAFT(path)(pictures, pictures)[0, :, 0, 0].tolist() == [24.0, -12.0]
+    assert T.RAFT(path)(pictures, pictures)[0, :, 0, 0].tolist() == [24.0, -12.0]
 
 
 def test_what_is_no_weights_is_refused_by_name(weights, tmp_path):
     for garbage in (tmp_path / "w.pth", tmp_path / "w.safetensors"):
         garbage.write_bytes(b"garbage")
         with pytest.raises(ValueError, match=f"'{garbage}' is not a readable weights file"):
-            RAFT(garbage)
+            T.RAFT(garbage)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.pth"):
-        RAFT(tmp_path / "nowhere.pth")
+        T.RAFT(tmp_path / "nowhere.pth")
     other = tmp_path / "other.pth"
     torch.save({"bias": torch.zeros(1)}, other)
     with pytest.raises(ValueError, match=r"other\.pth does not hold the weights of raft_small"):
-        RAFT(other)
+        T.RAFT(other)
     with pytest.raises(ValueError, match="raft_tiny"):
-        RAFT(weights, "raft_tiny")
+        T.RAFT(weights, "raft_tiny")
     with pytest.raises(ValueError, match="at least 128"):
-        RAFT(weights, min_side_px=96)
+        T.RAFT(weights, min_side_px=96)
 
 
 def test_torchvisions_network_takes_small_pictures(tmp_path):
@@ -287,6 +279,6 @@ def test_torchvisions_network_takes_small_pictures(tmp_path):
     path = tmp_path / "random.pth"
     torch.save(raft_small(weights=None).state_dict(), path)
     pictures = torch.randint(0, 256, (2, 2, 3, 40, 52), dtype=torch.uint8)
-    flow = RAFT(path, updates=2)(*pictures)
+    flow = T.RAFT(path, updates=2)(*pictures)
     assert flow.shape == (2, 2, 40, 52)
     assert flow.isfinite().all()
