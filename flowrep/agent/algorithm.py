@@ -299,13 +299,6 @@ class DivergenceWatch:
     """Keeps, on the device, the metrics of the first update with a `watched` one that isn't finite.
 
     Its tensors change in place, so that a CUDA graph can record.
-
-    >>> watch = DivergenceWatch(["q_loss"], ["entropy"])
-    >>> for q_loss in (0.5, float("nan"), 0.25):
-    ...     watch.record({"q_loss": torch.tensor(q_loss), "entropy": torch.tensor(1.0)})
-    >>> watch.check()
-    Traceback (most recent call last):
-    flowrep.agent.algorithm.DivergenceError: q_loss became nan in update 2 (q_loss=nan, entropy=1)
     """
 
     def __init__(

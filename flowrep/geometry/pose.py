@@ -207,13 +207,7 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
 
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
-    """Returns the rotation matrix `[*B, 3, 3]` of a rotation vector `[*B, 3]`, rad.
-
-    >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round().int()
-    tensor([[ 0, -1,  0],
-            [ 1,  0,  0],
-            [ 0,  0,  1]], dtype=torch.int32)
-    """
+    """Returns the rotation matrix `[*B, 3, 3]` of a rotation vector `[*B, 3]`, rad."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))

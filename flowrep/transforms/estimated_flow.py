@@ -92,11 +92,7 @@ class DIS:
 
 
 def whole_factor(height: int, width: int, min_side_px: int) -> int:
-    """Returns the smallest whole factor that makes both sides at least `min_side_px`.
-
-    >>> whole_factor(48, 84, 160), whole_factor(200, 300, 160)
-    (4, 1)
-    """
+    """Returns the smallest whole factor that makes both sides at least `min_side_px`."""
     return max(1, math.ceil(min_side_px / min(height, width)))
 
 

@@ -45,9 +45,6 @@ def config_class(
 
     `base` is TorchRL's config class of the group; with `partial`, Hydra returns a function of the
     arguments that are still missing.
-
-    >>> config_class(transforms.Depth)().range_m
-    100.0
     """
     # TorchRL's metaclasses hide the constructor's signature.
     made_by = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]

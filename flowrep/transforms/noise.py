@@ -228,11 +228,7 @@ def _check_options(sensors: Sequence[str], options: dict[str, float]) -> None:
 
 
 def split_mix(state: Tensor) -> Tensor:
-    """Returns the number that SplitMix64 generates from a state, int64, element by element.
-
-    >>> split_mix(torch.tensor([1234567]))
-    tensor([6457827717110365317])
-    """
+    """Returns the number that SplitMix64 generates from a state, int64, element by element."""
     z = state + _GAMMA  # the constants are those of Steele, Lea and Flood, 2014
     for places, factor in ((30, _FIRST), (27, _SECOND)):
         z ^= _shifted(z, places)
