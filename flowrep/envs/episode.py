@@ -61,13 +61,11 @@ class Moment(NamedTuple):
     ticks: int
 
 
-def ticks_for(
-    scene: Scene, frame_rate_hz: float, speed_mps: Range, vehicle_speed_mps: float
-) -> int:
+def ticks_for(scene: Scene, frame_rate_hz: float, speed_mps: Range, driven_mps: float) -> int:
     """Returns how often the footprint is checked in a step, for the speeds of an episode."""
     groups = [group for group in scene.pedestrian_groups if group.standing < group.count]
     fastest_mps = max(((group.speed_mps or speed_mps)[1] for group in groups), default=0.0)
-    driven_hz = vehicle_speed_mps * max(_CHECKS_PER_M, 1.0 / scene.vehicle.length_m)
+    driven_hz = driven_mps * max(_CHECKS_PER_M, 1.0 / scene.vehicle.length_m)
     checks_hz = max(_CHECKS_HZ, driven_hz, fastest_mps * _CHECKS_PER_M)
     return math.ceil(checks_hz / frame_rate_hz - 1e-9)
 
@@ -100,7 +98,7 @@ class Episode:
         # Rounding must not add a step: 200 / 12 · 15 is 250.00000000000003.
         self.limit_steps = math.ceil(scene.time_limit_s * frame_rate_hz - 1e-9)
         self.path = drawn if path is None else paths[path]
-        self.crowd: Crowd = draw_crowd(layout, scene.pedestrian_groups, speed_mps, rng)
+        self.crowd: Crowd = draw_crowd(layout, speed_mps, rng)
         self.goal = layout.zones[self.path.end]
         self.now = self.before = Moment(layout.start_state(self.path.start), 0)
         self.steps, self.outcome, self.hit = 0, Outcome.RUNNING, ""

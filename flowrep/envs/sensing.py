@@ -27,7 +27,7 @@ from flowrep.simulator.street import Street
 Array = NDArray[Any]
 
 
-def planar(x_m: float | Array, y_m: float | Array, yaw_rad: float | Array) -> Array:
+def planar(x_m: Any, y_m: Any, yaw_rad: Any) -> Array:
     """Returns the transforms [..., 4, 4] of planar poses, from body to world axes."""
     sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
     transforms = np.zeros((*np.shape(yaw_rad), 4, 4))
@@ -51,11 +51,9 @@ def rigid_inverse(transforms: Array) -> Array:
 class CameraPose:
     """The pose of a camera on a vehicle and its inverse, or arrays of them."""
 
-    def __init__(
-        self, x_m: float | Array, y_m: float | Array, yaw_rad: float | Array, mount: Array
-    ) -> None:  # mount: vehicle_from_cam [4, 4]
+    def __init__(self, x_m: Any, y_m: Any, yaw_rad: Any, vehicle_from_cam: Array) -> None:
         self.planar = np.stack([x_m, y_m, yaw_rad], axis=-1)
-        self.world_from_cam = planar(x_m, y_m, yaw_rad) @ mount
+        self.world_from_cam = planar(x_m, y_m, yaw_rad) @ vehicle_from_cam
         self.cam_from_world = rigid_inverse(self.world_from_cam)
 
 
@@ -93,9 +91,7 @@ _DRAWN = _MAPS | {"rgb"}
 class Sensing:
     """The camera of one environment and the requested sensors."""
 
-    def __init__(
-        self, street: Street, sensors: Sequence[str], renderer: str, picture_scale: int
-    ) -> None:
+    def __init__(self, street: Street, sensors: Sequence[str], renderer: str, scale: int) -> None:
         if unknown := [name for name in sensors if name not in SENSORS]:
             raise ValueError(f"unknown sensors {unknown}; they are: {', '.join(SENSORS)}")
         self.names = tuple(sensors)
@@ -106,9 +102,9 @@ class Sensing:
         self._projection = gl_projection(focal, focal, *size, camera.near_m, camera.far_m)
         self._vehicle_from_cam = vehicle_from_camera(camera)
         self._ids_by_number = street.ids_by_number()
-        self.renderer, self._scale = choose_renderer(renderer), picture_scale
-        if picture_scale != 1 and self.renderer == "pybullet":
-            raise ValueError(f"picture_scale={picture_scale} needs renderer 'rasteriser'")
+        self.renderer, self._scale = choose_renderer(renderer), scale
+        if scale != 1 and self.renderer == "pybullet":
+            raise ValueError(f"picture_scale={scale} needs renderer 'rasteriser'")
         self._rasterisers: dict[int, Any] = {}  # by scale
         if self.renderer != "pybullet" and not _DRAWN.isdisjoint(sensors):
             self._rasteriser(1)  # compiled before the first step

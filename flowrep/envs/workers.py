@@ -25,7 +25,6 @@ EnvFactory = Callable[[], gym.Env]
 VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
-_PRELOADED = "flowrep.envs.vector_env"  # imported once, by the server that workers are forked from
 
 
 class WorkerError(RuntimeError):
@@ -81,9 +80,9 @@ class WorkerVectorEnv(VectorEnv):
         # At exit, multiprocessing would wait for ever for processes that SIGTERM does not reach.
         self._end = util.Finalize(self, _end, args=(self._workers,), exitpriority=10)
         # fork would copy the locks of PyTorch's threads as they are; spawn would import gymnasium,
-        # numpy and PyBullet anew in each worker.
+        # numpy and PyBullet anew in each worker, not once in the server that they are forked from.
         context: Any = get_context("forkserver")
-        context.set_forkserver_preload([_PRELOADED])
+        context.set_forkserver_preload(["flowrep.envs.vector_env"])
         with sheltered():
             forkserver.ensure_running()
             memory = create_shared_memory(space, self.num_envs, context)

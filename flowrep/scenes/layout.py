@@ -229,7 +229,7 @@ class Layout:
             if row.side in ("start", "end"):
                 boxes.append(self._house_across(row, rng))
             else:
-                self._add_building_row(row, rng, boxes)
+                self._add_houses(row, rng, boxes)
         return tuple(boxes)
 
     def _house_across(self, row: BuildingRow, rng: np.random.Generator) -> Box:
@@ -242,9 +242,7 @@ class Layout:
         facing = heading - math.pi / 2 * ahead
         return Box("house", x, y, facing, size, int(rng.integers(1 << 16)))
 
-    def _add_building_row(
-        self, row: BuildingRow, rng: np.random.Generator, houses: list[Box]
-    ) -> None:
+    def _add_houses(self, row: BuildingRow, rng: np.random.Generator, houses: list[Box]) -> None:
         side = 1.0 if row.side == "left" else -1.0
         edge = self.roads[row.road].width_m / 2 + row.setback_m
         # The last house may stand beyond to_m, but then not beyond the road too.

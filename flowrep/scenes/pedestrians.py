@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from flowrep.scenes.layout import SHORTEST_M, Layout, parallel
-from flowrep.scenes.scene import PedestrianGroup, Range
+from flowrep.scenes.scene import Range
 
 Array = NDArray[Any]
 
@@ -170,13 +170,11 @@ class Crowd:
         return math.pi * (turned + ~is_near_far_end)
 
 
-def draw_crowd(
-    layout: Layout, groups: tuple[PedestrianGroup, ...], speed_mps: Range, rng: np.random.Generator
-) -> Crowd:
+def draw_crowd(layout: Layout, speed_mps: Range, rng: np.random.Generator) -> Crowd:
     """Returns a crowd with phases, directions, speeds and lanes drawn for one episode."""
     lines: list[Array] = []
     speeds, phases = [np.empty(0)], [np.empty(0)]
-    for group in groups:
+    for group in layout.scene.pedestrian_groups:
         low, high = group.speed_mps or speed_mps
         draws = 1 if group.draw == "group" else group.count
         # A uniform phase over the round trip draws the direction too.

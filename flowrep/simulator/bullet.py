@@ -55,9 +55,7 @@ class Simulator:
         weakref.finalize(self, pybullet.disconnect, self._client)
         self._texture = self._load_texture(texture_rgb)
 
-    def add_body(
-        self, mesh: Mesh, boxes_m: Sequence[tuple[float, float, float, float, float, float]] = ()
-    ) -> int:
+    def add_body(self, mesh: Mesh, boxes_m: Sequence[tuple[float, ...]] = ()) -> int:
         """Returns PyBullet's number of a body; boxes are (x, y, yaw, length, width, height)."""
         # PyBullet leaks the lists that it is given and their items. These lists end up empty, and
         # the numbers are the same objects for every client of the process.
@@ -104,11 +102,9 @@ class Simulator:
         point = pybullet.createVisualShape(pybullet.GEOM_MESH, **corners, **client)
         return pybullet.createMultiBody(1.0, solid, point, **client)
 
-    def place(
-        self, body: int, x_m: float, y_m: float, yaw_rad: float, height_m: float = 0.0
-    ) -> None:
+    def place(self, body: int, x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> None:
         """Places a body at a planar pose."""
-        self.place_at(body, (x_m, y_m, height_m), _about_z(yaw_rad))
+        self.place_at(body, (x_m, y_m, z_m), _about_z(yaw_rad))
 
     def place_at(self, body: int, xyz_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
         """Places a body anywhere."""

@@ -73,13 +73,13 @@ def choose_renderer(name: str) -> str:
     """Returns "rasteriser" or "pybullet"; "auto" is the rasteriser if numba is installed."""
     if name not in RENDERERS:
         raise ValueError(f"unknown renderer {name!r}; choose one of {', '.join(RENDERERS)}")
-    if name != "pybullet" and not numba_is_installed():
-        if name == "rasteriser":
-            raise ImportError(f"renderer 'rasteriser' needs numba; {_REMEDY}")
-        warnings.warn(
-            "numba is not installed, so PyBullet draws depth and ids: a picture of 84 x 84 "
-            f"pixels then takes about 2 ms instead of 0.2; {_REMEDY}",
-            stacklevel=2,
-        )
-        return "pybullet"
-    return "rasteriser" if name == "auto" else name
+    if name == "pybullet" or numba_is_installed():
+        return "rasteriser" if name == "auto" else name
+    if name == "rasteriser":
+        raise ImportError(f"renderer 'rasteriser' needs numba; {_REMEDY}")
+    warnings.warn(
+        "numba is not installed, so PyBullet draws depth and ids: a picture of 84 x 84 pixels then "
+        f"takes about 2 ms instead of 0.2; {_REMEDY}",
+        stacklevel=2,
+    )
+    return "pybullet"

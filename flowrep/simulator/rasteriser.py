@@ -77,8 +77,9 @@ class Rasteriser:
         look = *self._look, *((paint.grain(), paint.front_levels()) if rgb else _NO_TABLES)
         views = len(cam_from_world)
         depth = np.empty((views, *self._size), np.float32)
-        ids = (np.empty(depth.shape, np.uint8) for _ in range(2))
-        maps = Maps(depth, *ids, np.empty((views if rgb else 0, 3, *self._size), np.uint8))
+        semantic, instance = (np.empty(depth.shape, np.uint8) for _ in range(2))
+        colours = np.empty((views if rgb else 0, 3, *self._size), np.uint8)
+        maps = Maps(depth, semantic, instance, colours)
         _draw(*self._world, look, cam_from_world, world_from_body, is_shown, *maps)
         return maps
 

@@ -16,7 +16,7 @@ from flowrep.scenes.layout import Box, Layout
 from flowrep.scenes.scene import Scene, VehicleState
 from flowrep.simulator import meshes
 from flowrep.simulator.bullet import Simulator
-from flowrep.simulator.meshes import Body, gather, person_meshes
+from flowrep.simulator.meshes import Body, Mesh, gather, person_meshes
 from flowrep.simulator.paint import texture
 
 Array = NDArray[Any]
@@ -74,7 +74,7 @@ class Street:
         }
         parts = [mesh for i in range(count) for mesh in person_meshes(i)]
         for instance, mesh in enumerate(parts, start=1):
-            self._add_body(mesh, "pedestrian", instance=instance)
+            self._add_body(mesh, "pedestrian", instance)
         self.triangles = gather(self.bodies)
         reach_m = math.hypot(vehicle.length_m, vehicle.width_m) / 2
         self._person_reach_m = reach_m + pedestrians.RADIUS_M
@@ -148,7 +148,7 @@ class Street:
 
     def _add_ground(self, layout: Layout) -> None:
         striped = shapely.union_all([area.polygon for area in layout.crosswalks])
-        road, crosswalks = meshes.Mesh(), meshes.Mesh()
+        road, crosswalks = Mesh(), Mesh()
         road.ground(layout.drivable.difference(striped), 0.0, "asphalt")
         for name, line in layout.lines.items():
             if layout.roads[name].width_m >= _TWO_LANES_M:
@@ -160,7 +160,7 @@ class Street:
         if layout.terrain.is_empty:
             # The paving continues under the houses, so that no gap opens between them.
             paved = paved.buffer(2.0).difference(layout.drivable)
-        paving, grass = meshes.Mesh(), meshes.Mesh()
+        paving, grass = Mesh(), Mesh()
         paving.ground(paved, 0.0, "paving")
         paving.add(meshes.kerb(layout.drivable, paved))
         grass.ground(layout.terrain, 0.0, "grass")
@@ -173,20 +173,18 @@ class Street:
         for category in dict.fromkeys(box.category for box in boxes):
             own = [box for box in boxes if box.category == category]
             for first in range(0, len(own), _BOXES_A_BODY):
-                mesh, chunk = meshes.Mesh(), own[first : first + _BOXES_A_BODY]
+                mesh, chunk = Mesh(), own[first : first + _BOXES_A_BODY]
                 for box in chunk:
                     mesh.add(meshes.mesh_of(box))
                 self._add_solid(chunk, mesh)
 
-    def _add_solid(self, boxes: list[Box], mesh: meshes.Mesh) -> int:
+    def _add_solid(self, boxes: list[Box], mesh: Mesh) -> int:
         places = [(box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes]
         body = self._add_body(mesh, boxes[0].category, boxes_m=places)
         self._boxes += [(box, body) for box in boxes]
         return body
 
-    def _add_body(
-        self, mesh: meshes.Mesh, category: str, *, instance: int = 0, boxes_m: Sequence[Any] = ()
-    ) -> int:
+    def _add_body(self, mesh: Mesh, category: str, instance: int = 0, boxes_m: Any = ()) -> int:
         vertices, uvs = np.array(mesh.vertices), np.array(mesh.uvs)
         triangles, semantic = np.array(mesh.indices).reshape(-1, 3), CATEGORY_ID[category]
         self.bodies.append(Body(vertices, triangles, semantic, instance, uvs))

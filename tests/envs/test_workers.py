@@ -192,12 +192,11 @@ def is_running(pid):
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks into /proc")
-@pytest.mark.parametrize("how", ["left open at the end", "killed"])
-def test_no_worker_outlives_its_caller(tmp_path, how):
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_no_worker_outlives_its_caller(tmp_path, is_killed):
     script = tmp_path / "holder.py"
     script.write_text(HOLDER)
-    how_it_ends = "wait" if how == "killed" else "end"
-    command = [sys.executable, str(script), how_it_ends]
+    command = [sys.executable, str(script), "wait" if is_killed else "end"]
     paths = {"PYTHONPATH": os.pathsep.join([".", *sys.path]), "TMPDIR": str(tmp_path)}
     environment = os.environ | paths
     with subprocess.Popen(
@@ -206,10 +205,10 @@ def test_no_worker_outlives_its_caller(tmp_path, how):
         try:
             workers = [int(pid) for pid in holder.stdout.readline().split()]
             assert len(workers) == 2
-            if how == "killed":
+            if is_killed:
                 assert all(is_running(pid) for pid in workers)
                 holder.kill()
-            assert holder.wait(timeout=30) == (-signal.SIGKILL if how == "killed" else 0)
+            assert holder.wait(timeout=30) == (-signal.SIGKILL if is_killed else 0)
         finally:
             holder.kill()
     deadline = time.monotonic() + 10

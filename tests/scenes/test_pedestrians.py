@@ -183,7 +183,7 @@ def least_distance(scene, speed_mps, episodes):
     times = np.arange(0.0, scene.time_limit_s, 1 / 24)[:, None]
     for episode in range(episodes):
         rng = np.random.default_rng(episode)
-        places = draw_crowd(layout, scene.pedestrian_groups, speed_mps, rng).positions(times)
+        places = draw_crowd(layout, speed_mps, rng).positions(times)
         one, other = np.triu_indices(places.shape[1], 1)
         gaps = places[:, one] - places[:, other]
         least = min(least, np.hypot(gaps[..., 0], gaps[..., 1]).min())
