@@ -176,8 +176,7 @@ def _joined(maps: Iterable[NDArray[Any]]) -> NDArray[Any]:
     """Returns maps [C, H, W] along their channels: float32, with bytes divided by 255."""
     maps = list(maps)
     if any(each.dtype != np.uint8 for each in maps):
-        scales = (255.0 if each.dtype == np.uint8 else 1.0 for each in maps)
-        maps = [each.astype(np.float32) / scale for each, scale in zip(maps, scales)]
+        maps = [m.astype(np.float32) / (255.0 if m.dtype == np.uint8 else 1.0) for m in maps]
     return np.concatenate(maps)
 
 

@@ -13,15 +13,8 @@ from numpy.typing import NDArray
 from flowrep.envs.episode import Episode, Moment
 from flowrep.palette import CLASS_COLOURS, num_classes
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
+from flowrep.simulator import camera
 from flowrep.simulator.bullet import Picture
-from flowrep.simulator.camera import (
-    choose_renderer,
-    depth_from_zbuffer,
-    gl_projection,
-    gl_view,
-    sampled_intrinsics,
-    vehicle_from_camera,
-)
 from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
@@ -96,13 +89,17 @@ class Sensing:
             raise ValueError(f"unknown sensors {unknown}; they are: {', '.join(SENSORS)}")
         self.names = tuple(sensors)
         self._street, self._scene = street, street.layout.scene
-        self._camera = camera = self._scene.camera
-        focal, size = camera.focal_px, (camera.height_px, camera.width_px)
-        self.K = sampled_intrinsics(focal, focal, *size)
-        self._projection = gl_projection(focal, focal, *size, camera.near_m, camera.far_m)
-        self._vehicle_from_cam = vehicle_from_camera(camera)
+        config = self._scene.camera
+        self._size, self._range_m = (
+            (config.height_px, config.width_px),
+            (config.near_m, config.far_m),
+        )
+        pinhole = config.focal_px, config.focal_px, *self._size
+        self.K = camera.sampled_intrinsics(*pinhole)
+        self._projection = camera.gl_projection(*pinhole, *self._range_m)
+        self._vehicle_from_cam = camera.vehicle_from_camera(config)
         self._ids_by_number = street.ids_by_number()
-        self.renderer, self._scale = choose_renderer(renderer), scale
+        self.renderer, self._scale = camera.choose_renderer(renderer), scale
         if scale != 1 and self.renderer == "pybullet":
             raise ValueError(f"picture_scale={scale} needs renderer 'rasteriser'")
         self._rasterisers: dict[int, Any] = {}  # by scale
@@ -138,14 +135,12 @@ class Sensing:
 
     def look(self, episode: Episode) -> Picture:
         """Returns PyBullet's picture from an episode's camera, of the bodies as last placed."""
-        view = gl_view(self._camera_poses([episode.now]).cam_from_world[0])
-        size = self._camera.height_px, self._camera.width_px
-        return self._street.simulator.look(view, self._projection, *size)
+        view = camera.gl_view(self._camera_poses([episode.now]).cam_from_world[0])
+        return self._street.simulator.look(view, self._projection, *self._size)
 
     def space(self) -> spaces.Dict:
         """Returns the observation space."""
-        size = (self._camera.height_px, self._camera.width_px)
-        parts = len(PARTS) * self._scene.num_pedestrians
+        size, parts = self._size, len(PARTS) * self._scene.num_pedestrians
         classes = num_classes(self._scene.categories)
         every: dict[str, spaces.Space] = {
             "depth": spaces.Box(0.0, np.inf, (1, *size), np.float32),
@@ -185,10 +180,9 @@ class Sensing:
         if scale not in self._rasterisers:
             from flowrep.simulator.rasteriser import Rasteriser  # which imports numba
 
-            camera = self._camera
-            size = scale * camera.height_px, scale * camera.width_px
-            K, range_m = np.diag([scale, scale, 1.0]) @ self.K, (camera.near_m, camera.far_m)
-            self._rasterisers[scale] = Rasteriser(self._street.triangles, K, size, range_m)
+            height, width = self._size
+            K, size = np.diag([scale, scale, 1.0]) @ self.K, (scale * height, scale * width)
+            self._rasterisers[scale] = Rasteriser(self._street.triangles, K, size, self._range_m)
         return self._rasterisers[scale]
 
     def _pictured(self, episode: Episode) -> Arrays:
@@ -196,7 +190,7 @@ class Sensing:
         self._street.place_pedestrians(episode.poses)
         picture = self.look(episode)
         is_sky = picture.body < 0
-        depth = depth_from_zbuffer(picture.zbuffer, self._camera.near_m, self._camera.far_m)
+        depth = camera.depth_from_zbuffer(picture.zbuffer, *self._range_m)
         depth[is_sky] = np.inf
         semantic, instance = np.moveaxis(self._ids_by_number[picture.body], -1, 0)
         rgb = picture.rgba[..., :3].transpose(2, 0, 1).copy()
