@@ -5,8 +5,8 @@ files, byte for byte.
 """
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from itertools import cycle, pairwise
 from typing import Any, NamedTuple
 
@@ -61,13 +61,11 @@ class Look(NamedTuple):
 
 
 def looks(names: Sequence[str]) -> dict[str, Look]:
-    """Returns how each series of a figure is drawn: a stack, or one of its configs ("ego, noisy").
-
-    The paper's stacks look the same in all figures. With another among them, all have colours in
-    turn, so that no two look alike.
-    """
+    """Returns how series of a figure are drawn: stacks, or their configs ("ego, noisy")."""
     parts = [name.partition(", ")[::2] for name in names]
     stacks, variants = ([*dict.fromkeys(part)] for part in zip(*parts))
+    # The paper's stacks look the same in all figures. With another among them, all have colours in
+    # turn, so that no two look alike.
     are_known = {*stacks} <= {*_COLOURS}
     colours = _COLOURS if are_known else dict(zip(stacks, cycle(_OTHERS)))
     found = {}
@@ -89,9 +87,8 @@ def words(name: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-@contextmanager
-def styled(font_pt: float = 7.5) -> Iterator[None]:
-    """Draws figures in one style."""
+def styled(font_pt: float = 7.5) -> AbstractContextManager[None]:
+    """Returns the context that draws figures in one style."""
     settings: Any = {
         "font.size": font_pt,
         "axes.titlesize": font_pt + 0.5,
@@ -108,8 +105,7 @@ def styled(font_pt: float = 7.5) -> Iterator[None]:
         "legend.frameon": False,
         "text.parse_math": False,  # $ is literal
     }
-    with mpl.rc_context(settings):
-        yield
+    return mpl.rc_context(settings)
 
 
 def encoded(figure: Figure, kind: str, dpi: int = 300) -> bytes:
@@ -162,7 +158,7 @@ def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> 
 def _panels(
     panels: Sequence[tuple[str, Any]], draw: Callable[[Axes, Any], None], handles: Sequence[Any]
 ) -> Figure:
-    """Returns a figure with a panel of success per scene, as wide as a paper's column or page."""
+    # As wide as a paper's column or page.
     columns = min(len(panels), _MOST_IN_A_ROW)
     rows = -(-len(panels) // columns)
     width = _COLUMN_IN if len(panels) == 1 else _PAGE_IN
@@ -195,10 +191,8 @@ def _bars(axes: Axes, grid: Grid) -> None:
                 continue
             edge = "white" if look.hatch else _TEXT
             height, lengths = 100 * cell.score.value, _whiskers([cell.score])
-            axes.bar(
-                at, height, 0.92 * width,
-                facecolor=look.colour, hatch=look.hatch, edgecolor=edge, linewidth=0,
-            )  # fmt: skip
+            style = {"facecolor": look.colour, "hatch": look.hatch, "edgecolor": edge}
+            axes.bar(at, height, 0.92 * width, linewidth=0, **style)
             axes.errorbar(at, height, lengths, color=_TEXT, linewidth=0.9, **_CAPS)
             if len(cell.matrix.outcomes) > 1:
                 dots = (100 * rates(cell.matrix.outcomes)).tolist()
@@ -246,13 +240,11 @@ def _line_handles(style: Mapping[str, Look]) -> list[Any]:
 
 
 def _legend(figure: Figure, handles: Sequence[Any]) -> None:
-    """Puts a legend above the panels, in reading order."""
     em_in = mpl.rcParams["font.size"] / 72
     longest = max(len(handle.get_label()) for handle in handles)
     entry_in = (0.5 * longest + 3.5) * em_in  # half an em a letter, 3.5 for the sign and gaps
     columns = min(len(handles), max(1, int(figure.get_figwidth() / entry_in)))
+    # matplotlib fills column by column, and people read row by row.
     by_column = [handle for start in range(columns) for handle in handles[start::columns]]
-    figure.legend(
-        handles=by_column, loc="outside upper center", ncols=columns, handlelength=1.8,
-        columnspacing=1.2, handletextpad=0.5,
-    )  # fmt: skip
+    gaps = {"handlelength": 1.8, "columnspacing": 1.2, "handletextpad": 0.5}
+    figure.legend(handles=by_column, loc="outside upper center", ncols=columns, **gaps)

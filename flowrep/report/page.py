@@ -36,11 +36,11 @@ TEMPLATES = Environment(
 
 
 class Picture(NamedTuple):
-    """A plan or a film of one agent: its name, what it shows, a data URI."""
+    """A plan or a film of one agent."""
 
     title: str
     caption: str
-    data: str
+    data: str  # a URI
 
 
 class Drives(NamedTuple):
@@ -75,9 +75,8 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
             picture = Picture(title, film.name, data_uri("video/mp4", film.read_bytes()))
             drives.films.setdefault(f"{scene}, {words(film.stem)}", []).append(picture)
         if videos and not films:
-            drives.warnings.append(
-                f"{run.name} has no films: python -m flowrep.evaluate run={run.name} video=true"
-            )
+            remedy = f"python -m flowrep.evaluate run={run.name} video=true"
+            drives.warnings.append(f"{run.name} has no films: {remedy}")
     return drives
 
 
@@ -95,10 +94,8 @@ def tracks_of(run: Run, count: int) -> list[Track]:
             positions, starts, outcomes = saved["positions"], saved["starts"], saved["outcome"]
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return []
-    return [
-        Track(positions[starts[n] : starts[n + 1]].astype(float), str(outcomes[n]))
-        for n in chosen.tolist()
-    ]
+    tracks = [positions[starts[n] : starts[n + 1]].astype(float) for n in chosen]
+    return list(map(Track, tracks, outcomes[chosen].tolist()))
 
 
 def data_uri(kind: str, data: bytes) -> str:
@@ -108,37 +105,28 @@ def data_uri(kind: str, data: bytes) -> str:
 
 def render_page(report: Report, drives: Drives) -> str:
     """Returns the page of a report, with plans and films of some of its episodes, if any."""
-    runs = report.runs
-    stacks = sorted({run.stack for run in runs})
+    runs, stacks = report.runs, sorted({run.stack for run in report.runs})
     what = listed(stacks) if len(stacks) < 4 else f"{len(stacks)} stacks"
+    rows = []
+    for run in runs:
+        named = (run.name, run.config.get("experiment") or "", words(run.scene), run.stack)
+        frames, episodes = f"{run.frames:,} of {run.total_frames:,}", f"{run.tested.sum():,}"
+        rows.append((*named, str(run.seed), frames, episodes))
     return TEMPLATES.get_template("page.html.jinja").render(
         title=f"{what} in {listed([words(scene) for scene in scenes_of(runs)])}",
         summary=summary(runs),
         report=report,
         drawn=lambda figure: data_uri("image/svg+xml", encoded(figure, "svg")),
         drives=drives,
-        runs=[
-            (
-                run.name,
-                run.config.get("experiment") or "",
-                words(run.scene),
-                run.stack,
-                str(run.seed),
-                f"{run.frames:,} of {run.total_frames:,}",
-                f"{int(run.tested.sum()):,}",
-            )
-            for run in runs
-        ],
+        runs=rows,
     )
 
 
 def summary(runs: Sequence[Run]) -> str:
     """Returns a sentence on the runs that were read."""
-    finished = sum(run.is_finished for run in runs)
-    stacks = sorted({run.stack for run in runs})
-    scenes = [words(scene) for scene in scenes_of(runs)]
-    episodes = sum(int(run.tested.sum()) for run in runs)
+    finished, episodes = sum(r.is_finished for r in runs), sum(r.tested.sum() for r in runs)
+    stacks, scenes = sorted({run.stack for run in runs}), map(words, scenes_of(runs))
     return (
         f"Runs: {len(runs)}, {finished} of them finished; stacks: {listed(stacks)}, in "
-        f"{listed(scenes)}; evaluated episodes: {episodes:,}, those of baselines included."
+        f"{listed([*scenes])}; evaluated episodes: {episodes:,}, those of baselines included."
     )

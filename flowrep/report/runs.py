@@ -1,6 +1,7 @@
 """Runs as a report sees them: their columns, which may be compared, and what episodes came to."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -35,40 +36,26 @@ class Condition(NamedTuple):
     fps: float
 
 
+@dataclass(eq=False)
 class Run:
-    """A run's config and tables, and what a report asks for of them.
+    """A run's config and tables, and what a report asks for of them."""
 
-    Args:
-        name: its folder, or its name in packed tables.
-        config: the resolved config that it was started with.
-        episodes: the columns of evaluation.csv.
-        metrics: the columns of metrics.csv, nan where a cell is empty.
-        folder: where films and drives may lie; None for a run of packed tables.
-        machine: the commit, precision and CPU that trained it, "unknown" where not recorded.
+    name: str  # its folder, or its name in packed tables
+    config: Mapping[str, Any]
+    episodes: Columns  # of evaluation.csv
+    metrics: Columns  # of metrics.csv, nan where a cell is empty
+    folder: Path | None = None  # where films and drives may lie
+    machine: Mapping[str, str] = field(default_factory=dict)  # that trained it
 
-    Raises:
-        KeyError, TypeError, ValueError, AttributeError: the config is not what a run leaves.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        config: Mapping[str, Any],
-        episodes: Columns,
-        metrics: Columns,
-        folder: Path | None = None,
-        machine: Mapping[str, str] | None = None,
-    ) -> None:
-        self.name, self.config, self.folder = name, config, folder
-        self.episodes, self.metrics, self.machine = episodes, metrics, machine or {}
-        scene = config["scene"]
+    def __post_init__(self) -> None:
+        config, scene = self.config, self.config["scene"]
         self.scene: str = scene["name"]
         self.stack = stack_of(config["representations"])
         self.seed = int(config["seed"])
         self.speed: str = config["speed"]  # of the pedestrians in training
         self.fps = float(scene["frame_rate_hz"])
         self.total_frames = int(config["total_frames"])
-        columns = (metrics.get("frames", np.zeros(0)), episodes["frames"])
+        columns = (self.metrics.get("frames", np.zeros(0)), self.episodes["frames"])
         self.frames = max((int(c.max()) for c in columns if len(c)), default=0)
         self.is_finished = self.frames >= self.total_frames
         self.settings = _settings(config)
@@ -98,11 +85,8 @@ class Run:
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, str]:
-    """Returns what determines a run's weights, by dotted key, without the seed.
-
-    Keys of one scene alone are under the scene's name, and options of a representation under its
-    name: only runs that have the scene or the representation can differ in them.
-    """
+    # What determines a run's weights, by dotted key, without the seed. Keys of one scene alone are
+    # under its name, as options of a representation are: only runs that have it differ in them.
     parts = origin_of(config) | {"total_frames": config["total_frames"]}
     del parts["flowrep"], parts["seed"]
     scene = parts.pop("scene")
@@ -133,11 +117,7 @@ def in_order(found: Iterable[str], known: Sequence[str]) -> list[str]:
 
 
 def stack_of(representations: Iterable[str]) -> str:
-    """Returns the name of a set of representations, in any order.
-
-    >>> stack_of(["seg2", "obj", "ego"]), stack_of(["raw"])
-    ('ego+obj+seg2', 'raw')
-    """
+    """Returns the name of a set of representations, in any order."""
     return "+".join(in_order(representations, _REPRESENTATIONS))
 
 
@@ -166,10 +146,7 @@ class Group(NamedTuple):
 
 
 def groups_of(runs: Sequence[Run]) -> list[Group]:
-    """Returns runs grouped by the settings in which they differ, the largest group first.
-
-    Runs of a group differ in scene, representations and seed alone.
-    """
+    """Returns runs that differ in scene, representations and seed alone, largest groups first."""
     keys = dict.fromkeys(key for run in runs for key in run.settings)
     # a key that a run could have and doesn't is a difference, as when a later version added it
     own = [{k: run.settings.get(k, "absent") for k in keys if _can_have(run, k)} for run in runs]
@@ -201,10 +178,7 @@ def out_of_bounds_of_both(outcomes: NDArray[Any]) -> Array:
 
 
 class OutcomeMatrix(NamedTuple):
-    """The metric of each run and episode `[R, E]`, nan where it was not driven.
-
-    All runs are of one stack, scene and condition.
-    """
+    """The metric of each run and episode `[R, E]`, nan where it was not driven."""
 
     episodes: Array
     outcomes: Array
@@ -283,9 +257,9 @@ class Cell(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Success in one scene by series and condition; a place without runs has no cell.
+    """Success in one scene by series, which is a stack (of one config), and condition.
 
-    A series is a stack, or a stack of one config. Baselines go by their name and condition.
+    A place without runs has no cell.
     """
 
     scene: str
@@ -302,10 +276,7 @@ def grid_of(
     bootstrap: Bootstrap,
     baselines: Sequence[str] = BASELINES,
 ) -> Grid:
-    """Returns the success of several series of runs in a scene; those of others are left out.
-
-    Without `baselines` where the runs' configs differ, since a baseline's drives may differ too.
-    """
+    """Returns the success of several series of runs in a scene; those of others are left out."""
     here = {name: [run for run in runs if run.scene == scene] for name, runs in series.items()}
     cells = {
         (name, condition): Cell(matrix, bootstrap.success([matrix.outcomes]))

@@ -76,23 +76,19 @@ class Settings(NamedTuple):
 
 
 class Section(NamedTuple):
-    """One part of a report: its name, heading, tables, and figure with a caption.
-
-    `label` says what distinguishes the config of its runs from that of other sections' runs;
-    `folder` is for its files.
-    """
+    """One part of a report: its heading, tables, and figure with a caption."""
 
     name: str
     title: str
     tables: tuple[Table, ...] = ()
     figure: Figure | None = None
     caption: str = ""
-    label: str = ""
-    folder: str = ""
+    label: str = ""  # what distinguishes the config of its runs from other sections'
+    folder: str = ""  # of its files
 
 
 class Report(NamedTuple):
-    """Everything that a page shows of runs, except their drives."""
+    """What a page shows of runs, except their drives."""
 
     runs: tuple[Run, ...]
     warnings: tuple[str, ...]
@@ -129,17 +125,13 @@ def write_files(report: Report, folder: Path) -> list[Path]:
 
 def _unusable(run: Run, settings: Settings) -> str | None:
     """Returns why a run fills no cell, None if it does."""
+    policy, unused = settings.policy, "only its learning curve is used"
     if not run.is_finished:
-        return (
-            f"{run.name} is not finished, at {run.frames:,} of {run.total_frames:,} frames: only "
-            "its learning curve is used"
-        )
-    policy = settings.policy
+        reached = f"{run.frames:,} of {run.total_frames:,} frames"
+        return f"{run.name} is not finished, at {reached}: {unused}"
     if policy not in {condition.policy for condition in run.conditions}:
-        return (
-            f"{run.name} has no {policy} evaluation at its end: only its learning curve is used; "
-            f"python -m flowrep.evaluate run={run.name} policy={policy} adds one"
-        )
+        remedy = f"python -m flowrep.evaluate run={run.name} policy={policy} adds one"
+        return f"{run.name} has no {policy} evaluation at its end: {unused}; {remedy}"
     return None
 
 
@@ -184,7 +176,6 @@ def _success_section(
     settings: Settings,
     baselines: Sequence[str] = BASELINES,
 ) -> Section:
-    """Returns bars, a table of success and one of the pairs' differences, for series of runs."""
     runs = [run for members in series.values() for run in members]
     policy, bootstrap = settings
     conditions = _at_speeds(runs, policy)
@@ -194,11 +185,9 @@ def _success_section(
         f"Success of agents trained at {trained} speed, {policy} actions, {runs[0].fps:g} frames "
         f"per second: {INTERVALS}; dots are the seeds."
     )
-    tables = (
-        _success_table(name, grids, caption, bootstrap),
-        *_difference_tables(name, grids, pairs, bootstrap),
-    )
-    return Section(name, title, tables, draw_bars(grids), caption)
+    tables = [_success_table(name, grids, caption, bootstrap)]
+    tables += _difference_tables(name, grids, pairs, bootstrap)
+    return Section(name, title, tuple(tables), draw_bars(grids), caption)
 
 
 def _shares(grid: Grid, series: str) -> list[str]:
@@ -207,7 +196,6 @@ def _shares(grid: Grid, series: str) -> list[str]:
 
 
 def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bootstrap) -> Table:
-    """Returns success in % by scene and series, and over all scenes where there are several."""
     _, series, conditions, *_ = grids[0]
     blocks = []
     for grid in grids:
@@ -236,7 +224,6 @@ def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bo
 def _difference_tables(
     name: str, grids: Sequence[Grid], pairs: Sequence[tuple[str, str]], bootstrap: Bootstrap
 ) -> list[Table]:
-    """Returns the difference of each pair with its verdict, if there is a pair to compare."""
     chosen = pairs[:_MOST_PAIRS]
     places = [(words(grid.scene), [grid]) for grid in grids]
     if len(grids) > 1:
@@ -276,7 +263,7 @@ def _compared(
     second: tuple[str, Condition],
     bootstrap: Bootstrap,
 ) -> tuple[Comparison, int] | None:
-    """Returns a comparison over scenes and the number of its episodes; None where one has none."""
+    # A comparison over scenes, and the number of its episodes; None where a side has none.
     if not all({first, second} <= {*grid.cells} for grid in grids):
         return None
     sides = [side_by_side(grid.cells[first].matrix, grid.cells[second].matrix) for grid in grids]
@@ -285,8 +272,7 @@ def _compared(
 
 
 def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
-    """Returns Table III for the scenes of the runs, the paper's scene first."""
-    # the paper evaluates at low and high speed
+    # Table III. The paper evaluates at low and high speed
     fps, driven = runs[0].fps, {c.speed for c in _at_speeds(runs, settings.policy)}
     speeds = ["low", "high"] if {"low", "high"} <= driven else [runs[0].speed]
     conditions = [Condition(settings.policy, speed, fps) for speed in speeds]
@@ -325,7 +311,6 @@ def _failure_cells(
 
 
 def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
-    """Returns success at the training speed over all frame rates that were evaluated."""
     policy, speed, trained = settings.policy, runs[0].speed, runs[0].fps
     ours = [run for run in runs if len(_rates([run], policy)) > 1]
     conditions = [Condition(policy, speed, rate) for rate in _rates(ours, policy)]
@@ -345,9 +330,8 @@ def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
         f"{speed} speed, {policy} actions: {INTERVALS}. Points of one rate stand side by side."
     )
     heads = (*(f"{c.fps:g} Hz (%)" for c in conditions), f"{high.fps:g} → {low.fps:g} Hz (points)")
-    extra = "The last column is the change of the same agents on the same episodes."
-    header = ("representations", *heads)
-    table = Table("frame_rate_success", f"In %. {caption} {extra}", header, tuple(blocks))
+    said = f"In %. {caption} The last column is the change of the same agents on the same episodes."
+    table = Table("frame_rate_success", said, ("representations", *heads), tuple(blocks))
     title = "Sensitivity to the frame rate"
     return Section("frame_rate", title, (table,), draw_rates(grids), caption)
 
@@ -369,7 +353,7 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
 
 
 def _configs_section(groups: Sequence[Group], settings: Settings) -> Section:
-    """Returns the stacks that have runs of several configs, side by side and never pooled."""
+    # Stacks that have runs of several configs, side by side and never pooled.
     keys = dict.fromkeys(key for group in groups for key in group.differences)
     labels = [group.label for group in groups]
     are_short = all(0 < len(label) <= _LONGEST_LABEL for label in labels)

@@ -39,22 +39,15 @@ class Estimate(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """How much better one side does than another.
+    """How much better one side does than another."""
 
-    Args:
-        difference: of the means over runs, in the mean over scenes.
-        improvement: the probability that a run of the first side beats one of the second.
-        p_value: of Welch's t-test over the runs' scores; nan where a side has one run alone.
-        runs: the number of runs per side; that of one scene if a scene has one run of a side.
-    """
-
-    difference: Estimate
-    improvement: Estimate
-    p_value: float
-    runs: int
+    difference: Estimate  # of the means over runs, in the mean over scenes
+    improvement: Estimate  # the probability that a run of the first side beats one of the second
+    p_value: float  # of Welch's t-test over the runs' scores; nan where a side has one run alone
+    runs: int  # of a side; those of one scene if a scene has one run of a side
 
     def verdict(self, p_value: float) -> str:
-        """Returns in words how far the difference can be trusted, by its p value, corrected."""
+        """Returns how far the difference can be trusted, given its corrected p value."""
         # Both have to agree: a bootstrap over two or three runs has intervals that are too narrow.
         if self.difference.low <= 0 <= self.difference.high or p_value >= LEVEL:
             return "can't be told from noise"
@@ -68,14 +61,14 @@ class Comparison(NamedTuple):
 def rates(outcomes: Array, weights: Array | None = None) -> Array:
     """Returns each run's share of episodes with a property, such as success, [R].
 
-    With `weights` [N, E], how often each episode counts in each of N resamples: [N, R]. A run
-    without episodes in a resample keeps its own rate there.
+    With `weights` [N, E], how often each episode counts in each of N resamples: [N, R].
     """
     there, found = ~np.isnan(outcomes), np.nan_to_num(outcomes)
     own = found.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
     if weights is None:
         return own
     counts = weights @ there.T
+    # A run without episodes in a resample keeps its own rate there.
     return np.where(counts > 0, weights @ found.T / np.maximum(counts, 1), own)
 
 
@@ -113,11 +106,9 @@ class Bootstrap(NamedTuple):
         return _estimate(float(found.sum() / there.sum()), drawn, int(there.sum()))
 
     def compare(self, scenes: Sequence[tuple[Array, Array]]) -> Comparison:
-        """Returns how much better the first of each pair does than the second.
+        """Returns how much better the first of each scene's two sides does than the second.
 
-        Args:
-            scenes: the outcomes of two sides in each scene. Column e is the same episode in both,
-                so that an episode's difficulty is not part of the difference.
+        Column e is the same episode in both, so that its difficulty is no part of the difference.
         """
         own = [(rates(a), rates(b)) for a, b in scenes]
         drawn = [
@@ -141,10 +132,8 @@ class Bootstrap(NamedTuple):
         )
 
     def _rates(self, scene: int, outcomes: Array, sides: Sequence[int]) -> list[Array]:
-        """Returns rates [N, R] of resampled runs of each side, over the same drawn episodes.
-
-        `outcomes` is of all sides, stacked; `sides` has the number of runs of each.
-        """
+        # [N, R] of resampled runs of each side, over the same drawn episodes. `outcomes` is of all
+        # sides, stacked; `sides` has the number of runs of each.
         rng = np.random.default_rng((0, scene, _OF_RUNS))
         weights = _episode_weights(scene, outcomes.shape[1], self.resamples)
         drawn = []
@@ -172,26 +161,23 @@ def _estimate(value: float, drawn: Array, episodes: int, least: float = 0.0) -> 
 
 @lru_cache(maxsize=8)
 def _episode_weights(scene: int, episodes: int, resamples: int) -> Array:
-    """Returns how often each of `episodes` is in each resample, [N, E]."""
+    # How often each episode is in each resample, [N, E].
     rng = np.random.default_rng((0, scene, _OF_EPISODES))
     shares = np.full(episodes, 1 / episodes)
     return rng.multinomial(episodes, shares, size=resamples).astype(np.float64)
 
 
 def _improvement(ours: Array, theirs: Array) -> Any:
-    """Returns the share of pairs [..., R1] × [..., R2] in which ours is higher; a tie is half."""
+    # The share of pairs [..., R1] × [..., R2] in which ours is higher; a tie is half.
     a, b = ours[..., :, None], theirs[..., None, :]
     return ((a > b) + 0.5 * (a == b)).mean(axis=(-2, -1))
 
 
 class Effect(NamedTuple):
-    """A difference in the mean over scenes, its standard error and degrees of freedom.
-
-    Error and p value are nan where a scene has one run of a side alone.
-    """
+    """A difference in the mean over scenes, its standard error and degrees of freedom."""
 
     value: float
-    error: float
+    error: float  # nan where a scene has one run of a side alone
     freedom: float
 
     @property
@@ -210,11 +196,7 @@ class Effect(NamedTuple):
 
 
 def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
-    """Returns the mean over scenes of the first side's mean minus the second's.
-
-    Args:
-        scenes: for each scene the scores of the runs of both sides, or of one side alone.
-    """
+    """Returns the mean over scenes of the first side's mean minus the second's, if there is one."""
     means = [side[0].mean() - (side[1].mean() if len(side) > 1 else 0.0) for side in scenes]
     parts = [(s.var(ddof=1) / len(s), len(s) - 1) for side in scenes for s in side if len(s) > 1]
     if len(parts) < sum(map(len, scenes)):
@@ -227,11 +209,7 @@ def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Returns p values corrected for their number by Holm's method, nan left as it is.
-
-    >>> holm([0.01, 0.04, 0.03])
-    [0.03, 0.06, 0.06]
-    """
+    """Returns p values corrected for their number by Holm's method, nan left as it is."""
     known = sorted((p, i) for i, p in enumerate(p_values) if not np.isnan(p))
     corrected, worst = list(p_values), 0.0
     for place, (p, i) in enumerate(known):

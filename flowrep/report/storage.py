@@ -39,9 +39,6 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
 
     A folder of packed tables stands for its runs; with a pattern after its name, such as
     `outputs/reference/s_turn_*`, for those with such names.
-
-    Raises:
-        RunFolderError: one of the folders holds no run at all.
     """
     runs: dict[str, Run] = {}  # by path, so that a folder given twice counts once
     warnings: list[str] = []
@@ -53,15 +50,12 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
                 raise RunFolderError(f"'{folder}': no packed run in it has such a name")
             runs |= found
             continue
-        configs = [
-            config
-            for config in sorted(folder.rglob("config.yaml"))
-            if {".hydra", "wandb"}.isdisjoint(config.relative_to(folder).parts)
-        ]
-        if not configs:
+        paths = [config.parent for config in sorted(folder.rglob("config.yaml"))]
+        paths = [p for p in paths if {".hydra", "wandb"}.isdisjoint(p.relative_to(folder).parts)]
+        if not paths:
             what = "holds no run" if folder.exists() else "does not exist"
             raise RunFolderError(f"'{folder}' {what}. Give the folder of a run or of a sweep")
-        for path in (config.parent for config in configs):
+        for path in paths:
             try:
                 runs.setdefault(str(path.resolve()), read_run(path))
             except (RunFolderError, TableError, OSError, UnicodeDecodeError) as error:
@@ -70,11 +64,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
 
 
 def read_run(path: Path) -> Run:
-    """Returns the run in a folder.
-
-    Raises:
-        RunFolderError, TableError: its config or a table is not what a run leaves.
-    """
+    """Returns the run in a folder; raises RunFolderError or TableError for a damaged one."""
     folder = RunFolder.existing(path)
     config, tables = folder.read_config(), (folder.read_episodes(), folder.read_metrics())
     episodes, metrics = ({k: [row[k] for row in t] for k in (t[0] if t else ())} for t in tables)
@@ -109,7 +99,7 @@ def _metric_columns(cells: Cells) -> Columns:
 
 
 def _machine(path: Path) -> dict[str, str]:
-    """Returns what a run was computed with; several machines where it was resumed on another."""
+    # Several machines where it was resumed on another.
     noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
     of_each = {key: dict.fromkeys(str(machine.get(key)) for machine in noted) for key in _MACHINE}
     return {key: " | ".join(found) or "unknown" for key, found in of_each.items()}
@@ -144,10 +134,7 @@ def _of_runs(path: Path) -> dict[str, Cells]:
 
 
 def write_archive(runs: Sequence[Run], folder: Path) -> None:
-    """Packs runs into a folder, byte for byte the same for the same runs.
-
-    A run of the same name that is packed there already is replaced; others stay.
-    """
+    """Packs runs into a folder, in place of those of the same names, the same byte for byte."""
     folder.mkdir(parents=True, exist_ok=True)
     before = read_archive(folder) if is_archive(folder) else []
     kept = dict(sorted({Path(run.name).name: run for run in (*before, *runs)}.items()))

@@ -18,21 +18,15 @@ _LATEX: dict[str, str] = {character: rf"\{character}" for character in "&%$#_{}"
 
 
 class Table(NamedTuple):
-    """Text in rows.
-
-    Args:
-        name: the name of its files.
-        caption: describes the numbers.
-        header: the columns' names; the first column is aligned left, the others right.
-        blocks: (heading, rows) of groups of rows; a heading may be empty.
-        words: indices of further columns that are aligned left.
-    """
+    """Text in rows; `name` is that of its files."""
 
     name: str
     caption: str
     header: tuple[str, ...]
-    blocks: tuple[tuple[str, tuple[tuple[str, ...], ...]], ...]
-    words: tuple[int, ...] = ()
+    blocks: tuple[
+        tuple[str, tuple[tuple[str, ...], ...]], ...
+    ]  # headings, which may be "", and rows
+    words: tuple[int, ...] = ()  # columns that are aligned left, beside the first
 
     @property
     def alignment(self) -> str:
@@ -65,19 +59,15 @@ class Table(NamedTuple):
         """Returns a CSV table; a block's heading is its rows' first cell."""
         text = io.StringIO(newline="")
         writer = csv.writer(text, lineterminator="\n")
-        has_blocks = any(heading for heading, _ in self.blocks)
-        writer.writerow([*(["group"] if has_blocks else []), *self.header])
+        first = 0 if any(heading for heading, _ in self.blocks) else 1
+        writer.writerow(["group", *self.header][first:])
         for heading, rows in self.blocks:
-            writer.writerows([*([heading] if has_blocks else []), *row] for row in rows)
+            writer.writerows([heading, *row][first:] for row in rows)
         return text.getvalue()
 
 
 def latex_text(text: str) -> str:
-    r"""Returns text with LaTeX's special characters escaped.
-
-    >>> print(latex_text("85 % of ego_x"))
-    85 \% of ego\_x
-    """
+    """Returns text with LaTeX's special characters escaped."""
     return "".join(_LATEX.get(character, character) for character in text)
 
 
@@ -86,56 +76,36 @@ def _latex_row(row: Sequence[str]) -> str:
 
 
 def percent(estimate: Estimate, digits: int = 0) -> str:
-    """Returns a share with its interval in %.
-
-    >>> percent(Estimate(0.854, 0.791, 0.901))
-    '85 [79–90]'
-    """
+    """Returns a share with its interval in %, as "85 [79–90]"."""
     value, low, high = (100 * number for number in estimate)
     return f"{value:.{digits}f} [{low:.0f}–{high:.0f}]"
 
 
 def points(estimate: Estimate) -> str:
-    """Returns a difference of shares with its interval in percentage points.
-
-    >>> points(Estimate(0.123, -0.031, 0.2))
-    '+12 [−3, +20]'
-    """
+    """Returns a difference of shares with its interval in percentage points, as "+12 [−3, +20]"."""
     value, low, high = (signed(number) for number in estimate)
     return f"{value} [{low}, {high}]"
 
 
 def ratio(share: Estimate) -> str:
-    """Returns share : rest with its interval.
-
-    >>> ratio(Estimate(0.2, 0.1, 0.5))
-    '0.250 [0.111–1.000]'
-    """
+    """Returns share : rest with its interval, as "0.250 [0.111–1.000]"."""
     value, low, high = (f"{number / (1 - number):.3f}" if number < 1 else "∞" for number in share)
     return f"{value} [{low}–{high}]"
 
 
 def signed(share: float) -> str:
-    """Returns a difference in points with its sign, as text."""
+    """Returns a difference in points with its sign, as "+12"."""
     whole = round(100 * share)
     return f"{'+' if whole > 0 else '−' if whole < 0 else ''}{abs(whole)}"
 
 
 def p_text(p_value: float) -> str:
-    """Returns a p value as text, nothing for one that isn't known.
-
-    >>> p_text(0.0449), p_text(0.0001), p_text(float("nan"))
-    ('0.045', '<0.001', '')
-    """
+    """Returns a p value as text, nothing for one that isn't known."""
     if np.isnan(p_value):
         return ""
     return "<0.001" if p_value < 0.0005 else f"{p_value:.3f}"
 
 
 def listed(names: Sequence[str]) -> str:
-    """Returns names as a list in a sentence.
-
-    >>> listed(["a", "b", "c"]), listed(["a"])
-    ('a, b and c', 'a')
-    """
+    """Returns names as a list in a sentence: a, b and c."""
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -76,11 +76,7 @@ def flow_to_rgb(flow: Any, scale_px: float) -> Image:
 
 
 def flow_wheel(size_px: int, background: tuple[int, int, int] = (255, 255, 255)) -> Image:
-    """Returns the legend of `flow_to_rgb`: a disc whose rim is the scale.
-
-    >>> flow_wheel(65)[32, 64].tolist()  # rightmost point: flow to the right
-    [255, 0, 0]
-    """
+    """Returns the legend of `flow_to_rgb`: a disc whose rim is the scale."""
     axis = np.linspace(-1, 1, size_px, dtype=np.float32)
     u, v = np.meshgrid(axis, axis)
     disc = flow_to_rgb(np.stack([u, v]), scale_px=1.0)
@@ -122,20 +118,17 @@ def representation_strip(
     Args:
         maps: any of rgb (uint8), semantic (ids), depth (metres), raw, ego, obj (pixels), each
             `[C, H, W]`; drawn in this order, other keys are ignored.
-        flow_scale_px: flow at full saturation for raw, ego and obj; printed in the label.
-        depth_range_m: end of the depth colours; printed in the label.
+        flow_scale_px: flow at full saturation for raw, ego and obj; printed below them.
+        depth_range_m: end of the depth colours; printed below them.
 
     Raises:
         ValueError: a map has the wrong shape, or none of the names is present.
     """
+    depth_colours = partial(depth_to_rgb, range_m=depth_range_m)
     tiles: dict[str, tuple[str, Callable[[Any], Image], Note]] = {
         "rgb": ("RGB", lambda rgb: np.moveaxis(_channels("rgb", rgb, 3), 0, -1).astype("u1"), ""),
         "semantic": ("segmentation", classes_to_rgb, ""),
-        "depth": (
-            "depth, logarithmic",
-            partial(depth_to_rgb, range_m=depth_range_m),
-            partial(depth_bar, depth_range_m),
-        ),
+        "depth": ("depth, logarithmic", depth_colours, partial(depth_bar, depth_range_m)),
     }
     for name, scale_px in flow_scale_px.items():
         draw = partial(flow_to_rgb, scale_px=scale_px)
@@ -143,19 +136,14 @@ def representation_strip(
     names = set(maps.keys())
     images = {label: draw(maps[name]) for name, (label, draw, _) in tiles.items() if name in names}
     if not images:
-        raise ValueError(
-            f"nothing to draw: maps has {sorted(map(str, names))}, expected some of {list(tiles)}"
-        )
+        given = sorted(map(str, names))
+        raise ValueError(f"nothing to draw: maps has {given}, expected some of {list(tiles)}")
     notes = {label: note for label, _, note in tiles.values() if note}
     return strip(images, wheel_for=[f"{name} flow" for name in flow_scale_px], notes=notes)
 
 
 def flow_note(scale_px: float) -> str:
-    """Returns the legend of saturation at a scale; it is the square root of the magnitude.
-
-    >>> flow_note(20.0)
-    'full at 20 px, half at 5 px'
-    """
+    """Returns the legend of saturation at a scale; it is the square root of the magnitude."""
     return f"full at {scale_px:g} px, half at {scale_px / 4:g} px"
 
 
@@ -175,16 +163,13 @@ def strip(
 ) -> Image:
     """Returns images side by side, each under its label.
 
-    Small images are enlarged by a whole factor without interpolation. An image may be larger than
-    the others, by `tile_zoom` of their size.
+    Small images are enlarged by a whole factor without interpolation. Those that are larger than
+    the others by that factor, `tile_zoom`, stay as they are.
 
     Args:
-        images: label to image `[H, W, 3]`.
+        images: by label, `[H, W, 3]`.
         wheel_for: labels with the flow wheel beside them.
         notes: by label, the note below it: a text, or a function that draws a legend of a width.
-
-    Raises:
-        ValueError: the images differ in size otherwise.
     """
     height, width, _ = size = min(image.shape for image in images.values())
     zoom = tile_zoom(height, width)
@@ -214,11 +199,7 @@ def strip(
 
 
 def tile_zoom(height: int, width: int) -> int:
-    """Returns by which factor a strip enlarges images of a size.
-
-    >>> tile_zoom(48, 48), tile_zoom(480, 640)
-    (5, 1)
-    """
+    """Returns by which factor a strip enlarges images of a size."""
     return max(1, round(_TILE_PX / max(height, width)))
 
 
@@ -226,10 +207,8 @@ def contact_sheet(rows: Iterable[Image]) -> Image:
     """Returns images stacked vertically, with narrower ones padded with white."""
     rows = list(rows)
     width = max(row.shape[1] for row in rows)
-    filled = [
-        np.pad(r, ((0, _GAP_PX), (0, width - r.shape[1]), (0, 0)), constant_values=255)
-        for r in rows
-    ]
+    fills = [((0, _GAP_PX), (0, width - row.shape[1]), (0, 0)) for row in rows]
+    filled = [np.pad(row, fill, constant_values=255) for row, fill in zip(rows, fills)]
     return np.concatenate(filled)[:-_GAP_PX]
 
 
@@ -242,14 +221,10 @@ def write_png(path: str | Path, image: Image) -> None:
 
 
 class Video:
-    """An mp4 (H.264) that browsers play, written frame by frame.
+    """An mp4 (H.264) that browsers play, written frame by frame, in a folder made if needed.
 
     Odd sizes, which the codec does not support, are padded with a white row or column. Frames of
     other sizes than the first are cut or padded.
-
-    Args:
-        path: the file; its folder is created if needed.
-        fps: frames per second.
     """
 
     def __init__(self, path: str | Path, *, fps: float) -> None:
@@ -264,12 +239,10 @@ class Video:
 
             self._size = (image.shape[0] + 1) // 2 * 2, (image.shape[1] + 1) // 2 * 2
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            options: dict[str, Any] = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
+            options: Any = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
             # Half the time of x264's default at the same error, and no larger.
-            options["output_params"] = ["-preset", "veryfast"]
-            self._writer = imageio.get_writer(
-                self.path, fps=self.fps, macro_block_size=1, **options
-            )
+            options |= {"output_params": ["-preset", "veryfast"], "macro_block_size": 1}
+            self._writer = imageio.get_writer(self.path, fps=self.fps, **options)
         height, width = self._size
         image = image[:height, :width]
         fill = ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0))
@@ -295,7 +268,7 @@ def _text_bar(text: str, width: int, height: int, size: int, grey: int) -> Image
 
 
 def _written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, size: int) -> Image:
-    """Returns an image with texts drawn at positions (x, y), each with its anchor and colour."""
+    # Texts are (text, anchor, colour) by position (x, y).
     from PIL import Image as pillow
     from PIL import ImageDraw, ImageFont
 

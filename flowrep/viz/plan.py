@@ -49,24 +49,18 @@ class Track(NamedTuple):
 def draw_plan(layout: Layout, tracks: Iterable[Track] = (), *, path: str | None = None) -> Figure:
     """Returns a figure of a scene from above, x to the right, y upwards, metres on both axes.
 
-    Args:
-        layout: the scene's layout.
-        tracks: drives, coloured by their outcome.
-        path: the path whose closures are drawn in full; if None, all are drawn faintly.
+    The closures of `path` are drawn in full; if it is None, all are drawn faintly.
     """
     standing = [box.footprint for box in (*layout.buildings, *layout.obstacles)]
     shown = shapely.union_all([layout.drivable, layout.sidewalks, *standing])
     x0, y0, x1, y1 = shown.buffer(_MARGIN_M).bounds
     height = _WIDTH_IN * (y1 - y0) / (x1 - x0) + 1.6
     figure = Figure(figsize=(_WIDTH_IN, min(max(height, 3.0), 11.0)), layout="constrained")
-    axes = figure.add_subplot(
-        xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x (m)", ylabel="y (m)"
-    )
-    seen = _draw_ground(axes, layout)
-    seen |= _draw_solids(axes, layout, path)
+    labels: Any = {"xlabel": "x (m)", "ylabel": "y (m)"}
+    axes = figure.add_subplot(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", **labels)
+    seen = _draw_ground(axes, layout) | _draw_solids(axes, layout, path)
     handles: list[Any] = [Patch(color=colour, label=name) for name, colour in seen.items()]
-    handles += _draw_zones(axes, layout) + _draw_walks(axes, layout)
-    handles += _draw_tracks(axes, tracks)
+    handles += _draw_zones(axes, layout) + _draw_walks(axes, layout) + _draw_tracks(axes, tracks)
     axes.set_title(_words(layout.scene.name) + (f", path {_words(path)}" if path else ""))
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small")
     return figure
@@ -90,12 +84,8 @@ def _fill(axes: Axes, ground: BaseGeometry, colour: Any, **style: Any) -> None:
 
 def _draw_ground(axes: Axes, layout: Layout) -> dict[str, Any]:
     crosswalks = shapely.union_all([area.polygon for area in layout.crosswalks])
-    grounds = {
-        "terrain": layout.terrain,
-        "sidewalk": layout.sidewalks,
-        "road": layout.drivable,
-        "crosswalk": crosswalks,
-    }
+    grounds = {"terrain": layout.terrain, "sidewalk": layout.sidewalks, "road": layout.drivable}
+    grounds["crosswalk"] = crosswalks
     seen = {}
     for name, ground in grounds.items():
         if not ground.is_empty:
@@ -125,7 +115,7 @@ def _draw_solids(axes: Axes, layout: Layout, path: str | None) -> dict[str, Any]
 
 
 def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
-    """Fills zones, names each at its road, and shows with an arrow where vehicles start."""
+    # Each zone is named at its road, and an arrow shows where vehicles start.
     scene, named = layout.scene, set[str]()
     starts = {path.start for path in scene.paths}
     for kind, colour in _ZONE_COLOURS.items():
@@ -143,17 +133,11 @@ def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
             x, y, heading = layout.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
             # Starts to the left of the road and ends to its right: one place may be both.
             reach = _LABEL_PT if name in starts else -_LABEL_PT
-            axes.annotate(
-                _words(name),
-                (x, y),
-                (-reach * math.sin(heading), reach * math.cos(heading)),
-                textcoords="offset points",
-                ha="center",
-                va="center",
-                fontsize="small",
-                bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0},
-                zorder=6,
-            )
+            aside = -reach * math.sin(heading), reach * math.cos(heading)
+            box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0}
+            text: Any = {"ha": "center", "va": "center", "fontsize": "small", "zorder": 6}
+            place = {"xytext": aside, "textcoords": "offset points"}
+            axes.annotate(_words(name), (x, y), bbox=box, **place, **text)
     return [Patch(color=c, label=f"{k} zone") for k, c in reversed(_ZONE_COLOURS.items())]
 
 
