@@ -95,14 +95,11 @@ def styled(font_pt: float = 7.5) -> AbstractContextManager[None]:
         "axes.labelsize": font_pt,
         **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), font_pt - 0.5),
         **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), _TEXT),
-        "axes.edgecolor": _FAINT,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
+        **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+        **dict.fromkeys(("axes.edgecolor", "grid.color"), _FAINT),
         "axes.linewidth": 0.7,
-        "grid.color": _FAINT,
         "grid.alpha": 0.35,
         "grid.linewidth": 0.5,
-        "legend.frameon": False,
         "text.parse_math": False,  # $ is literal
     }
     return mpl.rc_context(settings)
@@ -169,11 +166,8 @@ def _panels(
             spare.set_visible(False)
         for axes, (scene, data) in zip(all_axes, panels):
             draw(axes, data)
-            axes.set_title(words(scene))
-            axes.set_ylim(0, 100)
-            axes.set_yticks(range(0, 101, 25))
+            axes.set(title=words(scene), ylim=(0, 100), yticks=range(0, 101, 25), axisbelow=True)
             axes.grid(axis="y")
-            axes.set_axisbelow(True)
         all_axes[0].set_ylabel("success (% of episodes)")
         _legend(figure, handles)
     return figure
@@ -205,8 +199,7 @@ def _bars(axes: Axes, grid: Grid) -> None:
                 ends = [group - 0.46, group + 0.46]
                 axes.plot(ends, [100 * share] * 2, line, color=_TEXT, linewidth=1.0)
     axes.set_xticks(range(len(grid.conditions)), [c.speed for c in grid.conditions])
-    axes.set_xlim(-0.5, len(grid.conditions) - 0.5)
-    axes.set_xlabel("pedestrians' speed mode")
+    axes.set(xlim=(-0.5, len(grid.conditions) - 0.5), xlabel="pedestrians' speed mode")
     axes.tick_params(axis="x", length=0)
 
 

@@ -43,27 +43,14 @@ _LONGEST_LABEL = 30  # of a config, in a legend
 _ALL = "ego+obj+seg2+depth2"
 
 # The paper's comparisons: name, title, stacks, and differences (first, second).
+_OF_FLOWS = (("ego+obj", "ego"), ("ego+obj", "raw"), ("ego+obj", "obj"), ("raw", "ego"))
+_OF_ADDED = (
+    ("ego+obj+seg2", "seg2"), ("ego+obj+depth2", "depth2"), ("ego+obj+seg2", "ego+obj"),
+    ("ego+obj+depth2", "ego+obj"), (_ALL, "ego+obj"), ("ego+obj", "seg2"), ("ego+obj", "depth2"),
+)  # fmt: skip
 _EXPERIMENTS = (
-    (
-        "flow_composition",
-        "Composition of the flow maps",
-        FLOW_STACKS,
-        (("ego+obj", "ego"), ("ego+obj", "raw"), ("ego+obj", "obj"), ("raw", "ego")),
-    ),
-    (
-        "complementary",
-        "Flow beside segmentation and depth",
-        COMPLEMENTARY_STACKS,
-        (
-            ("ego+obj+seg2", "seg2"),
-            ("ego+obj+depth2", "depth2"),
-            ("ego+obj+seg2", "ego+obj"),
-            ("ego+obj+depth2", "ego+obj"),
-            (_ALL, "ego+obj"),
-            ("ego+obj", "seg2"),
-            ("ego+obj", "depth2"),
-        ),
-    ),
+    ("flow_composition", "Composition of the flow maps", FLOW_STACKS, _OF_FLOWS),
+    ("complementary", "Flow beside segmentation and depth", COMPLEMENTARY_STACKS, _OF_ADDED),
 )
 _TABLE_III = ("ego+obj", "depth2", "seg2", "ego+obj+depth2", "ego+obj+seg2", _ALL)
 

@@ -86,7 +86,7 @@ class Bootstrap(NamedTuple):
     def mean(self, scenes: Sequence[Array], least: float = -1.0) -> Estimate:
         """Returns the same of outcomes from `least` to 1, such as changes between conditions."""
         value = np.mean([rates(outcomes).mean() for outcomes in scenes])
-        drawn = [self._rates(k, outcomes, [len(outcomes)])[0] for k, outcomes in enumerate(scenes)]
+        drawn = [self._rates(k, outcomes)[0] for k, outcomes in enumerate(scenes)]
         means = np.mean([d.mean(axis=-1) for d in drawn], axis=0)
         return _estimate(float(value), means, sum(s.shape[1] for s in scenes), least)
 
@@ -111,10 +111,7 @@ class Bootstrap(NamedTuple):
         Column e is the same episode in both, so that its difficulty is no part of the difference.
         """
         own = [(rates(a), rates(b)) for a, b in scenes]
-        drawn = [
-            self._rates(k, np.concatenate(pair), [len(side) for side in pair])
-            for k, pair in enumerate(scenes)
-        ]
+        drawn = [self._rates(k, *pair) for k, pair in enumerate(scenes)]
         difference, differences = (
             np.mean([a.mean(axis=-1) - b.mean(axis=-1) for a, b in pairs], axis=0)
             for pairs in (own, drawn)
@@ -131,13 +128,12 @@ class Bootstrap(NamedTuple):
             runs,
         )
 
-    def _rates(self, scene: int, outcomes: Array, sides: Sequence[int]) -> list[Array]:
-        # [N, R] of resampled runs of each side, over the same drawn episodes. `outcomes` is of all
-        # sides, stacked; `sides` has the number of runs of each.
+    def _rates(self, scene: int, *sides: Array) -> list[Array]:
+        # [N, R] of resampled runs of each side, over the same drawn episodes.
         rng = np.random.default_rng((0, scene, _OF_RUNS))
-        weights = _episode_weights(scene, outcomes.shape[1], self.resamples)
+        weights = _episode_weights(scene, sides[0].shape[1], self.resamples)
         drawn = []
-        for side in np.split(outcomes, np.cumsum(sides)[:-1]):
+        for side in sides:
             chosen = rng.integers(len(side), size=(self.resamples, len(side)))
             drawn.append(np.take_along_axis(rates(side, weights), chosen, axis=1))
         return drawn

@@ -8,36 +8,31 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pydantic
 import torch
 from numpy.typing import NDArray
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    PositiveFloat,
-    PositiveInt,
-    ValidationError,
-    field_validator,
-)
 
 from flowrep.geometry import CameraAxes, PoseDirection, PoseLayout, adapt_pose
 from flowrep.sequences.files import read_table
 from flowrep.sequences.recording import Pose, SequenceError
 
+Matrix = NDArray[np.float64]
 
-class Camera(BaseModel):
+
+class Camera(pydantic.BaseModel):
     """A camera in `intrinsics.json`, see docs/factorize.md."""
 
-    model_config = ConfigDict(allow_inf_nan=False)
+    model_config = pydantic.ConfigDict(allow_inf_nan=False)
 
-    width: PositiveInt
-    height: PositiveInt
-    fx: PositiveFloat
+    width: pydantic.PositiveInt
+    height: pydantic.PositiveInt
+    fx: pydantic.PositiveFloat
     fy: float
     cx: float
     cy: float
     first_pixel_centre: Literal[0.0, 0.5]  # type: ignore[valid-type]
 
-    @field_validator("fy")
+    @pydantic.field_validator("fy")
     @classmethod
     def _is_right_handed(cls, fy: float) -> float:
         if fy > 0:
@@ -48,7 +43,7 @@ class Camera(BaseModel):
         )
 
     @property
-    def K(self) -> NDArray[np.float64]:
+    def K(self) -> Matrix:
         """In flowrep's convention."""
         shift = 0.5 - self.first_pixel_centre
         return intrinsics(self.fx, self.fy, self.cx + shift, self.cy + shift)
@@ -84,17 +79,17 @@ def read_cameras(path: Path) -> Cameras:
         raise SequenceError(path, f"no such file; {remedy}")
     try:
         return Cameras.model_validate_json(path.read_bytes())
-    except ValidationError as error:
+    except pydantic.ValidationError as error:
         lines = [f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors()]
         raise SequenceError(path, f"{', '.join(lines)}; {remedy}") from None
 
 
-def intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Matrix:
     """Returns K `[3, 3]`."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def opencv_intrinsics(numbers: Sequence[float]) -> NDArray[np.float64]:
+def opencv_intrinsics(numbers: Sequence[float]) -> Matrix:
     """Returns K from fx, fy, cx, cy of a calibration with the centre of pixel (0, 0) at (0, 0).
 
     >>> opencv_intrinsics([525.0, 525.0, 319.5, 239.5])[:2, 2]
@@ -161,11 +156,7 @@ class Registration:
     """
 
     def __init__(
-        self,
-        K_depth: NDArray[np.float64],
-        K_colour: NDArray[np.float64],
-        colour_from_depth: NDArray[np.float64],
-        size: tuple[int, int],
+        self, K_depth: Matrix, K_colour: Matrix, colour_from_depth: Pose, size: tuple[int, int]
     ) -> None:
         self.size = size
         self.depth_from_colour = np.linalg.inv(colour_from_depth)

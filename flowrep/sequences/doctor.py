@@ -43,12 +43,9 @@ _USUAL_FACTORS = (0.001, 0.01, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 100.0, 1000.0)
 _SAME_AXES_DEG = 15.0
 
 _ASSUMED = {
-    "pose_direction": "camera_to_world",
-    "pose_axes": "opencv",
-    "depth_kind": "z",
-    "flow_direction": "forward",
-    "flow_channels": "uv",
-}
+    "pose_direction": "camera_to_world", "pose_axes": "opencv", "depth_kind": "z",
+    "flow_direction": "forward", "flow_channels": "uv",
+}  # fmt: skip
 
 
 class _Pair(NamedTuple):
@@ -95,26 +92,19 @@ def mistakes(given: Mapping[str, str], *, flow_is_recorded: bool = True) -> dict
     if flow_is_recorded:
         to = {"backward": "away from", "forward": "back to"}[given["flow_direction"]]
         other = "forward" if given["flow_direction"] == "backward" else "backward"
-        found[f"flow_direction={other}"] = Mistake(
-            f"the flow points {to} the previous frame", lambda pair: pair._replace(raw=-pair.raw)
-        )
+        text = f"the flow points {to} the previous frame"
+        found[f"flow_direction={other}"] = Mistake(text, lambda p: p._replace(raw=-p.raw))
         other = "row_column" if given["flow_channels"] == "uv" else "uv"
-        found[f"flow_channels={other}"] = Mistake(
-            f"the flow's channels are {other}", lambda pair: pair._replace(raw=pair.raw.flip(0))
-        )
+        text = f"the flow's channels are {other}"
+        found[f"flow_channels={other}"] = Mistake(text, lambda p: p._replace(raw=p.raw.flip(0)))
     else:
-        found["frames in reverse order"] = Mistake(
-            "the poses are in the reverse order of the pictures",
-            lambda pair: pair._replace(poses=pair.poses[::-1]),
-        )
-    found["rotations transposed"] = Mistake(
-        "the rotations are stored column by column, or inverted", _of_poses(_transposed)
-    )
+        text = "the poses are in the reverse order of the pictures"
+        found["frames in reverse order"] = Mistake(text, lambda p: p._replace(poses=p.poses[::-1]))
+    text = "the rotations are stored column by column, or inverted"
+    found["rotations transposed"] = Mistake(text, _of_poses(_transposed))
     for factor, size in ((2.0, "twice"), (0.5, "half")):
-        found[f"intrinsics times {factor:g}"] = Mistake(
-            f"the pictures are {size} as large as those that the intrinsics belong to",
-            partial(_scaled, factor),
-        )
+        text = f"the pictures are {size} as large as those that the intrinsics belong to"
+        found[f"intrinsics times {factor:g}"] = Mistake(text, partial(_scaled, factor))
     return found
 
 
@@ -330,12 +320,9 @@ def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
     """Returns the camera's axes by which the recorded motions become the estimated ones."""
     # Kabsch's rotation between rotation vectors and translations, each in units of its spread. It
     # isn't determined if the camera always moves along and turns about one line.
-    known = [
-        (geometry.relative_motion(*pair.poses, dtype=torch.float64), pair.estimated)
-        for pair in pairs
-        if pair.estimated is not None
-    ]
-    vectors = np.array([list(map(_vectors, motions)) for motions in known])
+    known = [pair for pair in pairs if pair.estimated is not None]
+    recorded = [geometry.relative_motion(*pair.poses, dtype=torch.float64) for pair in known]
+    vectors = np.array([(_vectors(r), _vectors(p.estimated)) for r, p in zip(recorded, known)])
     spread = np.sqrt(np.square(vectors).sum(-1).mean(0)) if len(vectors) > 1 else np.zeros(1)
     if not spread.all():
         return {}
@@ -355,7 +342,7 @@ def _other_axes(pairs: list[_Pair]) -> dict[str, Mistake]:
     return {"other axes": Mistake(says, _of_poses(lambda pose: pose @ given_from_opencv))}
 
 
-def _vectors(motion: Tensor) -> NDArray[np.float64]:
+def _vectors(motion: Any) -> NDArray[np.float64]:
     matrix = motion.numpy()
     return np.stack([cv2.Rodrigues(matrix[:3, :3])[0].ravel(), matrix[:3, 3]])
 

@@ -77,13 +77,10 @@ class Frames(Recording):
             self._registration = Registration(self._camera.K, self.K, extrinsics, colour.size)
         unit_m = depth_unit_m or (1.0 if self._depths[0].suffix.lower() == ".npy" else 0.001)
         self.conventions = {
-            "pose_direction": pose_direction,
-            "pose_axes": pose_axes,
-            "depth_kind": depth_kind,
-            "depth_unit_m": str(unit_m),
-            "flow_direction": flow_direction,
-            "flow_channels": flow_channels,
-        }
+            "pose_direction": pose_direction, "pose_axes": pose_axes,
+            "depth_kind": depth_kind, "depth_unit_m": str(unit_m),
+            "flow_direction": flow_direction, "flow_channels": flow_channels,
+        }  # fmt: skip
 
     def _by_stem(self, kind: str, suffixes: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
         folder = self.folder / kind
@@ -108,22 +105,17 @@ class Frames(Recording):
             depth = self._registration(depth)
             if world_from_cam is not None:
                 world_from_cam = world_from_cam @ self._registration.depth_from_colour
-        rgb, raw = self._rgbs.get(name), None
+        raw = since = None
         if self.has_flow and index > 0:
             path = self._flows[name]
             read = files.read_kitti_flow if path.suffix.lower() == ".png" else files.read_flo
             raw = geometry.adapt_flow(torch.from_numpy(read(path)), **self._flow_options).numpy()
-        return Frame(
-            name=name,
-            source=depth_path if rgb is None else rgb,
-            world_from_cam=world_from_cam,
-            K=self.K,
-            depth=depth,
-            rgb=None if rgb is None else files.read_rgb(rgb),
-            timestamp_s=None if self._times is None else float(self._times[index]),
-            raw=raw,
-            raw_since=None if raw is None else self._depths[index - 1].stem,
-        )
+            since = self._depths[index - 1].stem
+        source = self._rgbs.get(name, depth_path)
+        rgb = files.read_rgb(source) if self._rgbs else None
+        time_s = None if self._times is None else float(self._times[index])
+        flow: Any = {"raw": raw, "raw_since": since}
+        return Frame(name, source, world_from_cam, self.K, depth, rgb, time_s, **flow)
 
 
 class Zed(Recording):
@@ -155,14 +147,10 @@ class Zed(Recording):
         number = picture.stem.removeprefix("left")
         if number not in self._depths:
             raise SequenceError(self.folder, f"lacks depth{number} for {picture.name}")
-        return Frame(
-            name=number,
-            source=picture,
-            world_from_cam=self._poses[index] if self.has_poses else None,
-            K=self._camera.K,
-            depth=measured(files.read_depth(self._depths[number], self._camera.size)),
-            rgb=files.read_rgb(picture),
-        )
+        world_from_cam = self._poses[index] if self.has_poses else None
+        depth = measured(files.read_depth(self._depths[number], self._camera.size))
+        rgb = files.read_rgb(picture)
+        return Frame(number, picture, world_from_cam, self._camera.K, depth, rgb)
 
 
 def measured(depth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -11,15 +11,8 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from flowrep.progress import StopRequest, Stopwatch
+from flowrep.sequences import factorization
 from flowrep.sequences.doctor import Diagnosis, Doctor
-from flowrep.sequences.factorization import (
-    FlowSource,
-    MotionSource,
-    factorize_pair,
-    pairs,
-    recorded_flow,
-    repeats,
-)
 from flowrep.sequences.output import Output
 from flowrep.sequences.recording import Frame, Recording, Stream
 
@@ -35,8 +28,8 @@ class Job:
     """
 
     stream: Stream
-    flow_source: FlowSource
-    motion_source: MotionSource
+    flow_source: factorization.FlowSource
+    motion_source: factorization.MotionSource
     output: Output
     _: KW_ONLY
     start: int = 0
@@ -53,7 +46,8 @@ class Job:
         """Returns what the doctor says of pairs spread over the recording, None without poses."""
         if not isinstance(self.stream, Recording) or not self.stream.has_poses:
             return None
-        doctor = Doctor(self.stream.conventions, flow_is_recorded=self.flow_source is recorded_flow)
+        is_recorded = self.flow_source is factorization.recorded_flow
+        doctor = Doctor(self.stream.conventions, flow_is_recorded=is_recorded)
         used = self._indices
         places = np.linspace(1, len(used), DOCTOR_PAIRS, endpoint=False).astype(int)
         with self.clock("doctor"):
@@ -61,8 +55,8 @@ class Job:
                 # A pair that hardly moves, or repeats a picture, is passed over for the next one.
                 for place in range(first, min(end, first + DOCTOR_TRIES)):
                     both = (self.stream[i] for i in used[place - 1 : place + 1])
-                    _, (previous, current) = pairs(both)
-                    if previous is None or repeats(previous, current):
+                    _, (previous, current) = factorization.pairs(both)
+                    if previous is None or factorization.repeats(previous, current):
                         continue
                     if doctor.look(previous, current, self.flow_source(previous, current)):
                         break
@@ -73,15 +67,15 @@ class Job:
         is_recording = isinstance(self.stream, Recording)
         total = len(self._indices) if is_recording else None
         with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
-            indices = count(self.start, self.stride)
-            for index, (previous, current) in zip(indices, pairs(self._frames())):
+            indices, pairs = count(self.start, self.stride), factorization.pairs(self._frames())
+            for index, (previous, current) in zip(indices, pairs):
                 if previous is not None:
                     with self.clock("raw flow"):
                         raw = self.flow_source(previous, current)
                     with self.clock("motion"):
                         motion = self.motion_source(previous, current, raw)
                     with self.clock("factorising"):
-                        made = factorize_pair(previous, current, raw, motion)
+                        made = factorization.factorize_pair(previous, current, raw, motion)
                     with self.clock("writing"):
                         self.output.append(index, made)
                 bar.update()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -73,11 +74,15 @@ class Kitti(Recording):
         rgb = files.read_rgb(picture)
         K, focal_baseline, cam_from_cam0 = self._camera(pair)
         depth = np.full(rgb.shape[:2], np.nan, dtype=np.float32)
+        raw = since = None
         if is_current:
             disparity = files.read_png(self.folder / "disp_occ_0" / f"{name}.png", np.uint16)
             # Disparity is in 1/256 px, 0 where it is missing.
             known = np.where(disparity == 0, np.nan, disparity / 256)
             depth = (focal_baseline / known).astype(np.float32)
+            # Given is p_11 - p_10. Here 11 is the frame before, so that p_t - p_t' is the opposite.
+            raw = -files.read_kitti_flow(self.folder / "flow_occ" / f"{name}.png")
+            since = f"{pair}_11"
         world_from_cam = None
         if self.has_poses:
             cam0_from_velo = self._rigid("calib_velo_to_cam", pair)
@@ -89,19 +94,8 @@ class Kitti(Recording):
             packet = files.read_table(path, _OXTS_NUMBERS)[0]
             world_from_imu = _pose_from_oxts(packet, latitude_deg)
             world_from_cam = world_from_imu @ np.linalg.inv(cam_from_imu)
-        # Given is p_11 - p_10. Here 11 is the frame before, so that p_t - p_t' is the opposite.
-        flow = self.folder / "flow_occ" / f"{name}.png"
-        return Frame(
-            name=name,
-            source=picture,
-            world_from_cam=world_from_cam,
-            K=K,
-            depth=depth,
-            rgb=rgb,
-            raw=-files.read_kitti_flow(flow) if is_current else None,
-            raw_since=f"{pair}_11" if is_current else None,
-            clip=index // 2,
-        )
+        flow: Any = {"raw": raw, "raw_since": since}
+        return Frame(name, picture, world_from_cam, K, depth, rgb, clip=index // 2, **flow)
 
     def _camera(self, pair: str) -> tuple[NDArray[np.float64], float, Pose]:
         """Returns K, baseline times fx (px m), and `cam_from_cam0` of the left colour camera."""
@@ -129,11 +123,8 @@ def _pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float) -> Pose:
     pose = np.eye(4)
     roll, pitch, yaw = (cv2.Rodrigues(a * axis)[0] for a, axis in zip(angles, np.eye(3)))
     pose[:3, :3] = yaw @ pitch @ roll
-    pose[:3, 3] = (
-        scale * math.radians(longitude),
-        scale * math.log(math.tan(math.radians(90 + latitude) / 2)),
-        altitude,
-    )
+    north = scale * math.log(math.tan(math.radians(90 + latitude) / 2))
+    pose[:3, 3] = scale * math.radians(longitude), north, altitude
     return pose
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import shutil
@@ -19,6 +18,7 @@ from flowrep.extras import require
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
 from flowrep.sequences.files import Flow, write_flo, write_kitti_flow, write_picture
 from flowrep.sequences.recording import Pose, SequenceError
+from flowrep.tables import append_rows
 
 FLOW_NAMES = ("raw", "ego", "obj")
 _MOVING_SPREAD = 3.0
@@ -76,12 +76,7 @@ class Output:
         if self._rerun is not None:
             self._rerun.append(index, made)
         self.rows.append(score(index, made, moving_px=self.moving_px))
-        # Opened anew for each frame, so that a killed job leaves the rows that are done.
-        with (self.partial / "frames.csv").open("a", newline="", encoding="utf-8") as file:
-            table = csv.DictWriter(file, self.rows[-1].keys())
-            if len(self.rows) == 1:
-                table.writeheader()
-            table.writerow(self.rows[-1])
+        append_rows(self.partial / "frames.csv", self.rows[-1:])  # a killed job leaves what is done
 
     def close(self) -> None:
         """Completes the video and the rerun recording; without any frame the folder is removed."""

@@ -44,8 +44,8 @@ class Sintel(Recording):
 
     def _read(self, index: int) -> Frame:
         picture = self._pictures[index]
-        K, pose = _read_cam(self._file("camdata_left", picture, ".cam"))
-        depth = self._file("depth", picture, ".dpt")
+        K, world_from_cam = _read_cam(self._file("camdata_left", picture, ".cam"))
+        depth = files.read_tagged_floats(self._file("depth", picture, ".dpt"), 1)[..., 0]
         raw = since = None
         if self.has_flow and index > 0:
             number = picture.stem.removeprefix("frame_")
@@ -55,16 +55,8 @@ class Sintel(Recording):
             invalid = self._file("invalid", picture, ".png")
             if invalid.is_file():
                 raw[:, files.read_png(invalid, np.uint8) != 0] = np.nan
-        return Frame(
-            name=picture.stem,
-            source=picture,
-            world_from_cam=pose,
-            K=K,
-            depth=files.read_tagged_floats(depth, channels=1)[..., 0],
-            rgb=files.read_rgb(picture),
-            raw=raw,
-            raw_since=since,
-        )
+        rgb = files.read_rgb(picture)
+        return Frame(picture.stem, picture, world_from_cam, K, depth, rgb, raw=raw, raw_since=since)
 
     def _file(self, kind: str, picture: Path, suffix: str) -> Path:
         return self.folder / kind / self.scene / f"{picture.stem}{suffix}"
@@ -108,17 +100,11 @@ class TartanAir(Recording):
             hidden = flow.with_name(f"{number}_{since}_mask.npy")
             if hidden.is_file():
                 raw[:, files.read_npy(hidden) != 0] = np.nan
-        return Frame(
-            name=number,
-            source=self._pictures[index],
-            world_from_cam=self._poses[index],
-            # 90 degrees of horizontal view, a centred axis: 320, 320, 320, 240 at 640 x 480.
-            K=intrinsics(width / 2, width / 2, width / 2, height / 2),
-            depth=depth,
-            rgb=files.read_rgb(self._pictures[index]),
-            raw=raw,
-            raw_since=since,
-        )
+        # 90 degrees of horizontal view, a centred axis: 320, 320, 320, 240 at 640 x 480.
+        K = intrinsics(width / 2, width / 2, width / 2, height / 2)
+        picture, pose = self._pictures[index], self._poses[index]
+        rgb = files.read_rgb(picture)
+        return Frame(number, picture, pose, K, depth, rgb, raw=raw, raw_since=since)
 
     def _number(self, index: int) -> str:
         return self._pictures[index].stem.removesuffix("_left")
@@ -146,20 +132,17 @@ class VKitti2(Recording):
         number, path = int(name), self.folder / "extrinsic.txt"
         if number not in self._poses or number not in self._intrinsics:
             raise SequenceError(path, f"has no pose or intrinsics of frame {number}")
-        depth = files.read_png(self._maps("depth") / f"depth_{name}.png", np.uint16)
-        flow = self._maps("backwardFlow") / f"backwardFlow_{name}.png"
-        has_flow = self.has_flow and index > 0
-        return Frame(
-            name=name,
-            source=picture,
-            world_from_cam=as_pose(self._poses[number], path, direction="world_to_camera"),
-            K=opencv_intrinsics(self._intrinsics[number].tolist()),
-            depth=files.depth_from_integers(depth, 0.01, no_surface=65535),
-            rgb=files.read_rgb(picture),
+        pose = as_pose(self._poses[number], path, direction="world_to_camera")
+        K = opencv_intrinsics(self._intrinsics[number].tolist())
+        centimetres = files.read_png(self._maps("depth") / f"depth_{name}.png", np.uint16)
+        depth = files.depth_from_integers(centimetres, 0.01, no_surface=65535)
+        raw = since = None
+        if self.has_flow and index > 0:
             # Stored is the flow to the previous frame, on this one's grid.
-            raw=-_read_vkitti_flow(flow) if has_flow else None,
-            raw_since=f"{number - 1:0{len(name)}d}" if has_flow else None,
-        )
+            raw = -_read_vkitti_flow(self._maps("backwardFlow") / f"backwardFlow_{name}.png")
+            since = f"{number - 1:0{len(name)}d}"
+        rgb = files.read_rgb(picture)
+        return Frame(name, picture, pose, K, depth, rgb, raw=raw, raw_since=since)
 
     def _maps(self, kind: str) -> Path:
         return self.folder / "frames" / kind / f"Camera_{self.camera}"

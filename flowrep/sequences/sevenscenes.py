@@ -65,11 +65,5 @@ class SevenScenes(Recording):
             path = self.folder / f"{name}.pose.txt"
             pose = as_pose(read_table(path, 4).ravel(), path)
             world_from_cam = pose @ register.depth_from_colour
-        return Frame(
-            name=name,
-            source=colour,
-            world_from_cam=world_from_cam,
-            K=self.K,
-            depth=register(depth_from_integers(stored, 0.001, missing=(0, 65535))),
-            rgb=rgb,
-        )
+        depth = register(depth_from_integers(stored, 0.001, missing=(0, 65535)))
+        return Frame(name, colour, world_from_cam, self.K, depth, rgb)

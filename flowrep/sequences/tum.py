@@ -13,6 +13,9 @@ from flowrep.sequences.calibration import as_pose, check_numbers, opencv_intrins
 from flowrep.sequences.files import depth_from_integers, read_lines, read_png, read_rgb, read_table
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
 
 class Tum(Recording):
     """A folder with `rgb.txt`, `depth.txt` and, for poses, `groundtruth.txt`.
@@ -71,17 +74,11 @@ class Tum(Recording):
         if self.has_poses:
             before, after = (self._poses[of[place]] for of in (self._before, self._after))
             world_from_cam = interpolated_pose(before, after, float(self._share[place]))
-        return Frame(
-            name=rgb.stem,
-            source=rgb,
-            world_from_cam=world_from_cam,
-            K=self.K,
-            depth=depth_from_integers(stored, 1 / 5000, missing=(0,)),  # 5000 is a metre
-            rgb=read_rgb(rgb),
-            timestamp_s=float(self._times[place]),
-        )
+        depth = depth_from_integers(stored, 1 / 5000, missing=(0,))  # 5000 is a metre
+        time_s = float(self._times[place])
+        return Frame(rgb.stem, rgb, world_from_cam, self.K, depth, read_rgb(rgb), time_s)
 
-    def _index(self, name: str) -> tuple[NDArray[np.float64], list[Path]]:
+    def _index(self, name: str) -> tuple[Floats, list[Path]]:
         path = self.folder / name
         lines = [line.split(maxsplit=1) for line in read_lines(path)]
         try:
@@ -93,9 +90,7 @@ class Tum(Recording):
         _check_ascending(path, times)
         return times, [self.folder / name for _, name in lines]
 
-    def _between(
-        self, pose_times: NDArray[np.float64], times_s: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    def _between(self, pose_times: Floats, times_s: Floats) -> tuple[Indices, Indices, Floats]:
         # Poses before and after each time, -1 if too far, and the share of the way between them.
         if not self.interpolate:
             chosen = nearest(pose_times, times_s, self.tolerance_s)
@@ -108,14 +103,12 @@ class Tum(Recording):
         return np.where(inside, before, -1), after, gaps[0] / span
 
 
-def _check_ascending(path: Path, times_s: NDArray[np.float64]) -> None:
+def _check_ascending(path: Path, times_s: Floats) -> None:
     if not (np.diff(times_s) >= 0).all():  # nan compares False
         raise SequenceError(path, "times go backwards, or are not numbers")
 
 
-def nearest(
-    times_s: NDArray[np.float64], wanted_s: NDArray[np.float64], tolerance_s: float
-) -> NDArray[np.int64]:
+def nearest(times_s: Floats, wanted_s: Floats, tolerance_s: float) -> Indices:
     """Returns the index of the time nearest to each wanted one, -1 if none is near enough."""
     after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
     before = (after - 1).clip(0)

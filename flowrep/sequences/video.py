@@ -45,15 +45,11 @@ class StillVideo:
                 if picture is None:
                     break
                 height, width = picture.shape[:2]
-                yield Frame(
-                    name=f"{number:06d}",
-                    source=self.source,
-                    world_from_cam=np.eye(4),
-                    # A camera that stands still has no ego flow with any depth and any K.
-                    K=intrinsics(width, width, width / 2, height / 2),
-                    depth=np.full((height, width), np.inf, dtype=np.float32),
-                    rgb=np.ascontiguousarray(picture[..., ::-1]),
-                )
+                # A camera that stands still has no ego flow with any depth and any K.
+                K = intrinsics(width, width, width / 2, height / 2)
+                depth = np.full((height, width), np.inf, dtype=np.float32)
+                rgb = np.ascontiguousarray(picture[..., ::-1])
+                yield Frame(f"{number:06d}", self.source, np.eye(4), K, depth, rgb)
             if number == 0:
                 raise SequenceError(self.source, "OpenCV reads no picture of it as a video")
         finally:

@@ -124,8 +124,8 @@ def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
             if kind == "start":
                 x, y, yaw, _ = layout.start_state(name)
                 ahead = x + 8.0 * math.cos(yaw), y + 8.0 * math.sin(yaw)
-                style = {"arrowstyle": "->", "color": "black", "lw": 1.5}
-                axes.annotate("", ahead, (x, y), arrowprops=style, zorder=5)
+                arrow = {"arrowstyle": "->", "color": "black", "lw": 1.5}
+                axes.annotate("", ahead, (x, y), arrowprops=arrow, zorder=5)
             if name in named:
                 continue
             named.add(name)
@@ -135,9 +135,10 @@ def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
             reach = _LABEL_PT if name in starts else -_LABEL_PT
             aside = -reach * math.sin(heading), reach * math.cos(heading)
             box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0}
-            text: Any = {"ha": "center", "va": "center", "fontsize": "small", "zorder": 6}
-            place = {"xytext": aside, "textcoords": "offset points"}
-            axes.annotate(_words(name), (x, y), bbox=box, **place, **text)
+            style: Any = {"ha": "center", "va": "center", "textcoords": "offset points"}
+            axes.annotate(
+                _words(name), (x, y), aside, fontsize="small", bbox=box, zorder=6, **style
+            )
     return [Patch(color=c, label=f"{k} zone") for k, c in reversed(_ZONE_COLOURS.items())]
 
 
