@@ -10,9 +10,9 @@ pytest.importorskip("scipy", reason="reports are an extra")
 
 from flowrep.report.runs import Condition, change, curve_of, outcomes_of, side_by_side
 from flowrep.report.sections import Settings, assemble
-from flowrep.report.statistics import Bootstrap
+from flowrep.report.statistics import Bootstrap, Estimate
 from flowrep.report.storage import read_runs
-from flowrep.report.tables import Table
+from flowrep.report.tables import Table, listed, p_text, percent, points, ratio
 from tests.report.folders import config_of, rows_of, run_in, write_run
 
 ASK = Settings("greedy", Bootstrap(100))
@@ -205,6 +205,14 @@ def test_a_learning_curve_is_of_the_speed_and_frame_rate_of_training(tmp_path):
     write_run(tmp_path / "run", config, rows, [{"frames": 500, "success": 0.1}])
     curve = curve_of(read_runs([tmp_path])[0][0])
     assert curve == ([(500, 0.5), (1000, 0.75)], [(500, 0.1)])
+
+
+def test_numbers_are_told_with_their_intervals():
+    assert percent(Estimate(0.854, 0.791, 0.901)) == "85 [79–90]"
+    assert points(Estimate(0.123, -0.031, 0.2)) == "+12 [−3, +20]"
+    assert ratio(Estimate(0.2, 0.1, 1.0)) == "0.250 [0.111–∞]"
+    assert [p_text(p) for p in (0.0449, 0.0001, math.nan)] == ["0.045", "<0.001", ""]
+    assert (listed(["a", "b", "c"]), listed(["a"])) == ("a, b and c", "a")
 
 
 def test_a_table_is_latex_that_compiles_and_csv_that_reads():

@@ -156,3 +156,4 @@ def test_holm_leaves_out_what_is_not_known():
     assert holm([0.02, math.nan, 0.01])[::2] == [0.02, 0.02]
     assert math.isnan(holm([0.02, math.nan])[1])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([0.01, 0.04, 0.03]) == [0.03, 0.06, 0.06]  # in the order of the p values

@@ -13,22 +13,7 @@ import torch
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
-from flowrep.geometry import (
-    adapt_pose,
-    ego_flow,
-    invert_rigid,
-    relative_motion,
-    rigid_flow,
-)
-from flowrep.sequences import (
-    Doctor,
-    EstimatedFlowSource,
-    Frame,
-    Frames,
-    SevenScenes,
-    diagnose,
-    recorded_flow,
-)
+from flowrep import geometry, sequences
 from flowrep.transforms import DIS
 from tests.geometry.scenes import rigid
 from tests.sequences.synthetic import SEVEN_SCENES, needs_7scenes
@@ -52,12 +37,12 @@ class Case:
 
     def shown_to(self, doctor):
         poses, z, camera = (self.before, self.now), self.depth[0].numpy(), self.K.double().numpy()
-        frames = [Frame("", Path(), pose.numpy(), camera, z) for pose in poses]
+        frames = [sequences.Frame("", Path(), pose.numpy(), camera, z) for pose in poses]
         doctor.look(*frames, self.raw.numpy())
         return doctor
 
     def diagnosis(self, *conventions, flow_is_recorded=True):
-        doctor = Doctor(*conventions, flow_is_recorded=flow_is_recorded)
+        doctor = sequences.Doctor(*conventions, flow_is_recorded=flow_is_recorded)
         return self.shown_to(doctor).diagnosis()
 
 
@@ -67,9 +52,9 @@ def case_of(before, now, seed=0):
     depth = torch.linspace(2, 9, HEIGHT)[None, :, None] + rough
     instance = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.uint8)
     instance[0, 20:42, 5:38] = 1
-    camera = relative_motion(before, now)
+    camera = geometry.relative_motion(before, now)
     motions = torch.stack([camera, camera @ rigid((0.0, 0.0, 0.0), (0.3, 0.1, 0.0)).float()])
-    return Case(rigid_flow(depth, instance, K, motions).flow, depth, before, now)
+    return Case(geometry.rigid_flow(depth, instance, K, motions).flow, depth, before, now)
 
 
 @pytest.fixture
@@ -87,7 +72,7 @@ def changed(case, **changes):
 
 def turned(axes):
     """Returns what makes poses of a camera with OpenCV's axes those of one with others."""
-    given_from_opencv = adapt_pose(torch.eye(4), axes=axes)
+    given_from_opencv = geometry.adapt_pose(torch.eye(4), axes=axes)
     return lambda pose: pose @ given_from_opencv.mT
 
 
@@ -97,23 +82,18 @@ def ray_length(z):
     return z * (1 + x**2 + y**2).sqrt()
 
 
-def transposed(pose):
-    turned = pose.clone()
-    turned[:3, :3] = pose[:3, :3].mT
-    return turned
-
-
+ROTATION = torch.arange(4) < torch.tensor([3, 3, 3, 0])[:, None]  # of a pose
 # What the data are, by what has to be given for them.
 WRONG = {
-    "pose_direction=world_to_camera": {"pose": invert_rigid},
+    "pose_direction=world_to_camera": {"pose": geometry.invert_rigid},
     "flow_direction=backward": {"raw": torch.neg},
     "flow_channels=row_column": {"raw": lambda raw: raw.flip(0)},
     "pose_axes=opengl": {"pose": turned("opengl")},
     "pose_axes=x_forward_z_up": {"pose": turned("x_forward_z_up")},
     "pose_direction=world_to_camera pose_axes=opengl": {
-        "pose": lambda pose: invert_rigid(turned("opengl")(pose))
+        "pose": lambda pose: geometry.invert_rigid(turned("opengl")(pose))
     },
-    "rotations transposed": {"pose": transposed},
+    "rotations transposed": {"pose": lambda pose: torch.where(ROTATION, pose.mT, pose)},
     "intrinsics times 2": {"K": lambda K: K * torch.tensor([[0.5], [0.5], [1.0]])},
     "depth_kind=ray_length": {"depth": ray_length},
     "depth times 0.001": {"depth": lambda z: 1000 * z},
@@ -144,7 +124,8 @@ def test_a_wrong_convention_is_named_by_what_corrects_it(correction, right):
 
 def test_the_correction_is_relative_to_the_options_in_force(right):
     # The data's axes are x_forward_z_up, and opengl was given.
-    case = changed(right, pose=lambda p: adapt_pose(turned("x_forward_z_up")(p), axes="opengl"))
+    wrong = turned("x_forward_z_up")
+    case = changed(right, pose=lambda pose: geometry.adapt_pose(wrong(pose), axes="opengl"))
     found = case.diagnosis({"pose_axes": "opengl"})
     assert found.suspects[0] == "pose_axes=x_forward_z_up"
     assert "format.pose_axes=x_forward_z_up" in found.words
@@ -163,7 +144,7 @@ def test_flow_that_was_estimated_here_has_no_options(right):
 def test_axes_that_have_no_name_are_found_from_the_motions():
     # A camera mounted 40 degrees off about two axes.
     mount = rigid((0.5, 0.0, -0.7), (0.0, 0.0, 0.0))
-    doctor = Doctor()
+    doctor = sequences.Doctor()
     for case in (case_of(BEFORE, NOW), case_of(NOW, LATER, seed=1)):
         changed(case, pose=lambda pose: pose @ mount).shown_to(doctor)
     found = doctor.diagnosis()
@@ -173,14 +154,15 @@ def test_axes_that_have_no_name_are_found_from_the_motions():
 
 def test_straight_driving_leaves_several_conventions_that_it_cannot_tell_apart():
     ahead = rigid((0.0, 0.0, 0.0), (0.0, 0.0, 0.5))
-    found = changed(case_of(torch.eye(4).double(), ahead), pose=invert_rigid).diagnosis()
+    found = changed(case_of(torch.eye(4).double(), ahead), pose=geometry.invert_rigid).diagnosis()
     assert {"pose_direction=world_to_camera", "pose_axes=opengl"} <= set(found.suspects)
 
 
 def test_the_sky_is_at_infinity_as_either_kind_of_depth(right):
     # Were it nan once corrected, nothing would explain the flow of most of the picture.
     right.depth[:, :30] = torch.inf
-    right.raw[:, :30] = ego_flow(right.depth, K, relative_motion(BEFORE, NOW)).flow[:, :30]
+    ego = geometry.ego_flow(right.depth, K, geometry.relative_motion(BEFORE, NOW)).flow
+    right.raw[:, :30] = ego[:, :30]
     ray = changed(right, depth=ray_length).diagnosis()
     assert ray.rivals_px["depth_kind=ray_length"] < 0.02
     corrected_twice = changed(right, depth=lambda z: z / ray_length(torch.ones_like(z)))
@@ -203,7 +185,7 @@ def test_where_most_moves_what_stands_still_can_be_told(right):
     right.raw[:, :, :50] += torch.tensor([3.0, -2.0]).reshape(2, 1, 1)
     assert right.diagnosis().residual_px > 1
     static = (torch.arange(WIDTH) >= 52).expand(1, HEIGHT, WIDTH)
-    found = diagnose(right.raw, right.depth, K, BEFORE, NOW, static=static)
+    found = sequences.diagnose(right.raw, right.depth, K, BEFORE, NOW, static=static)
     assert found.residual_px < 1e-3
 
 
@@ -232,7 +214,7 @@ def test_a_camera_that_stands_still_tells_nothing(right):
 
 
 def test_several_pairs_are_weighed_together(right):
-    doctor = Doctor()
+    doctor = sequences.Doctor()
     for mistake in ("flow_direction=backward", "flow_direction=backward", "pose_axes=opengl"):
         changed(right, **WRONG[mistake]).shown_to(doctor)
     rivals_px = doctor.diagnosis().rivals_px
@@ -245,8 +227,8 @@ def test_large_pictures_are_sampled_without_a_shift():
     camera = torch.tensor([[500.0, 0, 310.0], [0, 480.0, 250.0], [0, 0, 1]])
     rows, columns = torch.arange(height)[:, None], torch.arange(width)
     z = (1.5 + 0.01 * rows + 0.004 * columns)[None]
-    raw, _ = ego_flow(z, camera, relative_motion(BEFORE, NOW))
-    found = diagnose(raw, z, camera, BEFORE, NOW)
+    raw, _ = geometry.ego_flow(z, camera, geometry.relative_motion(BEFORE, NOW))
+    found = sequences.diagnose(raw, z, camera, BEFORE, NOW)
     assert found.raw_px == pytest.approx(float(raw.norm(dim=0).median()), rel=0.02)
     assert found.residual_px < 1e-3
 
@@ -276,10 +258,10 @@ GIVEN = [
 
 @pytest.mark.parametrize(("options", "correction"), GIVEN, ids=str)
 def test_the_doctor_corrects_the_options_of_a_recorded_street(options, correction, street):
-    read = Frames(street, **options)
-    doctor = Doctor(read.conventions)
+    read = sequences.Frames(street, **options)
+    doctor = sequences.Doctor(read.conventions)
     for previous, current in pairwise(read):
-        doctor.look(previous, current, recorded_flow(previous, current))
+        doctor.look(previous, current, sequences.recorded_flow(previous, current))
     found = doctor.diagnosis()
     if correction is None:  # depth, poses and flow are rounded to float32 alone
         assert (found.suspects, found.residual_px < 1e-3) == ((), True), found.words
@@ -289,8 +271,8 @@ def test_the_doctor_corrects_the_options_of_a_recorded_street(options, correctio
 
 @needs_7scenes
 def test_mistakes_about_a_real_recording_are_named():
-    recording = SevenScenes(SEVEN_SCENES)
-    estimate = EstimatedFlowSource(DIS("fast"))
+    recording = sequences.SevenScenes(SEVEN_SCENES)
+    estimate = sequences.EstimatedFlowSource(DIS("fast"))
     real = [(*pair, estimate(*pair)) for pair in pairwise(recording[i] for i in range(3))]
     wrong = {
         None: lambda frame: {},
@@ -300,7 +282,7 @@ def test_mistakes_about_a_real_recording_are_named():
         },
     }
     for correction, changes in wrong.items():
-        doctor = Doctor(flow_is_recorded=False)
+        doctor = sequences.Doctor(flow_is_recorded=False)
         for *pair, raw in real:
             doctor.look(*(dataclasses.replace(frame, **changes(frame)) for frame in pair), raw)
         assert doctor.diagnosis().suspects[:1] == ((correction,) if correction else ())

@@ -13,17 +13,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 import cv2
 
-from flowrep.sequences import (
-    EstimatedFlowSource,
-    Frame,
-    Recording,
-    SequenceError,
-    estimated_motion,
-    factorize_frames,
-    factorize_pair,
-    recorded_flow,
-    recorded_motion,
-)
+from flowrep import sequences
 from flowrep.sequences.factorization import consistent
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import score, shown, video_frame
@@ -41,7 +31,7 @@ def frame(name="b", **changes):
         "depth": np.full((40, 60), 4.0, np.float32),
         "rgb": np.zeros((40, 60, 3), np.uint8),
     }
-    return Frame(**(plain | changes))
+    return sequences.Frame(**(plain | changes))
 
 
 def moved(x_m):
@@ -77,8 +67,8 @@ def test_after_a_repeated_picture_flow_spans_both_intervals():
         frame("c", rgb=np.roll(texture(), -3, axis=1), world_from_cam=moved(0.4)),
         frame("d", rgb=np.roll(texture(), -4, axis=1), world_from_cam=moved(0.6)),
     ]
-    source = EstimatedFlowSource(DIS())
-    first, repeated, after, then = factorize_frames(frames, source)
+    source = sequences.EstimatedFlowSource(DIS())
+    first, repeated, after, then = sequences.factorize_frames(frames, source)
     assert first is None
     assert np.isnan(repeated.raw).all()
     assert (source(frames[0], frames[0]) == 0).all()  # a camera that did not move
@@ -95,9 +85,9 @@ def test_without_poses_the_motion_is_estimated():
     raw[:, :20, :30] += np.float32([[[4.0]], [[-3.0]]])
     before = frame("a", world_from_cam=None)
     now = frame("b", world_from_cam=None, depth=depth, rgb=None)
-    with pytest.raises(SequenceError, match="poses=estimated"):
-        factorize_pair(before, now, raw)
-    made = factorize_pair(before, now, raw, estimated_motion(before, now, raw))
+    with pytest.raises(sequences.SequenceError, match="poses=estimated"):
+        sequences.factorize_pair(before, now, raw)
+    made = sequences.factorize_pair(before, now, raw, sequences.estimated_motion(before, now, raw))
     np.testing.assert_allclose(made.motion.prev_from_curr, moved(0.4), atol=2e-3)
     assert 0.7 < made.motion.inlier_share <= 0.8
     np.testing.assert_allclose(made.obj[:, 5, 5], [4.0, -3.0], atol=0.02)
@@ -114,12 +104,12 @@ def test_without_poses_the_motion_is_estimated():
 
 def test_a_motion_that_nothing_tells_leaves_flow_unknown():
     nothing = np.full((2, 40, 60), np.nan, np.float32)
-    motion = estimated_motion(frame("a"), frame("b"), nothing)
+    motion = sequences.estimated_motion(frame("a"), frame("b"), nothing)
     assert not motion.known
-    assert not factorize_pair(frame("a"), frame("b"), nothing, motion).ego_valid.any()
+    assert not sequences.factorize_pair(frame("a"), frame("b"), nothing, motion).ego_valid.any()
 
 
-class Walk(Recording):
+class Walk(sequences.Recording):
     """41 frames, 0.1 m apart."""
 
     count = 41
@@ -136,7 +126,7 @@ def test_the_doctor_looks_at_pairs_spread_over_the_recording_that_move():
         length_px = 0.0 if current.name in ("5", "6", "7", "9") else 3.0
         return np.full((2, 40, 60), length_px, np.float32)
 
-    diagnosis = Job(Walk(), flow_source, recorded_motion, output=None).examine()
+    diagnosis = Job(Walk(), flow_source, sequences.recorded_motion, output=None).examine()
     # A tenth of 40 pairs apart; where nothing moves, up to two more are tried.
     expected = [1, 5, 6, 7, 9, 10, 13, 17, 21, 25, 29, 33, 37]
     assert looked_at == [str(number) for number in expected]
@@ -148,7 +138,7 @@ def test_what_moves_stands_out_of_the_frames_own_error():
     raw = np.zeros((2, 40, 60), np.float32)
     raw[0] = 2.0
     raw[1, :10] = 9.0
-    row = score(1, factorize_pair(frame("a"), frame("b"), raw), moving_px=1.0)
+    row = score(1, sequences.factorize_pair(frame("a"), frame("b"), raw), moving_px=1.0)
     assert float(row["moving_share"]) == 0.25
 
 
@@ -160,7 +150,7 @@ def test_ego_flow_is_known_wherever_geometry_gives_it():
     raw[:, :, :20] = np.nan
     ahead = np.eye(4)
     ahead[2, 3] = 2.0
-    made = factorize_pair(frame("a", world_from_cam=ahead), frame("b", depth=depth), raw)
+    made = sequences.factorize_pair(frame("a", world_from_cam=ahead), frame("b", depth=depth), raw)
     assert made.ego_valid.tolist() == (depth == 4.0).tolist()
     assert made.valid.tolist() == ((depth == 4.0) & np.isfinite(raw[0])).tolist()
     assert not made.obj[:, ~made.valid].any()
@@ -173,13 +163,13 @@ def test_ego_flow_is_known_wherever_geometry_gives_it():
 def test_flow_of_ones_own_has_to_be_of_this_pair():
     raw = np.ones((2, 40, 60), np.float32)
     now = frame("c", raw=raw, raw_since="b")
-    assert recorded_flow(frame("b"), now) is raw
-    with pytest.raises(SequenceError, match=r"^c\.png: has flow since frame b, and here follows a"):
-        recorded_flow(frame("a"), now)
-    with pytest.raises(SequenceError, match=r"^b\.png: has no flow of its own"):
-        recorded_flow(frame("a"), frame("b"))
-    with pytest.raises(SequenceError, match="no picture to estimate flow from"):
-        EstimatedFlowSource(DIS())(frame("a", rgb=None), frame("b"))
+    assert sequences.recorded_flow(frame("b"), now) is raw
+    with pytest.raises(sequences.SequenceError, match=r"^c\.png: .* frame b, and here follows a"):
+        sequences.recorded_flow(frame("a"), now)
+    with pytest.raises(sequences.SequenceError, match=r"^b\.png: has no flow of its own"):
+        sequences.recorded_flow(frame("a"), frame("b"))
+    with pytest.raises(sequences.SequenceError, match="no picture to estimate flow from"):
+        sequences.EstimatedFlowSource(DIS())(frame("a", rgb=None), frame("b"))
 
 
 def test_a_row_says_medians_shares_and_the_error():
@@ -192,7 +182,7 @@ def test_a_row_says_medians_shares_and_the_error():
     truth = np.zeros_like(raw)
     truth[:, :, 59] = np.nan
     now = frame("b", depth=depth, raw=truth, raw_since="a", timestamp_s=1.5)
-    row = score(7, factorize_pair(frame("a"), now, raw), moving_px=4.9)
+    row = score(7, sequences.factorize_pair(frame("a"), now, raw), moving_px=4.9)
     assert row["index"] == 7
     assert row["name"] == "b"
     assert row["timestamp_s"] == "1.500000"
@@ -205,7 +195,7 @@ def test_a_row_says_medians_shares_and_the_error():
 def test_what_is_unknown_is_empty_in_the_row():
     nothing = np.full((2, 40, 60), np.nan, np.float32)
     of_b = frame("c", raw=np.ones((2, 40, 60), np.float32), raw_since="b")  # not of a
-    row = score(1, factorize_pair(frame("a"), of_b, nothing), moving_px=1.0)
+    row = score(1, sequences.factorize_pair(frame("a"), of_b, nothing), moving_px=1.0)
     assert float(row["valid_share"]) == 0.0
     assert [name for name, value in row.items() if value != ""] == ["index", "name", "valid_share"]
 
@@ -215,7 +205,7 @@ def test_what_is_unknown_is_empty_in_the_row():
 )
 def test_a_video_frame_has_two_rows_that_fit_a_screen(size, tile):
     now = frame(depth=np.ones(size, np.float32), rgb=np.full((*size, 3), 7, np.uint8))
-    image = video_frame(factorize_pair(now, now, np.zeros((2, *size), np.float32)))
+    image = video_frame(sequences.factorize_pair(now, now, np.zeros((2, *size), np.float32)))
     rows = 2 * (28 + 20 + tile[0]) + 4  # bars for label and note, a gap
     assert image.shape == (rows, 3 * tile[1] + 2 * 4, 3)
     assert (image[48 : 48 + tile[0], : tile[1]] == 7).all()

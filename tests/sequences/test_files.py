@@ -12,17 +12,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 import cv2
 
-from flowrep.sequences import (
-    Frames,
-    SequenceError,
-    StillVideo,
-    Tum,
-    VKitti2,
-    read_flo,
-    read_kitti_flow,
-    write_flo,
-    write_kitti_flow,
-)
+from flowrep import sequences
 from flowrep.sequences.factorization import pairs
 from tests.sequences import synthetic
 from tests.sequences.synthetic import camera_json, put
@@ -36,27 +26,27 @@ def flow():
 
 def test_flo_is_opencvs(flow, tmp_path):
     path = tmp_path / "a.flo"
-    write_flo(path, flow)
+    sequences.write_flo(path, flow)
     np.testing.assert_array_equal(cv2.readOpticalFlow(str(path)).transpose(2, 0, 1), flow)
     cv2.writeOpticalFlow(str(path), np.ascontiguousarray(2 * flow.transpose(1, 2, 0)))
-    np.testing.assert_array_equal(read_flo(path), 2 * flow)
+    np.testing.assert_array_equal(sequences.read_flo(path), 2 * flow)
 
 
 def test_unknown_flow_is_marked_as_the_format_says_and_comes_back_as_nan(flow, tmp_path):
     flow[1, 2, 3] = np.nan
     valid = np.ones((5, 7), bool)
     valid[4, 0] = False
-    write_flo(tmp_path / "a.flo", flow, valid)
+    sequences.write_flo(tmp_path / "a.flo", flow, valid)
     marked = cv2.readOpticalFlow(str(tmp_path / "a.flo"))
     assert marked[2, 3].tolist() == marked[4, 0].tolist() == [1e10, 1e10]
-    back = read_flo(tmp_path / "a.flo")
+    back = sequences.read_flo(tmp_path / "a.flo")
     assert np.isnan(back).all(0).nonzero()[0].tolist() == [2, 4]
     assert np.isnan(back).sum() == 4
 
 
 def test_kitti_png_by_hand(tmp_path):
     # u = 1.5 is 2^15 + 96, v = -2 is 2^15 - 128; the third channel says that it is known.
-    write_kitti_flow(tmp_path / "a.png", np.array([[[1.5]], [[-2.0]]], np.float32))
+    sequences.write_kitti_flow(tmp_path / "a.png", np.array([[[1.5]], [[-2.0]]], np.float32))
     blue_green_red = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert blue_green_red[0, 0, ::-1].tolist() == [32864, 32640, 1]
 
@@ -64,8 +54,8 @@ def test_kitti_png_by_hand(tmp_path):
 def test_kitti_png_round_trip_within_half_a_step(flow, tmp_path):
     flow[:, 1, 1] = np.nan
     flow[0, 3, 3] = 600.0  # more than the format can say
-    write_kitti_flow(tmp_path / "a.png", flow)
-    back = read_kitti_flow(tmp_path / "a.png")
+    sequences.write_kitti_flow(tmp_path / "a.png", flow)
+    back = sequences.read_kitti_flow(tmp_path / "a.png")
     unknown = np.isnan(back).any(0)
     assert np.argwhere(unknown).tolist() == [[1, 1], [3, 3]]
     assert np.abs(back - flow)[:, ~unknown].max() <= 0.5 / 64
@@ -73,7 +63,7 @@ def test_kitti_png_round_trip_within_half_a_step(flow, tmp_path):
 
 def refusal(read, name) -> str:
     """Returns the error, which has to be one line that names the file."""
-    with pytest.raises((SequenceError, OSError), match=re.escape(name)) as caught:
+    with pytest.raises((sequences.SequenceError, OSError), match=re.escape(name)) as caught:
         list(pairs(read()))
     assert "\n" not in str(caught.value)
     return str(caught.value)
@@ -88,9 +78,9 @@ def test_a_picture_that_was_cut_off_is_refused(suffix, kept, tmp_path):
     (tmp_path / "rgb/0001.png").unlink()
     path = tmp_path / f"rgb/0001.{suffix}"
     path.write_bytes(data)
-    assert len(list(Frames(tmp_path))) == 3
+    assert len(list(sequences.Frames(tmp_path))) == 3
     path.write_bytes(data[: int(kept * len(data))])
-    refusal(lambda: Frames(tmp_path), path.name)
+    refusal(lambda: sequences.Frames(tmp_path), path.name)
 
 
 def test_depth_that_is_nan_is_missing(tmp_path):
@@ -100,10 +90,10 @@ def test_depth_that_is_nan_is_missing(tmp_path):
         depth[i] = np.nan
         path.unlink()
         np.save(path.with_suffix(".npy"), depth)
-    frames = list(Frames(tmp_path))
+    frames = list(sequences.Frames(tmp_path))
     assert [np.argwhere(np.isnan(f.depth).all(1)).item() for f in frames] == [0, 1, 2]
     # A unit that is given holds for arrays too: 2.0 in decimetres.
-    assert Frames(tmp_path, depth_unit_m=0.1)[0].depth[5, 5] == pytest.approx(0.2)
+    assert sequences.Frames(tmp_path, depth_unit_m=0.1)[0].depth[5, 5] == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -181,20 +171,20 @@ def test_a_frame_that_a_table_lacks_is_named(tmp_path):
     synthetic.write_vkitti2(tmp_path)
     path = tmp_path / "extrinsic.txt"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
-    assert "frame 1" in refusal(lambda: VKitti2(tmp_path), "extrinsic.txt")
+    assert "frame 1" in refusal(lambda: sequences.VKitti2(tmp_path), "extrinsic.txt")
 
 
 def test_frames_of_differing_sizes_are_refused(tmp_path):
     synthetic.write_tum(tmp_path)
     for kind, dtype, shape in (("rgb", np.uint8, (12, 20, 3)), ("depth", np.uint16, (12, 20))):
         put(sorted((tmp_path / kind).iterdir())[2], np.zeros(shape, dtype))
-    says = refusal(lambda: Tum(tmp_path), "rgb/100.200000.png")
+    says = refusal(lambda: sequences.Tum(tmp_path), "rgb/100.200000.png")
     assert "20 x 12, the frame before 40 x 24" in says
 
 
 def test_a_moving_camera_needs_depth_and_a_video_has_none(tmp_path):
-    assert "format.still=true" in refusal(lambda: StillVideo(0), "0")
+    assert "format.still=true" in refusal(lambda: sequences.StillVideo(0), "0")
     path = tmp_path / "a.mp4"
-    refusal(lambda: StillVideo(path, still=True), "a.mp4")
+    refusal(lambda: sequences.StillVideo(path, still=True), "a.mp4")
     path.write_bytes(b"no video at all")
-    refusal(lambda: StillVideo(path, still=True), "a.mp4")
+    refusal(lambda: sequences.StillVideo(path, still=True), "a.mp4")

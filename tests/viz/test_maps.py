@@ -8,20 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from flowrep import viz
 from flowrep.palette import CLASS_COLOURS
-from flowrep.viz import (
-    classes_to_rgb,
-    contact_sheet,
-    depth_bar,
-    depth_to_rgb,
-    flow_note,
-    flow_to_rgb,
-    flow_wheel,
-    representation_strip,
-    strip,
-    write_png,
-    write_video,
-)
 
 
 def flow_of(u: float, v: float) -> np.ndarray:
@@ -41,30 +29,30 @@ def flow_of(u: float, v: float) -> np.ndarray:
     ],
 )
 def test_flow_colour_by_hand(u, v, rgb):
-    assert np.abs(flow_to_rgb(flow_of(u, v), scale_px=4.0)[0, 0].astype(int) - rgb).max() <= 1
+    assert np.abs(viz.flow_to_rgb(flow_of(u, v), scale_px=4.0)[0, 0].astype(int) - rgb).max() <= 1
 
 
 def test_flow_colour_is_the_hsv_wheel():
     u, v = 1.5, 2.0  # magnitude 2.5, an angle within no axis
     hue = np.arctan2(v, u) / (2 * np.pi)
     expected = 255 * np.array(colorsys.hsv_to_rgb(hue, np.sqrt(2.5 / 10), 1.0))
-    assert np.abs(flow_to_rgb(flow_of(u, v), scale_px=10.0)[0, 0] - expected).max() <= 0.51
+    assert np.abs(viz.flow_to_rgb(flow_of(u, v), scale_px=10.0)[0, 0] - expected).max() <= 0.51
 
 
 def test_flow_colour_does_not_depend_on_the_rest_of_the_image():
-    alone = flow_to_rgb(flow_of(0.3, -0.2), scale_px=2.0)[0, 0]
+    alone = viz.flow_to_rgb(flow_of(0.3, -0.2), scale_px=2.0)[0, 0]
     beside_a_giant = np.concatenate([flow_of(0.3, -0.2), flow_of(90.0, 5.0)], axis=-1)
     # Normalised per image, the small flow would be almost white here.
-    assert (flow_to_rgb(beside_a_giant, scale_px=2.0)[0, 0] == alone).all()
+    assert (viz.flow_to_rgb(beside_a_giant, scale_px=2.0)[0, 0] == alone).all()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_flow_that_is_not_finite_is_grey(bad):
-    assert flow_to_rgb(flow_of(0.0, bad), scale_px=1.0)[0, 0].tolist() == [128, 128, 128]
+    assert viz.flow_to_rgb(flow_of(0.0, bad), scale_px=1.0)[0, 0].tolist() == [128, 128, 128]
 
 
 def test_flow_wheel_is_its_own_legend():
-    wheel = flow_wheel(101)
+    wheel = viz.flow_wheel(101)
     assert wheel[50, 50].tolist() == [255, 255, 255]
     assert wheel[50, 0].tolist() == [0, 255, 255]  # left rim: flow to the left
     assert np.abs(wheel[100, 50].astype(int) - (128, 255, 0)).max() <= 1  # lower rim: down
@@ -72,18 +60,14 @@ def test_flow_wheel_is_its_own_legend():
 
 
 def test_classes_take_their_colour_from_the_one_table():
-    image = classes_to_rgb(torch.tensor([[[0, 4, 10, 200]]], dtype=torch.uint8))
-    assert [tuple(pixel) for pixel in image[0].tolist()] == [
-        CLASS_COLOURS["sky"],
-        CLASS_COLOURS["pedestrian"],
-        CLASS_COLOURS["traffic_light"],
-        (128, 128, 128),
-    ]
+    image = viz.classes_to_rgb(torch.tensor([[[0, 4, 10, 200]]], dtype=torch.uint8))
+    colours = [CLASS_COLOURS[name] for name in ("sky", "pedestrian", "traffic_light")]
+    assert [tuple(pixel) for pixel in image[0].tolist()] == [*colours, (128, 128, 128)]
 
 
 def test_depth_gets_darker_and_ends_in_black_where_nothing_is():
     depth = np.array([[[0.0, 1.0, 9.0, 99.0, 150.0, np.inf, np.nan]]], dtype=np.float32)
-    near, *rest, far, further, sky, missing = depth_to_rgb(depth, range_m=99.0)[0].astype(int)
+    near, *rest, far, further, sky, missing = viz.depth_to_rgb(depth, range_m=99.0)[0].astype(int)
     assert near.tolist() == [252, 253, 191]
     assert far.tolist() == further.tolist() == [40, 16, 80]
     assert sky.tolist() == [0, 0, 0]
@@ -106,7 +90,7 @@ def maps(height: int = 30, width: int = 40) -> dict[str, torch.Tensor]:
 def test_strip_draws_what_is_there_in_a_fixed_order_enlarged_without_blur():
     given = maps()
     given["obj"][0, 3, 5] = 5.0  # full colour at the default scale
-    image = representation_strip(given)
+    image = viz.representation_strip(given)
     # rgb, depth and obj, 40 columns enlarged 6 times, 2 gaps of 4; bars of 28 and 20 above 30 rows.
     assert image.shape == (48 + 180, 3 * 240 + 2 * 4, 3)
     assert (image[48:, :240] == 7).all()
@@ -116,7 +100,7 @@ def test_strip_draws_what_is_there_in_a_fixed_order_enlarged_without_blur():
 
 
 def test_labels_are_written_and_the_wheel_stands_beside_flow_only():
-    image = representation_strip(maps())
+    image = viz.representation_strip(maps())
     rgb_bar, obj_bar = image[:28, :240], image[:28, 488:]
     assert (rgb_bar < 128).any()
     assert (obj_bar < 128).any()
@@ -125,19 +109,17 @@ def test_labels_are_written_and_the_wheel_stands_beside_flow_only():
 
 
 def test_half_the_saturation_is_where_the_note_says():
-    assert flow_note(8.0) == "full at 8 px, half at 2 px"
-    half = flow_to_rgb(flow_of(2.0, 0.0), scale_px=8.0)[0, 0]
-    assert np.abs(half.astype(int) - (255, 128, 128)).max() <= 1
+    assert viz.flow_note(4.0) == "full at 4 px, half at 1 px"  # as the colours by hand above
 
 
 def test_the_given_scale_is_that_of_the_colours():
     given = {"obj": torch.full((2, 3, 40), 2.0)}
-    image = representation_strip(given, flow_scale_px={"obj": 8.0})
-    assert (image[48:] == flow_to_rgb(given["obj"], 8.0)[0, 0]).all()
+    image = viz.representation_strip(given, flow_scale_px={"obj": 8.0})
+    assert (image[48:] == viz.flow_to_rgb(given["obj"], 8.0)[0, 0]).all()
 
 
 def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
-    bar = depth_bar(99.0, 241)[0].astype(int)
+    bar = viz.depth_bar(99.0, 241)[0].astype(int)
     assert bar[0].tolist() == [252, 253, 191]
     assert bar[240].tolist() == [40, 16, 80]
     # 9 m is in the middle: log(1 + 9) is half of log(1 + 99), between the third and fourth stop.
@@ -147,14 +129,11 @@ def test_the_bar_of_depth_has_the_colours_of_depth_from_near_to_far():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: flow_to_rgb(np.zeros((3, 4, 2)), 1.0), r"flow must be \[2, H, W\].*\[3, 4, 2\]"),
-        (lambda: flow_to_rgb(flow_of(0, 0), 0.0), "scale_px must be positive"),
-        (lambda: depth_to_rgb(np.zeros((4, 4))), r"depth must be \[1, H, W\]"),
-        (lambda: representation_strip({"eggo": np.zeros(1)}), "eggo.*expected some of.*'ego'"),
-        (
-            lambda: strip({"a": np.zeros((2, 3, 3), np.uint8), "b": np.zeros((3, 2, 3), np.uint8)}),
-            "strip needs images",
-        ),
+        (lambda: viz.flow_to_rgb(np.zeros((3, 4, 2)), 1.0), r"must be \[2, H, W\].*\[3, 4, 2\]"),
+        (lambda: viz.flow_to_rgb(flow_of(0, 0), 0.0), "scale_px must be positive"),
+        (lambda: viz.depth_to_rgb(np.zeros((4, 4))), r"depth must be \[1, H, W\]"),
+        (lambda: viz.representation_strip({"eggo": np.zeros(1)}), "eggo.*expected some of.*'ego'"),
+        (lambda: viz.strip({"a": np.zeros((2, 3, 3)), "b": np.zeros((3, 2, 3))}), "needs images"),
     ],
 )
 def test_mistakes_are_named(call, message):
@@ -164,7 +143,7 @@ def test_mistakes_are_named(call, message):
 
 def test_contact_sheet_stacks_rows_of_different_width():
     wide, narrow = np.zeros((2, 9, 3), np.uint8), np.zeros((3, 4, 3), np.uint8)
-    sheet = contact_sheet([wide, narrow])
+    sheet = viz.contact_sheet([wide, narrow])
     assert sheet.shape == (2 + 4 + 3, 9, 3)
     assert (sheet[6:] == [[[0]] * 4 + [[255]] * 5] * 3).all()
 
@@ -172,7 +151,7 @@ def test_contact_sheet_stacks_rows_of_different_width():
 def test_png_comes_back_bit_for_bit(tmp_path):
     pillow = pytest.importorskip("PIL.Image")
     image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    write_png(tmp_path / "new" / "folder.png", image)
+    viz.write_png(tmp_path / "new" / "folder.png", image)
     assert (np.asarray(pillow.open(tmp_path / "new" / "folder.png")) == image).all()
 
 
@@ -180,7 +159,7 @@ def test_a_video_of_odd_size_can_be_played_and_keeps_the_size_of_its_first_frame
     imageio = pytest.importorskip("imageio.v3")
     frames = [np.full((33, 51, 3), grey, np.uint8) for grey in (20, 120, 220)]
     frames.append(np.zeros((40, 30, 3), np.uint8))
-    write_video(tmp_path / "new" / "episode.mp4", frames, fps=12)
+    viz.write_video(tmp_path / "new" / "episode.mp4", frames, fps=12)
     played = imageio.imread(tmp_path / "new" / "episode.mp4")
     assert played.shape == (4, 34, 52, 3)
     assert np.abs(played[:3, 16, 25, 0].astype(int) - [20, 120, 220]).max() <= 6
@@ -189,14 +168,11 @@ def test_a_video_of_odd_size_can_be_played_and_keeps_the_size_of_its_first_frame
 
 def test_a_strip_of_narrow_pictures_has_no_wheels():
     narrow = np.zeros((2, 480, 16), np.float32)
-    assert representation_strip({"raw": narrow, "obj": narrow}).shape[0] > 480
+    assert viz.representation_strip({"raw": narrow, "obj": narrow}).shape[0] > 480
 
 
 def test_importing_viz_needs_numpy_alone():
-    code = (
-        "import sys, flowrep.viz; "
-        "print([m for m in ('PIL', 'imageio', 'matplotlib', 'torch', 'pybullet') "
-        "if m in sys.modules])"
-    )
+    others = "{'PIL', 'imageio', 'matplotlib', 'torch', 'pybullet'}"
+    code = f"import sys, flowrep.viz; print({others} & sys.modules.keys())"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
+    assert found.stdout.strip() == "set()"
