@@ -117,7 +117,7 @@ class _Search:
         episode = self.episode
         state = VehicleState(*(np.array([value]) for value in episode.now.vehicle))
         steps, ticks = episode.steps, episode.now.ticks
-        history: list[tuple[Array, Array]] = []
+        history = np.empty((1, 0), dtype=np.int64)  # the decisions that led to each state
         while steps < episode.limit_steps:
             parents = np.repeat(np.arange(state.x_m.size), len(_ACTIONS))
             actions = np.tile(_ACTIONS, state.x_m.size)
@@ -127,11 +127,11 @@ class _Search:
             kept = np.flatnonzero(arrived)[:1] if arrived.any() else self.best(state, alive, beam)
             if not kept.size:
                 break
-            history.append((parents[kept], actions[kept]))
+            history = np.column_stack([history[parents], actions])[kept]
             state = VehicleState(*(value[kept] for value in state))
             if arrived.any():
-                return _trace(history), True
-        return _trace(history), False
+                return np.repeat(history[0], _HOLD_STEPS).tolist(), True
+        return np.repeat(history[0], _HOLD_STEPS).tolist(), False
 
     def drive(
         self, state: VehicleState, actions: Array, ticks: int
@@ -170,19 +170,9 @@ class _Search:
         high = np.array([state.x_m.max(), state.y_m.max()]) + reach
         people = people[((people > low) & (people < high)).all(axis=-1)]
         # Distance of each person from each footprint, in the vehicle's axes.
-        dx = people[:, 0] - state.x_m[:, None]
-        dy = people[:, 1] - state.y_m[:, None]
+        dx, dy = people[:, 0] - state.x_m[:, None], people[:, 1] - state.y_m[:, None]
         cosine, sine = np.cos(state.yaw_rad)[:, None], np.sin(state.yaw_rad)[:, None]
         ahead = np.abs(cosine * dx + sine * dy) - self.vehicle.length_m / 2
         aside = np.abs(cosine * dy - sine * dx) - self.vehicle.width_m / 2
         gap = np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
         return (gap < PERSON_RADIUS_M + _MARGIN_M).any(axis=-1)
-
-
-def _trace(history: list[tuple[Array, Array]]) -> list[int]:
-    """Returns the actions that lead to the first state of the last level, step by step."""
-    actions, at = list[int](), 0
-    for parents, chosen in reversed(history):
-        actions += [int(chosen[at])] * _HOLD_STEPS
-        at = int(parents[at])
-    return actions[::-1]

@@ -53,7 +53,15 @@ class Simulator:
         if self._client < 0:
             raise RuntimeError("PyBullet gave no client: close some environments first")
         weakref.finalize(self, pybullet.disconnect, self._client)
-        self._texture = self._load_texture(texture_rgb)
+        # PyBullet reads textures only from files, with v counted upwards from the bottom row. A TGA
+        # file is an 18-byte header and the pixels as BGR.
+        height, width, _ = texture_rgb.shape
+        size = width.to_bytes(2, "little") + height.to_bytes(2, "little")
+        header = bytes([0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0]) + size + bytes([24, 0x20])
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "texture.tga")
+            path.write_bytes(header + texture_rgb[::-1, :, ::-1].tobytes())
+            self._texture = pybullet.loadTexture(str(path), physicsClientId=self._client)
 
     def add_body(self, mesh: Mesh, boxes_m: Sequence[tuple[float, ...]] = ()) -> int:
         """Returns PyBullet's number of a body; boxes are (x, y, yaw, length, width, height)."""
@@ -127,17 +135,6 @@ class Simulator:
             np.asarray(zbuffer, dtype=np.float32).reshape(shape),
             np.asarray(body, dtype=np.int32).reshape(shape),
         )
-
-    def _load_texture(self, rgb: NDArray[np.uint8]) -> int:
-        # PyBullet reads textures only from files, with v counted upwards from the bottom row. A TGA
-        # file is an 18-byte header and the pixels as BGR.
-        height, width, _ = rgb.shape
-        size = width.to_bytes(2, "little") + height.to_bytes(2, "little")
-        header = bytes([0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0]) + size + bytes([24, 0x20])
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "texture.tga")
-            path.write_bytes(header + rgb[::-1, :, ::-1].tobytes())
-            return pybullet.loadTexture(str(path), physicsClientId=self._client)
 
 
 def _about_z(yaw_rad: float) -> tuple[float, float, float, float]:

@@ -82,7 +82,6 @@ class Street:
         self._centres = np.array([(box.x_m, box.y_m) for box, _ in self._boxes]).reshape(-1, 2)
         reaches = [math.hypot(*box.size_m[:2]) / 2 for box, _ in self._boxes]
         self._reaches_m = np.array(reaches) + reach_m
-        self._shown: dict[tuple[str, ...], Array] = {}
 
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
@@ -102,12 +101,10 @@ class Street:
 
     def is_shown(self, closures: tuple[str, ...]) -> NDArray[np.bool_]:
         """Returns which of the bodies are present while the named exits are closed."""
-        if closures not in self._shown:
-            shown = np.ones(len(self.bodies), dtype=bool)
-            for name, body in self._closures.items():
-                shown[body] = name in closures
-            self._shown[closures] = shown
-        return self._shown[closures]
+        shown = np.ones(len(self.bodies), dtype=bool)
+        for name, body in self._closures.items():
+            shown[body] = name in closures
+        return shown
 
     def close_exits(self, closures: tuple[str, ...]) -> None:
         """Places the named closures and hides all others."""
