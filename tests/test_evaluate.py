@@ -1,6 +1,5 @@
 """`flowrep.evaluate` on agents of a few frames: what it runs, what it refuses, what it keeps."""
 
-import csv
 import json
 import os
 import signal
@@ -51,11 +50,6 @@ def asked(*overrides):
     return validated(EvaluateConfig, plain("evaluate", *quick, *overrides))
 
 
-def rows_of(folder):
-    with folder.evaluation_path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     return saved(tmp_path_factory.mktemp("runs") / "dsac", "representations=[obj]")
@@ -77,7 +71,7 @@ def test_evaluated_again_the_table_is_the_same_byte_for_byte(untouched):
     before = untouched.evaluation_path.read_bytes()
     evaluate(asked(*many))
     assert untouched.evaluation_path.read_bytes() == before
-    rows = rows_of(untouched)
+    rows = untouched.read_episodes()
     assert {row["evaluation"] for row in rows} == {"evaluate"}
     with np.load(untouched.path / "drives.npz") as drives:
         assert drives["policy"].tolist() == [row["policy"] for row in rows]
@@ -95,10 +89,10 @@ def test_a_run_that_is_named_twice_is_evaluated_once(run, tmp_path):
 def test_an_agent_drives_in_another_scene_and_changed_scenes_are_told_apart(untouched):
     here = f"run={untouched.path}"
     evaluate(asked(here, "scene=s_turn", "baselines=[never_turn]"))
-    assert [row["scene"] for row in rows_of(untouched)] == ["s_turn"] * 4
+    assert [row["scene"] for row in untouched.read_episodes()] == ["s_turn"] * 4
     evaluate(asked(here, "scene=straight_road", "scene.time_limit_steps=3"))
     evaluate(asked(here, "scene=straight_road", "scene.time_limit_steps=4", "video=1"))
-    rows = rows_of(untouched)[4:]
+    rows = untouched.read_episodes()[4:]
     assert [row["scene"] for row in rows] == ["straight_road"] * 4
     assert len({row["scene_id"] for row in rows}) == 2
     assert {row["length"] for row in rows} == {"3", "4"}
@@ -164,8 +158,8 @@ def test_the_runs_of_a_sweep_are_evaluated_on_the_same_episodes(some, monkeypatc
     )
     folders, config = some("good_1", "good_2", overrides=["baselines=[random]"])
     evaluate(config)
-    assert rows_of(folders[0]) == rows_of(folders[1])
-    assert len(rows_of(folders[0])) == 4
+    assert folders[0].read_episodes() == folders[1].read_episodes()
+    assert len(folders[0].read_episodes()) == 4
     assert drivers == ["random"]  # once for both
 
 
@@ -178,7 +172,7 @@ def test_a_run_in_trouble_costs_no_other_its_episodes(some, capsys, trouble):
     with in_use, pytest.raises(SystemExit) as ended:
         evaluate(config)
     assert ended.value.code == 1
-    assert len(rows_of(folders[1])) == 2
+    assert len(folders[1].read_episodes()) == 2
     said = capsys.readouterr()
     errors = [line for line in said.err.splitlines() if line.startswith("error: ")]
     assert errors
@@ -193,7 +187,7 @@ def test_a_run_that_can_not_be_evaluated_is_named_and_the_others_are(some, capsy
     with pytest.raises(SystemExit) as ended:
         evaluate(config)
     assert ended.value.code == 1
-    assert len(rows_of(folders[1])) == 2
+    assert len(folders[1].read_episodes()) == 2
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert [str(folder.path) in said[-1] for folder in folders] == [True, False, True]
     _, config = some("bad_3")
@@ -209,7 +203,7 @@ def test_a_worker_that_dies_is_one_line_and_what_was_run_is_kept(some, monkeypat
     (folder,), config = some("good", overrides=["baselines=[random]"])
     with pytest.raises(WorkerError):
         evaluate(config)
-    assert [row["policy"] for row in rows_of(folder)] == ["greedy"] * 2
+    assert [row["policy"] for row in folder.read_episodes()] == ["greedy"] * 2
 
 
 def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(some, monkeypatch):
@@ -224,7 +218,7 @@ def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(some, monkeypatch):
     with pytest.raises(SystemExit) as ended:
         evaluate(config)
     assert ended.value.code == 130
-    assert [row["policy"] for row in rows_of(folder)] == ["greedy", "random"]
+    assert [row["policy"] for row in folder.read_episodes()] == ["greedy", "random"]
     assert not (folder.path / "videos").exists()
 
 
@@ -248,7 +242,7 @@ def test_a_stop_ends_between_two_films(some, monkeypatch):
 
 def own(name, output, *overrides):
     evaluate(asked(f"policy={name}", f"output={output}", "scene=straight_road", *overrides))
-    return rows_of(RunFolder(output))
+    return RunFolder(output).read_episodes()
 
 
 def episodes(rows, policy):
@@ -283,7 +277,7 @@ def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
     given = ["algorithm.precision=fp32", "representations=[ego,obj]"]
     run = saved(tmp_path / "run", *given)
     evaluate(asked(f"run={run.path}", "episodes=3"))
-    mine = episodes(rows_of(run), "greedy")
+    mine = episodes(run.read_episodes(), "greedy")
     folder = export(run)
     assert folder == run.path / "export"
     card = json.loads((folder / "agent.json").read_text())

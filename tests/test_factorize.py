@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import inspect
 import json
 import re
@@ -24,15 +23,10 @@ import imageio.v3 as imageio
 from flowrep.config import CONF_DIR, UsageError, group_choices
 from flowrep.config.schema import FactorizeConfig, validated
 from flowrep.factorize import factorize_recording, main
-from flowrep.sequences import (
-    Frame,
-    SequenceError,
-    read_flo,
-    read_kitti_flow,
-    recorded_motion,
-)
+from flowrep.sequences import Frame, SequenceError, read_flo, read_kitti_flow, recorded_motion
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
+from flowrep.tables import read_rows
 from tests.config.composing import plain
 from tests.sequences import synthetic
 from tests.sequences.synthetic import SEVEN_SCENES, needs_7scenes
@@ -49,8 +43,7 @@ def factorize(tmp_path, *overrides, source="in", format="frames"):
 
 
 def table(folder):
-    with (folder / "frames.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
+    return read_rows(folder / "frames.csv")
 
 
 def files_of(folder):
@@ -292,9 +285,7 @@ def test_a_still_camera_needs_neither_poses_nor_depth(tmp_path):
 @needs_7scenes
 def test_a_real_static_room_has_little_object_flow(tmp_path):
     options = ["stride=2", "stop=3", "video=false", "poses=estimated"]
-    out = tmp_path / "out"
-    given = [f"input={SEVEN_SCENES}", "format=sevenscenes", f"output={out}"]
-    factorize_recording(settings(*given, *options))
+    _, out = factorize(tmp_path, *options, source=SEVEN_SCENES, format="sevenscenes")
     (row,) = table(out)
     assert row["name"] == "frame-000102"
     raw_px, obj_px = float(row["raw_median_px"]), float(row["obj_median_px"])

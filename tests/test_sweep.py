@@ -1,6 +1,5 @@
 """A sweep is runs: each is begun or resumed by its own command, and what it left says the rest."""
 
-import csv
 import math
 import os
 import re
@@ -16,6 +15,7 @@ import yaml
 from flowrep import sweep
 from flowrep.config import UsageError, cli, group_choices
 from flowrep.config.schema import TrainConfig
+from flowrep.tables import read_rows
 from tests.config.composing import composed, plain
 
 
@@ -232,32 +232,16 @@ def started(folder):
     )
 
 
-def wait_for(find, seconds=180):
-    deadline = time.monotonic() + seconds
-    while not find() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert find()
-
-
-def ctrl_c(process):
-    """As a terminal does."""
-    os.killpg(process.pid, signal.SIGINT)
-
-
-def saved(folder):
-    """When the checkpoint of the run that can succeed was written."""
-    paths = folder.glob("*learning_rate-0.0003*/checkpoint/latest.safetensors")
-    return [path.stat().st_mtime_ns for path in paths]
-
-
 @pytest.mark.slow
 def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path):
     """Ctrl-C stops it after its first checkpoint; the second start ends it."""
     pytest.importorskip("pybullet", reason="training drives the simulated street")
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="it runs two at a time")
     process = started(tmp_path)
-    wait_for(lambda: saved(tmp_path))
-    ctrl_c(process)
+    checkpoint, deadline = "*rate-0.0003*/checkpoint/latest.safetensors", time.monotonic() + 180
+    while not any(tmp_path.glob(checkpoint)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     assert process.wait(timeout=180) == 130
     assert started(tmp_path).wait(timeout=300) == 1
     printed = (tmp_path / "printed").read_text()
@@ -267,6 +251,6 @@ def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path):
     assert "error: algorithm.learning_rate" in (failed / "job.log").read_text()
     assert f"hydra.sweep.dir={tmp_path}" in printed
     (whole,) = tmp_path.glob("*learning_rate-0.0003*")
-    with (whole / "metrics.csv").open(newline="") as file:
-        assert [int(row["frames"]) for row in csv.DictReader(file)] == list(range(20, 241, 20))
+    rows = read_rows(whole / "metrics.csv")
+    assert [int(row["frames"]) for row in rows] == list(range(20, 241, 20))
     assert (whole / "job.log").read_text().count("run folder: ") == 2  # begun, and resumed

@@ -43,12 +43,8 @@ def env(env_config):
 
 def network_for(env) -> MapNetwork:
     torch.manual_seed(0)
-    spec, keys = env.observation_spec, ["ego", "obj"]
-    device = torch.device("cpu")
-    policy = acting_network(
-        spec, env.action_spec, keys, device=device, precision="fp32", hidden_size=16
-    )
-    return policy.network
+    small = {"device": torch.device("cpu"), "precision": "fp32", "hidden_size": 16}
+    return acting_network(env.observation_spec, env.action_spec, ["ego", "obj"], **small).network
 
 
 def test_the_example_s_env_and_memory_are_flowrep_s(env_config, env):

@@ -8,13 +8,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
 
-from flowrep.experiment.agents import (
-    ExternalPolicy,
-    PolicyError,
-    Task,
-    check_card,
-    load_policy,
-)
+from flowrep.experiment.agents import ExternalPolicy, PolicyError, Task, check_card, load_policy
 
 TASK = Task(
     scene="straight_road",
@@ -37,12 +31,6 @@ def maps(count=2):
         },
         [count],
     )
-
-
-def written(tmp_path, body):
-    path = tmp_path / "mine.py"
-    path.write_text(body)
-    return str(path)
 
 
 @pytest.mark.parametrize(
@@ -71,11 +59,11 @@ def test_a_policy_sees_its_maps_and_nothing_of_the_env():
 
 def test_make_is_told_the_task_and_may_import_what_lies_beside_it(tmp_path):
     (tmp_path / "my_net.py").write_text("SIDE = 1\n")
-    path = written(
-        tmp_path,
+    path = tmp_path / "mine.py"
+    path.write_text(
         "import my_net\n"
         "def make(task):\n"
-        "    return lambda maps: [my_net.SIDE * len(task.representations)] * len(maps)\n",
+        "    return lambda maps: [my_net.SIDE * len(task.representations)] * len(maps)\n"
     )
     assert load_policy(f"{path}:make", TASK)(maps(3))["action"].tolist() == [2, 2, 2]
 
@@ -122,7 +110,8 @@ def test_what_is_no_action_is_named(given, said):
     ],
 )
 def test_what_fails_in_a_policy_is_one_line_with_its_place(tmp_path, body, name, said):
-    path = written(tmp_path, body)
+    path = tmp_path / "mine.py"
+    path.write_text(body)
     with pytest.raises(PolicyError, match=said) as caught:
         load_policy(f"{path}:{name}", TASK)(maps())
     assert str(caught.value).startswith(f"policy '{path}:{name}'")

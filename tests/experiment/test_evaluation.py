@@ -1,6 +1,5 @@
 """One loop drives every policy through the same episodes, and tables say how they ended."""
 
-import csv
 from dataclasses import replace
 from functools import partial
 
@@ -23,6 +22,7 @@ from flowrep.experiment.evaluation import (
     wilson_interval,
 )
 from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolder
+from flowrep.tables import read_rows
 
 NO_OP = 0
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
@@ -174,20 +174,14 @@ def test_another_agents_run_keeps_the_baselines_episodes(comparison, scene):
         made.append(changes)
         return make_env(scene, **{"representations": ["obj"]} | changes)
 
-    comparison.run(make, straight_on_policy(), num_envs=4)
+    other = weigher("obj")
+    other.load_state_dict({name: value + 2.0 for name, value in other.state_dict().items()})
+    comparison.run(make, other, num_envs=4)
     after = comparison.rows()
     of_random = [row for row in before if row["policy"] == "random"]
     assert [row for row in after if row["policy"] == "random"] == of_random
     assert after != before
     assert len(made) == 2  # an env for each frame rate, none for baselines
-
-
-def straight_on_policy():
-    class Ahead(nn.Module):
-        def forward(self, obj):
-            return torch.tensor([1.0, 0.0, 0.0]).expand(len(obj), 3)
-
-    return stochastic_policy(Ahead(), ["obj"], ACTIONS)
 
 
 def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
@@ -292,7 +286,6 @@ def test_the_table_of_causes_is_replaced(tmp_path):
     for _ in range(2):
         folder.save_episodes([row | {"episode_seed": k} for k, row in enumerate(rows)])
         folder.write_failures()
-    with folder.failures_path.open(newline="") as file:
-        (line,) = csv.DictReader(file)
+    (line,) = read_rows(folder.failures_path)
     assert line["collision: pedestrian"] == "37.5"
     assert float(line["timeout"]) == pytest.approx(25.0)

@@ -1,6 +1,5 @@
 """A run that is killed at any instant goes on, and ends as one that never was."""
 
-import csv
 import json
 import os
 import signal
@@ -15,7 +14,7 @@ pytest.importorskip("pybullet", reason="training drives the simulated street")
 from flowrep.agent import load_checkpoint
 from flowrep.experiment.run import RunFolder
 from tests.config.composing import plain
-from tests.experiment.test_runner import differing
+from tests.experiment.test_runner import differing, without_clock
 
 pytestmark = pytest.mark.slow
 
@@ -56,18 +55,6 @@ def carry_on():
         yield ask
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def without_clock(rows):
-    return [
-        {k: v for k, v in row.items() if k not in ("frames_per_second", "share_outside_updates")}
-        for row in rows
-    ]
-
-
 @pytest.mark.parametrize("algorithm", STAGES)
 def test_a_run_killed_again_and_again_ends_bit_for_bit_as_one_that_was_not(
     tmp_path, carry_on, algorithm
@@ -86,10 +73,10 @@ def test_a_run_killed_again_and_again_ends_bit_for_bit_as_one_that_was_not(
     assert carry_on(run)["code"] == 0
     expected = load_checkpoint(whole.checkpoint_path)
     assert differing(expected, load_checkpoint(run.checkpoint_path)) == []
-    rows = rows_of(run.metrics_path)
-    assert without_clock(rows) == without_clock(rows_of(whole.metrics_path))
+    rows = without_clock(run.read_metrics())
+    assert rows == without_clock(whole.read_metrics())
     assert [int(row["frames"]) for row in rows] == list(range(4, 49, 4))
-    assert rows_of(run.evaluation_path) == rows_of(whole.evaluation_path)
+    assert run.read_episodes() == whole.read_episodes()
 
 
 def test_a_full_disk_ends_in_one_line_and_leaves_the_last_checkpoint(tmp_path, carry_on):
@@ -122,4 +109,4 @@ def test_the_command_itself_is_killed_and_resumed(tmp_path):
     result = subprocess.run([*command, f"resume={run}"], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert load_checkpoint(latest)["frames"] == 96
-    assert [int(row["frames"]) for row in rows_of(run / "metrics.csv")] == list(range(4, 97, 4))
+    assert [int(row["frames"]) for row in RunFolder(run).read_metrics()] == list(range(4, 97, 4))

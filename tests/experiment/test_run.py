@@ -1,7 +1,6 @@
 """A run's folder: one owner, tables that survive, a checkpoint that belongs to its config."""
 
 import copy
-import csv
 import json
 import os
 import platform
@@ -153,11 +152,6 @@ def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_p
 CONFIG = {"representations": {"ego": None}, "flow": {"source": "exact"}, "seed": 3}
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_metrics_and_means_of_evaluations_go_to_tensorboard(tmp_path):
     """Two of four succeed; returns 1, 2, 3 and 10, lengths 10, 20, 30 and 60."""
     run = RunFolder(tmp_path)
@@ -195,7 +189,7 @@ def test_a_resumed_run_drops_the_rows_it_will_write_again(tmp_path):
         run.log_episodes([episode(frames, frames=str(frames))])
     run.forget_after(20)
     run.log_metrics(25, {"alpha": 0.5})
-    assert [row["frames"] for row in rows_of(run.metrics_path)] == ["10", "20", "25"]
+    assert [row["frames"] for row in run.read_metrics()] == ["10", "20", "25"]
     assert [row["frames"] for row in run.read_episodes()] == ["10", "20"]
 
 
@@ -214,7 +208,7 @@ def test_only_what_was_written_before_the_first_checkpoint_is_dropped_without_on
     run.log_episodes([episode(1, frames=str(frames), evaluation=kind)])
     with pytest.raises(RunFolderError, match=r"latest\.safetensors"):
         run.start_again(first_save=16)
-    assert len(rows_of(run.metrics_path)) == len(run.read_episodes()) == 1
+    assert len(run.read_metrics()) == len(run.read_episodes()) == 1
 
 
 def test_config_comes_back_as_written(tmp_path):

@@ -1,6 +1,5 @@
 """A run that is stopped and resumed is the run that was not, and logs what happened."""
 
-import csv
 import math
 import re
 from pathlib import Path
@@ -96,7 +95,6 @@ def test_updates_on_a_gpu_go_on_with_sums_from_a_file():
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
-
 SMALL = {"ppo": ["algorithm.rollout_length=16"]}
 
 
@@ -183,16 +181,11 @@ def differing(a, b, place="") -> list[str]:
     """Names every leaf in which two nested states differ."""
     if isinstance(a, TensorDict):
         a, b = a.to_dict(), b.to_dict()
-    if isinstance(a, dict):
-        return [
-            d for key in a.keys() | b.keys() for d in differing(a[key], b[key], f"{place}/{key}")
-        ]
     if isinstance(a, list):
-        return [
-            d
-            for i, pair in enumerate(zip(a, b, strict=True))
-            for d in differing(*pair, f"{place}/{i}")
-        ]
+        a, b = dict(enumerate(a)), dict(enumerate(b))
+    if isinstance(a, dict):
+        keys = a.keys() | b.keys()
+        return [d for key in keys for d in differing(a[key], b[key], f"{place}/{key}")]
     same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
     return [] if same else [place]
 
@@ -210,12 +203,15 @@ def test_how_many_processes_drive_is_not_seen_in_what_comes_out(tmp_path, monkey
     second.close()
 
 
+CLOCK = {"frames_per_second", "share_outside_updates"}
+
+
+def without_clock(rows):
+    return [{k: v for k, v in row.items() if k not in CLOCK} for row in rows]
+
+
 def logged(runner):
-    """What metrics.csv tells of the run, but not of the clock."""
-    with runner.folder.metrics_path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    clock = ("frames_per_second", "share_outside_updates")
-    return [{k: v for k, v in row.items() if k not in clock} for row in rows]
+    return without_clock(runner.folder.read_metrics())
 
 
 GLOSSARY = Path(__file__).parents[2] / "docs" / "metrics.md"
@@ -240,8 +236,7 @@ def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, algori
     assert len(rows) == 6
     assert all(any(row[name] != "nan" for row in rows) for name in rows[0])
     described = explained()
-    clock = {"frames_per_second", "share_outside_updates"}
-    assert {*rows[0], *clock} == described["Every run"] | described[f"algorithm={algorithm}"]
+    assert {*rows[0], *CLOCK} == described["Every run"] | described[f"algorithm={algorithm}"]
 
 
 @pytest.mark.slow
