@@ -6,7 +6,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from flowrep.extras import require
 
@@ -127,14 +127,12 @@ def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequ
     """Writes `video` episodes for each speed and frame rate, until a stop is asked for."""
     name = agent.config.scene["name"]
     where = "" if name == agent.trained_in else f"{name}_"
-    conditions = product(config.speed, config.fps, range(config.video))
-    for speed, rate, number in conditions:
+    for speed, rate, number in product(config.speed, config.fps, range(config.video)):
         if stop:
             return
-        episode_seed = config.seed + number
-        path = folder.video_path(f"{where}{speed}_{rate:g}fps_{episode_seed}")
-        rates: dict[str, Any] = {"speed": speed, "frame_rate_hz": float(rate)}
-        record_episode(agent, path, episode_seed=episode_seed, **rates)
+        seed = config.seed + number
+        path = folder.video_path(f"{where}{speed}_{rate:g}fps_{seed}")
+        record_episode(agent, path, episode_seed=seed, speed=speed, frame_rate_hz=float(rate))
         print(f"video: {path}")
 
 

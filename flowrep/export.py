@@ -26,9 +26,7 @@ from flowrep.envs import street_envs
 from flowrep.experiment import build
 from flowrep.experiment.agents import CARD, LOADER, PROGRAM
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
-from flowrep.scenes import load_scene
 
-WEIGHTS = "agent.safetensors"  # of the program alone
 ACTIONS = ("no_op", "turn_left", "turn_right")  # by their indices in flowrep.scenes.scene
 
 
@@ -64,7 +62,6 @@ def export(run: RunFolder, output: str | None = None) -> Path:
 def agent_card(config: TrainConfig, env: EnvBase, frames: int) -> dict[str, Any]:
     """Returns the description that others need to give the agent its observations."""
     spec, (street,) = env.observation_spec, street_envs(env)
-    scene = load_scene(config.scene)
     return {
         "flowrep": __version__,
         "maps": [
@@ -82,7 +79,7 @@ def agent_card(config: TrainConfig, env: EnvBase, frames: int) -> dict[str, Any]
         "intrinsics": street.K.tolist(),
         "num_classes": street.num_classes,
         "frame_rate_hz": street.frame_rate_hz,
-        "scene": scene.name,
+        "scene": config.scene["name"],
         "algorithm": config.algorithm.plain(),
         "frames": frames,
     }
@@ -114,19 +111,11 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
 
 
 def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any]) -> None:
-    """Writes the files needed to run an agent without flowrep.
-
-    ```
-    agent.pt2            the program, for torch.export.load
-    agent.safetensors    only its weights, those of ordinary convolutions and linear layers
-    agent.json           its inputs and actions, the `card`
-    load_agent.py        loads agent.pt2 and agent.json; needs only torch
-    ```
-    """
+    """Writes the program, its weights, its card, and the loader that needs only torch."""
     folder.mkdir(parents=True, exist_ok=True)
     torch.export.save(program, folder / PROGRAM)
     weights = {name: weight.detach().contiguous() for name, weight in program.state_dict.items()}
-    save_file(weights, folder / WEIGHTS)
+    save_file(weights, folder / "agent.safetensors")
     (folder / CARD).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
     shutil.copyfile(load_agent.__file__, folder / LOADER)
 

@@ -48,12 +48,7 @@ class StopRequest:
 
 @dataclass
 class Every:
-    """True once each time a step counter passes a multiple of `interval`, 0 for never.
-
-    >>> should_log = Every(10)
-    >>> [should_log(step) for step in (4, 8, 12, 16, 20, 24)]
-    [False, False, True, False, True, False]
-    """
+    """True once each time a step counter passes a multiple of `interval`, 0 for never."""
 
     interval: int
     last: int = 0
@@ -83,11 +78,9 @@ class Stopwatch:
     def __call__(self, section: str) -> Iterator[None]:
         """Adds the time spent inside to `section`."""
         start = time.perf_counter()
-        try:
-            yield
-        finally:
-            elapsed = time.perf_counter() - start
-            self.seconds[section] = self.seconds.get(section, 0.0) + elapsed
+        yield
+        elapsed = time.perf_counter() - start
+        self.seconds[section] = self.seconds.get(section, 0.0) + elapsed
 
     def share(self, section: str) -> float:
         """Returns the share of all counted time that a section took; 0 at first."""

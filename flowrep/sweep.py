@@ -71,13 +71,10 @@ def run_sweep() -> NoReturn:
             "resume= continues one run; continue a sweep with its own command and "
             "hydra.sweep.dir=<its folder>"
         )
-    folder = Path(f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep").absolute()
-    typed = []
-    for text in sys.argv[1:]:
-        if text.startswith("hydra.sweep.dir="):
-            folder = Path(cli.value_of(text)).absolute()
-        else:
-            typed.append(text)
+    typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
+    places = [cli.value_of(text) for text in sys.argv[1:] if text not in typed]
+    new = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
+    folder = Path(places[-1] if places else new).absolute()
     (folder / STOP).unlink(missing_ok=True)
     given = cli.override("hydra.sweep.dir", str(folder))
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]

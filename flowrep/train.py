@@ -32,8 +32,7 @@ PATIENCE_S = 60.0  # for the process of a run that was stopped and still saves
 def run(config: TrainConfig) -> float:
     """Trains, evaluates and films one agent, or continues a run with `resume=`.
 
-    Returns its final success at all speeds and frame rates, which a sweeper such as Optuna
-    maximises.
+    Returns its final success, which a sweeper such as Optuna maximises.
     """
     job = HydraConfig.get()
     typed = list(job.overrides.task)
@@ -121,9 +120,8 @@ def complete(runner: Runner, stop: StopRequest) -> bool:
     """Trains and evaluates as far as that is not done yet; returns whether all is done."""
     config, folder = runner.config, runner.folder
     if sweep.is_finished(folder.path, config):
-        print(
-            f"this run is complete; evaluate it with: {line_for('evaluate', run=str(folder.path))}"
-        )
+        how = line_for("evaluate", run=str(folder.path))
+        print(f"this run is complete; evaluate it with: {how}")
     else:
         runner.train(stop)
         if stop or not runner.evaluate("final", stop):

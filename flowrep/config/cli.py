@@ -259,11 +259,7 @@ def _parsed(text: str) -> Any:
 
 
 def override(key: str, text: str) -> str:
-    """Returns an override that sets `key` to exactly `text`, quoted only if necessary.
-
-    >>> print(override("resume", "outputs/a"), override("resume", "a=b, c"))
-    resume=outputs/a resume='a=b, c'
-    """
+    """Returns an override that sets `key` to exactly `text`, quoted only if necessary."""
     parsed = None if "${" in text else _parsed(f"{key}={text}")
     if parsed is not None and parsed.value() == text:
         return f"{key}={text}"

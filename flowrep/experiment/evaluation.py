@@ -198,12 +198,7 @@ def _act(
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Returns Wilson's score interval of a proportion; (0, 1) without trials.
-
-    >>> low, high = wilson_interval(8, 10)
-    >>> round(low, 3), round(high, 3)
-    (0.49, 0.943)
-    """
+    """Returns Wilson's score interval of a proportion; (0, 1) without trials."""
     if not trials:
         return 0.0, 1.0
     # the shares p from which the one found is at most z standard errors away: the solutions of
@@ -280,11 +275,7 @@ class Comparison:
             total=self.total, initial=self.done, unit="episode", desc="evaluating", leave=False,
             miniters=0, mininterval=0.5,
         ) as bar:  # fmt: skip
-
-            def show(_: TensorDictBase) -> None:
-                bar.update(0)  # its clock goes on: the first episodes take seconds
-
-            for name, episode in self._episodes(make_env, policy, num_envs, stop, show, pool):
+            for name, episode in self._episodes(make_env, policy, num_envs, stop, bar, pool):
                 found = self._found[episode.speed, episode.fps, name]
                 found[episode.seed] = episode
                 bar.update()
@@ -299,7 +290,7 @@ class Comparison:
         policy: Policy | str,
         num_envs: int,
         stop: StopRequest | None,
-        on_frame: Callable[[TensorDictBase], Any],
+        bar: tqdm,
         pool: Any,
     ) -> Iterator[tuple[str, Episode]]:
         """Yields the missing episodes, each with its policy's name."""
@@ -316,7 +307,8 @@ class Comparison:
                     continue
                 with closing(make(num_envs=side_by_side)) as env:
                     for name, job in jobs.items():
-                        for episode in evaluate(env, **job, on_frame=on_frame):
+                        # the bar's clock goes on: the first episodes take seconds
+                        for episode in evaluate(env, **job, on_frame=lambda _: bar.update(0)):
                             yield name, episode
 
     def _job(self, name: str, policy: Policy | str, rate: float) -> dict[str, Any]:

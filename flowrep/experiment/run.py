@@ -166,20 +166,7 @@ def _scalars(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
 
 
 class RunFolder:
-    """The files of one run, by name.
-
-    ```
-    config.yaml              the resolved config, enough to resume or evaluate
-    metrics.csv              a row for each logged step; tensorboard/ and wandb/ hold the same
-    checkpoint/              what a resumed run continues from
-    evaluation.csv           a row for each evaluated episode; `evaluation` says whether it was run
-                             while training, at the end of it ("final"), or by flowrep.evaluate
-    failures.csv             why episodes failed, by policy and speed
-    machine.json             what it was computed with, for each machine
-    drives.npz               where the vehicle was in final and later evaluations
-    videos/                  what the agent saw and did
-    ```
-    """
+    """The files of one run, by name; docs/runs.md says what is in them."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
