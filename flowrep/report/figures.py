@@ -169,7 +169,14 @@ def _panels(
             axes.set(title=words(scene), ylim=(0, 100), yticks=range(0, 101, 25), axisbelow=True)
             axes.grid(axis="y")
         all_axes[0].set_ylabel("success (% of episodes)")
-        _legend(figure, handles)
+        em_in = mpl.rcParams["font.size"] / 72
+        longest = max(len(handle.get_label()) for handle in handles)
+        entry_in = (0.5 * longest + 3.5) * em_in  # half an em a letter, 3.5 for the sign and gaps
+        beside = min(len(handles), max(1, int(width / entry_in)))
+        # matplotlib fills column by column, and people read row by row.
+        by_column = [handle for start in range(beside) for handle in handles[start::beside]]
+        gaps = {"handlelength": 1.8, "columnspacing": 1.2, "handletextpad": 0.5}
+        figure.legend(handles=by_column, loc="outside upper center", ncols=beside, **gaps)
     return figure
 
 
@@ -230,14 +237,3 @@ def _in_thousands(points: Sequence[tuple[int, float]]) -> tuple[list[float], lis
 
 def _line_handles(style: Mapping[str, Look]) -> list[Any]:
     return [Line2D([], [], linewidth=1.3, label=name, **look.line) for name, look in style.items()]
-
-
-def _legend(figure: Figure, handles: Sequence[Any]) -> None:
-    em_in = mpl.rcParams["font.size"] / 72
-    longest = max(len(handle.get_label()) for handle in handles)
-    entry_in = (0.5 * longest + 3.5) * em_in  # half an em a letter, 3.5 for the sign and gaps
-    columns = min(len(handles), max(1, int(figure.get_figwidth() / entry_in)))
-    # matplotlib fills column by column, and people read row by row.
-    by_column = [handle for start in range(columns) for handle in handles[start::columns]]
-    gaps = {"handlelength": 1.8, "columnspacing": 1.2, "handletextpad": 0.5}
-    figure.legend(handles=by_column, loc="outside upper center", ncols=columns, **gaps)

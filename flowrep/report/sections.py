@@ -259,7 +259,7 @@ def _compared(
 
 
 def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
-    # Table III. The paper evaluates at low and high speed
+    # The paper's Table III, which is of low and high speed together.
     fps, driven = runs[0].fps, {c.speed for c in _at_speeds(runs, settings.policy)}
     speeds = ["low", "high"] if {"low", "high"} <= driven else [runs[0].speed]
     conditions = [Condition(settings.policy, speed, fps) for speed in speeds]

@@ -173,9 +173,7 @@ def estimated_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
 
 
 def factorize_frames(
-    frames: Iterable[Frame],
-    flow_source: FlowSource,
-    motion_source: MotionSource = recorded_motion,
+    frames: Iterable[Frame], flow_source: FlowSource, motion_source: MotionSource = recorded_motion
 ) -> Iterator[FactorizedFrame | None]:
     """Yields the factorisation of each frame, None for a frame without a previous one.
 

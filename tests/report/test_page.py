@@ -145,16 +145,12 @@ def test_tracks_are_those_of_the_first_episodes(tmp_path):
     np.testing.assert_array_equal(second.points_m, [[0, 1], [2, 3]])
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("evaluation", "training"), ("policy", "sampled"), ("speed", "low"), ("fps", 6.0),
-        ("frames", 500),
-    ],
-)  # fmt: skip
-def test_only_greedy_drives_of_the_finished_agent_as_it_was_trained_are_drawn(tmp_path, key, value):
-    write_drives(run_in(tmp_path, "run", "sco"), **{key: np.full(3, value)})
-    assert tracks_of(read_run(tmp_path / "run"), 2) == []
+def test_only_greedy_drives_of_the_finished_agent_as_it_was_trained_are_drawn(tmp_path):
+    run = run_in(tmp_path, "run", "sco")
+    others = {"evaluation": "training", "policy": "sampled", "speed": "low", "fps": 6, "frames": 5}
+    for key, value in others.items():
+        write_drives(run, **{key: np.full(3, value)})
+        assert tracks_of(read_run(run), 2) == [], key
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04 damaged"])

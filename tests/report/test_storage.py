@@ -10,13 +10,7 @@ import yaml
 pytest.importorskip("scipy", reason="reports are an extra")
 
 from flowrep.experiment.run import RunFolderError
-from flowrep.report.storage import (
-    EPISODES,
-    read_run,
-    read_runs,
-    without_repeats,
-    write_archive,
-)
+from flowrep.report.storage import EPISODES, read_run, read_runs, without_repeats, write_archive
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
 

@@ -183,9 +183,7 @@ def test_a_row_says_medians_shares_and_the_error():
     truth[:, :, 59] = np.nan
     now = frame("b", depth=depth, raw=truth, raw_since="a", timestamp_s=1.5)
     row = score(7, sequences.factorize_pair(frame("a"), now, raw), moving_px=4.9)
-    assert row["index"] == 7
-    assert row["name"] == "b"
-    assert row["timestamp_s"] == "1.500000"
+    assert (row["index"], row["name"], row["timestamp_s"]) == (7, "b", "1.500000")
     assert float(row["valid_share"]) == pytest.approx(1199 / 2400, abs=1e-6)
     assert float(row["moving_share"]) == pytest.approx(300 / 1199, abs=1e-6)
     assert float(row["raw_median_px"]) == float(row["obj_median_px"]) == 0.0

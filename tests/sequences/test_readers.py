@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -35,13 +37,7 @@ def open_sevenscenes(folder):
     return SevenScenes(folder, depth_intrinsics=camera, colour_intrinsics=camera)
 
 
-def open_sintel(folder):
-    return Sintel(folder, scene="cave", backwards=True)
-
-
-def open_tartanair(folder):
-    return TartanAir(folder, backwards=True)
-
+open_sintel = partial(Sintel, scene="cave", backwards=True)
 
 # Format: how it is written, how it is opened, whether it has flow of its own, whether time runs
 # backwards in it, and how far flow may be from the truth: half a step of the format's own.
@@ -51,7 +47,7 @@ FORMATS = {
     "sevenscenes": (synthetic.write_sevenscenes, open_sevenscenes, False, False, 0),
     "vkitti2": (synthetic.write_vkitti2, VKitti2, True, False, (WIDTH - 1) / 65535),
     "sintel": (synthetic.write_sintel, open_sintel, True, True, 0),
-    "tartanair": (synthetic.write_tartanair, open_tartanair, True, True, 0),
+    "tartanair": (synthetic.write_tartanair, partial(TartanAir, backwards=True), True, True, 0),
     "kitti": (synthetic.write_kitti, open_kitti, True, False, 0.5 / 64),
     "zed": (synthetic.write_zed, Zed, False, False, 0),
 }
@@ -63,8 +59,7 @@ def test_what_was_written_is_read_and_object_flow_equals_the_truth(name, tmp_pat
     moments = write(tmp_path)
     ordered = moments[::-1] if backwards else moments
     recording = open_it(tmp_path)
-    assert recording.has_flow == has_flow
-    assert len(recording) == len(moments)
+    assert (recording.has_flow, len(recording)) == (has_flow, len(moments))
     # OpenCV's cx = 18 is the centre of column 18, which lies at 18.5.
     K = {"kitti": synthetic.KITTI_K, "tartanair": synthetic.TARTANAIR_K}.get(name, synthetic.K)
     for frame, moment in zip(recording, ordered):
