@@ -117,4 +117,5 @@ def test_flow_and_sensors_are_exact_unless_asked_otherwise():
     assert config["noise"]["drift_m"] == 0.1
     parameters = inspect.signature(EstimatedFlow).parameters
     assert config["flow"].pop("source") == "estimated"
-    assert config["flow"] == {name: parameters[name].default for name in config["flow"]}
+    defaults = {name: parameters[name].default for name in config["flow"]}
+    assert config["flow"] == defaults | {"picture_scale": 2}  # which needs a renderer

@@ -140,6 +140,7 @@ class EstimatedFlow(Section):
     weights: Text | None
     preset: Literal["ultrafast", "fast", "medium"]
     min_side_px: Count
+    picture_scale: Count = 1  # runs from before it lack it
 
 
 Flow = Annotated[ExactFlow | EstimatedFlow, Field(discriminator="source")]

@@ -138,6 +138,8 @@ def make_env(
     if num_envs < 1:
         raise ValueError(f"num_envs is {num_envs}; give at least one environment")
     loaded = load_scene(scene)
+    if isinstance(flow, Mapping):
+        picture_scale = flow.get("picture_scale", picture_scale)
     drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}
     street = partial(StreetEnv, loaded, speed, frame_rate_hz, **drawn)
     # An environment without sensors gives the transforms K, classes and frame rate.

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torchrl.data import TensorSpec, Unbounded
 
 from flowrep.extras import require
 from flowrep.geometry.checks import check_name
@@ -201,7 +202,7 @@ class EstimatedFlow(FlowTransform):
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
-    | `"rgb2"`, uint8 `[*B, 6, H, W]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` × `scale` |
+    | `"rgb2"`, uint8 `[*B, 6, kH, kW]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` |
     | | `"unscaled"` if chosen | as above | any | px/step |
     | | `"raw_valid"`, `"unscaled_valid"` | bool `[*B, 1, H, W]` | | |
 
@@ -211,8 +212,9 @@ class EstimatedFlow(FlowTransform):
 
     The input is the previous picture and, after it on the channels, the current one.
     `FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])` writes them, correctly across
-    resets and in a replay buffer. After a reset the current picture comes twice and flow is
-    exactly 0. Where the estimator's flow isn't finite, it is 0 and the mask beside it False.
+    resets and in a replay buffer. Pictures may be k = `picture_scale` times as large as the maps;
+    flow is then averaged. After a reset the current picture comes twice and flow is exactly 0.
+    Where the estimator's flow isn't finite, it is 0 and the mask beside it False.
 
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
@@ -222,6 +224,7 @@ class EstimatedFlow(FlowTransform):
         weights: file with RAFT's weights, see `flowrep.transforms.RAFT`.
         preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
         min_side_px: smaller pictures are enlarged to this; for RAFT to at least 128.
+        picture_scale: k, size of the pictures in sizes of the maps.
         outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw; for raw's `unit` and for `dt_s` and `out_keys` see `RawFlow`.
         in_keys: the pair of pictures.
@@ -248,6 +251,7 @@ class EstimatedFlow(FlowTransform):
         weights: str | Path | None = None,
         preset: str = DIS.preset,
         min_side_px: int = DIS.min_side_px,
+        picture_scale: int = 1,
         outputs: Sequence[str] = ("raw",),
         scale: float = 1.0,
         unit: str = "px_per_step",
@@ -259,6 +263,7 @@ class EstimatedFlow(FlowTransform):
         units = {name: unit if name == "raw" else "px_per_step" for name in outputs}
         super().__init__(None, [PICTURE_PAIR], in_keys, out_keys, outputs, scales, units, dt_s)
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
+        self.picture_scale = picture_scale
 
     def compute(self, pair: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs."""
@@ -274,10 +279,26 @@ class EstimatedFlow(FlowTransform):
         flow = -flow.to(torch.float32)
         # After a reset both pictures are the same, and nothing has moved.
         differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
-        flow = torch.where(differs, flow, 0.0).reshape(*batch, 2, *size)
+        flow = torch.where(differs, flow, 0.0)
+        if self.picture_scale > 1:
+            flow = functional.avg_pool2d(flow, self.picture_scale) / self.picture_scale
         known = flow.isfinite().all(-3, keepdim=True)
-        flow = torch.where(known, flow, 0.0)
+        flow, known = (
+            x.reshape(*batch, *x.shape[-3:]) for x in (torch.where(known, flow, 0.0), known)
+        )
         return self._written({"raw": flow, "unscaled": flow}, known)
+
+    def output_specs(self, pair: TensorSpec) -> tuple[TensorSpec, ...]:
+        """Returns an unbounded spec per flow and a boolean one per mask, of the maps' size."""
+        *batch, _, height, width = pair.shape
+        k = self.picture_scale
+        if height % k or width % k:
+            raise ValueError(
+                f"representation {self.label}: pictures of {height}x{width} are not "
+                f"picture_scale={k} times as large as maps"
+            )
+        size = (*batch, 6, height // k, width // k)
+        return super().output_specs(Unbounded(size, device=pair.device, dtype=pair.dtype))
 
 
 def _estimator(

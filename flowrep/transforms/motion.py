@@ -7,15 +7,17 @@ from collections.abc import Sequence
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.nn import functional
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
 from flowrep import geometry
 from flowrep.transforms import base
-from flowrep.transforms.base import Keys, RecurrentTransform, as_keys, check_choice
+from flowrep.transforms.base import Keys, Reads, RecurrentTransform, as_keys, check_choice
 from flowrep.transforms.flow import CameraTransform, Intrinsics
 
 _POSES: Keys = [("sensor", "world_from_cam"), ("sensor", "world_from_body")]
 _DEPTH: NestedKey = ("sensor", "depth")
+_PICTURE = Reads((3, "kH", "kW"), "integer")
 # EstimateCameraMotion's outputs, with their keys.
 _ESTIMATES: dict[str, NestedKey] = {
     "motion": ("sensor", "prev_from_curr"),
@@ -134,7 +136,7 @@ class EstimateCameraMotion(CameraTransform):
 
     Args:
         intrinsics: K `[3, 3]` of the maps, pixels, or the env's key for it, `[*B, 3, 3]`.
-        picture: key of the current picture, uint8 `[*B, 3, H, W]`. Give it if raw flow is
+        picture: key of the current picture, uint8 `[*B, 3, kH, kW]`, k ≥ 1. Give it if raw flow is
             estimated: flow of plain surfaces is then left out, and along edges.
         prior: key of the motion expected, `[*B, 4, 4]`, such as odometry's.
         outputs: which of `"motion"`, `"inlier_share"`, `"covariance"` and `"valid"` to write.
@@ -167,7 +169,7 @@ class EstimateCameraMotion(CameraTransform):
         check_choice("outputs", outputs, _ESTIMATES)
         reads = [base.FLOW, base.DEPTH]
         keys = as_keys(["raw", _DEPTH] if in_keys is None else in_keys)
-        for key, layout in ((picture, base.RGB), (prior, base.MOTION)):
+        for key, layout in ((picture, _PICTURE), (prior, base.MOTION)):
             if key is not None:
                 reads.append(layout)
                 keys += as_keys([key])
@@ -181,6 +183,9 @@ class EstimateCameraMotion(CameraTransform):
         """Returns the chosen outputs."""
         rest = list(more)
         picture = rest.pop(0) if self.has_picture else None
+        if picture is not None and (k := picture.shape[-1] // depth.shape[-1]) > 1:
+            averaged = functional.avg_pool2d(picture.reshape(-1, *picture.shape[-3:]).float(), k)
+            picture = averaged.reshape(*picture.shape[:-2], *averaged.shape[-2:])
         prior = rest.pop(0) if self.has_prior else None
         K = self.K if self.K is not None else rest.pop()
         motion, share, covariance, valid = geometry.camera_motion(

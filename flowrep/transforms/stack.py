@@ -19,7 +19,7 @@ from flowrep.transforms.noise import SENSORS, SensorNoise
 
 FLOW_SOURCES = MOTION_SOURCES = ("exact", "estimated")
 NOISE_OPTIONS = SENSORS["depth"].options + SENSORS["motion"].options
-_ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px")
+_ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px", "picture_scale")
 _FLOW_OPTIONS = ("scale", "unit")
 
 

@@ -24,8 +24,13 @@ def test_a_config_says_where_the_cameras_motion_is_from(motion):
     assert len(estimators) == (motion == "estimated")
 
 
-def test_the_agent_and_the_film_see_one_estimate():
-    env = make_env("straight_road", ["raw", "rgb"], keep_sensor=True, seed=0, flow="estimated")
+@pytest.mark.parametrize("picture_scale", [1, 2])
+def test_the_agent_and_the_film_see_one_estimate(picture_scale):
+    flow = {"source": "estimated", "picture_scale": picture_scale}
+    env = make_env(
+        "straight_road", ["raw", "rgb", "ego"], keep_sensor=True, seed=0, flow=flow,
+        motion="estimated",
+    )  # fmt: skip
     tensordict = env.reset()
     assert not tensordict["raw"].any()  # after a reset nothing has moved
     action = torch.zeros(1, dtype=torch.long)
@@ -34,9 +39,11 @@ def test_the_agent_and_the_film_see_one_estimate():
     K = torch.as_tensor(street_envs(env)[0].K).float()
     maps = maps_of(tensordict["sensor"][0], K)
     env.close()
+    assert maps["rgb"].shape[-1] == picture_scale * maps["raw"].shape[-1]
     sensor = tensordict["sensor"][0]
     exact, _ = rigid_flow(sensor["depth"], sensor["instance"], K, sensor["instance_motion"])
     assert torch.equal(maps["raw"], tensordict["raw"][0])
     assert not torch.allclose(maps["raw"], exact, atol=0.1)
     known = torch.isfinite(sensor["depth"])[0]
+    torch.testing.assert_close(tensordict["ego"][0], maps["ego"], atol=1e-5, rtol=0)
     torch.testing.assert_close((maps["ego"] + maps["obj"])[:, known], maps["raw"][:, known])

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional
+from torchrl.data import Unbounded
 from torchrl.envs import ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 
@@ -153,6 +154,20 @@ def test_object_flow_is_the_estimate_less_ego_flow():
     assert (td["raw"] == -4.0).all()
     torch.testing.assert_close(td["ego"], 2 * ego)
     torch.testing.assert_close(td["obj"], torch.where(valid, 8 * (-1.0 - ego), 0.0))
+
+
+def test_flow_of_larger_pictures_is_averaged_to_the_maps():
+    def columns_and_rows(current, previous):
+        u = torch.arange(6.0).expand(len(current), 4, 6)
+        return torch.stack([u, 10 * torch.arange(4.0)[:, None].expand_as(u)], 1)
+
+    flow = T.EstimatedFlow(columns_and_rows, picture_scale=2)
+    raw = flow(TensorDict({"rgb2": shifted_pair(4, 6, right=1, down=1)}))["raw"]
+    # the mean of two columns, in pixels twice as large; rival: every second one, 0 and -1 and -2
+    assert torch.equal(raw[0], torch.tensor([[-0.25, -1.25, -2.25]]).expand(2, 3))
+    assert torch.equal(raw[1], torch.tensor([[-2.5], [-12.5]]).expand(2, 3))
+    with pytest.raises(ValueError, match="pictures of 5x6 are not picture_scale=2 times"):
+        flow.output_specs(Unbounded((6, 5, 6)))
 
 
 def test_without_opencv_one_line_says_what_to_install(monkeypatch):
