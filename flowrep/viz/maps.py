@@ -163,19 +163,20 @@ def strip(
 ) -> Image:
     """Returns images side by side, each under its label.
 
-    Small images are enlarged by a whole factor without interpolation. Those that are larger than
-    the others by that factor, `tile_zoom`, stay as they are.
+    The smallest are enlarged by `tile_zoom`, and larger ones, as an estimator's pictures may be, to
+    the same size, all without interpolation.
 
     Args:
         images: by label, `[H, W, 3]`.
         wheel_for: labels with the flow wheel beside them.
         notes: by label, the note below it: a text, or a function that draws a legend of a width.
     """
-    height, width, _ = size = min(image.shape for image in images.values())
+    sizes = sorted({image.shape[:2] for image in images.values()})
+    height, width = sizes[0]
+    if any(h * width != w * height for h, w in sizes):
+        raise ValueError(f"a strip needs images of one ratio of height to width, got {sizes}")
     zoom = tile_zoom(height, width)
-    large = (zoom * height, zoom * width, 3)
-    if others := {image.shape for image in images.values()} - {size, large}:
-        raise ValueError(f"a strip needs images of {size} or {large}, got {sorted(others)}")
+    y, x = np.indices((zoom * height, zoom * width), sparse=True)
     with_wheel = frozenset(wheel_for)
     columns: list[Image] = []
     for label, image in images.items():
@@ -191,8 +192,8 @@ def strip(
                 legend = note(width * zoom)
                 rows = (0, _NOTE_PX - len(legend)), (0, 0), (0, 0)
                 column.append(np.pad(legend, rows, constant_values=255))
-        is_small = image.shape == size
-        column.append(image.repeat(zoom, axis=0).repeat(zoom, axis=1) if is_small else image)
+        h, w = image.shape[:2]
+        column.append(image[y * h // (zoom * height), x * w // (zoom * width)])
         gap = np.full((sum(map(len, column)), _GAP_PX, 3), _GAP_GREY, np.uint8)
         columns += [np.concatenate(column), gap]
     return np.concatenate(columns[:-1], axis=1)

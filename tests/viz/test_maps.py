@@ -99,6 +99,17 @@ def test_strip_draws_what_is_there_in_a_fixed_order_enlarged_without_blur():
     assert (np.delete(obj.reshape(30, 6, 40, 6, 3), 3, axis=0) == 255).all()
 
 
+@pytest.mark.parametrize("factor", [2, 6])  # an estimator's pictures; as large as the tiles
+def test_a_picture_larger_than_the_maps_is_as_large_as_they_in_a_strip(factor):
+    given = maps()
+    rgb = torch.zeros(3, 30 * factor, 40 * factor, dtype=torch.uint8)
+    rgb[:, :, 20 * factor :] = 9
+    image = viz.representation_strip(given | {"rgb": rgb})
+    assert image.shape == viz.representation_strip(given).shape
+    assert (image[48:, :120] == 0).all()
+    assert (image[48:, 120:240] == 9).all()
+
+
 def test_labels_are_written_and_the_wheel_stands_beside_flow_only():
     image = viz.representation_strip(maps())
     rgb_bar, obj_bar = image[:28, :240], image[:28, 488:]
