@@ -26,7 +26,7 @@ from torchrl.record.loggers import TensorboardLogger
 
 from flowrep import __version__
 from flowrep.agent import CheckpointError
-from flowrep.config.schema import ALGORITHMS
+from flowrep.config.schema import ALGORITHMS, EstimatedFlow
 from flowrep.experiment.evaluation import OUTCOMES, failure_causes
 from flowrep.extras import require
 from flowrep.tables import append_rows, is_whole, read_rows, write_rows
@@ -85,16 +85,19 @@ def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the identity of a run: flowrep's version, and the config keys that define it."""
     whole = {"motion": "exact", **config}  # earlier runs have no motion
     parts = json.loads(json.dumps({key: whole[key] for key in _IDENTITY}))
-    parts["algorithm"] = _without_defaults(parts["algorithm"])
-    return {"flowrep": __version__} | parts
+    return {"flowrep": __version__} | _without_defaults(parts)
 
 
-def _without_defaults(algorithm: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns an algorithm's options without those at the schema's default."""
+def _without_defaults(parts: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns parts of a config without options at the schema's default."""
     # only options that earlier runs did not have yet have a default there
-    section = ALGORITHMS.get(algorithm["_target_"])
-    fields = section.model_fields if section else {}
-    return {k: v for k, v in algorithm.items() if k not in fields or fields[k].default != v}
+    of_algorithm = ALGORITHMS.get(parts["algorithm"]["_target_"])
+    kept = dict(parts)
+    for key, section in {"algorithm": of_algorithm, "flow": EstimatedFlow}.items():
+        fields = section.model_fields if section else {}
+        options = parts[key].items()
+        kept[key] = {k: v for k, v in options if k not in fields or fields[k].default != v}
+    return kept
 
 
 def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
@@ -104,7 +107,7 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
             "install that version, or start a new run"
         )
-    there = _flat({"motion": "exact", **saved, "algorithm": _without_defaults(saved["algorithm"])})
+    there = _flat(_without_defaults({"motion": "exact", **saved}))
     here = _flat(expected)
     for key in {**there, **here}:
         was, now = there.get(key, "absent"), here.get(key, "absent")

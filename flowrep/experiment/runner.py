@@ -185,6 +185,7 @@ class Runner:
         """Ends the processes of environments and evaluation."""
         if self._pool is not None:
             self._pool.close()
+            self._pool = None
         if not self.env.is_closed:
             self.env.close()
 

@@ -120,6 +120,16 @@ def test_a_run_from_before_an_option_existed_is_the_same_as_with_its_default(con
         check_origin(origin_of(older), origin_of(config), PATH)
 
 
+def test_a_run_from_before_larger_pictures_is_one_of_pictures_as_large_as_the_maps(config):
+    flow = plain("train", "debug=smoke", "flow=estimated", "flow.picture_scale=1")["flow"]
+    now = config | {"flow": flow}
+    before = config | {"flow": {k: v for k, v in flow.items() if k != "picture_scale"}}
+    check_origin({**origin_of(now), "flow": before["flow"]}, origin_of(now), PATH)
+    now = config | {"flow": flow | {"picture_scale": 2}}
+    with pytest.raises(CheckpointError, match=r"flow\.picture_scale=absent"):
+        check_origin(origin_of(before), origin_of(now), PATH)
+
+
 def test_another_version_is_refused(config):
     with pytest.raises(CheckpointError, match=r"0\.0\.9"):
         check_origin(origin_of(config) | {"flowrep": "0.0.9"}, origin_of(config), PATH)
