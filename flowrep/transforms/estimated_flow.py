@@ -202,7 +202,7 @@ class EstimatedFlow(FlowTransform):
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
-    | `"rgb2"`, uint8 `[*B, 6, kH, kW]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` |
+    | `"rgb2"`, uint8 `[*B,6,kH,kW]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` × `scale` |
     | | `"unscaled"` if chosen | as above | any | px/step |
     | | `"raw_valid"`, `"unscaled_valid"` | bool `[*B, 1, H, W]` | | |
 
@@ -263,6 +263,8 @@ class EstimatedFlow(FlowTransform):
         units = {name: unit if name == "raw" else "px_per_step" for name in outputs}
         super().__init__(None, [PICTURE_PAIR], in_keys, out_keys, outputs, scales, units, dt_s)
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
+        if picture_scale < 1:
+            raise ValueError(f"picture_scale must be at least 1, got {picture_scale}")
         self.picture_scale = picture_scale
 
     def compute(self, pair: Tensor) -> tuple[Tensor, ...]:

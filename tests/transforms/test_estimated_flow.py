@@ -184,6 +184,7 @@ def test_without_opencv_one_line_says_what_to_install(monkeypatch):
         ({"weights": "w.pth"}, "weights= are RAFT's; estimator 'dis' has none"),
         ({"preset": "slow"}, r"preset must be one of .*'medium'\], got 'slow'"),
         ({"min_side_px": 0}, "min_side_px must be at least 1, got 0"),
+        ({"picture_scale": 0}, "picture_scale must be at least 1, got 0"),
         ({"estimator": brightening, "preset": "slow"}, "preset='slow' .* not read .* function"),
         ({"estimator": T.DIS(), "min_side_px": 96}, r"min_side_px=96 are not read .*DIS\(preset"),
         ({"outputs": ["valid"]}, r"some of \['raw', 'unscaled'\]"),
