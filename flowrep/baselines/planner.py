@@ -106,7 +106,7 @@ def _ground(layout: Layout, path: Path) -> tuple[shapely.Geometry, GoalDistance]
 
 
 class _Search:
-    # It simulates one episode for many vehicles at once.
+    """Simulates one episode for many vehicles at once."""
 
     def __init__(self, episode: Episode) -> None:
         self.episode, self.vehicle = episode, episode.layout.scene.vehicle

@@ -90,10 +90,8 @@ class Sensing:
         self.names = tuple(sensors)
         self._street, self._scene = street, street.layout.scene
         config = self._scene.camera
-        self._size, self._range_m = (
-            (config.height_px, config.width_px),
-            (config.near_m, config.far_m),
-        )
+        self._size = config.height_px, config.width_px
+        self._range_m = config.near_m, config.far_m
         pinhole = config.focal_px, config.focal_px, *self._size
         self.K = camera.sampled_intrinsics(*pinhole)
         self._projection = camera.gl_projection(*pinhole, *self._range_m)
@@ -111,7 +109,7 @@ class Sensing:
         return {name: stack[0] for name, stack in self.observe_all([episode]).items()}
 
     def observe_all(self, episodes: Sequence[Episode]) -> Arrays:
-        """Returns the current observations of N episodes of the scene, [N, ...]."""
+        """Returns the current observations of N episodes, [N, ...], each as if it were alone."""
         names = _DRAWN.intersection(self.names)
         observation = self._draw(episodes, names) if names else {}
         if not {"prev_from_curr", "instance_motion"}.isdisjoint(self.names):

@@ -158,7 +158,7 @@ def make_env(
         )
     probe.close()
     sensors = sensors_read(transforms)
-    if keep_sensor:
+    if keep_sensor:  # these two only if something reads them
         sensors = [name for name in SENSORS if name in sensors or name not in ("rgb", "frame")]
     elif sensors:
         transforms.append(DropSensor())

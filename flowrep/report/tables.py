@@ -23,9 +23,8 @@ class Table(NamedTuple):
     name: str
     caption: str
     header: tuple[str, ...]
-    blocks: tuple[
-        tuple[str, tuple[tuple[str, ...], ...]], ...
-    ]  # headings, which may be "", and rows
+    # headings, which may be "", and rows
+    blocks: tuple[tuple[str, tuple[tuple[str, ...], ...]], ...]
     words: tuple[int, ...] = ()  # columns that are aligned left, beside the first
 
     @property

@@ -17,9 +17,9 @@ SIZE_PX = 256  # a side of the texture
 _SWATCH_PX = 8
 _FRONT_PX = (60, 64)  # height, width of one house front in the texture
 _FLOORS = (2, 3, 4, 5)
+# Shares of light from everywhere and from the sun, and the direction to it, in the world.
 AMBIENT, DIFFUSE = 0.62, 0.46
 LIGHT = tuple((np.array([-4.0, 3.0, 9.0]) / np.linalg.norm([-4.0, 3.0, 9.0])).tolist())
-# Shares of light from everywhere and from the sun, and the direction to it, in the world.
 
 GRAIN_SIZE, FRONT_SIZE = 512, 64  # texels a side; of a house front as the rasteriser has it
 _TEXELS_A_M, _PEOPLE_TEXELS_A_M = 25.0, 200.0  # so the grain of roads repeats every 20 m

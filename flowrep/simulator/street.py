@@ -28,7 +28,10 @@ _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
 class SafeGround:
-    """A fast test that a vehicle is clear of edges, boxes and ending zones; if not, it may be."""
+    """A fast test that a vehicle is clear of edges, boxes and ending zones; not of people.
+
+    It errs on the safe side: where it returns False, exact tests decide.
+    """
 
     def __init__(self, layout: Layout) -> None:
         vehicle = layout.scene.vehicle

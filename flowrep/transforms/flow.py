@@ -255,7 +255,7 @@ class FlowFactorize(FlowTransform):
     | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
 
     Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the paper),
-    obj = raw − ego is the objects' own flow (Eq. 6), on `RawFlow`'s grid and channels. See
+    obj = raw − ego is the objects' own flow (Eq. 6), with `RawFlow`'s sign, grid and channels. See
     `flowrep.geometry.factorize`, also for `prev_from_curr` and where flow isn't known and 0. Raw
     flow isn't known either where the mask beside it, bool `"raw_valid"` (`RawFlow` and
     `EstimatedFlow` write it; its key follows raw's), is False: a store of raw flow keeps both. With
