@@ -99,7 +99,8 @@ class Sensing:
         self._ids_by_number = street.ids_by_number()
         self.renderer, self._scale = camera.choose_renderer(renderer), scale
         if scale != 1 and self.renderer == "pybullet":
-            raise ValueError(f"picture_scale={scale} needs renderer 'rasteriser'")
+            remedy = "needs renderer 'rasteriser'; give 1 with 'pybullet'"
+            raise ValueError(f"picture_scale={scale} {remedy}")
         self._rasterisers: dict[int, Any] = {}  # by scale
         if self.renderer != "pybullet" and not _DRAWN.isdisjoint(sensors):
             self._rasteriser(1)  # compiled before the first step
