@@ -1,4 +1,4 @@
-"""Evaluates agents: `python -m flowrep.evaluate run=outputs/... speed=[low,high]`."""
+"""Evaluates agents: `python -m flowrep.evaluate run=outputs/... 'speed=[low,high]'`."""
 
 import sys
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Trains an agent: `python -m flowrep.train representations=[ego,obj] preset=laptop`."""
+"""Trains an agent: `python -m flowrep.train 'representations=[ego,obj]' preset=laptop`."""
 
 from __future__ import annotations
 
