@@ -1,6 +1,7 @@
 """Shows a scene and how a policy drives in it: `python -m flowrep.view scene=s_turn`."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
@@ -26,14 +27,14 @@ from flowrep.config.schema import ViewConfig
 from flowrep.envs import street_envs
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import Episode, Policy, evaluate, print_table
-from flowrep.experiment.film import Maps, film_episode, make_filmed, maps_of
+from flowrep.experiment.film import Maps, draw_frames, film_episode, make_filmed, maps_of
 from flowrep.palette import CATEGORY_ID
 from flowrep.policies import load_agent
 from flowrep.scenes import Scene
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.scene import NO_OP, TURN_LEFT, TURN_RIGHT
 from flowrep.tables import write_rows
-from flowrep.viz import contact_sheet, representation_strip, write_png, write_video
+from flowrep.viz import contact_sheet, write_png, write_video
 from flowrep.viz.plan import Track, draw_plan
 
 ENVS = 16  # side by side, for the episodes that are not filmed
@@ -86,7 +87,7 @@ def view(
     with tqdm(desc="driving", unit="frame") as bar:
         frames, episode = film_episode(env, agent.policy, options[0], lambda _: bar.update())
     episodes = [episode, *drive_on(config, agent, options[1:])]
-    strips = [representation_strip(maps) for maps in tqdm(frames, desc="drawing", unit="frame")]
+    strips = list(draw_frames(tqdm(frames, desc="drawing", unit="frame"), env))
     chosen = moments([moving_pixels(maps) for maps in frames], config.sheet_rows)
     folder.mkdir(parents=True, exist_ok=True)
     write_png(folder / "sheet.png", contact_sheet(strips[i] for i in chosen))
@@ -242,11 +243,15 @@ def drive_in_window(
     intrinsics = torch.from_numpy(street_envs(env)[0].K)
     image, drawn_at = None, time.monotonic()
 
+    seen: deque[Maps] = deque()
+    pictures = draw_frames(iter(seen.popleft, None), env)
+
     def draw(tensordict: TensorDictBase) -> None:
         nonlocal image, drawn_at
         if keyboard.is_over or keyboard.is_new:
             raise NewEpisode
-        picture = representation_strip(maps_of(tensordict["sensor"][0].cpu(), intrinsics))
+        seen.append(maps_of(tensordict["sensor"][0].cpu(), intrinsics))
+        picture = next(pictures)
         image = image or axes.imshow(picture, interpolation="nearest")
         image.set_data(picture)
         title.set_text(f"{keyboard.driver} drives    {keyboard.HELP}")

@@ -1,7 +1,7 @@
 """Films of episodes, and the picture of a run's learning."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -82,13 +82,20 @@ def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> M
     return seen | {"depth": depth, "raw": raw, "ego": ego, "obj": obj}
 
 
+def draw_frames(frames: Iterable[Maps], env: EnvBase) -> Iterator[Any]:
+    """Yields the pictures of an env's film, with the time and the colours of its classes."""
+    (street,) = street_envs(env)
+    for number, maps in enumerate(frames):
+        time_s = number / street.frame_rate_hz
+        yield representation_strip(maps, categories=street.scene.categories, time_s=time_s)
+
+
 def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: Any) -> Episode:
     """Writes the video of one greedy episode; `changes` are of the arguments of `make_env`."""
     env = make_filmed(partial(agent.make_env, **changes), agent.config.representations)
     frames, episode = film_episode(env, agent.policy, {"episode_seed": episode_seed})
+    replace_file(path, partial(write_video, frames=draw_frames(frames, env), fps=episode.fps))
     env.close()
-    strips = map(representation_strip, frames)
-    replace_file(path, partial(write_video, frames=strips, fps=episode.fps))
     return episode
 
 

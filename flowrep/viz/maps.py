@@ -40,6 +40,7 @@ _OFF_WHITE = 255 * (
 ).astype(np.float32)
 _BAR_PX = 28
 _NOTE_PX = 20
+_CLASS_PX = 120
 _GAP_PX = 4
 _GAP_GREY = 200  # so that the white of no motion has an edge
 _TILE_PX = 240
@@ -112,6 +113,8 @@ def representation_strip(
     *,
     flow_scale_px: Mapping[str, float] = FLOW_SCALE_PX,
     depth_range_m: float = DEPTH_RANGE_M,
+    categories: Iterable[str] = (),
+    time_s: float | None = None,
 ) -> Image:
     """Returns the camera's picture and its representations side by side, labelled.
 
@@ -120,13 +123,16 @@ def representation_strip(
             `[C, H, W]`; drawn in this order, other keys are ignored.
         flow_scale_px: flow at full saturation for raw, ego and obj; printed below them.
         depth_range_m: end of the depth colours; printed below them.
+        categories: classes whose colours are explained below the strip.
+        time_s: printed below RGB's label.
 
     Raises:
         ValueError: a map has the wrong shape, or none of the names is present.
     """
     depth_colours = partial(depth_to_rgb, range_m=depth_range_m)
+    clock = "" if time_s is None else f"{time_s:.1f} s"
     tiles: dict[str, tuple[str, Callable[[Any], Image], Note]] = {
-        "rgb": ("RGB", lambda rgb: np.moveaxis(_channels("rgb", rgb, 3), 0, -1).astype("u1"), ""),
+        "rgb": ("RGB", _picture, clock),
         "semantic": ("segmentation", classes_to_rgb, ""),
         "depth": ("depth, logarithmic", depth_colours, partial(depth_bar, depth_range_m)),
     }
@@ -139,7 +145,23 @@ def representation_strip(
         given = sorted(map(str, names))
         raise ValueError(f"nothing to draw: maps has {given}, expected some of {list(tiles)}")
     notes = {label: note for label, _, note in tiles.values() if note}
-    return strip(images, wheel_for=[f"{name} flow" for name in flow_scale_px], notes=notes)
+    drawn = strip(images, wheel_for=[f"{name} flow" for name in flow_scale_px], notes=notes)
+    legend = class_legend(tuple(categories), drawn.shape[1])
+    return np.concatenate([drawn, legend])
+
+
+@lru_cache(maxsize=64)
+def class_legend(names: tuple[str, ...], width: int) -> Image:
+    """Returns classes' colours beside their names, in as many rows as the width asks for."""
+    columns = max(1, width // _CLASS_PX)
+    legend = np.full((-(-len(names) // columns) * _NOTE_PX, width, 3), 255, np.uint8)
+    texts = {}
+    for number, name in enumerate(names):
+        row, column = divmod(number, columns)
+        x, y = column * _CLASS_PX, row * _NOTE_PX
+        legend[y + 4 : y + 16, x + 2 : x + 14] = CLASS_COLOURS[name]
+        texts[x + 18, y + _NOTE_PX // 2] = name.replace("_", " "), "lm", (70, 70, 70)
+    return _written(legend, texts, size=14) if names else legend
 
 
 def flow_note(scale_px: float) -> str:
@@ -278,6 +300,10 @@ def _written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, 
     for place, (text, anchor, colour) in texts.items():
         draw.text(place, text, fill=colour, font=font, anchor=anchor)
     return np.array(picture)
+
+
+def _picture(rgb: Any) -> Image:
+    return np.moveaxis(_channels("rgb", rgb, 3), 0, -1).astype(np.uint8)
 
 
 def _channels(name: str, values: Any, channels: int) -> NDArray[Any]:

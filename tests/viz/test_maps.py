@@ -119,6 +119,18 @@ def test_labels_are_written_and_the_wheel_stands_beside_flow_only():
     assert (obj_bar[:, -28:].min(-1) != obj_bar[:, -28:].max(-1)).any()
 
 
+def test_a_strip_tells_the_time_and_its_classes():
+    classes, given = ("road", "pedestrian", "traffic_light"), maps(30, 20)
+    bare = viz.representation_strip(given | {"rgb": given["rgb"]}, time_s=0.0)
+    told = viz.representation_strip(given, time_s=2.5, categories=classes)
+    assert (told[28:48, :240] != bare[28:48, :240]).any()
+    legend = told[len(bare) :]
+    assert legend.shape == (20, bare.shape[1], 3)
+    assert [tuple(legend[10, x]) for x in (8, 128, 248)] == [CLASS_COLOURS[c] for c in classes]
+    narrow = viz.representation_strip({"depth": given["depth"]}, categories=classes)
+    assert len(narrow) == len(bare) + 3 * 20  # a row for each
+
+
 def test_half_the_saturation_is_where_the_note_says():
     assert viz.flow_note(4.0) == "full at 4 px, half at 1 px"  # as the colours by hand above
 
