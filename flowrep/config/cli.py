@@ -129,7 +129,7 @@ def print_error(problem: str | Exception) -> None:
 
 _ANSWERS = {
     r"Ambiguous value for argument '(([^=]+)=(.*))'":
-        "'{0}' is several values: add -m to run each, or write {1}=[{2}]",
+        "'{0}' is several values: add -m to run each, or write '{1}=[{2}]'",
     r"Config group override must be":
         "a group can't be null: write the name of a choice, --help lists them",
     r"Missing mandatory value(?s:.*)full_key: (\S+)": "{0} needs a value: {0}=...",

@@ -518,7 +518,7 @@ def _line(details: Any) -> str:
         return f"{key}: {message}" if key else message
     remedy = ""
     if kind == "list_type":
-        remedy = f"; write {key}=[{value}]"
+        remedy = f"; write '{key}=[{value}]'"
     elif kind == "int_type" and isinstance(value, float) and value.is_integer():
         remedy = f"; write {value:.0f}"
     return f"{key}: {message[0].lower()}{message[1:]}, not {value!r}{remedy}"

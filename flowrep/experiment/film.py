@@ -1,6 +1,5 @@
 """Films of episodes, and the picture of a run's learning."""
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -110,7 +109,8 @@ def draw_learning_curve(
     """Draws a run's success over frames, from the rows of metrics.csv and evaluation.csv.
 
     The line is the success rate over the last training episodes (sampled actions); the points are
-    the run's own greedy evaluations at its speed and frame rate, with 95 % Wilson intervals.
+    the run's own greedy evaluations at its speed and frame rate, with 95 % Wilson intervals. After
+    the same frames the final one counts, not with other episodes that one in training drove.
     """
     from matplotlib.figure import Figure  # a tenth of the time that a command takes to start
 
@@ -120,12 +120,14 @@ def draw_learning_curve(
     )
     points = [(int(row["frames"]), float(row["success"])) for row in metrics]
     axes.plot(*zip(*points) if points else ([], []), label="training, sampled actions")
-    outcomes = defaultdict(list)
+    outcomes: dict[str, dict[int, list[str]]] = {kind: {} for kind in ("training", "final")}
     for row in episodes:
-        is_own = row["evaluation"] in ("training", "final") and row["policy"] == "greedy"
+        is_own = row["evaluation"] in outcomes and row["policy"] == "greedy"
         if is_own and (row["speed"], float(row["fps"])) == (speed, fps):
-            outcomes[int(row["frames"])].append(row["outcome"])
-    for number, (frames, names) in enumerate(sorted(outcomes.items())):
+            of_kind = outcomes[row["evaluation"]]
+            of_kind.setdefault(int(row["frames"]), []).append(row["outcome"])
+    evaluations = outcomes["training"] | outcomes["final"]
+    for number, (frames, names) in enumerate(sorted(evaluations.items())):
         share, low, high = outcome_shares(names)["success"]
         axes.errorbar(
             frames,

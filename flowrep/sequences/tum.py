@@ -80,6 +80,8 @@ class Tum(Recording):
 
     def _index(self, name: str) -> tuple[Floats, list[Path]]:
         path = self.folder / name
+        if not path.is_file():
+            raise SequenceError(path, "is missing: give the folder that holds it, or its format=")
         lines = [line.split(maxsplit=1) for line in read_lines(path)]
         try:
             times = np.array([float(time) for time, _ in lines])

@@ -74,6 +74,7 @@ def test_the_curve_shows_the_runs_own_greedy_evaluations_at_its_own_speed(tmp_pa
     others = {"evaluation": "evaluate", "policy": "sampled", "speed": "low", "fps": "6.0"}
     rows = [row, row | {"outcome": "timeout"}, row | {"evaluation": "final", "frames": "200"}]
     rows += [row | {key: value} for key, value in others.items()]
+    rows.append(row | {"frames": "200", "outcome": "timeout"})  # other episodes than the final ones
     metrics = [{"frames": "50", "success": "0.5"}, {"frames": "100", "success": "nan"}]
     for points, episodes in ((metrics, rows), ([], [])):
         draw_learning_curve(tmp_path / "a.png", points, episodes, speed="normal", fps=12.0)
