@@ -92,7 +92,7 @@ class OffPolicy(Algorithm):
         total_frames: environment frames over the training, at whose end the learning rate is 0.
         device: where networks, replay and updates live.
         precision: `"auto"`, `"bf16"` or `"fp32"`; weights are float32 in each case.
-        learning_rate, tau, rate_factors: see `Algorithm`.
+        learning_rate: see `Algorithm`, as for `tau` and `rate_factors`.
         gamma: discount per frame.
         hidden_size: width of the single hidden layer after the embeddings.
         frames_per_update: environment frames per gradient step.

@@ -32,7 +32,7 @@ class ReplayMemory(TensorDictReplayBuffer):
     Args:
         codecs: the maps to keep; see `flowrep.agent.observation`.
         capacity: rows to keep; beyond that, the oldest is overwritten.
-        n_steps, gamma: see `SuccessorSampler`.
+        n_steps: see `SuccessorSampler`, as for `gamma`.
     """
 
     def __init__(

@@ -259,7 +259,7 @@ def diagnose(
         raw: `[2, H, W]`, pixels per step, assumed p_t - p_t' on the current grid; nan unknown.
         depth: `[1, H, W]`, of the current frame, assumed z in metres.
         K: `[3, 3]`, pixels.
-        world_from_prev, world_from_curr: `[4, 4]`, assumed with OpenCV's axes.
+        world_from_prev: as `world_from_curr` `[4, 4]`, assumed with OpenCV's axes.
         static: `[1, H, W]`, pixels known to be static; without it most of the picture has to be.
 
     >>> K = torch.tensor([[20.0, 0.0, 5.0], [0.0, 20.0, 4.0], [0.0, 0.0, 1.0]])

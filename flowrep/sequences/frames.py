@@ -23,10 +23,10 @@ class Frames(Recording):
     `poses.txt` the camera's motion has to be estimated.
 
     Args:
-        pose_layout, pose_direction, pose_axes: see `flowrep.geometry.adapt_pose`.
+        pose_layout: see `flowrep.geometry.adapt_pose`, as for `pose_direction` and `pose_axes`.
         depth_unit_m: the length of a stored 1, metres; None is 0.001 in a .png and 1 in a .npy.
-        depth_kind, near_m, far_m: see `flowrep.geometry.adapt_depth`.
-        flow_direction, flow_grid, flow_channels: see `flowrep.geometry.adapt_flow`.
+        depth_kind: see `flowrep.geometry.adapt_depth`, as for `near_m` and `far_m`.
+        flow_direction: see `flowrep.geometry.adapt_flow`, as for `flow_grid` and `flow_channels`.
     """
 
     no_flow = "it has no folder flow/: use flow=estimated"

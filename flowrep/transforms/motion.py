@@ -183,9 +183,11 @@ class EstimateCameraMotion(CameraTransform):
         """Returns the chosen outputs."""
         rest = list(more)
         picture = rest.pop(0) if self.has_picture else None
-        if picture is not None and (k := picture.shape[-1] // depth.shape[-1]) > 1:
-            averaged = functional.avg_pool2d(picture.reshape(-1, *picture.shape[-3:]).float(), k)
-            picture = averaged.reshape(*picture.shape[:-2], *averaged.shape[-2:])
+        if picture is not None:
+            k, size = picture.shape[-1] // depth.shape[-1], depth.shape[-2:]
+            if k > 1 and picture.shape[-2:] == (k * size[0], k * size[1]):  # others are refused
+                flat = picture.reshape(-1, *picture.shape[-3:]).float()
+                picture = functional.avg_pool2d(flat, k).reshape(*picture.shape[:-2], *size)
         prior = rest.pop(0) if self.has_prior else None
         K = self.K if self.K is not None else rest.pop()
         motion, share, covariance, valid = geometry.camera_motion(

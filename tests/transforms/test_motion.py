@@ -76,6 +76,9 @@ def test_an_estimate_reads_the_picture_the_prior_and_k_where_it_is_told():
     td = estimate(td)
     assert not td["sensor", "motion_valid"].any()  # the picture is plain
     assert torch.equal(td["sensor", "prev_from_curr"], td["odometry"])
+    td["sensor", "rgb"] = torch.zeros(3, 3, 32, 49, dtype=torch.uint8)  # twice 16 x 24 is 32 x 48
+    with pytest.raises(ValueError, match=r"one \(height, width\)"):
+        estimate(td)
 
 
 def test_options_of_an_estimate_are_checked():
