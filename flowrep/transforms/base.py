@@ -140,7 +140,21 @@ class MapTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return self._call(tensordict_reset)  # TorchRL's own doesn't call the transform
+        # TorchRL's own doesn't call the transform
+        begins = tensordict.get("_reset", None)
+        if begins is None or begins.is_cuda or self.compiled:  # a mask would wait or recompile
+            return self._call(tensordict_reset)
+        rows = flags_of_batch(begins, tensordict_reset)
+        if rows.all() == rows.any():
+            return self._call(tensordict_reset)
+        # TorchRL keeps only the rows that begin anew, and estimates are slow.
+        begun = self._call(tensordict_reset[rows])
+        for key in self.out_keys:
+            if (value := begun.get(key, None)) is not None:
+                whole = value.new_zeros((*rows.shape, *value.shape[1:]))
+                whole[rows] = value
+                tensordict_reset.set(key, whole)
+        return tensordict_reset
 
     @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

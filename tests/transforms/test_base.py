@@ -205,3 +205,17 @@ def test_all_that_is_computed_from_a_first_frame_is_what_a_reset_would_give():
     for flow in ("ego", "raw"):  # of an episode's first frame, and of no other, is 0
         still = (own[flow] == 0).flatten(2).all(-1)
         assert still.nonzero().tolist() == [[0, 0], [0, 3], [0, 6], [1, 0], [1, 4], [1, 8]]
+
+
+def test_a_reset_of_some_rows_computes_no_others():
+    computed = []
+
+    def counting(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+        computed.append(len(first))
+        return brightening(first, second)
+
+    stack = T.FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])
+    env = TransformedEnv(FakeSensorEnv((2,)), Compose(stack, T.EstimatedFlow(counting)))
+    env.rollout(5, break_when_any_done=False)
+    # the first row ends after its third step, the second after its fourth
+    assert computed == [2, 2, 2, 2, 1, 2, 1, 2]
