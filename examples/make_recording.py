@@ -7,8 +7,8 @@ It holds pictures, depth, the camera's poses and the simulator's own flow, so th
 `poses=estimated` and wrong options (`format.pose_axes=opengl`) can be tried as well.
 """
 
+import argparse
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,4 +77,6 @@ def make_recording(
 
 
 if __name__ == "__main__":
-    make_recording(*sys.argv[1:2] or ["street"])
+    parser = argparse.ArgumentParser(description="Writes ten frames of a street with people.")
+    parser.add_argument("folder", nargs="?", default="street", help="the new folder (%(default)s)")
+    make_recording(parser.parse_args().folder)
