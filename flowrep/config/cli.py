@@ -299,13 +299,13 @@ def unless_resumed(resume: str | None, folder: str) -> str:
 
 
 def folder_name(text: str) -> str:
-    """Returns a text as the name of a single folder, without path separators.
+    """Returns a text as the name of a single folder, without path separators, not hidden.
 
     >>> folder_name("s_turn"), folder_name("../../etc"), folder_name("..")
-    ('s_turn', '.._.._etc', '_')
+    ('s_turn', '_.._etc', '_')
     """
     name = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in str(text))[:200]
-    return "_" if name in ("", ".", "..") else name
+    return name.lstrip(".") or "_"
 
 
 def run_of_sweep(overrides: Iterable[str]) -> str:
