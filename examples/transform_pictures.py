@@ -16,7 +16,7 @@ from flowrep.envs import make_env, street_envs
 from flowrep.experiment.film import film_episode, make_filmed
 from flowrep.geometry import ego_flow, unproject
 from flowrep.scenes import load_scene
-from flowrep.transforms import DIS
+from flowrep.transforms import EstimatedFlow
 from flowrep.viz import (
     DEPTH_RANGE_M,
     FLOW_SCALE_PX,
@@ -98,8 +98,8 @@ def of_parts(instance):
 
 
 def of_estimates(step_before, step, now):
-    current, previous = step["rgb"][None], step_before["rgb"][None]
-    estimate = -DIS()(current, previous)[0]
+    pair = torch.cat([step_before["rgb"], step["rgb"]])
+    estimate = EstimatedFlow(picture_scale=pair.shape[-1] // SIZE_PX).compute(pair)[0]
     return {
         "raw, exact": flow_to_rgb(now["raw"], FLOW_SCALE_PX["raw"]),
         "raw, estimated (DIS)": flow_to_rgb(estimate, FLOW_SCALE_PX["raw"]),
