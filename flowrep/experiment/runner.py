@@ -261,8 +261,8 @@ def share_cores(config: TrainConfig) -> AbstractContextManager[None]:
 
 
 def progress_text(row: Mapping[str, float]) -> str:
-    """Returns the end of the progress line; nan values are left out."""
-    losses = [name for name in row if name.endswith("_loss")]
+    """Returns the end of the progress line, for 120 columns; nan values are left out."""
+    losses = [name for name in row if name.endswith("_loss")][:1]
     shown = {"success": f"{row['success']:.0%}"}
     shown |= {name: f"{row[name]:.3g}" for name in ("alpha", "entropy", *losses) if name in row}
     return ", ".join(

@@ -14,7 +14,7 @@ from flowrep.config import UsageError, group_choices
 from flowrep.config.schema import validated_run
 from flowrep.experiment import build
 from flowrep.experiment.run import RunFolder, RunFolderError
-from flowrep.experiment.runner import Means, RecentEpisodes, Runner
+from flowrep.experiment.runner import Means, RecentEpisodes, Runner, progress_text
 from flowrep.progress import StopRequest
 from flowrep.train import resumed
 from tests.config.composing import composed, plain
@@ -30,6 +30,12 @@ def step(rewards, outcomes):
         "done": torch.tensor(outcomes)[:, None] != RUNNING,
     }
     return TensorDict({"next": after}, [len(rewards)])
+
+
+def test_the_progress_line_has_what_fits_beside_the_bar():
+    row = {"success": 0.21, "alpha": 0.004991, "entropy": math.nan, "q_loss": 0.7812}
+    row |= {"actor_loss": 1.13, "alpha_loss": 0.112}
+    assert progress_text(row) == "success 21%, alpha 0.00499, q loss 0.781"
 
 
 STEPS = [
