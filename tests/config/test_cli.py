@@ -245,7 +245,8 @@ def test_run_folders_are_named_by_scene_representations_and_seed():
 @pytest.mark.parametrize("name", ["../../etc", "/etc", "..", "a/b", "..\\b", "x" * 500, ""])
 def test_a_name_becomes_a_visible_folder_in_the_output_folder(name):
     folder = cli.folder_name(name)
-    assert folder and not folder.startswith(".")
+    assert folder
+    assert not folder.startswith(".")
     assert Path(folder).name == folder
     assert len(folder) <= 255
 
