@@ -14,12 +14,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.data import TensorSpec, Unbounded
 
+from flowrep import geometry
 from flowrep.extras import require
 from flowrep.geometry.checks import check_name
+from flowrep.transforms import base
 from flowrep.transforms.base import Keys, Reads
-from flowrep.transforms.flow import FlowTransform
+from flowrep.transforms.flow import EGO_KEYS, FlowTransform, Intrinsics
 
-PICTURE_PAIR = Reads((6, "H", "W"), "integer")
+PICTURE_PAIR = Reads((6, "kH", "kW"), "integer")
 
 # Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
 Estimator = Callable[[Tensor, Tensor], Tensor]
@@ -203,8 +205,9 @@ class EstimatedFlow(FlowTransform):
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `"rgb2"`, uint8 `[*B,6,kH,kW]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` × `scale` |
-    | | `"unscaled"` if chosen | as above | any | px/step |
-    | | `"raw_valid"`, `"unscaled_valid"` | bool `[*B, 1, H, W]` | | |
+    | with `intrinsics`: | `"unscaled"` if chosen | as above | any | px/step |
+    | `("sensor", "depth")`, m | `"raw_valid"`, `"unscaled_valid"` | bool `[*B, 1, H, W]` | | |
+    | `("sensor", "prev_from_curr")` | | | | |
 
     Convention: as in `RawFlow`, on the current frame's grid. The estimator therefore runs from the
     current picture to the previous one and its flow is negated; from the previous to the current
@@ -216,18 +219,25 @@ class EstimatedFlow(FlowTransform):
     flow is then averaged. After a reset the current picture comes twice and flow is exactly 0.
     Where the estimator's flow isn't finite, it is 0 and the mask beside it False.
 
+    With `intrinsics` the camera's motion is compensated: the estimator sees the previous picture
+    warped by ego flow, to which its own answer, the objects' flow, is added. Large motion of the
+    world is then no difficulty, and object flow hardly ever appears where nothing moves. What the
+    previous picture didn't show has ego flow alone.
+
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
             from two batches of pictures, uint8 `[N, 3, H, W]`, to the flow from the first to the
             second, float `[N, 2, H, W]`, e.g. a configured `flowrep.transforms.DIS`. A function has
             none of the following three options.
+        intrinsics: K `[3, 3]` of the maps, or its key, see `RawFlow`; None leaves the pictures as
+            they are.
         weights: file with RAFT's weights, see `flowrep.transforms.RAFT`.
         preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
         min_side_px: smaller pictures are enlarged to this; for RAFT to at least 128.
         picture_scale: k, size of the pictures in sizes of the maps.
         outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw; for raw's `unit` and for `dt_s` and `out_keys` see `RawFlow`.
-        in_keys: the pair of pictures.
+        in_keys: the pair of pictures; with `intrinsics` also depth and the camera's motion.
 
     Example:
         A texture that moved 2 px to the right since the previous picture.
@@ -248,6 +258,7 @@ class EstimatedFlow(FlowTransform):
         self,
         estimator: str | Estimator = "dis",
         *,
+        intrinsics: Intrinsics | None = None,
         weights: str | Path | None = None,
         preset: str = DIS.preset,
         min_side_px: int = DIS.min_side_px,
@@ -256,21 +267,34 @@ class EstimatedFlow(FlowTransform):
         scale: float = 1.0,
         unit: str = "px_per_step",
         dt_s: float | None = None,
-        in_keys: Keys = "rgb2",
+        in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
+        reads, keys = [PICTURE_PAIR], ["rgb2"]
+        if intrinsics is not None:
+            reads, keys = [*reads, base.DEPTH, base.MOTION], [*keys, *EGO_KEYS]
+        keys = keys if in_keys is None else in_keys
         scales = {name: scale if name == "raw" else 1.0 for name in outputs}
         units = {name: unit if name == "raw" else "px_per_step" for name in outputs}
-        super().__init__(None, [PICTURE_PAIR], in_keys, out_keys, outputs, scales, units, dt_s)
+        super().__init__(intrinsics, reads, keys, out_keys, outputs, scales, units, dt_s)
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
         if picture_scale < 1:
             raise ValueError(f"picture_scale must be at least 1, got {picture_scale}")
         self.picture_scale = picture_scale
 
-    def compute(self, pair: Tensor) -> tuple[Tensor, ...]:
-        """Returns the chosen outputs."""
-        batch, size = pair.shape[:-3], pair.shape[-2:]
+    def compute(self, pair: Tensor, *camera: Tensor) -> tuple[Tensor, ...]:
+        """Returns the chosen outputs, from the pictures (and depth, camera motion and K)."""
+        batch, size, k = pair.shape[:-3], pair.shape[-2:], self.picture_scale
+        height, width = self._map_size(pair, *camera)
         previous, current = pair.to(torch.uint8).reshape(-1, 6, *size).chunk(2, -3)
+        # After a reset both pictures are the same, and nothing has moved.
+        differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
+        ego = shown = None
+        if camera:
+            _, depth, motion, K = self._at_one_precision([pair, *camera])
+            ego = geometry.ego_flow(depth, K, motion).flow.float().reshape(-1, 2, height, width)
+            shift = k * ego.repeat_interleave(k, -2).repeat_interleave(k, -1)
+            previous, shown = _warped(previous, shift)
         flow = self.estimator(current, previous)
         if flow.shape != (len(current), 2, *size):
             raise ValueError(
@@ -279,28 +303,51 @@ class EstimatedFlow(FlowTransform):
                 "OpenCV's, are moved by flow.movedim(-1, 1)"
             )
         flow = -flow.to(torch.float32)
-        # After a reset both pictures are the same, and nothing has moved.
-        differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
+        if shown is not None:
+            flow = torch.where(shown, flow, 0.0)
+        if k > 1:
+            flow = functional.avg_pool2d(flow, k) / k
+        if ego is not None:
+            flow = flow + ego
         flow = torch.where(differs, flow, 0.0)
-        if self.picture_scale > 1:
-            flow = functional.avg_pool2d(flow, self.picture_scale) / self.picture_scale
         known = flow.isfinite().all(-3, keepdim=True)
         flow, known = (
             x.reshape(*batch, *x.shape[-3:]) for x in (torch.where(known, flow, 0.0), known)
         )
         return self._written({"raw": flow, "unscaled": flow}, known)
 
-    def output_specs(self, pair: TensorSpec) -> tuple[TensorSpec, ...]:
+    def output_specs(self, pair: TensorSpec, *camera: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns an unbounded spec per flow and a boolean one per mask, of the maps' size."""
-        *batch, _, height, width = pair.shape
-        k = self.picture_scale
-        if height % k or width % k:
+        size = (*pair.shape[:-2], *self._map_size(pair, *camera))
+        return super().output_specs(Unbounded(size, device=pair.device, dtype=pair.dtype))
+
+    def _map_size(self, pair: Tensor | TensorSpec, *camera: Tensor | TensorSpec) -> tuple[int, int]:
+        """Returns height and width of the maps; raises ValueError if the pictures don't fit."""
+        k, (height, width) = self.picture_scale, pair.shape[-2:]
+        maps = camera[0].shape[-2:] if camera else (height // k, width // k)
+        if (height, width) != (k * maps[0], k * maps[1]):
+            what = f"maps of {maps[0]}x{maps[1]}" if camera else "maps"
             raise ValueError(
                 f"representation {self.label}: pictures of {height}x{width} are not "
-                f"picture_scale={k} times as large as maps"
+                f"picture_scale={k} times as large as {what}"
             )
-        size = (*batch, 6, height // k, width // k)
-        return super().output_specs(Unbounded(size, device=pair.device, dtype=pair.dtype))
+        return maps[0], maps[1]
+
+
+def _warped(pictures: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the previous pictures `[N, 3, H, W]` as flow moves them, and where they show it.
+
+    `flow` is that from the previous pictures to the current ones, on the current grid.
+    """
+    height, width = pictures.shape[-2:]
+    rows, columns = (torch.arange(n, device=flow.device) + 0.5 for n in (height, width))
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    size = flow.new_tensor([width, height]).reshape(2, 1, 1)
+    place = (torch.stack([u, v]) - flow) / size  # from 0 to 1
+    moved = functional.grid_sample(
+        pictures.float(), 2 * place.movedim(1, -1) - 1, padding_mode="border", align_corners=False
+    )
+    return moved.round().to(torch.uint8), ((place >= 0) & (place <= 1)).all(1, keepdim=True)
 
 
 def _estimator(

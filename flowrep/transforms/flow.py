@@ -26,7 +26,7 @@ Unit = Literal["px_per_step", "px_per_s"]
 CAMERA = Reads((3, 3), "float")
 _DEPTH: NestedKey = ("sensor", "depth")
 _RAW_KEYS: Keys = [_DEPTH, ("sensor", "instance"), ("sensor", "instance_motion")]
-_EGO_KEYS: list[NestedKey] = [_DEPTH, ("sensor", "prev_from_curr")]
+EGO_KEYS: list[NestedKey] = [_DEPTH, ("sensor", "prev_from_curr")]
 
 # K itself, or the key under which the env gives it.
 Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
@@ -302,9 +302,9 @@ class FlowFactorize(FlowTransform):
         out_keys: Keys | None = None,
     ) -> None:
         reads: list[Reads] = [base.DEPTH, base.MOTION]
-        keys: Keys = _EGO_KEYS
+        keys: Keys = EGO_KEYS
         if {"obj", "raw"} & set(outputs):
-            reads, keys = [base.FLOW, *reads], ["raw", *_EGO_KEYS]
+            reads, keys = [base.FLOW, *reads], ["raw", *EGO_KEYS]
         keys = keys if in_keys is None else in_keys
         super().__init__(intrinsics, reads, keys, out_keys, outputs, scale, unit, dt_s, compiled)
 

@@ -104,9 +104,10 @@ def representation_stack(
         dt_s: duration of a step in seconds; flow in `px_per_s` needs it.
         compiled: whether flow is computed through `torch.compile`, see `RawFlow`.
         flow: source of raw flow, and thus of obj: `"exact"` (`RawFlow`), `"estimated"`
-            (`EstimatedFlow`, from `("sensor", "rgb")`), or a mapping with one of them as `source`
-            and further options of `EstimatedFlow`. Ego flow, computed from depth and the camera's
-            motion, depends on it only if the motion is estimated.
+            (`EstimatedFlow`, from `("sensor", "rgb")`, compensated for the camera's motion if obj
+            is chosen), or a mapping with one of them as `source` and further options of
+            `EstimatedFlow`. Ego flow, computed from depth and the camera's motion, depends on it
+            only if the motion is estimated.
         motion: source of the camera's motion for ego and obj: `"exact"`, the env's
             `("sensor", "prev_from_curr")`, or `"estimated"` (`EstimateCameraMotion`, from raw flow
             and depth, noisy if depth is; odometry is then not read, and its drift not drawn).
@@ -254,20 +255,20 @@ def _flow_transforms(
     unscaled: NestedKey = _UNSCALED_KEY
     estimates_motion = keys["motion"] == _ESTIMATED_MOTION_KEY
     needs_unscaled = "obj" in flows or estimates_motion
+    compensated: Transform | None = None
     if estimator is not None and ("raw" in flows or needs_unscaled):
         unscaled = _ESTIMATED_FLOW_KEY
         written = {"unscaled": unscaled} | ({"raw": "raw"} if "raw" in flows else {})
-        transforms = [
-            FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY]),
-            EstimatedFlow(
-                **estimator,
-                outputs=list(written),
-                **factors.pop("raw", {}),
-                dt_s=context["dt_s"],
-                in_keys=_PICTURES_KEY,
-                out_keys=list(written.values()),
-            ),
-        ]
+        options: dict[str, Any] = factors.pop("raw", {}) | {"dt_s": context["dt_s"]}
+        options |= {"outputs": list(written), "out_keys": list(written.values())}
+        transforms = [FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])]
+        if "obj" in flows:
+            inputs = [_PICTURES_KEY, keys["depth"], keys["motion"]]
+            options |= {"intrinsics": intrinsics, "in_keys": inputs}
+            compensated = EstimatedFlow(**estimator, **options)
+            options = {"outputs": ["unscaled"], "out_keys": unscaled}
+        if compensated is None or estimates_motion:
+            transforms.append(EstimatedFlow(**estimator, **options | {"in_keys": _PICTURES_KEY}))
     elif needs_unscaled:  # raw, too, is then made from the unscaled flow
         transforms = [RawFlow(intrinsics, out_keys=unscaled, **context)]
     elif "raw" in flows:
@@ -281,6 +282,8 @@ def _flow_transforms(
             out_keys=[_ESTIMATED_MOTION_KEY],
         )
         transforms.append(estimate_motion)
+    if compensated is not None:
+        transforms.append(compensated)
     for transform in transforms:
         if transform.out_keys[0] not in flows:  # errors name what is made of it
             transform.label = " and ".join(map(repr, flows))

@@ -6,6 +6,7 @@ import torch
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 pytest.importorskip("cv2", reason="flow is estimated by OpenCV: pip install 'flowrep-rl[flow]'")
 
+from flowrep.baselines import BaselinePolicy
 from flowrep.envs import make_env, street_envs
 from flowrep.experiment import build
 from flowrep.experiment.film import maps_of
@@ -22,6 +23,21 @@ def test_a_config_says_where_the_cameras_motion_is_from(motion):
     estimators = [each for each in env.transform if isinstance(each, EstimateCameraMotion)]
     env.close()
     assert len(estimators) == (motion == "estimated")
+
+
+def test_with_the_camera_compensated_what_stands_still_has_hardly_any_object_flow():
+    options = ["preset=laptop", "flow=estimated", "representations=[ego,obj]", "num_envs=2"]
+    env = build.env(composed(*options, "num_workers=0", "device=cpu"), keep_sensor=True, seed=0)
+    planner, streets = BaselinePolicy("planner", env), torch.arange(2)
+    frames = env.rollout(40, lambda td: planner(td.set("env_id", streets)))["next"]
+    K, sensor = torch.as_tensor(street_envs(env)[0].K).float(), frames["sensor"]
+    env.close()
+    depth, ids, motions = (sensor[key] for key in ("depth", "instance", "instance_motion"))
+    exact = (rigid_flow(depth, ids, K, motions).flow - frames["ego"]).norm(dim=-3, keepdim=True)
+    moved = frames["obj"].norm(dim=-3, keepdim=True)
+    static = (ids == 0) & depth.isfinite()
+    assert (moved[static] > 1.0).float().mean() < 0.01  # 0.1 without
+    assert moved[exact > 0.5].median() > 0.5
 
 
 @pytest.mark.parametrize("picture_scale", [1, 2])

@@ -142,18 +142,48 @@ def test_pixels_that_an_estimator_does_not_know_have_flow_0_and_no_object_flow()
     assert not td["valid"][..., 4:].any()
 
 
-def test_object_flow_is_the_estimate_less_ego_flow():
+def test_pictures_are_compared_after_the_camera_s_motion_is_undone():
+    # fx 20, fy 30: 0.2 m to the right and 0.1 m down past a wall 2 m away move it by (-2, -1.5) px,
+    # in pictures twice as large by (-4, -3).
+    K, motion = [[20.0, 0.0, 6.0], [0.0, 30.0, 4.0], [0.0, 0.0, 1.0]], torch.eye(4)
+    motion[:2, 3] = torch.tensor([0.2, 0.1])
+    pair, seen = shifted_pair(16, 24, right=-4, down=-3), []
+
+    def aside(current, previous):
+        seen.extend([current, previous])
+        return torch.tensor([-2.0, 8.0]).reshape(1, 2, 1, 1).expand(1, 2, 16, 24)
+
+    flow = T.EstimatedFlow(aside, intrinsics=K, picture_scale=2)
+    sensor = {"depth": torch.full((1, 8, 12), 2.0), "prev_from_curr": motion}
+    raw = flow(TensorDict({"rgb2": pair, "sensor": sensor}))["raw"]
+    current, previous = seen
+    assert torch.equal(current[0], pair[3:])
+    assert torch.equal(previous[..., :-3, :-4], current[..., :-3, :-4])
+    # The estimate, (2, -8) px of the pictures, is (1, -4) of the maps. The pictures' last 3 rows
+    # and 4 columns, 1.5 and 2 of the maps, were not to be seen before: ego flow alone.
+    share = torch.ones(8, 12)
+    share[6], share[7], share[:, 10:] = 0.5, 0.0, 0.0
+    expected = torch.stack([-2.0 + 1.0 * share, -1.5 - 4.0 * share])
+    torch.testing.assert_close(raw, expected, atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match=r"16x24 are not picture_scale=2 times .* maps of 8x13"):
+        flow.compute(pair, torch.ones(1, 8, 13), motion)
+
+
+def test_object_flow_is_what_is_estimated_beside_the_camera_s_motion():
+    def aside(current, previous):
+        return torch.tensor([-1.0, 2.0]).reshape(1, 2, 1, 1).expand(len(current), 2, 5, 7)
+
     options = {"raw": {"scale": 4.0}, "ego": {"scale": 2.0}, "obj": {"scale": 8.0}}
-    flow = {"source": "estimated", "estimator": brightening}
+    flow = {"source": "estimated", "estimator": aside}
     stack = T.representation_stack(options, intrinsics=INTRINSICS, flow=flow)
     td = TransformedEnv(FakeSensorEnv((2,)), stack).rollout(2)[:, 1]
     sensor = td["sensor"]
-    K, motion = torch.tensor(INTRINSICS), sensor["prev_from_curr"]
-    ego, valid = ego_flow(sensor["depth"], K, motion)
-    assert (sensor["flow"] == -1.0).all()
-    assert (td["raw"] == -4.0).all()
+    ego, valid = ego_flow(sensor["depth"], torch.tensor(INTRINSICS), sensor["prev_from_curr"])
+    objects = torch.tensor([1.0, -2.0]).reshape(2, 1, 1).expand(2, 2, 5, 7)
+    torch.testing.assert_close(sensor["flow"], ego + objects)
+    torch.testing.assert_close(td["raw"], 4 * (ego + objects))
     torch.testing.assert_close(td["ego"], 2 * ego)
-    torch.testing.assert_close(td["obj"], torch.where(valid, 8 * (-1.0 - ego), 0.0))
+    torch.testing.assert_close(td["obj"], torch.where(valid, 8 * objects, 0.0))
 
 
 def test_flow_of_larger_pictures_is_averaged_to_the_maps():
