@@ -136,7 +136,7 @@ def representation_stack(
     if motion == "estimated" and not {"ego", "obj"}.isdisjoint(flows):
         keys["motion"] = _ESTIMATED_MOTION_KEY
     transforms += _flow_transforms(flows, estimator, intrinsics, keys, context)
-    written = [key for transform in transforms for key in transform.out_keys]
+    written = dict.fromkeys(key for transform in transforms for key in transform.out_keys)
     hidden = [key for key in written if key not in (*chosen, *_KEPT)]
     return Compose(*transforms, *([DropKeys(*hidden)] if hidden else []))
 

@@ -25,9 +25,11 @@ def test_a_config_says_where_the_cameras_motion_is_from(motion):
     assert len(estimators) == (motion == "estimated")
 
 
-def test_with_the_camera_compensated_what_stands_still_has_hardly_any_object_flow():
-    options = ["preset=laptop", "flow=estimated", "representations=[ego,obj]", "num_envs=2"]
-    env = build.env(composed(*options, "num_workers=0", "device=cpu"), keep_sensor=True, seed=0)
+@pytest.mark.parametrize("motion", ["exact", "estimated"])
+def test_with_the_camera_compensated_what_stands_still_has_hardly_any_object_flow(motion):
+    options = ["preset=laptop", "flow=estimated", f"motion={motion}", "representations=[ego,obj]"]
+    options += ["num_envs=2", "num_workers=0", "device=cpu"]
+    env = build.env(composed(*options), keep_sensor=True, seed=0)
     planner, streets = BaselinePolicy("planner", env), torch.arange(2)
     frames = env.rollout(40, lambda td: planner(td.set("env_id", streets)))["next"]
     K, sensor = torch.as_tensor(street_envs(env)[0].K).float(), frames["sensor"]
