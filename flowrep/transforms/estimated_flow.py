@@ -285,36 +285,45 @@ class EstimatedFlow(FlowTransform):
     def compute(self, pair: Tensor, *camera: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from the pictures (and depth, camera motion and K)."""
         batch, size, k = pair.shape[:-3], pair.shape[-2:], self.picture_scale
-        height, width = self._map_size(pair, *camera)
+        self._map_size(pair, *camera)
         previous, current = pair.to(torch.uint8).reshape(-1, 6, *size).chunk(2, -3)
         # After a reset both pictures are the same, and nothing has moved.
         differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
-        ego = shown = None
         if camera:
             _, depth, motion, K = self._at_one_precision([pair, *camera])
-            ego = geometry.ego_flow(depth, K, motion).flow.float().reshape(-1, 2, height, width)
-            shift = k * ego.repeat_interleave(k, -2).repeat_interleave(k, -1)
-            previous, shown = _warped(previous, shift)
-        flow = self.estimator(current, previous)
-        if flow.shape != (len(current), 2, *size):
-            raise ValueError(
-                f"representation {self.label}: the estimator should return [N, 2, H, W], "
-                f"{[len(current), 2, *size]}, got {list(flow.shape)}; channels that come last, as "
-                "OpenCV's, are moved by flow.movedim(-1, 1)"
-            )
-        flow = -flow.to(torch.float32)
-        if shown is not None:
-            flow = torch.where(shown, flow, 0.0)
+            ego = geometry.ego_flow(depth, K, motion).flow.float()
+            ego = ego.reshape(-1, 2, *ego.shape[-2:])
+            ego = k * ego.repeat_interleave(k, -2).repeat_interleave(k, -1)
+            flow = self._compensated(current, previous, ego)
+        else:
+            flow = self._estimate(current, previous)
+        flow = torch.where(differs, flow, 0.0)
         if k > 1:
             flow = functional.avg_pool2d(flow, k) / k
-        if ego is not None:
-            flow = flow + ego
-        flow = torch.where(differs, flow, 0.0)
         known = flow.isfinite().all(-3, keepdim=True)
         flow, known = (
             x.reshape(*batch, *x.shape[-3:]) for x in (torch.where(known, flow, 0.0), known)
         )
         return self._written({"raw": flow, "unscaled": flow}, known)
+
+    def _compensated(self, current: Tensor, previous: Tensor, ego: Tensor) -> Tensor:
+        """Returns flow `[N, 2, kH, kW]`, estimated after the previous picture is warped by ego."""
+        was, shown = _looked_up(previous.float(), ego)
+        own = torch.where(shown, self._estimate(current, was.round().to(torch.uint8)), 0.0)
+        # The warped picture shows at p - own what the previous one shows at p - own - ego(p - own).
+        return own + _looked_up(ego, own)[0]
+
+    def _estimate(self, current: Tensor, previous: Tensor) -> Tensor:
+        """Returns flow `[N, 2, kH, kW]`, float32, from the previous picture to the current one."""
+        flow = self.estimator(current, previous)
+        expected = (len(current), 2, *current.shape[-2:])
+        if flow.shape != expected:
+            raise ValueError(
+                f"representation {self.label}: the estimator should return [N, 2, H, W], "
+                f"{[*expected]}, got {list(flow.shape)}; channels that come last, as "
+                "OpenCV's, are moved by flow.movedim(-1, 1)"
+            )
+        return -flow.to(torch.float32)
 
     def output_specs(self, pair: TensorSpec, *camera: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns an unbounded spec per flow and a boolean one per mask, of the maps' size."""
@@ -334,20 +343,16 @@ class EstimatedFlow(FlowTransform):
         return maps[0], maps[1]
 
 
-def _warped(pictures: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the previous pictures `[N, 3, H, W]` as flow moves them, and where they show it.
-
-    `flow` is that from the previous pictures to the current ones, on the current grid.
-    """
-    height, width = pictures.shape[-2:]
+def _looked_up(maps: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns float maps `[N, C, H, W]` at p - flow for each pixel p, and where that is inside."""
+    height, width = maps.shape[-2:]
     rows, columns = (torch.arange(n, device=flow.device) + 0.5 for n in (height, width))
     v, u = torch.meshgrid(rows, columns, indexing="ij")
     size = flow.new_tensor([width, height]).reshape(2, 1, 1)
     place = (torch.stack([u, v]) - flow) / size  # from 0 to 1
-    moved = functional.grid_sample(
-        pictures.float(), 2 * place.movedim(1, -1) - 1, padding_mode="border", align_corners=False
-    )
-    return moved.round().to(torch.uint8), ((place >= 0) & (place <= 1)).all(1, keepdim=True)
+    grid = 2 * place.movedim(1, -1) - 1
+    found = functional.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+    return found, ((place >= 0) & (place <= 1)).all(1, keepdim=True)
 
 
 def _estimator(

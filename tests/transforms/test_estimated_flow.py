@@ -169,21 +169,39 @@ def test_pictures_are_compared_after_the_camera_s_motion_is_undone():
         flow.compute(pair, torch.ones(1, 8, 13), motion)
 
 
-def test_object_flow_is_what_is_estimated_beside_the_camera_s_motion():
+def test_the_camera_s_share_is_that_of_the_place_where_the_estimate_was_found():
+    # 0.5 m ahead towards a wall now 2 m away: all goes 0.5 / 2.5 of its distance from (4, 2) out.
+    K, motion = [[20.0, 0.0, 4.0], [0.0, 30.0, 2.0], [0.0, 0.0, 1.0]], torch.eye(4)
+    motion[2, 3] = 0.5
+
     def aside(current, previous):
-        return torch.tensor([-1.0, 2.0]).reshape(1, 2, 1, 1).expand(len(current), 2, 5, 7)
+        return torch.tensor([-1.0, 2.0]).reshape(1, 2, 1, 1).expand(1, 2, 6, 9)
+
+    sensor = {"depth": torch.full((1, 6, 9), 2.0), "prev_from_curr": motion}
+    pair = shifted_pair(6, 9, right=1, down=0)
+    flow = T.EstimatedFlow(aside, intrinsics=K)(TensorDict({"rgb2": pair, "sensor": sensor}))
+    # Rival: the share of the pixel itself, 0.2 * (4.5 - 4) and so on.
+    u = 1.0 + 0.2 * (torch.arange(9) + 0.5 - 1.0 - 4.0)
+    v = -2.0 + 0.2 * (torch.arange(6) + 0.5 + 2.0 - 2.0)
+    inside = flow["raw"][:, 0:4, 1:]  # where p - own is a pixel, too
+    expected = torch.stack(torch.meshgrid(u[1:], v[:4], indexing="xy"))
+    torch.testing.assert_close(inside, expected, atol=1e-5, rtol=0)
+
+
+def test_raw_flow_beside_object_flow_is_estimated_with_the_camera_compensated():
+    def still(current, previous):
+        return torch.zeros(len(current), 2, 5, 7)
 
     options = {"raw": {"scale": 4.0}, "ego": {"scale": 2.0}, "obj": {"scale": 8.0}}
-    flow = {"source": "estimated", "estimator": aside}
+    flow = {"source": "estimated", "estimator": still}
     stack = T.representation_stack(options, intrinsics=INTRINSICS, flow=flow)
     td = TransformedEnv(FakeSensorEnv((2,)), stack).rollout(2)[:, 1]
     sensor = td["sensor"]
-    ego, valid = ego_flow(sensor["depth"], torch.tensor(INTRINSICS), sensor["prev_from_curr"])
-    objects = torch.tensor([1.0, -2.0]).reshape(2, 1, 1).expand(2, 2, 5, 7)
-    torch.testing.assert_close(sensor["flow"], ego + objects)
-    torch.testing.assert_close(td["raw"], 4 * (ego + objects))
-    torch.testing.assert_close(td["ego"], 2 * ego)
-    torch.testing.assert_close(td["obj"], torch.where(valid, 8 * objects, 0.0))
+    ego, _ = ego_flow(sensor["depth"], torch.tensor(INTRINSICS), sensor["prev_from_curr"])
+    assert ego.abs().amax() > 0.5
+    for got, expected in [(sensor["flow"], ego), (td["raw"], 4 * ego), (td["ego"], 2 * ego)]:
+        torch.testing.assert_close(got, expected)
+    torch.testing.assert_close(td["obj"], torch.zeros_like(ego), atol=1e-4, rtol=0)
 
 
 def test_flow_of_larger_pictures_is_averaged_to_the_maps():
