@@ -74,7 +74,7 @@ def pictures(step_before, step, before, now, K):
             "a row an instance": flows["raw"],
             "their difference": flows["obj"],
         },
-        "estimated_flow": of_estimates(step_before, step, now),
+        "estimated_flow": of_estimates(step_before, step, now, K),
         "adapt": of_depth_kinds(now["depth"], K),
     }
 
@@ -97,13 +97,17 @@ def of_parts(instance):
     return PARTS[torch.where(ids > 0, (ids - 1) % 3 + 1, 0).numpy()]
 
 
-def of_estimates(step_before, step, now):
+def of_estimates(step_before, step, now, K):
     pair = torch.cat([step_before["rgb"], step["rgb"]])
-    estimate = EstimatedFlow(picture_scale=pair.shape[-1] // SIZE_PX).compute(pair)[0]
+    size = {"picture_scale": pair.shape[-1] // SIZE_PX}
+    plain = EstimatedFlow(**size).compute(pair)[0]
+    motion = step["instance_motion"][0]
+    compensated = EstimatedFlow(intrinsics=K, **size).compute(pair, now["depth"], motion)[0]
     return {
-        "raw, exact": flow_to_rgb(now["raw"], FLOW_SCALE_PX["raw"]),
-        "raw, estimated (DIS)": flow_to_rgb(estimate, FLOW_SCALE_PX["raw"]),
-        "obj from it": flow_to_rgb(estimate - now["ego"], FLOW_SCALE_PX["obj"]),
+        "obj, exact": flow_to_rgb(now["obj"], FLOW_SCALE_PX["obj"]),
+        "raw by DIS": flow_to_rgb(plain, FLOW_SCALE_PX["raw"]),
+        "obj from it": flow_to_rgb(plain - now["ego"], FLOW_SCALE_PX["obj"]),
+        "obj, compensated": flow_to_rgb(compensated - now["ego"], FLOW_SCALE_PX["obj"]),
     }
 
 

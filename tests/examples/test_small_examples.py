@@ -82,7 +82,9 @@ def test_flow_estimated_from_larger_pictures_is_drawn_beside_the_maps():
     from examples.transform_pictures import SIZE_PX, of_estimates
 
     still = {"rgb": torch.zeros(3, 2 * SIZE_PX, 2 * SIZE_PX, dtype=torch.uint8)}
-    now = dict.fromkeys(("raw", "ego"), torch.ones(2, SIZE_PX, SIZE_PX))
-    drawn = of_estimates(still, still, now)
+    still["instance_motion"] = torch.eye(4).unsqueeze(0)
+    now = dict.fromkeys(("obj", "ego"), torch.zeros(2, SIZE_PX, SIZE_PX))
+    now["depth"] = torch.ones(1, SIZE_PX, SIZE_PX)
+    drawn = of_estimates(still, still, now, torch.eye(3))
     assert {picture.shape for picture in drawn.values()} == {(SIZE_PX, SIZE_PX, 3)}
-    assert (drawn["raw, estimated (DIS)"] == 255).all()  # no flow is white
+    assert all((picture == 255).all() for picture in drawn.values())  # no flow is white
