@@ -309,7 +309,8 @@ class Scene(Part):
     """A complete scene as data; `load_scene` reads and checks one.
 
     Grass covers the ground between the roads and up to `terrain_m` beyond their bounds; 0 for none.
-    `corner_radius_m` rounds the kerb where roads meet.
+    `corner_radius_m` rounds the kerb where roads meet. `symmetric` says that a drive's left-right
+    image is a drive in this scene, too, so that an agent may learn from images.
     """
 
     name: FileName
@@ -331,6 +332,7 @@ class Scene(Part):
     crosswalks: tuple[Crosswalk, ...] = ()
     terrain_m: NotNegative = 0.0
     corner_radius_m: NotNegative = 0.0
+    symmetric: Annotated[bool, Strict()] = False
 
     @property
     def time_limit_s(self) -> float:
