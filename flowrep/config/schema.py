@@ -138,7 +138,7 @@ class EstimatedFlow(Section):
     source: Literal["estimated"]
     estimator: Literal["dis", "raft_small", "raft_large"]
     weights: Text | None
-    preset: Literal["ultrafast", "fast", "medium"]
+    preset: Literal["ultrafast", "fast", "medium", "fine"]
     min_side_px: Count
     picture_scale: Count = 1  # runs from before it lack it
 

@@ -266,6 +266,8 @@ def _flow_transforms(
             inputs = [_PICTURES_KEY, keys["depth"], keys["motion"]]
             options |= {"intrinsics": intrinsics, "in_keys": inputs}
             compensated = EstimatedFlow(**estimator, **options)
+            if estimator.get("preset") == "fine":
+                estimator = estimator | {"preset": "medium"}  # enough for the camera's motion
             options = {"outputs": ["unscaled"], "out_keys": unscaled}
         if compensated is None or estimates_motion:
             transforms.append(EstimatedFlow(**estimator, **options | {"in_keys": _PICTURES_KEY}))

@@ -230,7 +230,7 @@ def test_without_opencv_one_line_says_what_to_install(monkeypatch):
         ({"estimator": "farneback"}, r"one of \['dis', 'raft_small', 'raft_large'\].*'farneback'"),
         ({"estimator": "raft_small"}, "'raft_small' needs weights="),
         ({"weights": "w.pth"}, "weights= are RAFT's; estimator 'dis' has none"),
-        ({"preset": "slow"}, r"preset must be one of .*'medium'\], got 'slow'"),
+        ({"preset": "slow"}, r"preset must be one of .*'fine'\], got 'slow'"),
         ({"min_side_px": 0}, "min_side_px must be at least 1, got 0"),
         ({"picture_scale": 0}, "picture_scale must be at least 1, got 0"),
         ({"estimator": brightening, "preset": "slow"}, "preset='slow' .* not read .* function"),
