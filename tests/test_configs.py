@@ -118,4 +118,5 @@ def test_flow_and_sensors_are_exact_unless_asked_otherwise():
     parameters = inspect.signature(EstimatedFlow).parameters
     assert config["flow"].pop("source") == "estimated"
     defaults = {name: parameters[name].default for name in config["flow"]}
-    assert config["flow"] == defaults | {"picture_scale": 2}  # which needs a renderer
+    # small maps from larger pictures, which needs a renderer
+    assert config["flow"] == defaults | {"picture_scale": 4, "preset": "fine"}
