@@ -130,6 +130,12 @@ def test_a_run_from_before_larger_pictures_is_one_of_pictures_as_large_as_the_ma
         check_origin(origin_of(before), origin_of(now), PATH)
 
 
+def test_a_run_from_before_scenes_said_whether_they_are_symmetric_is_the_same(config):
+    assert config["scene"]["symmetric"]
+    scene = {key: value for key, value in config["scene"].items() if key != "symmetric"}
+    check_origin(origin_of(config | {"scene": scene}), origin_of(config), PATH)
+
+
 def test_another_version_is_refused(config):
     with pytest.raises(CheckpointError, match=r"0\.0\.9"):
         check_origin(origin_of(config) | {"flowrep": "0.0.9"}, origin_of(config), PATH)
