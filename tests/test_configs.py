@@ -106,6 +106,12 @@ def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
     env.close()
 
 
+@pytest.mark.parametrize(("scene", "mirrors"), [("three_way_junction", True), ("s_turn", False)])
+def test_the_recipe_learns_from_images_where_a_scene_is_its_own(scene, mirrors):
+    config = plain("train", "experiment=recipe", f"scene={scene}")
+    assert config["algorithm"]["mirror"] is mirrors
+
+
 def test_flow_and_sensors_are_exact_unless_asked_otherwise():
     from flowrep.transforms import EstimatedFlow
 

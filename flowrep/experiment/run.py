@@ -97,7 +97,7 @@ def _without_defaults(parts: Mapping[str, Any]) -> dict[str, Any]:
         fields = section.model_fields if section else {}
         options = parts[key].items()
         kept[key] = {k: v for k, v in options if k not in fields or fields[k].default != v}
-    # what presets read of a scene, and its streets don't
+    # read by configs that choose images, and by no street
     kept["scene"] = {key: value for key, value in parts["scene"].items() if key != "symmetric"}
     return kept
 

@@ -238,11 +238,11 @@ class EstimatedFlow(FlowTransform):
             from two batches of pictures, uint8 `[N, 3, H, W]`, to the flow from the first to the
             second, float `[N, 2, H, W]`, e.g. a configured `flowrep.transforms.DIS`. A function has
             none of the following three options.
-        intrinsics: K `[3, 3]` of the maps, or its key, see `RawFlow`; None leaves the pictures as
-            they are.
         weights: file with RAFT's weights, see `flowrep.transforms.RAFT`.
         preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
         min_side_px: smaller pictures are enlarged to this; for RAFT to at least 128.
+        intrinsics: K `[3, 3]` of the maps, or its key, see `RawFlow`; None leaves the pictures as
+            they are.
         picture_scale: k, size of the pictures in sizes of the maps.
         outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw; for raw's `unit` and for `dt_s` and `out_keys` see `RawFlow`.
@@ -267,10 +267,10 @@ class EstimatedFlow(FlowTransform):
         self,
         estimator: str | Estimator = "dis",
         *,
-        intrinsics: Intrinsics | None = None,
         weights: str | Path | None = None,
         preset: str = DIS.preset,
         min_side_px: int = DIS.min_side_px,
+        intrinsics: Intrinsics | None = None,
         picture_scale: int = 1,
         outputs: Sequence[str] = ("raw",),
         scale: float = 1.0,

@@ -266,11 +266,13 @@ def _flow_transforms(
             inputs = [_PICTURES_KEY, keys["depth"], keys["motion"]]
             options |= {"intrinsics": intrinsics, "in_keys": inputs}
             compensated = EstimatedFlow(**estimator, **options)
-            if estimator.get("preset") == "fine":
-                estimator = estimator | {"preset": "medium"}  # enough for the camera's motion
+            # then for the camera's motion alone, which a coarser estimate tells
             options = {"outputs": ["unscaled"], "out_keys": unscaled}
+            if estimator.get("preset") == "fine":
+                options["preset"] = "medium"
         if compensated is None or estimates_motion:
-            transforms.append(EstimatedFlow(**estimator, **options | {"in_keys": _PICTURES_KEY}))
+            plain = estimator | options | {"in_keys": _PICTURES_KEY}
+            transforms.append(EstimatedFlow(**plain))
     elif needs_unscaled:  # raw, too, is then made from the unscaled flow
         transforms = [RawFlow(intrinsics, out_keys=unscaled, **context)]
     elif "raw" in flows:

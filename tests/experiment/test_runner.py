@@ -32,12 +32,6 @@ def step(rewards, outcomes):
     return TensorDict({"next": after}, [len(rewards)])
 
 
-def test_the_progress_line_has_what_fits_beside_the_bar():
-    row = {"success": 0.21, "alpha": 0.004991, "entropy": math.nan, "q_loss": 0.7812}
-    row |= {"actor_loss": 1.13, "alpha_loss": 0.112}
-    assert progress_text(row) == "success 21%, alpha 0.00499, q loss 0.781"
-
-
 STEPS = [
     step([1.0, 10.0], [RUNNING, RUNNING]),
     step([2.0, 20.0], [RUNNING, COLLISION]),  # the second street: return 30 in 2 steps
@@ -326,3 +320,9 @@ def test_a_policy_that_can_draw_no_action_ends_the_run_by_name(tmp_path, change,
         runner.train(StopRequest())
     assert runner.frames < 400  # before the first look at the losses
     runner.close()
+
+
+def test_the_progress_line_has_what_fits_beside_the_bar():
+    row = {"success": 0.21, "alpha": 0.004991, "entropy": math.nan, "q_loss": 0.7812}
+    row |= {"actor_loss": 1.13, "alpha_loss": 0.112}
+    assert progress_text(row) == "success 21%, alpha 0.00499, q loss 0.781"
