@@ -74,6 +74,20 @@ def test_flow_lies_where_a_body_is_now_not_where_it_was():
     assert u[:40].abs().median() < 0.1
 
 
+def test_the_preset_fine_keeps_the_flow_of_small_bodies():
+    previous, body = texture(160, 160), texture(24, 8, seed=1)
+    current = previous.clone()
+    previous[:, 60:84, 70:78] = body
+    current[:, 60:84, 72:80] = body  # 2 px to the right, a body of 8 px
+    pair = TensorDict({"rgb2": torch.cat([previous, current])})
+    medium, fine = (
+        T.EstimatedFlow(preset=preset)(pair.clone())["raw"][0, 62:82, 73:79].median()
+        for preset in ("medium", "fine")
+    )
+    assert fine == pytest.approx(2.0, abs=0.3)
+    assert medium < 1.5
+
+
 def test_a_picture_that_stayed_the_same_has_exactly_no_flow():
     def noisy(first, second):
         return torch.ones(len(first), 2, *first.shape[-2:])
