@@ -61,7 +61,7 @@ def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():
     def algorithm(*line):
         return plain("train", *line)["algorithm"]
 
-    assert algorithm("preset=laptop")["n_steps"] == 3
+    assert algorithm("preset=laptop")["n_steps"] == 10
     assert algorithm("preset=paper")["n_steps"] == 1
     assert "n_steps" not in algorithm("preset=laptop", "algorithm=ppo")
     # the command line has the last word
@@ -107,8 +107,8 @@ def test_a_scene_of_one_s_own_is_found_beside_the_package_s(tmp_path):
 
 
 @pytest.mark.parametrize(("scene", "mirrors"), [("three_way_junction", True), ("s_turn", False)])
-def test_the_recipe_learns_from_images_where_a_scene_is_its_own(scene, mirrors):
-    config = plain("train", "experiment=recipe", f"scene={scene}")
+def test_laptop_presets_learn_from_images_where_a_scene_is_its_own(scene, mirrors):
+    config = plain("train", "preset=laptop_long", f"scene={scene}")
     assert config["algorithm"]["mirror"] is mirrors
 
 

@@ -39,8 +39,8 @@ class DIS:
     Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels,
     because the preset "medium" matches patches of 8 px at half size, too coarse for a picture of
     48 px. The faster presets choose their scale by the picture's width and gain less, or nothing.
-    "fine" is "medium" at the picture's full size and smooths a quarter as much: people keep more of
-    their flow, at three times the cost.
+    "fine" is "medium" at the picture's full size and smooths a tenth as much: people keep more of
+    their flow, at twice the cost.
 
     The pictures of a batch are split among as many threads as torch uses
     (`torch.set_num_threads`), since OpenCV releases Python's lock. Pictures on another device are
@@ -95,8 +95,9 @@ class DIS:
         if is_fine:
             estimator.setFinestScale(0)
             estimator.setPatchStride(4)
-            estimator.setGradientDescentIterations(16)
-            estimator.setVariationalRefinementAlpha(5.0)
+            estimator.setGradientDescentIterations(12)
+            estimator.setVariationalRefinementAlpha(2.0)
+            estimator.setVariationalRefinementIterations(2)
         flow = estimator.calc(*grey, None)
         if factor > 1:
             flow = cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) / factor
