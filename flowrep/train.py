@@ -81,8 +81,8 @@ def announce(config: TrainConfig, preset: str) -> None:
     print(f"device: {device.type} ({where}{cores})")
     if preset == "paper" and device.type == "cpu" and config.total_frames >= 1_000_000:
         print(
-            f"{config.total_frames:,} frames with the paper's settings take about three days on a "
-            "CPU; preset=laptop takes minutes"
+            f"{config.total_frames:,} frames with the paper's settings take one to two days on two "
+            "cores; preset=laptop takes minutes"
         )
 
 
