@@ -48,6 +48,7 @@ FIGURE = "images/results_claims.svg"
 CLAIMS = HERE / "claims.yaml"
 _SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
+_STUDY = {"resolution": ", 84 px", "presets_before": ", before"}  # in the figure
 _WIDEST = 80  # points of the figure's axis
 _POWER = 0.8
 _FOUND, _NEVER = 0.5, 0.05  # a run finds a way if it succeeds in this share of its episodes
@@ -154,7 +155,8 @@ def _contrast(
     together = effect([sides for s in chosen for sides in strata[s]]) if has_all else None
     p_value = float("nan") if together is None else _p_value(together, asked)
     by_scene = {scene: effect(found) for scene, found in strata.items()}
-    fewest = min((len(side) for of in strata.values() for x in of for side in x), default=0)
+    sides_of = [side for s in chosen for sides in strata.get(s, []) for side in sides]
+    fewest = min(map(len, sides_of), default=0)
     return Contrast(asked, together, by_scene, fewest, p_value)
 
 
@@ -269,8 +271,8 @@ def _label(claim: Claim, contrast: Contrast) -> str:
     if not what:
         units = [f"{n} Hz" if isinstance(n, int) else n for n in asked[kind]]
         what = (" − " if min(asked[kind].values()) < 0 else " and ").join(units)
-    size = ", 84 px" if asked.get("study") == "resolution" else ""
-    return f"{claim.number}  {' − '.join(names)}, {what}{size}"
+    study = _STUDY.get(asked.get("study", ""), "")
+    return f"{claim.number}  {' − '.join(names)}, {what}{study}"
 
 
 def _draw_effect(
@@ -302,7 +304,8 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     of_speeds = [Condition("never_turn", speed, runs[0].fps) for speed in SPEEDS]
     shares = [baseline_share(runs, condition) for condition in of_speeds]
     never = ["" if share is None else f"{100 * share:.0f}" for share in shares]
-    rows.append(["never turning", *never, *[""] * (len(header) - 4)])
+    if any(never):
+        rows.append(["never turning", *never, *[""] * (len(header) - 4)])
     return markdown(header, rows)
 
 
@@ -470,6 +473,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             variations=variation_table(declared["variations"], studies),
             runs=runs_table(studies),
             commands=declared["commands"],
+            commands_before=declared["commands_before"],
             number=len(runs),
             pixels=sorted(
                 {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
