@@ -156,49 +156,81 @@ def test_pixels_that_an_estimator_does_not_know_have_flow_0_and_no_object_flow()
     assert not td["valid"][..., 4:].any()
 
 
-def test_pictures_are_compared_after_the_camera_s_motion_is_undone():
-    # fx 20, fy 30: 0.2 m to the right and 0.1 m down past a wall 2 m away move it by (-2, -1.5) px,
-    # in pictures twice as large by (-4, -3).
-    K, motion = [[20.0, 0.0, 6.0], [0.0, 30.0, 4.0], [0.0, 0.0, 1.0]], torch.eye(4)
+# fx 20, fy 30: 0.2 m to the right and 0.1 m down past a wall 2 m away move it by (-2, -1.5) px, in
+# pictures twice as large by (-4, -3).
+WALL_K = [[20.0, 0.0, 6.0], [0.0, 30.0, 4.0], [0.0, 0.0, 1.0]]
+
+
+def past_a_wall(pair, estimate, depth=2.0):
+    """Returns raw flow of pictures of 20 x 28, and what the estimator was given."""
+    motion, seen = torch.eye(4), []
     motion[:2, 3] = torch.tensor([0.2, 0.1])
-    pair, seen = shifted_pair(16, 24, right=-4, down=-3), []
 
-    def aside(current, previous):
+    def estimator(current, previous):
         seen.extend([current, previous])
-        return torch.tensor([-2.0, 8.0]).reshape(1, 2, 1, 1).expand(1, 2, 16, 24)
+        return torch.tensor(estimate).reshape(1, 2, 1, 1).expand(1, 2, 20, 28)
 
-    flow = T.EstimatedFlow(aside, intrinsics=K, picture_scale=2)
-    sensor = {"depth": torch.full((1, 8, 12), 2.0), "prev_from_curr": motion}
-    raw = flow(TensorDict({"rgb2": pair, "sensor": sensor}))["raw"]
-    current, previous = seen
+    flow = T.EstimatedFlow(estimator, intrinsics=WALL_K, picture_scale=2)
+    depth = torch.full((1, 10, 14), depth) if isinstance(depth, float) else depth
+    sensor = {"depth": depth, "prev_from_curr": motion}
+    td = flow(TensorDict({"rgb2": pair, "sensor": sensor}))
+    with pytest.raises(ValueError, match=r"20x28 are not picture_scale=2 times .* maps of 10x13"):
+        flow.compute(pair, torch.ones(1, 10, 13), motion)
+    return td["raw"], *seen
+
+
+def test_pictures_are_compared_after_the_camera_s_motion_is_undone():
+    pair = shifted_pair(20, 28, right=-4 + 2, down=-3 - 6)  # something moves by (2, -6) px, too
+    raw, current, previous = past_a_wall(pair, [-2.0, 6.0])
     assert torch.equal(current[0], pair[3:])
-    assert torch.equal(previous[..., :-3, :-4], current[..., :-3, :-4])
-    # The estimate, (2, -8) px of the pictures, is (1, -4) of the maps. The pictures' last 3 rows
-    # and 4 columns, 1.5 and 2 of the maps, were not to be seen before: ego flow alone.
-    share = torch.ones(8, 12)
-    share[6], share[7], share[:, 10:] = 0.5, 0.0, 0.0
-    expected = torch.stack([-2.0 + 1.0 * share, -1.5 - 4.0 * share])
-    torch.testing.assert_close(raw, expected, atol=1e-5, rtol=0)
-    with pytest.raises(ValueError, match=r"16x24 are not picture_scale=2 times .* maps of 8x13"):
-        flow.compute(pair, torch.ones(1, 8, 13), motion)
+    # Without the camera's motion, what is at (x, y) before is at (x + 2, y - 6) now.
+    assert torch.equal(previous[..., 6:-3, :-4], current[..., :-9, 2:-2])
+    # (2, -6) px of the pictures are (1, -3) of the maps. The pictures' last 3 rows and 4 columns,
+    # 1.5 and 2 of the maps, were not to be seen before: ego flow alone.
+    expected = torch.tensor([-2.0 + 1.0, -1.5 - 3.0]).reshape(2, 1, 1)
+    torch.testing.assert_close(raw[:, :4, 2:11], expected.expand(2, 4, 9), atol=1e-5, rtol=0)
+    ego = torch.tensor([-2.0, -1.5]).reshape(2, 1, 1)
+    torch.testing.assert_close(raw[:, :, 12:], ego.expand(2, 10, 2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(raw[:, 9:], ego.expand(2, 1, 14), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("contrast", [0.01, 1.0])
+def test_an_estimate_that_does_not_explain_the_pictures_is_not_an_objects_flow(contrast):
+    pair = shifted_pair(20, 28, right=-4, down=-3)  # only the camera moved
+    pair = (128 + contrast * (pair.float() - 128)).to(torch.uint8)
+    raw, *_ = past_a_wall(pair, [-2.0, 6.0])
+    ego = torch.tensor([-2.0, -1.5]).reshape(2, 1, 1).expand(2, 10, 14)
+    torch.testing.assert_close(raw, ego, atol=1e-5, rtol=0)
+
+
+def test_where_depth_is_not_known_the_camera_s_share_is_that_of_neighbours():
+    depth = torch.full((1, 10, 14), 2.0)
+    depth[0, 5, 6], depth[0, 2, 9] = 0.0, torch.nan
+    raw, _, previous = past_a_wall(shifted_pair(20, 28, right=-4, down=-3), [0.0, 0.0], depth)
+    ego = torch.tensor([-2.0, -1.5]).reshape(2, 1, 1).expand(2, 10, 14)
+    torch.testing.assert_close(raw, ego, atol=1e-5, rtol=0)  # rival: 0 there, and less around it
 
 
 def test_the_camera_s_share_is_that_of_the_place_where_the_estimate_was_found():
     # 0.5 m ahead towards a wall now 2 m away: all goes 0.5 / 2.5 of its distance from (4, 2) out.
-    K, motion = [[20.0, 0.0, 4.0], [0.0, 30.0, 2.0], [0.0, 0.0, 1.0]], torch.eye(4)
+    K, motion, warped = [[20.0, 0.0, 4.0], [0.0, 30.0, 2.0], [0.0, 0.0, 1.0]], torch.eye(4), []
     motion[2, 3] = 0.5
 
     def aside(current, previous):
-        return torch.tensor([-1.0, 2.0]).reshape(1, 2, 1, 1).expand(1, 2, 6, 9)
+        warped.append(previous[0])
+        return torch.tensor([-1.0, 2.0]).reshape(1, 2, 1, 1).expand(1, 2, 12, 16)
 
-    sensor = {"depth": torch.full((1, 6, 9), 2.0), "prev_from_curr": motion}
-    pair = shifted_pair(6, 9, right=1, down=0)
-    flow = T.EstimatedFlow(aside, intrinsics=K)(TensorDict({"rgb2": pair, "sensor": sensor}))
+    sensor = {"depth": torch.full((1, 12, 16), 2.0), "prev_from_curr": motion}
+    before = shifted_pair(12, 16, right=1, down=0)[:3]
+    transform = T.EstimatedFlow(aside, intrinsics=K)
+    transform(TensorDict({"rgb2": torch.cat([before, before.flip(0)]), "sensor": sensor}))
+    now = warped[0].roll((-2, 1), (-2, -1))  # what the estimate says
+    flow = transform(TensorDict({"rgb2": torch.cat([before, now]), "sensor": sensor}))
     # Rival: the share of the pixel itself, 0.2 * (4.5 - 4) and so on.
-    u = 1.0 + 0.2 * (torch.arange(9) + 0.5 - 1.0 - 4.0)
-    v = -2.0 + 0.2 * (torch.arange(6) + 0.5 + 2.0 - 2.0)
-    inside = flow["raw"][:, 0:4, 1:]  # where p - own is a pixel, too
-    expected = torch.stack(torch.meshgrid(u[1:], v[:4], indexing="xy"))
+    u = 1.0 + 0.2 * (torch.arange(16) + 0.5 - 1.0 - 4.0)
+    v = -2.0 + 0.2 * (torch.arange(12) + 0.5 + 2.0 - 2.0)
+    expected = torch.stack(torch.meshgrid(u[3:], v[:8], indexing="xy"))
+    inside = flow["raw"][:, :8, 3:]  # the rest is near rows and columns that came round
     torch.testing.assert_close(inside, expected, atol=1e-5, rtol=0)
 
 
