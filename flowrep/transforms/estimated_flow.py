@@ -24,8 +24,8 @@ from flowrep.transforms.flow import EGO_KEYS, FlowTransform, Intrinsics
 PICTURE_PAIR = Reads((6, "kH", "kW"), "integer")
 
 # An object's flow is believed where it leaves less than 0.9 of the pictures' squared difference and
-# the gain is beyond rounding's. With 48 x 48 maps in four scenes, static pixels with more than 0.3 px
-# of object flow fall from 4.5 to 2 %, and people keep as much of theirs as without.
+# gains more than rounding can: three quarters of the static pixels with false object flow lose it,
+# and people keep as much of theirs (docs/transforms/estimated_flow.md).
 _CLEARLY, _GREY_LEVELS = 0.9, 2.0
 
 # Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
@@ -300,7 +300,7 @@ class EstimatedFlow(FlowTransform):
 
     def compute(self, pair: Tensor, *camera: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from the pictures (and depth, camera motion and K)."""
-        batch, size, k = pair.shape[:-3], pair.shape[-2:], self.picture_scale
+        batch, size = pair.shape[:-3], pair.shape[-2:]
         self._map_size(pair, *camera)
         previous, current = pair.to(torch.uint8).reshape(-1, 6, *size).chunk(2, -3)
         # After a reset both pictures are the same, and nothing has moved.

@@ -194,21 +194,55 @@ def test_pictures_are_compared_after_the_camera_s_motion_is_undone():
     torch.testing.assert_close(raw[:, 9:], ego.expand(2, 1, 14), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("contrast", [0.01, 1.0])
-def test_an_estimate_that_does_not_explain_the_pictures_is_not_an_objects_flow(contrast):
-    pair = shifted_pair(20, 28, right=-4, down=-3)  # only the camera moved
-    pair = (128 + contrast * (pair.float() - 128)).to(torch.uint8)
-    raw, *_ = past_a_wall(pair, [-2.0, 6.0])
+@pytest.mark.parametrize(
+    ("right", "down", "contrast"),
+    [(-4, -3, 1.0), (-4 + 2, -3 - 6, 0.01)],  # only the camera moved; a surface as good as plain
+)
+def test_an_estimate_that_does_not_explain_the_pictures_is_not_an_objects_flow(
+    right, down, contrast
+):
+    pair = shifted_pair(20, 28, right=right, down=down).float()
+    raw, *_ = past_a_wall((128 + contrast * (pair - 128)).to(torch.uint8), [-2.0, 6.0])
     ego = torch.tensor([-2.0, -1.5]).reshape(2, 1, 1).expand(2, 10, 14)
     torch.testing.assert_close(raw, ego, atol=1e-5, rtol=0)
+
+
+def test_an_estimate_that_is_not_finite_is_not_known_even_with_the_camera_compensated():
+    def half(current, previous):
+        flow = torch.zeros(1, 2, 20, 28)
+        flow[..., 14:] = torch.nan
+        return flow
+
+    sensor = {"depth": torch.full((1, 20, 28), 2.0), "prev_from_curr": torch.eye(4)}
+    pair = shifted_pair(20, 28, right=1, down=0)
+    td = T.EstimatedFlow(half, intrinsics=WALL_K)(TensorDict({"rgb2": pair, "sensor": sensor}))
+    assert torch.equal(td["raw_valid"][0, 0], torch.arange(28) < 14)
+    assert not td["raw"].any()
 
 
 def test_where_depth_is_not_known_the_camera_s_share_is_that_of_neighbours():
     depth = torch.full((1, 10, 14), 2.0)
     depth[0, 5, 6], depth[0, 2, 9] = 0.0, torch.nan
-    raw, _, previous = past_a_wall(shifted_pair(20, 28, right=-4, down=-3), [0.0, 0.0], depth)
+    raw, *_ = past_a_wall(shifted_pair(20, 28, right=-4, down=-3), [0.0, 0.0], depth)
     ego = torch.tensor([-2.0, -1.5]).reshape(2, 1, 1).expand(2, 10, 14)
     torch.testing.assert_close(raw, ego, atol=1e-5, rtol=0)  # rival: 0 there, and less around it
+
+
+def test_between_the_maps_pixels_the_camera_s_share_is_smooth():
+    # 0.5 m ahead towards a wall now 2 m away shrinks a ramp of 6 a pixel to 0.8 of that, 4.8.
+    K, motion, warped = [[20.0, 0.0, 5.0], [0.0, 30.0, 2.0], [0.0, 0.0, 1.0]], torch.eye(4), []
+    motion[2, 3] = 0.5
+
+    def still(current, previous):
+        warped.append(previous[0])
+        return torch.zeros(1, 2, 16, 40)
+
+    ramp = (6 * torch.arange(40)).to(torch.uint8).expand(3, 16, 40)
+    sensor = {"depth": torch.full((1, 4, 10), 2.0), "prev_from_curr": motion}
+    transform = T.EstimatedFlow(still, intrinsics=K, picture_scale=4)
+    transform(TensorDict({"rgb2": torch.cat([ramp, ramp.flip(-1)]), "sensor": sensor}))
+    steps = warped[0].int().diff()[..., 2:-3]  # half a pixel of the maps from the border
+    assert set(steps.unique().tolist()) == {4, 5}  # rival: 6, 6, 6 and then 1
 
 
 def test_the_camera_s_share_is_that_of_the_place_where_the_estimate_was_found():
