@@ -90,10 +90,14 @@ def test_a_run_on_estimated_flow_is_trained_evaluated_and_filmed(tmp_path):
     pytest.importorskip("cv2", reason="flow is estimated by OpenCV")
     asked = ["flow=estimated", "flow.preset=ultrafast", "motion=estimated", "total_frames=64"]
     asked += ["evaluation.final_episodes=1", "evaluation.every_frames=0", "evaluation.baselines=[]"]
+    asked += ["evaluation.policies=[greedy]"]
     run = tmp_path / "run"
     command("train", "debug=smoke", *asked, f"hydra.run.dir={run}", cwd=tmp_path)
     assert "motion: estimated" in (run / "config.yaml").read_text()
-    assert {row["speed"] for row in read_rows(run / "evaluation.csv")} == {"low", "normal", "high"}
+    rows = read_rows(run / "evaluation.csv")
+    assert [(row["speed"], row["policy"]) for row in rows] == [
+        (speed, "greedy") for speed in ("low", "normal", "high")
+    ]
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_type_hints
 
 from pydantic import (
     BaseModel,
@@ -302,8 +302,8 @@ class EnvConfig(Command):
     scene: dict[str, Any]  # flowrep.scenes.load_scene checks it
 
 
-FINAL_POLICIES = ("greedy", "sampled")
-"""How the agent acts in its final evaluation, beside the baselines."""
+Acting = Literal["greedy", "sampled"]
+"""How an agent acts in its final evaluation."""
 
 
 class Evaluation(Section):
@@ -314,13 +314,15 @@ class Evaluation(Section):
     final_episodes: Count
     speeds: Annotated[list[SpeedMode], Field(min_length=1), Distinct]
     fps: Annotated[list[FrameRate], Field(min_length=1), Distinct]
+    # not in runs before it
+    policies: Annotated[list[Acting], Field(min_length=1), Distinct] = [*get_args(Acting)]
     baselines: Annotated[list[BaselineName], Distinct]
     video: bool
 
     @property
     def final_total(self) -> int:
         """The number of episodes of the final evaluation."""
-        policies = len(FINAL_POLICIES) + len(self.baselines)
+        policies = len(self.policies) + len(self.baselines)
         return len(self.speeds) * len(self.fps) * policies * self.final_episodes
 
 
@@ -374,7 +376,7 @@ class EvaluateConfig(Command):
     @property
     def own_policies(self) -> list[str]:
         """The policies that are not a run's: path.py:make, package.module:make or path.pt2."""
-        return [name for name in self.policy if name not in ("greedy", "sampled")]
+        return [name for name in self.policy if name not in get_args(Acting)]
 
     @model_validator(mode="after")
     def _fits_together(self) -> EvaluateConfig:
@@ -429,7 +431,7 @@ class ReportConfig(Command):
 
     run: Annotated[list[Text], Field(min_length=1), OneOrMore]
     output: Text | None
-    policy: Literal["greedy", "sampled"]
+    policy: Acting
     resamples: Count
     trajectories: CountOrZero
     videos: CountOrZero

@@ -21,7 +21,7 @@ from flowrep.agent import (
     load_checkpoint,
     save_checkpoint,
 )
-from flowrep.config.schema import FINAL_POLICIES, TrainConfig
+from flowrep.config.schema import TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
 from flowrep.envs.workers import available_cores
 from flowrep.experiment import build
@@ -145,7 +145,7 @@ class Runner:
         config, asked, fps = self.config, self.config.evaluation, self.env.base_env.frame_rate_hz
         if kind == "final":
             episodes = asked.speeds, asked.fps, asked.final_episodes, FINAL_SEED
-            comparison = Comparison(*episodes, FINAL_POLICIES, asked.baselines)
+            comparison = Comparison(*episodes, asked.policies, asked.baselines)
         else:
             comparison = Comparison([config.speed], [fps], asked.episodes, EVALUATION_SEED)
         agent = Agent(self.agent.policy, config, self.frames)

@@ -48,6 +48,8 @@ def refusal(command, model, line):
         "evaluation.speeds=[low,low]",
         "evaluation.speeds=[low,hgih]",
         "evaluation.fps=[12,0.1]",
+        "evaluation.policies=[]",
+        "evaluation.policies=[greedy,random]",
         "evaluation=null",
         "total_frames=2e6",
         "seed=-1",
@@ -88,6 +90,12 @@ def test_a_value_that_can_not_be_is_named(line):
 )
 def test_what_just_can_be_passes(line):
     assert composed(*line.split()).seed >= 0
+
+
+def test_a_final_evaluation_has_as_many_episodes_as_was_asked():
+    asked = "final_episodes=5", "speeds=[low,high]", "policies=[greedy]", "baselines=[random]"
+    config = composed(*(f"evaluation.{each}" for each in asked))
+    assert config.evaluation.final_total == 5 * 2 * 2
 
 
 def test_everything_that_is_wrong_is_said_at_once():
