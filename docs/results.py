@@ -295,9 +295,7 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     header += [f"find all {_paths(runs[0])} ways"] if is_fork else []
     rows = []
     for stack, members in in_stacks(runs).items():
-        each = outcomes_of(members, Condition("greedy", members[0].speed, members[0].fps))
-        of_runs = [] if each is None else [f"{100 * r:.0f}" for r in rates(each.outcomes)]
-        rows.append([_stack(stack), *_successes(members), ", ".join(of_runs)])
+        rows.append([_stack(stack), *_successes(members), _each_run(members)])
         if is_fork:
             found = sum(min(_by_way(run)) >= _FOUND for run in members)
             rows[-1].append(f"{found} of {len(members)}")
@@ -340,6 +338,12 @@ def _successes(runs: Sequence[Run]) -> list[str]:
     conditions = [Condition("greedy", speed, runs[0].fps) for speed in SPEEDS]
     found = [outcomes_of(runs, condition) for condition in conditions]
     return [percent(Bootstrap().success([m.outcomes])) if m else "" for m in found]
+
+
+def _each_run(runs: Sequence[Run]) -> str:
+    """Returns the runs' success at their training speed."""
+    each = outcomes_of(runs, Condition("greedy", runs[0].speed, runs[0].fps))
+    return ", ".join(f"{100 * rate:.0f}" for rate in ([] if each is None else rates(each.outcomes)))
 
 
 def _stack(stack: str) -> str:
@@ -386,6 +390,21 @@ def variation_table(titles: Mapping[str, str], studies: Studies) -> str:
         for stack, runs in in_stacks(members).items()
     ]
     return markdown(("", "", "low", "normal", "high", "runs"), rows)
+
+
+def estimates_table(titles: Mapping[str, str], studies: Studies) -> str:
+    """Returns success at the training speed, scene beside scene, with more and more estimated."""
+    scenes = list(dict.fromkeys(scene for study in titles for scene in studies[study]))
+    rows = []
+    for study, title in titles.items():
+        of_scenes = [in_stacks(studies[study].get(scene, [])) for scene in scenes]
+        for stack in in_order([stack for of in of_scenes for stack in of], STACKS):
+            cells: list[str] = []
+            for runs in (of.get(stack, []) for of in of_scenes):
+                cells += [_successes(runs)[1], _each_run(runs)] if runs else ["", ""]
+            rows.append((title, _stack(stack), *cells))
+    header = [x for scene in scenes for x in (words(scene), "each run")]
+    return markdown(("", "", *header), rows)
 
 
 def runs_table(studies: Studies) -> str:
@@ -471,7 +490,8 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
                 words(scene): rate_table(of) for scene, of in studies["frame_rate"].items()
             },
             variations=variation_table(declared["variations"], studies),
-            runs=runs_table(studies),
+            estimates=estimates_table(declared["estimates"], studies),
+            runs=runs_table({s: of for s, of in studies.items() if s not in declared["estimates"]}),
             commands=declared["commands"],
             commands_before=declared["commands_before"],
             number=len(runs),

@@ -172,6 +172,27 @@ def test_frame_rates_are_compared_on_the_same_episodes():
     assert "|50|100|−50|0.50|1|" in table
 
 
+def test_estimates_stand_scene_beside_scene_with_each_run():
+    def run(name, successes, scene, stack="ego+obj"):
+        return run_of(name, {"normal": letters(successes)}, scene=scene, stack=stack)
+
+    studies = {
+        "exact": {
+            "straight_road": [run("a", 8, "straight_road"), run("b", 6, "straight_road")],
+            "s_turn": [run("c", 2, "s_turn", "raw")],
+        },
+        "noise": {"s_turn": [run("d", 0, "s_turn")]},
+    }
+    table = results.estimates_table({"exact": "none", "noise": "much"}, studies)
+    header, _, *rows = ([c.strip() for c in line.split("|")[1:-1]] for line in table.splitlines())
+    assert header == ["", "", "Straight Road", "each run", "S-Turn", "each run"]
+    assert [[c.split(" [")[0] for c in row] for row in rows] == [
+        ["none", "`[raw]`", "", "", "25", "25"],
+        ["none", "`[ego,obj]`", "88", "100, 75", "", ""],
+        ["much", "`[ego,obj]`", "", "", "0", "0"],
+    ]
+
+
 def test_an_episodes_path_is_the_one_that_it_draws():
     from flowrep.envs.episode import Episode
     from flowrep.scenes import load_scene
