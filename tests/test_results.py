@@ -194,20 +194,13 @@ def test_estimates_stand_scene_beside_scene_with_each_run():
 
 
 def test_a_protocol_stands_beside_the_other_with_its_own_verdict():
-    # 0.5 ± 0.088 of 2 degrees in each scene, of which the second protocol has one
-    runs = runs_with(both=(6, 7), raw=(2, 3))
-    wide = [replace(run, name=f"wide_{run.name}") for run in runs if run.scene == "s_turn"]
-    studies = {"main": SCENES, "wide": {"s_turn": "wide_*"}}
-    (narrow,), _ = claims(runs, HIGH, studies=studies)
-    declared = {"claim": "c", "contrasts": [HIGH], "limits": ""}
-    found = results.studies_of({"studies": studies}, wide)
-    of_wide = {"scenes": ["s_turn"], "primary": [declared], "secondary": []}
-    (second,), _ = results.claims_of(of_wide, found, "wide")
-    row = results.protocols_table([narrow], [second], "s_turn").splitlines()[-1]
-    label, first, other, verdict = (cell.strip() for cell in row.split("|")[1:-1])
-    assert label == "1  [ego,obj] − [raw], high"
-    assert first == other.split(", p")[0] == "+50 [+12, +88]"
-    assert verdict == "**holds**"
+    # 0.5 ± 0.088 of 2 degrees in each scene, and its opposite in the other protocol, of one scene
+    (narrow,), _ = claims(runs_with(both=(6, 7), raw=(2, 3)), HIGH)
+    (wide,), _ = claims(runs_with(both=(2, 3), raw=(6, 7)), HIGH, scenes=["s_turn"])
+    row = results.protocols_table([narrow], [wide], "s_turn").splitlines()[-1]
+    p_value = "0.030"  # t = 5.66
+    cells = ["1  [ego,obj] − [raw], high", "+50 [+12, +88]", f"−50 [−88, −12], p = {p_value}"]
+    assert row == f"|{'|'.join(cells)}|**contradicted**|"
 
 
 def test_an_episodes_path_is_the_one_that_it_draws():
