@@ -494,6 +494,13 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
     of_wide = {**declared, "scenes": [*studies["wide_speeds"]]}
     wide, _ = claims_of(of_wide, studies, "wide_speeds")
     main, forks = studies["main"], declared["forks"]
+    # row 19 at each of its speeds alone
+    asked = {"first": "ego+obj", "second": "raw", "expect": "more"}
+    confirmed = studies["wide_confirmation"]
+    alone = {
+        speed: _effect_text(_contrast({**asked, "success": {speed: 1}}, confirmed, [*confirmed]))
+        for speed in ("low", "high")
+    }
     every = [run for of in main.values() for run in of]
     smallest = smallest_differences(primary) or [float("nan")]
     text = (
@@ -502,6 +509,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         .render(
             primary=claims_table(primary, "p (Holm)"),
             secondary=claims_table(secondary, "p"),
+            alone=alone,
             wide=protocols_table(primary, wide, "straight_road"),
             figure=FIGURE,
             scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
