@@ -83,7 +83,9 @@ def child(request: dict, output) -> None:
 
 def answer(request: dict) -> dict:
     """Runs one command in a process of its own; kills it when its time is over."""
-    with tempfile.TemporaryFile("w+") as output:
+    # Appended to and read by its name: what the command leaves behind (multiprocessing's resource
+    # tracker, with a last warning) may still write, and would move a shared position.
+    with tempfile.NamedTemporaryFile("a") as output:
         pid = os.fork()
         if not pid:
             child(request, output)
@@ -91,8 +93,8 @@ def answer(request: dict) -> dict:
             time.sleep(request["kill_after_s"])
             os.kill(pid, signal.SIGKILL)
         _, status = os.waitpid(pid, 0)
-        output.seek(0)
-        return {"code": os.waitstatus_to_exitcode(status), "printed": output.read()}
+        printed = Path(output.name).read_text(encoding="utf-8")
+        return {"code": os.waitstatus_to_exitcode(status), "printed": printed}
 
 
 if __name__ == "__main__":
