@@ -50,7 +50,6 @@ _SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
 _STUDY = {  # in the figure
     "resolution": ", 84 px",
-    "presets_before": ", before",
     "wide_confirmation": ", 0.6–2.4 m/s",
 }
 _WIDEST = 80  # points of the figure's axis
@@ -64,10 +63,14 @@ def studies_of(declared: Mapping[str, Any], runs: Sequence[Run]) -> Studies:
     """Returns the finished runs of each study and scene, where there are any."""
     found = {
         study: {
-            scene: [r for r in runs if fnmatch(r.name, pattern) and r.is_finished]
-            for scene, pattern in patterns.items()
+            scene: [
+                run
+                for run in runs
+                if run.is_finished and any(fnmatch(run.name, p) for p in patterns.split())
+            ]
+            for scene, patterns in of_scenes.items()
         }
-        for study, patterns in declared["studies"].items()
+        for study, of_scenes in declared["studies"].items()
     }
     return {name: {s: of for s, of in study.items() if of} for name, study in found.items()}
 
@@ -522,7 +525,6 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             estimates=estimates_table(declared["estimates"], studies),
             runs=runs_table({s: of for s, of in studies.items() if s not in declared["estimates"]}),
             commands=declared["commands"],
-            commands_before=declared["commands_before"],
             number=len(runs),
             pixels=sorted(
                 {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
@@ -534,7 +536,6 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             repeats=repeats(every, [run for run in runs if run not in every]),
             sampled=sampled_minus_greedy(every),
             collapsed=collapses(main.get("straight_road", [])),
-            unknown=sum(run.machine.get("precision") == "unknown" for run in runs),
             np=np,
         )
     )

@@ -56,6 +56,16 @@ def runs_with(**successes):
 HIGH = {"first": "ego+obj", "second": "raw", "success": {"high": 1}, "expect": "more"}
 
 
+def test_a_studys_runs_have_names_like_any_of_its_patterns():
+    names = ("road_raw_s12", "road_raw_s13", "road_all_s12", "turn_raw_s13")
+    runs = [run_of(name, {"high": letters(8)}) for name in names]
+    declared = {"studies": {"main": {"straight_road": "road_*_s13 road_all_*", "s_turn": "none_*"}}}
+    found = results.studies_of(declared, runs)
+    assert {scene: [r.name for r in of] for scene, of in found["main"].items()} == {
+        "straight_road": ["road_raw_s13", "road_all_s12"]
+    }
+
+
 @pytest.mark.parametrize(
     ("expect", "both", "raw", "verdict"),
     [
