@@ -329,14 +329,16 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     return markdown(header, rows)
 
 
-def one_way(runs: Iterable[Run]) -> tuple[int, int]:
-    """Returns how many runs don't find all ways of their scene, and how many never drive one.
-
-    Those that arrive nowhere are not counted.
-    """
-    of_runs = map(_by_way, runs)
-    missed = [ways for ways in of_runs if max(ways) > _NEVER and min(ways) < _FOUND]
-    return len(missed), sum(max(ways) >= _FOUND and min(ways) <= _NEVER for ways in missed)
+def short_of_all_ways(runs: Iterable[Run]) -> tuple[list[str], list[str]]:
+    """Returns the runs that don't find all ways, with their worst, and those that never arrive."""
+    short, lost = [], []
+    for run in runs:
+        ways, name = _by_way(run), f"{_stack(run.stack)} seed {run.seed} in {_SHORT[run.scene]}"
+        if max(ways) <= _NEVER:
+            lost.append(name)
+        elif min(ways) < _FOUND:
+            short.append(f"{name} ({100 * min(ways):.0f} %)")
+    return short, lost
 
 
 def drawn_paths(episode_seeds: Iterable[int], paths: int) -> Array:
@@ -516,7 +518,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             wide=protocols_table(primary, wide, "straight_road"),
             figure=FIGURE,
             scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
-            one_way=one_way(run for run in every if run.scene in forks),
+            short=short_of_all_ways(run for run in every if run.scene in forks),
             failures=failure_table(declared["table_iii"], main.get("s_turn", [])),
             frame_rates={
                 words(scene): rate_table(of) for scene, of in studies["frame_rate"].items()

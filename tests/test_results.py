@@ -170,9 +170,11 @@ def test_a_run_finds_a_way_by_half_of_its_episodes():
     runs = [
         run_of("t_one", {"normal": one}, paths=2),
         run_of("t_all", {"normal": "s" * 8}, paths=2),
-        run_of("t_none", {"normal": "c" * 8}, paths=2),
+        run_of("t_none", {"normal": "c" * 8}, seed=2, paths=2),
     ]
-    assert results.one_way(runs) == (1, 1)
+    short, lost = results.short_of_all_ways(runs)
+    assert short == ["`[ego,obj]` seed 0 in SR (0 %)"]
+    assert lost == ["`[ego,obj]` seed 2 in SR"]
     assert "1 of 3" in results.scene_table(runs, is_fork=True)
 
 
