@@ -6,6 +6,7 @@ that all compared runs drove.
 """
 
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -54,7 +55,7 @@ _STUDY = {  # in the figure
 }
 _WIDEST = 80  # points of the figure's axis
 _POWER = 0.8
-_FOUND, _NEVER = 0.5, 0.05  # a run finds a way if it succeeds in this share of its episodes
+_FOUND = 0.5  # a run finds a way if it succeeds in this share of its episodes
 
 Studies = Mapping[str, Mapping[str, Sequence[Run]]]
 
@@ -319,7 +320,7 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     for stack, members in in_stacks(runs).items():
         rows.append([_stack(stack), *_successes(members), _each_run(members)])
         if is_fork:
-            found = sum(min(_by_way(run)) >= _FOUND for run in members)
+            found = sum(min(map(_share, _ends_by_way(run))) >= _FOUND for run in members)
             rows[-1].append(f"{found} of {len(members)}")
     of_speeds = [Condition("never_turn", speed, runs[0].fps) for speed in SPEEDS]
     shares = [baseline_share(runs, condition) for condition in of_speeds]
@@ -329,16 +330,16 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     return markdown(header, rows)
 
 
-def short_of_all_ways(runs: Iterable[Run]) -> tuple[list[str], list[str]]:
-    """Returns the runs that don't find all ways, with their worst, and those that never arrive."""
-    short, lost = [], []
+def missed_ways(runs: Iterable[Run]) -> list[str]:
+    """Returns the runs that miss a way, with success and commonest failure on their worst."""
+    missed = []
     for run in runs:
-        ways, name = _by_way(run), f"{_stack(run.stack)} seed {run.seed} in {_SHORT[run.scene]}"
-        if max(ways) <= _NEVER:
-            lost.append(name)
-        elif min(ways) < _FOUND:
-            short.append(f"{name} ({100 * min(ways):.0f} %)")
-    return short, lost
+        worst = min(_ends_by_way(run), key=_share)
+        if _share(worst) < _FOUND:
+            end, _ = Counter(worst[worst != "success"].tolist()).most_common(1)[0]
+            name = f"{_stack(run.stack)} seed {run.seed} in {_SHORT[run.scene]}"
+            missed.append(f"{name} ({100 * _share(worst):.0f} %, {words(end).lower()})")
+    return missed
 
 
 def drawn_paths(episode_seeds: Iterable[int], paths: int) -> Array:
@@ -350,12 +351,16 @@ def _paths(run: Run) -> int:
     return len(run.config["scene"]["paths"])
 
 
-def _by_way(run: Run) -> list[float]:
-    """Returns a run's greedy success on each path at its training speed."""
+def _ends_by_way(run: Run) -> list[Array]:
+    """Returns how episodes end on each path, greedy and at the run's training speed."""
     driven = run.under(Condition("greedy", run.speed, run.fps))
     drawn = drawn_paths(driven["episode_seed"], _paths(run))
-    on_path = [driven["outcome"][drawn == path] for path in range(_paths(run))]
-    return [float(success(ends).mean()) if len(ends) else 0.0 for ends in on_path]
+    ends = np.where(driven["hit"] == "", driven["outcome"], driven["hit"])
+    return [ends[drawn == path] for path in range(_paths(run))]
+
+
+def _share(ends: Array) -> float:
+    return float(success(ends).mean()) if len(ends) else 0.0
 
 
 def _successes(runs: Sequence[Run]) -> list[str]:
@@ -518,7 +523,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             wide=protocols_table(primary, wide, "straight_road"),
             figure=FIGURE,
             scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
-            short=short_of_all_ways(run for run in every if run.scene in forks),
+            missed=missed_ways(run for run in every if run.scene in forks),
             failures=failure_table(declared["table_iii"], main.get("s_turn", [])),
             frame_rates={
                 words(scene): rate_table(of) for scene, of in studies["frame_rate"].items()

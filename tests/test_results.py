@@ -170,11 +170,13 @@ def test_a_run_finds_a_way_by_half_of_its_episodes():
     runs = [
         run_of("t_one", {"normal": one}, paths=2),
         run_of("t_all", {"normal": "s" * 8}, paths=2),
-        run_of("t_none", {"normal": "c" * 8}, seed=2, paths=2),
+        # the second way's episodes are those of s..oo.c.
+        run_of("t_half", {"normal": "sssooccc"}, seed=2, paths=2),
     ]
-    short, lost = results.short_of_all_ways(runs)
-    assert short == ["`[ego,obj]` seed 0 in SR (0 %)"]
-    assert lost == ["`[ego,obj]` seed 2 in SR"]
+    assert results.missed_ways(runs) == [
+        "`[ego,obj]` seed 0 in SR (0 %, pedestrian)",
+        "`[ego,obj]` seed 2 in SR (25 %, out of bounds)",
+    ]
     assert "1 of 3" in results.scene_table(runs, is_fork=True)
 
 
