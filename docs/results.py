@@ -225,7 +225,7 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     for claim in claims:
         effects = "; ".join(map(_effect_text, claim.contrasts))
         by_scene = "; ".join(
-            " / ".join(f"{_SHORT[scene]} {signed(e.value)}" for scene, e in c.by_scene.items())
+            ", ".join(f"{_SHORT[scene]} {signed(e.value)}" for scene, e in c.by_scene.items())
             for c in claim.contrasts
         )
         row = f"[row {claim.number}](#the-claims-in-one-figure)"
