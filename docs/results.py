@@ -228,10 +228,10 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
             ", ".join(f"{_SHORT[scene]} {signed(e.value)}" for scene, e in c.by_scene.items())
             for c in claim.contrasts
         )
-        row = f"[row {claim.number}](#the-claims-in-one-figure)"
+        row = f"[{claim.number}](#the-claims-in-one-figure)"
         rows.append((claim.text, f"**{claim.verdict}**", effects, by_scene, row, claim.limits))
     effect_name = f"effect over scenes [95 %], {p_name}"
-    header = ("claim", "verdict", effect_name, "by scene", "figure", "what limits it")
+    header = ("claim", "verdict", effect_name, "by scene", "row of the figure", "what limits it")
     return markdown(header, rows)
 
 
@@ -331,15 +331,15 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
 
 
 def missed_ways(runs: Iterable[Run]) -> list[str]:
-    """Returns the runs that miss a way, with success and commonest failure on their worst."""
-    missed = []
+    """Returns each stack's seeds that miss a way, and how each ends on its worst."""
+    missed: dict[str, list[str]] = {}
     for run in runs:
         worst = min(_ends_by_way(run), key=_share)
         if _share(worst) < _FOUND:
             end, _ = Counter(worst[worst != "success"].tolist()).most_common(1)[0]
-            name = f"{_stack(run.stack)} seed {run.seed} in {_SHORT[run.scene]}"
-            missed.append(f"{name} ({100 * _share(worst):.0f} %, {words(end).lower()})")
-    return missed
+            seeds = missed.setdefault(f"{_stack(run.stack)} in {_SHORT[run.scene]}", [])
+            seeds.append(f"{run.seed}: {100 * _share(worst):.0f} %, {words(end).lower()}")
+    return [f"{name} ({'; '.join(seeds)})" for name, seeds in missed.items()]
 
 
 def drawn_paths(episode_seeds: Iterable[int], paths: int) -> Array:

@@ -174,8 +174,7 @@ def test_a_run_finds_a_way_by_half_of_its_episodes():
         run_of("t_half", {"normal": "sssooccc"}, seed=2, paths=2),
     ]
     assert results.missed_ways(runs) == [
-        "`[ego,obj]` seed 0 in SR (0 %, pedestrian)",
-        "`[ego,obj]` seed 2 in SR (25 %, out of bounds)",
+        "`[ego,obj]` in SR (0: 0 %, pedestrian; 2: 25 %, out of bounds)"
     ]
     assert "1 of 3" in results.scene_table(runs, is_fork=True)
 
