@@ -171,12 +171,14 @@ def test_a_run_finds_a_way_by_half_of_its_episodes():
         run_of("t_one", {"normal": one}, paths=2),
         run_of("t_all", {"normal": "s" * 8}, paths=2),
         # the second way's episodes are those of s..oo.c.
-        run_of("t_half", {"normal": "sssooccc"}, seed=2, paths=2),
+        run_of("t_few", {"normal": "sssooccc"}, seed=2, paths=2),
+        # half of the first way's succeed, those of .ss..c.c
+        run_of("t_half", {"normal": "ssssscsc"}, seed=3, paths=2),
     ]
     assert results.missed_ways(runs) == [
         "`[ego,obj]` in SR (0: 0 %, pedestrian; 2: 25 %, out of bounds)"
     ]
-    assert "1 of 3" in results.scene_table(runs, is_fork=True)
+    assert "2 of 4" in results.scene_table(runs, is_fork=True)
 
 
 def test_frame_rates_are_compared_on_the_same_episodes():
