@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import reduce
-from itertools import count, product
+from itertools import chain, count, product
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -320,14 +320,19 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     for stack, members in in_stacks(runs).items():
         rows.append([_stack(stack), *_successes(members), _each_run(members)])
         if is_fork:
-            found = sum(min(map(_share, _ends_by_way(run))) >= _FOUND for run in members)
-            rows[-1].append(f"{found} of {len(members)}")
+            rows[-1].append(all_ways_found(members))
     of_speeds = [Condition("never_turn", speed, runs[0].fps) for speed in SPEEDS]
     shares = [baseline_share(runs, condition) for condition in of_speeds]
     never = ["" if share is None else f"{100 * share:.0f}" for share in shares]
     if any(never):
         rows.append(["never turning", *never, *[""] * (len(header) - 4)])
     return markdown(header, rows)
+
+
+def all_ways_found(runs: Sequence[Run]) -> str:
+    """Returns how many of the runs find all ways."""
+    found = sum(min(map(_share, _ends_by_way(run))) >= _FOUND for run in runs)
+    return f"{found} of {len(runs)}"
 
 
 def missed_ways(runs: Iterable[Run]) -> list[str]:
@@ -524,6 +529,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             figure=FIGURE,
             scenes={words(scene): scene_table(of, scene in forks) for scene, of in main.items()},
             missed=missed_ways(run for run in every if run.scene in forks),
+            ways={s: all_ways_found([*chain(*studies[s].values())]) for s in declared["ways"]},
             failures=failure_table(declared["table_iii"], main.get("s_turn", [])),
             frame_rates={
                 words(scene): rate_table(of) for scene, of in studies["frame_rate"].items()

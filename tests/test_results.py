@@ -179,6 +179,7 @@ def test_a_run_finds_a_way_by_half_of_its_episodes():
         "`[ego,obj]` in SR (0: 0 %, pedestrian; 2: 25 %, out of bounds)"
     ]
     assert "2 of 4" in results.scene_table(runs, is_fork=True)
+    assert results.all_ways_found(runs[1:]) == "2 of 3"
 
 
 def test_frame_rates_are_compared_on_the_same_episodes():
