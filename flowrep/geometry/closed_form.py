@@ -5,6 +5,11 @@ With x~ = p - c the pixel relative to the principal point c, K' the intrinsics w
 
     p' ~ (I + A) x~ + e / Z,    A = K' (R - I) K'^-1,    e = K' T        (homogeneous)
 
+relative to c. If the previous frame had other intrinsics K_p, with M those relative to c too
+(principal point c_p - c), it was at
+
+    A = (M (R - I) + K_p - K) K'^-1,    e = M T
+
 so that with q = A x~ + e / Z the flow p - p' is (x~ qz - qx, y~ qz - qy) / (1 + qz). No two large
 numbers are subtracted: the float32 result is an order of magnitude closer to float64 than p - p'
 computed with the homography K R K^-1, and without motion flow is exactly 0.
@@ -51,8 +56,10 @@ def _within_bounds(tensor: Tensor, dims: tuple[int, ...]) -> Tensor:
     return (tensor.abs() <= LARGEST).all(dims)  # nan compares False
 
 
-def motion_coefficients(K: Tensor, prev_from_curr: Tensor, known: Tensor) -> Tensor:
-    """Returns A (row by row) and e, `[*B, 12]`.
+def motion_coefficients(
+    K: Tensor, prev_K: Tensor | None, prev_from_curr: Tensor, known: Tensor
+) -> Tensor:
+    """Returns A (row by row) and e, `[*B, 12]`; without `prev_K` the previous K is the same.
 
     Where an input isn't known, they place every point behind the previous camera, so that no pixel
     is valid, without a check per pixel.
@@ -62,25 +69,33 @@ def motion_coefficients(K: Tensor, prev_from_curr: Tensor, known: Tensor) -> Ten
     """
     bounded = _within_bounds(prev_from_curr, (-2, -1))
     motion = torch.where(bounded[..., None, None], prev_from_curr, 0.0)
-    fx, skew, fy = K[..., 0, 0], K[..., 0, 1], K[..., 1, 1]
+    fx, skew, fy = _focal(K)
     d = [[motion[..., i, j] - float(i == j) for j in range(3)] for i in range(3)]  # R - I
-    tx, ty, tz = motion[..., 0, 3], motion[..., 1, 3], motion[..., 2, 3]
-    rows = [
-        [fx * d[0][j] + skew * d[1][j] for j in range(3)],
-        [fy * d[1][j] for j in range(3)],
-        d[2],
-    ]  # K' (R - I)
+    t = [motion[..., i, 3] for i in range(3)]
+    fx_p, skew_p, fy_p = (fx, skew, fy) if prev_K is None else _focal(prev_K)
+    columns = [[fx_p * x + skew_p * y, fy_p * y, z] for x, y, z in (*zip(*d), t)]  # M (R - I | T)
+    if prev_K is not None:
+        change = prev_K - K
+        right, down = change[..., :2, 2].unbind(-1)
+        columns = [[x + right * z, y + down * z, z] for x, y, z in columns]
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)):
+            columns[j][i] = columns[j][i] + change[..., i, j]
+    *rows, e = *zip(*columns[:3]), columns[3]
     a = []
     for in_x, in_y, constant in rows:  # ... K'^-1
         a_x = in_x / fx
         a += [a_x, (in_y - skew * a_x) / fy, constant]
-    e = [fx * tx + skew * ty, fy * ty, tz]
     coefficients = torch.stack(torch.broadcast_tensors(*a, *e), -1)
     known = (known & bounded & _within_bounds(coefficients, (-1,))).unsqueeze(-1)
     behind = (0.0, -2.0, 0.0)  # 1 + qz = -1
     # Concatenated, so that inductor stores the result instead of repeating `where` at every pixel.
     parts = zip(coefficients.split([8, 1, 3], -1), behind)
     return torch.cat([torch.where(known, part, otherwise) for part, otherwise in parts], -1)
+
+
+def _focal(K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns fx, skew and fy."""
+    return K[..., 0, 0], K[..., 0, 1], K[..., 1, 1]
 
 
 def flow_planes(

@@ -67,7 +67,7 @@ class MotionEstimate(NamedTuple):
 class _Samples(NamedTuple):
     """Pixels of B frames, `[B, N]` each, of which the first `number` are known."""
 
-    focal: Tensor  # fx, skew, fy: [B, 3]
+    focal: Tensor  # fx, skew, fy of the previous camera: [B, 3]
     values: Tensor  # [B, 6 or 9, N]: ray x, y, 1 and q; flow u, v; with a picture xx, xy, yy
     known: Tensor  # [B, N]
     number: Tensor  # [B]
@@ -93,6 +93,7 @@ def camera_motion(
     depth: Tensor,
     K: Tensor,
     *,
+    prev_K: Tensor | None = None,
     picture: Tensor | None = None,
     prior: Tensor | None = None,
 ) -> MotionEstimate:
@@ -116,6 +117,7 @@ def camera_motion(
         flow: `[*B, 2, H, W]`, pixels per step, nan where it isn't known.
         depth: `[*B, 1, H, W]`, metres along the optical axis.
         K: `[*B, 3, 3]`, pixels.
+        prev_K: K of the previous frame, `[*B, 3, 3]`, if it was another.
         picture: the current picture `[*B, C, H, W]`, 0 to 255; give it if flow is estimated.
         prior: the motion expected `[*B, 4, 4]`, the last one or odometry's; identity by default.
 
@@ -132,6 +134,8 @@ def camera_motion(
     """
     given: dict[str, tuple[Tensor, tuple[int | str, ...]]]
     given = {"flow": (flow, (2, "H", "W")), "depth": (depth, (1, "H", "W")), "K": (K, (3, 3))}
+    if prev_K is not None:
+        given["prev_K"] = prev_K, (3, 3)
     if prior is not None:
         given["prior"] = prior, (4, 4)
     if picture is not None:
@@ -151,7 +155,8 @@ def camera_motion(
         return tensor.to(to).expand(*batch, *size).reshape(-1, *size)
 
     structure = None if picture is None else structure_tensor(flat(picture, 3))
-    samples = _samples(flat(flow, 3), flat(depth, 3), flat(K, 2, torch.float64), structure)
+    cameras = [flat(each, 2, torch.float64) for each in (K, K if prev_K is None else prev_K)]
+    samples = _samples(flat(flow, 3), flat(depth, 3), *cameras, structure)
     expected = torch.eye(4) if prior is None else prior
     expected = flat(expected.to(depth.device), 2, torch.float64)
     motion = _best_hypothesis(samples, expected, has_prior=prior is not None)
@@ -182,8 +187,14 @@ def structure_tensor(picture: Tensor) -> Tensor:
     return torch.stack([own + noise * xx, noise * xy, own + noise * yy], -3) / det.unsqueeze(-3)
 
 
-def _samples(flow: Tensor, depth: Tensor, K: Tensor, structure: Tensor | None) -> _Samples:
-    """Returns up to `PIXELS` known pixels of each frame, spread over the picture."""
+def _samples(
+    flow: Tensor, depth: Tensor, K: Tensor, prev_K: Tensor, structure: Tensor | None
+) -> _Samples:
+    """Returns up to `PIXELS` known pixels of each frame, spread over the picture.
+
+    Their flow is that which the previous camera's pixels tell of the rays' motion: without the part
+    that a change of K causes by itself.
+    """
     batch, _, height, width = flow.shape
     size = height * width
     looked_at = min(size, CANDIDATES)
@@ -208,14 +219,20 @@ def _samples(flow: Tensor, depth: Tensor, K: Tensor, structure: Tensor | None) -
     is_known = torch.arange(PIXELS, device=flow.device) < number.unsqueeze(-1)
     values = values.gather(-1, order.unsqueeze(1).expand(-1, values.shape[1], -1))
     values = torch.where(is_known.unsqueeze(1), values, 1.0)
-    place, focal = pixel[order], K[:, [0, 0, 1], [0, 1, 1]]
-    fx, skew, fy, cx, cy = (
-        torch.cat([focal, K[:, :2, 2]], -1).to(values.dtype).unsqueeze(-1).unbind(1)
-    )
+    place = pixel[order]
+    (fx, skew, cx), (_, fy, cy), _ = _entries(K, values.dtype)
     y = (place // width + 0.5 - cy) / fy
     x = (place % width + 0.5 - cx - skew * y) / fx
+    (fx, skew, cx), (_, fy, cy), _ = _entries(prev_K - K, values.dtype)
+    moved = values[:, :2] + torch.stack([fx * x + skew * y + cx, fy * y + cy], 1)
     ray = torch.stack([x, y, torch.ones_like(x), values[:, 2].reciprocal()], 1)
-    return _Samples(focal, torch.cat([ray, values[:, :2], values[:, 3:]], 1), is_known, number)
+    focal = prev_K[:, [0, 0, 1], [0, 1, 1]]
+    return _Samples(focal, torch.cat([ray, moved, values[:, 3:]], 1), is_known, number)
+
+
+def _entries(K: Tensor, dtype: torch.dtype) -> list[list[Tensor]]:
+    """Returns the rows of K `[B, 3, 3]`, `[B, 1]` each."""
+    return [list(row.unbind(-1)) for row in K.to(dtype).unsqueeze(1).unbind(-2)]
 
 
 def _best_hypothesis(samples: _Samples, expected: Tensor, *, has_prior: bool) -> Tensor:

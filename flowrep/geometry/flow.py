@@ -44,14 +44,21 @@ class Factors(NamedTuple):
     valid: Tensor
 
 
-def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Tensor = 1.0) -> Flow:
+def ego_flow(
+    depth: Tensor,
+    K: Tensor,
+    prev_from_curr: Tensor,
+    *,
+    prev_K: Tensor | None = None,
+    dt: float | Tensor = 1.0,
+) -> Flow:
     """Returns the flow of a static world under the camera's motion.
 
     Convention: (p_t - p_t') / dt on the current frame's grid, t' the previous frame; u right,
     v down, pixels. If the camera drives forward, flow points outwards. Depth inf moves by rotation
     only. Flow is invalid, and 0, where depth is nan or <= 0; where the point was not in front of
     the previous camera at a hundredth of its current depth or more (closer to it, flow grows
-    without bound); and everywhere if K, the motion or a tensor `dt` isn't finite, `dt` isn't
+    without bound); and everywhere if a K, the motion or a tensor `dt` isn't finite, `dt` isn't
     positive or an entry is beyond 1e8. Valid flow is finite.
 
     Equations 7 to 11 of the paper. Floats narrower than float32 are computed in float32.
@@ -61,6 +68,7 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
         K: `[*B, 3, 3]`, rows (fx, skew, cx), (0, fy, cy), (0, 0, 1), pixels.
         prev_from_curr: `[*B, 4, 4]`, rigid, metres; takes a point in the current camera's frame
             into the previous camera's.
+        prev_K: K of the previous frame, `[*B, 3, 3]`, if it was another (zoom, autofocus).
         dt: time between the frames, a number or `[*B]`; 1 gives px/step, seconds give px/s.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
@@ -70,8 +78,8 @@ def ego_flow(depth: Tensor, K: Tensor, prev_from_curr: Tensor, *, dt: float | Te
     >>> flow[0], valid[0]  # everything moved fx * 0.5 m / 4 m = 0.5 px to the left
     (tensor([[-0.5000, -0.5000]]), tensor([[True, True]]))
     """
-    batch = _check(depth, K, prev_from_curr, dt)
-    u, v, valid = _planes(batch, depth, None, K, prev_from_curr.unsqueeze(-3), dt)
+    batch = _check(depth, K, prev_K, prev_from_curr, dt)
+    u, v, valid = _planes(batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
@@ -81,6 +89,7 @@ def rigid_flow(
     K: Tensor,
     prev_from_curr_by_instance: Tensor,
     *,
+    prev_K: Tensor | None = None,
     dt: float | Tensor = 1.0,
 ) -> Flow:
     """Returns the flow of a world of rigid bodies: the simulator's exact raw flow.
@@ -92,7 +101,7 @@ def rigid_flow(
     known makes only the pixels of its instance invalid.
 
     Args:
-        depth: see `ego_flow`, as for `K` and `dt`.
+        depth: see `ego_flow`, as for `K`, `prev_K` and `dt`.
         instance: `[*B, 1, H, W]`, integers in [0, N), 0 for the static world; others raise
             RuntimeError.
         prev_from_curr_by_instance: `[*B, N, 4, 4]`.
@@ -107,8 +116,8 @@ def rigid_flow(
     motions = prev_from_curr_by_instance
     check_shape("instance", instance, (1, "H", "W"), ids=True)
     check_shape("prev_from_curr_by_instance", motions, ("N", 4, 4))
-    batch = _check(depth, K, motions[..., 0, :, :], dt, instance=instance)
-    u, v, valid = _planes(batch, depth, instance, K, motions, dt)
+    batch = _check(depth, K, prev_K, motions[..., 0, :, :], dt, instance=instance)
+    u, v, valid = _planes(batch, depth, instance, K, prev_K, motions, dt)
     return Flow(closed_form.stack_planes(u, v), closed_form.mask_channel(valid))
 
 
@@ -118,6 +127,7 @@ def factorize(
     K: Tensor,
     prev_from_curr: Tensor,
     *,
+    prev_K: Tensor | None = None,
     dt: float | Tensor = 1.0,
 ) -> Factors:
     """Returns raw flow split into ego flow and object flow.
@@ -132,7 +142,7 @@ def factorize(
     Args:
         raw: `[*B, 2, H, W]`, pixels per dt, nan where it isn't known; or what `rigid_flow` returns,
             which says so with a mask (its flow alone, 0 there, would count as measured).
-        depth: see `ego_flow`, as for `K` and `prev_from_curr`.
+        depth: see `ego_flow`, as for `K`, `prev_from_curr` and `prev_K`.
         dt: see `ego_flow`; the unit of `raw` must agree.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
@@ -148,9 +158,9 @@ def factorize(
         # Viewed as bytes, as inductor's CPU code fails to compile a `where` on a bool view.
         raw = torch.where(raw.valid.view(torch.uint8) != 0, raw.flow, math.nan)
     check_shape("raw", raw, (2, "H", "W"))
-    batch = _check(depth, K, prev_from_curr, dt, raw=raw)
+    batch = _check(depth, K, prev_K, prev_from_curr, dt, raw=raw)
     # Ego flow is rounded regardless of raw's dtype, so that static pixels have exactly 0 obj.
-    u, v, valid = _planes(batch, depth, None, K, prev_from_curr.unsqueeze(-3), dt)
+    u, v, valid = _planes(batch, depth, None, K, prev_K, prev_from_curr.unsqueeze(-3), dt)
     dtype = torch.promote_types(u.dtype, raw.dtype)
     compute = torch.promote_types(u.dtype, torch.float32)
     raw = raw.to(dtype).expand(*batch, -1, -1, -1)
@@ -220,13 +230,21 @@ def check_flow_options(direction: str, grid: str, channels: str) -> None:
 
 
 def _check(
-    depth: Tensor, K: Tensor, motion: Tensor, dt: float | Tensor, **image: Tensor
+    depth: Tensor,
+    K: Tensor,
+    prev_K: Tensor | None,
+    motion: Tensor,
+    dt: float | Tensor,
+    **image: Tensor,
 ) -> torch.Size:
     """Checks the arguments' shapes and returns their common leading batch."""
     check_shape("depth", depth, (1, "H", "W"))
     check_shape("K", K, (3, 3))
     check_shape("prev_from_curr", motion, (4, 4))
     batches = {"depth": depth.shape[:-3], "K": K.shape[:-2], "prev_from_curr": motion.shape[:-2]}
+    if prev_K is not None:
+        check_shape("prev_K", prev_K, (3, 3))
+        batches["prev_K"] = prev_K.shape[:-2]
     for name, other in image.items():
         batches[name] = other.shape[:-3]
         if other.shape[-2:] != depth.shape[-2:]:
@@ -249,16 +267,23 @@ def _planes(
     depth: Tensor,
     instance: Tensor | None,
     K: Tensor,
+    prev_K: Tensor | None,
     motions: Tensor,
     dt: float | Tensor,
 ) -> Planes:
     """Returns the flow of a motion per instance, `[*B, N, 4, 4]`; without ids, of the first."""
     height, width = depth.shape[-2:]
     dtype = torch.promote_types(torch.promote_types(depth.dtype, K.dtype), motions.dtype)
+    if prev_K is not None:
+        dtype = torch.promote_types(dtype, prev_K.dtype)
     compute = torch.promote_types(dtype, torch.float32)
     K, dt, known = known_camera(K.to(compute), dt)
-    known = known.unsqueeze(-1)
-    by_motion = motion_coefficients(K.unsqueeze(-3), motions.to(compute), known)  # [*B, N, 12]
+    if prev_K is not None:
+        prev_K, _, prev_known = known_camera(prev_K.to(compute), 1.0)
+        prev_K, known = prev_K.unsqueeze(-3), known & prev_known
+    by_motion = motion_coefficients(
+        K.unsqueeze(-3), prev_K, motions.to(compute), known.unsqueeze(-1)
+    )  # [*B, N, 12]
     x, y = centred_pixels(height, width, K)
     depth = depth.squeeze(-3).expand(*batch, -1, -1)
     if instance is not None:

@@ -30,6 +30,8 @@ SPOILT = [
     *(("motion", at, bad) for at in itertools.product(range(4), range(4)) for bad in (NAN, -INF)),
     *(("dt", (), bad) for bad in (0.0, -0.5, NAN, INF, -INF, 1e-40)),
     *(("K", at, 0.0) for at in ((0, 0), (1, 1))),  # no focal length
+    *(("prev_K", at, bad) for at in ((0, 0), (0, 1), (1, 2)) for bad in (NAN, INF, 1e9)),
+    *(("prev_K", at, 0.0) for at in ((0, 0), (1, 1))),
 ]
 
 
@@ -39,10 +41,14 @@ def test_one_impossible_entry_makes_its_frame_unknown_and_no_other(name, entry, 
     depth[..., 0, 0] = INF
     given = {"depth": depth, "K": K.repeat(2, 1, 1), "motion": torch.stack([MOTION, OTHER_MOTION])}
     given["dt"] = torch.tensor([0.5, 0.25])
-    alone = ego_flow(*(given[key][1] for key in ("depth", "K", "motion")), dt=0.25)
+    given["prev_K"] = 1.1 * given["K"]
+    names = ("depth", "K", "motion")
+    zoom = {} if name != "prev_K" else {"prev_K": given["prev_K"]}
+    zoomed = {key: prev_K[1].clone() for key, prev_K in zoom.items()}
+    alone = ego_flow(*(given[key][1] for key in names), dt=0.25, **zoomed)
     given[name][(0, *entry)] = value
-    leaves = [given[key].requires_grad_() for key in ("depth", "K", "motion")]
-    flow, valid = ego_flow(*leaves, dt=given["dt"])
+    leaves = [given[key].requires_grad_() for key in (*names, *zoom)]
+    flow, valid = ego_flow(*leaves[:3], dt=given["dt"], **zoom)
     assert not valid[0].any()
     assert flow[0].abs().max() == 0
     assert torch.equal(flow[1], alone.flow)
@@ -149,18 +155,20 @@ def test_gradients(function):
     depth, raw = depth_with_every_mask(), raw_flow()
     raw[0, 2, 2] = math.nan
     raw, camera, motions = leaves(raw, K, torch.stack([BACKED_OFF, OTHER_MOTION]))
+    prev_camera = (K + 0.3 * K.triu()).requires_grad_()
     instance = torch.arange(HEIGHT * WIDTH).reshape(1, HEIGHT, WIDTH) % 2
 
-    def flow(raw, depth, camera, motions):
+    def flow(raw, depth, camera, motions, prev_K):
         if function is rigid_flow:
-            return rigid_flow(depth, instance, camera, motions).flow
+            return rigid_flow(depth, instance, camera, motions, prev_K=prev_K).flow
         if function is ego_flow:
-            return ego_flow(depth, camera, motions[0], dt=0.5).flow
-        return factorize(raw, depth, camera, motions[0])[:2]
+            return ego_flow(depth, camera, motions[0], prev_K=prev_K, dt=0.5).flow
+        return factorize(raw, depth, camera, motions[0], prev_K=prev_K)[:2]
 
     valid = ego_flow(depth, K, BACKED_OFF).valid
     assert valid[0, 0].tolist() == [True] + 5 * [False] + [True]
-    assert gradcheck(flow, (raw, depth, camera, motions))
+    assert gradcheck(flow, (raw, depth, camera, motions, None))
+    assert gradcheck(flow, (raw, depth, camera, motions, prev_camera))
 
 
 def test_a_point_level_with_the_previous_camera_sends_back_zero_not_nan():

@@ -29,10 +29,11 @@ def inputs(*batch: int):
     return depth, instance.expand_as(depth), K.float(), motions.expand(*batch, 3, 4, 4)
 
 
-def everything(depth, instance, K, motions, dt=1.0):
+def everything(depth, instance, K, motions, dt=1.0, prev_K=None):
     """Returns raw, where it is known, ego, obj, and where they are known."""
-    raw, raw_valid = rigid_flow(depth, instance, K, motions, dt=dt)
-    return raw, raw_valid, *factorize(raw, depth, K, motions[..., 0, :, :], dt=dt)
+    before = {"prev_K": prev_K, "dt": dt}
+    raw, raw_valid = rigid_flow(depth, instance, K, motions, **before)
+    return raw, raw_valid, *factorize(raw, depth, K, motions[..., 0, :, :], **before)
 
 
 @pytest.fixture(autouse=True)
@@ -56,9 +57,10 @@ def test_camera_is_one_graph():
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("dt", [0.25, torch.tensor([0.5, 2.0])])
-def test_flow_is_one_graph(dt):
+@pytest.mark.parametrize("prev_K", [None, 1.1 * K.float()])
+def test_flow_is_one_graph(dt, prev_K):
     compiled = torch.compile(everything, fullgraph=True, backend="eager")
-    assert_same(compiled(*inputs(2), dt), everything(*inputs(2), dt))
+    assert_same(compiled(*inputs(2), dt, prev_K), everything(*inputs(2), dt, prev_K))
 
 
 @pytest.mark.slow
@@ -72,9 +74,10 @@ def test_sizes_may_change_between_calls():
 
 @pytest.mark.slow
 @needs_compiler
-def test_compiled_code_gives_the_bits_of_eager_from_transposed_memory_too():
+@pytest.mark.parametrize("prev_K", [None, 1.1 * K.float()])
+def test_compiled_code_gives_the_bits_of_eager_from_transposed_memory_too(prev_K):
     depth, instance, camera, motions = inputs(2)
-    given = depth.mT.contiguous().mT, instance, camera, motions
+    given = depth.mT.contiguous().mT, instance, camera, motions, 1.0, prev_K
     got, expected = torch.compile(everything, fullgraph=True)(*given), everything(*given)
     for part, eager in zip(got, expected):
         assert part.shape == eager.shape

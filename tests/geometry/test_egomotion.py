@@ -96,6 +96,19 @@ def test_a_camera_with_skew_and_oblong_pixels_in_float64():
     assert estimate.covariance.dtype == torch.float64
 
 
+def test_a_zoom_between_the_frames_is_no_motion_of_the_camera():
+    depth, motion = blocks(3), motions(3)
+    motion[0] = torch.eye(4)
+    before = CAMERA.clone()
+    before[0, 0], before[1, 1], before[0, 2] = 70.1, 64.0, 41.5
+    flow = g.ego_flow(depth, CAMERA, motion, prev_K=before).flow
+    estimate = g.camera_motion(flow, depth, CAMERA, prev_K=before)
+    assert estimate.valid.all()
+    torch.testing.assert_close(estimate.prev_from_curr, motion, rtol=0, atol=1e-5)
+    one_K = g.camera_motion(flow, depth, CAMERA).prev_from_curr
+    assert (one_K[0] - motion[0])[2, 3] > 0.05  # taken for a drive ahead
+
+
 def test_no_flow_is_exactly_no_motion():
     estimate = g.camera_motion(torch.zeros(2, SIZE, SIZE), blocks(1)[0], CAMERA)
     assert estimate.valid

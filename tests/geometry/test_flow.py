@@ -202,6 +202,85 @@ def test_unknown_flow_of_a_body_is_no_object_flow():
     assert valid.tolist() == [[[True, False]]]
 
 
+# Zoomed in, sheared and shifted: no entry is that of K.
+PREV_K = torch.tensor([[12.5, 0.4, 3.3], [0.0, 7.2, 2.2], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def flow_pixel_by_pixel(depth, K, motion, prev_K) -> torch.Tensor:
+    """Returns flow `[2, H, W]` in plain floats: to the point, to the camera before, to its pixel."""
+    (fx, skew, cx), (_, fy, cy), _ = K.tolist()
+    (fx_p, skew_p, cx_p), (_, fy_p, cy_p), _ = prev_K.tolist()
+    out = torch.zeros(2, *depth.shape[-2:], dtype=torch.float64)
+    for row, column in product(*map(range, depth.shape[-2:])):
+        z = depth[0, row, column].item()
+        y = z * (row + 0.5 - cy) / fy
+        x = (z * (column + 0.5 - cx) - skew * y) / fx
+        before = [r[0] * x + r[1] * y + r[2] * z + r[3] for r in motion.tolist()]
+        u = (fx_p * before[0] + skew_p * before[1]) / before[2] + cx_p
+        v = fy_p * before[1] / before[2] + cy_p
+        out[0, row, column], out[1, row, column] = column + 0.5 - u, row + 0.5 - v
+    return out
+
+
+def test_another_k_in_the_previous_frame_agrees_with_brute_force():
+    depth, instance = depth_map(), instance_map()
+    each = [flow_pixel_by_pixel(depth, K, motion, PREV_K) for motion in MOTIONS]
+    expected = torch.stack(each).gather(0, instance.long().expand(1, 2, -1, -1))[0]
+    raw = rigid_flow(depth, instance, K, MOTIONS, prev_K=PREV_K)
+    torch.testing.assert_close(raw.flow, expected, rtol=0, atol=1e-12)
+    ego, obj, valid = factorize(raw, depth, K, MOTION, prev_K=PREV_K)
+    torch.testing.assert_close(ego, each[0], rtol=0, atol=1e-12)
+    assert valid.all()
+    assert obj[:, instance[0] == 0].abs().max() == 0
+    # K of now for both frames, or the two exchanged, is off by pixels.
+    for wrong in ({}, {"prev_K": K}):
+        assert (ego_flow(depth, K, MOTION, **wrong).flow - ego).norm(dim=0).median() > 0.5
+    exchanged = ego_flow(depth, PREV_K, MOTION, prev_K=K).flow
+    assert (exchanged - ego).norm(dim=0).median() > 0.5
+
+
+def test_a_camera_that_only_zooms_by_hand():
+    # fx 4 -> 8 and cx 1 -> 1.5 while nothing moves: pixel (3, 0), 2 px right of cx, was at
+    # 1 + 2 * 4 / 8 = 2, so u = 3.5 - 2; at the other focal length it would be -2.
+    now, before = camera(fx=8.0, cx=1.5), camera(fx=4.0, cx=1.0)
+    raw, _ = ego_flow(torch.full((1, 1, 4), 3.0), now, moved(), prev_K=before)
+    assert raw[:, 0, 3].tolist() == [1.5, 0.0]
+    _, obj, _ = factorize(raw, torch.full((1, 1, 4), 3.0), now, moved(), prev_K=before)
+    assert not obj.any()
+
+
+ZOOMS = {  # a telephone's autofocus within a thirtieth of a second; a film that zooms in
+    "autofocus": (1455.07, 1459.04),
+    "1 % a frame": (1120.0, 1131.2),
+}
+
+
+@pytest.mark.parametrize("zoom", ZOOMS)
+def test_a_focal_length_that_changes_leaves_no_object_flow(zoom):
+    before, now = (
+        torch.tensor([[f, 0, 950.5], [0, 1.01 * f, 715.0], [0, 0, 1]], dtype=torch.float64)
+        for f in ZOOMS[zoom]
+    )
+    depth = 2 + 3 * torch.rand(1, 24, 32, generator=torch.Generator().manual_seed(1)).double()
+    motion = torch.eye(4, dtype=torch.float64) if zoom == "autofocus" else MOTION
+    raw = flow_pixel_by_pixel(depth, now, motion, before)
+    _, obj, valid = factorize(raw, depth, now, motion, prev_K=before)
+    assert valid.all()
+    assert obj.abs().max() < 1e-9
+    _, ignored, _ = factorize(raw, depth, now, motion)
+    assert ignored.norm(dim=0).median() > 1.0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_same_k_before_changes_nothing_and_nothing_moving_is_exactly_0(dtype):
+    depth, camera = depth_map().to(dtype), K.to(dtype)
+    alone = ego_flow(depth, camera, MOTION.to(dtype)).flow
+    assert torch.equal(ego_flow(depth, camera, MOTION.to(dtype), prev_K=camera).flow, alone)
+    still, valid = ego_flow(depth, camera, torch.eye(4, dtype=dtype), prev_K=camera)
+    assert valid.all()
+    assert still.abs().max() == 0
+
+
 def test_flow_that_needs_no_change_and_flow_that_points_back():
     # The point at column 7, row 2 came from column 4, row 3: p_t - p_t' = (3, -1).
     want = torch.tensor([3.0, -1.0]).reshape(2, 1, 1)
@@ -232,6 +311,10 @@ def test_any_batch_equals_a_loop(function, batch):
     for at in product(*map(range, batch)):
         alone = function(*(image[at] for image in maps), Ks[at], motions[at], dt=0.5)
         assert all(torch.equal(part[at], one) for part, one in zip(together, alone))
+    zoomed = function(*maps, Ks, motions, prev_K=PREV_K)
+    for at in product(*map(range, batch)):
+        alone = function(*(image[at] for image in maps), Ks[at], motions[at], prev_K=PREV_K)
+        assert all(torch.equal(part[at], one) for part, one in zip(zoomed, alone))
     one_camera = function(*maps, K, motions)
     for part, other in zip(one_camera, function(*maps, K.expand_as(Ks), motions)):
         assert torch.equal(part, other)

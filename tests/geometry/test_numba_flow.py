@@ -86,6 +86,17 @@ def test_a_camera(calls, dt):
     assert flow.valid[0, 0, 4].tolist() == [True, False, False, False, True, False, True]
 
 
+def test_a_k_of_its_own_in_the_previous_frame(calls):
+    depth, instance, Ks, motions = scene()
+    before = 1.2 * Ks
+    before[1, 0, 0] = math.nan
+    flow = rigid_flow(depth, instance, Ks, motions, prev_K=before)
+    assert_same_bits(flow, by_torch(rigid_flow, depth, instance, Ks, motions, prev_K=before))
+    assert len(calls) == 1
+    assert not flow.valid[1].any()
+    assert flow.valid[0].any()
+
+
 def test_factors_and_what_they_share(calls):
     depth, instance, Ks, motions = scene()
     raw = rigid_flow(depth, instance, Ks, motions).flow
