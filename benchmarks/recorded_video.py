@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import torch
 
-from flowrep.sequences import EstimatedFlowSource, Frames, SevenScenes, recorded_motion
+from flowrep.sequences import EstimatedFlowSource, open_recording, recorded_motion
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
 from flowrep.transforms import DIS
@@ -71,7 +71,7 @@ def measure(
         write_recording(folder / "in", FRAMES, 480, 640)
         if register:
             as_seven_scenes(folder / "in")
-        stream = SevenScenes(folder / "in") if register else Frames(folder / "in")
+        stream = open_recording(folder / "in", "sevenscenes" if register else "frames")
         source = EstimatedFlowSource(DIS(preset), check_consistency=check_consistency)
         out = Output(folder / "out", {}, flow_files=flow_files)
         job = Job(stream, source, recorded_motion, out)
@@ -106,7 +106,7 @@ def memory(frames: int = 10_000) -> None:
         (folder / "in/poses.txt").write_text("\n".join(lines))
         out = WatchedOutput(folder / "out", {}, flow_files=(), pictures_every=0)
         source = EstimatedFlowSource(DIS("fast"))
-        Job(Frames(folder / "in"), source, recorded_motion, out).run()
+        Job(open_recording(folder / "in", "frames"), source, recorded_motion, out).run()
 
 
 class WatchedOutput(Output):

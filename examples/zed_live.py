@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 
 from flowrep.sequences import EstimatedFlowSource, Frame, SequenceError, recorded_motion
-from flowrep.sequences.calibration import opencv_intrinsics
-from flowrep.sequences.frames import measured
+from flowrep.sequences.calibration import camera_matrix
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
 from flowrep.transforms import DIS
@@ -68,7 +67,7 @@ class ZedLive:
         sl = self._sl
         runtime, picture, depth, pose = sl.RuntimeParameters(), sl.Mat(), sl.Mat(), sl.Pose()
         left = camera.get_camera_information().camera_configuration.calibration_parameters.left_cam
-        K = opencv_intrinsics([left.fx, left.fy, left.cx, left.cy])
+        K = camera_matrix([left.fx, left.fy, left.cx, left.cy], (0, 0), first_pixel_centre=0.0)
         number, clip = 0, 0
         while True:
             error = camera.grab(runtime)
@@ -81,12 +80,13 @@ class ZedLive:
                 continue
             camera.retrieve_image(picture, sl.VIEW.LEFT)
             camera.retrieve_measure(depth, sl.MEASURE.DEPTH)
+            z = np.asarray(depth.get_data(), dtype=np.float32)
             yield Frame(
                 name=f"{number:06d}",
                 source=self.source,
                 world_from_cam=np.array(pose.pose_data(sl.Transform()).m, dtype=np.float64),
                 K=K,
-                depth=measured(np.asarray(depth.get_data(), dtype=np.float32)),
+                depth=np.where(np.isfinite(z), z, np.float32(np.nan)),  # inf is too far, not sky
                 rgb=cv2.cvtColor(picture.get_data(), cv2.COLOR_BGRA2RGB).astype(
                     np.uint8, copy=False
                 ),

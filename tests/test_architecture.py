@@ -30,7 +30,8 @@ FLOWREP_IMPORTS_ALLOWED = {
     "load_agent": set(),
     "pretrained": {"experiment", "agent", "config"},
     "policies": {"pretrained", "experiment", "baselines", "config"},
-    "sequences": {"sequences", "progress", "tables", "extras", "transforms", "geometry", "viz"},
+    "sequences": {"sequences", "config", "progress", "tables", "extras"}
+    | {"transforms", "geometry", "viz"},
     "sweep": {"config", "progress", "tables"},
     "config": {"config"},
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}

@@ -23,7 +23,8 @@ import imageio.v3 as imageio
 from flowrep.config import CONF_DIR, UsageError, group_choices
 from flowrep.config.schema import FactorizeConfig, validated
 from flowrep.factorize import factorize_recording, main
-from flowrep.sequences import Frame, SequenceError, read_flo, read_kitti_flow, recorded_motion
+from flowrep.sequences import Frame, SequenceError, read_flow, recorded_motion
+from flowrep.sequences.declared import declaration
 from flowrep.sequences.job import Job
 from flowrep.sequences.output import Output
 from flowrep.tables import read_rows
@@ -66,10 +67,10 @@ def test_all_that_is_written(moments, tmp_path):
     assert files_of(out) == sorted([*flows, *others, *tables])
     assert not (tmp_path / "out.partial").exists()
     for name, moment in zip(("0001", "0002"), moments[1:]):
-        np.testing.assert_array_equal(read_flo(out / f"flow/raw/{name}.flo"), moment.raw)
-        obj = read_flo(out / f"flow/obj/{name}.flo")
+        np.testing.assert_array_equal(read_flow(out / f"flow/raw/{name}.flo"), moment.raw)
+        obj = read_flow(out / f"flow/obj/{name}.flo")
         np.testing.assert_allclose(obj, moment.obj, atol=2e-4)
-        np.testing.assert_allclose(read_kitti_flow(out / f"flow/obj/{name}.png"), obj, atol=1 / 128)
+        np.testing.assert_allclose(read_flow(out / f"flow/obj/{name}.png"), obj, atol=1 / 128)
         arrays = np.load(out / f"flow/{name}.npz")
         np.testing.assert_allclose(arrays["ego"] + arrays["obj"], moment.raw, atol=1e-5)
         assert arrays["valid"].all()
@@ -241,17 +242,24 @@ def test_what_cannot_be_is_refused_by_name(key, value, moments, tmp_path):
 
 
 @pytest.mark.parametrize("name", group_choices("format"))
-def test_a_format_spells_out_every_option_of_its_reader_in_its_order(name):
+def test_a_format_gives_options_of_its_reader_and_the_plain_layout_all(name):
     options = OmegaConf.to_container(OmegaConf.load(CONF_DIR / "format" / f"{name}.yaml"))
-    reader = get_class(options.pop("_target_"))
-    assert name in (reader.__name__.lower(), reader.__name__.removeprefix("Still").lower())
-    _, *parameters = inspect.signature(reader).parameters.values()
-    defaults = {
-        p.name: "???" if p.default is p.empty else
-        list(p.default) if isinstance(p.default, tuple) else p.default
-        for p in parameters
-    }  # fmt: skip
-    assert list(options.items()) == list(defaults.items())
+    _, *parameters = inspect.signature(get_class(declaration(name)["_target_"])).parameters.values()
+    if options.pop("defaults", None) is None:
+        del options["_target_"]
+        assert list(options) == [p.name for p in parameters]
+        for p in parameters:  # the code formats have defaults of their own
+            assert p.default in (p.empty, options[p.name])
+    else:
+        assert {*options} <= {p.name for p in parameters}
+    # Composed by Hydra, a format is what the same name gives in Python.
+    given = [f"format={name}", "input=x", "output=y"]
+    needed = [f"format.{key}=1" for key, value in declaration(name).items() if value == "???"]
+    composed = settings(*given, *needed).format.options()
+    same = {key: value for key, value in declaration(name).items() if value != "???"}
+    assert {key: composed[key] for key in same if key != "_target_"} == {
+        key: value for key, value in same.items() if key != "_target_"
+    }
 
 
 def test_the_command_ends_with_one_line_and_code_2(tmp_path, monkeypatch, capsys):

@@ -1,22 +1,36 @@
-"""Cameras of recordings: intrinsics, poses, registration of depth to colour."""
+"""Cameras of recordings: intrinsics, lens distortion, poses, registration of depth to colour."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias, get_args
 
+import cv2
 import numpy as np
 import pydantic
 import torch
 from numpy.typing import NDArray
 
 from flowrep.geometry import CameraAxes, PoseDirection, PoseLayout, adapt_pose
-from flowrep.sequences.files import read_table
+from flowrep.sequences.files import regular
 from flowrep.sequences.recording import Pose, SequenceError
 
-Matrix = NDArray[np.float64]
+Matrix: TypeAlias = NDArray[np.float64]
+Layout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz", "xyzw_xyz"]
+Axes: TypeAlias = Literal[CameraAxes, "unity", "unreal"]
+Lens: TypeAlias = Literal["opencv", "fisheye"]
+
+# OpenCV's right, down and forward as (axis, sign) of left-handed cameras, whose worlds are too.
+_LEFT_HANDED = {
+    "unity": ((0, 1), (1, -1), (2, 1)),  # x right, y up, z forward
+    "unreal": ((1, 1), (2, -1), (0, 1)),  # x forward, y right, z up
+}
+MIRROR_REMEDY = (
+    "fy is positive. Where it is negative (ICL-NUIM) the camera is left-handed, with y up and z "
+    "ahead: give fy without its sign, and format.pose_axes=unity mirrors the poses"
+)
 
 
 class Camera(pydantic.BaseModel):
@@ -31,30 +45,17 @@ class Camera(pydantic.BaseModel):
     cx: float
     cy: float
     first_pixel_centre: Literal[0.0, 0.5]  # type: ignore[valid-type]
-
-    @pydantic.field_validator("fy")
-    @classmethod
-    def _is_right_handed(cls, fy: float) -> float:
-        if fy > 0:
-            return fy
-        raise ValueError(
-            "should be positive. Where it is negative (ICL-NUIM) the camera is left-handed, with y "
-            "up and z ahead: mirror the poses, F @ pose @ F with F = diag(1, -1, 1, 1)"
-        )
+    distortion: list[float] = []
+    lens: Lens = "opencv"
 
     @property
-    def K(self) -> Matrix:
-        """In flowrep's convention."""
+    def numbers(self) -> list[float]:
+        """fx, fy, cx, cy, with the centre of pixel (0, 0) at (0.5, 0.5)."""
         shift = 0.5 - self.first_pixel_centre
-        return intrinsics(self.fx, self.fy, self.cx + shift, self.cy + shift)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width."""
-        return self.height, self.width
+        return [self.fx, self.fy, self.cx + shift, self.cy + shift]
 
 
-Row = tuple[float, float, float, float]
+Row: TypeAlias = tuple[float, float, float, float]
 
 
 class ColourCamera(Camera):
@@ -75,66 +76,112 @@ def read_cameras(path: Path) -> Cameras:
         'it holds {"width": .., "height": .., "fx": .., "fy": .., "cx": .., "cy": .., '
         '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5}'
     )
-    if not path.is_file():
-        raise SequenceError(path, f"no such file; {remedy}")
     try:
-        return Cameras.model_validate_json(path.read_bytes())
+        return Cameras.model_validate_json(regular(path).read_bytes())
+    except FileNotFoundError:
+        raise SequenceError(path, f"no such file; {remedy}") from None
     except pydantic.ValidationError as error:
         lines = [f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors()]
         raise SequenceError(path, f"{', '.join(lines)}; {remedy}") from None
 
 
-def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Matrix:
-    """Returns K `[3, 3]`."""
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+def camera_matrix(
+    numbers: Sequence[float] | Matrix,
+    size: tuple[int, ...],
+    first_pixel_centre: float,
+    source: object = "intrinsics",
+) -> Matrix:
+    """Returns K `[3, 3]` in flowrep's convention.
 
+    Args:
+        numbers: fx, fy, cx, cy; the 9, 12 or 16 numbers of a matrix; or one, the focal length in
+            picture widths, of a camera with square pixels and a centred axis.
+        size: of the picture, height and width.
+        first_pixel_centre: where the numbers put the centre of pixel (0, 0): 0 as OpenCV
+            calibrates, or 0.5.
 
-def opencv_intrinsics(numbers: Sequence[float]) -> Matrix:
-    """Returns K from fx, fy, cx, cy of a calibration with the centre of pixel (0, 0) at (0, 0).
-
-    >>> opencv_intrinsics([525.0, 525.0, 319.5, 239.5])[:2, 2]
+    >>> camera_matrix([525.0, 525.0, 319.5, 239.5], (480, 640), 0.0)[:2, 2]
     array([320., 240.])
     """
-    fx, fy, cx, cy = numbers
-    return intrinsics(fx, fy, cx + 0.5, cy + 0.5)
-
-
-def check_numbers(option: str, numbers: Sequence[float], meaning: str) -> None:
-    """Raises SequenceError if an option has not as many numbers as its meaning, "x, y, z"."""
-    if len(numbers) != len(meaning.split(", ")):
-        raise SequenceError(option, f"should be [{meaning}], not {list(numbers)}")
+    values = np.array(numbers, dtype=np.float64).ravel()
+    if len(values) == 1:
+        width, shift = size[1], 0.5 - first_pixel_centre
+        values = np.array([*(values * width).repeat(2), width / 2 - shift, size[0] / 2 - shift])
+    if len(values) not in (4, 9, 12, 16):
+        meaning = "[fx, fy, cx, cy], a matrix, or [a focal length in picture widths]"
+        raise SequenceError(source, f"should be {meaning}, not {values.tolist()}")
+    if len(values) == 4:
+        fx, fy, cx, cy = values
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    else:
+        K = values.reshape(4 if len(values) == 16 else 3, -1)[:3, :3]
+    if K[1, 1] < 0:
+        raise SequenceError(source, MIRROR_REMEDY)
+    K[:2, 2] += 0.5 - first_pixel_centre
+    return K
 
 
 def as_pose(
     numbers: NDArray[np.float64],
-    source: Path,
+    source: object,
     *,
-    layout: PoseLayout = "matrix",
+    layout: Layout = "matrix",
     direction: PoseDirection = "camera_to_world",
-    axes: CameraAxes = "opencv",
+    axes: Axes = "opencv",
 ) -> Pose:
-    """Returns `world_from_cam` `[*B, 4, 4]` from the 7, 12 or 16 numbers of each pose."""
+    """Returns `world_from_cam` `[*B, 4, 4]` from the 7, 12 or 16 numbers of each pose.
+
+    The worlds of left-handed `axes` are mirrored: motions between their poses are then those of
+    OpenCV's camera.
+    """
     values = torch.from_numpy(np.array(numbers, dtype=np.float64))
+    given: PoseLayout = "xyz_xyzw" if layout == "xyzw_xyz" else layout
     if layout == "matrix":
         values = values.unflatten(-1, (-1, 4))
-        layout = "matrix" if values.shape[-2] == 4 else "matrix_3x4"
+        given = "matrix" if values.shape[-2] == 4 else "matrix_3x4"
+    elif layout == "xyzw_xyz":
+        values = values.roll(3, -1)
+    known: Any = axes if axes in get_args(CameraAxes) else "opencv"
     try:
-        return adapt_pose(values, layout=layout, direction=direction, axes=axes).numpy()
+        pose = adapt_pose(values, layout=given, direction=direction, axes=known).numpy()
     except ValueError as error:
         raise SequenceError(source, str(error)) from None
+    if axes in _LEFT_HANDED:
+        columns = [sign * pose[..., axis] for axis, sign in _LEFT_HANDED[axes]]
+        pose = np.diag([1.0, -1.0, 1.0, 1.0]) @ np.stack([*columns, pose[..., 3]], -1)
+    return pose
 
 
-def read_poses(path: Path, frames: int, *, layout: PoseLayout = "xyz_xyzw", **options: Any) -> Pose:
-    """Returns `world_from_cam` `[N, 4, 4]` of a file with a pose per line, for `as_pose`."""
-    numbers = read_table(path, 7, 12, 16)
-    if len(numbers) != frames:
-        raise SequenceError(path, f"has {len(numbers)} poses for {frames} frames")
-    width = numbers.shape[1]
-    fitting = ("xyz_xyzw", "xyz_wxyz") if width == 7 else ("matrix",)
-    if layout not in fitting:
-        remedy = " or ".join(f"format.pose_layout={name}" for name in fitting)
-        raise SequenceError(path, f"has {width} numbers in a line, as {remedy}")
-    return as_pose(numbers, path, layout=layout, **options)
+class Undistortion:
+    """Takes the distortion of a lens out of maps; the camera that is left has the same K.
+
+    Args:
+        K: the camera's, in flowrep's convention.
+        distortion: OpenCV's k1, k2, p1, p2, k3, ... of 4, 5, 8, 12 or 14 numbers; its k1 to k4 of a
+            fisheye.
+        size: height and width.
+    """
+
+    def __init__(
+        self, K: Matrix, distortion: Sequence[float], lens: Lens, size: tuple[int, int]
+    ) -> None:
+        if len(distortion) not in ((4,) if lens == "fisheye" else (4, 5, 8, 12, 14)):
+            counts = "4 numbers" if lens == "fisheye" else "4, 5, 8, 12 or 14 numbers"
+            raise SequenceError("distortion", f"has {counts} of a lens={lens}: {list(distortion)}")
+        opencv = K.copy()
+        opencv[:2, 2] -= 0.5  # its pixel centres are whole numbers
+        coefficients = np.array(distortion, dtype=np.float64)
+        make: Any = cv2.fisheye if lens == "fisheye" else cv2
+        self._maps = make.initUndistortRectifyMap(
+            opencv, coefficients, np.eye(3), opencv, size[::-1], cv2.CV_32FC1
+        )
+
+    def __call__(self, image: Any, *, nearest: bool = False) -> Any:
+        """Returns the map of the rectified camera; nan, or black, where the lens saw nothing."""
+        border = np.nan if image.dtype.kind == "f" else 0.0
+        way = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        columns, rows = self._maps
+        return cv2.remap(image, columns, rows, way, borderValue=4 * [border])
 
 
 _LARGEST_FOOTPRINT_PX = 8

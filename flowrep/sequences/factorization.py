@@ -71,7 +71,8 @@ def recorded_flow(previous: Frame, current: Frame) -> Flow:
     if current.raw is None:
         raise SequenceError(current.source, "has no flow of its own: use flow=estimated")
     if current.raw_since != previous.name:
-        cause = f"has flow since frame {current.raw_since}, and here follows {previous.name}"
+        since = current.raw_since or "that is missing"
+        cause = f"has flow since frame {since}, and here follows {previous.name}"
         remedy = "use flow=estimated, or stride=1 and a recording without gaps"
         raise SequenceError(current.source, f"{cause}: {remedy}")
     return current.raw

@@ -1,4 +1,4 @@
-"""Files of recordings: text, pictures, arrays, depth maps and flow.
+"""Files of recordings: text, JSON, pictures, arrays, depth maps and flow.
 
 What is invalid raises `SequenceError`, which names the file; what is missing, `OSError`, which does
 so too.
@@ -6,168 +6,275 @@ so too.
 
 from __future__ import annotations
 
+import json
 import re
 import struct
-from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrep.extras import require
 from flowrep.sequences.recording import SequenceError
 
-PICTURES = (".png", ".jpg", ".jpeg")
-DEPTH_FILES = (".png", ".npy")
+DepthCoding: TypeAlias = Literal["float32_rgba", "rgb24"]
+FlowCoding: TypeAlias = Literal["kitti", "vkitti2", "kubric"]
+Flow: TypeAlias = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
+
+_SUFFIXES = {
+    "picture": (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tif", ".tiff", ".npy"),
+    "map": (".png", ".npy", ".tif", ".tiff", ".pgm", ".pfm", ".exr", ".dpt"),
+    "flow": (".flo", ".png", ".npy", ".pfm", ".flo5"),
+    "numbers": (".txt", ".csv", ".json", ".cam"),
+}
 FLO_TAG = 202021.25
 _FLO_UNKNOWN, _FLO_LARGEST = 1e10, 1e9  # what is written for unknown flow, and what is not read
 
-Flow = NDArray[np.float32]  # [2, H, W], u right, v down; nan where unknown
+
+def find_files(path: Path, kind: str) -> dict[str, Path]:
+    """Returns the files of a pattern by what `*` stands for, in the order of their numbers.
+
+    A pattern without a suffix finds the files of all suffixes of its kind.
+    """
+    before, _, after = path.name.partition("*")
+    any_suffix = not any(after.lower().endswith(_SUFFIXES[kind]) for kind in _SUFFIXES)
+    found: dict[str, Path] = {}
+    for file in path.parent.iterdir() if path.parent.is_dir() else ():
+        if any_suffix and file.suffix.lower() not in _SUFFIXES[kind]:
+            continue
+        stem = file.stem if any_suffix else file.name
+        if stem.startswith(before) and stem.endswith(after):
+            name = stem[len(before) : len(stem) - len(after)]
+            if other := found.get(name):
+                raise SequenceError(file, f"belongs to the same frame as {other.name}; remove one")
+            found[name] = file
+    return {name: found[name] for name in sorted(found, key=_natural)}
 
 
-def list_files(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Path]:
-    """Returns a folder's files with one of the suffixes, sorted by number, then by name."""
-    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes]
-    found = [path for path in found if path.name.startswith(prefix)]
-    if not found:
-        raise SequenceError(folder, f"holds no {prefix}*{' or '.join(suffixes)} file")
-    found.sort(key=_natural)
-    for first, second in pairwise(found):
-        if first.stem == second.stem:
-            raise SequenceError(second, f"belongs to the same frame as {first.name}; remove one")
-    return found
-
-
-def _natural(path: Path) -> tuple[list[int | str], str]:
+def _natural(name: str) -> list[int | str]:
     # frame_9 comes before frame_10; texts and numbers take turns, so all are comparable
-    pieces = re.split(r"([0-9]+)", path.stem)
-    return [int(piece) if piece.isdecimal() else piece for piece in pieces], path.name
+    return [int(piece) if piece.isdecimal() else piece for piece in re.split(r"([0-9]+)", name)]
+
+
+def with_suffix(path: Path, kind: str) -> Path:
+    """Returns a file's path, with the first suffix of its kind that exists if it has none."""
+    if path.name.lower().endswith(tuple(_SUFFIXES[kind])):
+        return path
+    paths = [path.with_name(path.name + suffix) for suffix in _SUFFIXES[kind]]
+    return next((found for found in paths if found.exists()), path)
+
+
+def regular(path: Path) -> Path:
+    """Returns a path, unless it is that of a pipe, which would be read for ever."""
+    if path.exists() and not path.is_file():
+        raise SequenceError(path, "is no file")
+    return path
 
 
 def read_lines(path: Path) -> list[str]:
     """Returns the non-empty lines; `#` starts a comment."""
-    lines = map(str.strip, path.read_text("utf-8", errors="replace").splitlines())
+    lines = map(str.strip, regular(path).read_text("utf-8-sig", errors="replace").splitlines())
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def read_table(path: Path, *columns: int, header: bool = False) -> NDArray[np.float64]:
-    """Returns the numbers of a text file, with one of the permitted numbers of `columns`."""
-    # Separated by blanks or commas.
-    lines = [line.replace(",", " ") for line in read_lines(path)[int(header) :]]
-    if not lines:
-        raise SequenceError(path, "holds no numbers")
+def read_json(path: Path, *keys: str) -> Any:
+    """Returns the value at a path of keys, a number for a place in a list."""
     try:
-        table = np.loadtxt(lines, ndmin=2)
-    except ValueError as error:
-        raise SequenceError(path, str(error)) from None
-    width = table.shape[1]
-    if width not in columns:
+        value = json.loads(regular(path).read_bytes())
+        for key in keys:
+            value = value[int(key)] if isinstance(value, list) else value[key]
+    except (ValueError, LookupError, TypeError) as error:
+        raise SequenceError(path, f"has no value at {'.'.join(keys)} ({error!r})") from None
+    return value
+
+
+def read_table(path: Path, *columns: int) -> NDArray[np.float64]:
+    """Returns the numbers of a file, a row a line, with one of the permitted numbers of columns.
+
+    They are separated by blanks or commas; a line that begins with a word is a header. Of JSON,
+    `path` ends in `file.json:key.key`; the numbers of several keys, with `+` between them, stand
+    side by side. Sintel's `.cam` is one row, K and the extrinsics.
+    """
+    name, _, keys = path.name.partition(":")
+    path = path.with_name(name)
+    try:
+        if path.suffix.lower() == ".json":
+            parts = [np.array(read_json(path, *key.split(".")), float) for key in keys.split("+")]
+            table = np.hstack([part if part.ndim == 2 else part.reshape(-1, 1) for part in parts])
+        elif path.suffix.lower() == ".cam":
+            tag, *row = struct.unpack("<f21d", regular(path).read_bytes())
+            table = np.array([row] if tag == FLO_TAG else [])
+        else:
+            lines = [line.replace(",", " ") for line in read_lines(path)]
+            if lines and not re.match(r"[-+.]?(\d|nan|inf)", lines[0], re.IGNORECASE):
+                del lines[0]
+            table = np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
+    except (ValueError, struct.error) as error:
+        raise SequenceError(path, f"holds no table of numbers: {error}") from None
+    if not table.size:
+        raise SequenceError(path, "holds no numbers")
+    if columns and table.shape[1] not in columns:
         expected = " or ".join(map(str, columns))
-        raise SequenceError(path, f"has {width} numbers in a line, expected {expected}")
+        raise SequenceError(path, f"has {table.shape[1]} numbers in a line, expected {expected}")
     return table
+
+
+def read_array(path: Path) -> NDArray[Any]:
+    """Returns a picture or an array, `[H, W]` or `[H, W, channels]` with red first."""
+    suffix, array = path.suffix.lower(), None
+    try:
+        if suffix == ".npy":
+            # Mapped, since memory for what a broken header promises would be allocated.
+            mapped = np.load(regular(path), mmap_mode="r")
+            array = np.array(mapped) if isinstance(mapped, np.ndarray) else None
+        elif suffix in (".flo", ".dpt"):
+            array = read_tagged_floats(path, channels=2 if suffix == ".flo" else 1)
+        elif suffix == ".exr":
+            array = _read_exr(path)
+        elif suffix == ".flo5":
+            raise SequenceError(path, "is HDF5, which isn't read: convert it to .flo or .npy")
+        else:
+            array = _decoded(regular(path).read_bytes())
+    except (ValueError, EOFError, RuntimeError, cv2.error) as error:
+        raise SequenceError(path, f"can't be read as {suffix}: {error}") from None
+    if array is None:
+        raise SequenceError(path, f"is no {suffix} file, or was cut off")
+    return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+
+
+def _decoded(data: bytes) -> NDArray[Any] | None:
+    # OpenCV fills up a JPEG (before version 5 a PNG, too) that was cut off with grey and says
+    # nothing, so look for its end. Some cameras write a few bytes after it.
+    end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(data[:2], b"")
+    if not data or end not in data[-4096:]:
+        return None
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if picture is None or picture.ndim == 2:
+        return picture
+    return picture[..., [2, 1, 0, 3][: picture.shape[2]]]
+
+
+def _read_exr(path: Path) -> NDArray[Any]:
+    """Returns the first of the channels Z, R, Y and V; renderers put a layer's name before it."""
+    require("reading .exr", "exr", "OpenEXR")
+    import OpenEXR
+
+    planes = OpenEXR.File(str(regular(path)), separate_channels=True).channels()
+    name = min(planes, key=lambda name: (f"ZRYV{name[-1]}".index(name[-1]), name))
+    pixels: NDArray[Any] = planes[name].pixels
+    return pixels
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
     """Returns a colour picture `[H, W, 3]`; a grey one has three equal channels."""
-    picture = _decode(path)
+    picture = read_array(path)
     if picture.dtype != np.uint8:
         raise SequenceError(path, f"has {8 * picture.itemsize} bits per channel, colour has 8")
-    blue_green_red = picture[..., :3] if picture.ndim == 3 else np.stack(3 * [picture], -1)
-    return np.ascontiguousarray(blue_green_red[..., ::-1])
+    colours = picture[..., :3] if picture.ndim == 3 else np.stack(3 * [picture], -1)
+    return np.ascontiguousarray(colours)
 
 
-def read_png(path: Path, dtype: type, channels: int = 1) -> NDArray[Any]:
-    """Returns a picture of a given type, `[H, W]`, or `[H, W, channels]` with red first."""
-    picture = _decode(path)
-    found = 1 if picture.ndim == 2 else picture.shape[2]
+def read_integers(path: Path, dtype: type, channels: int = 1) -> NDArray[Any]:
+    """Returns a picture of a given type, `[H, W]` or `[H, W, channels]`."""
+    picture = read_array(path)
+    found = 1 if picture.ndim == 2 else picture.shape[-1]
     if picture.dtype != dtype or found != channels:
         expected = f"{channels} of {8 * np.dtype(dtype).itemsize}"
         raise SequenceError(
             path, f"has {found} channels of {8 * picture.itemsize} bits, expected {expected}"
         )
-    return picture if channels == 1 else picture[..., ::-1]
-
-
-def _decode(path: Path) -> NDArray[Any]:
-    data = path.read_bytes()
-    # OpenCV fills up a picture that was cut off with grey and says nothing, so look for its end.
-    # Some cameras write a few bytes after it.
-    whole = b"IEND" in data[-4096:] or (data[:2] == b"\xff\xd8" and b"\xff\xd9" in data[-4096:])
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
-    if picture is None:
-        raise SequenceError(path, "is no PNG or JPEG, or was cut off")
     return picture
 
 
-def read_npy(path: Path, dims: int = 2) -> NDArray[Any]:
-    """Returns an array with a number of dimensions."""
-    try:
-        array: NDArray[Any] = np.load(path)
-    except (ValueError, EOFError) as error:
-        raise SequenceError(path, f"is no whole .npy file ({error})") from None
-    if array.ndim != dims:
-        raise SequenceError(path, f"holds an array {list(array.shape)}, expected {dims} dimensions")
-    return array
-
-
-def depth_from_integers(
-    values: NDArray[np.uint16],
-    unit_m: float,
-    *,
-    missing: Iterable[int] = (),
-    no_surface: int | None = None,
-) -> NDArray[np.float32]:
-    """Returns depth in metres: nan for the values that mean "missing", inf for "no surface".
-
-    >>> stored = np.array([[0, 1500, 65535]], np.uint16)
-    >>> depth_from_integers(stored, 0.001, missing=(0, 65535))
-    array([[nan, 1.5, nan]], dtype=float32)
-    """
-    depth = (values * np.float64(unit_m)).astype(np.float32)
-    depth[np.isin(values, list(missing))] = np.nan
-    if no_surface is not None:
-        depth[values == no_surface] = np.inf
-    return depth
-
-
 def read_depth(
-    path: Path, size: tuple[int, int], unit_m: float | None = None
+    path: Path,
+    unit_m: float | None = None,
+    missing: Collection[int] = (0, 65535),
+    no_surface: int | None = None,
+    coding: DepthCoding | None = None,
 ) -> NDArray[np.float32]:
-    """Returns the depth of a .png (0 and 65535 are missing) or .npy, of the given size, in metres.
+    """Returns stored depth `[H, W]` in metres: nan where missing, inf where there is no surface.
 
-    A stored 1 is `unit_m` long; None is a millimetre in a .png and a metre in a .npy.
+    Args:
+        unit_m: the length of a stored 1; None is a millimetre of whole numbers, a metre of floats.
+        missing: whole numbers that mean so.
+        no_surface: the whole number that means so.
+        coding: of colour pictures: `"float32_rgba"`, the bytes of a float are blue, green, red and
+            alpha (TartanAir V2); `"rgb24"`, red + 256 green + 65536 blue (CARLA).
     """
-    if path.suffix.lower() == ".npy":
-        depth = read_npy(path)
-        if depth.dtype.kind != "f":
-            raise SequenceError(path, f"holds {depth.dtype}, expected floats")
-        depth = (depth * np.float64(1.0 if unit_m is None else unit_m)).astype(np.float32)
-    else:
-        unit_m = 0.001 if unit_m is None else unit_m
-        depth = depth_from_integers(read_png(path, np.uint16), unit_m, missing=(0, 65535))
-    if depth.shape != size:
-        (height, width), (own_height, own_width) = size, depth.shape
-        raise SequenceError(
-            path, f"is {own_width} x {own_height}, intrinsics.json says {width} x {height}"
-        )
+    stored = read_array(path)
+    if coding == "float32_rgba" and stored.dtype == np.uint8 and stored.shape[2:] == (4,):
+        stored = np.ascontiguousarray(stored[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
+    elif coding == "rgb24" and stored.dtype == np.uint8 and stored.shape[2:] in ((3,), (4,)):
+        stored = stored[..., :3].astype(np.uint32) @ np.array([1, 256, 65536], np.uint32)
+    is_whole = stored.dtype.kind in "ui" and stored.itemsize > 1
+    if stored.ndim != 2 or not (is_whole or stored.dtype.kind == "f"):
+        given = f"holds {stored.dtype} {list(stored.shape)}"
+        wanted = "one channel of 16 bits or floats" if coding is None else f"depth_coding={coding}"
+        raise SequenceError(path, f"{given}, expected {wanted}")
+    unit_m = usual_unit_m(stored) if unit_m is None else unit_m
+    depth = (stored * np.float64(unit_m)).astype(np.float32)
+    if is_whole:
+        depth[np.isin(stored, list(missing))] = np.nan
+        if no_surface is not None:
+            depth[stored == no_surface] = np.inf
     return depth
 
 
-def read_flo(path: Path) -> Flow:
-    """Returns a .flo file's flow `[2, H, W]`, nan where unknown."""
-    flow = read_tagged_floats(path, channels=2).transpose(2, 0, 1)
-    known = np.abs(flow).max(0) <= _FLO_LARGEST  # nan compares False
-    return np.where(known, flow, np.float32(np.nan))
+def usual_unit_m(stored: NDArray[Any]) -> float:
+    """Returns the length of a stored 1: a millimetre of whole numbers, a metre of floats."""
+    return 0.001 if stored.dtype.kind in "ui" and stored.ndim == 2 else 1.0
+
+
+def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:
+    """Returns the first two channels of a file as flow `[2, H, W]`, nan where unknown.
+
+    Args:
+        coding: of a PNG: `"kitti"`, steps of 1/64 px; `"vkitti2"`, shares of the picture's size;
+            `"kubric"`, shares of the range in `data_ranges.json`.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        return _read_coded_flow(path, coding)
+    stored = read_array(path)
+    if stored.ndim != 3 or stored.dtype.kind != "f" or stored.shape[2] < 2:
+        given = f"holds {stored.dtype} {list(stored.shape)}"
+        raise SequenceError(path, f"{given}, expected floats [height, width, 2]")
+    flow = stored[..., :2].transpose(2, 0, 1).astype(np.float32)
+    if suffix == ".flo":
+        flow[:, ~(np.abs(flow).max(0) <= _FLO_LARGEST)] = np.nan  # nan compares False
+    return flow
+
+
+def _read_coded_flow(path: Path, coding: FlowCoding) -> Flow:
+    red, green, blue = read_integers(path, np.uint16, 3).transpose(2, 0, 1)
+    stored = np.stack([red, green]).astype(np.float32)
+    if coding == "kubric":
+        kind = path.stem.rpartition("_")[0]  # forward_flow, backward_flow
+        least, most = (
+            float(read_json(path.with_name("data_ranges.json"), kind, x)) for x in ("min", "max")
+        )
+        return stored * np.float32((most - least) / 65535) + np.float32(least)
+    if coding == "vkitti2":
+        height, width = red.shape
+        size = np.array([width - 1, height - 1], np.float32)[:, None, None]
+        flow = (stored * np.float32(2 / 65535) - 1) * size
+    else:
+        flow = (stored - 2**15) / 64
+    flow[:, blue == 0] = np.nan
+    return flow.astype(np.float32, copy=False)
 
 
 def read_tagged_floats(path: Path, channels: int) -> NDArray[np.float32]:
     """Returns the floats of a .flo file or of Sintel's .dpt, `[H, W, channels]`."""
-    data = path.read_bytes()
+    data = regular(path).read_bytes()
     if len(data) >= 12:
         tag, width, height = struct.unpack_from("<fii", data)
-        if tag == FLO_TAG and len(data) == 12 + 4 * channels * width * height:
+        fits = width > 0 and height > 0 and len(data) == 12 + 4 * channels * width * height
+        if tag == FLO_TAG and fits:
             values = np.frombuffer(data, "<f4", offset=12).astype(np.float32)
             return values.reshape(height, width, channels)
     raise SequenceError(path, f"is not {FLO_TAG}, width, height and {channels} floats a pixel")
@@ -182,14 +289,6 @@ def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) ->
     path.write_bytes(header + marked.astype("<f4").tobytes())
 
 
-def read_kitti_flow(path: Path) -> Flow:
-    """Returns the flow `[2, H, W]` of a KITTI PNG, nan where its third channel is 0."""
-    u, v, valid = read_png(path, np.uint16, 3).transpose(2, 0, 1)
-    flow = (np.stack([u, v]).astype(np.float32) - 2**15) / 64
-    flow[:, valid == 0] = np.nan
-    return flow.astype(np.float32, copy=False)
-
-
 def write_kitti_flow(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:
     """Writes flow `[2, H, W]` in steps of 1/64 px; beyond 512 px it is marked as unknown."""
     known = np.isfinite(flow).all(0) & (valid is None or valid)
@@ -200,7 +299,8 @@ def write_kitti_flow(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = N
 
 
 def write_picture(path: Path, image: NDArray[Any]) -> None:
-    """Writes a picture `[H, W, 3]` as a PNG with fast rather than strong compression."""
+    """Writes a picture `[H, W]` or `[H, W, 3]` as a PNG, compressed fast rather than well."""
     # Not imwrite, which says nothing of a full disk.
-    data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+    blue_green_red = image if image.ndim == 2 else image[..., ::-1]
+    data = cv2.imencode(".png", blue_green_red, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
     path.write_bytes(data.tobytes())

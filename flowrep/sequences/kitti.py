@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.sequences import files
-from flowrep.sequences.calibration import as_pose, opencv_intrinsics
+from flowrep.sequences.calibration import as_pose, camera_matrix
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 
 EARTH_RADIUS_M = 6378137.0
@@ -44,7 +44,7 @@ class Kitti(Recording):
         mapping: str | Path | None = None,
     ) -> None:
         self.folder, self.has_poses = Path(folder), raw_data is not None
-        names = [path.stem for path in files.list_files(self.folder / "image_2", (".png",))]
+        names = files.find_files(self.folder / "image_2/*.png", "picture")
         self._pairs = [name[:6] for name in names if re.fullmatch(r"\d{6}_10", name)]
         self.count = 2 * len(self._pairs)
         if raw_data is None:
@@ -76,12 +76,12 @@ class Kitti(Recording):
         depth = np.full(rgb.shape[:2], np.nan, dtype=np.float32)
         raw = since = None
         if is_current:
-            disparity = files.read_png(self.folder / "disp_occ_0" / f"{name}.png", np.uint16)
+            disparity = files.read_integers(self.folder / "disp_occ_0" / f"{name}.png", np.uint16)
             # Disparity is in 1/256 px, 0 where it is missing.
             known = np.where(disparity == 0, np.nan, disparity / 256)
             depth = (focal_baseline / known).astype(np.float32)
             # Given is p_11 - p_10. Here 11 is the frame before, so that p_t - p_t' is the opposite.
-            raw = -files.read_kitti_flow(self.folder / "flow_occ" / f"{name}.png")
+            raw = -files.read_flow(self.folder / "flow_occ" / f"{name}.png")
             since = f"{pair}_11"
         world_from_cam = None
         if self.has_poses:
@@ -107,7 +107,7 @@ class Kitti(Recording):
         # P = K [I | t], so that the left colour camera sees a rectified point at x + K^-1 p.
         cam_from_rectified = np.eye(4)
         cam_from_rectified[:3, 3] = np.linalg.solve(left[:, :3], left[:, 3])
-        K = opencv_intrinsics([left[0, 0], left[1, 1], left[0, 2], left[1, 2]])
+        K = camera_matrix(left, (0, 0), first_pixel_centre=0.0)
         return K, float(left[0, 3] - right[0, 3]), cam_from_rectified @ rectified_from_cam0
 
     def _rigid(self, kind: str, pair: str) -> Pose:

@@ -40,8 +40,9 @@ class Frame:
         depth: `[H, W]`, metres.
         rgb: `[H, W, 3]`.
         raw: `[2, H, W]`, the recording's own p_t - p_t'; nan where unknown.
-        raw_since: the name of the frame t' that `raw` is measured from.
+        raw_since: the name of the frame t' that `raw` is measured from, None if it is missing.
         clip: the number of its shot. There is no flow from one clip to another.
+        position: its place in the recording, counted with the frames that are missing in it.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Frame:
     raw: NDArray[np.float32] | None = None
     raw_since: str | None = None
     clip: int = 0
+    position: int | None = None
 
     @property
     def size(self) -> tuple[int, int]:

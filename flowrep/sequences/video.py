@@ -1,17 +1,20 @@
-"""A webcam or a video file of a camera that stands still: no pose sensor, no depth."""
+"""Videos: a webcam or a file, and of a recording with depth its pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from flowrep.sequences.calibration import intrinsics
+from flowrep.sequences.calibration import camera_matrix
 from flowrep.sequences.recording import Frame, SequenceError
+
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
 
 
 class StillVideo:
@@ -38,19 +41,43 @@ class StillVideo:
             raise SequenceError(source, "no such file; give a video file or a camera's number")
 
     def __iter__(self) -> Iterator[Frame]:
-        capture: Any = cv2.VideoCapture(self._place)
-        try:
-            for number in count():
-                picture = capture.read()[1]
-                if picture is None:
-                    break
-                height, width = picture.shape[:2]
-                # A camera that stands still has no ego flow with any depth and any K.
-                K = intrinsics(width, width, width / 2, height / 2)
-                depth = np.full((height, width), np.inf, dtype=np.float32)
-                rgb = np.ascontiguousarray(picture[..., ::-1])
-                yield Frame(f"{number:06d}", self.source, np.eye(4), K, depth, rgb)
-            if number == 0:
-                raise SequenceError(self.source, "OpenCV reads no picture of it as a video")
-        finally:
-            capture.release()
+        for number, rgb in enumerate(pictures(self._place)):
+            height, width = rgb.shape[:2]
+            # A camera that stands still has no ego flow with any depth and any K.
+            K = camera_matrix([1.0], (height, width), first_pixel_centre=0.5)
+            depth = np.full((height, width), np.inf, dtype=np.float32)
+            yield Frame(f"{number:06d}", self.source, np.eye(4), K, depth, rgb)
+
+
+def pictures(source: int | str) -> Iterator[NDArray[np.uint8]]:
+    """Yields the pictures of a camera or of a file."""
+    capture: Any = cv2.VideoCapture(source)
+    try:
+        for number in count():
+            picture = capture.read()[1]
+            if picture is None:
+                if number == 0:
+                    raise SequenceError(source, "OpenCV reads no picture of it as a video")
+                return
+            yield np.ascontiguousarray(picture[..., ::-1])
+    finally:
+        capture.release()
+
+
+class VideoPictures:
+    """The pictures of a video file by their numbers."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._next, self._pictures = 0, iter(list[NDArray[np.uint8]]())
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        """Returns a picture; one before the last that was read starts again from the first."""
+        # Not OpenCV's seeking, which misses the picture in some codecs.
+        if self._next == 0 or index < self._next:
+            self._next, self._pictures = 0, pictures(str(self.path))
+        picture = next(islice(self._pictures, index - self._next, None), None)
+        if picture is None:
+            raise SequenceError(self.path, f"has no picture {index}")
+        self._next = index + 1
+        return picture

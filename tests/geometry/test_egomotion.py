@@ -205,10 +205,9 @@ def test_estimated_flow_of_a_street_gives_nearly_the_motion(scene):
 @pytest.mark.parametrize("pair", [(0, 1), (1, 2)])
 def test_recorded_pictures_tell_the_motion_better_than_the_recorded_poses(pair):
     sequences = pytest.importorskip("flowrep.sequences")
-    from flowrep.sequences.sevenscenes import SevenScenes
     from flowrep.transforms import DIS
 
-    recording = SevenScenes(FOLDER)
+    recording = sequences.open_recording(FOLDER, "sevenscenes")
     before, now = (recording[i] for i in pair)
     flow = torch.as_tensor(sequences.EstimatedFlowSource(DIS("fast"))(before, now))
     depth, camera = torch.as_tensor(now.depth)[None], torch.as_tensor(now.K).float()

@@ -258,7 +258,7 @@ GIVEN = [
 
 @pytest.mark.parametrize(("options", "correction"), GIVEN, ids=str)
 def test_the_doctor_corrects_the_options_of_a_recorded_street(options, correction, street):
-    read = sequences.Frames(street, **options)
+    read = sequences.open_recording(street, "frames", **options)
     doctor = sequences.Doctor(read.conventions)
     for previous, current in pairwise(read):
         doctor.look(previous, current, sequences.recorded_flow(previous, current))
@@ -271,7 +271,7 @@ def test_the_doctor_corrects_the_options_of_a_recorded_street(options, correctio
 
 @needs_7scenes
 def test_mistakes_about_a_real_recording_are_named():
-    recording = sequences.SevenScenes(SEVEN_SCENES)
+    recording = sequences.open_recording(SEVEN_SCENES, "sevenscenes")
     estimate = sequences.EstimatedFlowSource(DIS("fast"))
     real = [(*pair, estimate(*pair)) for pair in pairwise(recording[i] for i in range(3))]
     wrong = {

@@ -1,0 +1,486 @@
+"""Recordings by declaration: which files they hold and in which conventions, see conf/format/."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from omegaconf import OmegaConf
+
+from flowrep import geometry
+from flowrep.config import CONF_DIR
+from flowrep.sequences import files
+from flowrep.sequences.calibration import (
+    Axes,
+    Layout,
+    Lens,
+    Matrix,
+    Registration,
+    Undistortion,
+    as_pose,
+    camera_matrix,
+    read_cameras,
+)
+from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
+from flowrep.sequences.video import VIDEOS, VideoPictures
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+LeftOut = dict[str, NDArray[np.bool_]]  # frames by why they are left out
+
+PLAY_BACKWARDS = (
+    "its flow leads to the next frame: format.backwards=true plays it from the last frame to the "
+    "first, where that is the previous one"
+)
+
+
+@dataclass(eq=False)
+class DeclaredRecording(Recording):
+    """A folder of numbered or time-stamped pictures and depth maps, and of tables of numbers.
+
+    `conf/format/frames.yaml` explains all options and holds those of the plain layout;
+    `open_recording` reads it and the formats that say what is different in theirs.
+    """
+
+    folder: Path
+    _: KW_ONLY
+    rgb: str | None
+    depth: str
+    confidence: str | None
+    flow: str | None
+    flow_mask: str | None
+    poses: str | None
+    times: str | None
+    intrinsics: str | Sequence[float]
+    depth_intrinsics: str | Sequence[float] | None
+    colour_from_depth: Sequence[float] | None
+    scene: str | int | None
+    camera: str | int | None
+    render: str | None
+    depth_by: Literal["name", "order", "time"]
+    rows_by: Literal["order", "number", "time"]
+    key_column: int
+    rows_where: Sequence[int | str] | None
+    pose_columns: Sequence[int] | None
+    intrinsics_columns: Sequence[int] | None
+    time_unit_s: float
+    tolerance_s: float
+    interpolate: bool
+    pose_offset_s: float
+    pose_lag_frames: int
+    leave_out: Sequence[str]
+    backwards: bool
+    pose_layout: Layout
+    pose_direction: geometry.PoseDirection
+    pose_axes: Axes
+    marker_from_cam: Sequence[float] | None
+    first_pixel_centre: float
+    distortion: Sequence[float]
+    lens: Lens
+    resize_rgb: bool
+    depth_unit_m: float | None
+    depth_kind: geometry.DepthKind
+    near_m: float | None
+    far_m: float | None
+    depth_coding: files.DepthCoding | None
+    depth_missing: Sequence[int]
+    depth_no_surface: int | None
+    depth_inf: Literal["no_surface", "missing"]
+    min_confidence: int
+    flow_coding: files.FlowCoding
+    flow_to: Literal["previous", "next"]
+    flow_direction: geometry.Direction
+    flow_grid: geometry.Grid
+    flow_channels: geometry.Channels
+
+    def __post_init__(self) -> None:
+        self.folder = Path(self.folder)
+        if self.depth_unit_m is not None and not self.depth_unit_m > 0:
+            raise ValueError(f"depth_unit_m is positive, got {self.depth_unit_m}")
+        self.has_flow, self.no_flow = self._flow_fits()
+        depths, depth_times_s = self._listing(self.depth, "map")
+        times_s, listed, rgb, self._video = depth_times_s, depths, self._path(self.rgb or "x"), None
+        self._rgbs: list[Path] | None = None
+        if rgb.suffix.lower() in VIDEOS:
+            self._video = VideoPictures(rgb)
+        elif self.rgb is not None and (rgb.parent.is_dir() or not self.has_flow):
+            listed, times_s = self._listing(self.rgb, "picture")
+            self._rgbs = [*listed.values()]
+        self._names, self._times_s, self._same = [*listed], times_s, np.arange(len(listed))
+        left_out = self._match_depth(depths, depth_times_s)
+        if self.times is not None and self._exists(self.times):
+            times, rows, *_ = self._rows(self.times, (0, 1))
+            self._times_s = times[rows, 0] * self.time_unit_s
+        left_out |= self._read_poses() | self._read_intrinsics()
+        if unknown := {*self.leave_out} - {*self._names}:
+            raise SequenceError("leave_out", f"names frame {min(unknown)}, which isn't there")
+        left_out["in format.leave_out"] = np.isin(self._names, list(self.leave_out))
+        self._choose(left_out)
+        self._made: dict[Any, tuple[Any, Any]] = {}
+        unit_m = self.depth_unit_m or files.usual_unit_m(files.read_array(self._depths[0]))
+        self.conventions = {
+            "pose_direction": self.pose_direction, "pose_axes": self.pose_axes,
+            "depth_kind": self.depth_kind, "depth_unit_m": str(unit_m),
+            "flow_direction": self.flow_direction, "flow_channels": self.flow_channels,
+        }  # fmt: skip
+
+    # Which files there are.
+
+    def _path(self, pattern: str, **words: str) -> Path:
+        """Returns a pattern's path; `*` stays."""
+        given: dict[str, Any] = {n: getattr(self, n) for n in ("scene", "camera", "render")} | words
+        for word in re.findall(r"{(\w+)}", pattern):
+            if given.get(word) is None:
+                raise SequenceError(f"format.{word}", f"needs a value, for {pattern}")
+        return self.folder / pattern.format(**given)
+
+    def _file(self, pattern: str, kind: str, name: str, **words: str) -> Path:
+        path = self._path(pattern, **words)
+        return files.with_suffix(path.with_name(path.name.replace("*", name)), kind)
+
+    def _exists(self, pattern: str) -> bool:
+        path = self._path(pattern.partition(":")[0], next="*")
+        return path.parent.is_dir() and any(path.parent.glob(path.name))
+
+    def _flow_fits(self) -> tuple[bool, str]:
+        """Returns whether the recording's own flow can be used, or else why not."""
+        if self.flow is None:
+            return False, self.no_flow
+        if (self.flow_to == "next") != self.backwards:
+            played = "its flow leads to the previous frame: use format.backwards=false"
+            return False, played if self.backwards else PLAY_BACKWARDS
+        if self.distortion:
+            return False, "its flow is that of distorted pictures: use flow=estimated"
+        return self._exists(self.flow), f"no such file: {self._path(self.flow, next='*')}"
+
+    def _listing(self, pattern: str, kind: str) -> tuple[dict[str, Path], Floats | None]:
+        """Returns files by the names of their frames, and their times if these are needed."""
+        path, is_timed = self._path(pattern), "time" in (self.depth_by, self.rows_by)
+        try:
+            if "*" in pattern:
+                found = files.find_files(path, kind)
+                times = [float(name) for name in found if is_timed]
+            else:
+                lines = [line.split(maxsplit=1) for line in files.read_lines(path)]
+                found = {Path(name).stem: self.folder / name for _, name in lines}
+                times = [float(time) for time, _ in lines]
+        except (ValueError, FileNotFoundError) as error:
+            remedy = f"give the folder whose {path.name} has '<time> <file>' in each line"
+            raise SequenceError(path, f"{error}: {remedy}, or its format=") from None
+        if not found:
+            used = (self.rgb, self.depth, self.flow, self.poses, self.intrinsics)
+            layout = ", ".join(name for name in used if isinstance(name, str))
+            raise SequenceError(path, f"no such files: give a folder with {layout}, or its format=")
+        if not times:
+            return found, None
+        return found, _ascending(path, np.array(times) * self.time_unit_s)
+
+    # What belongs together.
+
+    def _match_depth(self, depths: dict[str, Path], times_s: Floats | None) -> LeftOut:
+        """Finds the depth map of each frame; returns the frames that have none."""
+        maps, lacking = [*depths.values()], np.zeros(len(self._names), dtype=bool)
+        places, by = np.arange(len(self._names)), self.depth_by
+        if by == "time" and self._times_s is not None and times_s is not None:
+            places = nearest(times_s, self._times_s, self.tolerance_s)
+            # Two pictures may be nearest to one depth map: it belongs to the nearer of them.
+            lacking = nearest(self._times_s, times_s, self.tolerance_s)[places] != self._same
+            lacking |= places < 0
+        elif by == "name" and (unpaired := {*self._names} ^ depths.keys()):
+            name, lacks = min(unpaired), self.rgb if min(unpaired) in depths else self.depth
+            raise SequenceError(self._path(lacks or "").parent, f"lacks a file for frame {name}")
+        elif by == "name":
+            place_of = {name: place for place, name in enumerate(depths)}
+            places = np.array([place_of[name] for name in self._names])
+        elif len(maps) != len(places):
+            counts = f"{len(places)} pictures and {len(maps)} depth maps"
+            raise SequenceError(self.folder, f"has {counts}: format.depth_by=order pairs all")
+        self._depths = [maps[place] for place in places]
+        return {f"without depth within {self.tolerance_s} s": lacking}
+
+    def _rows(
+        self, pattern: str, columns: Sequence[int] | None
+    ) -> tuple[Floats, Indices, Indices, Floats]:
+        """Returns a table's columns, the rows before and after each frame (-1: none), the share."""
+        path, is_keyed = self._path(pattern), "*" not in pattern and self.rows_by != "order"
+        if "*" in pattern:
+            paths = [self._file(pattern, "numbers", name) for name in self._names]
+            each = [files.read_table(path).ravel() for path in paths]
+            for path, numbers in zip(paths, each):
+                if len(numbers) != len(each[0]):
+                    says = f"has {len(numbers)} numbers, {paths[0].name} {len(each[0])}"
+                    raise SequenceError(path, says)
+            table = np.stack(each)
+        else:
+            table = files.read_table(path)
+        if self.rows_where is not None:
+            column, value = map(str, self.rows_where)
+            table = table[table[:, int(column)] == float(self._path(value).name)]
+        first, end = columns or (self.key_column + 1 if is_keyed else 0, table.shape[1])
+        if not len(table) or not first < end <= table.shape[1]:
+            counts = f"{len(table)} rows of {table.shape[1]} numbers"
+            raise SequenceError(
+                path, f"has {counts}, expected at least {max(end, first + 1)} in each"
+            )
+        before = after = self._same
+        share = np.zeros(len(before))
+        if is_keyed and self._times_s is not None and self.rows_by == "time":
+            times_s = _ascending(path, table[:, self.key_column] * self.time_unit_s)
+            times_s = times_s + self.pose_offset_s
+            before = after = nearest(times_s, self._times_s, self.tolerance_s)
+            if self.interpolate:
+                before, after, share = between(times_s, self._times_s, self.tolerance_s)
+        elif is_keyed:
+            row_of = {int(key): row for row, key in enumerate(table[:, self.key_column])}
+            before = after = np.array([row_of.get(_number(name), -1) for name in self._names])
+        elif len(table) != len(before):
+            raise SequenceError(path, f"has {len(table)} rows for {len(before)} frames")
+        return table[:, first:end], before, after, share
+
+    def _read_poses(self) -> LeftOut:
+        self.has_poses = self.poses is not None and self._exists(self.poses)
+        if self.poses is None or not self.has_poses:
+            return {}
+        path = self._path(self.poses)
+        numbers, before, after, self._share = self._rows(self.poses, self.pose_columns)
+        width = numbers.shape[1]
+        if width not in ((12, 16) if self.pose_layout == "matrix" else (7,)):
+            fitting = {7: "xyz_xyzw or xyz_wxyz", 12: "matrix", 16: "matrix"}.get(width)
+            remedy = f"give format.pose_layout={fitting}" if fitting else "expected 7, 12 or 16"
+            raise SequenceError(path, f"has {width} numbers a pose: {remedy}")
+        turns = numbers[:, :4] if self.pose_layout == "xyzw_xyz" else numbers[:, 3:7]
+        if self.pose_layout == "matrix":
+            turns = numbers.reshape(len(numbers), -1, 4)[:, :3, :3].reshape(-1, 9)
+        lost = ~np.isfinite(numbers).all(1) | (turns == 0).all(1)
+        if not lost.all():
+            numbers[lost] = numbers[~lost][0]  # so that an error names the row that is wrong
+            options: Any = {"direction": self.pose_direction, "axes": self.pose_axes}
+            self._poses = as_pose(numbers, path, layout=self.pose_layout, **options)
+            if self.marker_from_cam is not None:
+                fixed: Any = "xyz_xyzw" if len(self.marker_from_cam) == 7 else "matrix"
+                marker = np.array(self.marker_from_cam)
+                self._poses @= as_pose(marker, "marker_from_cam", layout=fixed)
+        lag = self.pose_lag_frames
+        lacking = (before < 0) | (np.minimum(before, after) + lag < 0)
+        lacking |= np.maximum(before, after) + lag >= len(lost)
+        self._before, self._after = (np.where(lacking, 0, of + lag) for of in (before, after))
+        near = f" within {self.tolerance_s} s" if self.rows_by == "time" else ""
+        is_lost = ~lacking & (lost[self._before] | lost[self._after])
+        return {f"without a pose{near}": lacking, f"lost (nan, inf, 0) in {path.name}": is_lost}
+
+    def _read_intrinsics(self) -> LeftOut:
+        """Reads the numbers of K, and of depth's camera if it is another."""
+        numbers: Any = self.intrinsics
+        shift: Any = self.colour_from_depth or ()
+        self._depth_numbers: Any = self.depth_intrinsics
+        self._size = self._colour_size = None
+        self._centre, lacking = self.first_pixel_centre, np.zeros(len(self._names), dtype=bool)
+        if isinstance(self._depth_numbers, str):
+            self._depth_numbers = files.read_table(self._path(self._depth_numbers))
+        if isinstance(numbers, str) and ("*" in numbers or self.intrinsics_columns is not None):
+            table, rows, *_ = self._rows(numbers, self.intrinsics_columns)
+            numbers, lacking = table[rows], rows < 0
+        elif isinstance(numbers, str) and not numbers.endswith(".json"):
+            numbers = files.read_table(self._path(numbers)).ravel()
+        elif isinstance(numbers, str):
+            cameras = read_cameras(self._path(numbers))
+            camera, self._centre = cameras.colour or cameras, 0.5
+            numbers, self._size = camera.numbers, (cameras.height, cameras.width)
+            if not self.distortion:
+                self.distortion, self.lens = camera.distortion, camera.lens
+            if cameras.colour is not None:
+                self._colour_size = camera.height, camera.width
+                self._depth_numbers = cameras.numbers
+                shift = np.ravel(cameras.colour.colour_from_depth)
+        if len(shift) == 3:
+            shift = np.column_stack([np.eye(3), shift]).ravel()
+        self._colour_from_depth = as_pose(shift, "colour_from_depth") if len(shift) else np.eye(4)
+        one_each = np.array(numbers, dtype=np.float64)
+        self._numbers = np.broadcast_to(one_each, (len(lacking), one_each.shape[-1]))
+        camera_matrix(self._numbers[0], (2, 2), self._centre, self.intrinsics)  # or an error, early
+        return {"without intrinsics": lacking}
+
+    def _choose(self, left_out: LeftOut) -> None:
+        """Numbers the frames that are left, in the order in which they are played."""
+        kept, notes = np.ones(len(self._names), dtype=bool), []
+        for why, frames in left_out.items():
+            kept &= ~frames
+            if frames.any():
+                count = f"{frames.sum()} of {len(kept)} frames are left out"
+                notes.append(f"{count}, {why}: {', '.join(np.array(self._names)[frames][:3])}")
+        if not kept.any():
+            remedy = (
+                "raise format.tolerance_s, check that files share a clock, or format.poses=null"
+            )
+            raise SequenceError(self.folder, f"{'; '.join(notes)}; none is left: {remedy}")
+        if self.distortion:
+            notes.append("pictures and depth are undistorted")
+        self._order = np.flatnonzero(kept)[:: -1 if self.backwards else 1]
+        self.count, self.notes = len(self._order), tuple(notes)
+        self._clips = np.cumsum(~kept) * self.has_flow  # its own flow does not skip a frame
+        values = self._times_s
+        if values is None:
+            values = np.array([float(_number(name)) for name in self._names])
+        # The place of each frame in a recording without gaps.
+        steps = np.diff(values)
+        usual = np.median(steps) if len(steps) and (steps > 0).all() else np.inf
+        self._positions = np.append(0, np.rint(steps / usual).clip(1).cumsum()).astype(int)
+
+    # The frames.
+
+    def _read(self, index: int) -> Frame:
+        i = int(self._order[index])
+        name, source, raw, since = self._names[i], self._depths[i], None, None
+        rgb: NDArray[np.uint8] | None = None
+        if self._rgbs is not None:
+            source = self._rgbs[i]
+            rgb = files.read_rgb(source)
+        elif self._video is not None:
+            rgb, source = self._video[i], self._video.path
+        depth = self._stored_depth(i)
+        size: tuple[int, ...] = depth.shape if rgb is None else rgb.shape[:2]
+        K = camera_matrix(self._numbers[i], size, self._centre)
+        if self.resize_rgb and rgb is not None:
+            (height, width), size = size, depth.shape
+            K = np.diag([size[1] / width, size[0] / height, 1.0]) @ K
+            smaller: Any = cv2.resize(rgb, size[::-1], interpolation=cv2.INTER_AREA)
+            rgb = smaller
+        pose = self._pose(i) if self.has_poses else None
+        if self._depth_numbers is None:
+            depth = self._along_the_axis(depth, K)
+        else:
+            size = self._colour_size or size
+            K_depth = camera_matrix(self._depth_numbers, depth.shape, self._centre)
+            register = self._once(Registration, K_depth, K, self._colour_from_depth, size)
+            depth = register(self._along_the_axis(depth, K_depth))
+            pose = None if pose is None else pose @ register.depth_from_colour
+        if self.distortion:
+            rectify = self._once(Undistortion, K, self.distortion, self.lens, size)
+            rgb = None if rgb is None else rectify(rgb)
+            depth = rectify(depth, nearest=True) if self._depth_numbers is None else depth
+        if self.flow is not None and self.has_flow and index > 0:
+            other = i + 1 if self.backwards else i - 1
+            raw = self._raw(self.flow, name, self._names[other])
+            is_next = abs(self._positions[i] - self._positions[other]) == 1
+            since = self._names[other] if is_next else None
+        time_s = None if self._times_s is None else float(self._times_s[i])
+        places: Any = {"clip": int(self._clips[i]), "position": int(self._positions[i])}
+        return Frame(name, source, pose, K, depth, rgb, time_s, raw, since, **places)
+
+    def _once(self, make: Any, *arguments: Any) -> Any:
+        """Returns what `make` makes of arguments, the same while they don't change."""
+        made = self._made.get(make)
+        if made is None or not all(map(np.array_equal, made[0], arguments)):
+            made = self._made[make] = arguments, make(*arguments)
+        return made[1]
+
+    def _stored_depth(self, i: int) -> NDArray[np.float32]:
+        path, codes = self._depths[i], (self.depth_missing, self.depth_no_surface)
+        depth = files.read_depth(path, self.depth_unit_m, *codes, self.depth_coding)
+        size = self._size or depth.shape
+        if depth.shape != size and not self.resize_rgb:
+            (height, width), (own_height, own_width) = size, depth.shape
+            says = f"is {own_width} x {own_height}, {self.intrinsics} says {width} x {height}"
+            raise SequenceError(path, says)
+        if self.depth_inf == "missing":
+            depth[np.isinf(depth)] = np.nan
+        if self.confidence is not None:
+            trust = files.read_array(self._file(self.confidence, "map", self._names[i]))
+            if trust.shape != depth.shape:
+                raise SequenceError(path, f"and its confidence differ in size: {list(trust.shape)}")
+            depth[trust < self.min_confidence] = np.nan
+        return depth
+
+    def _along_the_axis(self, depth: NDArray[np.float32], K: Matrix) -> NDArray[np.float32]:
+        options: Any = {"near_m": self.near_m, "far_m": self.far_m}
+        if self.depth_kind == "ray_length":
+            options["K"] = torch.from_numpy(K).float()
+        stored = torch.from_numpy(depth)[None]
+        return geometry.adapt_depth(stored, self.depth_kind, **options)[0].numpy()
+
+    def _pose(self, i: int) -> Pose:
+        before, after = self._poses[self._before[i]], self._poses[self._after[i]]
+        return interpolated_pose(before, after, self._share[i]) if self.interpolate else before
+
+    def _raw(self, pattern: str, name: str, other: str) -> files.Flow:
+        stored = files.read_flow(self._file(pattern, "flow", name, next=other), self.flow_coding)
+        # Played backwards, the next frame is the one before.
+        is_forward = (self.flow_direction == "forward") != (self.flow_to == "next")
+        options: Any = {"direction": "forward" if is_forward else "backward"}
+        options |= {"grid": self.flow_grid, "channels": self.flow_channels}
+        raw: files.Flow = geometry.adapt_flow(torch.from_numpy(stored), **options).numpy()
+        if self.flow_mask is not None:
+            mask = self._file(self.flow_mask, "map", name, next=other)
+            if mask.is_file():
+                raw[:, files.read_array(mask) != 0] = np.nan
+        return raw
+
+
+def _number(name: str) -> int:
+    digits = re.search(r"[0-9]+$", name)
+    return int(digits[0]) if digits else -1
+
+
+def _ascending(path: Path, times_s: Floats) -> Floats:
+    if not (np.diff(times_s) >= 0).all():  # nan compares False
+        raise SequenceError(path, "times go backwards, or are not numbers")
+    return times_s
+
+
+def nearest(times_s: Floats, wanted_s: Floats, tolerance_s: float) -> Indices:
+    """Returns the index of the time nearest to each wanted one, -1 if none is near enough."""
+    after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
+    before = (after - 1).clip(0)
+    gap_after, gap_before = (np.abs(times_s[index] - wanted_s) for index in (after, before))
+    found = np.where(gap_before <= gap_after, before, after)
+    return np.where(np.minimum(gap_before, gap_after) <= tolerance_s, found, -1)
+
+
+def between(
+    times_s: Floats, wanted_s: Floats, tolerance_s: float
+) -> tuple[Indices, Indices, Floats]:
+    """Returns the times before and after each wanted one, -1 if too far, and the share between."""
+    after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
+    before = np.where(times_s[after] == wanted_s, after, after - 1)
+    gaps = wanted_s - times_s[before], times_s[after] - wanted_s
+    inside = (before >= 0) & (np.minimum(*gaps) >= 0) & (np.maximum(*gaps) <= tolerance_s)
+    span = np.maximum(times_s[after] - times_s[before], 1e-9)
+    return np.where(inside, before, -1), after, gaps[0] / span
+
+
+def interpolated_pose(before: Pose, after: Pose, share: float) -> Pose:
+    """Returns the pose at a share of the way, with constant velocity and angular velocity."""
+    axis_angle, _ = cv2.Rodrigues(before[:3, :3].T @ after[:3, :3])
+    pose = np.eye(4)
+    pose[:3, :3] = before[:3, :3] @ cv2.Rodrigues(share * axis_angle)[0]
+    pose[:3, 3] = (1 - share) * before[:3, 3] + share * after[:3, 3]
+    return pose
+
+
+def declaration(format_name: str) -> dict[str, Any]:
+    """Returns the keys of `conf/format/<name>.yaml` and of the formats that it begins with."""
+    plain: Any = OmegaConf.to_container(OmegaConf.load(CONF_DIR / f"format/{format_name}.yaml"))
+    keys: dict[str, Any] = {}
+    for base in plain.pop("defaults", []):
+        keys |= {} if base == "_self_" else declaration(base)
+    return keys | plain
+
+
+def open_recording(folder: str | Path, format: str, **options: Any) -> Recording:
+    """Returns the recording in a folder, in a format of `conf/format/` with other options.
+
+    >>> open_recording("rgbd_dataset_freiburg1_desk", "tum", tolerance_s=0.05)  # doctest: +SKIP
+    """
+    from flowrep import sequences
+
+    keys = declaration(format) | options
+    reader = getattr(sequences, keys.pop("_target_").rpartition(".")[2])
+    recording: Recording = reader(folder, **keys)
+    return recording
