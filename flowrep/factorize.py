@@ -37,6 +37,7 @@ def factorize_recording(config: FactorizeConfig) -> int:
         scale_px=config.scale_px.model_dump(),
         depth_range_m=config.depth_range_m,
         moving_px=config.moving_px,
+        masks=config.masks,
         video_fps=config.video_fps if config.video else None,
         rerun=config.rerun,
     )
@@ -46,9 +47,9 @@ def factorize_recording(config: FactorizeConfig) -> int:
         diagnosis = job.examine()
         if diagnosis is not None:
             print(f"{'warning: ' if diagnosis.suspects else ''}{diagnosis.words}")
-        if not job.run():
+        if stopped_by := job.run():
             print(f"stopped after {len(output.rows)} frames, which are in {output.partial}")
-            return 130
+            return stopped_by
     if not output.rows:
         why = f"no two frames of start={start} stride={stride} follow each other in a clip"
         raise sequences.SequenceError(config.input, why)

@@ -63,7 +63,8 @@ def test_all_that_is_written(moments, tmp_path):
     kinds = ("raw", "ego", "obj")
     flows = [f"flow/{k}/{n}{s}" for k in kinds for n in ("0001", "0002") for s in (".flo", ".png")]
     others = ["flow/0001.npz", "flow/0002.npz", *(f"pictures/{k}/0002.png" for k in kinds)]
-    tables = ["frames.csv", "job.json", "strip.mp4", "summary.json"]
+    others += ["moving/0001.png", "moving/0002.png"]
+    tables = ["frames.csv", "job.json", "strip.mp4", "summary.json", "trajectory.txt"]
     assert files_of(out) == sorted([*flows, *others, *tables])
     assert not (tmp_path / "out.partial").exists()
     for name, moment in zip(("0001", "0002"), moments[1:]):
@@ -80,13 +81,25 @@ def test_all_that_is_written(moments, tmp_path):
     np.testing.assert_allclose(np.load(out / "flow/0001.npz")["prev_from_curr"], expected)
     assert len(imageio.imread(out / "strip.mp4", plugin="FFMPEG")) == 2
     rows = table(out)
-    names = ["index", "name", "timestamp_s", "raw_median_px", "ego_median_px", "obj_median_px"]
+    names = ["index", "name", "timestamp_s", "gap"]
+    names += [f"{kind}_median_{unit}" for unit in ("px", "px_per_s") for kind in kinds]
     names += ["valid_share", "moving_share", "epe_px", "inlier_share", "recorded_obj_median_px"]
     assert list(rows[0]) == [*names, "rotation_off_deg", "translation_off_m"]
     assert [row["name"] for row in rows] == ["0001", "0002"]
     for row, moment in zip(rows, moments[1:]):
         moving = np.hypot(*moment.obj) > 0.01
         assert float(row["moving_share"]) == pytest.approx(moving.mean())
+        mask = cv2.imread(str(out / f"moving/{row['name']}.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(mask, np.where(moving, 255, 0))
+        assert row["gap"] == "0"
+        # The frames are a tenth of a second apart.
+        assert float(row["raw_median_px_per_s"]) == pytest.approx(10 * float(row["raw_median_px"]))
+    lines = np.loadtxt(out / "trajectory.txt")
+    np.testing.assert_allclose(lines[:, 0], [0.0, 0.1, 0.2])
+    for line, moment in zip(lines, moments):
+        np.testing.assert_allclose(line[1:4], moment.world_from_cam[:3, 3], atol=1e-6)
+        expected = synthetic.quaternion_line(moment.world_from_cam).split()
+        np.testing.assert_allclose(line[4:], [float(x) for x in expected[3:]], atol=1e-6)
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["frames"], summary["suspects"]) == (2, [])
 

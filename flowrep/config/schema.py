@@ -465,6 +465,7 @@ class FactorizeConfig(Command):
     check_consistency: bool
     moving_px: Positive
     flow_files: Annotated[list[Literal["flo", "kitti", "npz"]], Distinct]
+    masks: bool
     pictures_every: CountOrZero
     video: bool
     video_fps: Positive

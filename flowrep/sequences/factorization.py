@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from flowrep.geometry import camera_motion, factorize, relative_motion
 from flowrep.sequences.files import Flow
@@ -35,6 +36,11 @@ class Motion:
     prev_from_curr: Pose = field(default_factory=lambda: np.eye(4))
     known: bool = True
     inlier_share: float = math.nan
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether it comes from flow and depth, and not from recorded poses."""
+        return not math.isnan(self.inlier_share)
 
 
 @dataclass(frozen=True)
@@ -167,10 +173,16 @@ def estimated_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
     # Texture tells which estimated flow can be trusted: where there is none, flow is 0.
     if current.rgb is not None and raw is not current.raw:
         picture = torch.from_numpy(current.rgb).permute(2, 0, 1)
-    found = camera_motion(torch.from_numpy(raw), depth, K, picture=picture)
+    prev_K = _previous_K(previous, current)
+    found = camera_motion(torch.from_numpy(raw), depth, K, prev_K=prev_K, picture=picture)
     if not found.valid:
         return Motion(known=False, inlier_share=0.0)
     return Motion(found.prev_from_curr.double().numpy(), inlier_share=float(found.inlier_share))
+
+
+def _previous_K(previous: Frame, current: Frame) -> Tensor | None:
+    """Returns the previous frame's K if it differs from the current one's (zoom, autofocus)."""
+    return None if (previous.K == current.K).all() else torch.from_numpy(previous.K).float()
 
 
 def factorize_frames(
@@ -202,6 +214,7 @@ def factorize_pair(
         torch.from_numpy(current.depth)[None],
         torch.from_numpy(current.K).float(),
         torch.from_numpy(motion.prev_from_curr).float(),
+        prev_K=_previous_K(previous, current),
     )
     is_known = ego_valid[0].numpy() & motion.known
     valid = is_known & measured

@@ -62,8 +62,8 @@ class Job:
                         break
         return doctor.diagnosis()
 
-    def run(self) -> bool:
-        """Factorises all frames; returns whether it came to the end, and not to a Ctrl-C."""
+    def run(self) -> int:
+        """Factorises all frames; returns 0, or the exit code for the signal that stopped it."""
         is_recording = isinstance(self.stream, Recording)
         total = len(self._indices) if is_recording else None
         with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
@@ -83,7 +83,7 @@ class Job:
                     break
             bar.set_description("completing the video")
             self.output.close()
-        return not interrupted or not is_recording  # Ctrl-C is the end of a camera
+        return interrupted.exit_code if is_recording else 0  # a signal is the end of a camera
 
     def _frames(self) -> Iterator[Frame]:
         frames: Iterator[Frame] = islice(self.stream, self.start, self.stop, self.stride)

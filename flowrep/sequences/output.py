@@ -17,7 +17,7 @@ from flowrep import viz
 from flowrep.extras import require
 from flowrep.sequences.factorization import FactorizedFrame, factorize_pair
 from flowrep.sequences.files import Flow, write_flo, write_kitti_flow, write_picture
-from flowrep.sequences.recording import Pose, SequenceError
+from flowrep.sequences.recording import Frame, Pose, SequenceError
 from flowrep.tables import append_rows
 
 FLOW_NAMES = ("raw", "ego", "obj")
@@ -36,6 +36,7 @@ class Output:
         scale_px: the flow of full colour by name, None for 20 each.
         depth_range_m: the depth at which the video's colours end.
         moving_px: the least object flow from which a pixel counts as moving by itself.
+        masks: whether a mask of these pixels is written for each frame.
         video_fps: None for no video.
     """
 
@@ -49,6 +50,7 @@ class Output:
         scale_px: Mapping[str, float] | None = None,
         depth_range_m: float = 10.0,
         moving_px: float = 1.0,
+        masks: bool = False,
         video_fps: float | None = None,
         rerun: bool = False,
     ) -> None:
@@ -62,6 +64,7 @@ class Output:
         self.flow_files, self.pictures_every, self.moving_px = flow_files, pictures_every, moving_px
         self.scale_px = scale_px or dict.fromkeys(FLOW_NAMES, 20.0)
         self.depth_range_m, self.rows = depth_range_m, list[dict[str, Any]]()
+        self.masks, self._poses = masks, dict[str, Pose]()
         self.partial.mkdir(parents=True)
         self._write_json("job.json", settings)
         self._video = viz.Video(self.partial / "strip.mp4", fps=video_fps) if video_fps else None
@@ -70,11 +73,16 @@ class Output:
     def append(self, index: int, made: FactorizedFrame) -> None:
         """Writes a frame's files, then its row."""
         self._write_flow(index, made)
+        if self.masks:
+            code = np.where(moves(made, self.moving_px), 255, 0)
+            mask = np.where(made.valid, code, 127).astype(np.uint8)
+            write_picture(self._place(f"moving/{made.frame.name}.png"), mask)
+        pose = self._write_pose(index, made)
         if self._video is not None:
             scales: Any = {"flow_scale_px": self.scale_px, "depth_range_m": self.depth_range_m}
             self._video.append(video_frame(made, **scales))
         if self._rerun is not None:
-            self._rerun.append(index, made)
+            self._rerun.append(index, made, pose)
         self.rows.append(score(index, made, moving_px=self.moving_px))
         append_rows(self.partial / "frames.csv", self.rows[-1:])  # a killed job leaves what is done
 
@@ -95,7 +103,7 @@ class Output:
     def medians(self) -> dict[str, float | None]:
         """Returns the median over the frames of each column of measurements."""
         medians: dict[str, float | None] = {}
-        for name in list(self.rows[0])[3:]:
+        for name in list(self.rows[0])[4:]:
             values = [float(row[name]) for row in self.rows if row[name] != ""]
             medians[name] = float(np.median(values)) if values else None
         return medians
@@ -115,8 +123,29 @@ class Output:
                 write_picture(self._place(f"pictures/{kind}/{name}.png"), picture)
         if "npz" in self.flow_files:
             contents: Any = {key: getattr(made, key) for key in (*FLOW_NAMES, "valid", "ego_valid")}
-            contents |= {"K": made.frame.K, "prev_from_curr": made.motion.prev_from_curr}
+            contents |= {"K": made.frame.K, "prev_K": made.previous.K}
+            contents |= {"prev_from_curr": made.motion.prev_from_curr}
             np.savez(self._place(f"flow/{name}.npz"), **contents)
+
+    def _write_pose(self, index: int, made: FactorizedFrame) -> Pose:
+        """Adds a frame's pose to trajectory.txt and returns it: the recorded one, or estimated.
+
+        Estimated motions are chained from the first frame of a clip, from its recorded pose if it
+        has one. Frames without a time have their number.
+        """
+        frame, before, lines = made.frame, made.previous, []
+        if before.name not in self._poses:
+            start = np.eye(4) if before.world_from_cam is None else before.world_from_cam
+            self._poses[before.name] = start
+            lines.append(tum_line(_stamp(before, index - 1), start))
+        pose = frame.world_from_cam
+        if pose is None or made.motion.is_estimated:
+            pose = self._poses[before.name] @ made.motion.prev_from_curr
+        self._poses[frame.name] = pose
+        lines.append(tum_line(_stamp(frame, index), pose))
+        with (self.partial / "trajectory.txt").open("a", encoding="utf-8") as file:
+            file.writelines(lines)
+        return pose
 
     def _place(self, name: str) -> Path:
         path = self.partial / name
@@ -130,20 +159,20 @@ class Output:
 def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, Any]:
     """Returns a row of frames.csv: medians over valid pixels, shares in [0, 1]."""
     frame, truth = made.frame, made.frame.raw
-    flows = made.raw, made.ego, made.obj
-    raw_px, ego_px, obj_px = (np.hypot(*flow)[made.valid] for flow in flows)
-    obj_median_px = _median(obj_px)
-    # Where most of the picture is static, the median is the error of estimated flow and of poses.
-    moves = obj_px > max(moving_px, _MOVING_SPREAD * obj_median_px)
+    times_s = made.previous.timestamp_s, frame.timestamp_s
+    seconds = math.nan if None in times_s else abs(times_s[1] - times_s[0]) or math.nan
+    medians_px = {name: _median(np.hypot(*getattr(made, name))[made.valid]) for name in FLOW_NAMES}
+    moving = moves(made, moving_px)[made.valid]
+    spans = frame.position is not None and made.previous.position is not None
     row: dict[str, Any] = {
         "index": index,
         "name": frame.name,
         "timestamp_s": "" if frame.timestamp_s is None else f"{frame.timestamp_s:.6f}",
-        "raw_median_px": _median(raw_px),
-        "ego_median_px": _median(ego_px),
-        "obj_median_px": obj_median_px,
+        "gap": abs(frame.position - made.previous.position) - 1 if spans else "",
+        **{f"{name}_median_px": px for name, px in medians_px.items()},
+        **{f"{name}_median_px_per_s": px / seconds for name, px in medians_px.items()},
         "valid_share": float(made.valid.mean()),
-        "moving_share": float(moves.mean()) if len(moves) else math.nan,
+        "moving_share": float(moving.mean()) if len(moving) else math.nan,
         "epe_px": math.nan,
         "inlier_share": made.motion.inlier_share,
         "recorded_obj_median_px": math.nan,
@@ -155,8 +184,7 @@ def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, A
         known_px = error_px[np.isfinite(error_px)]
         row["epe_px"] = float(known_px.mean()) if len(known_px) else math.nan
     has_poses = not any(f.world_from_cam is None for f in (made.previous, frame))
-    is_estimated = made.motion.known and not math.isnan(made.motion.inlier_share)
-    if has_poses and is_estimated:  # beside the recorded motion
+    if has_poses and made.motion.known and made.motion.is_estimated:  # beside the recorded motion
         recorded = factorize_pair(made.previous, frame, made.raw)
         off = np.linalg.inv(recorded.motion.prev_from_curr) @ made.motion.prev_from_curr
         turn_rad = float(np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]))
@@ -167,6 +195,36 @@ def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, A
         if isinstance(value, float):  # six digits; nothing for what is unknown
             row[name] = f"{value:.6g}" if math.isfinite(value) else ""
     return row
+
+
+def moves(made: FactorizedFrame, moving_px: float) -> NDArray[np.bool_]:
+    """Returns the pixels that move by themselves `[H, W]`: beyond `moving_px` and the error.
+
+    Where most of the picture is static, the median of object flow is the error of estimated flow
+    and of poses: 1.18 s, if x and y err by a deviation of s, and one length in 500 exceeds 3.5 s.
+    """
+    lengths_px = np.hypot(*made.obj)
+    least_px = np.nanmax([moving_px, _MOVING_SPREAD * _median(lengths_px[made.valid])])
+    found: NDArray[np.bool_] = made.valid & (lengths_px > least_px)
+    return found
+
+
+def _stamp(frame: Frame, index: int) -> float:
+    number = index if frame.position is None else frame.position
+    return float(number) if frame.timestamp_s is None else frame.timestamp_s
+
+
+def tum_line(time_s: float, world_from_cam: Pose) -> str:
+    """Returns the line "time tx ty tz qx qy qz qw" of a pose.
+
+    >>> tum_line(0.5, np.eye(4))
+    '0.500000 0 0 0 0 0 0 1\\n'
+    """
+    axis_angle = cv2.Rodrigues(world_from_cam[:3, :3])[0].ravel()
+    half_rad = float(np.linalg.norm(axis_angle)) / 2
+    axis_sin = axis_angle / 2 * np.sinc(half_rad / np.pi)  # sin(a) / a, 1 where there is no turn
+    numbers = [*world_from_cam[:3, 3], *axis_sin, math.cos(half_rad)]
+    return f"{time_s:.6f} {' '.join(f'{number:.9g}' for number in numbers)}\n"
 
 
 def _median(values: NDArray[np.float32]) -> float:
@@ -210,18 +268,13 @@ class RerunExport:
         self._stream = rerun.RecordingStream("flowrep", recording_id=path.parent.stem)
         self._stream.save(str(path))
         self._scale_px = scale_px
-        self._poses: dict[str, Pose] = {}
 
-    def append(self, index: int, made: FactorizedFrame) -> None:
+    def append(self, index: int, made: FactorizedFrame, pose: Pose) -> None:
         """Logs one frame."""
         rr, frame, log = self._rerun, made.frame, self._stream.log
         self._stream.set_time("frame", sequence=index)
         if frame.timestamp_s is not None:
             self._stream.set_time("time", duration=frame.timestamp_s)
-        pose = frame.world_from_cam
-        if pose is None:  # the estimated motions so far, one after the other
-            before = self._poses.get(made.previous.name, np.eye(4))
-            pose = self._poses[frame.name] = before @ made.motion.prev_from_curr
         log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         size, axes = frame.size[::-1], rr.ViewCoordinates.RDF
         camera = rr.Pinhole(image_from_camera=frame.K, resolution=size, camera_xyz=axes)
