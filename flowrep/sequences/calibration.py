@@ -165,9 +165,10 @@ class Undistortion:
     def __init__(
         self, K: Matrix, distortion: Sequence[float], lens: Lens, size: tuple[int, int]
     ) -> None:
-        if len(distortion) not in ((4,) if lens == "fisheye" else (4, 5, 8, 12, 14)):
-            counts = "4 numbers" if lens == "fisheye" else "4, 5, 8, 12 or 14 numbers"
-            raise SequenceError("distortion", f"has {counts} of a lens={lens}: {list(distortion)}")
+        counts = (4,) if lens == "fisheye" else (4, 5, 8, 12, 14)
+        if len(distortion) not in counts:
+            says = f"has {len(distortion)} numbers, a lens={lens} one of {counts}"
+            raise SequenceError("distortion", says)
         opencv = K.copy()
         opencv[:2, 2] -= 0.5  # its pixel centres are whole numbers
         coefficients = np.array(distortion, dtype=np.float64)

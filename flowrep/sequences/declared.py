@@ -16,18 +16,8 @@ from omegaconf import OmegaConf
 
 from flowrep import geometry
 from flowrep.config import CONF_DIR
-from flowrep.sequences import files
-from flowrep.sequences.calibration import (
-    Axes,
-    Layout,
-    Lens,
-    Matrix,
-    Registration,
-    Undistortion,
-    as_pose,
-    camera_matrix,
-    read_cameras,
-)
+from flowrep.sequences import calibration, files
+from flowrep.sequences.calibration import as_pose, camera_matrix
 from flowrep.sequences.recording import Frame, Pose, Recording, SequenceError
 from flowrep.sequences.video import VIDEOS, VideoPictures
 
@@ -77,13 +67,13 @@ class DeclaredRecording(Recording):
     pose_lag_frames: int
     leave_out: Sequence[str]
     backwards: bool
-    pose_layout: Layout
+    pose_layout: calibration.Layout
     pose_direction: geometry.PoseDirection
-    pose_axes: Axes
+    pose_axes: calibration.Axes
     marker_from_cam: Sequence[float] | None
     first_pixel_centre: float
     distortion: Sequence[float]
-    lens: Lens
+    lens: calibration.Lens
     resize_rgb: bool
     depth_unit_m: float | None
     depth_kind: geometry.DepthKind
@@ -113,23 +103,23 @@ class DeclaredRecording(Recording):
         elif self.rgb is not None and (rgb.parent.is_dir() or not self.has_flow):
             listed, times_s = self._listing(self.rgb, "picture")
             self._rgbs = [*listed.values()]
-        self._names, self._times_s, self._same = [*listed], times_s, np.arange(len(listed))
+        self._names, self._times_s = [*listed], times_s
         left_out = self._match_depth(depths, depth_times_s)
         if self.times is not None and self._exists(self.times):
-            times, rows, *_ = self._rows(self.times, (0, 1))
-            self._times_s = times[rows, 0] * self.time_unit_s
+            table, rows, *_ = self._rows(self.times, (0, 1))
+            self._times_s = table[rows, 0] * self.time_unit_s
+            left_out["without a time"] = rows < 0
         left_out |= self._read_poses() | self._read_intrinsics()
+        self.has_flow, self.no_flow = self._flow_fits()  # now that the lens is known
         if unknown := {*self.leave_out} - {*self._names}:
             raise SequenceError("leave_out", f"names frame {min(unknown)}, which isn't there")
         left_out["in format.leave_out"] = np.isin(self._names, list(self.leave_out))
         self._choose(left_out)
         self._made: dict[Any, tuple[Any, Any]] = {}
         unit_m = self.depth_unit_m or files.usual_unit_m(files.read_array(self._depths[0]))
-        self.conventions = {
-            "pose_direction": self.pose_direction, "pose_axes": self.pose_axes,
-            "depth_kind": self.depth_kind, "depth_unit_m": str(unit_m),
-            "flow_direction": self.flow_direction, "flow_channels": self.flow_channels,
-        }  # fmt: skip
+        named = ("pose_direction", "pose_axes", "depth_kind", "flow_direction", "flow_channels")
+        self.conventions = {name: getattr(self, name) for name in named}
+        self.conventions |= {"depth_unit_m": str(unit_m)}
 
     # Which files there are.
 
@@ -186,24 +176,22 @@ class DeclaredRecording(Recording):
 
     def _match_depth(self, depths: dict[str, Path], times_s: Floats | None) -> LeftOut:
         """Finds the depth map of each frame; returns the frames that have none."""
-        maps, lacking = [*depths.values()], np.zeros(len(self._names), dtype=bool)
-        places, by = np.arange(len(self._names)), self.depth_by
-        if by == "time" and self._times_s is not None and times_s is not None:
+        if self.depth_by == "time" and self._times_s is not None and times_s is not None:
             places = nearest(times_s, self._times_s, self.tolerance_s)
             # Two pictures may be nearest to one depth map: it belongs to the nearer of them.
-            lacking = nearest(self._times_s, times_s, self.tolerance_s)[places] != self._same
-            lacking |= places < 0
-        elif by == "name" and (unpaired := {*self._names} ^ depths.keys()):
-            name, lacks = min(unpaired), self.rgb if min(unpaired) in depths else self.depth
-            raise SequenceError(self._path(lacks or "").parent, f"lacks a file for frame {name}")
-        elif by == "name":
-            place_of = {name: place for place, name in enumerate(depths)}
-            places = np.array([place_of[name] for name in self._names])
-        elif len(maps) != len(places):
-            counts = f"{len(places)} pictures and {len(maps)} depth maps"
-            raise SequenceError(self.folder, f"has {counts}: format.depth_by=order pairs all")
-        self._depths = [maps[place] for place in places]
-        return {f"without depth within {self.tolerance_s} s": lacking}
+            frames = nearest(self._times_s, times_s, self.tolerance_s)
+            self._depths = [[*depths.values()][place] for place in places]
+            lacking = (places < 0) | (frames[places] != np.arange(len(places)))
+            return {f"without depth within {self.tolerance_s} s": lacking}
+        by_order = self.depth_by == "order"
+        ours, theirs = (range(len(x)) if by_order else x for x in (self._names, depths))
+        if unpaired := {*ours} ^ {*theirs}:
+            lacks = self.rgb if min(unpaired) in theirs else self.depth
+            raise SequenceError(
+                self._path(lacks or "").parent, f"lacks frame {min(unpaired)}'s file"
+            )
+        self._depths = [dict(zip(theirs, depths.values()))[key] for key in ours]
+        return {}
 
     def _rows(
         self, pattern: str, columns: Sequence[int] | None
@@ -215,8 +203,7 @@ class DeclaredRecording(Recording):
             each = [files.read_table(path).ravel() for path in paths]
             for path, numbers in zip(paths, each):
                 if len(numbers) != len(each[0]):
-                    says = f"has {len(numbers)} numbers, {paths[0].name} {len(each[0])}"
-                    raise SequenceError(path, says)
+                    raise SequenceError(path, f"has {len(numbers)} numbers, others {len(each[0])}")
             table = np.stack(each)
         else:
             table = files.read_table(path)
@@ -225,11 +212,9 @@ class DeclaredRecording(Recording):
             table = table[table[:, int(column)] == float(self._path(value).name)]
         first, end = columns or (self.key_column + 1 if is_keyed else 0, table.shape[1])
         if not len(table) or not first < end <= table.shape[1]:
-            counts = f"{len(table)} rows of {table.shape[1]} numbers"
-            raise SequenceError(
-                path, f"has {counts}, expected at least {max(end, first + 1)} in each"
-            )
-        before = after = self._same
+            size = f"{len(table)} rows of {table.shape[1]}"
+            raise SequenceError(path, f"has {size} numbers, expected {max(end, first + 1)}")
+        before = after = np.arange(len(self._names))
         share = np.zeros(len(before))
         if is_keyed and self._times_s is not None and self.rows_by == "time":
             times_s = _ascending(path, table[:, self.key_column] * self.time_unit_s)
@@ -249,7 +234,7 @@ class DeclaredRecording(Recording):
         if self.poses is None or not self.has_poses:
             return {}
         path = self._path(self.poses)
-        numbers, before, after, self._share = self._rows(self.poses, self.pose_columns)
+        numbers, before, after, share = self._rows(self.poses, self.pose_columns)
         width = numbers.shape[1]
         if width not in ((12, 16) if self.pose_layout == "matrix" else (7,)):
             fitting = {7: "xyz_xyzw or xyz_wxyz", 12: "matrix", 16: "matrix"}.get(width)
@@ -262,50 +247,57 @@ class DeclaredRecording(Recording):
         if not lost.all():
             numbers[lost] = numbers[~lost][0]  # so that an error names the row that is wrong
             options: Any = {"direction": self.pose_direction, "axes": self.pose_axes}
-            self._poses = as_pose(numbers, path, layout=self.pose_layout, **options)
+            poses = as_pose(numbers, path, layout=self.pose_layout, **options)
             if self.marker_from_cam is not None:
                 fixed: Any = "xyz_xyzw" if len(self.marker_from_cam) == 7 else "matrix"
                 marker = np.array(self.marker_from_cam)
-                self._poses @= as_pose(marker, "marker_from_cam", layout=fixed)
-        lag = self.pose_lag_frames
-        lacking = (before < 0) | (np.minimum(before, after) + lag < 0)
-        lacking |= np.maximum(before, after) + lag >= len(lost)
-        self._before, self._after = (np.where(lacking, 0, of + lag) for of in (before, after))
+                poses @= as_pose(marker, "marker_from_cam", layout=fixed)
+        lacking, lag = before < 0, self.pose_lag_frames
+        lacking |= (np.minimum(before, after) + lag < 0) | (after + lag >= len(lost))
+        before, after = (np.where(lacking, 0, rows + lag) for rows in (before, after))
+        is_lost = ~lacking & (lost[before] | lost[after])
+        if not lost.all():
+            places = zip(poses[before], poses[after], share)
+            self._poses = (
+                [interpolated_pose(*p) for p in places] if self.interpolate else poses[before]
+            )
         near = f" within {self.tolerance_s} s" if self.rows_by == "time" else ""
-        is_lost = ~lacking & (lost[self._before] | lost[self._after])
         return {f"without a pose{near}": lacking, f"lost (nan, inf, 0) in {path.name}": is_lost}
 
     def _read_intrinsics(self) -> LeftOut:
         """Reads the numbers of K, and of depth's camera if it is another."""
-        numbers: Any = self.intrinsics
-        shift: Any = self.colour_from_depth or ()
-        self._depth_numbers: Any = self.depth_intrinsics
         self._size = self._colour_size = None
-        self._centre, lacking = self.first_pixel_centre, np.zeros(len(self._names), dtype=bool)
-        if isinstance(self._depth_numbers, str):
-            self._depth_numbers = files.read_table(self._path(self._depth_numbers))
-        if isinstance(numbers, str) and ("*" in numbers or self.intrinsics_columns is not None):
-            table, rows, *_ = self._rows(numbers, self.intrinsics_columns)
-            numbers, lacking = table[rows], rows < 0
-        elif isinstance(numbers, str) and not numbers.endswith(".json"):
-            numbers = files.read_table(self._path(numbers)).ravel()
-        elif isinstance(numbers, str):
-            cameras = read_cameras(self._path(numbers))
-            camera, self._centre = cameras.colour or cameras, 0.5
-            numbers, self._size = camera.numbers, (cameras.height, cameras.width)
+        source = self._path(self.intrinsics) if isinstance(self.intrinsics, str) else "intrinsics"
+        if isinstance(self.intrinsics, str) and self.intrinsics.endswith(".json"):
+            cameras = calibration.read_cameras(self._path(self.intrinsics))
+            camera = cameras.colour or cameras
+            self._size = cameras.height, cameras.width
+            self.intrinsics, self.first_pixel_centre = camera.numbers, 0.5
             if not self.distortion:
                 self.distortion, self.lens = camera.distortion, camera.lens
             if cameras.colour is not None:
                 self._colour_size = camera.height, camera.width
-                self._depth_numbers = cameras.numbers
-                shift = np.ravel(cameras.colour.colour_from_depth)
+                self.depth_intrinsics = cameras.numbers
+                self.colour_from_depth = np.ravel(cameras.colour.colour_from_depth).tolist()
+        lacking, given = np.zeros(len(self._names), dtype=bool), self.intrinsics
+        if isinstance(given, str) and ("*" in given or self.intrinsics_columns is not None):
+            numbers, rows, *_ = self._rows(given, self.intrinsics_columns)
+            numbers, lacking = numbers[rows], rows < 0
+        else:
+            numbers = self._numbers_in(given)
+        camera_matrix(numbers[0], (2, 2), self.first_pixel_centre, source)  # or an error, early
+        self._K_numbers = numbers.repeat(len(lacking) // len(numbers), axis=0)
+        own = self.depth_intrinsics
+        self._depth_numbers = None if own is None else self._numbers_in(own)
+        shift = np.array(self.colour_from_depth or 3 * [0.0])
         if len(shift) == 3:
             shift = np.column_stack([np.eye(3), shift]).ravel()
-        self._colour_from_depth = as_pose(shift, "colour_from_depth") if len(shift) else np.eye(4)
-        one_each = np.array(numbers, dtype=np.float64)
-        self._numbers = np.broadcast_to(one_each, (len(lacking), one_each.shape[-1]))
-        camera_matrix(self._numbers[0], (2, 2), self._centre, self.intrinsics)  # or an error, early
+        self._colour_from_depth = as_pose(shift, "colour_from_depth")
         return {"without intrinsics": lacking}
+
+    def _numbers_in(self, given: str | Sequence[float]) -> Floats:
+        table = files.read_table(self._path(given)) if isinstance(given, str) else np.array(given)
+        return table.reshape(1, -1)
 
     def _choose(self, left_out: LeftOut) -> None:
         """Numbers the frames that are left, in the order in which they are played."""
@@ -316,9 +308,7 @@ class DeclaredRecording(Recording):
                 count = f"{frames.sum()} of {len(kept)} frames are left out"
                 notes.append(f"{count}, {why}: {', '.join(np.array(self._names)[frames][:3])}")
         if not kept.any():
-            remedy = (
-                "raise format.tolerance_s, check that files share a clock, or format.poses=null"
-            )
+            remedy = "raise format.tolerance_s, or set format.poses=null"
             raise SequenceError(self.folder, f"{'; '.join(notes)}; none is left: {remedy}")
         if self.distortion:
             notes.append("pictures and depth are undistorted")
@@ -338,7 +328,7 @@ class DeclaredRecording(Recording):
     def _read(self, index: int) -> Frame:
         i = int(self._order[index])
         name, source, raw, since = self._names[i], self._depths[i], None, None
-        rgb: NDArray[np.uint8] | None = None
+        rgb: Any = None
         if self._rgbs is not None:
             source = self._rgbs[i]
             rgb = files.read_rgb(source)
@@ -346,23 +336,30 @@ class DeclaredRecording(Recording):
             rgb, source = self._video[i], self._video.path
         depth = self._stored_depth(i)
         size: tuple[int, ...] = depth.shape if rgb is None else rgb.shape[:2]
-        K = camera_matrix(self._numbers[i], size, self._centre)
+        K = K_depth = camera_matrix(self._K_numbers[i], size, self.first_pixel_centre)
         if self.resize_rgb and rgb is not None:
             (height, width), size = size, depth.shape
-            K = np.diag([size[1] / width, size[0] / height, 1.0]) @ K
-            smaller: Any = cv2.resize(rgb, size[::-1], interpolation=cv2.INTER_AREA)
-            rgb = smaller
-        pose = self._pose(i) if self.has_poses else None
-        if self._depth_numbers is None:
-            depth = self._along_the_axis(depth, K)
-        else:
+            K = K_depth = np.diag([size[1] / width, size[0] / height, 1.0]) @ K
+            rgb = cv2.resize(rgb, size[::-1], interpolation=cv2.INTER_AREA)
+        if self._depth_numbers is not None:
+            K_depth = camera_matrix(self._depth_numbers, depth.shape, self.first_pixel_centre)
+        options: Any = {"near_m": self.near_m, "far_m": self.far_m}
+        if self.depth_kind == "ray_length":
+            options["K"] = torch.from_numpy(K_depth).float()
+        stored = torch.from_numpy(depth)[None]
+        depth = geometry.adapt_depth(stored, self.depth_kind, **options)[0].numpy()
+        pose = self._poses[i] if self.has_poses else None
+        if self._depth_numbers is not None:
             size = self._colour_size or size
-            K_depth = camera_matrix(self._depth_numbers, depth.shape, self._centre)
-            register = self._once(Registration, K_depth, K, self._colour_from_depth, size)
-            depth = register(self._along_the_axis(depth, K_depth))
-            pose = None if pose is None else pose @ register.depth_from_colour
+            register = self._once(
+                calibration.Registration, K_depth, K, self._colour_from_depth, size
+            )
+            depth, pose = (
+                register(depth),
+                pose if pose is None else pose @ register.depth_from_colour,
+            )
         if self.distortion:
-            rectify = self._once(Undistortion, K, self.distortion, self.lens, size)
+            rectify = self._once(calibration.Undistortion, K, self.distortion, self.lens, size)
             rgb = None if rgb is None else rectify(rgb)
             depth = rectify(depth, nearest=True) if self._depth_numbers is None else depth
         if self.flow is not None and self.has_flow and index > 0:
@@ -386,8 +383,7 @@ class DeclaredRecording(Recording):
         depth = files.read_depth(path, self.depth_unit_m, *codes, self.depth_coding)
         size = self._size or depth.shape
         if depth.shape != size and not self.resize_rgb:
-            (height, width), (own_height, own_width) = size, depth.shape
-            says = f"is {own_width} x {own_height}, {self.intrinsics} says {width} x {height}"
+            says = f"has {list(depth.shape)} rows and columns, intrinsics.json says {list(size)}"
             raise SequenceError(path, says)
         if self.depth_inf == "missing":
             depth[np.isinf(depth)] = np.nan
@@ -397,17 +393,6 @@ class DeclaredRecording(Recording):
                 raise SequenceError(path, f"and its confidence differ in size: {list(trust.shape)}")
             depth[trust < self.min_confidence] = np.nan
         return depth
-
-    def _along_the_axis(self, depth: NDArray[np.float32], K: Matrix) -> NDArray[np.float32]:
-        options: Any = {"near_m": self.near_m, "far_m": self.far_m}
-        if self.depth_kind == "ray_length":
-            options["K"] = torch.from_numpy(K).float()
-        stored = torch.from_numpy(depth)[None]
-        return geometry.adapt_depth(stored, self.depth_kind, **options)[0].numpy()
-
-    def _pose(self, i: int) -> Pose:
-        before, after = self._poses[self._before[i]], self._poses[self._after[i]]
-        return interpolated_pose(before, after, self._share[i]) if self.interpolate else before
 
     def _raw(self, pattern: str, name: str, other: str) -> files.Flow:
         stored = files.read_flow(self._file(pattern, "flow", name, next=other), self.flow_coding)

@@ -80,17 +80,6 @@ def read_lines(path: Path) -> list[str]:
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def read_json(path: Path, *keys: str) -> Any:
-    """Returns the value at a path of keys, a number for a place in a list."""
-    try:
-        value = json.loads(regular(path).read_bytes())
-        for key in keys:
-            value = value[int(key)] if isinstance(value, list) else value[key]
-    except (ValueError, LookupError, TypeError) as error:
-        raise SequenceError(path, f"has no value at {'.'.join(keys)} ({error!r})") from None
-    return value
-
-
 def read_table(path: Path, *columns: int) -> NDArray[np.float64]:
     """Returns the numbers of a file, a row a line, with one of the permitted numbers of columns.
 
@@ -102,7 +91,12 @@ def read_table(path: Path, *columns: int) -> NDArray[np.float64]:
     path = path.with_name(name)
     try:
         if path.suffix.lower() == ".json":
-            parts = [np.array(read_json(path, *key.split(".")), float) for key in keys.split("+")]
+            parts = []
+            for steps in keys.split("+"):
+                value = json.loads(regular(path).read_bytes())
+                for step in steps.split("."):
+                    value = value[int(step)] if isinstance(value, list) else value[step]
+                parts.append(np.array(value, dtype=np.float64))
             table = np.hstack([part if part.ndim == 2 else part.reshape(-1, 1) for part in parts])
         elif path.suffix.lower() == ".cam":
             tag, *row = struct.unpack("<f21d", regular(path).read_bytes())
@@ -112,8 +106,8 @@ def read_table(path: Path, *columns: int) -> NDArray[np.float64]:
             if lines and not re.match(r"[-+.]?(\d|nan|inf)", lines[0], re.IGNORECASE):
                 del lines[0]
             table = np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
-    except (ValueError, struct.error) as error:
-        raise SequenceError(path, f"holds no table of numbers: {error}") from None
+    except (ValueError, LookupError, TypeError, struct.error) as error:
+        raise SequenceError(path, f"holds no table of numbers {keys}: {error!r}") from None
     if not table.size:
         raise SequenceError(path, "holds no numbers")
     if columns and table.shape[1] not in columns:
@@ -131,14 +125,18 @@ def read_array(path: Path) -> NDArray[Any]:
             mapped = np.load(regular(path), mmap_mode="r")
             array = np.array(mapped) if isinstance(mapped, np.ndarray) else None
         elif suffix in (".flo", ".dpt"):
-            array = read_tagged_floats(path, channels=2 if suffix == ".flo" else 1)
+            data = regular(path).read_bytes()
+            tag, width, height = struct.unpack_from("<fii", data)
+            if tag == FLO_TAG:
+                values = np.frombuffer(data, "<f4", offset=12).astype(np.float32)
+                array = values.reshape(height, width, 2 if suffix == ".flo" else 1)
         elif suffix == ".exr":
             array = _read_exr(path)
         elif suffix == ".flo5":
             raise SequenceError(path, "is HDF5, which isn't read: convert it to .flo or .npy")
         else:
             array = _decoded(regular(path).read_bytes())
-    except (ValueError, EOFError, RuntimeError, cv2.error) as error:
+    except (ValueError, EOFError, RuntimeError, struct.error, cv2.error) as error:
         raise SequenceError(path, f"can't be read as {suffix}: {error}") from None
     if array is None:
         raise SequenceError(path, f"is no {suffix} file, or was cut off")
@@ -175,18 +173,6 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
         raise SequenceError(path, f"has {8 * picture.itemsize} bits per channel, colour has 8")
     colours = picture[..., :3] if picture.ndim == 3 else np.stack(3 * [picture], -1)
     return np.ascontiguousarray(colours)
-
-
-def read_integers(path: Path, dtype: type, channels: int = 1) -> NDArray[Any]:
-    """Returns a picture of a given type, `[H, W]` or `[H, W, channels]`."""
-    picture = read_array(path)
-    found = 1 if picture.ndim == 2 else picture.shape[-1]
-    if picture.dtype != dtype or found != channels:
-        expected = f"{channels} of {8 * np.dtype(dtype).itemsize}"
-        raise SequenceError(
-            path, f"has {found} channels of {8 * picture.itemsize} bits, expected {expected}"
-        )
-    return picture
 
 
 def read_depth(
@@ -236,48 +222,28 @@ def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:
         coding: of a PNG: `"kitti"`, steps of 1/64 px; `"vkitti2"`, shares of the picture's size;
             `"kubric"`, shares of the range in `data_ranges.json`.
     """
-    suffix = path.suffix.lower()
-    if suffix == ".png":
-        return _read_coded_flow(path, coding)
-    stored = read_array(path)
-    if stored.ndim != 3 or stored.dtype.kind != "f" or stored.shape[2] < 2:
-        given = f"holds {stored.dtype} {list(stored.shape)}"
-        raise SequenceError(path, f"{given}, expected floats [height, width, 2]")
+    stored, suffix = read_array(path), path.suffix.lower()
+    is_right = stored.dtype == np.uint16 if suffix == ".png" else stored.dtype.kind == "f"
+    if not is_right or stored.shape[2:] not in ((2,), (3,)):
+        says = f"holds {stored.dtype} {list(stored.shape)}, expected floats [height, width, 2]"
+        raise SequenceError(path, f"{says}, or a PNG of three channels of 16 bits")
     flow = stored[..., :2].transpose(2, 0, 1).astype(np.float32)
     if suffix == ".flo":
         flow[:, ~(np.abs(flow).max(0) <= _FLO_LARGEST)] = np.nan  # nan compares False
-    return flow
-
-
-def _read_coded_flow(path: Path, coding: FlowCoding) -> Flow:
-    red, green, blue = read_integers(path, np.uint16, 3).transpose(2, 0, 1)
-    stored = np.stack([red, green]).astype(np.float32)
+    if suffix != ".png":
+        return flow
     if coding == "kubric":
         kind = path.stem.rpartition("_")[0]  # forward_flow, backward_flow
-        least, most = (
-            float(read_json(path.with_name("data_ranges.json"), kind, x)) for x in ("min", "max")
-        )
-        return stored * np.float32((most - least) / 65535) + np.float32(least)
+        ranges = read_table(path.with_name(f"data_ranges.json:{kind}.min+{kind}.max"))
+        least, most = map(float, ranges[0])
+        return flow * np.float32((most - least) / 65535) + np.float32(least)
     if coding == "vkitti2":
-        height, width = red.shape
-        size = np.array([width - 1, height - 1], np.float32)[:, None, None]
-        flow = (stored * np.float32(2 / 65535) - 1) * size
+        size = np.array(stored.shape[1::-1], np.float32)[:, None, None]  # width, height
+        flow = (flow * np.float32(2 / 65535) - 1) * (size - 1)
     else:
-        flow = (stored - 2**15) / 64
-    flow[:, blue == 0] = np.nan
-    return flow.astype(np.float32, copy=False)
-
-
-def read_tagged_floats(path: Path, channels: int) -> NDArray[np.float32]:
-    """Returns the floats of a .flo file or of Sintel's .dpt, `[H, W, channels]`."""
-    data = regular(path).read_bytes()
-    if len(data) >= 12:
-        tag, width, height = struct.unpack_from("<fii", data)
-        fits = width > 0 and height > 0 and len(data) == 12 + 4 * channels * width * height
-        if tag == FLO_TAG and fits:
-            values = np.frombuffer(data, "<f4", offset=12).astype(np.float32)
-            return values.reshape(height, width, channels)
-    raise SequenceError(path, f"is not {FLO_TAG}, width, height and {channels} floats a pixel")
+        flow = (flow - 2**15) / 64
+    flow[:, stored[..., 2] == 0] = np.nan
+    return flow
 
 
 def write_flo(path: Path, flow: Flow, valid: NDArray[np.bool_] | None = None) -> None:

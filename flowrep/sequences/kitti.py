@@ -46,19 +46,24 @@ class Kitti(Recording):
         self.folder, self.has_poses = Path(folder), raw_data is not None
         names = files.find_files(self.folder / "image_2/*.png", "picture")
         self._pairs = [name[:6] for name in names if re.fullmatch(r"\d{6}_10", name)]
+        if not self._pairs:
+            raise SequenceError(
+                self.folder, "has no image_2/*_10.png: give training/ of the data set"
+            )
         self.count = 2 * len(self._pairs)
         if raw_data is None:
             return
         if mapping is None:
             raise SequenceError(raw_data, "is of no use without format.mapping=train_mapping.txt")
         self._oxts = {}  # the folder of GPS and IMU packets and the frame number, by pair
-        for pair, line in enumerate(Path(mapping).read_text("utf-8").splitlines()):
-            if not line.strip():  # a pair without a raw recording
-                continue
-            if len(words := line.split()) != 3 or not words[2].isdecimal():
+        for pair, line in enumerate(
+            files.regular(Path(mapping)).read_text("utf-8-sig").splitlines()
+        ):
+            words = line.split()  # none if the pair has no raw recording
+            if words and (len(words) != 3 or not words[2].isdecimal()):
                 raise SequenceError(mapping, f"{line[:60]!r} is not a date, recording and frame")
-            date, drive, frame = words
-            self._oxts[pair] = Path(raw_data, date, drive, "oxts", "data"), int(frame)
+            if words:
+                self._oxts[pair] = Path(raw_data, *words[:2], "oxts", "data"), int(words[2])
         posed = [name for name in self._pairs if int(name) in self._oxts]
         if not posed:
             raise SequenceError(mapping, f"names no raw recording of the pictures in {folder}")
@@ -76,10 +81,9 @@ class Kitti(Recording):
         depth = np.full(rgb.shape[:2], np.nan, dtype=np.float32)
         raw = since = None
         if is_current:
-            disparity = files.read_integers(self.folder / "disp_occ_0" / f"{name}.png", np.uint16)
-            # Disparity is in 1/256 px, 0 where it is missing.
-            known = np.where(disparity == 0, np.nan, disparity / 256)
-            depth = (focal_baseline / known).astype(np.float32)
+            path = self.folder / "disp_occ_0" / f"{name}.png"
+            disparity_px = files.read_depth(path, 1 / 256, missing=(0,)).astype(np.float64)
+            depth = (focal_baseline / disparity_px).astype(np.float32)
             # Given is p_11 - p_10. Here 11 is the frame before, so that p_t - p_t' is the opposite.
             raw = -files.read_flow(self.folder / "flow_occ" / f"{name}.png")
             since = f"{pair}_11"

@@ -159,16 +159,16 @@ class Output:
 def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, Any]:
     """Returns a row of frames.csv: medians over valid pixels, shares in [0, 1]."""
     frame, truth = made.frame, made.frame.raw
-    times_s = made.previous.timestamp_s, frame.timestamp_s
-    seconds = math.nan if None in times_s else abs(times_s[1] - times_s[0]) or math.nan
+    before_s, now_s = made.previous.timestamp_s, frame.timestamp_s
+    seconds = math.nan if before_s is None or now_s is None else abs(now_s - before_s) or math.nan
+    before, now = made.previous.position, frame.position
     medians_px = {name: _median(np.hypot(*getattr(made, name))[made.valid]) for name in FLOW_NAMES}
     moving = moves(made, moving_px)[made.valid]
-    spans = frame.position is not None and made.previous.position is not None
     row: dict[str, Any] = {
         "index": index,
         "name": frame.name,
         "timestamp_s": "" if frame.timestamp_s is None else f"{frame.timestamp_s:.6f}",
-        "gap": abs(frame.position - made.previous.position) - 1 if spans else "",
+        "gap": "" if before is None or now is None else abs(now - before) - 1,
         **{f"{name}_median_px": px for name, px in medians_px.items()},
         **{f"{name}_median_px_per_s": px / seconds for name, px in medians_px.items()},
         "valid_share": float(made.valid.mean()),

@@ -104,13 +104,11 @@ class Recording(ABC):
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         frame = self._read(index)
-        sizes: dict[str, tuple[int, ...]] = {"depth": frame.size}
-        if frame.rgb is not None:
-            sizes["colour"] = frame.rgb.shape[:2]
-        if frame.raw is not None:
-            sizes["flow"] = frame.raw.shape[1:]
-        if len({*sizes.values()}) > 1:
-            listing = ", ".join(f"{name} {w} x {h}" for name, (h, w) in sizes.items())
+        shapes = {"depth": frame.size}
+        shapes |= {} if frame.rgb is None else {"colour": frame.rgb.shape[:2]}
+        shapes |= {} if frame.raw is None else {"flow": frame.raw.shape[1:]}
+        if len({*shapes.values()}) > 1:
+            listing = ", ".join(f"{name} {w} x {h}" for name, (h, w) in shapes.items())
             raise SequenceError(frame.source, f"pictures of one frame differ in size: {listing}")
         try:
             check_intrinsics("intrinsics", torch.from_numpy(frame.K))
