@@ -130,16 +130,19 @@ def test_a_wrong_convention_is_said(moments, tmp_path, capsys):
     assert summary["suspects"][0] == "pose_direction=camera_to_world"
 
 
-def test_ctrl_c_keeps_the_frames_that_are_done(moments, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_keeps_the_frames_that_are_done(
+    number, code, moments, tmp_path, monkeypatch, capsys
+):
     append = Output.append
 
     def interrupted(self, *arguments):
         append(self, *arguments)
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)
 
     monkeypatch.setattr(Output, "append", interrupted)
-    code, out = factorize(tmp_path, "flow=exact")
-    assert code == 130
+    ended, out = factorize(tmp_path, "flow=exact")
+    assert ended == code
     assert "out.partial" in capsys.readouterr().out
     assert not out.exists()
     partial = tmp_path / "out.partial"
@@ -172,6 +175,28 @@ def test_what_cannot_be_factorised_is_named_and_leaves_nothing(moments, tmp_path
     with pytest.raises((SequenceError, ValueError), match=named):
         factorize(tmp_path, *overrides, "video=false")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+
+
+def test_an_estimated_trajectory_begins_with_the_recorded_pose(moments, tmp_path):
+    options = ["poses=estimated", "video=false", "flow_files=[]"]
+    _, out = factorize(tmp_path, "flow=exact", *options)
+    for line, moment in zip(np.loadtxt(out / "trajectory.txt"), moments):
+        np.testing.assert_allclose(line[1:4], moment.world_from_cam[:3, 3], atol=2e-3)
+
+
+def test_a_mask_says_what_is_unknown(moments, tmp_path):
+    flow = moments[1].raw.copy()
+    flow[:, 3, 4] = np.nan
+    synthetic.put(tmp_path / "in/flow/0001.flo", flow)
+    _, out = factorize(tmp_path, "flow=exact", "video=false", "moving_px=0.01")
+    mask = cv2.imread(str(out / "moving/0001.png"), cv2.IMREAD_UNCHANGED)
+    moving = np.hypot(*moments[1].obj) > 0.01
+    expected = np.where(moving, 255, 0)
+    expected[3, 4] = 127
+    np.testing.assert_array_equal(mask, expected)
+    shutil.rmtree(out)
+    factorize(tmp_path, "flow=exact", "video=false", "masks=false")
+    assert not (out / "moving").exists()
 
 
 @pytest.mark.parametrize(("stride", "names"), [(1, ["0001", "0002"]), (2, ["0002"])])
@@ -236,6 +261,10 @@ def test_without_poses_the_cameras_motion_is_estimated(moments, tmp_path, capsys
     expected = np.linalg.inv(synthetic.pose(0)) @ synthetic.pose(1)
     estimated = np.load(out / "flow/0001.npz")["prev_from_curr"]
     np.testing.assert_allclose(estimated, expected, atol=1e-3)
+    # Chained from the identity: poses relative to the first camera.
+    last = np.loadtxt(out / "trajectory.txt")[2]
+    relative = np.linalg.inv(synthetic.pose(0)) @ synthetic.pose(2)
+    np.testing.assert_allclose(last[1:4], relative[:3, 3], atol=2e-3)
     for row in table(out):
         assert float(row["inlier_share"]) > 0.7
         assert row["rotation_off_deg"] == row["recorded_obj_median_px"] == ""
@@ -266,13 +295,14 @@ def test_a_format_gives_options_of_its_reader_and_the_plain_layout_all(name):
     else:
         assert {*options} <= {p.name for p in parameters}
     # Composed by Hydra, a format is what the same name gives in Python.
-    given = [f"format={name}", "input=x", "output=y"]
-    needed = [f"format.{key}=1" for key, value in declaration(name).items() if value == "???"]
-    composed = settings(*given, *needed).format.options()
-    same = {key: value for key, value in declaration(name).items() if value != "???"}
-    assert {key: composed[key] for key in same if key != "_target_"} == {
-        key: value for key, value in same.items() if key != "_target_"
-    }
+    keys = declaration(name)
+    needed = [key for key, value in keys.items() if value == "needed"]
+    given = [f"format={name}", "input=x", "output=y", *(f"format.{key}=1" for key in needed)]
+    composed = settings(*given).format.options()
+    assert composed == {k: 1 if k in needed else v for k, v in keys.items() if k != "_target_"}
+    for key in needed:
+        with pytest.raises(UsageError, match=rf"format\.{key}=\.\.\."):
+            settings(*(text for text in given if not text.startswith(f"format.{key}")))
 
 
 def test_the_command_ends_with_one_line_and_code_2(tmp_path, monkeypatch, capsys):
@@ -283,6 +313,43 @@ def test_the_command_ends_with_one_line_and_code_2(tmp_path, monkeypatch, capsys
     assert ended.value.code == 2
     assert re.fullmatch(r"error: .*nowhere.*\n", capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
+
+
+def run(monkeypatch, *arguments) -> int:
+    monkeypatch.setattr(sys, "argv", ["factorize", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code
+
+
+@pytest.mark.parametrize("format", ["frames", "tum", "sevenscenes", "replica", "kitti"])
+def test_a_wrong_folder_is_told_what_was_expected(format, tmp_path, monkeypatch, capsys):
+    (tmp_path / "in").mkdir()
+    given = [f"format={format}", f"input={tmp_path / 'in'}", f"output={tmp_path / 'out'}"]
+    assert run(monkeypatch, *given) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    expected = {"frames": "depth/*, ", "tum": "depth.txt", "sevenscenes": "*.pose.txt"}
+    assert expected.get(format, {"replica": "traj.txt", "kitti": "image_2"}.get(format)) in line
+    assert "Errno" not in line
+
+
+def test_a_format_of_ones_own_says_what_is_different(moments, tmp_path, monkeypatch):
+    # As the plain layout, but with left/, metric.npy depth in decimetres, and OpenCV's intrinsics.
+    folder = tmp_path / "in"
+    (folder / "rgb").rename(folder / "left")
+    for path in (folder / "depth").iterdir():
+        depth = 10 * moments[int(path.stem)].depth
+        path.unlink()
+        np.save(folder / f"depth/z_{path.stem}.npy", depth)
+    own = ["defaults: [frames, _self_]", "rgb: left/*", "depth: depth/z_*.npy"]
+    own += ["depth_unit_m: 0.1", "intrinsics: [31.0, 27.0, 18.0, 12.5]", "first_pixel_centre: 0.0"]
+    synthetic.put(tmp_path / "conf/format/mine.yaml", own)
+    out = tmp_path / "out"
+    where = ["--config-dir", str(tmp_path / "conf"), "format=mine", "flow=exact", "video=false"]
+    assert run(monkeypatch, *where, f"input={folder}", f"output={out}") == 0
+    for moment, name in zip(moments[1:], ("0001", "0002")):
+        obj = read_flow(out / f"flow/obj/{name}.flo")
+        np.testing.assert_allclose(obj, moment.obj, atol=2e-4)
 
 
 def test_a_still_camera_needs_neither_poses_nor_depth(tmp_path):

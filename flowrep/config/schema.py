@@ -442,6 +442,13 @@ class Reader(Target):
 
     target: Annotated[str, Field(pattern=r"^flowrep\.sequences\.\w+$")] = Field(alias="_target_")
 
+    @model_validator(mode="after")
+    def _has_what_it_needs(self) -> Reader:
+        # Not ???, which does not replace the value of the format that this one begins with.
+        for key in [key for key, value in self.options().items() if value == "needed"]:
+            raise ValueError(f"{key} needs a value: format.{key}=...")
+        return self
+
 
 class FlowScale(Section):
     """Flow of full colour, pixels."""

@@ -92,6 +92,8 @@ class DeclaredRecording(Recording):
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder)
+        for key in [key for key, value in vars(self).items() if value == "needed"]:
+            raise ValueError(f"{key} needs a value")
         if self.depth_unit_m is not None and not self.depth_unit_m > 0:
             raise ValueError(f"depth_unit_m is positive, got {self.depth_unit_m}")
         self.has_flow, self.no_flow = self._flow_fits()
@@ -163,7 +165,8 @@ class DeclaredRecording(Recording):
                 times = [float(time) for time, _ in lines]
         except (ValueError, FileNotFoundError) as error:
             remedy = f"give the folder whose {path.name} has '<time> <file>' in each line"
-            raise SequenceError(path, f"{error}: {remedy}, or its format=") from None
+            says = "is missing" if isinstance(error, FileNotFoundError) else error
+            raise SequenceError(path, f"{says}: {remedy}, or its format=") from None
         if not found:
             used = (self.rgb, self.depth, self.flow, self.poses, self.intrinsics)
             layout = ", ".join(name for name in used if isinstance(name, str))

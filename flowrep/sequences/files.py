@@ -127,7 +127,7 @@ def read_array(path: Path) -> NDArray[Any]:
         elif suffix in (".flo", ".dpt"):
             data = regular(path).read_bytes()
             tag, width, height = struct.unpack_from("<fii", data)
-            if tag == FLO_TAG:
+            if tag == FLO_TAG and min(width, height) > 0:
                 values = np.frombuffer(data, "<f4", offset=12).astype(np.float32)
                 array = values.reshape(height, width, 2 if suffix == ".flo" else 1)
         elif suffix == ".exr":
@@ -241,7 +241,7 @@ def read_flow(path: Path, coding: FlowCoding = "kitti") -> Flow:
         size = np.array(stored.shape[1::-1], np.float32)[:, None, None]  # width, height
         flow = (flow * np.float32(2 / 65535) - 1) * (size - 1)
     else:
-        flow = (flow - 2**15) / 64
+        flow = (flow - np.float32(2**15)) / np.float32(64)
     flow[:, stored[..., 2] == 0] = np.nan
     return flow
 

@@ -102,6 +102,21 @@ def test_without_poses_the_motion_is_estimated():
     assert float(row["recorded_obj_median_px"]) > 1 > float(row["obj_median_px"])
 
 
+def test_an_autofocus_moves_nothing():
+    # fx from 1455.07 to 1459.04 within 33 ms, of a camera that stands still: pixel u was nearer to
+    # the axis before, at (u - cx) 1455.07 / 1459.04 + cx. Pictures are smaller here by 1 / 20.
+    before, now = (np.diag([f / 30, f / 30, 1]) @ K for f in (1455.07 / 20, 1459.04 / 20))
+    before[:2, 2] = now[:2, 2] = 30.5, 21.0
+    row, column = np.indices((40, 60)) + 0.5
+    raw = np.stack([column - 30.5, row - 21.0]) * (1 - 1455.07 / 1459.04)
+    pair = frame("a", K=before), frame("b", K=now, rgb=None)
+    made = sequences.factorize_pair(*pair, raw.astype(np.float32))
+    assert made.valid.all()
+    assert np.abs(made.obj).max() < 1e-5 < np.abs(raw).max() / 1000
+    motion = sequences.estimated_motion(*pair, raw.astype(np.float32))
+    np.testing.assert_allclose(motion.prev_from_curr, np.eye(4), atol=1e-4)
+
+
 def test_a_motion_that_nothing_tells_leaves_flow_unknown():
     nothing = np.full((2, 40, 60), np.nan, np.float32)
     motion = sequences.estimated_motion(frame("a"), frame("b"), nothing)
@@ -183,11 +198,28 @@ def test_a_row_says_medians_shares_and_the_error():
     truth[:, :, 59] = np.nan
     now = frame("b", depth=depth, raw=truth, raw_since="a", timestamp_s=1.5)
     row = score(7, sequences.factorize_pair(frame("a"), now, raw), moving_px=4.9)
-    assert (row["index"], row["name"], row["timestamp_s"]) == (7, "b", "1.500000")
+    assert (row["index"], row["name"], row["timestamp_s"], row["gap"]) == (7, "b", "1.500000", "")
+    assert row["raw_median_px_per_s"] == ""  # the frame before has no time
     assert float(row["valid_share"]) == pytest.approx(1199 / 2400, abs=1e-6)
     assert float(row["moving_share"]) == pytest.approx(300 / 1199, abs=1e-6)
     assert float(row["raw_median_px"]) == float(row["obj_median_px"]) == 0.0
     assert float(row["epe_px"]) == pytest.approx(5 * 300 / (40 * 59), abs=1e-6)
+
+
+def test_dropped_frames_and_seconds_stand_in_the_row():
+    # Two frames are missing between a and b, which are 0.1 s apart; all moves by 5 px.
+    raw = np.zeros((2, 40, 60), np.float32)
+    raw[:] = np.float32([3.0, -4.0]).reshape(2, 1, 1)
+    before = frame("a", position=4, timestamp_s=2.0)
+    now = frame("b", position=7, timestamp_s=2.1, world_from_cam=moved(0.5))
+    row = score(7, sequences.factorize_pair(before, now, raw), moving_px=1.0)
+    assert row["gap"] == 2
+    assert float(row["raw_median_px_per_s"]) == pytest.approx(50.0)
+    # Half a metre to the right before a wall 4 m away: -30 * 0.5 / 4 = -3.75 px.
+    assert float(row["ego_median_px_per_s"]) == pytest.approx(37.5, rel=1e-4)
+    assert float(row["obj_median_px_per_s"]) == pytest.approx(10 * np.hypot(6.75, 4), rel=1e-4)
+    # Played backwards, the later frame comes first.
+    assert score(7, sequences.factorize_pair(now, before, raw), moving_px=1.0)["gap"] == 2
 
 
 def test_what_is_unknown_is_empty_in_the_row():

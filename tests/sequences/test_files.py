@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
 import re
+import signal
 import struct
 
 import numpy as np
@@ -167,6 +171,67 @@ def test_a_mistake_ends_in_a_line_that_names_the_file(name, file, content, says,
     # Where sizes differ, it is the frame's.
     named = "0001.png" if "colour 39" in says or "flow 40" in says else file.split("/")[-1]
     assert says in refusal(lambda: open_it(tmp_path), named)
+
+
+def npy_header(shape) -> bytes:
+    file = io.BytesIO()
+    header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue()
+
+
+# Format, file, what it holds: what no memory, no patience and no shape would be enough for.
+BROKEN = [
+    ("frames", "depth/0001.npy", npy_header((400_000, 400_000))),  # 596 GiB
+    ("frames", "depth/0001.npy", npy_header((0, 40))),
+    ("frames", "flow/0001.flo", flo(-40, -24, 8 * 40 * 24)),
+    ("frames", "flow/0001.flo", flo(40, -1, 8 * 40 * 24)),
+    ("frames", "flow/0001.flo", flo(0, 24, 0)),
+    ("sintel", "depth/cave/frame_0001.dpt", flo(-40, -24, 4 * 40 * 24)),
+]
+
+
+@pytest.mark.parametrize(("name", "file", "content"), BROKEN)
+def test_a_size_that_cannot_be_ends_in_a_line(name, file, content, tmp_path):
+    write, open_it, *_ = FORMATS[name]
+    write(tmp_path)
+    if file.endswith(".npy"):
+        (tmp_path / file).with_suffix(".png").unlink()
+    put(tmp_path / file, content)
+    refusal(lambda: open_it(tmp_path), file.split("/")[-1])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_pipe_is_refused_and_not_waited_for(name, tmp_path):
+    write, open_it, *_ = FORMATS[name]
+    write(tmp_path)
+
+    def too_long(*_):
+        raise TimeoutError("it waits for the pipe")
+
+    previous = signal.signal(signal.SIGALRM, too_long)
+    try:
+        for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+            content = path.read_bytes()
+            path.unlink()
+            os.mkfifo(path)
+            signal.alarm(20)
+            with contextlib.suppress(sequences.SequenceError):  # what is optional is not there
+                list(open_it(tmp_path))
+            signal.alarm(0)
+            path.unlink()
+            path.write_bytes(content)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
+
+
+def test_flo5_is_named_as_what_it_is(tmp_path):
+    synthetic.write_frames(tmp_path)
+    (tmp_path / "flow/0001.flo").rename(tmp_path / "flow/0001.flo5")
+    says = refusal(lambda: sequences.open_recording(tmp_path, "frames"), "0001.flo5")
+    assert ".flo" in says
 
 
 def test_a_frame_that_a_table_lacks_is_left_out_and_named(tmp_path):

@@ -1,0 +1,436 @@
+"""What a declaration may say: files of many kinds, matching, poses, lenses."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2", reason="recordings need OpenCV")
+
+import cv2
+
+from flowrep.sequences import SequenceError, factorize_frames, open_recording
+from tests.sequences import synthetic
+from tests.sequences.synthetic import HEIGHT, WIDTH, K, numbers, put, quaternion_line
+
+FRAMES = ("0000", "0001", "0002")
+
+
+def open_frames(folder, **options):
+    return open_recording(folder, "frames", **options)
+
+
+@pytest.fixture
+def moments(tmp_path):
+    return synthetic.write_frames(tmp_path)
+
+
+def replace(folder, suffix, content):
+    """Writes frame 1's map in another kind of file."""
+    path = folder / "0001.png"
+    path.unlink()
+    if suffix == ".npy":
+        np.save(path.with_suffix(suffix), content)
+    else:
+        path.with_suffix(suffix).write_bytes(cv2.imencode(suffix, content)[1].tobytes())
+
+
+# Files.
+
+
+@pytest.mark.parametrize(
+    ("suffix", "dtype", "unit_m"),
+    [
+        (".pgm", np.uint16, 0.001), (".tiff", np.uint16, 0.001), (".tiff", np.float32, 1.0),
+        (".pfm", np.float32, 1.0), (".npy", np.uint16, 0.001), (".npy", np.int32, 0.001),
+        (".npy", np.float64, 1.0),
+    ],
+)  # fmt: skip
+def test_depth_in_files_of_many_kinds(suffix, dtype, unit_m, moments, tmp_path):
+    stored = moments[1].depth / unit_m
+    stored = (np.rint(stored) if unit_m < 1 else stored).astype(dtype)
+    replace(tmp_path / "depth", suffix, stored)
+    np.testing.assert_allclose(open_frames(tmp_path)[1].depth, moments[1].depth, rtol=1e-6)
+    scaled = open_frames(tmp_path, depth_unit_m=2 * unit_m)[1].depth
+    np.testing.assert_allclose(scaled, 2 * moments[1].depth, rtol=1e-6)
+
+
+def test_an_array_with_a_channel_is_a_map(moments, tmp_path):
+    replace(tmp_path / "depth", ".npy", moments[1].depth[..., None])
+    np.testing.assert_array_equal(open_frames(tmp_path)[1].depth, moments[1].depth)
+
+
+def test_of_an_exr_file_the_depth_is_read(moments, tmp_path):
+    OpenEXR = pytest.importorskip("OpenEXR", reason="no OpenEXR")
+    (tmp_path / "depth/0001.png").unlink()
+    path = tmp_path / "depth/0001.exr"
+    planes = dict.fromkeys(("View.Combined.A", "View.Combined.R"), 0 * moments[1].depth)
+    OpenEXR.File({}, planes | {"View.Depth.Z": moments[1].depth}).write(str(path))
+    np.testing.assert_array_equal(open_frames(tmp_path)[1].depth, moments[1].depth)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(SequenceError, match=r"0001\.exr"):
+        open_frames(tmp_path)[1]
+
+
+def test_carlas_depth_has_24_bits(moments, tmp_path):
+    # red + 256 green + 65536 blue, of 2^24 - 1 for a kilometre; OpenCV writes blue first.
+    for i, moment in enumerate(moments):
+        code = np.rint(moment.depth / 1000 * (2**24 - 1)).astype(np.uint32)
+        if i == 1:
+            code[2, 3] = 2**24 - 1
+        coded = np.stack([code >> 16, code >> 8 & 255, code & 255], -1).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"depth/{i:04d}.png"), coded)
+    unit_m = 1000 / (2**24 - 1)
+    options = {"depth_coding": "rgb24", "depth_unit_m": unit_m, "depth_missing": []}
+    depth = open_frames(tmp_path, **options, depth_no_surface=2**24 - 1)[1].depth
+    assert depth[2, 3] == np.inf
+    depth[2, 3] = moments[1].depth[2, 3]
+    np.testing.assert_allclose(depth, moments[1].depth, atol=unit_m)
+
+
+@pytest.mark.parametrize("suffix", [".ppm", ".tiff", ".bmp", ".npy"])
+def test_pictures_in_files_of_many_kinds(suffix, moments, tmp_path):
+    blue_green_red = moments[1].rgb[..., ::-1]
+    replace(tmp_path / "rgb", suffix, moments[1].rgb if suffix == ".npy" else blue_green_red)
+    np.testing.assert_array_equal(open_frames(tmp_path)[1].rgb, moments[1].rgb)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".pfm"])
+def test_flow_in_files_of_many_kinds(suffix, moments, tmp_path):
+    u, v = moments[1].raw
+    (tmp_path / "flow/0001.flo").unlink()
+    if suffix == ".npy":
+        np.save(tmp_path / "flow/0001.npy", np.stack([u, v], -1))
+    else:  # OpenCV writes the last channel first
+        content = cv2.imencode(suffix, np.stack([0 * u, v, u], -1))[1].tobytes()
+        put(tmp_path / "flow/0001.pfm", content)
+    np.testing.assert_array_equal(open_frames(tmp_path)[1].raw, moments[1].raw)
+
+
+def test_a_byte_order_mark_is_not_a_number(tmp_path):
+    synthetic.write_tum(tmp_path)
+    for name in ("rgb", "depth", "groundtruth"):
+        path = tmp_path / f"{name}.txt"
+        lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+        path.write_bytes(b"\xef\xbb\xbf" + "\n".join(lines).encode())
+    assert len(open_recording(tmp_path, "tum")) == 3
+
+
+# What belongs together.
+
+
+def test_files_named_by_their_times_are_matched_by_these(moments, tmp_path):
+    # Pictures every 100 ms in nanoseconds; depth 4 ms later, of the second picture 60 ms later.
+    poses = []
+    for i, moment in enumerate(moments):
+        later = (4, 60, 4)[i]
+        (tmp_path / f"rgb/{i:04d}.png").rename(tmp_path / f"rgb/{10**9 + i * 10**8}.png")
+        (tmp_path / f"depth/{i:04d}.png").rename(
+            tmp_path / f"depth/{10**9 + i * 10**8 + later * 10**6}.png"
+        )
+        poses.append(f"{10**9 + i * 10**8 + 7 * 10**6} {quaternion_line(moment.world_from_cam)}")
+    put(tmp_path / "poses.txt", poses)
+    options = {"depth_by": "time", "rows_by": "time", "time_unit_s": 1e-9, "flow": None}
+    options |= {"pose_layout": "xyz_xyzw", "times": None}
+    recording = open_frames(tmp_path, **options)
+    assert [frame.timestamp_s for frame in recording] == pytest.approx([1.0, 1.2])
+    assert "1100000000" in recording.notes[0]
+    for frame, moment in zip(recording, (moments[0], moments[2])):
+        np.testing.assert_allclose(frame.depth, moment.depth, rtol=1e-6)
+        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-9)
+    # 7 ms are too many; with an offset they are 1 ms.
+    with pytest.raises(SequenceError, match="tolerance_s"):
+        open_frames(tmp_path, **options, tolerance_s=0.005)
+    assert len(open_frames(tmp_path, **options, tolerance_s=0.005, pose_offset_s=-0.006)) == 2
+
+
+def test_depth_of_other_names_is_matched_by_its_order(moments, tmp_path):
+    for i, name in enumerate(FRAMES):
+        (tmp_path / f"depth/{name}.png").rename(tmp_path / f"depth/d{i}.png")
+    with pytest.raises(SequenceError, match="lacks"):
+        open_frames(tmp_path)
+    frame = open_frames(tmp_path, depth_by="order")[2]
+    np.testing.assert_allclose(frame.depth, moments[2].depth, rtol=1e-6)
+    (tmp_path / "depth/d0.png").unlink()
+    with pytest.raises(SequenceError, match="lacks"):
+        open_frames(tmp_path, depth_by="order")
+
+
+def test_frames_may_be_left_out_by_name(moments, tmp_path):
+    recording = open_frames(tmp_path, leave_out=["0001"])
+    assert [frame.name for frame in recording] == ["0000", "0002"]
+    assert "0001" in recording.notes[0]
+    # Flow of its own is that since frame 1, so that no pair is left.
+    assert [*factorize_frames(recording, lambda a, b: b.raw)] == [None, None]
+    assert [frame.position for frame in recording] == [0, 2]
+    with pytest.raises(SequenceError, match=r"leave_out.*0009"):
+        open_frames(tmp_path, leave_out=["0009"])
+
+
+# Poses.
+
+LOST = {
+    "-inf": " ".join(["-inf"] * 16), "nan": " ".join(["nan"] * 12), "zeros": " ".join(["0"] * 16),
+    "zeros but for the last row": "0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 1",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lost", LOST)
+def test_a_lost_pose_is_left_out_and_counted(lost, moments, tmp_path):
+    width = len(LOST[lost].split())
+    lines = [numbers(m.world_from_cam.ravel()[:width]) for m in moments]
+    put(tmp_path / "poses.txt", [lines[0], LOST[lost], lines[2]])
+    recording = open_frames(tmp_path)
+    assert [frame.name for frame in recording] == ["0000", "0002"]
+    (note,) = recording.notes
+    assert note.startswith("1 of 3")
+    assert "poses.txt" in note
+    np.testing.assert_allclose(recording[1].world_from_cam, moments[2].world_from_cam)
+    # The row of one that is wrong is named as before.
+    put(tmp_path / "poses.txt", [LOST[lost], lines[1], numbers(2 * np.eye(4)[: width // 4])])
+    with pytest.raises(SequenceError, match=r"poses\.txt.*\[2\]"):
+        open_frames(tmp_path)
+
+
+def test_a_lost_quaternion_is_left_out_too(tmp_path):
+    moments = synthetic.write_tum(tmp_path)
+    lines = (tmp_path / "groundtruth.txt").read_text().splitlines()
+    time_s = lines[2].split()[0]
+    for numbers_lost in ("1 2 3 0 0 0 0", "nan nan nan 0 0 0 1"):
+        put(tmp_path / "groundtruth.txt", [lines[1], f"{time_s} {numbers_lost}", lines[3]])
+        recording = open_recording(tmp_path, "tum")
+        assert len(recording) == len(moments) - 1
+        assert recording.notes[0].startswith("1 of 3")
+
+
+LAYOUTS = {"xyz_xyzw": [0, 1, 2, 3, 4, 5, 6], "xyz_wxyz": [0, 1, 2, 6, 3, 4, 5]} | {
+    "xyzw_xyz": [3, 4, 5, 6, 0, 1, 2]
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layouts_of_a_quaternion(layout, moments, tmp_path):
+    rows = [np.array(quaternion_line(m.world_from_cam).split())[LAYOUTS[layout]] for m in moments]
+    put(tmp_path / "poses.txt", [" ".join(row) for row in rows])
+    for frame, moment in zip(open_frames(tmp_path, pose_layout=layout), moments):
+        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-12)
+
+
+# Where OpenCV's right, down and forward lie in the axes of left-handed cameras.
+LEFT_HANDED = {
+    "unity": np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, 1]]),  # x right, y up, z forward
+    "unreal": np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]]),  # x forward, y right, z up
+}
+
+
+@pytest.mark.parametrize("axes", LEFT_HANDED)
+@pytest.mark.parametrize("direction", ["camera_to_world", "world_to_camera"])
+def test_left_handed_poses_give_the_same_motion(axes, direction, moments, tmp_path):
+    mirror, given_from_opencv = np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(4)
+    given_from_opencv[:3, :3] = LEFT_HANDED[axes]
+    poses = [mirror @ m.world_from_cam @ np.linalg.inv(given_from_opencv) for m in moments]
+    assert all(np.linalg.det(pose) > 0 for pose in poses)
+    poses = [np.linalg.inv(p) if direction == "world_to_camera" else p for p in poses]
+    put(tmp_path / "poses.txt", map(numbers, poses))
+    recording = open_frames(tmp_path, pose_axes=axes, pose_direction=direction)
+    truth = iter(moments[1:])
+    for made in [*factorize_frames(recording, lambda a, b: next(truth).raw)][1:]:
+        expected = moments[int(made.frame.name)].obj
+        assert np.abs(made.obj - expected).max() < 2e-4
+
+
+def test_a_negative_fy_is_refused_with_the_mirror(tmp_path):
+    synthetic.write_tum(tmp_path)
+    with pytest.raises(SequenceError, match="pose_axes=unity"):
+        open_recording(tmp_path, "tum", intrinsics=[481.2, -480.0, 319.5, 239.5])
+
+
+@pytest.mark.parametrize("count", [7, 12, 16])
+def test_poses_of_a_marker_and_poses_that_lag(count, moments, tmp_path):
+    marker_from_cam = synthetic.rigid((0.1, -0.2, 0.3), (0.05, 0.12, -0.02)).numpy()
+    poses = [m.world_from_cam @ np.linalg.inv(marker_from_cam) for m in moments]
+    # The pose of frame i is in row i + 1.
+    put(tmp_path / "poses.txt", map(numbers, [np.eye(4), *poses[:2]]))
+    given = quaternion_line(marker_from_cam).split() if count == 7 else marker_from_cam.ravel()
+    given = [float(x) for x in given][:count]
+    recording = open_frames(tmp_path, marker_from_cam=given, pose_lag_frames=1)
+    assert [frame.name for frame in recording] == ["0000", "0001"]  # the last has no row
+    for frame, moment in zip(recording, moments):
+        np.testing.assert_allclose(frame.world_from_cam, moment.world_from_cam, atol=1e-9)
+
+
+# Cameras.
+
+
+def test_intrinsics_in_files_and_lists(moments, tmp_path):
+    put(tmp_path / "K.txt", map(numbers, K))
+    put(tmp_path / "camera.json", [json.dumps({"left": {"f": [31, 27], "c": [[18.5, 13]]}})])
+    for name in FRAMES:
+        put(tmp_path / f"K/{name}.txt", [numbers([31.0, 27.0, 18.5, 13.0])])
+    for given in ("K.txt", "K/*.txt", [31.0, 27.0, 18.5, 13.0], [*K.ravel()]):
+        assert open_frames(tmp_path, intrinsics=given)[1].K.tolist() == K.tolist()
+    opencv = open_frames(tmp_path, intrinsics="K.txt", first_pixel_centre=0.0)[1].K
+    assert opencv[:2, 2].tolist() == [19.0, 13.5]
+    # A focal length of 0.75 picture widths, of which there are 40.
+    expected = [[30, 0, 20], [0, 30, 12], [0, 0, 1]]
+    assert open_frames(tmp_path, intrinsics=[0.75])[1].K.tolist() == expected
+    with pytest.raises(SequenceError, match="fx, fy, cx, cy"):
+        open_frames(tmp_path, intrinsics=[31.0, 27.0])
+
+
+def test_pictures_are_shrunk_to_the_size_of_depth_with_their_camera(moments, tmp_path):
+    for i, moment in enumerate(moments):
+        put(tmp_path / f"rgb/{i:04d}.png", moment.rgb.repeat(3, 0).repeat(2, 1))
+    large = [2 * 31.0, 3 * 27.0, 2 * 18.5, 3 * 13.0]
+    with pytest.raises(SequenceError, match="differ in size"):
+        open_frames(tmp_path, intrinsics=large)[0]
+    frame = open_frames(tmp_path, intrinsics=large, resize_rgb=True)[0]
+    np.testing.assert_array_equal(frame.rgb, moments[0].rgb)
+    np.testing.assert_allclose(frame.K, K)
+
+
+def test_depth_of_little_confidence_is_missing(moments, tmp_path):
+    for name in FRAMES:
+        trust = np.full((HEIGHT, WIDTH), 2, np.uint8)
+        trust[3, 4], trust[5, 6] = 0, 1
+        put(tmp_path / f"trust/{name}.png", trust)
+    for least, missing in ((1, [[3, 4]]), (2, [[3, 4], [5, 6]])):
+        depth = open_frames(tmp_path, confidence="trust/*", min_confidence=least)[1].depth
+        assert np.argwhere(np.isnan(depth)).tolist() == missing
+    put(tmp_path / "trust/0001.png", np.zeros((3, 4), np.uint8))
+    with pytest.raises(SequenceError, match="confidence"):
+        open_frames(tmp_path, confidence="trust/*")[1]
+
+
+# Lenses. A camera with K sees a wall with a smooth picture, at a depth that grows to the right.
+RADIAL = [-0.28, 0.07, 0.002, -0.003, 0.01]  # k1, k2, p1, p2, k3
+FISHEYE = [0.08, -0.03, 0.01, -0.002]
+LENS_K = np.array([[95.0, 0.0, 62.5], [0.0, 90.0, 44.0], [0.0, 0.0, 1.0]])
+LENS_SIZE = (90, 120)
+
+
+def distorted(x, y, lens):
+    """Returns where a lens puts the direction (x, y, 1), by OpenCV's formulas."""
+    r2 = x * x + y * y
+    if lens == "fisheye":
+        r = np.sqrt(r2)
+        angle = np.arctan(r)
+        k1, k2, k3, k4 = FISHEYE
+        scale = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+        scale = np.where(r > 0, scale / np.where(r > 0, r, 1), 1.0)
+        return x * scale, y * scale
+    k1, k2, p1, p2, k3 = RADIAL
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def directions():
+    row, column = np.indices(LENS_SIZE) + 0.5  # pixel centres
+    return (column - 62.5) / 95, (row - 44) / 90
+
+
+def undistorted(x, y, lens):
+    """Returns the direction that a lens puts at (x, y), by fixed-point steps."""
+    u, v = x, y
+    for _ in range(200):
+        there = distorted(u, v, lens)
+        u, v = u + x - there[0], v + y - there[1]
+    return u, v
+
+
+def picture(x, y):
+    waves = (np.sin(3 * x + 1), np.cos(2 * y), np.sin(2 * x - 3 * y))
+    return np.stack([127 + 100 * wave for wave in waves], -1)
+
+
+def write_lens(folder, lens):
+    seen = undistorted(*directions(), lens)  # what the camera's pixels see
+    wall = 2.0 + seen[0]
+    for name in ("0", "1"):
+        put(folder / f"rgb/{name}.png", np.rint(picture(*seen)).astype(np.uint8))
+        put(folder / f"depth/{name}.npy", wall.astype(np.float32))
+    return wall
+
+
+@pytest.mark.parametrize("lens", ["opencv", "fisheye"])
+@pytest.mark.parametrize("place", ["options", "intrinsics.json"])
+def test_a_lens_is_taken_out_of_pictures_and_depth(lens, place, tmp_path):
+    wall = write_lens(tmp_path, lens)
+    coefficients = FISHEYE if lens == "fisheye" else RADIAL
+    options = {"intrinsics": [95.0, 90.0, 62.5, 44.0], "distortion": coefficients, "lens": lens}
+    if place == "intrinsics.json":
+        camera = {"width": 120, "height": 90, "fx": 95, "fy": 90, "cx": 62, "cy": 43.5}
+        camera |= {"first_pixel_centre": 0, "distortion": coefficients, "lens": lens}
+        put(tmp_path / "intrinsics.json", [json.dumps(camera)])
+        options = {}
+    recording = open_frames(tmp_path, **options)
+    frame = recording[1]
+    assert any("undistorted" in note for note in recording.notes)
+    np.testing.assert_allclose(frame.K, LENS_K)
+    # Pixel (row, column) of the rectified camera sees (x, y), which the lens puts at (u, v).
+    x, y = directions()
+    u, v = (a * f + c for a, f, c in zip(distorted(x, y, lens), (95, 90), (62.5, 44)))
+    inside = (u >= 0.5) & (u <= 119.5) & (v >= 0.5) & (v <= 89.5)
+    assert inside.mean() > 0.8
+    # Colour is interpolated: that of the direction, but for the rounding to 8 bits; with the pixel
+    # centre half a pixel off it would be 2 off.
+    error = np.abs(frame.rgb - picture(x, y))[inside]
+    assert error.max() < 1.6
+    assert error.mean() < 0.5
+    # Depth is the nearest stored value.
+    nearest = wall[
+        np.clip(np.rint(v - 0.5), 0, 89).astype(int), np.clip(np.rint(u - 0.5), 0, 119).astype(int)
+    ]
+    known = np.isfinite(frame.depth)
+    assert (known[inside]).all()
+    np.testing.assert_allclose(frame.depth[inside], nearest[inside], atol=0.011)  # a column is 1/95
+    exact = np.isclose(frame.depth, nearest, atol=1e-6)[inside]
+    assert exact.mean() > 0.97  # halves may be rounded either way
+    outside = (u < -1) | (u > 121) | (v < -1) | (v > 91)
+    assert not known[outside].any()
+
+
+def test_a_lens_needs_as_many_numbers_as_its_formula_has(moments, tmp_path):
+    with pytest.raises(SequenceError, match=r"distortion.*fisheye"):
+        open_frames(tmp_path, distortion=RADIAL, lens="fisheye")[0]
+
+
+def test_flow_of_distorted_pictures_is_not_used(moments, tmp_path):
+    recording = open_frames(tmp_path, distortion=RADIAL)
+    assert not recording.has_flow
+    assert "distorted" in recording.no_flow
+
+
+# Gaps.
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_a_frame_knows_its_place_in_a_recording_with_gaps(timed, tmp_path):
+    places = [0, 1, 2, 4, 5, 8]
+    for place in places:
+        put(tmp_path / f"rgb/{10 * place:04d}.png", np.zeros((4, 6, 3), np.uint8))
+        put(tmp_path / f"depth/{10 * place:04d}.png", np.full((4, 6), 1000, np.uint16))
+    if timed:  # 30 a second, with a jitter of 3 ms
+        put(tmp_path / "timestamps.txt", [f"{p / 30 + 0.003 * (p % 2)}" for p in places])
+    recording = open_frames(tmp_path, intrinsics=[1.0])
+    assert [frame.position for frame in recording] == places
+
+
+def test_flow_since_a_frame_that_is_missing_is_refused(tmp_path):
+    synthetic.write_vkitti2(tmp_path)
+    for kind in ("rgb", "depth"):
+        (tmp_path / f"frames/{kind}/Camera_0/{kind}_00001.png").unlink()
+    for number in range(3, 6):  # the usual step is 1
+        for kind in ("rgb", "depth", "backwardFlow"):
+            folder = tmp_path / f"frames/{kind}/Camera_0"
+            (folder / f"{kind}_{number:05d}.png").write_bytes(
+                (folder / f"{kind}_00002.png").read_bytes()
+            )
+    recording = open_recording(tmp_path, "vkitti2", poses=None, intrinsics=[0.5])
+    assert [frame.raw_since for frame in recording] == [None, None, "00002", "00003", "00004"]
+    assert [frame.position for frame in recording] == [0, 2, 3, 4, 5]
