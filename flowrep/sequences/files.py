@@ -144,8 +144,8 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
-    # OpenCV fills up a JPEG (before version 5 a PNG, too) that was cut off with grey and says
-    # nothing, so look for its end. Some cameras write a few bytes after it.
+    # Before version 5 OpenCV fills up a picture that was cut off with grey and says nothing, so
+    # look for its end. Some cameras write a few bytes after it.
     end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(data[:2], b"")
     if not data or end not in data[-4096:]:
         return None

@@ -235,6 +235,8 @@ def test_left_handed_poses_give_the_same_motion(axes, direction, moments, tmp_pa
     poses = [np.linalg.inv(p) if direction == "world_to_camera" else p for p in poses]
     put(tmp_path / "poses.txt", map(numbers, poses))
     recording = open_frames(tmp_path, pose_axes=axes, pose_direction=direction)
+    for frame in recording:  # the world is mirrored, too
+        assert np.linalg.det(frame.world_from_cam) == pytest.approx(1)
     truth = iter(moments[1:])
     for made in [*factorize_frames(recording, lambda a, b: next(truth).raw)][1:]:
         expected = moments[int(made.frame.name)].obj
@@ -289,6 +291,18 @@ def test_pictures_are_shrunk_to_the_size_of_depth_with_their_camera(moments, tmp
     frame = open_frames(tmp_path, intrinsics=large, resize_rgb=True)[0]
     np.testing.assert_array_equal(frame.rgb, moments[0].rgb)
     np.testing.assert_allclose(frame.K, K)
+
+
+def test_rays_are_those_of_depths_camera(moments, tmp_path):
+    # Of the same place, but with half the focal length: pixel (12, 20) sees along the axis of both,
+    # (12, 30) of the pictures sees x = 10 / 30 where depth's camera has its column 25, x = 5 / 15.
+    for name in FRAMES:
+        (tmp_path / f"depth/{name}.png").unlink()
+        np.save(tmp_path / f"depth/{name}.npy", np.full((HEIGHT, WIDTH), 2.0, np.float32))
+    cameras = {"intrinsics": [30.0, 30.0, 20.5, 12.5], "depth_intrinsics": [15.0, 15.0, 20.5, 12.5]}
+    depth = open_frames(tmp_path, **cameras, depth_kind="ray_length")[0].depth
+    assert depth[12, 20] == pytest.approx(2.0)
+    assert depth[12, 30] == pytest.approx(2.0 / np.hypot(1, 1 / 3), rel=1e-6)
 
 
 def test_depth_of_little_confidence_is_missing(moments, tmp_path):
