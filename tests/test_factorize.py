@@ -352,6 +352,14 @@ def test_a_format_of_ones_own_says_what_is_different(moments, tmp_path, monkeypa
         np.testing.assert_allclose(obj, moment.obj, atol=2e-4)
 
 
+def test_the_format_of_ones_own_in_the_docs_has_keys_that_there_are():
+    page = (CONF_DIR.parent / "docs/factorize.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```yaml\n(defaults.*?)```", page, re.DOTALL)
+    keys = OmegaConf.to_container(OmegaConf.create(block))
+    assert keys.pop("defaults") == ["frames", "_self_"]
+    assert keys.keys() <= declaration("frames").keys()
+
+
 def test_a_still_camera_needs_neither_poses_nor_depth(tmp_path):
     # A texture before which another goes 2 px to the right each frame.
     random = np.random.default_rng(0)

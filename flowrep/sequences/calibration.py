@@ -77,7 +77,7 @@ def read_cameras(path: Path) -> Cameras:
         '"first_pixel_centre": 0 (as OpenCV calibrates) or 0.5}'
     )
     try:
-        return Cameras.model_validate_json(regular(path).read_bytes())
+        return Cameras.model_validate_json(regular(path).read_text("utf-8-sig", "replace"))
     except FileNotFoundError:
         raise SequenceError(path, f"no such file; {remedy}") from None
     except pydantic.ValidationError as error:

@@ -164,6 +164,8 @@ class DeclaredRecording(Recording):
                 lines = [line.split(maxsplit=1) for line in files.read_lines(path)]
                 found = {Path(name).stem: self.folder / name for _, name in lines}
                 times = [float(time) for time, _ in lines]
+                if len(found) < len(times):
+                    raise ValueError("two pictures have one name")
         except (ValueError, FileNotFoundError) as error:
             remedy = f"give the folder whose {path.name} has '<time> <file>' in each line"
             says = "is missing" if isinstance(error, FileNotFoundError) else error

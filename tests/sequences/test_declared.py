@@ -110,6 +110,10 @@ def test_flow_in_files_of_many_kinds(suffix, moments, tmp_path):
 
 
 def test_a_byte_order_mark_is_not_a_number(tmp_path):
+    synthetic.write_frames(tmp_path / "plain")
+    path = tmp_path / "plain/intrinsics.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(open_frames(tmp_path / "plain")) == 3
     synthetic.write_tum(tmp_path)
     for name in ("rgb", "depth", "groundtruth"):
         path = tmp_path / f"{name}.txt"
