@@ -1,4 +1,9 @@
-"""Evaluates agents: `python -m flowrep.evaluate run=outputs/... 'speed=[low,high]'`."""
+"""Evaluates agents: `python -m flowrep.evaluate run=outputs/... 'speed=[low,high]'`.
+
+What needs PyTorch, which takes seconds to import, is imported when the config has passed.
+"""
+
+from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
@@ -6,7 +11,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from flowrep.extras import require
 
@@ -15,13 +20,12 @@ require("evaluation", "train", "hydra", "pydantic", module=__name__)
 from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
 from flowrep.config.schema import EvaluateConfig
-from flowrep.experiment import build
-from flowrep.experiment.agents import Agent, load_trained
-from flowrep.experiment.evaluation import Comparison, print_results
-from flowrep.experiment.film import record_episode
-from flowrep.experiment.run import RunFolder
-from flowrep.policies import load_agent
 from flowrep.progress import StopRequest
+
+if TYPE_CHECKING:
+    from flowrep.experiment.agents import Agent
+    from flowrep.experiment.evaluation import Comparison
+    from flowrep.experiment.run import RunFolder
 
 
 class Target(NamedTuple):
@@ -60,6 +64,10 @@ def run(config: EvaluateConfig) -> None:
 
 def targets_of(config: EvaluateConfig) -> list[Target]:
     """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own."""
+    from flowrep.experiment.agents import load_trained
+    from flowrep.experiment.run import RunFolder
+    from flowrep.policies import load_agent
+
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.own_policies:
         runs: dict[Path, RunFolder] = {}  # each once, under whatever names
@@ -84,6 +92,9 @@ def evaluate_one(
     config: EvaluateConfig, target: Target, comparisons: dict[str, Comparison], stop: StopRequest
 ) -> None:
     """Runs an agent's episodes, keeps finished ones even if interrupted, and films some."""
+    from flowrep.experiment import build
+    from flowrep.experiment.evaluation import Comparison, print_results
+
     agent, folder = target.load(), target.folder
     origin = agent.origin("evaluate")
     # agents of one scene share the baselines' episodes
@@ -125,6 +136,8 @@ def evaluate_one(
 
 def film(config: EvaluateConfig, agent: Agent, folder: RunFolder, stop: StopRequest) -> None:
     """Writes `video` episodes for each speed and frame rate, until a stop is asked for."""
+    from flowrep.experiment.film import record_episode
+
     name = agent.config.scene["name"]
     where = "" if name == agent.trained_in else f"{name}_"
     for speed, rate, number in product(config.speed, config.fps, range(config.video)):

@@ -1,32 +1,53 @@
-"""Trains an agent: `python -m flowrep.train 'representations=[ego,obj]' preset=laptop`."""
+"""Trains an agent: `python -m flowrep.train 'representations=[ego,obj]' preset=laptop`.
+
+What needs PyTorch, which takes seconds to import, is imported when the config has passed.
+"""
 
 from __future__ import annotations
 
 import logging
 import sys
+from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
 
 require("training", "train", "hydra", "pydantic", "matplotlib", "imageio", module=__name__)
 
-import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
 
 from flowrep import sweep
-from flowrep.agent import CheckpointError, DivergenceError
-from flowrep.agent.observation import compute_dtype
 from flowrep.config import UsageError
-from flowrep.config.cli import OF_THE_MACHINE, exit_with, line_for, run_command
+from flowrep.config.cli import OF_THE_MACHINE, checked, end_with, exit_with, line_for, run_command
 from flowrep.config.schema import TrainConfig, validated_run
-from flowrep.envs import WorkerError
-from flowrep.envs.workers import available_cores
-from flowrep.experiment import build
-from flowrep.experiment.run import RunFolder, cpu_name, machine_of
-from flowrep.experiment.runner import Runner
 from flowrep.progress import StopRequest
-from flowrep.scenes import load_scene
+
+if TYPE_CHECKING:
+    from flowrep.experiment.run import RunFolder
+    from flowrep.experiment.runner import Runner
 
 PATIENCE_S = 60.0  # for the process of a run that was stopped and still saves
+
+
+class EarlyCheck(Callback):
+    """Refuses a config before Hydra makes the run's folder; conf/run_folder.yaml names it."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Ends the process if the config is wrong."""
+        try:
+            model = checked(config, TrainConfig)
+            if model.resume is not None:
+                return
+            from flowrep.scenes import load_scene
+
+            load_scene(model.scene)
+            if model.device not in ("auto", "cpu"):
+                from flowrep.experiment import build
+
+                build.device(model.device)
+        except Exception as error:  # Hydra would only warn
+            end_with(error, TrainConfig)
 
 
 def run(config: TrainConfig) -> float:
@@ -34,13 +55,14 @@ def run(config: TrainConfig) -> float:
 
     Returns its final success, which a sweeper such as Optuna maximises.
     """
+    from flowrep.experiment.run import RunFolder
+
     job = HydraConfig.get()
     typed = list(job.overrides.task)
     if config.resume is not None:
         folder = RunFolder.existing(config.resume)
         with folder.held("training", PATIENCE_S):
             return finish(resumed(config, folder, typed), folder)
-    load_scene(config.scene)
     folder = RunFolder(job.runtime.output_dir)
     with folder.held("training"):
         folder.check_is_new()
@@ -73,6 +95,12 @@ def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainCo
 
 def announce(config: TrainConfig, preset: str) -> None:
     """Prints what is about to be run where, and on a CPU how long the paper's settings take."""
+    import torch
+
+    from flowrep.envs.workers import available_cores
+    from flowrep.experiment import build
+    from flowrep.experiment.run import cpu_name
+
     device = build.device(config.device)
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
     cores = f", {available_cores()} cores" if device.type == "cpu" else ""
@@ -88,6 +116,12 @@ def announce(config: TrainConfig, preset: str) -> None:
 
 def finish(config: TrainConfig, folder: RunFolder) -> float:
     """Does what remains of a run (training, evaluation, video) and returns its success."""
+    from flowrep.agent import CheckpointError, DivergenceError
+    from flowrep.agent.observation import compute_dtype
+    from flowrep.envs import WorkerError
+    from flowrep.experiment.run import machine_of
+    from flowrep.experiment.runner import Runner
+
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
     how_to_go_on = line_for("train", resume=str(folder.path))
     with StopRequest() as stop:

@@ -11,8 +11,10 @@ import re
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from hashlib import sha1
+from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,16 +23,17 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import env_override
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from flowrep import __version__
 from flowrep.config import CONF_DIR, UsageError, config_groups, group_choices
 from flowrep.config.schema import Section, validated
+from flowrep.config.yaml_file import check_yaml, checked_yaml
 
 EXIT_USAGE = 2
-FOLDERS = ("resume", "run", "input", "output")
+FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir")
 """Keys whose values are folders, which may have any name."""
 OF_THE_MACHINE = ("device", "num_workers")
 """Keys that don't define a run and may change when it is resumed."""
@@ -59,7 +62,8 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[S
     try:
         sys.argv[1:] = as_typed(sys.argv[1:], schema)
         _show_if_asked(sys.argv[1:], config_name)
-        with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra raises its errors, not prints them
+        # Hydra raises its errors, not prints them
+        with env_override({"HYDRA_FULL_ERROR": "1"}), _files_named():
             main(job)()
     except KeyboardInterrupt:
         sys.exit(130)
@@ -68,6 +72,39 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[S
             problem = f"the output folder can't be made ({error}): give another with hydra.run.dir="
             error = UsageError(problem)
         end_with(error, schema)
+
+
+@contextmanager
+def _files_named() -> Iterator[None]:
+    """Lets errors of YAML files that Hydra reads name the file and the line.
+
+    Hydra reads each with `OmegaConf.load`, and has no hook between reading a file and copying what
+    is in it, which takes forever where aliases repeat each other.
+    """
+    load: Any = OmegaConf.load
+
+    def checked_load(file: Any) -> Any:
+        if not hasattr(file, "read"):
+            return load(file)
+        text = file.read()
+        if re.search(r"(^|[\s\[{,])\*\w", text):  # an alias
+            checked_yaml(file.name, text, check_yaml)
+        return checked_yaml(file.name, text, mapping)
+
+    def mapping(text: str) -> Any:
+        try:
+            config = load(StringIO(text))
+        except OmegaConfBaseException as error:  # a key or an interpolation that can't be
+            raise ValueError(error) from error
+        if not isinstance(config, DictConfig):
+            raise ValueError("it should hold `key: value` lines")
+        return config
+
+    OmegaConf.load = checked_load  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        OmegaConf.load = load  # type: ignore[method-assign]
 
 
 def end_with(error: Exception, schema: type[Section]) -> NoReturn:
@@ -105,8 +142,9 @@ def checked(config: DictConfig, schema: type[Section]) -> Any:
 
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
-    """Returns a composed config as plain data, with interpolations resolved."""
-    plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    """Returns a composed config as plain data, without Hydra's, with interpolations resolved."""
+    own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    plain: Any = OmegaConf.to_container(own, resolve=True, throw_on_missing=True)
     return plain
 
 
@@ -124,60 +162,30 @@ def print_error(problem: str | Exception) -> None:
         print(f"error: {line}", file=sys.stderr)
 
 
-# What Hydra says in several lines, and what a newcomer types.
-
-
-_ANSWERS = {
-    r"Ambiguous value for argument '(([^=]+)=(.*))'":
-        "'{0}' is several values: add -m to run each, or write '{1}=[{2}]'",
-    r"Config group override must be":
-        "a group can't be null: write the name of a choice, --help lists them",
-    r"Missing mandatory value(?s:.*)full_key: (\S+)": "{0} needs a value: {0}=...",
-    r"Interpolation key '(\S+)'": "{0} needs a value: {0}=...",
-    r"(Unknown plugin class : 'hydra_plugins\.(\w+))": "{0}...': pip install {1}",
-}  # fmt: skip
-"""Beginnings of Hydra's errors, and what to do about them."""
-
-
 def explained(error: Exception, schema: type[Section]) -> str:
-    """Returns an error of Hydra's in one line, with what exists instead; others as they are."""
+    """Returns an error in a line: after a typo or a wrong choice with what there is instead."""
     text = str(error)
-    if isinstance(error, OverrideParseException):
-        return _unreadable(error.override)
     missing = re.match(r"In '[^']*': Could not (?:find|load) '([^']+)/([^/']+)'", text)
     if isinstance(error, MissingConfigException) and missing:
         group, name = missing.groups()
-        if name.endswith(".yaml"):
-            top, stem = group.partition("/")[0], name.removesuffix(".yaml")
-            return (
-                f"{group}/{name} is a file: put it into a folder {top}/ and write "
-                f"--config-dir <the folder that holds {top}/> {top}={stem}"
-            )
         there = ", ".join(sorted(error.options or group_choices(group)))
-        return f"unknown {group} '{name}'; there are: {there}"
+        file = f"{group}/{name.removesuffix('.yaml')}.yaml"
+        return (
+            f"unknown {group} '{name}'; there are: {there}. A choice of your own is a file {file} "
+            "in a folder that --config-dir names"
+        )
     unknown = re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text)
     if unknown:
         return _unknown_key(unknown[1], schema)
-    for beginning, answer in _ANSWERS.items():
-        if found := re.match(beginning, text):
-            return answer.format(*found.groups())
+    if isinstance(error, UnicodeDecodeError):  # of a file, which it doesn't name
+        line = error.object[: error.end].splitlines()[-1].decode("utf-8", "replace")
+        return f"a YAML file is not in UTF-8: '{line}'"
     if not isinstance(error, HydraException | OmegaConfBaseException):
         return text
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    place = ("full_key:", "object_type=", "See http", "provider=")
-    return " ".join(x for x in lines if not x.startswith(place)).partition(" Config search path")[0]
-
-
-def _unreadable(typed: str) -> str:
-    """Returns why Hydra can't read an argument, and how it could."""
-    key, equals, value = typed.partition("=")
-    if not equals:
-        return f"can't read '{typed}': write key=value; --help lists the keys"
-    if value.startswith("[") and not value.endswith("]"):
-        return f"can't read '{typed}': write a list without spaces, {key}=[a,b], or in quotes"
-    if value.startswith(("[", "{", "(")):
-        return f"can't read '{typed}'"
-    return f"can't read '{typed}'; quoted it is {shlex.join([override(key, value)])}"
+    useless = ("object_type=", "See http", "provider=")
+    said = " ".join(line for line in lines if not line.startswith(useless))
+    return said.partition(" Config search path")[0]
 
 
 def _unknown_key(key: str, schema: type[Section]) -> str:
@@ -186,9 +194,10 @@ def _unknown_key(key: str, schema: type[Section]) -> str:
         return f"unknown key '{key}': --cfg job shows the keys that there are"
     groups = [group for group in config_groups() if group in schema.model_fields]
     files = [(group, path) for group in groups for path in CONF_DIR.glob(f"{group}/**/*.yaml")]
-    places = sorted({f"{group}.{key}" for group, path in files if key in OmegaConf.load(path)})
-    if places:
-        return f"unknown key '{key}': do you mean {' or '.join(places)}?"
+    line = re.compile(rf"^{re.escape(key)}:", re.MULTILINE)
+    meant = sorted({f"{g}.{key}" for g, path in files if line.search(path.read_text("utf-8"))})
+    if meant:
+        return f"unknown key '{key}': do you mean {' or '.join(meant)}?"
     keys = [*schema.model_fields, *(("preset", "debug") if "resume" in schema.model_fields else ())]
     return f"unknown key '{key}'; there are: {', '.join(keys)}"
 
@@ -216,10 +225,13 @@ def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
 
 def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
     """Returns a command line as Hydra reads it: folders quoted, those without a key named `run`."""
-    # quoted are folders that exist, and those that Hydra would take for a number
+    # quoted are folders that exist, and those that Hydra can't read, or would take for a number
     keys, folders, others, previous = schema.model_fields, [], [], ""
     for text in arguments:
         key, _, value = text.partition("=")
+        is_split = value.startswith("[") and "]" not in value  # by the shell, at a space
+        if is_split and not Path(value).exists():
+            raise UsageError(f"'{text}' is no list: write {key}=[a,b], or '{key}=[a, b]' in quotes")
         if text.startswith("--") and key[2:] in {*keys, *config_groups()}:
             raise UsageError(f"'{text}': write {key[2:]}=<value>, without --")
         may_be_bare = "run" in keys and text[:1] not in "-~+" and not previous.startswith("-")
@@ -241,7 +253,8 @@ def _is_misread(key: str, text: str) -> bool:
     """Returns whether a folder's name means something else to Hydra, or might."""
     parsed = _parsed(f"{key}={text}")
     is_number = parsed is not None and isinstance(parsed.value(), int | float)  # true is one, too
-    return Path(text).exists() or (is_number and key != "input")  # that may be a camera's number
+    is_named = is_number and key != "input"  # that may be a camera's number
+    return parsed is None or is_named or Path(text).exists()
 
 
 def value_of(text: str) -> str:

@@ -8,10 +8,10 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from flowrep.config import CONF_DIR
+from flowrep.config import CONF_DIR, UsageError
+from flowrep.config.yaml_file import read_yaml
 from flowrep.scenes.checks import check_path, check_references, check_walks
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.scene import Scene, SceneError
@@ -41,9 +41,9 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
             raise SceneError(f"unknown scene {str(scene)!r}; choose one of {known}, or a YAML file")
         path = CONF_DIR / "scene" / f"{scene}.yaml"
     try:
-        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise SceneError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
+        data = read_yaml(path)
+    except UsageError as error:
+        raise SceneError(str(error)) from error
     return _loaded(data, str(path))
 
 
@@ -96,14 +96,3 @@ def _complaint(error: ValidationError) -> str:
     given = "" if first["type"] == "missing" else f"; got {first['input']!r:.60}"
     return f"{key}: {problem}{given}"
 
-
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, which takes the last of two equal keys, but refuses them instead."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        names = [key.value for key, _ in node.value]
-        for key, _ in node.value:
-            if names.count(key.value) > 1 and key.tag != "tag:yaml.org,2002:merge":
-                problem = f"the key {key.value!r} is given twice"
-                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
-        return super().construct_mapping(node, deep)

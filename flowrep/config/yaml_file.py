@@ -1,0 +1,88 @@
+"""Reads YAML that a user wrote: what is wrong with it is one line, with the file and the line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flowrep.config import UsageError
+
+MAX_NODES = 100_000
+"""Values of a file in which aliases are written out: each scene of flowrep's has some thousand."""
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, which takes the last of two equal keys, but refuses them instead.
+
+    It also refuses aliases that repeat each other: ten lines of ten aliases are 10¹⁰ values as soon
+    as somebody copies what was read, and an alias within its own anchor is endless.
+    """
+
+    def get_single_node(self) -> Any:
+        root = super().get_single_node()
+        if root is not None:
+            self._size(root, {})
+        return root
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        names = [key.value for key, _ in node.value]
+        for key, _ in node.value:
+            if names.count(key.value) > 1 and key.tag != "tag:yaml.org,2002:merge":
+                raise _problem(f"the key {key.value!r} is given twice", key)
+        return super().construct_mapping(node, deep)
+
+    def _size(self, node: Any, sizes: dict[int, int | None]) -> int:
+        """Returns how many values a node has with its aliases written out; `sizes` by identity."""
+        if isinstance(node, yaml.ScalarNode):
+            return 1
+        if id(node) not in sizes:
+            sizes[id(node)] = None  # being counted
+            pairs = isinstance(node, yaml.MappingNode)
+            parts = [part for pair in node.value for part in pair] if pairs else node.value
+            sizes[id(node)] = 1 + sum(self._size(part, sizes) for part in parts)
+        size = sizes[id(node)]
+        if size is None:
+            raise _problem("an alias is within its own anchor", node)
+        if size > MAX_NODES:
+            raise _problem(f"its aliases stand for more than {MAX_NODES:,} values", node)
+        return size
+
+
+def _problem(text: str, node: Any) -> yaml.MarkedYAMLError:
+    return yaml.constructor.ConstructorError(None, None, text, node.start_mark)
+
+
+def read_yaml(path: str | Path) -> Any:
+    """Returns the content of a YAML file.
+
+    Raises:
+        UsageError: it can't be read, in one line with the file and the line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: can't be read: {error}") from error
+    return checked_yaml(path, text, lambda text: yaml.load(text, _Loader))
+
+
+def check_yaml(text: str) -> None:
+    """Raises an error if the aliases of a YAML text repeat each other, or it can't be read."""
+    _Loader(text).get_single_node()
+
+
+def checked_yaml(path: str | Path, text: str, load: Callable[[str], Any]) -> Any:
+    """Returns what `load` makes of the text of a YAML file; its errors name the file."""
+    try:
+        return load(text)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = "" if mark is None else f", line {mark.line + 1}"
+        what = " ".join(filter(None, (error.problem, error.context)))
+        raise UsageError(f"{path}{line}: {what}") from error
+    except RecursionError as error:
+        raise UsageError(f"{path}: is nested too deeply") from error
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise UsageError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
