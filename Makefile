@@ -60,7 +60,7 @@ SCENES = straight_road s_turn h_shaped_pathways three_way_junction
 
 gallery: $(INSTALLED)  ## Make the README's gallery anew
 	for scene in $(SCENES); do \
-	  $(BIN)/python -m flowrep.view scene=$$scene sheet_rows=2 video=false hydra.run.dir=outputs/gallery/$$scene || exit 1; \
+	  $(BIN)/python -m flowrep.view scene=$$scene sheet_rows=2 video=false output=outputs/gallery/$$scene || exit 1; \
 	  cp outputs/gallery/$$scene/sheet.png docs/images/gallery_$$scene.png; \
 	  cp outputs/gallery/$$scene/plan.png docs/images/plan_$$scene.png; \
 	done

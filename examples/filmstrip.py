@@ -7,16 +7,16 @@ representation side by side and `obj_scale.png` explains the scale of object flo
 """
 
 import sys
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from flowrep import pretrained
-from flowrep.baselines import BaselinePolicy
-from flowrep.envs import make_env
-from flowrep.experiment.film import film_episode, make_filmed
+from flowrep.experiment.film import OUTCOME_S, Film
+from flowrep.policies import load_agent
+from flowrep.scenes import load_scene
 from flowrep.viz import (
     FLOW_SCALE_PX,
     flow_note,
@@ -28,30 +28,32 @@ from flowrep.viz import (
 
 
 def main(folder: Path, seed: int = 561807780) -> None:
-    env = make_filmed(partial(make_env, "straight_road"), {})
-    frames, episode = film_episode(env, BaselinePolicy("planner", env), {"episode_seed": seed})
-    env.close()
-    chosen = liveliest(frames)
+    scene = asdict(load_scene("straight_road"))
+    film = Film(load_agent("planner", scene=scene, device="cpu", num_envs=1, num_workers=0))
+    frames, episode = film.drive({"episode_seed": seed})
+    film.close()
+    chosen = liveliest([frame.maps for frame in frames])
     write_png(folder / "strip.png", representation_strip(chosen))
     write_png(folder / "obj_scale.png", three_ways(chosen))
     print(f"{folder}: one of {len(frames)} steps of an episode that ended in {episode.outcome}")
     write_gif(folder / "agent.gif")
 
 
-def write_gif(path: Path, seed: int = 1, steps: slice = slice(20, 92, 2)) -> None:
-    """Films what a trained agent sees, beside the picture and the classes, which it doesn't."""
-    agent = pretrained.load("straight_road", device="cpu")
-    env = make_filmed(agent.make_env, agent.config.representations)
-    frames, episode = film_episode(env, agent.policy, {"episode_seed": seed})
-    env.close()
-    shown = [{name: maps[name] for name in ("rgb", "semantic", "obj")} for maps in frames[steps]]
-    images = [representation_strip(maps) for maps in shown]
+def write_gif(path: Path, seed: int = 1, last: int = 72, every: int = 2) -> None:
+    """Films the end of a trained agent's drive: the picture, the classes, and what it reads."""
+    film = Film(pretrained.load("straight_road", device="cpu"))
+    film.tiles = {name: film.tiles[name] for name in ("rgb", "seg", "obj")}
+    frames, episode = film.drive({"episode_seed": seed})
+    film.close()
+    images = [film.draw(frame) for frame in frames[-1 - last : -1 : every]]
+    images.append(film.draw(frames[-1], episode))
     # one palette for all frames, with the rare colours too; no dithering: a sixth of the size
-    palette = Image.fromarray(np.concatenate(images[::3])).quantize(96, Image.Quantize.MAXCOVERAGE)
+    sample = np.concatenate([*images[::3], images[-1]])
+    palette = Image.fromarray(sample).quantize(96, Image.Quantize.MAXCOVERAGE)
     first, *others = [Image.fromarray(each).quantize(palette=palette, dither=0) for each in images]
-    duration = 1000 * steps.step / episode.fps
-    first.save(path, save_all=True, append_images=others, duration=duration, loop=0)
-    print(f"{path}: {len(images)} of {len(frames)} steps, which end in {episode.outcome}")
+    durations = [1000 * every / episode.fps] * len(others) + [1000 * OUTCOME_S]
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
+    print(f"{path}: the last {last} of {len(frames)} steps, which end in {episode.outcome}")
 
 
 def liveliest(frames):

@@ -4,17 +4,16 @@ python examples/transform_pictures.py docs/images/transforms
 """
 
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from flowrep.baselines import BaselinePolicy
-from flowrep.envs import make_env, street_envs
-from flowrep.experiment.film import film_episode, make_filmed
+from flowrep.experiment.film import Film
 from flowrep.geometry import ego_flow, unproject
+from flowrep.policies import load_agent
 from flowrep.scenes import load_scene
 from flowrep.transforms import EstimatedFlow
 from flowrep.viz import (
@@ -38,11 +37,14 @@ PARTS = np.array([(235, 235, 235), (222, 40, 60), (46, 64, 196), (60, 160, 90)],
 def main(folder: str) -> None:
     scene = load_scene(SCENE)
     camera = replace(scene.camera, height_px=SIZE_PX, width_px=SIZE_PX)
-    env = make_filmed(partial(make_env, replace(scene, camera=camera)), {})
-    K, steps = torch.as_tensor(street_envs(env)[0].K), []
-    policy = BaselinePolicy("planner", env)
-    maps, _ = film_episode(env, policy, {"episode_seed": SEED}, on_frame=steps.append)
-    env.close()
+    scene = asdict(replace(scene, camera=camera))
+    film = Film(load_agent("planner", scene=scene, device="cpu", num_envs=1, num_workers=0))
+    K, steps = torch.as_tensor(film.street.K), []
+    frames, _ = film.drive(
+        {"episode_seed": SEED}, lambda tensordict: steps.append(tensordict["sensor"][0])
+    )
+    film.close()
+    maps = [frame.maps for frame in frames]
     # The step with the most motion, but nobody right in front of the camera.
     motion = [int(((frame["obj"] != 0) & (frame["depth"] > 5)).sum()) for frame in maps]
     at = max(range(1, len(maps)), key=lambda i: motion[i])
@@ -59,15 +61,15 @@ def pictures(step_before, step, before, now, K):
     rgb = now["rgb"].numpy().transpose(1, 2, 0)
     return {
         "rgb": {"rgb": rgb},
-        "segmentation": {"rgb": rgb, "seg": classes_to_rgb(now["semantic"])},
+        "segmentation": {"rgb": rgb, "seg": classes_to_rgb(now["seg"])},
         "depth": {"rgb": rgb, "depth": depth_to_rgb(now["depth"])},
         "frame_stack": {
-            "seg2, first": classes_to_rgb(before["semantic"]),
-            "seg2, second": classes_to_rgb(now["semantic"]),
+            "seg2, first": classes_to_rgb(before["seg"]),
+            "seg2, second": classes_to_rgb(now["seg"]),
         },
         "raw_flow": {"rgb": rgb, "raw": flows["raw"]},
         "flow_factorize": {name: flows[name] for name in ("raw", "ego", "obj")},
-        "camera_motion": of_camera_motions(now["depth"], K),
+        "camera_motion": of_camera_motions(step["depth"], K),
         "instance_ids": {"rgb": rgb, "ids: body, left, right leg": of_parts(step["instance"])},
         "instance_motion": {
             "every row is row 0": flow_to_rgb(now["ego"], FLOW_SCALE_PX["raw"]),
@@ -75,7 +77,7 @@ def pictures(step_before, step, before, now, K):
             "their difference": flows["obj"],
         },
         "estimated_flow": of_estimates(step_before, step, now, K),
-        "adapt": of_depth_kinds(now["depth"], K),
+        "adapt": of_depth_kinds(step["depth"], K),
     }
 
 
@@ -102,7 +104,7 @@ def of_estimates(step_before, step, now, K):
     size = {"picture_scale": pair.shape[-1] // SIZE_PX}
     plain = EstimatedFlow(**size).compute(pair)[0]
     motion = step["instance_motion"][0]
-    compensated = EstimatedFlow(intrinsics=K, **size).compute(pair, now["depth"], motion)[0]
+    compensated = EstimatedFlow(intrinsics=K, **size).compute(pair, step["depth"], motion)[0]
     return {
         "obj, exact": flow_to_rgb(now["obj"], FLOW_SCALE_PX["obj"]),
         "raw by DIS": flow_to_rgb(plain, FLOW_SCALE_PX["raw"]),

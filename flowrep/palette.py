@@ -1,4 +1,4 @@
-"""The one table of classes: name, id in the semantic map, colour in every picture."""
+"""Colours that are the same in every picture: of classes, whose ids are here too, and outcomes."""
 
 CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
     "sky": (112, 178, 232),
@@ -14,6 +14,14 @@ CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
     "traffic_light": (250, 214, 40),
 }
 """Class name to colour; a class id is the name's place in this table."""
+
+OUTCOME_COLOURS = {
+    "success": "#0072b2",
+    "collision": "#d55e00",
+    "out_of_bounds": "#cc79a7",
+    "timeout": "#f0c000",
+}
+"""Colour of each outcome in every figure, safe for colour-blind readers (Okabe and Ito)."""
 
 CATEGORY_ID: dict[str, int] = {name: i for i, name in enumerate(CLASS_COLOURS)}
 

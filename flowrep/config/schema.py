@@ -419,6 +419,7 @@ class ViewConfig(Command):
     speed: SpeedMode
     frame_rate_hz: FrameRate | None
     path: Text | None
+    output: Text | None
     seed: Seed
     episodes: Count
     sheet_rows: Count

@@ -1,101 +1,262 @@
 """Films of episodes, and the picture of a run's learning."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import partial
+from itertools import repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.data import Categorical
 
+from flowrep.baselines import BaselinePolicy
 from flowrep.envs import street_envs
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.evaluation import Episode, Policy, evaluate, outcome_shares
+from flowrep.experiment.evaluation import Episode, evaluate, outcome_shares
 from flowrep.experiment.run import replace_file
-from flowrep.geometry import factorize, rigid_flow
-from flowrep.viz import representation_strip, write_video
-from flowrep.viz.maps import tile_zoom
+from flowrep.palette import OUTCOME_COLOURS
+from flowrep.scenes.scene import YAW_SIGN
+from flowrep.simulator.camera import choose_renderer
+from flowrep.transforms import representation_stack
+from flowrep.transforms.stack import FLOWS, representation_options
+from flowrep.viz import (
+    Image,
+    Tile,
+    classes_to_rgb,
+    grey_to_rgb,
+    representation_strip,
+    stock_tiles,
+    write_video,
+)
+from flowrep.viz.maps import class_legend, resized, text_bar, tile_zoom
+from flowrep.viz.overlay import legend_strip, steering, with_steering
 
-Maps = dict[str, Tensor]
+LEGEND_S, OUTCOME_S = 3.0, 1.0
+"""How long a film shows its legend before the episode, and the last frame with the outcome."""
+
+_MOST_TILES = 4  # of a representation that has no colours: one for each channel
+_STATUS_PX = 28
+_ACTIONS = ("keeps its yaw rate", "turns left", "turns right")  # in the order of YAW_SIGN
 
 
-def make_filmed(make_env: Callable[..., EnvBase], representations: Mapping[str, Any]) -> EnvBase:
-    """Returns an env of one street for `film_episode`: it keeps every sensor, rgb included.
+class Frame(NamedTuple):
+    """What a film shows of one step."""
 
-    Unless the agent or an estimator sees it too, rgb is as large as the tiles of a film.
+    maps: dict[str, Tensor]  # [C, H, W] by tile; ids, metres or px per step
+    steps: int  # of the episode so far
+    turned: float  # the yaw rate in shares of the largest, positive to the left
+    action: int | None = None  # chosen at this frame; None if unknown, as at the last one
+
+
+class Film:
+    """An agent's env of one street, its frames, and their pictures.
+
+    What the agent reads is drawn as its env's transforms write it, noisy or estimated, and framed.
+    What it doesn't read of rgb, seg, depth, raw, ego and obj stands beside it, from the simulator's
+    exact sensors.
+
+    Args:
+        agent: whose policy drives.
+        changes: of the arguments of `make_env`.
+
+    Attributes:
+        env: of one street, with the sensors.
+        tiles: what is drawn, by name; fewer may be left in it.
+        framed: the names of what the agent reads.
     """
-    seen = {**representations, "rgb": {}}
-    make = partial(make_env, representations=seen, keep_sensor=True, num_envs=1, num_workers=0)
-    env = make()
-    is_for_us = (
-        "rgb" not in representations
-        and sum(("sensor", "rgb") in transform.in_keys for transform in env.transform) == 1
-    )
-    (street,) = street_envs(env)
-    if not is_for_us or street.sensing.renderer == "pybullet":
-        return env
-    size = env.observation_spec["sensor", "rgb"].shape[-2:]
-    env.close()
-    return make(picture_scale=tile_zoom(*size))
 
+    def __init__(self, agent: Agent, **changes: Any) -> None:
+        self.agent = agent
+        read = agent.config.representations
+        self.env = agent.make_env(
+            representations={**read, "rgb": read.get("rgb")},
+            keep_sensor=True,
+            num_envs=1,
+            num_workers=0,
+            picture_scale=_picture_scale(agent),
+            **changes,
+        )
+        (self.street,) = street_envs(self.env)
+        policy = agent.policy
+        self.policy = BaselinePolicy(policy, self.env) if isinstance(policy, str) else policy
+        self.tiles = stock_tiles()
+        if exact := [name for name in self.tiles if name not in (*read, "rgb")]:
+            context: dict[str, Any] = {
+                "intrinsics": torch.from_numpy(self.street.K),
+                "num_classes": self.street.num_classes,
+                "dt_s": 1.0 / self.street.frame_rate_hz,
+            }
+            self.env.append_transform(representation_stack(exact, **context))
+        self.framed = [name for name in read if name in self.tiles]
+        # the key of each tile's map, and what turns what is there into the tile's units
+        self._maps = {name: (name, self._in_units(name)) for name in self.tiles}
+        for name in read:
+            if name not in self._maps:
+                self._add_tiles(name)
+        height, width = self.env.observation_spec["seg"].shape[-2:]
+        zoom = tile_zoom(height, width)
+        self._tile_size = zoom * height, zoom * width
 
-def film_episode(
-    env: EnvBase,
-    policy: Policy | str,
-    options: Mapping[str, Any],
-    on_frame: Callable[[TensorDictBase], None] = lambda tensordict: None,
-) -> tuple[list[Maps], Episode]:
-    """Returns the maps of every frame of one greedy episode, and the episode.
+    def drive(
+        self,
+        options: Mapping[str, Any],
+        on_frame: Callable[[TensorDictBase], Any] = lambda tensordict: None,
+    ) -> tuple[list[Frame], Episode]:
+        """Returns every frame of one greedy episode, and the episode.
 
-    `env` is of `make_filmed`, `options` are of `StreetEnv.reset`, and `on_frame` gets the sensors.
-    """
-    intrinsics = torch.as_tensor(street_envs(env)[0].K)
-    frames: list[Maps] = []
+        `options` are of `StreetEnv.reset`; `on_frame` gets the env's TensorDict.
+        """
+        frames: list[Frame] = []
 
-    def keep(tensordict: TensorDictBase) -> None:
-        sensor = tensordict["sensor"][0].cpu()
-        frames.append(maps_of(sensor, intrinsics))
-        on_frame(sensor)
+        def note(tensordict: TensorDictBase) -> TensorDictBase:
+            acted = self.policy(tensordict)
+            frames[-1] = frames[-1]._replace(action=int(acted["action"]))
+            return acted
 
-    (episode,) = evaluate(env, policy, [options], on_frame=keep)
-    return frames, episode
+        def keep(tensordict: TensorDictBase) -> None:
+            frames.append(self.frame(tensordict))
+            on_frame(tensordict)
 
+        (episode,) = evaluate(self.env, note, [options], on_frame=keep)
+        return frames, episode
 
-def maps_of(sensor: Mapping[str, Any] | TensorDictBase, intrinsics: Tensor) -> Maps:
-    """Returns rgb, semantic, depth, raw, ego and obj `[C, H, W]` from one env's sensors.
+    def frame(self, tensordict: TensorDictBase) -> Frame:
+        """Returns the frame of the street's present state and the env's TensorDict."""
+        maps = {tile: make(tensordict[key][0].cpu()) for tile, (key, make) in self._maps.items()}
+        episode = self.street.episode
+        limit = torch.deg2rad(torch.tensor(self.street.scene.vehicle.max_yaw_rate_dps)).item()
+        return Frame(maps, episode.steps, episode.now.vehicle.yaw_rate_rps / limit)
 
-    Flow is in px/step, and as estimated or noisy as the agent's own.
-    """
-    raw = measured = sensor.get("flow", None)
-    if raw is None:
-        exact, instance = sensor["depth"], sensor["instance"]
-        measured = rigid_flow(exact, instance, intrinsics, sensor["instance_motion"])
-        raw = measured.flow
-    depth = sensor.get("noisy_depth", sensor["depth"])
-    told = sensor.get("noisy_motion", sensor["prev_from_curr"])
-    motion = sensor.get("estimated_motion", told)
-    ego, obj, _ = factorize(measured, depth, intrinsics, motion)
-    seen = {"rgb": sensor["rgb"], "semantic": sensor["semantic"]}
-    return seen | {"depth": depth, "raw": raw, "ego": ego, "obj": obj}
+    def draw(self, frame: Frame, ended: Episode | None = None) -> Image:
+        """Returns a frame's picture; that of an episode that has `ended` says how."""
+        sign = 0.0 if frame.action is None else YAW_SIGN[frame.action]
+        tiles = {**self.tiles, "rgb": self._with_wheel(frame.turned, sign)}
+        categories = self.street.scene.categories
+        drawn = representation_strip(
+            frame.maps, tiles=tiles, framed=self.framed, categories=categories
+        )
+        if ended is not None:
+            return _above(drawn, how_it_ended(ended), OUTCOME_COLOURS[ended.outcome])
+        action = "" if frame.action is None else _ACTIONS[frame.action]
+        return _above(drawn, f"{frame.steps / self.street.frame_rate_hz:.1f} s   {action}")
 
+    def legend(self) -> Image:
+        """Returns a picture of the frames' size that explains them."""
+        tiles, categories = dict(self.tiles), self.street.scene.categories
+        about = f"{tiles['rgb'].about} Wheel: yaw rate. Arrow: action."
+        tiles["rgb"] = tiles["rgb"]._replace(about=about)
+        keys = {
+            tiles["rgb"].label: steering(0.3, 1.0),
+            self.tiles["seg"].label: class_legend(categories, self._tile_size[1]),
+        }
+        framed = [tiles[name].label for name in self.framed if name in tiles]
+        drawn = legend_strip(
+            tiles.values(), self._tile_size, keys=keys, framed=framed, categories=categories
+        )
+        name = self.agent.policy if isinstance(self.agent.policy, str) else "the agent"
+        if framed:
+            return _above(drawn, f"framed: what {name} reads; the other maps are exact")
+        return _above(drawn, f"{name} reads none of these maps")
 
-def draw_frames(frames: Iterable[Maps], env: EnvBase) -> Iterator[Any]:
-    """Yields the pictures of an env's film, with the time and the colours of its classes."""
-    (street,) = street_envs(env)
-    for number, maps in enumerate(frames):
-        time_s = number / street.frame_rate_hz
-        yield representation_strip(maps, categories=street.scene.categories, time_s=time_s)
+    def pictures(self, frames: Sequence[Frame], episode: Episode) -> Iterator[Image]:
+        """Yields the pictures of a film: the legend, the episode, and how it ended."""
+        yield from repeat(self.legend(), max(1, round(LEGEND_S * episode.fps)))
+        yield from map(self.draw, frames[:-1])
+        last = self.draw(frames[-1], episode)
+        yield from repeat(last, max(1, round(OUTCOME_S * episode.fps)))
+
+    def close(self) -> None:
+        """Closes the env."""
+        self.env.close()
+
+    def _with_wheel(self, turned: float, sign: float) -> Tile:
+        tile = self.tiles["rgb"]
+
+        def draw(rgb: Tensor) -> Image:
+            return with_steering(resized(tile.draw(rgb), *self._tile_size), turned, sign)
+
+        return tile._replace(draw=draw)
+
+    def _in_units(self, name: str) -> Callable[[Tensor], Tensor]:
+        """Returns what turns a map as the agent reads it into ids, metres or px per step."""
+        options = representation_options(name) | dict(self._given(name))
+        if "encoding" in options:
+            return lambda ids: ids if len(ids) == 1 else ids.argmax(0, keepdim=True)
+        if "range_m" in options:  # 1 is the sky's, too
+            return lambda depth: torch.where(depth < 1, depth * options["range_m"], torch.inf)
+        if name in FLOWS:
+            dt_s = 1.0 / self.street.frame_rate_hz if options["unit"] == "px_per_s" else 1.0
+            return lambda flow: flow * (dt_s / options["scale"])
+        return lambda values: values
+
+    def _add_tiles(self, name: str) -> None:
+        """Adds tiles for a representation that has none: one for each frame, or each channel."""
+        options, spec = representation_options(name) | dict(self._given(name)), self._spec(name)
+        in_units, frames_of = self._in_units(name), {"seg2": "seg", "depth2": "depth"}.get(name)
+        if frames_of is not None:  # oldest first
+            tile, parts = self.tiles[frames_of], int(options["k"])
+        else:
+            tile, parts = Tile(name, _plain(spec), about="As the agent reads it."), spec.shape[-3]
+        for i in range(min(parts, _MOST_TILES)):
+            label = name if parts == 1 else f"{name}, {i + 1} of {parts}"
+            self.tiles[label] = tile._replace(label=label)
+            self._maps[label] = name, lambda values, i=i: in_units(values.chunk(parts)[i])
+            self.framed.append(label)
+
+    def _given(self, name: str) -> Mapping[str, Any]:
+        return self.agent.config.representations.get(name) or {}
+
+    def _spec(self, name: str) -> Any:
+        return self.env.observation_spec[name]
 
 
 def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: Any) -> Episode:
-    """Writes the video of one greedy episode; `changes` are of the arguments of `make_env`."""
-    env = make_filmed(partial(agent.make_env, **changes), agent.config.representations)
-    frames, episode = film_episode(env, agent.policy, {"episode_seed": episode_seed})
-    replace_file(path, partial(write_video, frames=draw_frames(frames, env), fps=episode.fps))
-    env.close()
+    """Writes the film of one greedy episode; `changes` are of the arguments of `make_env`."""
+    with closing(Film(agent, **changes)) as film:
+        frames, episode = film.drive({"episode_seed": episode_seed})
+        write_video(path, film.pictures(frames, episode), fps=episode.fps)
     return episode
+
+
+def how_it_ended(episode: Episode) -> str:
+    """Returns an episode's outcome in words."""
+    hit = f" ({episode.hit.replace('_', ' ')})" if episode.hit else ""
+    words = episode.outcome.replace("_", " ")
+    seconds = episode.length / episode.fps
+    return f"{words}{hit} after {seconds:.1f} s, return {episode.total_reward:.2f}"
+
+
+def _picture_scale(agent: Agent) -> int:
+    """Returns the size of the picture in sizes of the maps: a tile's, if it is for films alone.
+
+    An estimator's pictures have the size that the config says, whatever is asked for here.
+    """
+    config = agent.config
+    if "rgb" in config.representations or choose_renderer(config.renderer) == "pybullet":
+        return 1
+    return tile_zoom(config.scene["camera"]["height_px"], config.scene["camera"]["width_px"])
+
+
+def _plain(spec: Any) -> Callable[[Any], Image]:
+    """Returns what draws a channel of a map of this spec, which has no colours of its own."""
+    if isinstance(spec, Categorical):
+        return classes_to_rgb
+    low, high = float(spec.space.low.min()), float(spec.space.high.max())
+    return partial(grey_to_rgb, low=low, high=high) if high - low < 1e6 else grey_to_rgb
+
+
+def _above(picture: Image, text: str, colour: str = "#ffffff") -> Image:
+    """Returns a picture above a line of text on a bar of a colour."""
+    background: Any = tuple(bytes.fromhex(colour[1:]))
+    grey = 255 if sum(background) < 400 else 40
+    bar = text_bar(
+        text, picture.shape[1], _STATUS_PX, size=16, colour=(grey,) * 3, background=background
+    )
+    return np.concatenate([picture, bar])
 
 
 def draw_learning_curve(
@@ -109,8 +270,8 @@ def draw_learning_curve(
     """Draws a run's success over frames, from the rows of metrics.csv and evaluation.csv.
 
     The line is the success rate over the last training episodes (sampled actions); the points are
-    the run's own greedy evaluations at its speed and frame rate, with 95 % Wilson intervals. After
-    the same frames the final one counts, not with other episodes that one in training drove.
+    the run's own greedy evaluations at its speed and frame rate, with 95 % Wilson intervals. If a
+    training evaluation and the final one share a frame count, only the final one is drawn.
     """
     from matplotlib.figure import Figure  # a tenth of the time that a command takes to start
 

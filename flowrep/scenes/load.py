@@ -95,4 +95,3 @@ def _complaint(error: ValidationError) -> str:
     problem = first["msg"].removeprefix("Value error, ")
     given = "" if first["type"] == "missing" else f"; got {first['input']!r:.60}"
     return f"{key}: {problem}{given}"
-

@@ -4,7 +4,7 @@ from flowrep.viz.maps import (
     DEPTH_RANGE_M,
     FLOW_SCALE_PX,
     Image,
-    Video,
+    Tile,
     classes_to_rgb,
     contact_sheet,
     depth_bar,
@@ -12,14 +12,16 @@ from flowrep.viz.maps import (
     flow_note,
     flow_to_rgb,
     flow_wheel,
+    grey_to_rgb,
     representation_strip,
+    stock_tiles,
     strip,
     write_png,
-    write_video,
 )
+from flowrep.viz.video import Video, is_playable, write_video
 
 __all__ = [
-    "DEPTH_RANGE_M", "FLOW_SCALE_PX", "Image", "Video", "classes_to_rgb", "contact_sheet",
-    "depth_bar", "depth_to_rgb", "flow_note", "flow_to_rgb", "flow_wheel", "representation_strip",
-    "strip", "write_png", "write_video",
+    "DEPTH_RANGE_M", "FLOW_SCALE_PX", "Image", "Tile", "Video", "classes_to_rgb", "contact_sheet",
+    "depth_bar", "depth_to_rgb", "flow_note", "flow_to_rgb", "flow_wheel", "grey_to_rgb",
+    "is_playable", "representation_strip", "stock_tiles", "strip", "write_png", "write_video",
 ]  # fmt: skip

@@ -6,12 +6,11 @@ Images are numpy uint8 `[H, W, 3]`. Maps go in as numpy or torch, `[C, H, W]`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +42,8 @@ _NOTE_PX = 20
 _CLASS_PX = 120
 _GAP_PX = 4
 _GAP_GREY = 200  # so that the white of no motion has an edge
+_FRAME_PX, _FRAME_COLOUR = 5, (230, 97, 1)
+_NOTE_COLOUR = (70, 70, 70)
 _TILE_PX = 240
 
 
@@ -93,6 +94,13 @@ def classes_to_rgb(semantic: Any) -> Image:
     return palette[ids.astype(np.uint8)]
 
 
+def grey_to_rgb(values: Any, low: float = -1.0, high: float = 1.0) -> Image:
+    """Returns a map `[1, H, W]` in grey, black at `low` and below, white at `high` and above."""
+    share = (_channels("a map", values, 1)[0].astype(np.float32) - low) / (high - low)
+    grey = np.rint(255 * np.clip(np.nan_to_num(share), 0, 1)).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
 def depth_to_rgb(depth: Any, range_m: float = DEPTH_RANGE_M) -> Image:
     """Returns depth `[1, H, W]` in metres as colour, near light and far dark, logarithmically.
 
@@ -108,44 +116,82 @@ def depth_to_rgb(depth: Any, range_m: float = DEPTH_RANGE_M) -> Image:
     return np.rint(rgb).astype(np.uint8)
 
 
-def representation_strip(
-    maps: Mapping[str, Any],
+class Tile(NamedTuple):
+    """How a map is drawn and explained."""
+
+    label: str
+    draw: Callable[[Any], Image]  # takes the map [C, H, W]
+    note: Note = ""  # below the label
+    about: str = ""  # what it shows, in a sentence
+    is_flow: bool = False  # whether it has the colours of `flow_to_rgb`
+
+
+def stock_tiles(
     *,
     flow_scale_px: Mapping[str, float] = FLOW_SCALE_PX,
     depth_range_m: float = DEPTH_RANGE_M,
+) -> dict[str, Tile]:
+    """Returns the tiles of rgb, seg, depth and flow, in the order in which they are drawn."""
+    depth_colours = partial(depth_to_rgb, range_m=depth_range_m)
+    bar = partial(depth_bar, depth_range_m)
+    tiles = {
+        "rgb": Tile("RGB", _picture, about="What the camera sees."),
+        "seg": Tile("segmentation", classes_to_rgb, about="The class of each pixel."),
+        "depth": Tile(
+            "depth, logarithmic",
+            depth_colours,
+            bar,
+            f"Distance along the view. Black: nothing within {depth_range_m:g} m.",
+        ),
+    }
+    about = {
+        "raw": "Motion of each pixel since the last step. Hue: direction.",
+        "ego": "The part of it that the camera's own motion causes.",
+        "obj": "The rest: what moves by itself.",
+    }
+    for name, scale_px in flow_scale_px.items():
+        draw = partial(flow_to_rgb, scale_px=scale_px)
+        note = flow_note(scale_px)
+        tiles[name] = Tile(f"{name} flow", draw, note, about.get(name, ""), is_flow=True)
+    return tiles
+
+
+def representation_strip(
+    maps: Mapping[str, Any],
+    *,
+    tiles: Mapping[str, Tile] | None = None,
+    framed: Collection[str] = (),
+    flow_scale_px: Mapping[str, float] = FLOW_SCALE_PX,
+    depth_range_m: float = DEPTH_RANGE_M,
     categories: Iterable[str] = (),
-    time_s: float | None = None,
 ) -> Image:
     """Returns the camera's picture and its representations side by side, labelled.
 
     Args:
-        maps: any of rgb (uint8), semantic (ids), depth (metres), raw, ego, obj (pixels), each
+        maps: any of rgb (uint8), seg (ids), depth (metres), raw, ego, obj (pixels), each
             `[C, H, W]`; drawn in this order, other keys are ignored.
+        tiles: how maps are drawn, by name; `stock_tiles` of the two arguments below if None.
+        framed: names of maps with a frame around them.
         flow_scale_px: flow at full saturation for raw, ego and obj; printed below them.
         depth_range_m: end of the depth colours; printed below them.
         categories: classes whose colours are explained below the strip.
-        time_s: printed below RGB's label.
 
     Raises:
         ValueError: a map has the wrong shape, or none of the names is present.
     """
-    depth_colours = partial(depth_to_rgb, range_m=depth_range_m)
-    clock = "" if time_s is None else f"{time_s:.1f} s"
-    tiles: dict[str, tuple[str, Callable[[Any], Image], Note]] = {
-        "rgb": ("RGB", _picture, clock),
-        "semantic": ("segmentation", classes_to_rgb, ""),
-        "depth": ("depth, logarithmic", depth_colours, partial(depth_bar, depth_range_m)),
-    }
-    for name, scale_px in flow_scale_px.items():
-        draw = partial(flow_to_rgb, scale_px=scale_px)
-        tiles[name] = f"{name} flow", draw, flow_note(scale_px)
+    if tiles is None:
+        tiles = stock_tiles(flow_scale_px=flow_scale_px, depth_range_m=depth_range_m)
     names = set(maps.keys())
-    images = {label: draw(maps[name]) for name, (label, draw, _) in tiles.items() if name in names}
-    if not images:
+    shown = {name: tile for name, tile in tiles.items() if name in names}
+    if not shown:
         given = sorted(map(str, names))
         raise ValueError(f"nothing to draw: maps has {given}, expected some of {list(tiles)}")
-    notes = {label: note for label, _, note in tiles.values() if note}
-    drawn = strip(images, wheel_for=[f"{name} flow" for name in flow_scale_px], notes=notes)
+    drawn = strip(
+        {tile.label: tile.draw(maps[name]) for name, tile in shown.items()},
+        wheel_for=[tile.label for tile in shown.values() if tile.is_flow],
+        notes={tile.label: tile.note for tile in shown.values() if tile.note},
+        framed=[tile.label for name, tile in shown.items() if name in framed],
+    )
     legend = class_legend(tuple(categories), drawn.shape[1])
     return np.concatenate([drawn, legend])
 
@@ -160,8 +206,8 @@ def class_legend(names: tuple[str, ...], width: int) -> Image:
         row, column = divmod(number, columns)
         x, y = column * _CLASS_PX, row * _NOTE_PX
         legend[y + 4 : y + 16, x + 2 : x + 14] = CLASS_COLOURS[name]
-        texts[x + 18, y + _NOTE_PX // 2] = name.replace("_", " "), "lm", (70, 70, 70)
-    return _written(legend, texts, size=14) if names else legend
+        texts[x + 18, y + _NOTE_PX // 2] = name.replace("_", " "), "lm", _NOTE_COLOUR
+    return written(legend, texts, size=14) if names else legend
 
 
 def flow_note(scale_px: float) -> str:
@@ -174,7 +220,7 @@ def depth_bar(range_m: float, width: int) -> Image:
     metres = np.expm1(np.linspace(0, np.log1p(range_m), width))
     bar = depth_to_rgb(metres[None, None].repeat(_NOTE_PX - 2, axis=1), range_m)
     ends = {2: ("near", "lm", (0, 0, 0)), width - 2: (f"{range_m:g} m", "rm", (255, 255, 255))}
-    return _written(bar, {(x, (_NOTE_PX - 2) // 2): text for x, text in ends.items()}, size=13)
+    return written(bar, {(x, (_NOTE_PX - 2) // 2): text for x, text in ends.items()}, size=13)
 
 
 def strip(
@@ -182,6 +228,7 @@ def strip(
     *,
     wheel_for: Iterable[str] = (),
     notes: Mapping[str, Note] = MappingProxyType({}),
+    framed: Collection[str] = (),
 ) -> Image:
     """Returns images side by side, each under its label.
 
@@ -192,33 +239,44 @@ def strip(
         images: by label, `[H, W, 3]`.
         wheel_for: labels with the flow wheel beside them.
         notes: by label, the note below it: a text, or a function that draws a legend of a width.
+        framed: labels with a frame around label and image.
     """
     sizes = sorted({image.shape[:2] for image in images.values()})
     height, width = sizes[0]
     if any(h * width != w * height for h, w in sizes):
         raise ValueError(f"a strip needs images of one ratio of height to width, got {sizes}")
     zoom = tile_zoom(height, width)
-    y, x = np.indices((zoom * height, zoom * width), sparse=True)
     with_wheel = frozenset(wheel_for)
     columns: list[Image] = []
     for label, image in images.items():
-        bar = _text_bar(label, width * zoom, _BAR_PX, 18, 0).copy()
+        bar = text_bar(label, width * zoom, _BAR_PX, size=18).copy()
         if label in with_wheel and width * zoom >= _BAR_PX:
             bar[1 : _BAR_PX - 1, -_BAR_PX:-2] = flow_wheel(_BAR_PX - 2)
         column = [bar]
         if notes.keys() & images.keys():
             note = notes.get(label, "")
             if isinstance(note, str):
-                column.append(_text_bar(note, width * zoom, _NOTE_PX, 14, 70))
+                column.append(text_bar(note, width * zoom, _NOTE_PX, colour=_NOTE_COLOUR))
             else:
                 legend = note(width * zoom)
                 rows = (0, _NOTE_PX - len(legend)), (0, 0), (0, 0)
                 column.append(np.pad(legend, rows, constant_values=255))
-        h, w = image.shape[:2]
-        column.append(image[y * h // (zoom * height), x * w // (zoom * width)])
-        gap = np.full((sum(map(len, column)), _GAP_PX, 3), _GAP_GREY, np.uint8)
-        columns += [np.concatenate(column), gap]
+        column.append(resized(image, zoom * height, zoom * width))
+        whole = np.concatenate(column)
+        if framed:
+            colour = _FRAME_COLOUR if label in framed else (255, 255, 255)
+            size = len(whole) + 2 * _FRAME_PX, whole.shape[1] + 2 * _FRAME_PX, 3
+            frame = np.full(size, colour, np.uint8)
+            frame[_FRAME_PX:-_FRAME_PX, _FRAME_PX:-_FRAME_PX] = whole
+            whole = frame
+        columns += [whole, np.full((len(whole), _GAP_PX, 3), _GAP_GREY, np.uint8)]
     return np.concatenate(columns[:-1], axis=1)
+
+
+def resized(image: Image, height: int, width: int) -> Image:
+    """Returns an image in another size, without interpolation."""
+    y, x = np.indices((height, width), sparse=True)
+    return image[y * image.shape[0] // height, x * image.shape[1] // width]
 
 
 def tile_zoom(height: int, width: int) -> int:
@@ -243,55 +301,23 @@ def write_png(path: str | Path, image: Image) -> None:
     pillow.fromarray(image).save(path)
 
 
-class Video:
-    """An mp4 (H.264) that browsers play, written frame by frame, in a folder made if needed.
-
-    Odd sizes, which the codec does not support, are padded with a white row or column. Frames of
-    other sizes than the first are cut or padded.
-    """
-
-    def __init__(self, path: str | Path, *, fps: float) -> None:
-        self.path, self.fps = Path(path), fps
-        self._writer: Any = None
-        self._size = 0, 0
-
-    def append(self, image: Image) -> None:
-        """Adds a frame `[H, W, 3]`."""
-        if self._writer is None:
-            import imageio.v2 as imageio
-
-            self._size = (image.shape[0] + 1) // 2 * 2, (image.shape[1] + 1) // 2 * 2
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            options: Any = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
-            # Half the time of x264's default at the same error, and no larger.
-            options |= {"output_params": ["-preset", "veryfast"], "macro_block_size": 1}
-            self._writer = imageio.get_writer(self.path, fps=self.fps, **options)
-        height, width = self._size
-        image = image[:height, :width]
-        fill = ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0))
-        self._writer.append_data(np.pad(image, fill, constant_values=255))
-
-    def close(self) -> None:
-        """Completes the file; without frames there is none."""
-        if self._writer is not None:
-            self._writer.close()
-
-
-def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
-    """Writes frames `[H, W, 3]` as an mp4, see `Video`."""
-    with closing(Video(path, fps=fps)) as video:
-        for frame in frames:
-            video.append(frame)
-
-
 @lru_cache(maxsize=64)
-def _text_bar(text: str, width: int, height: int, size: int, grey: int) -> Image:
-    bar = np.full((height, width, 3), 255, np.uint8)
-    return _written(bar, {(2, height // 2): (text, "lm", (grey, grey, grey))}, size=size)
+def text_bar(
+    text: str,
+    width: int,
+    height: int,
+    *,
+    size: int = 14,
+    colour: tuple[int, int, int] = (0, 0, 0),
+    background: tuple[int, int, int] = (255, 255, 255),
+) -> Image:
+    """Returns a line of text on a bar of a colour."""
+    bar = np.full((height, width, 3), background, np.uint8)
+    return written(bar, {(2, height // 2): (text, "lm", colour)}, size=size)
 
 
-def _written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, size: int) -> Image:
-    # Texts are (text, anchor, colour) by position (x, y).
+def written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, size: int) -> Image:
+    """Returns an image with texts, each (text, Pillow's anchor, colour) by its position (x, y)."""
     from PIL import Image as pillow
     from PIL import ImageDraw, ImageFont
 

@@ -17,16 +17,8 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from flowrep.palette import CLASS_COLOURS
+from flowrep.palette import CLASS_COLOURS, OUTCOME_COLOURS
 from flowrep.scenes.layout import Layout
-
-OUTCOME_COLOURS = {
-    "success": "#0072b2",
-    "collision": "#d55e00",
-    "out_of_bounds": "#cc79a7",
-    "timeout": "#f0c000",
-}
-"""Colour of each outcome in every figure, safe for colour-blind readers (Okabe and Ito)."""
 
 _WALK_COLOUR = "black"
 _ZONE_COLOURS = {"end": "#56b4e9", "start": "#009e73"}  # starts are drawn last, on top

@@ -1,0 +1,130 @@
+"""A window in which a policy drives, or whoever holds the arrow keys."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import cycle
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from flowrep.config import UsageError
+from flowrep.experiment.evaluation import Policy, evaluate
+from flowrep.experiment.film import Film, Frame, how_it_ended
+from flowrep.scenes.scene import NO_OP, TURN_LEFT, TURN_RIGHT
+
+
+class NewEpisode(Exception):
+    """The episode was left for the next one."""
+
+
+class Keyboard:
+    """A policy that takes the action of the held keys, or lets another, of this name, drive.
+
+    Both keys together cancel out.
+    """
+
+    ACTIONS = {"left": TURN_LEFT, "right": TURN_RIGHT}  # noqa: RUF012 - never changed
+    HELP = "← → steer    S switch driver    R new episode    Q quit"
+
+    def __init__(self, other: Policy, name: str) -> None:
+        self.is_over = self.is_new = False
+        self._other, self._held = other, set[str]()
+        self._names = cycle([name, "you"])
+        self.driver = "you"
+
+    def press(self, key: str | None) -> None:
+        """Handles a key press; other keys than letters may have no name."""
+        key = (key or "").lower()
+        if key in self.ACTIONS:
+            self._held.add(key)
+        elif key == "s":
+            self.driver = next(self._names)
+        self.is_new |= key == "r"
+        self.is_over |= key in ("q", "escape")
+
+    def release(self, key: str | None) -> None:
+        """Handles a key release."""
+        self._held.discard((key or "").lower())
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes `action`."""
+        if self.driver != "you":
+            return self._other(tensordict)
+        actions = [self.ACTIONS[key] for key in self._held]
+        action = actions[0] if len(actions) == 1 else NO_OP
+        return tensordict.set("action", torch.full(tensordict.shape, action))
+
+
+def drive_by_hand(
+    keyboard: Keyboard,
+    film: Film,
+    options: dict[str, Any],
+    pause: Callable[[float], Any] | None = None,
+) -> None:
+    """Opens a window and drives one episode after the other until it is closed.
+
+    A finished one stays in view until R begins the next, of the next seed. `pause` draws, and
+    handles keys for some seconds; by default in a window on the screen.
+    """
+    import matplotlib.pyplot as plt
+
+    # Disable Matplotlib's own shortcuts for the driver's keys (left: back, r: home, q: quit).
+    shortcuts: Any = {name: [] for name in plt.rcParams if name.startswith("keymap.")}
+    with plt.rc_context(shortcuts):
+        figure = plt.figure(figsize=(12.5, 2.7))
+        if pause is None and type(figure.canvas).required_interactive_framework is None:
+            plt.close(figure)
+            raise UsageError(
+                "interactive=true needs a screen, and tkinter or PyQt to open a window on it "
+                f"(matplotlib found only the backend {plt.get_backend()!r})"
+            )
+        listen = figure.canvas.mpl_connect
+        listen("key_press_event", lambda event: keyboard.press(event.key))
+        listen("key_release_event", lambda event: keyboard.release(event.key))
+        listen("close_event", lambda event: keyboard.press("q"))
+        while not keyboard.is_over:
+            keyboard.is_new = False
+            with suppress(NewEpisode):
+                drive_in_window(figure, keyboard, film, options, pause or plt.pause)
+            options = options | {"episode_seed": options["episode_seed"] + 1}
+        plt.close(figure)
+
+
+def drive_in_window(
+    figure: Any,
+    keyboard: Keyboard,
+    film: Film,
+    options: dict[str, Any],
+    pause: Callable[[float], Any],
+) -> None:
+    """Drives an episode, draws each step at the env's frame rate, and waits for R or Q."""
+    figure.clear()
+    axes = figure.add_axes((0, 0, 1, 0.92))
+    axes.set_axis_off()
+    title = figure.suptitle("", fontfamily="monospace", fontsize=10)
+    image, drawn_at = None, time.monotonic()
+
+    def show(picture: Any) -> None:
+        nonlocal image
+        image = image or axes.imshow(picture, interpolation="nearest")
+        image.set_data(picture)
+
+    def draw(tensordict: TensorDictBase) -> None:
+        nonlocal drawn_at
+        if keyboard.is_over or keyboard.is_new:
+            raise NewEpisode
+        latest.append(film.frame(tensordict))
+        show(film.draw(latest[-1]))
+        title.set_text(f"{keyboard.driver} drives    {keyboard.HELP}")
+        pause(max(1e-3, 1 / film.street.frame_rate_hz - (time.monotonic() - drawn_at)))
+        drawn_at = time.monotonic()
+
+    latest: deque[Frame] = deque(maxlen=1)
+    (episode,) = evaluate(film.env, keyboard, [options], on_frame=draw)
+    show(film.draw(latest[-1], episode))
+    title.set_text(f"{how_it_ended(episode)}    {keyboard.HELP}")
+    while not (keyboard.is_over or keyboard.is_new):
+        pause(0.05)

@@ -1,0 +1,127 @@
+"""Videos: an mp4 is either whole or not there."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Iterable
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import numpy as np
+
+from flowrep.viz.maps import Image
+
+# Constant quality, near lossless. `veryfast` takes half the time of x264's default at the same
+# error, and the file is no larger.
+_CODEC = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "10", "-preset", "veryfast")
+
+
+class Video:
+    """An mp4 (H.264) that browsers play, written frame by frame, in a folder made if needed.
+
+    The file gets its name when it is complete. Odd sizes, which the codec does not support, are
+    padded with a white row or column. Frames of other sizes than the first are cut or padded.
+
+    FFmpeg is started here, since imageio's writer ignores its exit status, and so a full disk.
+
+    Raises:
+        OSError: FFmpeg can't write the file; the message names it.
+    """
+
+    def __init__(self, path: str | Path, *, fps: float) -> None:
+        self.path, self.fps = Path(path), fps
+        self._partial = self.path.with_name(f"{self.path.stem}.tmp{self.path.suffix}")
+        self._size = 0, 0
+        self._ffmpeg: subprocess.Popen[bytes] | None = None
+        self._messages: IO[bytes] | None = None
+
+    def append(self, image: Image) -> None:
+        """Adds a frame `[H, W, 3]`."""
+        if self._ffmpeg is None:
+            self._start((image.shape[0] + 1) // 2 * 2, (image.shape[1] + 1) // 2 * 2)
+        height, width = self._size
+        image = image[:height, :width]
+        fill = ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0))
+        frame = np.pad(image, fill, constant_values=255)
+        assert self._ffmpeg is not None
+        assert self._ffmpeg.stdin is not None
+        try:
+            self._ffmpeg.stdin.write(frame.tobytes())
+        except BrokenPipeError:
+            self.close()  # which says why it has ended
+
+    def close(self) -> None:
+        """Completes the file; without frames there is none."""
+        if self._ffmpeg is None:
+            return
+        status, said = self._end()
+        if status or not self._partial.is_file():
+            self._partial.unlink(missing_ok=True)
+            raise OSError(f"{self.path} can't be written: {said or f'FFmpeg ended with {status}'}")
+        self._partial.replace(self.path)
+
+    def discard(self) -> None:
+        """Ends without a file."""
+        if self._ffmpeg is not None:
+            self._ffmpeg.kill()
+            self._end()
+            self._partial.unlink(missing_ok=True)
+
+    def __enter__(self) -> Video:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, _: Any, __: TracebackType | None) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
+
+    def _start(self, height: int, width: int) -> None:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        self._size = height, width
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        rate = str(Fraction(self.fps).limit_denominator())
+        raw = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate)
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - closed with FFmpeg
+        self._ffmpeg = subprocess.Popen(
+            [get_ffmpeg_exe(), "-y", "-v", "error", *raw, "-i", "-", *_CODEC, str(self._partial)],
+            stdin=subprocess.PIPE,
+            stderr=self._messages,
+            start_new_session=True,  # Ctrl-C is for this process, which may still want the file
+        )
+
+    def _end(self) -> tuple[int, str]:
+        """Waits for FFmpeg and returns its exit status and its last message."""
+        assert self._ffmpeg is not None
+        assert self._ffmpeg.stdin is not None
+        assert self._messages is not None
+        with suppress(BrokenPipeError):
+            self._ffmpeg.stdin.close()
+        status = self._ffmpeg.wait()
+        with self._messages as file:
+            file.seek(0)
+            lines = file.read().decode(errors="replace").split("\n")
+        self._ffmpeg = None
+        return status, next((line.strip() for line in reversed(lines) if line.strip()), "")
+
+
+def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:
+    """Writes frames `[H, W, 3]` as an mp4, see `Video`."""
+    with Video(path, fps=fps) as video:
+        for frame in frames:
+            video.append(frame)
+
+
+def is_playable(path: str | Path) -> bool:
+    """Returns whether a video is there and can be read."""
+    from imageio_ffmpeg import count_frames_and_secs
+
+    try:
+        return Path(path).is_file() and count_frames_and_secs(str(path))[0] > 0
+    except RuntimeError:  # FFmpeg can't read it
+        return False
