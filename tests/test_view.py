@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from functools import partial
 
 import imageio.v3 as imageio
 import matplotlib
@@ -16,22 +15,23 @@ pytest.importorskip("pybullet", reason="the command needs the simulator")
 
 from flowrep.config import UsageError
 from flowrep.config.schema import ViewConfig, validated
-from flowrep.envs import make_env, street_envs
-from flowrep.experiment.film import make_filmed
+from flowrep.experiment.film import LEGEND_S, Film
+from flowrep.experiment.window import Keyboard, drive_by_hand
+from flowrep.policies import load_agent
 from flowrep.scenes import load_scene
 from flowrep.tables import read_rows
 from flowrep.view import (
-    Keyboard,
+    FILES,
     agent_of,
     category_rows,
-    drive_by_hand,
     drive_on,
     episodes_of,
-    make_env_of,
+    folder_of,
     moments,
     moving_pixels,
+    replace_files,
 )
-from tests.config.composing import plain
+from tests.config.composing import composed, plain
 
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
 NO_OP, LEFT, RIGHT = 0, 1, 2
@@ -58,11 +58,9 @@ def asked(*overrides):
 def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
     out = tmp_path / "seen"
     short = ["scene=three_way_junction", "scene.time_limit_steps=40", "policy=never_turn"]
-    done = view(*short, *SMALL, f"hydra.run.dir={out}")
+    done = view(*short, *SMALL, f"output={out}")
     assert done.returncode == 0, done.stderr
-    assert {path.name for path in out.iterdir()} == {
-        "sheet.png", "episode.mp4", "plan.png", "episodes.csv", "categories.csv"
-    }  # fmt: skip
+    assert {path.name for path in out.iterdir()} == {*FILES}
     first, second = read_rows(out / "episodes.csv")
     assert (first["outcome"], first["hit"], first["length"]) == ("timeout", "", "40")
     assert [first["episode_seed"], second["episode_seed"]] == ["0", "1"]
@@ -70,7 +68,8 @@ def test_a_scene_is_driven_drawn_filmed_and_counted(tmp_path):
     assert len(seen) == 11
     assert min(seen["road"], seen["sky"], seen["pedestrian"], seen["tree"]) > 0
     frames = imageio.imread(out / "episode.mp4", plugin="FFMPEG")
-    assert len(frames) == int(first["length"]) + 1
+    # legend, every frame with the last one, which stays for a second: 12 frames
+    assert len(frames) == 12 * LEGEND_S + int(first["length"]) + 12
     # Six tiles of 32 x 24, enlarged by a whole factor to some 240 px each.
     assert frames.shape[2] > 6 * 200
 
@@ -86,13 +85,43 @@ def test_a_run_and_a_policy_of_ones_own_drive_as_baselines_do(tmp_path):
     for policy, scene in ((str(run.path), "straight_road"), (f"{path}:make", "s_turn")):
         config = asked(f"policy={policy}", "scene=s_turn", "representations=[seg]", "episodes=3")
         agent = agent_of(config, is_scene_given=False)
-        env = make_filmed(make_env_of(config, agent), agent.config.representations)
-        assert env.base_env.scene.name == scene  # a run's agent is at home in its own
-        env.close()
+        film = Film(agent)
+        assert film.street.scene.name == scene  # a run's agent is at home in its own
+        film.close()
         ended[policy] = drive_on(config, agent, options_of(config))
         assert [episode.seed for episode in ended[policy]] == [0, 1, 2]
     never = driven(asked("policy=never_turn", "scene=s_turn", "episodes=3"))
     assert [e.outcome for e in ended[f"{path}:make"]] == [e.outcome for e in never]
+
+
+def test_a_folder_belongs_to_a_scene_and_a_policy():
+    scenes = [load_scene(name) for name in ("straight_road", "s_turn")]
+    policies = "planner", "outputs/a run/", "outputs/another", "../mine.py:make"
+    folders = {folder_of(asked(f"policy='{p}'"), s) for p in policies for s in scenes}
+    assert len(folders) == 8
+    assert {folder.parent.parent.as_posix() for folder in folders} == {"outputs/view"}
+    assert folder_of(asked("output=here"), scenes[0]).as_posix() == "here"
+
+
+def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    for folder, names in ((old, [*FILES, "notes.txt"]), (new, ["sheet.png", "plan.png"])):
+        folder.mkdir()
+        for name in names:
+            (folder / name).write_text(folder.name)
+    replace_files(new, old)  # of a view with video=false
+    left = {path.name: path.read_text() for path in old.iterdir()}
+    assert left == {"sheet.png": "new", "plan.png": "new", "notes.txt": "old"}
+
+
+@pytest.mark.slow
+def test_a_refused_view_leaves_no_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for wrong in ("policy=pilot", "path=up", "speed=fast"):
+        done = view(wrong)
+        assert done.returncode == 2
+        assert wrong.partition("=")[0] in done.stderr
+        assert not [*tmp_path.iterdir()]
 
 
 def test_what_is_no_policy_or_path_is_named():
@@ -166,19 +195,20 @@ def test_a_key_acts_while_it_is_held():
 
 
 @pytest.fixture
-def env(straight_road):
-    env = make_filmed(partial(make_env, straight_road), {})
-    yield env
-    env.close()
+def film():
+    scene = composed("debug=smoke").scene
+    film = Film(load_agent("planner", scene=scene, device="cpu", num_envs=1, num_workers=0))
+    yield film
+    film.close()
 
 
-def drive_with_keys(env, keys):
+def drive_with_keys(film, keys):
     """Drives in a window; at each pause the next key is pressed, None presses none."""
     seen, keys = [], iter(keys)
 
     def pause(seconds):
         figure = plt.gcf()
-        episode = street_envs(env)[0].episode
+        episode = film.street.episode
         title = figure._suptitle.get_text()
         seen.append((title, episode.seed, episode.steps, episode.now.vehicle.yaw_rad))
         key = next(keys, "q")
@@ -189,12 +219,12 @@ def drive_with_keys(env, keys):
             figure.canvas.callbacks.process("key_press_event", event)
 
     with matplotlib.rc_context({"backend": "agg"}):
-        drive_by_hand(Keyboard(never, "planner"), env, {"episode_seed": 1}, pause)
+        drive_by_hand(Keyboard(never, "planner"), film, {"episode_seed": 1}, pause)
     return seen
 
 
-def test_the_window_hears_the_keys_and_an_ended_episode_waits_for_r(env):
-    seen = drive_with_keys(env, ["left", *[None] * 40, "r", None])
+def test_the_window_hears_the_keys_and_an_ended_episode_waits_for_r(film):
+    seen = drive_with_keys(film, ["left", *[None] * 40, "r", None])
     assert [steps for _, _, steps, _ in seen[:4]] == [0, 1, 2, 3]
     assert seen[3][3] > 0  # left turns left
     ended = [title for title, *_ in seen if title.startswith("out of bounds")]
@@ -203,14 +233,14 @@ def test_the_window_hears_the_keys_and_an_ended_episode_waits_for_r(env):
     assert (seed, steps, last[1]) == (2, 0, 2)
 
 
-def test_an_episode_can_be_left_for_the_next_and_the_window_be_closed(env):
-    seen = drive_with_keys(env, [None, "r", None, "close"])
+def test_an_episode_can_be_left_for_the_next_and_the_window_be_closed(film):
+    seen = drive_with_keys(film, [None, "r", None, "close"])
     assert [(seed, steps) for _, seed, steps, _ in seen] == [(1, 0), (1, 1), (2, 0), (2, 1)]
 
 
-def test_without_a_screen_one_line_says_what_is_missing(env):
+def test_without_a_screen_one_line_says_what_is_missing(film):
     with (
         matplotlib.rc_context({"backend": "agg"}),
         pytest.raises(UsageError, match=r"^interactive=true .*screen.*$"),
     ):
-        drive_by_hand(Keyboard(never, "never_turn"), env, {"episode_seed": 1})
+        drive_by_hand(Keyboard(never, "never_turn"), film, {"episode_seed": 1})

@@ -124,7 +124,7 @@ def is_a_mistake(error: Exception) -> bool:
 
 def checked(config: DictConfig, schema: type[Section]) -> Any:
     """Returns a composed config as its model; keys that the user added (`+note=pilot`) pass."""
-    plain, job = plain_config(config), HydraConfig.get()
+    plain, job = plain_config(config), config.get("hydra") or HydraConfig.get()
     model = validated(schema, plain)
     typed = job.overrides.task
     keys = [text.partition("=")[0].rpartition("@")[2] for text in typed]  # +group@key=choice

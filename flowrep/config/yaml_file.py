@@ -28,10 +28,11 @@ class _Loader(yaml.SafeLoader):
         return root
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        names = [key.value for key, _ in node.value]
+        names: list[Any] = []
         for key, _ in node.value:
-            if names.count(key.value) > 1 and key.tag != "tag:yaml.org,2002:merge":
+            if key.value in names and key.tag != "tag:yaml.org,2002:merge":
                 raise _problem(f"the key {key.value!r} is given twice", key)
+            names.append(key.value)
         return super().construct_mapping(node, deep)
 
     def _size(self, node: Any, sizes: dict[int, int | None]) -> int:

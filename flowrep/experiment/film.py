@@ -185,7 +185,7 @@ class Film:
         """Returns what turns a map as the agent reads it into ids, metres or px per step."""
         options = representation_options(name) | dict(self._given(name))
         if "encoding" in options:
-            return lambda ids: ids if len(ids) == 1 else ids.argmax(0, keepdim=True)
+            return lambda ids: ids if len(ids) == 1 else ids.argmax(0, keepdim=True).byte()
         if "range_m" in options:  # 1 is the sky's, too
             return lambda depth: torch.where(depth < 1, depth * options["range_m"], torch.inf)
         if name in FLOWS:

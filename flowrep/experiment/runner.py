@@ -168,6 +168,7 @@ class Runner:
         """Writes causes of failure and learning curve, and films an episode unless it is there."""
         # drawing takes seconds to import
         from flowrep.experiment.film import draw_learning_curve, record_episode
+        from flowrep.viz import is_playable
 
         self.close()  # its processes take memory, and so does filming
         metrics, episodes = self.folder.read_metrics(), self.folder.read_episodes()
@@ -176,7 +177,7 @@ class Runner:
         path = self.folder.curve_path
         draw_learning_curve(path, metrics, episodes, speed=self.config.speed, fps=fps)
         path = self.folder.video_path(f"episode_{self.config.speed}")
-        if self.config.evaluation.video and not path.exists():
+        if self.config.evaluation.video and not is_playable(path):
             agent = Agent(self.agent.policy, self.config, self.frames)
             record_episode(agent, path, episode_seed=FINAL_SEED)
             print(f"video: {path}")

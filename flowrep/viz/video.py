@@ -105,9 +105,9 @@ class Video:
         status = self._ffmpeg.wait()
         with self._messages as file:
             file.seek(0)
-            lines = file.read().decode(errors="replace").split("\n")
+            said = file.read().decode(errors="replace").strip().rpartition("\n")[2]
         self._ffmpeg = None
-        return status, next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return status, said.rpartition("] ")[2]  # without the part of FFmpeg that says it
 
 
 def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> None:

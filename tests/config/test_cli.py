@@ -47,7 +47,7 @@ MISTAKES = [
     ("train representations=[eggo]", ["eggo", "ego", "depth2", "seg"]),
     ("train hydra/launcher=joblb", ["joblb", "basic"]),
     ("train -m representations=[ego],[raw,eggo]", ["eggo", "depth2"]),
-    ("train scene=my/x.yaml", ["x.yaml", "--config-dir", "scene=x"]),
+    ("train scene=my/x.yaml", ["my/x.yaml", "--config-dir", "s_turn"]),
     ("factorize input=x output=y", ["format", "tum", "vkitti2"]),
     # a key that doesn't exist
     ("train sed=3", ["sed", "seed", "total_frames", "preset"]),
@@ -56,18 +56,18 @@ MISTAKES = [
     ("train scene.camera.heigth_px=84", ["scene.camera.heigth_px"]),
     ("train +algorithm.gama=0.9", ["algorithm.gama"]),
     # nothing where something is needed
-    ("train scene=null", ["null"]),
+    ("train scene=null", ["group"]),
     ("train representations=[]", ["representations"]),
-    ("train ~algorithm", ["algorithm"]),
+    ("train ~algorithm", ["preset"]),
     ("train total_frames=???", ["total_frames"]),
-    ("factorize input=x output=y format=sintel", ["format.scene=..."]),
+    ("factorize input=x output=y format=sintel", ["format.scene"]),
     ("report", ["run"]),
-    # what Hydra can't read
-    ("train 'representations=[ego,' 'obj]'", ["representations=[ego,", "without spaces"]),
-    ("train hydra.run.dir=/home/josé/x", ["'hydra.run.dir='\"'\"'/home/josé/x'\"'\"''"]),
-    ("train outputs", ["outputs", "key=value"]),
+    # what Hydra can't read, or a shell has split
+    ("train 'representations=[ego,' 'obj]'", ["representations=[ego,", "representations=[a,b]"]),
+    ("evaluate run=a 'speed=[low,' 'high]'", ["speed=[low,", "speed=[a,b]"]),
+    ("train outputs", ["outputs"]),
     ("train --preset laptop", ["preset=<value>"]),
-    ("train seed=0,1", ["seed=0,1", "-m", "seed=[0,1]"]),
+    ("train seed=0,1", ["seed=0,1"]),
     ("report x run=y", ["x", "run="]),
     # places that don't exist, flags that contradict each other
     ("train --config-dir nowhere", ["nowhere"]),
@@ -75,7 +75,7 @@ MISTAKES = [
     ("train -m --cfg job", ["--multirun", "--cfg"]),
     # values
     ("train algorithm.gamma=2 evaluation.episodes=0 seed=x", ["gamma", "episodes", "seed"]),
-    ("train -m seed=0 hydra/launcher=ray_jobs", ["pip install hydra_ray_launcher"]),
+    ("train -m seed=0 hydra/launcher=ray_jobs", ["hydra_ray_launcher"]),
 ]
 
 
@@ -159,6 +159,62 @@ def test_configs_of_ones_own_are_found(run, form, tmp_path, monkeypatch):
         assert names in said.err
 
 
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]\n"
+    for before, name in zip("abcdefgh", "bcdefghi")
+)
+"""A billion values in nine lines."""
+
+SLIPS = {
+    "a list that is not closed": ("seed: [1\nspeed: low\n", 2),
+    "a tab": ("seed: 1\n\tspeed: low\n", 2),
+    "a key twice": ("seed: 1\nspeed: low\nseed: 2\n", 3),
+    "an alias without an anchor": ("seed: *there\n", 1),
+    "aliases that repeat each other": (BOMB, 5),  # 111,111 of them
+    "an alias within its anchor": ("a: 1\nb: &b [*b]\n", 2),
+    "two documents": ("seed: 1\n---\nseed: 2\n", 2),
+    "a tag": ("seed: !!python/name:os.system\n", 1),
+    # these have no line
+    "a list": ("- seed\n", None),
+    "a number": ("3\n", None),
+    "an open interpolation": ("speed: ${seed\n", None),
+    "too deep": ("a: " + "[" * 2000 + "]" * 2000, None),
+}
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("slip", SLIPS)
+@pytest.mark.parametrize("group", ["scene", "preset", "experiment", "representations", ""])
+def test_a_slip_in_a_file_of_ones_own_names_file_and_line(run, tmp_path, group, slip):
+    text, number = SLIPS[slip]
+    file = tmp_path / "conf" / group / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text(text)
+    choice = {"": "--config-name=mine", "representations": "representations=[mine]"}
+    line = choice.get(group, f"{group}=mine")
+    code, found, said = run("train", "--config-dir", str(tmp_path / "conf"), line)
+    assert (code, found) == (2, [])
+    (told,) = said.err.splitlines()
+    assert told.startswith(f"error: {file}" + (f", line {number}: " if number else ": "))
+
+
+def test_a_file_in_another_encoding_is_recognised_by_its_line(run, tmp_path):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "mine.yaml").write_bytes("name: mine\n# große Straße\n".encode("cp1252"))
+    code, _, said = run("train", "--config-dir", str(tmp_path), "scene=mine")
+    assert code == 2
+    assert "UTF-8" in said.err
+    assert "# gro" in said.err
+
+
+def test_aliases_that_are_used_with_measure_pass(run, tmp_path):
+    (tmp_path / "experiment").mkdir()
+    text = "# @package _global_\nevaluation: {episodes: &n 7, final_episodes: *n}\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(text)
+    code, (config,), _ = run("train", "--config-dir", str(tmp_path), "experiment=mine")
+    assert (code, config.evaluation.episodes, config.evaluation.final_episodes) == (0, 7, 7)
+
+
 def test_a_scene_file_that_kept_the_name_of_its_original_is_refused(run, tmp_path):
     (tmp_path / "scene").mkdir()
     original = (CONF_DIR / "scene" / "s_turn.yaml").read_text()
@@ -219,6 +275,13 @@ def test_folders_that_are_there_are_taken_as_they_were_typed(tmp_path, monkeypat
 def test_what_is_no_folder_stays_what_it_is():
     typed = ["run=[a,b]", "+note=x", "~policy", "trajectories=2", "--cfg", "job", "resume="]
     assert cli.as_typed(typed, schema.ReportConfig) == typed
+
+
+@pytest.mark.parametrize("key", ["hydra.run.dir", "hydra.sweep.dir", "resume"])
+def test_a_folder_that_hydra_can_not_read_is_quoted(key):
+    typed = cli.as_typed([f"{key}=/home/josé/x (2)"], schema.TrainConfig)
+    (parsed,) = OverridesParser.create().parse_overrides(typed)
+    assert parsed.value() == "/home/josé/x (2)"
 
 
 @pytest.mark.parametrize("name", ["20240501", "1e3", "0x10", "true", "inf"])

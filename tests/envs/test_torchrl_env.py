@@ -20,7 +20,6 @@ from flowrep.envs import (
     street_envs,
 )
 from flowrep.envs.sensing import SENSORS
-from flowrep.experiment.film import maps_of
 from flowrep.palette import CATEGORY_ID
 from flowrep.transforms import FlowFactorize, RawFlow
 
@@ -305,14 +304,3 @@ def test_what_was_hit_stands_beside_the_outcome(make):
     # Straight on, only people are in the way.
     assert set(hit[collided].tolist()) == {CATEGORY_ID["pedestrian"]}
     assert (hit[~collided] == 255).all()
-
-
-def test_the_agent_and_the_film_see_one_noise(make):
-    env = make(representations=["ego", "obj", "depth", "rgb"], noise=NOISE, keep_sensor=True)
-    begun = env.reset(seed=0).set("action", torch.tensor([1]))
-    seen = env.step(begun)["next"]
-    maps = maps_of(seen["sensor"][0], torch.as_tensor(street_envs(env)[0].K).float())
-    for name in ("ego", "obj"):
-        torch.testing.assert_close(maps[name], seen[name][0])
-    assert torch.equal(maps["depth"].isnan(), seen["depth"][0] == 0)
-    assert not maps["raw"].isnan().any()

@@ -1,56 +1,204 @@
 """Films of episodes and the learning curve."""
 
-from functools import partial
-
+import numpy as np
 import pytest
 import torch
+from torchrl.data import Bounded
 
 pytest.importorskip("pybullet", reason="the simulated street is driven")
 
-from flowrep.envs import make_env, street_envs
-from flowrep.experiment.film import (
-    draw_learning_curve,
-    film_episode,
-    make_filmed,
-    maps_of,
-    record_episode,
-)
+from flowrep.experiment.agents import Agent
+from flowrep.experiment.film import LEGEND_S, Film, draw_learning_curve, record_episode
+from flowrep.palette import OUTCOME_COLOURS
 from flowrep.policies import load_agent
+from flowrep.transforms import Depth, stack
 from tests.config.composing import composed
+
+FRAME_COLOUR = (230, 97, 1)
 
 
 def leave_the_road(tensordict):
     return tensordict.set("action", torch.ones(len(tensordict), dtype=torch.int64))
 
 
-def test_a_film_is_of_the_episode_that_names_it():
-    env, sensors = make_filmed(partial(make_env, "straight_road"), {"seg": {}}), []
-    frames, episode = film_episode(
-        env, leave_the_road, {"episode_seed": 2_000_017}, on_frame=sensors.append
+@pytest.fixture
+def film_of():
+    """Films an agent of a config that leaves the road to the left; closed when the test ends."""
+    made = []
+
+    def film_of(*overrides, policy=leave_the_road):
+        small = "debug=smoke", "device=cpu"
+        made.append(Film(Agent(policy, composed(*small, *overrides))))
+        return made[-1]
+
+    yield film_of
+    for film in made:
+        film.close()
+
+
+def test_a_film_is_of_the_episode_that_names_it(film_of):
+    film, sensors = film_of("representations=[seg]"), []
+    frames, episode = film.drive(
+        {"episode_seed": 2_000_017}, lambda tensordict: sensors.append(tensordict["sensor"][0])
     )
-    assert street_envs(env)[0].episode.seed == episode.seed == 2_000_017
+    assert film.street.episode.seed == episode.seed == 2_000_017
     assert episode.outcome == "out_of_bounds"
     assert len(frames) == len(sensors) == episode.length + 1
-    intrinsics = torch.as_tensor(street_envs(env)[0].K)
-    for name, drawn in maps_of(sensors[3], intrinsics).items():
-        assert torch.equal(drawn, frames[3][name])
-    torch.testing.assert_close(frames[3]["raw"], frames[3]["ego"] + frames[3]["obj"])
+    assert [frame.steps for frame in frames] == [*range(episode.length + 1)]
+    # with the frame in which the episode has ended, where nothing is decided any more
+    assert [frame.action for frame in frames] == [1] * episode.length + [None]
+    turned = [frame.turned for frame in frames]
+    assert turned == sorted(turned)
+    assert turned[0] == 0 < turned[1]  # to the left
+    # 35°/s² for a twelfth of a second, in shares of 60°/s
+    assert turned[1] == pytest.approx(35 / 12 / 60)
+
+
+def test_what_the_agent_does_not_read_is_exact(film_of):
+    film, last = film_of("representations=[seg]"), []
+    frames, _ = film.drive(
+        {"episode_seed": 3}, lambda tensordict: last.append(tensordict["sensor"][0].clone())
+    )
+    maps, sensor = frames[9].maps, last[9]
+    assert film.framed == ["seg"]
+    assert torch.equal(maps["seg"], sensor["semantic"])
+    near = sensor["depth"] < 99.9
+    torch.testing.assert_close(maps["depth"][near], sensor["depth"][near])
+    assert maps["depth"][sensor["depth"].isinf()].isinf().all()
+    torch.testing.assert_close(maps["raw"], maps["ego"] + maps["obj"])
+    assert maps["ego"].abs().max() > 0.1
+
+
+def test_what_the_agent_reads_is_drawn_in_its_units_and_as_noisy_as_it_is(film_of):
+    options = "representations.obj.scale=0.2", "representations.ego.unit=px_per_s"
+    noise = "noise=depth_camera", "noise.depth_dropout=0.2"
+    film, seen = film_of("representations=[ego,obj,depth]", *options, *noise), []
+    frames, _ = film.drive({"episode_seed": 3}, lambda tensordict: seen.append(tensordict.clone()))
+    maps, read = frames[9].maps, seen[9]
+    torch.testing.assert_close(maps["obj"], read["obj"][0] * 5.0)
+    torch.testing.assert_close(maps["ego"], read["ego"][0] / 12.0)  # at 12 frames a second
+    torch.testing.assert_close(maps["depth"], (read["depth"][0] * 100.0).where(
+        read["depth"][0] < 1, torch.tensor(torch.inf)
+    ))  # fmt: skip
+    holes = read["sensor", "noisy_depth"][0].isnan()
+    assert holes.float().mean() > 0.1
+    assert (maps["depth"][holes] == 0).all()
+    assert film.framed == ["ego", "obj", "depth"]
+
+
+@pytest.mark.slow
+def test_a_film_leaves_the_agents_estimates_as_they_are(film_of):
+    """The maps beside them must not change how they are estimated."""
+    pytest.importorskip("cv2", reason="flow is estimated by OpenCV")
+    overrides = "representations=[raw]", "flow=estimated_fast"
+    film, seen = film_of(*overrides), []
+    film.drive({"episode_seed": 3}, lambda tensordict: seen.append(tensordict["raw"].clone()))
+    env = film.agent.make_env(num_envs=1, num_workers=0)
+    tensordict = env.reset(options={"episodes": [{"episode_seed": 3}]})
+    for filmed in seen[:6]:
+        assert torch.equal(tensordict["raw"], filmed)
+        tensordict = env.step(leave_the_road(tensordict))["next"]
     env.close()
 
 
 @pytest.mark.parametrize(
     ("representation", "flow", "rgb"),
     [
-        ("seg", "exact", (3, 252, 252)),  # three times the maps, as large as a film's tiles
-        ("rgb", "exact", (3, 84, 84)),  # the agent sees it
-        ("obj", "estimated", (3, 84, 84)),  # flow is estimated from it
+        ("seg", "exact", (200, 240)),  # five times the maps, as large as a film's tiles
+        ("rgb", "exact", (40, 48)),  # the agent sees it
+        ("obj", "estimated", (160, 192)),  # flow is estimated from pictures of four times the size
     ],
 )
-def test_the_picture_is_large_unless_something_else_reads_it(representation, flow, rgb):
-    make = partial(make_env, "straight_road", flow=flow)
-    env = make_filmed(make, {representation: {}})
-    assert env.observation_spec["sensor", "rgb"].shape == (1, *rgb)
-    env.close()
+def test_the_picture_is_large_unless_something_else_reads_it(film_of, representation, flow, rgb):
+    film = film_of(f"representations=[{representation}]", f"flow={flow}")
+    assert film.env.observation_spec["sensor", "rgb"].shape == (1, 3, *rgb)
+
+
+def columns_of(picture, colour):
+    """Returns in which columns of a picture a colour fills most rows: upright lines."""
+    is_it = (np.abs(picture.astype(int) - colour) <= 2).all(-1)
+    return np.flatnonzero(is_it[:200].mean(axis=0) > 0.95)
+
+
+def test_what_the_agent_reads_is_framed_and_a_baseline_reads_nothing(film_of):
+    film = film_of("representations=[ego]")
+    frames, _ = film.drive({"episode_seed": 3})
+    picture = film.draw(frames[0])
+    left, right = columns_of(picture, FRAME_COLOUR)[[0, -1]]
+    # six tiles of 240 px, with 5 px around each and 4 px between: ego is the fifth
+    assert left == 4 * (240 + 10 + 4)
+    assert right - left + 1 == 250
+    scene = composed("debug=smoke").scene
+    with_planner = Film(load_agent("planner", scene=scene, device="cpu", num_envs=1, num_workers=0))
+    frames, _ = with_planner.drive({"episode_seed": 3})
+    assert not columns_of(with_planner.draw(frames[0]), FRAME_COLOUR).size
+    with_planner.close()
+
+
+def test_the_last_picture_shows_the_outcome_in_its_colour(film_of):
+    film = film_of("representations=[seg]")
+    frames, episode = film.drive({"episode_seed": 3})
+    pictures = list(film.pictures(frames, episode))
+    legend = round(LEGEND_S * episode.fps)
+    assert len(pictures) == legend + episode.length + 12  # the last frame for a second
+    assert {picture.shape for picture in pictures} == {pictures[0].shape}
+    assert all((picture == pictures[-1]).all() for picture in pictures[-12:])
+    colour = tuple(bytes.fromhex(OUTCOME_COLOURS["out_of_bounds"][1:]))
+    has_it = [tuple(picture[-3, -3]) == colour for picture in pictures]
+    assert has_it == [False] * (len(pictures) - 12) + [True] * 12
+    # what is above it is the frame in which the episode ended
+    bare = film.draw(frames[-1])
+    assert (pictures[-1][:-28] == bare[:-28]).all()
+
+
+def test_the_film_opens_with_a_legend_of_flow(film_of):
+    film = film_of("representations=[seg]")
+
+    def has_red():  # the wheel's: flow to the right, at its rim
+        return (np.abs(film.legend().astype(int) - (255, 0, 0)).max(-1) < 10).any()
+
+    assert has_red()
+    film.tiles = {name: film.tiles[name] for name in ("rgb", "seg")}
+    assert not has_red()
+
+
+def test_frames_of_a_stack_have_a_tile_each(film_of):
+    film = film_of("representations=[depth2,seg2]", "representations.seg2.encoding=onehot")
+    frames, _ = film.drive({"episode_seed": 3})
+    assert film.framed == ["depth2, 1 of 2", "depth2, 2 of 2", "seg2, 1 of 2", "seg2, 2 of 2"]
+    before, now = frames[4].maps, frames[5].maps
+    for name in ("depth", "seg"):  # oldest first; the newest is the exact one here
+        torch.testing.assert_close(now[f"{name}2, 1 of 2"], before[name])
+        torch.testing.assert_close(now[f"{name}2, 2 of 2"], now[name])
+    assert film.draw(frames[5]).shape == film.legend().shape
+
+
+class Nearness(Depth):
+    """A representation of a user's own, of two channels."""
+
+    def compute(self, depth):
+        near = 1 / depth.clamp(min=1.0)
+        return (torch.cat([near, near.square()], dim=-3),)
+
+    def output_specs(self, depth):
+        shape = *depth.shape[:-3], 2, *depth.shape[-2:]
+        return (Bounded(0.0, 1.0, shape=shape, device=depth.device, dtype=torch.float32),)
+
+
+def test_a_representation_of_ones_own_is_shown_in_grey(monkeypatch):
+    entry = stack._Representation(Nearness)
+    monkeypatch.setitem(stack._REPRESENTATIONS, "near", entry)
+    monkeypatch.setattr(stack, "REPRESENTATIONS", (*stack.REPRESENTATIONS, "near"))
+    config = composed("debug=smoke", "device=cpu")
+    agent = Agent(leave_the_road, config.model_copy(update={"representations": {"near": {}}}))
+    film = Film(agent)
+    frames, _ = film.drive({"episode_seed": 3})
+    assert film.framed == ["near, 1 of 2", "near, 2 of 2"]
+    drawn = [film.tiles[name].draw(frames[5].maps[name]) for name in film.framed]
+    near = 1 / frames[5].maps["depth"][0].clamp(min=1.0).numpy()
+    for image, shares in zip(drawn, (near, near**2)):
+        assert np.abs(image[..., 0] - 255 * shares)[near > 0.011].max() <= 0.51
+    film.close()
 
 
 @pytest.mark.slow
@@ -60,7 +208,8 @@ def test_a_recorded_episode_is_a_whole_film(tmp_path):
     agent = load_agent("random", scene=scene, device="cpu", num_envs=1, num_workers=0)
     episode = record_episode(agent, path, episode_seed=3, frame_rate_hz=6.0)
     assert episode.fps == 6.0
-    assert len(imageio.imread(path, plugin="FFMPEG")) == episode.length + 1
+    played = imageio.imread(path, plugin="FFMPEG")
+    assert len(played) == 6 * LEGEND_S + episode.length + 6
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
 
 
