@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
 from flowrep.tables import read_rows
+from flowrep.viz import is_playable
 
 pytestmark = pytest.mark.slow
 
@@ -31,6 +32,38 @@ def smoke_run(tmp_path_factory):
     printed = command("train", "debug=smoke", "seed=3", cwd=folder)
     (run,) = folder.glob("outputs/*/*_straight_road_ego+obj_s3")
     return run, printed
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("train --help", 0),
+        ("train total_frames=abc", 2),
+        ("train scene.layout_seed=x", 2),
+        ("train sed=1", 2),
+        ("evaluate --help", 0),
+        ("evaluate episodes=0", 2),
+        ("view --help", 0),
+        ("view speed=fast", 2),
+    ],
+)
+def test_help_and_refusals_need_no_pytorch_and_no_folder(tmp_path, line, code):
+    name, *arguments = line.split()
+    command = [sys.executable, "-X", "importtime", "-m", f"flowrep.{name}", *arguments]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=ENVIRONMENT)
+    assert result.returncode == code
+    imported = {text.rpartition("|")[2].strip() for text in result.stderr.splitlines()}
+    assert "hydra" in imported
+    assert not {"torch", "matplotlib", "pybullet"} & imported
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_device_that_is_not_there_leaves_no_folder(tmp_path):
+    line = [sys.executable, "-m", "flowrep.train", "device=cuda:93"]
+    result = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, env=ENVIRONMENT)
+    assert result.returncode == 2
+    assert "device=cuda:93" in result.stderr
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
@@ -67,7 +100,10 @@ def test_a_complete_run_is_not_evaluated_twice(smoke_run):
     before = [table.read_text() for table in tables]
     tables[1].unlink()  # a full disk, say, left out what comes after the evaluation
     (run / "learning_curve.png").unlink()
+    film = run / "videos" / "episode_normal.mp4"
+    film.write_bytes(film.read_bytes()[:5000])  # of a version that didn't notice a full disk
     assert "this run is complete" in command("train", f"resume={run}", cwd=run)
+    assert is_playable(film)
     assert [table.read_text() for table in tables] == before
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
 

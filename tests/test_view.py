@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from contextlib import closing
 
 import imageio.v3 as imageio
 import matplotlib
@@ -31,7 +32,9 @@ from flowrep.view import (
     moving_pixels,
     replace_files,
 )
+from flowrep.view import view as show
 from tests.config.composing import composed, plain
+from tests.viz.test_video import full_after
 
 SMALL = ["scene.camera.height_px=24", "scene.camera.width_px=32", "episodes=2", "sheet_rows=2"]
 NO_OP, LEFT, RIGHT = 0, 1, 2
@@ -112,6 +115,19 @@ def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
     replace_files(new, old)  # of a view with video=false
     left = {path.name: path.read_text() for path in old.iterdir()}
     assert left == {"sheet.png": "new", "plan.png": "new", "notes.txt": "old"}
+
+
+@pytest.mark.slow
+def test_a_full_disk_leaves_the_earlier_view_whole(tmp_path):
+    (tmp_path / "sheet.png").write_text("old")
+    config = asked("scene.time_limit_steps=20", *SMALL, "episodes=1")
+    agent = agent_of(config, is_scene_given=True)
+    with closing(Film(agent)) as film:
+        options = episodes_of(config, film.street.scene)
+        with full_after(5_000), pytest.raises(OSError, match=r"episode\.mp4"):
+            show(config, agent, film, options, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
+    assert (tmp_path / "sheet.png").read_text() == "old"
 
 
 @pytest.mark.slow

@@ -241,6 +241,9 @@ def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
             is_name = key in FOLDERS and value and _is_misread(key, value)
             others.append(override(key, value) if is_name else text)
         previous = text
+    # argparse takes all keys from one stretch: `seed=0,1 -m scene=s_turn` has two
+    is_sweep = [text for text in others if text in ("-m", "--multirun")][:1]
+    others = [*is_sweep, *(text for text in others if text not in ("-m", "--multirun"))]
     if not folders:
         return others
     if any(text.startswith("run=") for text in others):

@@ -1,5 +1,8 @@
 """Streets with pedestrians in PyBullet: gymnasium environments and `make_env` for TorchRL.
 
+Importing this registers them with gymnasium, which from 1.0 on finds no plugins by itself.
+`gymnasium.make("flowrep.envs:flowrep/StraightRoad-v0")` imports it first.
+
 What needs PyTorch is imported when it is first asked for: workers step environments without it.
 """
 

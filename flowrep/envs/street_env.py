@@ -63,6 +63,12 @@ class StreetEnv(gym.Env):
         renderer: str = "auto",
         picture_scale: int = 1,
     ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(
+                f"render_mode is {render_mode!r}; give 'rgb_array' or None. A window opens with "
+                "gymnasium.wrappers.HumanRendering around an env of 'rgb_array', or with python -m "
+                "flowrep.view interactive=true"
+            )
         self.scene = load_scene(scene)
         self.speed_mps = _speed_range(self.scene, speed)
         self.frame_rate_hz = _frame_rate(self.scene, frame_rate_hz)

@@ -24,6 +24,19 @@ from flowrep.transforms import Mirror, representation_stack
 from flowrep.transforms.stack import FLOWS
 
 
+def usable_device(device: str | torch.device) -> torch.device:
+    """Returns a device on which tensors can be made.
+
+    Raises:
+        ValueError: there is no such device, or this PyTorch can't use it.
+    """
+    try:
+        return torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError) as error:  # the latter of a PyTorch without CUDA
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device={device} can't be used: {reason}. Try device=cpu") from None
+
+
 def sensors_read(transforms: Iterable[Any]) -> list[str]:
     """Returns the sensors that transforms read."""
     keys = {key for transform in transforms for key in transform.in_keys}
@@ -128,7 +141,7 @@ def make_env(
 
     Raises:
         SceneError: if the scene is invalid.
-        ValueError: if `compiled=True` and no C++ compiler is found.
+        ValueError: if the device can't be used, or if `compiled=True` and no C++ compiler is found.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -137,6 +150,7 @@ def make_env(
     """
     if num_envs < 1:
         raise ValueError(f"num_envs is {num_envs}; give at least one environment")
+    device = usable_device(device)
     loaded = load_scene(scene)
     if isinstance(flow, Mapping):
         picture_scale = flow.get("picture_scale", picture_scale)
@@ -170,7 +184,7 @@ def make_env(
         loaded,
         probe.frame_rate_hz,
         transforms,
-        device=torch.device(device),
+        device=device,
         categorical_action_encoding=True,
     )
     env = TransformedEnv(base, transforms)

@@ -14,6 +14,7 @@ from flowrep.agent import Algorithm
 from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
 from flowrep.envs import make_env, make_mirror
+from flowrep.envs.torchrl_env import usable_device
 from flowrep.envs.workers import available_cores
 from flowrep.experiment.evaluation_pool import EvaluationPool, can_travel
 from flowrep.simulator.camera import choose_renderer
@@ -25,11 +26,7 @@ def device(name: str) -> torch.device:
     """Returns the named device; "auto" is a CUDA device if there is one, else the CPU."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return torch.empty(0, device=name).device
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise UsageError(f"device={name} can't be used: {reason}. Try device=cpu") from None
+    return usable_device(name)
 
 
 def env(config: EnvConfig, **changes: Any) -> EnvBase:

@@ -94,9 +94,12 @@ class MapTransform(Transform):
         for key, value in zip(self.in_keys, maps):
             if value is None:
                 offered = sorted(source.keys(True, True), key=str)
+                remedy = "Name another one with in_keys=, or let the env emit it."
+                if key[0] == "sensor" and "sensor" not in source.keys():
+                    remedy += " make_env drops its sensors' keys unless it gets keep_sensor=True."
                 raise MissingKey(
                     f"representation {self.label} needs key {key!r}; the env offers {offered}. "
-                    "Name another one with in_keys=, or let the env emit it."
+                    f"{remedy}"
                 )
         # The TensorDict's or the spec's batch; that of the inputs may have further dims.
         batch, leading = source.shape, maps[0].shape[: -len(self.reads[0].shape)]

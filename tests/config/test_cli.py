@@ -277,6 +277,11 @@ def test_what_is_no_folder_stays_what_it_is():
     assert cli.as_typed(typed, schema.ReportConfig) == typed
 
 
+def test_a_sweeps_flag_may_stand_anywhere():
+    typed = cli.as_typed(["seed=0,1", "-m", "speed=low"], schema.TrainConfig)
+    assert typed == ["-m", "seed=0,1", "speed=low"]
+
+
 @pytest.mark.parametrize("key", ["hydra.run.dir", "hydra.sweep.dir", "resume"])
 def test_a_folder_that_hydra_can_not_read_is_quoted(key):
     typed = cli.as_typed([f"{key}=/home/josé/x (2)"], schema.TrainConfig)

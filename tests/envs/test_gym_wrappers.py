@@ -1,5 +1,8 @@
 """Representations without TorchRL: numpy maps that other learners take as they are."""
 
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -20,6 +23,19 @@ def test_gymnasiums_own_checks_pass(joined):
     env = gymnasium.make(ID, representations=["ego", "seg2"], joined=joined)
     check_env(env, skip_render_check=True)
     assert env.unwrapped.K.shape == (3, 3)
+
+
+@pytest.mark.slow
+def test_gymnasium_finds_a_street_by_its_module_where_nobody_has_imported_flowrep():
+    made = f"gymnasium.make('flowrep.envs:{ID}').unwrapped.scene.name"
+    code = f"import gymnasium, sys; assert 'flowrep' not in sys.modules; print({made})"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "straight_road"
+
+
+def test_a_window_that_can_not_open_is_refused_at_once():
+    with pytest.raises(ValueError, match="human"):
+        gymnasium.make(ID, render_mode="human")
 
 
 def test_maps_are_those_of_the_torchrl_env():

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from flowrep import envs
@@ -21,7 +22,7 @@ from flowrep.envs import (
 )
 from flowrep.envs.sensing import SENSORS
 from flowrep.palette import CATEGORY_ID
-from flowrep.transforms import FlowFactorize, RawFlow
+from flowrep.transforms import Depth, FlowFactorize, RawFlow
 
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
 
@@ -87,6 +88,24 @@ def test_marks_that_name_no_street_reset_none_and_no_marks_all(make):
 def test_no_environments_and_too_many_workers_are_refused(num_envs, num_workers):
     with pytest.raises(ValueError, match=r"num_\w+ is "):
         make_env("straight_road", num_envs=num_envs, num_workers=num_workers)
+
+
+@pytest.mark.parametrize("device", ["cuda:93", "gpu"])
+def test_a_device_that_can_not_be_used_is_named_at_once(device):
+    with pytest.raises(ValueError, match=rf"^device={device} .*device=cpu$"):
+        make_env("straight_road", device=device)
+
+
+def test_a_transform_of_dropped_sensors_says_how_to_keep_them(make):
+    env = TransformedEnv(make(representations=["seg"]), Depth())
+    with pytest.raises(KeyError, match="keep_sensor=True"):
+        env.reset()
+    kept = TransformedEnv(make(representations=["seg"], keep_sensor=True), Depth())
+    assert kept.reset()["depth"].shape == (1, 1, 84, 84)
+    # what is no sensor's has another reason
+    with pytest.raises(KeyError) as caught:
+        TransformedEnv(make(representations=["seg"]), Depth(in_keys="metres")).reset()
+    assert "keep_sensor" not in str(caught.value)
 
 
 @pytest.mark.slow_after_first
