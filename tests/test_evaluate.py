@@ -116,7 +116,7 @@ def test_an_edited_config_is_refused(untouched):
 
 def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypatch):
     untouched.evaluation_path.write_text("scene;fps\nstraight_road;12\n")
-    monkeypatch.setattr("flowrep.evaluate.Comparison.run", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr("flowrep.experiment.evaluation.Comparison.run", lambda *_, **__: pytest.fail("too late"))
     with pytest.raises(TableError, match=r"evaluation\.csv"):
         evaluate(asked(f"run={untouched.path}"))
 
@@ -140,7 +140,7 @@ def some(tmp_path, monkeypatch):
         return Agent(straight_on, config, 64, "straight_road")
 
     def make(*names, overrides=()):
-        monkeypatch.setattr("flowrep.evaluate.load_trained", load)
+        monkeypatch.setattr("flowrep.experiment.agents.load_trained", load)
         folders = [RunFolder(tmp_path / name) for name in names]
         for folder in folders:
             folder.write_config({})
@@ -229,7 +229,7 @@ def test_a_stop_ends_between_two_films(some, monkeypatch):
         filmed.append(path.name)
         signal.raise_signal(signal.SIGTERM)  # as schedulers send it
 
-    monkeypatch.setattr("flowrep.evaluate.record_episode", record)
+    monkeypatch.setattr("flowrep.experiment.film.record_episode", record)
     _, config = some("good", overrides=["video=2", "seed=7", "episodes=1"])
     with pytest.raises(SystemExit) as ended:
         evaluate(config)

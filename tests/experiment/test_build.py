@@ -57,5 +57,5 @@ def test_what_is_no_algorithm_is_refused(target, options, says):
 
 def test_a_device_that_is_not_there_is_named():
     assert device("cpu").type == "cpu"
-    with pytest.raises(UsageError, match="device=cuda:99"):
+    with pytest.raises(ValueError, match="device=cuda:99"):
         device("cuda:99")
