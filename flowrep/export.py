@@ -1,37 +1,40 @@
-"""Exports a trained agent: `python -m flowrep.export run=outputs/...`."""
+"""Exports a trained agent: `python -m flowrep.export run=outputs/...`.
+
+What needs PyTorch, which takes seconds to import, is imported when the config has passed.
+"""
+
+from __future__ import annotations
 
 import copy
 import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
 
 require("an export", "train", "hydra", "pydantic", module=__name__)
 
-import torch
-from safetensors.torch import save_file
-from torch.export import Dim, ExportedProgram
-from torchrl.data import Composite
-from torchrl.envs import EnvBase
-
-from flowrep import __version__, load_agent
-from flowrep.agent import load_checkpoint
-from flowrep.agent.networks import PolicyNetwork
+from flowrep import __version__
 from flowrep.config.cli import run_command
 from flowrep.config.schema import ExportConfig, TrainConfig, validated_run
-from flowrep.envs import street_envs
-from flowrep.experiment import build
-from flowrep.experiment.agents import CARD, LOADER, PROGRAM
-from flowrep.experiment.run import RunFolder, check_origin, origin_of
+
+if TYPE_CHECKING:
+    import torch
+    from torch.export import ExportedProgram
+    from torchrl.data import Composite
+    from torchrl.envs import EnvBase
+
+    from flowrep.experiment.run import RunFolder
 
 ACTIONS = ("no_op", "turn_left", "turn_right")  # by their indices in flowrep.scenes.scene
 
 
 def run(config: ExportConfig) -> None:
     """Writes the agent of a run as files that can be used without flowrep."""
+    from flowrep.experiment.run import RunFolder
+
     folder = export(RunFolder.existing(config.run), config.output)
     print(f"the agent is in {folder}; load_agent.py there shows how to run it")
 
@@ -41,6 +44,10 @@ def export(run: RunFolder, output: str | None = None) -> Path:
 
     This is `output`, or `export` in the run's folder if None.
     """
+    from flowrep.agent import load_checkpoint
+    from flowrep.experiment import build
+    from flowrep.experiment.run import check_origin, origin_of
+
     own = validated_run(run.read_config(), f"{run.path}/config.yaml")
     state = load_checkpoint(run.checkpoint_path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(own.plain()), run.checkpoint_path)
@@ -61,6 +68,8 @@ def export(run: RunFolder, output: str | None = None) -> Path:
 
 def agent_card(config: TrainConfig, env: EnvBase, frames: int) -> dict[str, Any]:
     """Returns the description that others need to give the agent its observations."""
+    from flowrep.envs import street_envs
+
     spec, (street,) = env.observation_spec, street_envs(env)
     return {
         "flowrep": __version__,
@@ -95,6 +104,11 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
     The maps are arguments in the policy's order, with the dtypes of the specs, for any N. The
     greedy action has the largest score. For stochastic policies, the scores are logits.
     """
+    import torch
+    from torch.export import Dim
+
+    from flowrep.agent.networks import PolicyNetwork
+
     networks = [module for module in policy.modules() if isinstance(module, PolicyNetwork)]
     if len(networks) != 1:
         raise ExportError(
@@ -112,6 +126,12 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
 
 def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any]) -> None:
     """Writes the program, its weights, its card, and the loader that needs only torch."""
+    import torch
+    from safetensors.torch import save_file
+
+    from flowrep import load_agent
+    from flowrep.experiment.agents import CARD, LOADER, PROGRAM
+
     folder.mkdir(parents=True, exist_ok=True)
     torch.export.save(program, folder / PROGRAM)
     weights = {name: weight.detach().contiguous() for name, weight in program.state_dict.items()}

@@ -1,29 +1,40 @@
-"""Factorises recorded video: `python -m flowrep.factorize input=... format=tum output=...`."""
+"""Factorises recorded video: `python -m flowrep.factorize input=... format=tum output=...`.
+
+What needs PyTorch, which takes seconds to import, is imported when the config has passed.
+"""
 
 from __future__ import annotations
 
 import sys
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flowrep.extras import require
 
 require("factorising", "factorize", "cv2", "hydra", "imageio", "pydantic", "tqdm", module=__name__)
 
-import cv2
 from hydra.utils import get_class
 
-from flowrep import sequences
 from flowrep.config import UsageError
 from flowrep.config.cli import run_command
 from flowrep.config.schema import FactorizeConfig, check_options
-from flowrep.sequences.factorization import FlowSource, MotionSource
-from flowrep.sequences.job import Job
-from flowrep.sequences.output import Output
+
+if TYPE_CHECKING:
+    from flowrep import sequences
+    from flowrep.sequences.factorization import FlowSource, MotionSource
 
 
 def factorize_recording(config: FactorizeConfig) -> int:
     """Writes raw, ego and object flow of a recording; returns the exit code."""
+    import cv2
+
+    from flowrep import sequences
+    from flowrep.sequences.job import Job
+    from flowrep.sequences.output import Output
+
+    # OpenCV's messages about broken files would clutter the one-line error.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     stream = open_stream(config)
     flow_source = open_flow_source(config, stream)
     motion_source = open_motion_source(config, stream)
@@ -60,6 +71,8 @@ def factorize_recording(config: FactorizeConfig) -> int:
 
 def open_stream(config: FactorizeConfig) -> sequences.Stream:
     """Returns the recording or camera that `input` and `format` name."""
+    from flowrep import sequences
+
     reader, options, source = get_class(config.format.target), config.format.options(), config.input
     check_options(reader, options, "format")
     if issubclass(reader, sequences.Recording) and not Path(str(source)).is_dir():
@@ -69,6 +82,8 @@ def open_stream(config: FactorizeConfig) -> sequences.Stream:
 
 def open_flow_source(config: FactorizeConfig, stream: sequences.Stream) -> FlowSource:
     """Returns the source of raw flow."""
+    from flowrep import sequences
+
     options = config.plain()["flow"]
     if options.pop("source") == "exact":
         if not stream.has_flow:
@@ -84,6 +99,8 @@ def open_flow_source(config: FactorizeConfig, stream: sequences.Stream) -> FlowS
 
 def open_motion_source(config: FactorizeConfig, stream: sequences.Stream) -> MotionSource:
     """Returns the source of the camera's motion: the recorded poses, if there are any."""
+    from flowrep import sequences
+
     if config.poses == "estimated":
         return sequences.estimated_motion
     if stream.has_poses:
@@ -96,8 +113,6 @@ def open_motion_source(config: FactorizeConfig, stream: sequences.Stream) -> Mot
 
 def main() -> None:
     """Entry point."""
-    # OpenCV's messages about broken files would clutter the one-line error.
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     run_command("factorize", lambda config: sys.exit(factorize_recording(config)), FactorizeConfig)
 
 

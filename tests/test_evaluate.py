@@ -116,7 +116,9 @@ def test_an_edited_config_is_refused(untouched):
 
 def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypatch):
     untouched.evaluation_path.write_text("scene;fps\nstraight_road;12\n")
-    monkeypatch.setattr("flowrep.experiment.evaluation.Comparison.run", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr(
+        "flowrep.experiment.evaluation.Comparison.run", lambda *_, **__: pytest.fail("too late")
+    )
     with pytest.raises(TableError, match=r"evaluation\.csv"):
         evaluate(asked(f"run={untouched.path}"))
 

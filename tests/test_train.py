@@ -43,6 +43,12 @@ def smoke_run(tmp_path_factory):
         ("train sed=1", 2),
         ("evaluate --help", 0),
         ("evaluate episodes=0", 2),
+        ("export --help", 0),
+        ("export", 2),
+        ("factorize --help", 0),
+        ("factorize input=x output=y format=frames video_fps=0", 2),
+        ("report --help", 0),
+        ("report x videos=-1", 2),
         ("view --help", 0),
         ("view speed=fast", 2),
     ],
@@ -54,7 +60,7 @@ def test_help_and_refusals_need_no_pytorch_and_no_folder(tmp_path, line, code):
     assert result.returncode == code
     imported = {text.rpartition("|")[2].strip() for text in result.stderr.splitlines()}
     assert "hydra" in imported
-    assert not {"torch", "matplotlib", "pybullet"} & imported
+    assert not {"torch", "matplotlib", "pybullet", "cv2", "scipy"} & imported
     assert not [*tmp_path.iterdir()]
 
 

@@ -100,11 +100,12 @@ def _files_named() -> Iterator[None]:
             raise ValueError("it should hold `key: value` lines")
         return config
 
-    OmegaConf.load = checked_load  # type: ignore[method-assign]
+    omegaconf: Any = OmegaConf
+    omegaconf.load = checked_load
     try:
         yield
     finally:
-        OmegaConf.load = load  # type: ignore[method-assign]
+        omegaconf.load = load
 
 
 def end_with(error: Exception, schema: type[Section]) -> NoReturn:
@@ -143,7 +144,7 @@ def checked(config: DictConfig, schema: type[Section]) -> Any:
 
 def plain_config(config: DictConfig) -> dict[str, Any]:
     """Returns a composed config as plain data, without Hydra's, with interpolations resolved."""
-    own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     plain: Any = OmegaConf.to_container(own, resolve=True, throw_on_missing=True)
     return plain
 

@@ -1,5 +1,6 @@
 """Films of episodes, and the picture of a run's learning."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
@@ -84,6 +85,8 @@ class Film:
         policy = agent.policy
         self.policy = BaselinePolicy(policy, self.env) if isinstance(policy, str) else policy
         self.tiles = stock_tiles()
+        rgb = self.tiles["rgb"]
+        self.tiles["rgb"] = rgb._replace(about=f"{rgb.about} Wheel: yaw rate. Arrow: action.")
         if exact := [name for name in self.tiles if name not in (*read, "rgb")]:
             context: dict[str, Any] = {
                 "intrinsics": torch.from_numpy(self.street.K),
@@ -127,17 +130,19 @@ class Film:
     def frame(self, tensordict: TensorDictBase) -> Frame:
         """Returns the frame of the street's present state and the env's TensorDict."""
         maps = {tile: make(tensordict[key][0].cpu()) for tile, (key, make) in self._maps.items()}
-        episode = self.street.episode
-        limit = torch.deg2rad(torch.tensor(self.street.scene.vehicle.max_yaw_rate_dps)).item()
-        return Frame(maps, episode.steps, episode.now.vehicle.yaw_rate_rps / limit)
+        episode, vehicle = self.street.episode, self.street.scene.vehicle
+        turned = episode.now.vehicle.yaw_rate_rps / math.radians(vehicle.max_yaw_rate_dps)
+        return Frame(maps, episode.steps, turned)
 
     def draw(self, frame: Frame, ended: Episode | None = None) -> Image:
         """Returns a frame's picture; that of an episode that has `ended` says how."""
-        sign = 0.0 if frame.action is None else YAW_SIGN[frame.action]
-        tiles = {**self.tiles, "rgb": self._with_wheel(frame.turned, sign)}
-        categories = self.street.scene.categories
+        tiles = dict(self.tiles)
+        if "rgb" in tiles:
+            sign = 0.0 if frame.action is None else YAW_SIGN[frame.action]
+            tiles["rgb"] = self._with_steering(frame.turned, sign)
+        classes = self.street.scene.categories
         drawn = representation_strip(
-            frame.maps, tiles=tiles, framed=self.framed, categories=categories
+            frame.maps, tiles=tiles, framed=self.framed, categories=classes
         )
         if ended is not None:
             return _above(drawn, how_it_ended(ended), OUTCOME_COLOURS[ended.outcome])
@@ -146,19 +151,13 @@ class Film:
 
     def legend(self) -> Image:
         """Returns a picture of the frames' size that explains them."""
-        tiles, categories = dict(self.tiles), self.street.scene.categories
-        about = f"{tiles['rgb'].about} Wheel: yaw rate. Arrow: action."
-        tiles["rgb"] = tiles["rgb"]._replace(about=about)
-        keys = {
-            tiles["rgb"].label: steering(0.3, 1.0),
-            self.tiles["seg"].label: class_legend(categories, self._tile_size[1]),
-        }
-        framed = [tiles[name].label for name in self.framed if name in tiles]
+        classes = self.street.scene.categories
+        keys = {"rgb": steering(0.3, 1.0), "seg": class_legend(classes, self._tile_size[1])}
         drawn = legend_strip(
-            tiles.values(), self._tile_size, keys=keys, framed=framed, categories=categories
+            self.tiles, self._tile_size, keys=keys, framed=self.framed, categories=classes
         )
         name = self.agent.policy if isinstance(self.agent.policy, str) else "the agent"
-        if framed:
+        if self.framed:
             return _above(drawn, f"framed: what {name} reads; the other maps are exact")
         return _above(drawn, f"{name} reads none of these maps")
 
@@ -173,7 +172,7 @@ class Film:
         """Closes the env."""
         self.env.close()
 
-    def _with_wheel(self, turned: float, sign: float) -> Tile:
+    def _with_steering(self, turned: float, sign: float) -> Tile:
         tile = self.tiles["rgb"]
 
         def draw(rgb: Tensor) -> Image:
@@ -181,9 +180,13 @@ class Film:
 
         return tile._replace(draw=draw)
 
+    def _options(self, name: str) -> dict[str, Any]:
+        given = self.agent.config.representations.get(name) or {}
+        return representation_options(name) | dict(given)
+
     def _in_units(self, name: str) -> Callable[[Tensor], Tensor]:
         """Returns what turns a map as the agent reads it into ids, metres or px per step."""
-        options = representation_options(name) | dict(self._given(name))
+        options = self._options(name)
         if "encoding" in options:
             return lambda ids: ids if len(ids) == 1 else ids.argmax(0, keepdim=True).byte()
         if "range_m" in options:  # 1 is the sky's, too
@@ -195,23 +198,20 @@ class Film:
 
     def _add_tiles(self, name: str) -> None:
         """Adds tiles for a representation that has none: one for each frame, or each channel."""
-        options, spec = representation_options(name) | dict(self._given(name)), self._spec(name)
-        in_units, frames_of = self._in_units(name), {"seg2": "seg", "depth2": "depth"}.get(name)
-        if frames_of is not None:  # oldest first
-            tile, parts = self.tiles[frames_of], int(options["k"])
+        spec, in_units = self.env.observation_spec[name], self._in_units(name)
+        if frames_of := {"seg2": "seg", "depth2": "depth"}.get(name):  # oldest first
+            tile, count = self.tiles[frames_of], int(self._options(name)["k"])
         else:
-            tile, parts = Tile(name, _plain(spec), about="As the agent reads it."), spec.shape[-3]
-        for i in range(min(parts, _MOST_TILES)):
-            label = name if parts == 1 else f"{name}, {i + 1} of {parts}"
+            tile, count = Tile(name, _plain(spec), about="As the agent reads it."), spec.shape[-3]
+        for i in range(min(count, _MOST_TILES)):
+
+            def part(values: Tensor, i: int = i) -> Tensor:
+                return in_units(values.chunk(count)[i])
+
+            label = name if count == 1 else f"{name}, {i + 1} of {count}"
             self.tiles[label] = tile._replace(label=label)
-            self._maps[label] = name, lambda values, i=i: in_units(values.chunk(parts)[i])
+            self._maps[label] = name, part
             self.framed.append(label)
-
-    def _given(self, name: str) -> Mapping[str, Any]:
-        return self.agent.config.representations.get(name) or {}
-
-    def _spec(self, name: str) -> Any:
-        return self.env.observation_spec[name]
 
 
 def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: Any) -> Episode:

@@ -1,28 +1,32 @@
-"""Reports on runs: `python -m flowrep.report outputs/<sweep>`."""
+"""Reports on runs: `python -m flowrep.report outputs/<sweep>`.
+
+What takes seconds to import is imported when the config has passed.
+"""
+
+from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flowrep.extras import require
 
 require("a report", "report", "hydra", "pydantic", "matplotlib", "scipy", "jinja2", module=__name__)
 
-import rich.box
-import rich.table
-from rich.console import Console
-from rich.text import Text
-
 from flowrep.config import UsageError
 from flowrep.config.cli import run_command
 from flowrep.config.schema import ReportConfig
-from flowrep.report.page import drives_of, render_page, summary
-from flowrep.report.sections import Settings, assemble, write_files
-from flowrep.report.statistics import Bootstrap
-from flowrep.report.storage import is_archive, read_runs, without_repeats
-from flowrep.report.tables import Table
+
+if TYPE_CHECKING:
+    from flowrep.report.tables import Table
 
 
 def report(config: ReportConfig) -> Path:
     """Writes figures, tables and a page of runs; returns the page's path."""
+    from flowrep.report.page import drives_of, render_page, summary
+    from flowrep.report.sections import Settings, assemble, write_files
+    from flowrep.report.statistics import Bootstrap
+    from flowrep.report.storage import is_archive, read_runs, without_repeats
+
     folders = list(map(Path, config.run))
     is_of_runs = folders[0].is_dir() and not is_archive(folders[0])
     output = Path(config.output or (folders[0] if is_of_runs else Path("outputs")) / "report")
@@ -55,6 +59,11 @@ def report(config: ReportConfig) -> Path:
 
 def show(table: Table, title: str) -> None:
     """Prints a table."""
+    import rich.box
+    import rich.table
+    from rich.console import Console
+    from rich.text import Text
+
     heading = Text(title, style="table.title")  # in a str, brackets would be markup
     shown = rich.table.Table(title=heading, box=rich.box.SIMPLE, pad_edge=False)
     for name, side in zip(table.header, table.alignment):

@@ -95,7 +95,7 @@ class MapTransform(Transform):
             if value is None:
                 offered = sorted(source.keys(True, True), key=str)
                 remedy = "Name another one with in_keys=, or let the env emit it."
-                if key[0] == "sensor" and "sensor" not in source.keys():
+                if key[0] == "sensor" and source.get("sensor", None) is None:
                     remedy += " make_env drops its sensors' keys unless it gets keep_sensor=True."
                 raise MissingKey(
                     f"representation {self.label} needs key {key!r}; the env offers {offered}. "

@@ -65,7 +65,7 @@ def with_steering(image: Image, turned: float, sign: float = 0.0) -> Image:
 
 
 def legend_strip(
-    tiles: Iterable[Tile],
+    tiles: Mapping[str, Tile],
     size: tuple[int, int],
     *,
     keys: Mapping[str, Image],
@@ -75,20 +75,20 @@ def legend_strip(
     """Returns a strip whose tiles explain what a strip of the same size shows.
 
     Args:
-        tiles: those of the strip.
+        tiles: those of the strip, by name.
         size: height and width of its tiles.
-        keys: by label, a picture below the explanation; flow has the wheel of its colours.
-        framed: labels of tiles with a frame.
+        keys: by name, a picture below the explanation; flow has the wheel of its colours.
+        framed: names of tiles with a frame.
         categories: classes whose colours are explained below.
     """
-    tiles = list(tiles)
     wheel = flow_wheel(min(size) // 2)
     pages = {
-        tile.label: _page(size, tile.about, wheel if tile.is_flow else keys.get(tile.label))
-        for tile in tiles
+        tile.label: _page(size, tile.about, wheel if tile.is_flow else keys.get(name))
+        for name, tile in tiles.items()
     }
-    notes = {tile.label: tile.note for tile in tiles if tile.note}
-    drawn = strip(pages, notes=notes, framed=framed)
+    notes = {tile.label: tile.note for tile in tiles.values() if tile.note}
+    labels = [tile.label for name, tile in tiles.items() if name in framed]
+    drawn = strip(pages, notes=notes, framed=labels)
     return np.concatenate([drawn, class_legend(tuple(categories), drawn.shape[1])])
 
 

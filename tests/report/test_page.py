@@ -104,7 +104,7 @@ def test_nothing_to_report_on_is_one_line(tmp_path, monkeypatch, capsys, damaged
 
 def test_what_was_found_is_printed_and_where_it_was_written(tmp_path, monkeypatch, capsys):
     run = run_in(tmp_path, "run", "soccc")
-    monkeypatch.setattr("flowrep.report.__main__.write_files", lambda *_: [])
+    monkeypatch.setattr("flowrep.report.sections.write_files", lambda *_: [])
     monkeypatch.setattr(sys, "argv", ["flowrep-report", str(run), f"output={tmp_path / 'out'}"])
     main()
     said = capsys.readouterr().out
