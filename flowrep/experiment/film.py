@@ -199,8 +199,9 @@ class Film:
     def _add_tiles(self, name: str) -> None:
         """Adds tiles for a representation that has none: one for each frame, or each channel."""
         spec, in_units = self.env.observation_spec[name], self._in_units(name)
-        if frames_of := {"seg2": "seg", "depth2": "depth"}.get(name):  # oldest first
+        if frames_of := {"seg2": "seg", "depth2": "depth"}.get(name):
             tile, count = self.tiles[frames_of], int(self._options(name)["k"])
+            tile = tile._replace(about=f"{tile.about} The last {count} frames, oldest first.")
         else:
             tile, count = Tile(name, _plain(spec), about="As the agent reads it."), spec.shape[-3]
         for i in range(min(count, _MOST_TILES)):

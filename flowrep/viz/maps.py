@@ -275,8 +275,8 @@ def strip(
 
 def resized(image: Image, height: int, width: int) -> Image:
     """Returns an image in another size, without interpolation."""
-    y, x = np.indices((height, width), sparse=True)
-    return image[y * image.shape[0] // height, x * image.shape[1] // width]
+    rows, columns = (np.arange(n) * m // n for n, m in zip((height, width), image.shape))
+    return image.take(rows, axis=0).take(columns, axis=1)
 
 
 def tile_zoom(height: int, width: int) -> int:
