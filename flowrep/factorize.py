@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from flowrep.extras import require
 
-require("factorising", "factorize", "cv2", "hydra", "imageio", "pydantic", "tqdm", module=__name__)
+require("factorising", "factorize", "cv2", "hydra", "imageio_ffmpeg", "pydantic", "tqdm", module=__name__)
 
 from hydra.utils import get_class
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from flowrep.extras import require
 
-require("training", "train", "hydra", "pydantic", "matplotlib", "imageio", module=__name__)
+require("training", "train", "hydra", "pydantic", "matplotlib", "imageio_ffmpeg", module=__name__)
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback

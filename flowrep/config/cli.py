@@ -86,10 +86,10 @@ def _files_named() -> Iterator[None]:
     def checked_load(file: Any) -> Any:
         if not hasattr(file, "read"):
             return load(file)
-        text = file.read()
+        text, name = file.read(), getattr(file, "name", "a YAML file")
         if re.search(r"(^|[\s\[{,])\*\w", text):  # an alias
-            checked_yaml(file.name, text, check_yaml)
-        return checked_yaml(file.name, text, mapping)
+            checked_yaml(name, text, check_yaml)
+        return checked_yaml(name, text, mapping)
 
     def mapping(text: str) -> Any:
         try:
@@ -243,8 +243,8 @@ def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
             others.append(override(key, value) if is_name else text)
         previous = text
     # argparse takes all keys from one stretch: `seed=0,1 -m scene=s_turn` has two
-    is_sweep = [text for text in others if text in ("-m", "--multirun")][:1]
-    others = [*is_sweep, *(text for text in others if text not in ("-m", "--multirun"))]
+    flags = {"-m", "--multirun"} & {*others}
+    others = [*flags, *(text for text in others if text not in flags)]
     if not folders:
         return others
     if any(text.startswith("run=") for text in others):
@@ -258,7 +258,8 @@ def _is_misread(key: str, text: str) -> bool:
     parsed = _parsed(f"{key}={text}")
     is_number = parsed is not None and isinstance(parsed.value(), int | float)  # true is one, too
     is_named = is_number and key != "input"  # that may be a camera's number
-    return parsed is None or is_named or Path(text).exists()
+    is_unreadable = parsed is None and not text.startswith("[")
+    return is_unreadable or is_named or Path(text).exists()
 
 
 def value_of(text: str) -> str:
