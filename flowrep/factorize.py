@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING
 
 from flowrep.extras import require
 
-require("factorising", "factorize", "cv2", "hydra", "imageio_ffmpeg", "pydantic", "tqdm", module=__name__)
+require(
+    "factorising", "factorize", "cv2", "hydra", "imageio_ffmpeg", "pydantic", "tqdm",
+    module=__name__,
+)  # fmt: skip
 
 from hydra.utils import get_class
 

@@ -39,7 +39,9 @@ def test_an_import_names_the_extra(path, says, monkeypatch):
 
 
 def test_a_command_ends_in_one_line_with_what_it_would_miss_at_its_end(monkeypatch):
-    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "imageio_ffmpeg" else name)
+    monkeypatch.setattr(
+        extras, "find_spec", lambda name: None if name == "imageio_ffmpeg" else name
+    )
     with pytest.raises(SystemExit) as caught:
         load("__main__", "train.py")
     assert caught.value.code.startswith("error: training needs imageio_ffmpeg; run: pip install")

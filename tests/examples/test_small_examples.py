@@ -83,8 +83,8 @@ def test_flow_estimated_from_larger_pictures_is_drawn_beside_the_maps():
 
     still = {"rgb": torch.zeros(3, 2 * SIZE_PX, 2 * SIZE_PX, dtype=torch.uint8)}
     still["instance_motion"] = torch.eye(4).unsqueeze(0)
+    still["depth"] = torch.ones(1, SIZE_PX, SIZE_PX)
     now = dict.fromkeys(("obj", "ego"), torch.zeros(2, SIZE_PX, SIZE_PX))
-    now["depth"] = torch.ones(1, SIZE_PX, SIZE_PX)
     drawn = of_estimates(still, still, now, torch.eye(3))
     assert {picture.shape for picture in drawn.values()} == {(SIZE_PX, SIZE_PX, 3)}
     assert all((picture == 255).all() for picture in drawn.values())  # no flow is white
