@@ -99,7 +99,8 @@ def position_and_quaternion(pose):
 
 def test_the_env_guide_runs_with_the_readers_own_env():
     namespace = {"my_env": TwoBodies(), "__name__": "__main__"}
-    exec(python_of(DOCS / "use_in_your_env.md"), namespace)
+    # the reader's maps are 84 x 84, the test's 7 x 5
+    exec(python_of(DOCS / "use_in_your_env.md").replace(" 42.0]", " 3.0]"), namespace)
     rollout = namespace["rollout"]
     want, got = rollout["want"], rollout["sensor"]
     motions = got["instance_motion"]

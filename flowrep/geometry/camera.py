@@ -12,6 +12,10 @@ from flowrep.geometry.checks import check_name, check_shape, common_batch, first
 
 FovAxis: TypeAlias = Literal["horizontal", "vertical"]
 
+# A camera's focal length, in sizes of its picture's longer side, and how far within the picture its
+# principal point lies, as a share of width or height: see `check_intrinsics`.
+SHORTEST, LONGEST, BORDER = 0.2, 20.0, 0.1
+
 
 def project(points_cam: Tensor, K: Tensor) -> Tensor:
     """Returns the pixel coordinates (u, v) at which a camera sees points.
@@ -140,27 +144,53 @@ def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
     return K_opencv + half_pixel
 
 
-def check_intrinsics(name: str, K: Tensor) -> None:
-    """Checks that every K `[*B, 3, 3]` has the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1).
+def check_intrinsics(
+    name: str, K: Tensor, size: tuple[int, int] | None = None, *, allow_unknown: bool = False
+) -> None:
+    """Checks that every K `[*B, 3, 3]` is a camera's, with pictures of `size` (height, width).
 
-    ValueError says which K, the argument called `name`, is the first that has other rows, nan or
-    inf, or a focal length that is not positive. The check waits for a GPU.
+    ValueError says which K, the argument called `name`, is the first that has other rows than
+    (fx, skew, cx), (0, fy, cy), (0, 0, 1), nan or inf, or a focal length that is not positive; or,
+    if the size is given, that no camera has whose picture this is. Bounds on that are wide: a focal
+    length of 0.2 to 20 times the longer side, that is, fields of view of 136 to 3 degrees, and a
+    principal point a tenth of the picture from its border or more. Lenses are centred to a few per
+    cent, and a crop may lose four ninths of the picture on one side. K of a picture of twice the
+    size has it at the border. With `allow_unknown`, a K with nan, inf or without focal length
+    passes, as the flow functions mark its frame invalid. The check waits for a GPU.
 
     >>> check_intrinsics("K", torch.tensor([[4.0, 0.0, 0.0], [0.0, 8.0, 0.0], [1.5, 2.5, 1.0]]))
     Traceback (most recent call last):
     ValueError: K should have the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, ...
+    >>> check_intrinsics("K", torch.tensor([[60.0, 0, 80], [0, 60, 60], [0, 0, 1]]), (60, 80))
+    Traceback (most recent call last):
+    ValueError: K is of no camera whose picture is 80 wide and 60 high: ...
     """
     check_shape(name, K, (3, 3))
     fixed = K.new_tensor([0.0, 0.0, 0.0, 1.0])
     zeros_and_one = torch.cat([K[..., 1, :1], K[..., 2, :]], -1)
-    right = (
-        K.isfinite().flatten(-2).all(-1)
-        & (K.diagonal(dim1=-2, dim2=-1)[..., :2] > 0.0).all(-1)
-        & ((zeros_and_one - fixed).abs() <= 1e-6).all(-1)
-    )
-    if not bool(right.all()):
-        where, index = first_wrong(name, ~right)
+    focal = K.diagonal(dim1=-2, dim2=-1)[..., :2]
+    known = K.isfinite().flatten(-2).all(-1)
+    wrong = ~known | (focal <= 0.0).any(-1) | ((zeros_and_one - fixed).abs() > 1e-6).any(-1)
+    unknown = ~known | (focal == 0.0).any(-1) if allow_unknown else torch.zeros_like(wrong)
+    if bool((wrong & ~unknown).any()):
+        where, index = first_wrong(name, wrong & ~unknown)
         raise ValueError(
             f"{where} should have the rows (fx, skew, cx), (0, fy, cy), (0, 0, 1) in pixels, "
             f"finite, fx and fy positive; got {K[index].tolist()}. Pass K.T if it is transposed"
+        )
+    if size is None or not min(size):
+        return
+    height, width = size
+    side = max(size)
+    shares = K[..., :2, 2] / K.new_tensor([width, height])
+    wrong = ((focal < SHORTEST * side) | (focal > LONGEST * side)).any(-1)
+    wrong = (wrong | ((shares - 0.5).abs() > 0.5 - BORDER).any(-1)) & ~unknown
+    if bool(wrong.any()):
+        where, index = first_wrong(name, wrong)
+        raise ValueError(
+            f"{where} is of no camera whose picture is {width} wide and {height} high: fx and fy "
+            f"should be {SHORTEST * side:g} to {LONGEST * side:g} px, cx "
+            f"{BORDER * width:g} to {(1 - BORDER) * width:g}, cy {BORDER * height:g} to "
+            f"{(1 - BORDER) * height:g}; got {K[index].tolist()}. If it is of a picture of another "
+            "size, or divided by the size, scale its first two rows"
         )

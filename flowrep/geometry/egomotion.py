@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep.geometry.checks import check_shape, common_batch
-from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST
+from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, known_camera
 from flowrep.geometry.pose import rotation_from_vector
 
 PIXELS = 1536  # used in a Gauss-Newton step; more gain nothing
@@ -154,11 +154,19 @@ def camera_motion(
         size = tensor.shape[-dims:]
         return tensor.to(to).expand(*batch, *size).reshape(-1, *size)
 
-    structure = None if picture is None else structure_tensor(flat(picture, 3))
-    cameras = [flat(each, 2, torch.float64) for each in (K, K if prev_K is None else prev_K)]
-    samples = _samples(flat(flow, 3), flat(depth, 3), *cameras, structure)
+    K_now, K_before = (flat(x, 2, torch.float64) for x in (K, K if prev_K is None else prev_K))
     expected = torch.eye(4) if prior is None else prior
     expected = flat(expected.to(depth.device), 2, torch.float64)
+    (K_now, _, known), (K_before, _, known_before) = (
+        known_camera(each, 1.0) for each in (K_now, K_before)
+    )
+    has_prior = expected.isfinite().flatten(1).all(-1, keepdim=True).unsqueeze(-1)
+    expected = torch.where(has_prior, expected, torch.eye(4, device=depth.device).double())
+    known = known & known_before & has_prior.flatten()
+    # a frame that misses one of them has no known pixel
+    flow = torch.where(known[:, None, None, None], flat(flow, 3), math.nan)
+    structure = None if picture is None else structure_tensor(flat(picture, 3))
+    samples = _samples(flow, flat(depth, 3), K_now, K_before, structure)
     motion = _best_hypothesis(samples, expected, has_prior=prior is not None)
     motion = _descended(samples, motion, _STEPS)
     share, covariance, valid = _described(samples, motion)

@@ -10,13 +10,18 @@ from flowrep.transforms.flow import FlowFactorize, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.maps import Depth, InstanceIds, Rgb, Segmentation
 from flowrep.transforms.mirror import Mirror
-from flowrep.transforms.motion import CameraMotion, EstimateCameraMotion, InstanceMotion
+from flowrep.transforms.motion import (
+    CameraMotion,
+    EstimateCameraMotion,
+    InstanceMotion,
+    PreviousIntrinsics,
+)
 from flowrep.transforms.noise import SensorNoise
 from flowrep.transforms.stack import REPRESENTATIONS, representation_options, representation_stack
 
 __all__ = [
     "DIS", "RAFT", "REPRESENTATIONS", "AdaptDepth", "AdaptFlow", "AdaptPose", "BodyRows",
     "CameraMotion", "Depth", "EstimateCameraMotion", "EstimatedFlow", "FlowFactorize", "FrameStack",
-    "InstanceIds", "InstanceMotion", "Mirror", "RawFlow", "Rgb", "Segmentation", "SensorNoise",
-    "representation_options", "representation_stack",
+    "InstanceIds", "InstanceMotion", "Mirror", "PreviousIntrinsics", "RawFlow", "Rgb",
+    "Segmentation", "SensorNoise", "representation_options", "representation_stack",
 ]  # fmt: skip

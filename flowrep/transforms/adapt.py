@@ -44,6 +44,8 @@ class AdaptDepth(CameraTransform):
         tensor([[[0.5000, 2.0000]]])
     """
 
+    reads_previous_frame = False
+
     def __init__(
         self,
         kind: geometry.DepthKind,

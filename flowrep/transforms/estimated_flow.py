@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn import functional
 from torchrl.data import TensorSpec, Unbounded
@@ -248,8 +249,8 @@ class EstimatedFlow(FlowTransform):
         weights: file with RAFT's weights, see `flowrep.transforms.RAFT`.
         preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
         min_side_px: smaller pictures are enlarged to this; for RAFT to at least 128.
-        intrinsics: K `[3, 3]` of the maps, or its key, see `RawFlow`; None leaves the pictures as
-            they are.
+        intrinsics: K `[3, 3]` of the maps, or its key; see `RawFlow`, as for `prev_intrinsics`.
+            None leaves the pictures as they are.
         picture_scale: k, size of the pictures in sizes of the maps.
         outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw; for raw's `unit` and for `dt_s` and `out_keys` see `RawFlow`.
@@ -278,6 +279,7 @@ class EstimatedFlow(FlowTransform):
         preset: str = DIS.preset,
         min_side_px: int = DIS.min_side_px,
         intrinsics: Intrinsics | None = None,
+        prev_intrinsics: NestedKey | None = None,
         picture_scale: int = 1,
         outputs: Sequence[str] = ("raw",),
         scale: float = 1.0,
@@ -292,7 +294,8 @@ class EstimatedFlow(FlowTransform):
         keys = keys if in_keys is None else in_keys
         scales = {name: scale if name == "raw" else 1.0 for name in outputs}
         units = {name: unit if name == "raw" else "px_per_step" for name in outputs}
-        super().__init__(intrinsics, reads, keys, out_keys, outputs, scales, units, dt_s)
+        options = (outputs, scales, units, dt_s, False, prev_intrinsics)
+        super().__init__(intrinsics, reads, keys, out_keys, *options)
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
         if picture_scale < 1:
             raise ValueError(f"picture_scale must be at least 1, got {picture_scale}")
@@ -306,8 +309,8 @@ class EstimatedFlow(FlowTransform):
         # After a reset both pictures are the same, and nothing has moved.
         differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
         if camera:
-            _, depth, motion, K = self._at_one_precision([pair, *camera])
-            ego, seen = geometry.ego_flow(depth, K, motion)
+            _, depth, motion, K, prev_K = self._at_one_precision([pair, *camera])
+            ego, seen = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
             ego = ego.float().reshape(-1, 2, *ego.shape[-2:])
             flow = self._compensated(current, previous, ego, seen.reshape(-1, 1, *ego.shape[-2:]))
         else:

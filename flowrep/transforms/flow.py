@@ -6,20 +6,27 @@ import math
 import os
 import shutil
 import sys
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
-from torchrl.data import Categorical, TensorSpec, Unbounded
+from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.geometry.checks import check_name
+from flowrep.geometry.checks import check_name, first_wrong
 from flowrep.transforms import base
-from flowrep.transforms.base import Keys, MapTransform, Reads, as_keys, check_choice
+from flowrep.transforms.base import (
+    Keys,
+    MapTransform,
+    Reads,
+    as_keys,
+    check_choice,
+    flags_of_batch,
+)
 
 Unit = Literal["px_per_step", "px_per_s"]
 
@@ -27,6 +34,9 @@ CAMERA = Reads((3, 3), "float")
 _DEPTH: NestedKey = ("sensor", "depth")
 _RAW_KEYS: Keys = [_DEPTH, ("sensor", "instance"), ("sensor", "instance_motion")]
 EGO_KEYS: list[NestedKey] = [_DEPTH, ("sensor", "prev_from_curr")]
+
+_CALLS_PER_LOOK = 100  # at the values of K on a GPU
+_SAME_CAMERA = 1e-5  # of fx: up to 0.01 px for a picture 1,000 wide
 
 # K itself, or the key under which the env gives it.
 Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
@@ -36,10 +46,16 @@ class CameraTransform(MapTransform):
     """Holds K in its original float type, even if the transform is cast to another.
 
     Raw flow, where it is the first input, becomes nan where the mask under `mask_key` is False. A
-    key of K, `[*B, 3, 3]`, is read after all other keys.
+    key of K, `[*B, 3, 3]`, is read after all other keys, and that of the previous frame's K last.
+
+    A K that no camera of these maps has raises ValueError, see `check_intrinsics`; one that isn't
+    known (nan, inf, no focal length) makes its frame invalid. A K under a key that changes within
+    an episode raises ValueError too, unless the previous frame's has a key. Values are looked at
+    when they change, on a GPU in one call of a hundred, so that nothing waits for it.
     """
 
     K: Tensor | None
+    reads_previous_frame = True  # whether K of the previous frame matters
 
     def __init__(
         self,
@@ -48,15 +64,104 @@ class CameraTransform(MapTransform):
         in_keys: Keys,
         out_keys: Keys,
         writes: int = 1,
+        prev_intrinsics: NestedKey | None = None,
     ) -> None:
-        K = None
+        K, keys = None, []
         if intrinsics is not None:
             if isinstance(intrinsics, str) or all(isinstance(part, str) for part in intrinsics):
-                reads, in_keys = [*reads, CAMERA], [*as_keys(in_keys), *as_keys([intrinsics])]
+                keys = as_keys([intrinsics])
             else:
                 K = as_intrinsics(intrinsics)
-        super().__init__(reads, in_keys, out_keys, writes)
+        if prev_intrinsics is not None:
+            if not keys:
+                raise ValueError(
+                    "prev_intrinsics is the key of the previous frame's K; intrinsics has to be "
+                    "the key of the current frame's"
+                )
+            keys += as_keys([prev_intrinsics])
+        super().__init__(
+            [*reads, *[CAMERA] * len(keys)], [*as_keys(in_keys), *keys], out_keys, writes
+        )
         self.register_buffer("K", K, persistent=False)
+        self.camera_keys = keys
+        self._calls = 0
+        self._checked: dict[str, tuple[tuple[int, int], Tensor | None]] = {}
+
+    def _inputs(self, source: TensorDictBase | Composite) -> list[Any]:
+        maps = super()._inputs(source)
+        self._check_cameras(maps)
+        return maps
+
+    def _check_cameras(self, maps: Sequence[Tensor | TensorSpec]) -> None:
+        """Raises ValueError for a K that no camera of these maps has, where it is a new one."""
+        if self.K is None and not self.camera_keys:
+            return
+        size = _map_size(maps, self.reads)
+        if self.K is not None and self._checked.get("intrinsics") != (size, None):
+            geometry.check_intrinsics("intrinsics", self.K, size)
+            self._checked["intrinsics"] = size, None
+        for key, K in zip(self.camera_keys, maps[len(maps) - len(self.camera_keys) :]):
+            if not isinstance(K, Tensor) or not self._looks_at(K):
+                continue
+            name = f"key {key!r}"
+            checked_size, checked = self._checked.get(name, (None, None))
+            if checked_size == size and checked is not None and torch.equal(checked, K):
+                continue
+            geometry.check_intrinsics(name, K, size, allow_unknown=True)
+            self._checked[name] = size, K.detach().clone()
+
+    def _looks_at(self, K: Tensor) -> bool:
+        """Returns whether K's values are to be read now: on a GPU that waits for it."""
+        if torch.compiler.is_compiling() or K.is_meta:
+            return False
+        return K.device.type == "cpu" or self._calls % _CALLS_PER_LOOK == 0
+
+    def _check_one_camera(
+        self, before: Tensor | None, now: Tensor | None, ended: Tensor | None
+    ) -> None:
+        """Raises ValueError if K changes from frame to frame where no episode has `ended`."""
+        if before is None or now is None or not self._looks_at(now) or torch.equal(before, now):
+            return
+        # more than rounding; what isn't known compares False
+        changes = (now - before).abs().amax((-2, -1)) > _SAME_CAMERA * now[..., 0, 0].abs()
+        if ended is not None:
+            changes &= ~expand_as_right(ended, changes)
+        if bool(changes.any()):
+            where, index = first_wrong(f"key {self.camera_keys[0]!r}", changes)
+            raise ValueError(
+                f"{where} changes within an episode, from {before[index].tolist()} to "
+                f"{now[index].tolist()}, and flow depends on both: give the previous frame's K a "
+                "key, prev_intrinsics=, which the transform PreviousIntrinsics can write"
+            )
+
+    @property
+    def _needs_one_camera(self) -> bool:
+        return self.reads_previous_frame and len(self.camera_keys) == 1
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._calls += 1
+        if self._needs_one_camera:
+            key, done = self.camera_keys[0], next_tensordict.get("done", None)
+            ended = None if done is None else flags_of_batch(done, next_tensordict)
+            # the last frame of an episode may be the next one's first
+            self._check_one_camera(tensordict.get(key, None), next_tensordict.get(key, None), ended)
+        return super()._step(tensordict, next_tensordict)
+
+    @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the outputs for a batch of any shape, at its root and under `"next"`."""
+        self._calls += 1
+        if self._needs_one_camera:
+            key, done = self.camera_keys[0], tensordict.get(("next", "done"), None)
+            ended = None if done is None else flags_of_batch(done, tensordict)
+            now, later = tensordict.get(key, None), tensordict.get(("next", key), None)
+            if now is not None and later is None and "time" in tensordict.names:
+                time = tensordict.names.index("time")
+                length = tensordict.shape[time] - 1
+                now, later = now.narrow(time, 0, length), now.narrow(time, 1, length)
+                ended = None if ended is None else ended.narrow(time, 0, length)
+            self._check_one_camera(now, later, ended)
+        return super().forward(tensordict)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         maps = super()._read(tensordict)
@@ -101,10 +206,11 @@ class FlowTransform(CameraTransform):
         unit: str | Mapping[str, str],
         dt_s: float | None,
         compiled: bool = False,
+        prev_intrinsics: NestedKey | None = None,
     ) -> None:
         check_choice("outputs", outputs, self.known)
         keys = as_keys(list(outputs) if out_keys is None else out_keys)
-        super().__init__(intrinsics, reads, in_keys, keys, writes=len(outputs))
+        super().__init__(intrinsics, reads, in_keys, keys, len(outputs), prev_intrinsics)
         self.outputs = tuple(outputs)
         self.masks = [mask_key(key) for name, key in zip(outputs, keys) if name in self.masked]
         self.out_keys: list[NestedKey] = [*keys, *self.masks]
@@ -117,13 +223,14 @@ class FlowTransform(CameraTransform):
             _check_compiler()
         self.compiled = bool(compiled)
 
-    def _at_one_precision(self, maps: Sequence[Tensor]) -> list[Tensor]:
-        """Returns the inputs and K, the last, in depth's float type, at least float32."""
+    def _at_one_precision(self, maps: Sequence[Tensor]) -> list[Any]:
+        """Returns the inputs, K and the previous K or None, in depth's type, at least float32."""
         # Raw and ego flow have to round alike, or obj is rounding noise on static pixels.
         (depth,) = (x for x, reads in zip(maps, self.reads) if reads == base.DEPTH)
         dtype = torch.promote_types(depth.dtype, torch.float32)
         maps = [*maps] if self.K is None else [*maps, self.K]
-        return [x.to(dtype) if x.is_floating_point() else x for x in maps]
+        maps = [x.to(dtype) if x.is_floating_point() else x for x in maps]
+        return maps if len(self.camera_keys) == 2 else [*maps, None]
 
     def _written(self, made: Mapping[str, Tensor], valid: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, flows in their units, and the masks."""
@@ -137,26 +244,12 @@ class FlowTransform(CameraTransform):
         """Returns an unbounded spec per flow and a boolean one per mask."""
         like = next((x for x, reads in zip(specs, self.reads) if reads == base.DEPTH), specs[0])
         batch, size, device = like.shape[:-3], like.shape[-2:], like.device
-        self._warn_of_foreign_camera(size)
         flow = Unbounded(
             (*batch, 2, *size), device=device, dtype=torch.promote_types(like.dtype, torch.float32)
         )
         valid = Categorical(2, shape=(*batch, 1, *size), device=device, dtype=torch.bool)
         names = (*self.outputs, *["valid"] * len(self.masks))
         return tuple((valid if name == "valid" else flow).clone() for name in names)
-
-    def _warn_of_foreign_camera(self, size: torch.Size) -> None:
-        """Warns if the principal point is outside the maps, as K of a larger picture has it."""
-        if self.K is None or not size[0] or not size[1]:
-            return
-        (cx, cy), (height, width) = self.K[:2, 2].tolist(), size
-        if not (0 <= cx <= width and 0 <= cy <= height):
-            warnings.warn(
-                f"{type(self).__name__}: K has its principal point at ({cx:g}, {cy:g}), outside "
-                f"the maps ({width} wide, {height} high): is it of a picture of another "
-                "size? Scale its first two rows with the picture",
-                stacklevel=2,
-            )
 
 
 class RawFlow(FlowTransform):
@@ -179,6 +272,9 @@ class RawFlow(FlowTransform):
     Args:
         intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
             it, `[*B, 3, 3]`.
+        prev_intrinsics: key of the previous frame's K, beside that of K, for cameras that zoom or
+            focus, see `PreviousIntrinsics`. Without it, a K that is seen to change within an
+            episode is refused; a replay sample of single frames doesn't show that it does.
         outputs: which of `"raw"` and `"valid"` to write.
         scale: factor on the flow.
         unit: `"px_per_step"` or `"px_per_s"`.
@@ -192,7 +288,7 @@ class RawFlow(FlowTransform):
             `("sensor", "flow_valid")` for `("sensor", "flow")`.
 
     Example:
-        A body a metre away was 0.1 m further left: fx · 0.1 m / 1 m = 5 px to the right.
+        A body a metre away was 0.1 m further left: fx · 0.1 m / 1 m = 3 px to the right.
 
         >>> from tensordict import TensorDict
         >>> motions = torch.eye(4).repeat(2, 1, 1)
@@ -202,9 +298,9 @@ class RawFlow(FlowTransform):
         ...     "instance": torch.tensor([[[0, 1]]]),
         ...     "instance_motion": motions,
         ... }
-        >>> raw = RawFlow([[50.0, 0, 1], [0, 50.0, 0.5], [0, 0, 1]])
+        >>> raw = RawFlow([[30.0, 0, 1], [0, 30.0, 0.5], [0, 0, 1]])
         >>> raw(TensorDict({"sensor": sensor}))["raw"][0, 0, 1]
-        tensor(5.)
+        tensor(3.)
     """
 
     known = ("raw", "valid")
@@ -214,6 +310,7 @@ class RawFlow(FlowTransform):
         self,
         intrinsics: Intrinsics,
         *,
+        prev_intrinsics: NestedKey | None = None,
         outputs: Sequence[str] = ("raw",),
         scale: float = 1.0,
         unit: str = "px_per_step",
@@ -224,12 +321,13 @@ class RawFlow(FlowTransform):
     ) -> None:
         reads = [base.DEPTH, base.IDS, base.MOTIONS]
         keys = _RAW_KEYS if in_keys is None else in_keys
-        super().__init__(intrinsics, reads, keys, out_keys, outputs, scale, unit, dt_s, compiled)
+        options = (outputs, scale, unit, dt_s, compiled, prev_intrinsics)
+        super().__init__(intrinsics, reads, keys, out_keys, *options)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from depth, instance ids and motions (and K)."""
-        depth, instance, motions, K = self._at_one_precision(maps)
-        flow, valid = geometry.rigid_flow(depth, instance, K, motions)
+        depth, instance, motions, K, prev_K = self._at_one_precision(maps)
+        flow, valid = geometry.rigid_flow(depth, instance, K, motions, prev_K=prev_K)
         return self._written({"raw": flow}, valid)
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
@@ -262,7 +360,7 @@ class FlowFactorize(FlowTransform):
     the simulator's raw flow, obj is exactly 0 on everything static.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps, or its key, see `RawFlow`.
+        intrinsics: K `[3, 3]` of the maps, or its key; see `RawFlow`, as for `prev_intrinsics`.
         outputs: which of `"ego"`, `"obj"`, `"raw"` (the raw flow itself, in the chosen unit, 0
             where it isn't finite) and `"valid"` to write. With ego alone, raw flow isn't read.
         scale: factor on the flows, or a mapping from output to factor.
@@ -273,18 +371,18 @@ class FlowFactorize(FlowTransform):
         out_keys: one key per output; their names by default.
 
     Example:
-        The camera moved 0.1 m to the right, so a wall a metre away moves by fx · 0.1 = 5 px to the
-        left; a pixel with a measured flow of 0 has an object flow of +5 px.
+        The camera moved 0.1 m to the right, so a wall a metre away moves by fx · 0.1 = 3 px to the
+        left; a pixel with a measured flow of 0 has an object flow of +3 px.
 
         >>> from tensordict import TensorDict
         >>> motion = torch.eye(4)
         >>> motion[0, 3] = 0.1
-        >>> raw = torch.tensor([[[-5.0, 0.0]], [[0.0, 0.0]]])
+        >>> raw = torch.tensor([[[-3.0, 0.0]], [[0.0, 0.0]]])
         >>> sensor = {"depth": torch.ones(1, 1, 2), "prev_from_curr": motion}
-        >>> split = FlowFactorize([[50.0, 0, 1], [0, 50.0, 0.5], [0, 0, 1]])
+        >>> split = FlowFactorize([[30.0, 0, 1], [0, 30.0, 0.5], [0, 0, 1]])
         >>> td = split(TensorDict({"raw": raw, "sensor": sensor}))
         >>> td["ego"][0], td["obj"][0]
-        (tensor([[-5., -5.]]), tensor([[0., 5.]]))
+        (tensor([[-3., -3.]]), tensor([[0., 3.]]))
     """
 
     known = ("ego", "obj", "raw", "valid")
@@ -293,6 +391,7 @@ class FlowFactorize(FlowTransform):
         self,
         intrinsics: Intrinsics,
         *,
+        prev_intrinsics: NestedKey | None = None,
         outputs: Sequence[str] = ("ego", "obj"),
         scale: float | Mapping[str, float] = 1.0,
         unit: str | Mapping[str, str] = "px_per_step",
@@ -306,19 +405,27 @@ class FlowFactorize(FlowTransform):
         if {"obj", "raw"} & set(outputs):
             reads, keys = [base.FLOW, *reads], ["raw", *EGO_KEYS]
         keys = keys if in_keys is None else in_keys
-        super().__init__(intrinsics, reads, keys, out_keys, outputs, scale, unit, dt_s, compiled)
+        options = (outputs, scale, unit, dt_s, compiled, prev_intrinsics)
+        super().__init__(intrinsics, reads, keys, out_keys, *options)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, from (raw,) depth and camera motion (and K)."""
-        *raw, depth, motion, K = self._at_one_precision(maps)
+        *raw, depth, motion, K, prev_K = self._at_one_precision(maps)
         if not raw:
-            ego, valid = geometry.ego_flow(depth, K, motion)
+            ego, valid = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
             return self._written({"ego": ego}, valid)
-        ego, obj, valid = geometry.factorize(raw[0], depth, K, motion)
+        ego, obj, valid = geometry.factorize(raw[0], depth, K, motion, prev_K=prev_K)
         made = {"ego": ego, "obj": obj}
         if "raw" in self.outputs:
             made["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
         return self._written(made, valid)
+
+
+def _map_size(maps: Sequence[Tensor | TensorSpec], reads: Sequence[Reads]) -> tuple[int, int]:
+    """Returns height and width of the maps."""
+    at, like = next((each.shape.index("H"), i) for i, each in enumerate(reads) if "H" in each.shape)
+    height, width, *_ = maps[like].shape[at - len(reads[like].shape) :]
+    return height, width
 
 
 def mask_key(flow: NestedKey) -> NestedKey:

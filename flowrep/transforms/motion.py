@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from flowrep import geometry
 from flowrep.transforms import base
 from flowrep.transforms.base import Keys, Reads, RecurrentTransform, as_keys, check_choice
-from flowrep.transforms.flow import CameraTransform, Intrinsics
+from flowrep.transforms.flow import CAMERA, CameraTransform, Intrinsics
 
 _POSES: Keys = [("sensor", "world_from_cam"), ("sensor", "world_from_body")]
 _DEPTH: NestedKey = ("sensor", "depth")
@@ -116,6 +116,40 @@ class InstanceMotion(RecurrentTransform):
         return (Unbounded(shape, device=bodies.device, dtype=torch.float32),)
 
 
+class PreviousIntrinsics(RecurrentTransform):
+    """K of the step before, for envs whose camera zooms or focuses.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `("sensor", "K")` | `("sensor", "prev_K")` | as K, float `[*B, 3, 3]` | | px |
+
+    The flow transforms read it under the key that their `prev_intrinsics` names. After a reset it
+    is the current K. The previous step's K is read as `CameraMotion`'s pose.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> K = torch.tensor([[40.0, 0.0, 4.0], [0.0, 50.0, 3.0], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
+        >>> K[1, 0, 0] = 44.0
+        >>> td = TensorDict({"sensor": {"K": K}, "next": {"done": torch.zeros(2, 1).bool()}}, [2])
+        >>> td.names = ["time"]
+        >>> PreviousIntrinsics()(td)["sensor", "prev_K"][:, 0, 0]
+        tensor([40., 40.])
+    """
+
+    def __init__(
+        self, *, in_keys: Keys = ("sensor", "K"), out_keys: Keys = ("sensor", "prev_K")
+    ) -> None:
+        super().__init__([CAMERA], in_keys, out_keys)
+
+    def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
+        """Returns the K of the step before."""
+        return (before[0],)
+
+    def output_specs(self, K: TensorSpec) -> tuple[TensorSpec]:
+        """Returns K's spec."""
+        return (K.clone(),)
+
+
 class EstimateCameraMotion(CameraTransform):
     """The camera's motion estimated from flow and depth, for envs and robots that give no pose.
 
@@ -135,7 +169,8 @@ class EstimateCameraMotion(CameraTransform):
     flow then need no pose.
 
     Args:
-        intrinsics: K `[3, 3]` of the maps, pixels, or the env's key for it, `[*B, 3, 3]`.
+        intrinsics: K `[3, 3]` of the maps, pixels, or the env's key for it, `[*B, 3, 3]`; see
+            `RawFlow`, as for `prev_intrinsics`.
         picture: key of the current picture, uint8 `[*B, 3, kH, kW]`, k ≥ 1. Give it if raw flow is
             estimated: flow of plain surfaces is then left out, and along edges.
         prior: key of the motion expected, `[*B, 4, 4]`, such as odometry's.
@@ -160,6 +195,7 @@ class EstimateCameraMotion(CameraTransform):
         self,
         intrinsics: Intrinsics,
         *,
+        prev_intrinsics: NestedKey | None = None,
         picture: NestedKey | None = None,
         prior: NestedKey | None = None,
         outputs: Sequence[str] = tuple(_ESTIMATES),
@@ -175,7 +211,7 @@ class EstimateCameraMotion(CameraTransform):
                 keys += as_keys([key])
         own_keys: Keys = [_ESTIMATES[name] for name in outputs]
         written = own_keys if out_keys is None else out_keys
-        super().__init__(intrinsics, reads, keys, written, writes=len(outputs))
+        super().__init__(intrinsics, reads, keys, written, len(outputs), prev_intrinsics)
         self.outputs = tuple(outputs)
         self.has_picture, self.has_prior = picture is not None, prior is not None
 
@@ -189,9 +225,10 @@ class EstimateCameraMotion(CameraTransform):
                 flat = picture.reshape(-1, *picture.shape[-3:]).float()
                 picture = functional.avg_pool2d(flat, k).reshape(*picture.shape[:-2], *size)
         prior = rest.pop(0) if self.has_prior else None
-        K = self.K if self.K is not None else rest.pop()
+        K = self.K if self.K is not None else rest.pop(0)
+        prev_K = rest.pop() if rest else None
         motion, share, covariance, valid = geometry.camera_motion(
-            raw, depth, K, picture=picture, prior=prior
+            raw, depth, K, prev_K=prev_K, picture=picture, prior=prior
         )
         made = {
             "motion": motion.float(),

@@ -80,6 +80,7 @@ def representation_stack(
     representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None],
     *,
     intrinsics: Intrinsics | None = None,
+    prev_intrinsics: NestedKey | None = None,
     num_classes: int | None = None,
     dt_s: float | None = None,
     compiled: bool = False,
@@ -98,8 +99,8 @@ def representation_stack(
     Args:
         representations: names, or a mapping from name to options (`representation_options`); a
             name is one of `REPRESENTATIONS`, its key in the TensorDict is the same.
-        intrinsics: K `[3, 3]` of the sensor maps in pixels; raw, ego and obj need it, except for
-            estimated raw flow.
+        intrinsics: K `[3, 3]` of the sensor maps in pixels, or its key; raw, ego and obj need it,
+            except for estimated raw flow. For `prev_intrinsics` see `RawFlow`.
         num_classes: number of semantic classes; seg and seg2 need it.
         dt_s: duration of a step in seconds; flow in `px_per_s` needs it.
         compiled: whether flow is computed through `torch.compile`, see `RawFlow`.
@@ -135,7 +136,8 @@ def representation_stack(
     context = {"dt_s": dt_s, "compiled": compiled}
     if motion == "estimated" and not {"ego", "obj"}.isdisjoint(flows):
         keys["motion"] = _ESTIMATED_MOTION_KEY
-    transforms += _flow_transforms(flows, estimator, intrinsics, keys, context)
+    camera = {"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics}
+    transforms += _flow_transforms(flows, estimator, camera, keys, context)
     written = dict.fromkeys(key for transform in transforms for key in transform.out_keys)
     hidden = [key for key in written if key not in (*chosen, *_KEPT)]
     return Compose(*transforms, *([DropKeys(*hidden)] if hidden else []))
@@ -245,7 +247,7 @@ def _estimator_options(flow: str | Mapping[str, Any]) -> dict[str, Any] | None:
 def _flow_transforms(
     flows: dict[str, dict[str, Any]],
     estimator: dict[str, Any] | None,
-    intrinsics: Intrinsics | None,
+    camera: dict[str, Any],
     keys: dict[str, NestedKey],
     context: dict[str, Any],
 ) -> list[Transform]:
@@ -264,7 +266,7 @@ def _flow_transforms(
         transforms = [FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])]
         if "obj" in flows:
             inputs = [_PICTURES_KEY, keys["depth"], keys["motion"]]
-            options |= {"intrinsics": intrinsics, "in_keys": inputs}
+            options |= camera | {"in_keys": inputs}
             compensated = EstimatedFlow(**estimator, **options)
             # then for the camera's motion alone, which a coarser estimate tells
             options = {"outputs": ["unscaled"], "out_keys": unscaled}
@@ -274,12 +276,12 @@ def _flow_transforms(
             plain = estimator | options | {"in_keys": _PICTURES_KEY}
             transforms.append(EstimatedFlow(**plain))
     elif needs_unscaled:  # raw, too, is then made from the unscaled flow
-        transforms = [RawFlow(intrinsics, out_keys=unscaled, **context)]
+        transforms = [RawFlow(**camera, out_keys=unscaled, **context)]
     elif "raw" in flows:
-        transforms = [RawFlow(intrinsics, **factors.pop("raw"), **context)]
+        transforms = [RawFlow(**camera, **factors.pop("raw"), **context)]
     if estimates_motion:
         estimate_motion = EstimateCameraMotion(
-            intrinsics,
+            **camera,
             picture=None if estimator is None else _PICTURE_KEY,
             outputs=["motion"],
             in_keys=[unscaled, keys["depth"]],
@@ -294,7 +296,7 @@ def _flow_transforms(
     if factors:
         raw = [] if set(factors) == {"ego"} else [unscaled]
         split = FlowFactorize(
-            intrinsics,
+            **camera,
             outputs=list(factors),
             scale={name: options["scale"] for name, options in factors.items()},
             unit={name: options["unit"] for name, options in factors.items()},

@@ -207,7 +207,7 @@ PREV_K = torch.tensor([[12.5, 0.4, 3.3], [0.0, 7.2, 2.2], [0.0, 0.0, 1.0]], dtyp
 
 
 def flow_pixel_by_pixel(depth, K, motion, prev_K) -> torch.Tensor:
-    """Returns flow `[2, H, W]` in plain floats: to the point, to the camera before, to its pixel."""
+    """Returns flow `[2, H, W]` in plain floats: unproject, move, project with the K before."""
     (fx, skew, cx), (_, fy, cy), _ = K.tolist()
     (fx_p, skew_p, cx_p), (_, fy_p, cy_p), _ = prev_K.tolist()
     out = torch.zeros(2, *depth.shape[-2:], dtype=torch.float64)

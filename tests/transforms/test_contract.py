@@ -131,6 +131,11 @@ CASES = {
         {("own", "motion"): the_same("prev_from_curr")},
         carries=True,
     ),
+    "PreviousIntrinsics": Case(
+        lambda: T.PreviousIntrinsics(out_keys=("own", "K")),
+        {("own", "K"): the_same("K")},
+        carries=True,
+    ),
     "InstanceMotion": Case(
         lambda: T.InstanceMotion(out_keys=[("own", "motions")]),
         {("own", "motions"): the_same("instance_motion")},

@@ -11,7 +11,17 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
 from torchrl.envs.transforms import Compose, RenameTransform
 
-from flowrep.transforms import AdaptDepth, FlowFactorize, RawFlow, representation_stack
+from flowrep import geometry
+from flowrep.transforms import (
+    AdaptDepth,
+    EstimateCameraMotion,
+    EstimatedFlow,
+    FlowFactorize,
+    FrameStack,
+    PreviousIntrinsics,
+    RawFlow,
+    representation_stack,
+)
 from tests.transforms.fake_env import INTRINSICS, WALKER, FakeSensorEnv, frame
 
 # fx = 40, fy = 20, cx = 2, cy = 1: pixel (column 1, row 0) sits at x~ = -0.5, y~ = -0.5.
@@ -223,3 +233,152 @@ def test_k_keeps_its_type_whatever_the_transform_is_cast_to(cast, given):
         assert torch.equal(transform.K, K)
         assert not transform.state_dict()
         assert transform.to("meta").K.is_meta  # devices it follows
+
+
+class ZoomingEnv(FakeSensorEnv):
+    """Has a focal length that grows by 3 % a step; from episode to episode K differs, too."""
+
+    def __init__(self, batch_size=(), zoom=0.03):
+        super().__init__(batch_size)
+        self.zoom = zoom
+
+    def _observe(self):
+        seen = super()._observe()
+        steps, episodes = (
+            torch.tensor(x).reshape(self.batch_size) for x in (self.steps, self.episodes)
+        )
+        seen["sensor", "K"][..., 0, 0] *= (1 + self.zoom) ** steps + 0.1 * episodes
+        return seen
+
+
+CAMERA = {"intrinsics": ("sensor", "K"), "prev_intrinsics": ("sensor", "prev_K")}
+
+
+def test_a_camera_that_zooms_has_the_flow_of_both_its_cameras_online_and_in_replay():
+    raw, split = RawFlow(**CAMERA), FlowFactorize(**CAMERA)
+    env = TransformedEnv(ZoomingEnv((2,)), Compose(PreviousIntrinsics(), raw, split))
+    check_env_specs(env, seed=None)
+    online = env.rollout(6, break_when_any_done=False)
+    frames = online["next"].reshape(-1)
+    stands = frames["sensor", "instance"] != WALKER
+    for one, still in zip(frames, stands & frames["sensor", "depth"].isfinite()):
+        sensor = one["sensor"]
+        points = geometry.unproject(sensor["depth"], sensor["K"])
+        was = geometry.transform_points(sensor["prev_from_curr"], points)
+        moved = geometry.project(points, sensor["K"]) - geometry.project(was, sensor["prev_K"])
+        want = moved.movedim(-1, 0)[:, still[0]]
+        torch.testing.assert_close(one["raw"][:, still[0]], want, atol=1e-4, rtol=0)
+    assert not frames["obj"][stands.expand_as(frames["obj"])].any()
+    alone = frames.select("sensor")[torch.randperm(len(frames))]  # shuffled, without a next frame
+    alone = split(raw(alone))
+    stands = alone["sensor", "instance"] != WALKER
+    assert not alone["obj"][stands.expand_as(alone["obj"])].any()
+
+
+READERS = {
+    "raw": lambda **camera: RawFlow(**camera),
+    "factors": lambda **camera: FlowFactorize(**camera, outputs=["ego"]),
+    "estimated flow": lambda **camera: EstimatedFlow(
+        lambda a, b: torch.zeros(len(a), 2, 5, 7), **camera
+    ),
+    "motion": lambda **camera: EstimateCameraMotion(**camera),
+    "stack": lambda **camera: representation_stack(["ego"], **camera),
+}
+
+
+@pytest.mark.parametrize("make", READERS.values(), ids=list(READERS))
+def test_a_k_that_changes_is_refused_by_whatever_would_ignore_it(make):
+    def stack(**camera):
+        pictures = FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])
+        return Compose(PreviousIntrinsics(), RawFlow(**CAMERA), pictures, make(**camera))
+
+    one_key = {"intrinsics": ("sensor", "K")}
+    with pytest.raises(ValueError, match=r"'K'\)\[0\].* changes .*prev_intrinsics"):
+        TransformedEnv(ZoomingEnv((2,)), stack(**one_key)).rollout(3)
+    TransformedEnv(ZoomingEnv((2,), zoom=0.0), stack(**one_key)).rollout(
+        9, break_when_any_done=False
+    )
+    TransformedEnv(ZoomingEnv((2,)), stack(**CAMERA)).rollout(6, break_when_any_done=False)
+
+
+def test_a_k_that_changes_is_seen_in_whatever_batch_shows_it():
+    raw = RawFlow(("sensor", "K"))
+    batch = ZoomingEnv((2,)).rollout(6, break_when_any_done=False)
+    alone = batch.exclude(("next", "sensor"))
+    assert alone.names == [None, "time"]
+    for td in (batch, batch[:, :1], batch.reshape(-1), alone):
+        with pytest.raises(ValueError, match="prev_intrinsics"):
+            raw(td.clone())
+    raw(alone.reshape(-1))  # frames that nothing connects
+    raw(ZoomingEnv((2,), zoom=1e-8).rollout(6, break_when_any_done=False))  # rounding
+    raw(ZoomingEnv((2,), zoom=0.0).rollout(9, break_when_any_done=False))  # another K an episode
+
+
+SIZE = torch.tensor([[7.0], [5.0], [1.0]])
+WRONG_CAMERAS = {  # of maps 7 wide and 5 high
+    "transposed": lambda K: K.mT,
+    "normalised by the size": lambda K: K / SIZE,
+    "twice": lambda K: 2 * K,
+    "of a picture of twice the size": lambda K: K * torch.tensor([[2.0], [2.0], [1.0]]),
+    "cx = cy = 0": lambda K: K * torch.eye(3),
+    "a focal length of 25 widths": lambda K: K * torch.tensor([[30.0, 1, 1], [1] * 3, [1] * 3]),
+    "fy < 0": lambda K: K * torch.tensor([[1.0] * 3, [1, -1, 1], [1] * 3]),
+}
+each_wrong_camera = pytest.mark.parametrize(
+    "spoil", WRONG_CAMERAS.values(), ids=list(WRONG_CAMERAS)
+)
+every_reader = pytest.mark.parametrize(
+    "make", [RawFlow, FlowFactorize, EstimateCameraMotion, partial(AdaptDepth, "ray_length")]
+)
+
+
+@each_wrong_camera
+@every_reader
+def test_a_k_that_no_camera_of_the_maps_has_is_refused_by_both_roads(make, spoil):
+    td = TensorDict({"sensor": frame(env=1, episode=0, step=2)})
+    td["depth"], td["raw"] = td["sensor", "depth"], torch.zeros(2, 5, 7)
+    env = TransformedEnv(
+        FakeSensorEnv((3,)),
+        Compose(
+            RawFlow(INTRINSICS), RenameTransform([("sensor", "depth")], ["depth"], create_copy=True)
+        ),
+    )
+    with pytest.raises(ValueError, match=r"^intrinsics "):
+        env.append_transform(make(intrinsics=spoil(torch.tensor(INTRINSICS)))).rollout(1)
+    with pytest.raises(ValueError, match=r"^intrinsics "):
+        make(intrinsics=spoil(torch.tensor(INTRINSICS)))(td.clone())
+    batch = torch.stack([td.clone() for _ in range(3)])
+    by_key = make(intrinsics=("sensor", "K"))
+    by_key(batch.clone())
+    batch["sensor", "K"][1] = spoil(batch["sensor", "K"][1].clone())
+    with pytest.raises(ValueError, match=r"^key \('sensor', 'K'\)\[1\] "):
+        by_key(batch)
+
+
+@pytest.mark.parametrize("unknown", [math.nan, math.inf, 0.0])
+def test_a_k_under_a_key_that_is_not_known_makes_its_frame_alone_invalid(unknown):
+    td = torch.stack([TensorDict({"sensor": frame(env=e, episode=0, step=2)}) for e in (0, 1, 2)])
+    td["sensor", "prev_K"] = td["sensor", "K"].clone()
+    stack = Compose(
+        RawFlow(**CAMERA),
+        FlowFactorize(**CAMERA),
+        EstimateCameraMotion(**CAMERA, out_keys=list("abcd")),
+    )
+    good = stack(td.clone())
+    for key in ("K", "prev_K"):
+        spoilt = td.clone()
+        spoilt["sensor", key][1] *= unknown
+        spoilt = stack(spoilt)
+        assert not spoilt["raw_valid"][1].any()
+        assert spoilt["obj"][1].abs().max() == 0
+        assert spoilt["d"].flatten().tolist() == [True, False, True]
+        for name in ("raw", "ego", "obj", "raw_valid", "a"):
+            assert torch.equal(spoilt[name][::2], good[name][::2])
+
+
+@pytest.mark.parametrize("share", [0.11, 0.89])
+def test_crops_and_telephoto_and_wide_lenses_are_cameras(share):
+    # A crop that lost up to four ninths of the picture on one side; lenses of 2.9 and 136 degrees.
+    for focal in (1.5, 139.0):
+        K = torch.tensor([[focal, 0.5, 7 * share], [0.0, focal, 5 * share], [0.0, 0.0, 1.0]])
+        TransformedEnv(FakeSensorEnv(), RawFlow(K)).rollout(2)
