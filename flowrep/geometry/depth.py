@@ -11,7 +11,11 @@ from torch import Tensor
 from flowrep.geometry.camera import pixel_rays
 from flowrep.geometry.checks import check_name, check_shape, common_batch
 
-DepthKind: TypeAlias = Literal["z", "ray_length", "z_buffer"]
+DepthKind: TypeAlias = Literal["z", "ray_length", "z_buffer", "reversed_z_buffer"]
+
+# What renderers in float32 make of a buffer's 1 where nothing is drawn: up to three times the
+# spacing of numbers below 1 off, in the products of which PyBullet's software renderer composes it.
+_ROUNDING = 3 * 2.0**-24
 
 
 def adapt_depth(
@@ -29,15 +33,16 @@ def adapt_depth(
     Convention: `"z"` is depth along the optical axis and returned unchanged; `"ray_length"` is the
     distance from the camera's centre to the surface, metres (lidar, "distance to camera");
     `"z_buffer"` is OpenGL's depth buffer in [0, 1], 0 at `near_m` and 1 at `far_m` or where nothing
-    was drawn. Pass `1 - depth` for a reversed buffer. inf stays inf and nan stays nan.
+    was drawn; `"reversed_z_buffer"` is 1 at `near_m` and 0 there (MuJoCo's `mjDEPTH_ZEROFAR`, many
+    game engines). Where nothing was drawn depth is inf. inf stays inf and nan stays nan.
 
     Args:
         depth: `[*B, 1, H, W]`, of that `kind`.
         K: `[*B, 3, 3]`, pixels; only for `"ray_length"`.
-        near_m: the near plane; only for `"z_buffer"`.
-        far_m: the far plane, `math.inf` if the projection has none; only for `"z_buffer"`.
+        near_m: the near plane; only for the two buffers.
+        far_m: the far plane, `math.inf` if the projection has none; only for the two buffers.
         scale_m: metres per unit of `depth`, 1 if it is float; whole numbers, such as uint16
-            millimetres (0.001), need it. Not for `"z_buffer"`.
+            millimetres (0.001), need it. Not for the two buffers.
         nothing: a value, before scaling, that means no measurement; it becomes nan.
 
     >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
@@ -56,7 +61,8 @@ def adapt_depth(
     if K is not None:
         return z_from_ray_length(depth, K)
     if near_m is not None and far_m is not None:
-        return z_from_z_buffer(depth, near_m=near_m, far_m=far_m)
+        is_reversed = kind == "reversed_z_buffer"
+        return z_from_z_buffer(depth, near_m=near_m, far_m=far_m, is_reversed=is_reversed)
     return depth
 
 
@@ -76,11 +82,15 @@ def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
     return (ray_length / per_z.unsqueeze(-3)).to(ray_length.dtype)
 
 
-def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
-    """Returns depth along the optical axis from OpenGL's depth buffer of a perspective camera.
+def z_from_z_buffer(
+    z_buffer: Tensor, *, near_m: float, far_m: float, is_reversed: bool = False
+) -> Tensor:
+    """Returns depth along the optical axis from the depth buffer of a perspective camera.
 
-    The result is inf where the buffer is 1 (nothing was drawn) and nan where it is outside [0, 1];
-    see `adapt_depth`.
+    The result is inf where nothing was drawn and nan where the buffer is outside [0, 1], both up to
+    rounding: PyBullet's software renderer has 0.9999999 or 1.0000001 where nothing was drawn, so a
+    surface that close to the far plane counts as none. A reversed buffer is exactly 0 there, as
+    numbers near 0 are exact. See `adapt_depth`.
 
     >>> z_from_z_buffer(torch.tensor([[[0.5]]]), near_m=0.5, far_m=torch.inf)
     tensor([[[1.]]])
@@ -88,10 +98,15 @@ def z_from_z_buffer(z_buffer: Tensor, *, near_m: float, far_m: float) -> Tensor:
     check_shape("z_buffer", z_buffer, (1, "H", "W"))
     if not 0 < near_m < far_m:
         raise ValueError(f"planes need 0 < near_m < far_m, got near_m={near_m}, far_m={far_m}")
-    # near * far / (far - b (far - near)), without a difference of large numbers near b = 1.
-    z = near_m / ((1.0 - z_buffer) + z_buffer * (near_m / far_m))
-    z = torch.where(z_buffer == 1.0, torch.inf, z)
-    return torch.where((z_buffer >= 0.0) & (z_buffer <= 1.0), z, torch.nan)
+    tolerance = _ROUNDING / (1.0 - near_m / far_m)
+    if is_reversed:
+        to_near, to_far, is_sky = z_buffer, 1.0 - z_buffer, z_buffer == 0.0
+    else:
+        to_near, to_far, is_sky = 1.0 - z_buffer, z_buffer, (1.0 - z_buffer).abs() <= tolerance
+    # near * far / (far - b (far - near)), without a difference of large numbers near the far plane
+    z = torch.where(is_sky, torch.inf, near_m / (to_near + to_far * (near_m / far_m)))
+    is_known = is_sky | ((to_near >= 0.0) & (to_far >= -tolerance))
+    return torch.where(is_known, z, torch.nan)
 
 
 def check_depth_options(
@@ -105,14 +120,15 @@ def check_depth_options(
     check_name("kind", kind, DepthKind)
     if has_camera != (kind == "ray_length"):
         raise ValueError(f"'ray_length' needs K, the other kinds do not read it; kind is {kind!r}")
+    is_buffer = kind.endswith("z_buffer")
     planes = (near_m is not None) + (far_m is not None)
-    if planes != (2 if kind == "z_buffer" else 0):
+    if planes != (2 if is_buffer else 0):
         raise ValueError(
-            "'z_buffer' needs near_m and far_m, the other kinds do not read them; "
-            f"kind is {kind!r}, near_m={near_m}, far_m={far_m}"
+            "'z_buffer' and 'reversed_z_buffer' need near_m and far_m, the other kinds do not "
+            f"read them; kind is {kind!r}, near_m={near_m}, far_m={far_m}"
         )
-    if scale_m is not None and (kind == "z_buffer" or not 0 < scale_m < math.inf):
+    if scale_m is not None and (is_buffer or not 0 < scale_m < math.inf):
         raise ValueError(
-            f"scale_m is metres per unit, positive, and 'z_buffer' has none; kind is {kind!r}, "
+            f"scale_m is metres per unit, positive, and a z-buffer has none; kind is {kind!r}, "
             f"scale_m={scale_m}"
         )

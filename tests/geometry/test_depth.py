@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
+import numpy as np
+import pytest
 import torch
 
 from flowrep.geometry import adapt_depth, unproject
@@ -49,3 +52,63 @@ def test_an_opengl_z_buffer_becomes_metres():
     # Without a far plane b = 1 - near / z: 0.75 at four times the near plane.
     endless = adapt_depth(depth_of(0.75), "z_buffer", near_m=0.5, far_m=math.inf)
     assert endless.item() == 2.0
+
+
+def test_a_reversed_z_buffer_becomes_metres_and_keeps_what_is_far():
+    # 1 at the near plane: b = (1/z - 1/far) / (1/near - 1/far). near 0.5 m, far 8 m, z = 2 m:
+    # (0.5 - 0.125) / (2 - 0.125) = 0.2. Read as an ordinary one it would be 0.615 m.
+    buffer = depth_of(1.0, 0.2, 0.0, 1.1, -0.1, math.nan)
+    z = adapt_depth(buffer, "reversed_z_buffer", near_m=0.5, far_m=8.0).flatten()
+    torch.testing.assert_close(z[:2], torch.tensor([0.5, 2.0]))
+    assert z[2] == math.inf
+    assert z[3:].isnan().all()
+    # 999 m before a far plane of 1,000 m: 1 - b, in float32 the sky's 1, would lose the surface
+    near, far, surface = 0.01, 1000.0, 999.0
+    b = (1 / surface - 1 / far) / (1 / near - 1 / far)
+    z = adapt_depth(depth_of(b), "reversed_z_buffer", near_m=near, far_m=far)
+    torch.testing.assert_close(z.item(), surface, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("as_float64", [False, True])  # without numpy PyBullet returns a tuple
+def test_the_sky_of_pybullets_software_renderer_is_no_wall(as_float64):
+    # Where nothing is drawn it writes what is near 1: 0.9999999 at (0.1, 100), which is 99.99 m,
+    # 1.0000001, out of [0, 1], at (0.02, 20). Here a wall at 0.9 of the far plane fills the lower
+    # half of each picture.
+    bullet = pytest.importorskip("pybullet")
+    client = bullet.connect(bullet.DIRECT)
+    nears = [0.01, 0.02, 0.05, 0.1, 0.2]
+    fars = [2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 70, 80, 100, 150, 200, 300]
+    inexact = 0
+    try:
+        view = bullet.computeViewMatrix([0, 0, 0], [1, 0, 0], [0, 0, 1])
+        for near, far in product(nears, [*fars, 500, 700, 1000]):
+            box = {"halfExtents": [0.01 * far, far, far], "physicsClientId": client}
+            shape = bullet.createVisualShape(bullet.GEOM_BOX, **box)
+            place = [0.91 * far, 0, -1.05 * far]
+            wall = bullet.createMultiBody(0, -1, shape, place, physicsClientId=client)
+            lens = bullet.computeProjectionMatrixFOV(60, 8 / 6, near, far)
+            software = {"renderer": bullet.ER_TINY_RENDERER, "physicsClientId": client}
+            *_, buffer, ids = bullet.getCameraImage(8, 6, view, lens, **software)
+            bullet.removeBody(wall, physicsClientId=client)
+            buffer, ids = (np.reshape(part, (1, 6, 8)) for part in (buffer, ids))
+            buffer = torch.as_tensor(buffer.astype("f8" if as_float64 else "f4"))
+            is_wall = torch.as_tensor(ids) == wall
+            assert is_wall.float().mean() == 0.5
+            inexact += bool((buffer[~is_wall] != 1.0).any())
+            z = adapt_depth(buffer, "z_buffer", near_m=near, far_m=far)
+            assert (z[~is_wall] == math.inf).all(), (near, far)
+            # a buffer's last digit is far / near times its spacing, 6e-8, in depth
+            within = 1e-6 * far / near + 1e-3
+            assert (z[is_wall] / (0.9 * far) - 1).abs().max() < within, (near, far)
+    finally:
+        bullet.disconnect(client)
+    assert inexact > 10
+
+
+def test_a_surface_that_the_buffer_tells_from_the_far_plane_is_none_of_the_sky():
+    near, far = 0.1, 100.0
+    below_one = depth_of(*(1 - k * 2.0**-24 for k in range(8)))
+    z = adapt_depth(below_one, "z_buffer", near_m=near, far_m=far).flatten()
+    assert z.isinf().tolist() == [True] * 4 + [False] * 4
+    expected = near / (4 * 2.0**-24 * (1 - near / far) + near / far)  # 99.98 m
+    torch.testing.assert_close(z[4].item(), expected, rtol=1e-6, atol=0)
