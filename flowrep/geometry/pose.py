@@ -17,7 +17,7 @@ PoseLayout: TypeAlias = Literal[
     "matrix", "matrix_3x4", "xyz_xyzw", "xyz_wxyz", "xyz_yaw", "xyz_yaw_pitch"
 ]
 PoseDirection: TypeAlias = Literal["camera_to_world", "world_to_camera"]
-CameraAxes: TypeAlias = Literal["opencv", "opengl", "ned", "x_forward_z_up"]
+CameraAxes: TypeAlias = Literal["opencv", "opengl", "ned", "x_forward_z_up", "unreal", "unity"]
 
 POSE_SHAPES: dict[str, tuple[int, ...]] = {
     "matrix": (4, 4), "matrix_3x4": (3, 4), "xyz_xyzw": (7,), "xyz_wxyz": (7,),
@@ -30,7 +30,11 @@ _OPENCV_AXES = {
     "opengl": ((0, 1), (1, -1), (2, -1)),  # x right, y up, z backward
     "ned": ((1, 1), (2, 1), (0, 1)),  # x forward, y right, z down
     "x_forward_z_up": ((1, -1), (2, -1), (0, 1)),  # x forward, y left, z up
+    "unreal": ((1, 1), (2, -1), (0, 1)),  # x forward, y right, z up
+    "unity": ((0, 1), (1, -1), (2, 1)),  # x right, y up, z forward
 }
+# The last two are left-handed: their worlds become right-handed by the opposite of this axis.
+_OPPOSITE_WORLD_AXIS = {"unreal": 1, "unity": 2}
 
 
 def invert_rigid(a_from_b: Tensor) -> Tensor:
@@ -233,13 +237,17 @@ def adapt_pose(
     z down; `"x_forward_z_up"` x forward, y left, z up. The world's axes are left unchanged, as they
     cancel in every relative motion.
 
+    Two are those of left-handed simulators, camera and world alike: `"unreal"` (also CARLA)
+    x forward, y right, z up; `"unity"` x right, y up, z forward. Their world becomes right-handed:
+    unreal's y points left, unity's z backward. Poses of bodies have to be given the same axes then.
+
     Args:
         pose: `[*B, 4, 4]`, or what `layout` says.
         layout: `"matrix"`; `"matrix_3x4"`, the same without its last row; `"xyz_xyzw"` or
             `"xyz_wxyz"`, `[*B, 7]`, translation and unit quaternion, its real part last or first;
             `"xyz_yaw"` or `"xyz_yaw_pitch"`, `[*B, 4]` or `[*B, 5]`, translation and angles in
-            radians in a world whose z is up: yaw counter-clockwise from the world's x, pitch
-            upwards, of a camera that looks along its own x (`axes="x_forward_z_up"`).
+            radians in a world whose z is up: yaw from the world's x to its y, pitch upwards, of a
+            camera that looks along its own x (`axes="x_forward_z_up"` or `"unreal"`).
         direction: `"camera_to_world"` maps points in the camera's frame to the world's;
             `"world_to_camera"` (extrinsics) is the inverse.
         check: whether a pose that is not rigid raises ValueError. The check waits for a GPU.
@@ -264,7 +272,11 @@ def adapt_pose(
     # Each column is a given one or its opposite. They are picked, as a product would round and
     # constants created here would be copied to a GPU in every call.
     columns = [sign * matrix[..., axis : axis + 1] for axis, sign in _OPENCV_AXES[axes]]
-    return torch.cat([*columns, matrix[..., 3:]], -1)
+    matrix = torch.cat([*columns, matrix[..., 3:]], -1)
+    if (opposite := _OPPOSITE_WORLD_AXIS.get(axes)) is None:
+        return matrix
+    rows = matrix.split(1, -2)
+    return torch.cat([-row if axis == opposite else row for axis, row in enumerate(rows)], -2)
 
 
 def check_pose_options(layout: str, direction: str, axes: str) -> None:
@@ -272,10 +284,10 @@ def check_pose_options(layout: str, direction: str, axes: str) -> None:
     check_name("layout", layout, PoseLayout)
     check_name("direction", direction, PoseDirection)
     check_name("axes", axes, CameraAxes)
-    if layout.startswith("xyz_yaw") and axes != "x_forward_z_up":
+    if layout.startswith("xyz_yaw") and axes not in ("x_forward_z_up", "unreal"):
         raise ValueError(
-            f"layout {layout!r} is of a camera that looks along its own x: "
-            f'axes="x_forward_z_up", not {axes!r}'
+            f"layout {layout!r} is of a camera that looks along its own x, with z up: "
+            f'axes="x_forward_z_up" or "unreal", not {axes!r}'
         )
 
 

@@ -89,7 +89,8 @@ class AdaptPose(MapTransform):
     | a pose | `("sensor", "world_from_cam")` | float64 `[*B, 4, 4]` | rigid | m |
 
     Convention and further arguments: see `flowrep.geometry.adapt_pose`. It also converts poses of
-    bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, as a body's own axes do not matter.
+    bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, as a body's own axes do not matter; in a
+    left-handed world (`"unreal"`, `"unity"`) with the camera's, which turn the world, too.
 
     Args:
         check: whether ill-formed poses raise ValueError at resets, in the envs that are reset, and

@@ -144,6 +144,71 @@ def test_axes_of_one_and_the_same_camera(axes):
     )
 
 
+# A camera that went 2 m ahead, 1 m to the right and 0.5 m up, then turned to the right (sine 0.28,
+# cosine 0.96) and upwards (0.6, 0.8). In the axes of the camera before, right, down and forward:
+#   right (0.96, 0, -0.28), forward (0.8 * 0.28, -0.6, 0.8 * 0.96), down = forward x right.
+# Below are the same three directions, and where it went, in each simulator's left-handed axes.
+TURNED = torch.tensor(
+    [[0.96, 0.168, 0.224, 1], [0, 0.8, -0.6, -0.5], [-0.28, 0.576, 0.768, 2], [0, 0, 0, 1]],
+    dtype=torch.float64,
+)
+LEFT_HANDED = {
+    # columns forward, right, up; rows the same
+    "unreal": [[0.768, -0.28, -0.576, 2], [0.224, 0.96, -0.168, 1], [0.6, 0, 0.8, 0.5]],
+    # columns right, up, forward; rows the same
+    "unity": [[0.96, -0.168, 0.224, 1], [0, 0.8, 0.6, 0.5], [-0.28, -0.576, 0.768, 2]],
+}
+
+
+@pytest.mark.parametrize("axes", LEFT_HANDED)
+def test_a_camera_of_a_left_handed_world_moves_as_it_did(axes):
+    prev_from_curr = torch.tensor([*LEFT_HANDED[axes], [0, 0, 0, 1]], dtype=torch.float64)
+    world_from_prev = rigid((0.4, -1.1, 0.7), (30.0, -20.0, 5.0))
+    poses = [world_from_prev, world_from_prev @ prev_from_curr]
+    before, now = g.adapt_pose(torch.stack(poses), axes=axes)
+    torch.testing.assert_close(g.relative_motion(before, now, dtype=torch.float64), TURNED)
+    g.check_rigid("pose", torch.stack([before, now]))  # right-handed
+    extrinsics = g.invert_rigid(torch.stack(poses))
+    before, now = g.adapt_pose(extrinsics, axes=axes, direction="world_to_camera")
+    torch.testing.assert_close(g.relative_motion(before, now, dtype=torch.float64), TURNED)
+    # Right-handed axes get it wrong: "ned" has the rise as a fall, "x_forward_z_up" the other side.
+    for rival in ("ned", "x_forward_z_up", "opengl", "opencv"):
+        before, now = g.adapt_pose(torch.stack(poses), axes=rival)
+        assert (g.relative_motion(before, now)[:3, 3] - TURNED[:3, 3]).abs().max() > 0.9
+
+
+def test_where_a_left_handed_world_s_camera_is_and_looks():
+    # Both at 5 along the first axis, 6 along the second, 7 along the third. Unreal's after a
+    # quarter turn to the right, from x to y: it looks along y, the picture's right is -x. In a
+    # right-handed world whose y is left that is along -y, from (5, -6, 7).
+    unreal = torch.tensor([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1.0]])
+    expected = [[-1, 0, 0, 5], [0, 0, -1, -6], [0, -1, 0, 7], [0, 0, 0, 1]]
+    assert g.adapt_pose(unreal, axes="unreal").tolist() == expected
+    yaw = torch.tensor([5.0, 6.0, 7.0, QUARTER_TURN]).double()
+    by_angle = g.adapt_pose(yaw, layout="xyz_yaw", axes="unreal")
+    torch.testing.assert_close(by_angle, torch.tensor(expected).double())
+    # Unity's unturned: right x, down -y, forward z, which is -z in a world whose z is backward.
+    unity = torch.eye(4)
+    unity[:3, 3] = torch.tensor([5.0, 6.0, 7.0])
+    expected = [[1, 0, 0, 5], [0, -1, 0, 6], [0, 0, -1, -7], [0, 0, 0, 1]]
+    assert g.adapt_pose(unity, axes="unity").tolist() == expected
+
+
+@pytest.mark.parametrize("axes", LEFT_HANDED)
+def test_a_body_in_a_left_handed_world_moves_as_it_did(axes):
+    # The camera stands, the body comes 1 m nearer and 2 m to the right, 0.5 m up. A point on it was
+    # 1 m further, 2 m to the left and 0.5 m lower.
+    steps = {"unreal": (-1.0, 2.0, 0.5), "unity": (2.0, 0.5, -1.0)}
+    camera = rigid((0.2, 0.5, -0.3), (3.0, 2.0, 1.0))
+    before = camera @ rigid((0.1, 0.2, 0.3), (5.0, 4.0, 6.0))
+    now = camera @ rigid((0, 0, 0), steps[axes]) @ camera.inverse() @ before
+    camera, before, now = g.adapt_pose(torch.stack([camera, before, now]), axes=axes)
+    motion = g.instance_motion(camera, camera, before[None], now[None], dtype=torch.float64)[1]
+    expected = torch.eye(4).double()
+    expected[:3, 3] = torch.tensor([-2.0, 0.5, 1.0])
+    torch.testing.assert_close(motion, expected)
+
+
 def test_a_pose_without_its_last_row():
     whole = torch.tensor([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1.0]])
     assert g.adapt_pose(whole[:3], layout="matrix_3x4").equal(whole.double())

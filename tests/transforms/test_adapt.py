@@ -42,7 +42,7 @@ def test_intrinsics_of_each_sample_may_lie_under_a_key():
     [
         (lambda: T.AdaptDepth("ray_length"), "needs K"),
         (lambda: T.AdaptDepth("z", out_keys="depth"), "reads and writes depth: a second pass"),
-        (lambda: T.AdaptPose(axes="gl"), r"'x_forward_z_up'\], got 'gl'"),
+        (lambda: T.AdaptPose(axes="gl"), r"'unity'\], got 'gl'"),
         (lambda: T.AdaptFlow(direction="forward", grid="previous"), "swap the two pictures"),
         (lambda: T.InstanceIds([3, 1, 3]), r"must name each body once, got \[3, 1, 3\]"),
     ],
