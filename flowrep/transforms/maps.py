@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Literal
 
@@ -19,6 +20,9 @@ from flowrep.geometry.checks import check_name
 from flowrep.transforms.base import DEPTH, IDS, RGB, Keys, MapTransform, check_own_keys
 
 Encoding = Literal["ids", "onehot"]
+
+_LINK_BIT = 24  # PyBullet's ids: body + (link + 1 << 24)
+_CALLS_PER_LOOK = 100  # at ids without a row, on a GPU or once some were named
 
 
 class Rgb(MapTransform):
@@ -171,9 +175,20 @@ class InstanceIds(MapTransform):
     | --- | --- | --- | --- | --- |
     | ids | `("sensor", "instance")` | uint8 `[*B, 1, H, W]` (int32 from 256 bodies) | 0 … N | row |
 
+    Ids that have no row become 0, the static world, and each is named once in a warning, with its
+    share of the pixels, unless it is negative (a background) or one of `static_ids`. They are
+    looked for in every call until some were named, then, as always on a GPU, in one of a hundred.
+
+    PyBullet's ids with links (`ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX`) hold a body's id and,
+    from bit 24 on, 1 + its link's. Bodies may then be named as (body, link), each with the pose of
+    its link, -1 for the base. Those that `body_ids` has without their links raise ValueError in a
+    picture of such ids, unless `links_as_body` says that links move as their bodies.
+
     Args:
-        body_ids: the ids of the bodies, in the order of their poses: the first becomes 1. Every
-            other id, also a negative one, becomes 0, the static world.
+        body_ids: the ids of the bodies, or (body, link), in the order of their poses: the first
+            becomes 1.
+        static_ids: ids of what stands still, such as the floor's.
+        links_as_body: whether PyBullet's links that are not named take their body's row.
         out_keys: must differ from `in_keys`, so that nothing is adapted twice.
 
     Example:
@@ -188,24 +203,87 @@ class InstanceIds(MapTransform):
 
     def __init__(
         self,
-        body_ids: Sequence[int],
+        body_ids: Sequence[int | tuple[int, int]],
         *,
+        static_ids: Sequence[int] = (0,),
+        links_as_body: bool = False,
         in_keys: Keys = "segmentation",
         out_keys: Keys = ("sensor", "instance"),
     ) -> None:
         super().__init__([IDS], in_keys, out_keys)
         check_own_keys(self)
-        if len(set(body_ids)) != len(body_ids):
+        packed = [_packed(*x) if isinstance(x, (tuple, list)) else int(x) for x in body_ids]
+        if len(set(packed)) != len(packed):
             raise ValueError(f"body_ids must name each body once, got {list(body_ids)}")
-        ids = torch.tensor(list(body_ids), dtype=torch.long)
+        ids = torch.tensor(packed, dtype=torch.long)
         self.register_buffer("body_ids", ids, persistent=False)
+        self.links_as_body = bool(links_as_body)
+        self._static = {int(each) for each in static_ids}
+        self._calls_to_skip = 0
 
     def compute(self, ids: Tensor) -> tuple[Tensor]:
         """Returns each pixel's row."""
-        return (geometry.instance_rows(ids, self.body_ids),)
+        rows = geometry.instance_rows(ids, self.body_ids)
+        if self.links_as_body:
+            bodies = geometry.instance_rows(_body_of(ids), self.body_ids)
+            rows = torch.where(rows == 0, bodies, rows)
+        return (rows,)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict = super()._call(next_tensordict)
+        ids = next_tensordict.get(self.in_keys[0], None)
+        if ids is None or torch.compiler.is_compiling():
+            return next_tensordict
+        self._calls_to_skip -= 1
+        if self._calls_to_skip < 0:
+            self._calls_to_skip = _CALLS_PER_LOOK - 1 if ids.is_cuda else 0
+            self._name_ids_without_row(ids, next_tensordict[self.out_keys[0]])
+        return next_tensordict
+
+    def _name_ids_without_row(self, ids: Tensor, rows: Tensor) -> None:
+        """Warns of ids that count as the static world; ValueError if they are bodies' links."""
+        without = (rows == 0) & (ids >= 0)
+        for number in self._static:
+            without &= ids != number
+        if not bool(without.any()):
+            return
+        numbers, counts = (x.tolist() for x in ids[without].unique(return_counts=True))
+        bodies = self.body_ids.tolist()
+        if not self.links_as_body and max(bodies, default=0) < 1 << _LINK_BIT:
+            links = [n for n in numbers if n >> _LINK_BIT and n % (1 << _LINK_BIT) in bodies]
+            if links:
+                raise ValueError(
+                    f"{self.in_keys[0]!r} holds PyBullet's ids with links, {_named(links[0])} for "
+                    "instance, and body_ids has bodies without links: name those that have a pose "
+                    "of their own as (body, link), -1 for the base, or say links_as_body=True"
+                )
+        shares = [f"{_named(n)} ({count / ids.numel():.1%})" for n, count in zip(numbers, counts)]
+        warnings.warn(
+            f"{self.in_keys[0]!r}: ids without a row count as the static world: "
+            f"{', '.join(shares[:8])} of the pixels{', ...' * (len(shares) > 8)}. If they move, "
+            "body_ids needs them; if not, name them in static_ids",
+            stacklevel=2,
+        )
+        self._static |= set(numbers)
+        self._calls_to_skip = _CALLS_PER_LOOK - 1
 
     def output_specs(self, ids: TensorSpec) -> tuple[TensorSpec]:
         """Returns a categorical spec of 1 + N rows."""
         rows = 1 + len(self.body_ids)
         dtype = torch.uint8 if rows <= 256 else torch.int32
         return (Categorical(rows, shape=ids.shape, device=ids.device, dtype=dtype),)
+
+
+def _packed(body: int, link: int) -> int:
+    """Returns PyBullet's id of a body's link."""
+    return body + (link + 1 << _LINK_BIT)
+
+
+def _body_of(ids: Tensor) -> Tensor:
+    """Returns the ids of the bodies of PyBullet's ids with links; a negative one stays."""
+    return torch.where(ids < 0, ids, ids % (1 << _LINK_BIT)) if ids.element_size() > 2 else ids
+
+
+def _named(number: int) -> str:
+    link, body = divmod(number, 1 << _LINK_BIT)
+    return f"{number} = body {body}, link {link - 1}" if link else str(number)

@@ -123,7 +123,9 @@ CASES = {
         before=raw_flow,
     ),
     "InstanceIds": Case(
-        lambda: T.InstanceIds([3, 1], in_keys=("sensor", "semantic"), out_keys="rows"),
+        lambda: T.InstanceIds(
+            [3, 1], static_ids=[0, 2], in_keys=("sensor", "semantic"), out_keys="rows"
+        ),
         {"rows": functools.partial(oracles.rows_of_classes, bodies=[3, 1])},
     ),
     "CameraMotion": Case(
