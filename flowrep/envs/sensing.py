@@ -1,7 +1,4 @@
-"""What an env's camera senses: maps, and the motion of bodies and camera since the last step.
-
-Motions are composed in numpy and float64, since workers that step environments do without PyTorch.
-"""
+"""What an env's camera senses: maps, and the motion of bodies and camera since the last step."""
 
 from collections.abc import Sequence, Set
 from typing import Any
@@ -15,6 +12,7 @@ from flowrep.palette import CLASS_COLOURS, num_classes
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
 from flowrep.simulator import camera
 from flowrep.simulator.bullet import Picture
+from flowrep.simulator.motion import instance_motion, relative_motion, rigid_inverse
 from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
@@ -29,50 +27,6 @@ def planar(x_m: Any, y_m: Any, yaw_rad: Any) -> Array:
     transforms[..., 0, 3], transforms[..., 1, 3] = x_m, y_m
     transforms[..., 2, 2] = transforms[..., 3, 3] = 1.0
     return transforms
-
-
-def rigid_inverse(transforms: Array) -> Array:
-    """Returns the inverses of rigid transforms [..., 4, 4]: (Rᵀ, -Rᵀt) for (R, t)."""
-    inverse = np.zeros_like(transforms)
-    rotation = transforms[..., :3, :3].swapaxes(-1, -2)
-    inverse[..., :3, :3] = rotation
-    inverse[..., :3, 3:] = -(rotation @ transforms[..., :3, 3:])
-    inverse[..., 3, 3] = 1.0
-    return inverse
-
-
-class CameraPose:
-    """The pose of a camera on a vehicle and its inverse, or arrays of them."""
-
-    def __init__(self, x_m: Any, y_m: Any, yaw_rad: Any, vehicle_from_cam: Array) -> None:
-        self.planar = np.stack([x_m, y_m, yaw_rad], axis=-1)
-        self.world_from_cam = planar(x_m, y_m, yaw_rad) @ vehicle_from_cam
-        self.cam_from_world = rigid_inverse(self.world_from_cam)
-
-
-def relative_camera(before: CameraPose, now: CameraPose) -> Array:
-    """Returns prev_from_curr [..., 4, 4]; exactly the identity if the camera did not move."""
-    motion = before.cam_from_world @ now.world_from_cam
-    # The product of a matrix and its inverse is off by rounding, and flow by a little more than 0.
-    motion[(before.planar == now.planar).all(axis=-1)] = np.eye(4)
-    return motion
-
-
-def instance_motion(
-    before: CameraPose, now: CameraPose, prev_world_from_body: Array, world_from_body: Array
-) -> Array:
-    """Returns prev_from_curr by instance [..., 1 + M, 4, 4]; row 0 is the static world's.
-
-    Row i maps a point fixed to body i from the current camera's frame to its position in the
-    previous camera's frame.
-    """
-    static = relative_camera(before, now)[..., None, :, :]
-    # now: body ← world ← camera; then: camera ← world ← body, in which the point has stayed
-    body_from_cam = rigid_inverse(world_from_body) @ now.world_from_cam[..., None, :, :]
-    carried = before.cam_from_world[..., None, :, :] @ prev_world_from_body @ body_from_cam
-    # Who kept their pose has exactly the numbers of row 0, so that their object flow is exactly 0.
-    moved = (world_from_body != prev_world_from_body).any(axis=(-2, -1))
-    return np.concatenate([static, np.where(moved[..., None, None], carried, static)], axis=-3)
 
 
 Arrays = dict[str, Array]
@@ -122,7 +76,7 @@ class Sensing:
                 rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
                 observation |= {"instance_motion": rows, "prev_from_curr": rows[:, 0].copy()}
             else:
-                observation["prev_from_curr"] = relative_camera(before, now).astype(np.float32)
+                observation["prev_from_curr"] = relative_motion(before, now).astype(np.float32)
         if "frame" in self.names:
             named = [(episode.seed, episode.steps) for episode in episodes]
             observation["frame"] = np.array(named, dtype=np.int64)
@@ -134,7 +88,7 @@ class Sensing:
 
     def look(self, episode: Episode) -> Picture:
         """Returns PyBullet's picture from an episode's camera, of the bodies as last placed."""
-        view = camera.gl_view(self._camera_poses([episode.now]).cam_from_world[0])
+        view = camera.gl_view(rigid_inverse(self._camera_poses([episode.now])[0]))
         return self._street.simulator.look(view, self._projection, *self._size)
 
     def space(self) -> spaces.Dict:
@@ -169,7 +123,7 @@ class Sensing:
     def views(self, episodes: Sequence[Episode]) -> tuple[Array, Array, Array]:
         """Returns the poses of cameras and people's parts and what is shown, of N episodes."""
         return (
-            self._camera_poses([episode.now for episode in episodes]).cam_from_world,
+            rigid_inverse(self._camera_poses([episode.now for episode in episodes])),
             world_from_parts(np.stack([episode.poses for episode in episodes])),
             np.stack([self._street.is_shown(episode.path.closures) for episode in episodes]),
         )
@@ -197,6 +151,7 @@ class Sensing:
         maps = {"depth": depth, "semantic": semantic, "instance": instance}
         return {name: array[None] for name, array in maps.items()} | {"rgb": rgb}
 
-    def _camera_poses(self, moments: Sequence[Moment]) -> CameraPose:
+    def _camera_poses(self, moments: Sequence[Moment]) -> Array:
+        """Returns world_from_cam [N, 4, 4]."""
         x_m, y_m, yaw_rad, _ = np.array([moment.vehicle for moment in moments]).T
-        return CameraPose(x_m, y_m, yaw_rad, self._vehicle_from_cam)
+        return planar(x_m, y_m, yaw_rad) @ self._vehicle_from_cam

@@ -4,14 +4,19 @@ Convention: camera axes are OpenCV's (x right, y down, z forward), pixel (0, 0)'
 (0.5, 0.5), depth is metres along z.
 """
 
+from __future__ import annotations
+
 import math
 import warnings
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.extras import numba_is_installed
-from flowrep.scenes.scene import CameraConfig
+
+if TYPE_CHECKING:  # scenes need shapely and pydantic; a camera in another simulator doesn't
+    from flowrep.scenes.scene import CameraConfig
 
 Matrix = NDArray[np.float64]
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,0 +1,50 @@
+"""Rigid poses and the motions between them, in numpy and float64.
+
+`flowrep.geometry` has the same for tensors. Workers that step environments do without PyTorch.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+def rigid_inverse(a_from_b: Array) -> Array:
+    """Returns the inverses of rigid transforms [..., 4, 4]: (Rᵀ, -Rᵀt) for (R, t)."""
+    inverse = np.zeros_like(a_from_b)
+    rotation = a_from_b[..., :3, :3].swapaxes(-1, -2)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3:] = -(rotation @ a_from_b[..., :3, 3:])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def relative_motion(world_from_prev: Array, world_from_curr: Array) -> Array:
+    """Returns prev_from_curr [..., 4, 4]; exactly the identity if the camera did not move."""
+    motion = rigid_inverse(world_from_prev) @ world_from_curr
+    # The product of a matrix and its inverse is off by rounding, and flow by a little more than 0.
+    motion[(world_from_prev == world_from_curr).all(axis=(-2, -1))] = np.eye(4)
+    return motion
+
+
+def instance_motion(
+    world_from_prev: Array,
+    world_from_curr: Array,
+    world_from_prev_body: Array,
+    world_from_curr_body: Array,
+) -> Array:
+    """Returns prev_from_curr by instance [..., 1 + M, 4, 4]; row 0 is the static world's.
+
+    Row i maps a point fixed to body i from the current camera's frame to its position in the
+    previous camera's frame.
+    """
+    static = relative_motion(world_from_prev, world_from_curr)[..., None, :, :]
+    # now: body ← world ← camera; then: camera ← world ← body, in which the point has stayed
+    body_from_curr = rigid_inverse(world_from_curr_body) @ world_from_curr[..., None, :, :]
+    prev_from_world = rigid_inverse(world_from_prev)[..., None, :, :]
+    carried = prev_from_world @ world_from_prev_body @ body_from_curr
+    # Who kept their pose has exactly the numbers of row 0, so that their object flow is exactly 0.
+    moved = (world_from_curr_body != world_from_prev_body).any(axis=(-2, -1))
+    return np.concatenate([static, np.where(moved[..., None, None], carried, static)], axis=-3)
