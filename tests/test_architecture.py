@@ -21,6 +21,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "scenes": {"scenes", "config", "extras", "palette"},
     "simulator": {"simulator", "scenes", "palette", "extras"},
     "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette", "extras"},
+    "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
     | {"transforms", "geometry", "palette", "progress", "tables", "config", "extras", "viz"},
@@ -38,7 +39,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     | {"extras", "tables"},
 }
 THIRD_PARTY_ONLY_IN = {
-    "pybullet": {"simulator/bullet.py"},
+    "pybullet": {"simulator/bullet.py", "pybullet.py"},
     "numba": {"extras.py"},
     "hydra": {
         "train.py",
@@ -62,6 +63,7 @@ PACKAGES_LIMITED_TO = {
     "agent": {"torch", "tensordict", "torchrl", "safetensors", "numpy"},
     "scenes": {"numpy", "shapely", "yaml", "pydantic", "pydantic_core"},
     "simulator": {"numpy", "pybullet", "shapely"},
+    "pybullet": {"numpy", "pybullet", "gymnasium"},
 }
 
 # Nothing of flowrep imports this one: whoever has Hydra does.

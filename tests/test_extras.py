@@ -20,6 +20,7 @@ MODULES = {
     "report/__main__.py": "needs hydra; run: pip install 'flowrep-rl[report]'",
     "agent/__init__.py": "needs safetensors; run: pip install 'flowrep-rl[train]'",
     "envs/__init__.py": "needs pybullet; run: pip install 'flowrep-rl[sim]'",
+    "pybullet.py": "needs pybullet; run: pip install 'flowrep-rl[sim]'",
     "scenes/__init__.py": "needs shapely; run: pip install 'flowrep-rl[sim]'",
     "torchrl_configs.py": "needs hydra; run: pip install 'flowrep-rl[train]'",
 }

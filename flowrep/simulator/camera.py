@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.extras import numba_is_installed
+from flowrep.simulator.motion import rigid_inverse
 
 if TYPE_CHECKING:  # scenes need shapely and pydantic; a camera in another simulator doesn't
     from flowrep.scenes.scene import CameraConfig
@@ -45,6 +47,18 @@ def gl_projection(
 def gl_view(cam_from_world: Matrix) -> list[float]:
     """Returns the 16 numbers, column by column, of the OpenGL view matrix (y up, z backward)."""
     return (_GL_FROM_CV @ cam_from_world).T.ravel().tolist()
+
+
+def pose_of_view(view: Sequence[float]) -> Matrix:
+    """Returns world_from_cam [4, 4], with OpenCV's axes, of the 16 numbers of a view matrix."""
+    numbers = np.asarray(view, dtype=np.float64)
+    if numbers.size != 16:
+        raise ValueError(f"a view has 16 numbers, column by column; got {numbers.size}")
+    gl_from_world = numbers.reshape(4, 4).T
+    rotation = gl_from_world[:3, :3]
+    if not abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3:
+        raise ValueError(f"a view is a rotation and a translation; got {numbers.tolist()}")
+    return rigid_inverse(gl_from_world) @ _GL_FROM_CV
 
 
 def vehicle_from_camera(camera: CameraConfig) -> Matrix:

@@ -1,0 +1,483 @@
+"""The sensor keys of any PyBullet world: `BulletCamera`, and `BulletFlow` for gymnasium envs."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Literal, TypeAlias
+
+from flowrep.extras import require
+
+require("flowrep.pybullet", "sim", "pybullet", "gymnasium")
+
+import gymnasium as gym
+import numpy as np
+import pybullet
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from flowrep.simulator.camera import depth_from_zbuffer, gl_view, pose_of_view, sampled_intrinsics
+from flowrep.simulator.motion import instance_motion, rigid_inverse
+
+Array: TypeAlias = NDArray[Any]
+View: TypeAlias = Sequence[float]
+
+_TAG = "flowrep"
+_RIGID, _SOFT = 1, 3  # what getDynamicsInfo returns as a body's type has no names in PyBullet
+
+
+class BulletCamera:
+    """A camera in a PyBullet world: what it sees, and how all that it sees has moved.
+
+    Each call takes one picture and returns the sensor keys as numpy arrays, which
+    `TensorDict(sensor=camera())` takes as they are. Call it once a step, and `reset` at the first
+    frame of an episode.
+
+    | key | shape | |
+    | --- | --- | --- |
+    | `depth` | float32 `[1, H, W]` | metres along z, `inf` where nothing was drawn |
+    | `instance` | uint8 or int16 `[1, H, W]` | the row of `instance_motion`, 0 for the sky |
+    | `prev_from_curr` | float32 `[4, 4]` | the camera's motion since the last call |
+    | `instance_motion` | float32 `[1 + max_instances, 4, 4]` | the same for each body or link |
+    | `semantic`, with `classes` | uint8 `[1, H, W]` | |
+    | `rgb`, with `rgb=True` | uint8 `[3, H, W]` | |
+
+    A body keeps its row while it exists. The motion of one that wasn't there at the last call is
+    nan, as is that of a soft body, so that their flow is unknown. Links move as they are drawn:
+    `getLinkState` is a substep behind, and with `computeForwardKinematics` would change what the
+    env reads next. To tell a body from one that later gets its number, each is marked once with
+    PyBullet's `addUserData`; nothing else in the world changes.
+
+    Args:
+        client: a `BulletClient`, the number of a client, or the module `pybullet`.
+        width: pixels.
+        height: pixels.
+        fov_deg: vertical field of view, as in `computeProjectionMatrixFOV`; needs `near_m` and
+            `far_m`. Beyond `far_m`, nothing is drawn.
+        projection: instead, the 16 numbers of a perspective `computeProjectionMatrix`.
+        view: the 16 numbers of `computeViewMatrix`, or a function that returns them at each call.
+            Without it, each call needs one.
+        link: (body, link) that the camera rides on, link -1 for the base. `view` is then in the
+            axes of the URDF's link; without it, the camera looks along their z and y is down.
+        instances: `"links"`, or `"bodies"` for one row a body, which must have no moving joints.
+        max_instances: the number of rows for bodies and links that exist at once.
+        classes: class ids by body; other bodies, and the sky, are 0.
+        rgb: whether to return the picture.
+        renderer: PyBullet's constant. K is that of the renderer that draws in fact: without EGL's
+            plugin or a window, the software renderer does, whatever is asked for.
+        picture: further arguments of `getCameraImage`, such as `lightDirection` or `shadow`.
+
+    Attributes:
+        K: `[3, 3]`, pixels, such that unprojected depth lies on the surfaces.
+        rows: rows of `instance_motion` by (body, link); a body's base is link -1.
+
+    Raises:
+        ValueError: arguments that don't fit together, a world of more than `max_instances`, or a
+            `link` that doesn't exist.
+
+    Example:
+        >>> client = pybullet.connect(pybullet.DIRECT)
+        >>> ball = pybullet.createVisualShape(pybullet.GEOM_SPHERE, 0.5, physicsClientId=client)
+        >>> ball = pybullet.createMultiBody(0, -1, ball, [0, 0, 2], physicsClientId=client)
+        >>> view = pybullet.computeViewMatrix([0, -3, 2], [0, 0, 2], [0, 0, 1])
+        >>> camera = BulletCamera(client, 60, 40, fov_deg=60, view=view)
+        >>> camera.reset()["depth"][0, 20, 30].round(1)
+        np.float32(2.5)
+        >>> pybullet.resetBasePositionAndOrientation(ball, [0.25, 0, 2], [0, 0, 0, 1], client)
+        >>> camera()["instance_motion"][camera.rows[ball, -1], :3, 3]  # it was 25 cm to the left
+        array([-0.25,  0.  ,  0.  ], dtype=float32)
+        >>> pybullet.disconnect(client)
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        width: int,
+        height: int,
+        *,
+        fov_deg: float | None = None,
+        projection: View | None = None,
+        near_m: float = 0.05,
+        far_m: float = 100.0,
+        view: View | Callable[[], View] | None = None,
+        link: tuple[int, int] | None = None,
+        instances: Literal["links", "bodies"] = "links",
+        max_instances: int = 64,
+        classes: Mapping[int, int] | None = None,
+        rgb: bool = False,
+        renderer: int = pybullet.ER_TINY_RENDERER,
+        **picture: Any,
+    ) -> None:
+        if instances not in ("links", "bodies"):
+            raise ValueError(f"instances must be 'links' or 'bodies', got {instances!r}")
+        if not 1 <= max_instances < 1 << 15:
+            raise ValueError(f"max_instances must be 1 to {(1 << 15) - 1}, got {max_instances}")
+        self._client = _Client(client) if isinstance(client, int) else client
+        self.width, self.height = width, height
+        if projection is None:
+            if fov_deg is None or not (0 < fov_deg < 180 and 0 < near_m < far_m):
+                raise ValueError(
+                    "give fov_deg between 0 and 180, with 0 < near_m < far_m, or projection; got "
+                    f"fov_deg={fov_deg}, near_m={near_m}, far_m={far_m}"
+                )
+            projection = pybullet.computeProjectionMatrixFOV(fov_deg, width / height, near_m, far_m)
+        elif fov_deg is not None:
+            raise ValueError("give fov_deg or projection, not both")
+        self._picture = {"shadow": 0, "renderer": renderer} | picture
+        self._picture["projectionMatrix"] = list(projection)
+        flags = pybullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
+        self._picture["flags"] = self._picture.get("flags", 0) | flags
+        self.K, self._range_m = self._read(np.array(projection, dtype=np.float32))
+        self._view, self._link = view, link
+        self._has_links, self.max_instances = instances == "links", max_instances
+        self._classes, self._has_rgb = classes, rgb
+        self._instance_type = np.uint8 if max_instances < 256 else np.int16
+        self.rows: dict[tuple[int, int], int] = {}
+        self._bodies: dict[str, _Body] = {}  # by tag
+        self._before: tuple[Array, Array] | None = None  # poses of the camera and by row
+        self._row_of: dict[tuple[str, int], int] = {}  # by tag and link
+
+    def reset(self, view: View | None = None) -> dict[str, Array]:
+        """Returns the sensor keys of an episode's first frame: nothing has moved yet."""
+        self._before, self._row_of = None, {}
+        return self(view)
+
+    def __call__(self, view: View | None = None) -> dict[str, Array]:
+        """Returns the sensor keys of this step.
+
+        Args:
+            view: the camera's view now, instead of the constructor's.
+        """
+        bodies = self._there()
+        poses = {tag: body.poses(self._client) for tag, body in bodies.items()}
+        world_from_cam = self._pose(view, bodies, poses)
+        if not self._has_links:
+            poses = {tag: pose[:1] for tag, pose in poses.items()}
+        row_of = self._rows(poses)
+        self.rows = {(bodies[tag].number, link): row for (tag, link), row in row_of.items()}
+        now = np.full((self.max_instances, 4, 4), np.nan)
+        for tag, pose in poses.items():
+            now[[row_of[tag, link - 1] - 1 for link in range(len(pose))]] = pose
+        camera_before, before = self._before or (world_from_cam, now)
+        motion = instance_motion(camera_before, world_from_cam, before, now)
+        absent = np.ones(1 + self.max_instances, dtype=bool)
+        absent[list(row_of.values())] = False
+        motion[absent] = motion[0]
+        self._before, self._row_of = (world_from_cam, now), row_of
+        motions = motion.astype(np.float32)
+        maps = self._look(world_from_cam, bodies)
+        return maps | {"prev_from_curr": motions[0].copy(), "instance_motion": motions}
+
+    def space(self) -> spaces.Dict:
+        """Returns the space of the sensor keys, for gymnasium."""
+        size, anything = (1, self.height, self.width), (-np.inf, np.inf)
+        maps: dict[str, spaces.Space] = {
+            "depth": spaces.Box(0.0, np.inf, size, np.float32),
+            "instance": spaces.Box(0, self.max_instances, size, self._instance_type),
+            "prev_from_curr": spaces.Box(*anything, (4, 4), np.float32),
+            "instance_motion": spaces.Box(*anything, (1 + self.max_instances, 4, 4), np.float32),
+        }
+        if self._classes is not None:
+            most = max(self._classes.values(), default=0)
+            maps["semantic"] = spaces.Box(0, most, size, np.uint8)
+        if self._has_rgb:
+            maps["rgb"] = spaces.Box(0, 255, (3, *size[1:]), np.uint8)
+        return spaces.Dict(maps)
+
+    def _read(self, projection: Array) -> tuple[Array, tuple[float, float]]:
+        """Returns K and the near and far plane of a projection, float32 as PyBullet reads it."""
+        matrix = projection.reshape(4, 4).T
+        free = {(0, 0), (0, 2), (1, 1), (1, 2), (2, 2), (2, 3), (3, 2)}
+        fixed = [matrix[i, j] for i in range(4) for j in range(4) if (i, j) not in free]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            near_m = matrix[2, 3] / (matrix[2, 2] - 1)
+            far_m = matrix[2, 3] / (matrix[2, 2] + 1)
+        if any(fixed) or matrix[3, 2] != -1 or not 0 < near_m < far_m:
+            raise ValueError(
+                "projection must be that of a perspective camera, as computeProjectionMatrixFOV "
+                f"and computeProjectionMatrix return it; got {projection.tolist()}"
+            )
+        half = self.width / 2, self.height / 2
+        fx, fy = half[0] * float(matrix[0, 0]), half[1] * float(matrix[1, 1])
+        K = np.array([[fx, 0.0, half[0]], [0.0, fy, half[1]], [0.0, 0.0, 1.0]])
+        if _software_draws(self._client, self._picture["renderer"]):
+            K = sampled_intrinsics(fx, fy, self.height, self.width)
+        K[:2, 2] += half[0] * -float(matrix[0, 2]), half[1] * float(matrix[1, 2])  # off-centre
+        return K, (float(near_m), float(far_m))
+
+    def _there(self) -> dict[str, _Body]:
+        """Returns the bodies that exist now, by the tag that each keeps while it exists."""
+        client, bodies = self._client, {}
+        for number in map(client.getBodyUniqueId, range(client.getNumBodies())):
+            key = client.getUserDataId(number, _TAG)
+            if key < 0:  # no camera has seen it: a new body, perhaps of a number used before
+                key = client.addUserData(number, _TAG, uuid.uuid4().hex)
+            tag = client.getUserData(key).decode()
+            bodies[tag] = self._bodies.get(tag) or _Body(client, number)
+            if bodies[tag].joints and not self._has_links:
+                raise ValueError(
+                    f"body {number} ({bodies[tag].name}) has joints, so that its links move "
+                    "apart: use instances='links'"
+                )
+        self._bodies = bodies
+        return bodies
+
+    def _rows(self, poses: Mapping[str, Array]) -> dict[tuple[str, int], int]:
+        """Returns the row of each instance: as it was, or a free one for a new instance."""
+        there = [(tag, link - 1) for tag, pose in poses.items() for link in range(len(pose))]
+        # A row stays empty for a step: a pixel of the same row is of the same body in both frames.
+        taken = set(self._row_of.values())
+        free = (row for row in range(1, 1 + self.max_instances) if row not in taken)
+        row_of = {each: self._row_of.get(each) or next(free, 0) for each in there}
+        if lacking := sum(row == 0 for row in row_of.values()):
+            raise ValueError(
+                f"{len(there)} bodies and links are there, and {len(taken - set(row_of.values()))} "
+                f"have just left: give max_instances={self.max_instances + lacking} or more"
+            )
+        return row_of
+
+    def _pose(
+        self, view: View | None, bodies: Mapping[str, _Body], poses: Mapping[str, Array]
+    ) -> Array:
+        """Returns world_from_cam [4, 4]."""
+        if view is None:
+            view = self._view() if callable(self._view) else self._view
+        if self._link is None:
+            if view is None:
+                raise ValueError("the camera has no view: give it to BulletCamera or to each call")
+            return pose_of_view(view)
+        body, link = self._link
+        for tag, there in bodies.items():
+            if there.number == body and -1 <= link < len(there.parents):
+                world_from_link = poses[tag][1 + link] @ there.mass_from_link[1 + link]
+                return world_from_link if view is None else world_from_link @ pose_of_view(view)
+        raise ValueError(
+            f"no body {body} with a link {link}; there are "
+            f"{ {each.number: f'{len(each.parents)} links' for each in bodies.values()} }"
+        )
+
+    def _look(self, world_from_cam: Array, bodies: Mapping[str, _Body]) -> dict[str, Array]:
+        view = gl_view(rigid_inverse(world_from_cam))
+        _, _, rgba, zbuffer, ids = self._client.getCameraImage(
+            self.width, self.height, view, **self._picture
+        )
+        shape = self.height, self.width  # PyBullet returns tuples if it was built without numpy
+        ids = np.asarray(ids, dtype=np.int32).reshape(shape)
+        zbuffer = np.asarray(zbuffer, dtype=np.float32).reshape(shape)
+        is_sky = ids == -1
+        # Not by the z-buffer, which is next to 1 there, above or below, but seldom 1.
+        depth = depth_from_zbuffer(zbuffer, *self._range_m)
+        depth[is_sky] = np.inf
+        # ids are body + ((link + 1) << 24), of which the sky's -1 is body 0xffffff, link 254
+        packed = np.where(is_sky, 0, ids).view(np.uint32)
+        body, link = packed & 0xFFFFFF, packed >> 24
+        rows = self._table(bodies, int(body.max()), int(link.max()))
+        instance = rows[body, link] if self._has_links else rows[body, 0]
+        instance[is_sky] = 0
+        if (instance < 0).any():
+            unknown = sorted({int(number) for number in body[instance < 0]})
+            raise RuntimeError(
+                f"the picture shows bodies {unknown}, or links of them, that this client doesn't "
+                "list: another process added them; call its syncBodyInfo()"
+            )
+        maps = {"depth": depth[None], "instance": instance[None].astype(self._instance_type)}
+        if self._classes is not None:
+            class_of = np.zeros(int(body.max()) + 1, dtype=np.uint8)
+            for number, class_id in self._classes.items():
+                if number < len(class_of):
+                    class_of[number] = class_id
+            maps["semantic"] = np.where(is_sky, np.uint8(0), class_of[body])[None]
+        if self._has_rgb:
+            colours = np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4)[..., :3]
+            maps["rgb"] = np.ascontiguousarray(colours.transpose(2, 0, 1))
+        return maps
+
+    def _table(self, bodies: Mapping[str, _Body], most_body: int, most_link: int) -> Array:
+        """Returns the row by body and 1 + link, -1 for those that don't exist."""
+        table = np.full((1 + most_body, 1 + most_link), -1, dtype=np.int32)
+        for (body, link), row in self.rows.items():
+            if body <= most_body and link < most_link:
+                table[body, 1 + link] = row
+        return table
+
+
+class BulletFlow(gym.Wrapper):
+    """Adds a camera's sensor keys to the observations of a gymnasium env on PyBullet.
+
+    They are under `"sensor"`, beside the entries of a dict of observations, or beside
+    `"observation"` if the env returns an array. At a reset nothing has moved.
+
+    Args:
+        env: on PyBullet.
+        camera: a function that takes `env.unwrapped` and returns its `BulletCamera`. It is called
+            after each reset, since some envs connect or load their robot anew in theirs, and once
+            after a reset here. Or a `BulletCamera`, of a world that lasts.
+
+    Attributes:
+        camera: the `BulletCamera`.
+        K: its K `[3, 3]`; through further wrappers, `env.get_wrapper_attr("K")`.
+
+    Example:
+        >>> import panda_gym  # doctest: +SKIP
+        >>> from torchrl.envs import Compose, GymWrapper, TransformedEnv
+        >>> from flowrep.transforms import FlowFactorize, RawFlow
+        >>> view = pybullet.computeViewMatrix([0.7, 0.5, 0.6], [0, 0, 0.1], [0, 0, 1])
+        >>> env = BulletFlow(  # doctest: +SKIP
+        ...     gym.make("PandaReach-v3"),
+        ...     lambda env: BulletCamera(env.sim.physics_client, 96, 64, fov_deg=60, view=view),
+        ... )
+        >>> flow = Compose(RawFlow(env.K), FlowFactorize(env.K))  # doctest: +SKIP
+        >>> TransformedEnv(GymWrapper(env), flow).rollout(3)["obj"].shape  # doctest: +SKIP
+        torch.Size([3, 2, 64, 96])
+    """
+
+    def __init__(self, env: gym.Env, camera: Callable[[Any], BulletCamera] | BulletCamera) -> None:
+        super().__init__(env)
+        if isinstance(camera, BulletCamera):
+            self._make: Callable[[Any], BulletCamera] = lambda _: camera
+        else:
+            self._make = camera
+            env.reset()
+        self.camera = self._make(env.unwrapped)
+        seen = env.observation_space
+        entries = dict(seen.spaces) if isinstance(seen, spaces.Dict) else {"observation": seen}
+        if "sensor" in entries:
+            raise ValueError("the env's observations have a 'sensor' already; rename it first")
+        self.observation_space = spaces.Dict(entries | {"sensor": self.camera.space()})
+
+    @property
+    def K(self) -> Array:
+        """The camera's K `[3, 3]`, pixels."""
+        return self.camera.K
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begins an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.camera = self._make(self.env.unwrapped)
+        return self._beside(observation, self.camera.reset()), info
+
+    def step(self, action: Any) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
+        """Acts."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._beside(observation, self.camera()), reward, terminated, truncated, info
+
+    def _beside(self, observation: Any, maps: dict[str, Array]) -> dict[str, Any]:
+        entries = observation if isinstance(observation, dict) else {"observation": observation}
+        return {**entries, "sensor": maps}
+
+
+class _Client:
+    """PyBullet's functions, for a client of which there is only the number."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def __getattr__(self, name: str) -> Any:
+        return partial(getattr(pybullet, name), physicsClientId=self._number)
+
+
+class _Body:
+    """A body: what doesn't change while it exists, and the poses of its base and links.
+
+    Poses are those of the centres of mass, as `getBasePositionAndOrientation` gives them.
+    """
+
+    def __init__(self, client: Any, number: int) -> None:
+        self.number = number
+        self.name = client.getBodyInfo(number)[1].decode()
+        base = client.getDynamicsInfo(number, -1)
+        if base[10] == _RIGID and len(client.getVisualShapeData(number)) > 1:
+            raise ValueError(
+                f"body {number} ({self.name}) was loaded with useMaximalCoordinates: PyBullet "
+                "draws its links under one id and doesn't tell where they are; load it without"
+            )
+        self.is_soft = base[10] == _SOFT
+        links = range(0 if self.is_soft else client.getNumJoints(number))
+        infos = [client.getJointInfo(number, link) for link in links]
+        states = [client.getLinkState(number, link) for link in links]
+        self.parents = [info[16] for info in infos]
+        self.types = np.array([info[2] for info in infos])
+        self.joints = [link for link in links if infos[link][2] != pybullet.JOINT_FIXED]
+        inertial = [base[3:5], *(state[2:4] for state in states)]
+        self.mass_from_link = rigid_inverse(_transforms(*zip(*inertial)))
+        # Bullet's own joints: axis and frame have the axes of the link's inertia, the rotation
+        # leads from the parent to the link, and the centre of mass is where the link's origin,
+        # which is the joint, was moved from.
+        turned = _transforms([(0.0, 0.0, 0.0)] * len(infos), [info[15] for info in infos])
+        self.parent_from_joint = rigid_inverse(turned)
+        self.parent_from_joint[:, :3, 3] = np.array([i[14] for i in infos]).reshape(-1, 3)
+        self.joint_from_mass = np.tile(np.eye(4), (len(infos), 1, 1))
+        self.joint_from_mass[:, :3, 3] = -self.mass_from_link[1:, :3, 3]
+        self.axes = np.array([info[13] for info in infos], dtype=np.float64).reshape(-1, 3)
+        # Bullet turns about axes of any length, MJCF's (2, 1, 1) for instance, and slides along
+        # them by that length.
+        x, y, z = (self.axes / np.linalg.norm(self.axes, axis=1, keepdims=True).clip(1e-12)).T
+        o = np.zeros_like(x)
+        self.cross = np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(-1, 3, 3)
+        self.cross_twice = self.cross @ self.cross
+
+    def poses(self, client: Any) -> Array:
+        """Returns world_from_mass [1 + links, 4, 4], of the base first."""
+        if self.is_soft:
+            return np.full((1, 4, 4), np.nan)
+        base = _transforms(*([part] for part in client.getBasePositionAndOrientation(self.number)))
+        if not self.parents:
+            return base
+        local = self.parent_from_joint @ self._joints(client) @ self.joint_from_mass
+        world = np.empty((1 + len(local), 4, 4))
+        world[0] = base[0]
+        for link, parent in enumerate(self.parents):
+            world[1 + link] = world[1 + parent] @ local[link]
+        return world
+
+    def _joints(self, client: Any) -> Array:
+        """Returns the transforms [links, 4, 4] of the joints' positions."""
+        links = range(len(self.parents))
+        position = np.array([state[0] for state in client.getJointStates(self.number, links)])
+        angle = np.where(self.types == pybullet.JOINT_REVOLUTE, position, 0.0)[:, None, None]
+        slide = np.where(self.types == pybullet.JOINT_PRISMATIC, position, 0.0)
+        moved = np.zeros((len(links), 4, 4))
+        turned = np.sin(angle) * self.cross + (1 - np.cos(angle)) * self.cross_twice
+        moved[:, :3, :3] = np.eye(3) + turned  # Rodrigues
+        moved[:, :3, 3] = slide[:, None] * self.axes
+        moved[:, 3, 3] = 1.0
+        for link in self.joints:
+            if self.types[link] == pybullet.JOINT_SPHERICAL:
+                quaternion = client.getJointStateMultiDof(self.number, link)[0]
+                moved[link] = _transforms([(0.0, 0.0, 0.0)], [quaternion])[0]
+            elif self.types[link] not in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC):
+                moved[link] = np.nan  # a planar joint, say: its flow is unknown
+        return moved
+
+
+def _transforms(positions: Sequence[View], quaternions_xyzw: Sequence[View]) -> Array:
+    """Returns the transforms [N, 4, 4] of N positions and quaternions."""
+    transforms = np.zeros((len(positions), 4, 4))
+    x, y, z, w = np.array(quaternions_xyzw, dtype=np.float64).reshape(-1, 4).T
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    transforms[:, :3, :3] = np.stack(rows, -1).reshape(-1, 3, 3)
+    transforms[:, :3, 3] = np.array(positions, dtype=np.float64).reshape(-1, 3)
+    transforms[:, 3, 3] = 1.0
+    return transforms
+
+
+def _software_draws(client: Any, renderer: int) -> bool:
+    """Returns whether the software renderer draws this client's pictures.
+
+    PyBullet doesn't say: EGL's plugin replaces that renderer without a trace. But OpenGL's buffer
+    is exactly 1 in the sky, and the software renderer's is rounded for most near and far planes.
+    """
+    up = pybullet.computeViewMatrix([0, 0, 1e6], [0, 0, 2e6], [0, 1, 0])
+    for near_m, far_m in ((0.1, 20.0), (0.02, 20.0), (0.1, 100.0), (0.1, 3.0)):
+        projection = pybullet.computeProjectionMatrixFOV(60, 1, near_m, far_m)
+        _, _, _, zbuffer, _ = client.getCameraImage(1, 1, up, projection, renderer=renderer)
+        if np.asarray(zbuffer).item() != 1.0:
+            return True
+    return False
