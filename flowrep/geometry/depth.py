@@ -27,6 +27,7 @@ def adapt_depth(
     far_m: float | None = None,
     scale_m: float | None = None,
     nothing: float | None = None,
+    sky: float | None = None,
 ) -> Tensor:
     """Returns depth along the optical axis, `[*B, 1, H, W]`, metres.
 
@@ -44,19 +45,25 @@ def adapt_depth(
         scale_m: metres per unit of `depth`, 1 if it is float; whole numbers, such as uint16
             millimetres (0.001), need it. Not for the two buffers.
         nothing: a value, before scaling, that means no measurement; it becomes nan.
+        sky: a value, before scaling, that means no surface, as simulators have it where nothing was
+            drawn; it becomes inf, as does what is below, or if it is positive (a far plane) what
+            is beyond 0.999 of it. Not for `"z_buffer"`.
 
     >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
     tensor([[[1., 2., inf]]])
     >>> adapt_depth(torch.tensor([[[0, 2500]]]).short(), "z", scale_m=1e-3, nothing=0)
     tensor([[[   nan, 2.5000]]])
     """
-    check_depth_options(kind, K is not None, near_m, far_m, scale_m)
+    check_depth_options(kind, K is not None, near_m, far_m, scale_m, sky)
+    is_sky = None if sky is None else _is_sky(depth, sky)
     unmeasured = None if nothing is None else depth == nothing
     if scale_m is not None:
         # Divided, since 1 / 0.001 is exact and 0.001 isn't: 3,000 mm are 3 m, not 3.0000002.
         depth = (depth if depth.is_floating_point() else depth.float()) / (1.0 / scale_m)
     if unmeasured is not None:
         depth = torch.where(unmeasured, torch.nan, depth)
+    if is_sky is not None:
+        depth = torch.where(is_sky, torch.inf, depth)
     check_shape("depth", depth, (1, "H", "W"))
     if K is not None:
         return z_from_ray_length(depth, K)
@@ -64,6 +71,12 @@ def adapt_depth(
         is_reversed = kind == "reversed_z_buffer"
         return z_from_z_buffer(depth, near_m=near_m, far_m=far_m, is_reversed=is_reversed)
     return depth
+
+
+def _is_sky(depth: Tensor, sky: float) -> Tensor:
+    """Returns where depth is the simulator's value for no surface, or on the sky's side of it."""
+    # A far plane comes out of a float32 buffer up to a thousandth off.
+    return depth >= 0.999 * sky if sky > 0 else depth <= sky
 
 
 def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
@@ -115,6 +128,7 @@ def check_depth_options(
     near_m: float | None,
     far_m: float | None,
     scale_m: float | None = None,
+    sky: float | None = None,
 ) -> None:
     """Raises ValueError if an argument that `kind` needs is missing, or an unused one is given."""
     check_name("kind", kind, DepthKind)
@@ -132,3 +146,5 @@ def check_depth_options(
             f"scale_m is metres per unit, positive, and a z-buffer has none; kind is {kind!r}, "
             f"scale_m={scale_m}"
         )
+    if sky is not None and kind == "z_buffer":
+        raise ValueError("a z-buffer's sky is at the far plane: sky is for the other kinds")

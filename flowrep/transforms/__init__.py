@@ -5,6 +5,7 @@ ValueError names an input of another layout, and `MissingKey`, a KeyError, one t
 """
 
 from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose, BodyRows
+from flowrep.transforms.conventions import CONVENTIONS, Convention, sensors_from
 from flowrep.transforms.estimated_flow import DIS, RAFT, EstimatedFlow
 from flowrep.transforms.flow import FlowFactorize, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
@@ -20,8 +21,9 @@ from flowrep.transforms.noise import SensorNoise
 from flowrep.transforms.stack import REPRESENTATIONS, representation_options, representation_stack
 
 __all__ = [
-    "DIS", "RAFT", "REPRESENTATIONS", "AdaptDepth", "AdaptFlow", "AdaptPose", "BodyRows",
-    "CameraMotion", "Depth", "EstimateCameraMotion", "EstimatedFlow", "FlowFactorize", "FrameStack",
-    "InstanceIds", "InstanceMotion", "Mirror", "PreviousIntrinsics", "RawFlow", "Rgb",
-    "Segmentation", "SensorNoise", "representation_options", "representation_stack",
+    "CONVENTIONS", "DIS", "RAFT", "REPRESENTATIONS", "AdaptDepth", "AdaptFlow", "AdaptPose",
+    "BodyRows", "CameraMotion", "Convention", "Depth", "EstimateCameraMotion", "EstimatedFlow",
+    "FlowFactorize", "FrameStack", "InstanceIds", "InstanceMotion", "Mirror",
+    "PreviousIntrinsics", "RawFlow", "Rgb", "Segmentation", "SensorNoise", "representation_options",
+    "representation_stack", "sensors_from",
 ]  # fmt: skip

@@ -55,17 +55,18 @@ class AdaptDepth(CameraTransform):
         far_m: float | None = None,
         scale_m: float | None = None,
         nothing: float | None = None,
+        sky: float | None = None,
         channels_last: bool = False,
         in_keys: Keys = "depth",
         out_keys: Keys = ("sensor", "depth"),
     ) -> None:
-        check_depth_options(kind, intrinsics is not None, near_m, far_m, scale_m)
+        check_depth_options(kind, intrinsics is not None, near_m, far_m, scale_m, sky)
         shape = ("H", "W", 1) if channels_last else base.DEPTH.shape
         reads = Reads(shape, "float" if scale_m is None else "any")
         super().__init__(intrinsics, [reads], in_keys, out_keys)
         check_own_keys(self)
         self.options: dict[str, Any] = {"kind": kind, "near_m": near_m, "far_m": far_m}
-        self.options |= {"scale_m": scale_m, "nothing": nothing}
+        self.options |= {"scale_m": scale_m, "nothing": nothing, "sky": sky}
         self.channels_last = channels_last
 
     def compute(self, depth: Tensor, K: Tensor | None = None) -> tuple[Tensor]:

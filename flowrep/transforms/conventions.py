@@ -1,0 +1,443 @@
+"""Conventions of simulators, by name: `sensors_from("isaac_lab", ...)` gives the adapters.
+
+`CONVENTIONS` is the table. Each row says where its facts come from, and whether they were tried on
+the simulator itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import TensorSpec, Unbounded
+from torchrl.envs.transforms import CatTensors, Transform
+
+from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose
+from flowrep.transforms.base import Keys, MapTransform, Reads
+from flowrep.transforms.flow import Intrinsics
+from flowrep.transforms.maps import InstanceIds
+from flowrep.transforms.motion import CameraMotion, InstanceMotion
+
+Options: TypeAlias = Mapping[str, Any]
+Layout: TypeAlias = Literal["hw", "hwc"]
+
+_PARTS = "adapted"  # what adapters pass on to the next, and nobody else reads
+
+
+@dataclass(frozen=True)
+class Convention:
+    """What a simulator gives: names of its buffers, and the options of their adapters.
+
+    An option that is the name of an argument of `sensors_from` stands for its value.
+
+    Args:
+        simulator: its name, and the version that the facts are of.
+        sources: where the simulator's makers say so.
+        tried: how it was tried on the simulator itself; empty if only on buffers written as the
+            sources say.
+        layout: of depth and flow, `"hw"` or `"hwc"`.
+        ids_layout: of ids; of several channels, the first counts.
+        depth: options of `AdaptDepth` by buffer, the usual one first.
+        pose: buffers of the camera's pose, one or position and quaternion.
+        pose_options: of `AdaptPose`.
+        bodies: buffers of the bodies' poses.
+        bodies_options: of their `AdaptPose`.
+        ids: buffer of instance ids.
+        flow: buffer of measured flow, if it has any whose convention is known.
+        flow_options: of `AdaptFlow`.
+        K: where K comes from.
+        notes: what else has to be known.
+    """
+
+    simulator: str
+    sources: tuple[str, ...]
+    tried: str
+    layout: Layout
+    ids_layout: Layout
+    depth: Mapping[str, Options]
+    pose: tuple[str, ...]
+    pose_options: Options
+    bodies: tuple[str, ...]
+    bodies_options: Options
+    ids: str
+    K: str
+    flow: str = ""
+    flow_options: Options = field(default_factory=dict)
+    notes: str = ""
+
+
+_ISAAC_DEPTH = {
+    "distance_to_image_plane": {"kind": "z", "sky": 0.0},
+    "depth": {"kind": "z", "sky": 0.0},
+    "distance_to_camera": {"kind": "ray_length", "sky": 0.0, "intrinsics": "intrinsics"},
+}
+_ISAAC_3 = Convention(
+    simulator="Isaac Lab 3.0",
+    sources=(
+        "isaac-sim.github.io/IsaacLab/release/3.0.0: Migrating To 3.0; Camera; "
+        "isaaclab.sensors.camera.camera_data",
+        "Omniverse Replicator, Annotators Information: Motion Vectors",
+    ),
+    tried="",
+    layout="hwc",
+    ids_layout="hwc",
+    depth=_ISAAC_DEPTH,
+    pose=("pos_w", "quat_w_ros"),
+    pose_options={"layout": "xyz_xyzw", "axes": "opencv"},
+    bodies=("body_link_pose_w",),
+    bodies_options={"layout": "xyz_xyzw"},
+    ids="instance_id_segmentation_fast",
+    flow="motion_vectors",
+    flow_options={"direction": "backward", "grid": "current"},
+    K="intrinsic_matrices, pixel centres at halves",
+    notes="Quaternions are (x, y, z, w). Buffers are ProxyArrays: pass their `.torch`. The "
+    "camera's pose is that of its start unless its config has update_latest_camera_pose=True. "
+    "Motion vectors come from the RTX renderers alone, Newton's Warp renderer has none. Ids differ "
+    "between environments: bodies' motions need an env of one.",
+)
+
+CONVENTIONS: dict[str, Convention] = {
+    "isaac_lab": _ISAAC_3,
+    "isaac_lab_2": Convention(
+        simulator="Isaac Lab 2.3",
+        sources=(
+            "isaac-sim.github.io/IsaacLab/v2.3.2: isaaclab.sensors.camera.camera_data; "
+            "isaaclab.sensors.camera.tiled_camera",
+            "Omniverse Replicator, Annotators Information: Motion Vectors",
+        ),
+        tried="",
+        layout="hwc",
+        ids_layout="hwc",
+        depth=_ISAAC_DEPTH,
+        pose=("pos_w", "quat_w_ros"),
+        pose_options={"layout": "xyz_wxyz", "axes": "opencv"},
+        bodies=("body_link_pose_w",),
+        bodies_options={"layout": "xyz_wxyz"},
+        ids="instance_id_segmentation_fast",
+        flow="motion_vectors",
+        flow_options={"direction": "backward", "grid": "current"},
+        K="intrinsic_matrices, pixel centres at halves",
+        notes="Quaternions are (w, x, y, z). A TiledCamera's pose is that of its start unless its "
+        "config has update_latest_camera_pose=True (return_latest_camera_pose before 2.1).",
+    ),
+    "maniskill": Convention(
+        simulator="ManiSkill 3.0.1",
+        sources=("mani_skill.render.shaders; mani_skill.sensors.camera",),
+        tried="examples/maniskill_flow.py",
+        layout="hwc",
+        ids_layout="hwc",
+        depth={"depth": {"kind": "z", "scale_m": 1e-3, "sky": 0.0}},
+        pose=("cam2world_gl",),
+        pose_options={"axes": "opengl"},
+        bodies=("body_poses",),
+        bodies_options={},
+        ids="segmentation",
+        K="intrinsic_cv, pixel centres at halves",
+        notes="Depth is int16 millimetres: what is farther than 32.7 m wraps round and counts as "
+        "sky. flowrep.maniskill.ManiSkillEnv collects the buffers and the poses of "
+        "segmentation_id_map.",
+    ),
+    "mujoco": Convention(
+        simulator="MuJoCo 3.10",
+        sources=("mujoco.readthedocs.io: Python, Renderer; XML reference, body/camera",),
+        tried="examples/mujoco_flow.py",
+        layout="hw",
+        ids_layout="hwc",
+        depth={"depth": {"kind": "z", "sky": "far_m"}},
+        pose=("camera_pose",),
+        pose_options={"axes": "opengl"},
+        bodies=("xpos", "xquat"),
+        bodies_options={"layout": "xyz_wxyz"},
+        ids="segmentation",
+        K="intrinsics_from_fov(fovy), with <quality offsamples='0'/>",
+        notes="Ids are geoms', so body_ids names geoms, and xpos and xquat have a row for each: "
+        "data.xpos[model.geom_bodyid[geoms]]. Where nothing is drawn, depth is the far plane, "
+        "model.vis.map.zfar * model.stat.extent. The camera's pose is cam_xmat with cam_xpos. Call "
+        "mj_forward before reading poses.",
+    ),
+    "mjlab": Convention(
+        simulator="mjlab 1.6 (MuJoCo Warp 4.0)",
+        sources=("mjlab.sensor.camera_sensor; mujoco_warp._src.render",),
+        tried="",
+        layout="hwc",
+        ids_layout="hwc",
+        depth={"depth": {"kind": "z", "sky": 0.0}},
+        pose=("camera_pose",),
+        pose_options={"axes": "opengl"},
+        bodies=("xpos", "xquat"),
+        bodies_options={"layout": "xyz_wxyz"},
+        ids="segmentation",
+        K="intrinsics_from_fov(fovy)",
+        notes="As MuJoCo's, but depth is 0 where nothing is hit. TorchRL's MJLabWrapper passes on "
+        "RGB alone.",
+    ),
+    "newton": Convention(
+        simulator="Newton 1.8",
+        sources=("newton.sensors.SensorCamera; newton.State.body_q",),
+        tried="",
+        layout="hw",
+        ids_layout="hw",
+        depth={
+            "forward_depth": {"kind": "z", "sky": 0.0},
+            "depth": {"kind": "ray_length", "sky": 0.0, "intrinsics": "intrinsics"},
+        },
+        pose=("camera_transforms",),
+        pose_options={"layout": "xyz_xyzw", "axes": "opengl"},
+        bodies=("body_q",),
+        bodies_options={"layout": "xyz_xyzw"},
+        ids="shape_index",
+        K="intrinsics_from_fov(camera_fov), pixel centres at halves",
+        notes="Ids are those of shapes, so body_ids names shapes and body_q has a row for each: "
+        "state.body_q[model.shape_body[shapes]]. A miss has depth 0, clear_data.clear_depth; "
+        "SensorTiledCamera documents a negative one.",
+    ),
+    "genesis": Convention(
+        simulator="Genesis 1.4.5",
+        sources=("genesis.vis.camera.Camera: render, transform, intrinsics",),
+        tried="",
+        layout="hw",
+        ids_layout="hw",
+        depth={"depth": {"kind": "z", "sky": "far_m"}},
+        pose=("transform",),
+        pose_options={"axes": "opengl"},
+        bodies=("links_pos", "links_quat"),
+        bodies_options={"layout": "xyz_wxyz"},
+        ids="segmentation",
+        K="camera.intrinsics",
+        notes="far_m is the camera's far. Ids are indices of scene.segmentation_idx_dict, at "
+        "VisOptions(segmentation_level='link') one a link. Depth is 4 x multisampled, which mixes "
+        "depths at edges. TorchRL's GenesisWrapper doesn't reset the scene.",
+    ),
+    "habitat": Convention(
+        simulator="Habitat-Sim 0.3.3",
+        sources=("habitat_sim: gfx_batch/DepthUnprojection, agent.SixDOFPose, CameraSensorSpec",),
+        tried="",
+        layout="hw",
+        ids_layout="hw",
+        depth={"depth_sensor": {"kind": "z", "sky": 0.0}},
+        pose=("position", "rotation"),
+        pose_options={"layout": "xyz_wxyz", "axes": "opengl"},
+        bodies=("object_position", "object_rotation"),
+        bodies_options={"layout": "xyz_wxyz"},
+        ids="semantic_sensor",
+        K="intrinsics_from_fov(hfov, axis='horizontal')",
+        notes="Take the sensor's pose, agent.get_state().sensor_states[name], not the agent's. "
+        "quaternion.as_float_array gives (w, x, y, z); an object's rotation is a Magnum "
+        "quaternion, scalar and vector.",
+    ),
+    "kubric": Convention(
+        simulator="Kubric (0ee21e2, MOVi)",
+        sources=("kubric: challenges/movi/README.md; renderer/blender_utils.py; core/cameras.py",),
+        tried="",
+        layout="hwc",
+        ids_layout="hwc",
+        depth={
+            "depth": {"kind": "ray_length", "sky": 1e10, "intrinsics": "intrinsics"},
+            "z": {"kind": "z", "sky": 1e10},
+        },
+        pose=("positions", "quaternions"),
+        pose_options={"layout": "xyz_wxyz", "axes": "opengl"},
+        bodies=("instance_positions", "instance_quaternions"),
+        bodies_options={"layout": "xyz_wxyz"},
+        ids="segmentations",
+        flow="backward_flow",
+        flow_options={"direction": "backward", "grid": "current", "channels": "row_column"},
+        K="focal_length / sensor_width * width",
+        notes="forward_flow lies on the frame it starts from: swap the frames' roles to use it. "
+        "MOVi's flow of 16 bits has to be scaled back by its range first. Segmentation is an "
+        "instance's index + 1.",
+    ),
+    "ai2thor": Convention(
+        simulator="AI2-THOR 5",
+        sources=("ai2thor.allenai.org: Environment State; ai2thor.server.Event",),
+        tried="",
+        layout="hw",
+        ids_layout="hw",
+        depth={"depth_frame": {"kind": "z", "sky": "far_m"}},
+        pose=("camera_pose",),
+        pose_options={"axes": "unity"},
+        bodies=("object_poses",),
+        bodies_options={"axes": "unity"},
+        ids="instance_ids",
+        K="intrinsics_from_fov(fieldOfView)",
+        notes="Unity's world is left-handed, with y up: poses are 4 x 4 matrices in it. far_m is "
+        "the camera's far plane, 20 m by default. Ids are colours: number them, by "
+        "event.object_id_to_color. renderFlowImage isn't documented.",
+    ),
+    "carla": Convention(
+        simulator="CARLA 0.9.16",
+        sources=("carla.readthedocs.io/en/0.9.16: Sensors reference; carla.Transform.get_matrix",),
+        tried="",
+        layout="hw",
+        ids_layout="hw",
+        depth={"depth": {"kind": "z", "scale_m": 1000.0 / (256**3 - 1), "sky": 256**3 - 1}},
+        pose=("transform",),
+        pose_options={"axes": "unreal"},
+        bodies=("actor_transforms",),
+        bodies_options={"axes": "unreal"},
+        ids="instance",
+        K="intrinsics_from_fov(fov, axis='horizontal')",
+        notes="Depth is R + 256 G + 65536 B, as int32, and an id G + 256 B of the instance camera; "
+        "raw_data is BGRA. Poses are transform.get_matrix(). Set lens_circle_multiplier and lens_k "
+        "so that no lens distorts. The optical flow camera's direction and step aren't documented "
+        "(carla #4795): check it before use.",
+    ),
+    "airsim": Convention(
+        simulator="Cosys-AirSim 3.3",
+        sources=("Cosys-AirSim: docs/image_apis.md; docs/apis.md, Coordinate system",),
+        tried="",
+        layout="hw",
+        ids_layout="hw",
+        depth={
+            "DepthPlanar": {"kind": "z", "sky": "far_m"},
+            "DepthPerspective": {"kind": "ray_length", "sky": "far_m", "intrinsics": "intrinsics"},
+        },
+        pose=("camera_position", "camera_orientation"),
+        pose_options={"layout": "xyz_wxyz", "axes": "ned"},
+        bodies=("object_positions", "object_orientations"),
+        bodies_options={"layout": "xyz_wxyz"},
+        ids="segmentation",
+        K="intrinsics_from_fov(fov, axis='horizontal')",
+        notes="far_m is what the sky has in your world, such as 65504: look at a pixel. Ids are "
+        "colours: pack them, R + 256 G + 65536 B, by simGetSegmentationColorMap. OpticalFlow is of "
+        "the camera's motion alone, without a documented unit.",
+    ),
+    "pybullet": Convention(
+        simulator="PyBullet 3.2.7",
+        sources=("PyBullet Quickstart Guide: getCameraImage, computeViewMatrix",),
+        tried="tests/transforms/test_conventions.py",
+        layout="hw",
+        ids_layout="hw",
+        depth={"depth": {"kind": "z_buffer", "near_m": "near_m", "far_m": "far_m"}},
+        pose=("view",),
+        pose_options={"direction": "world_to_camera", "axes": "opengl"},
+        bodies=("positions", "orientations"),
+        bodies_options={"layout": "xyz_xyzw"},
+        ids="segmentation",
+        K="flowrep.pybullet.BulletCamera.K; the software renderer's is centred + (0.5, -0.5)",
+        notes="flowrep.pybullet.BulletCamera does all this, links and bodies that come and go "
+        "included. The view is np.reshape(viewMatrix, (4, 4)).T. Ids of links are "
+        "body + ((link + 1) << 24), and a link's pose is getLinkState's with "
+        "computeForwardKinematics=1: without it, a substep old.",
+    ),
+}
+
+
+def sensors_from(
+    simulator: str,
+    *,
+    depth: str | None = None,
+    body_ids: Sequence[Any] | None = None,
+    flow: bool = False,
+    intrinsics: Intrinsics | None = None,
+    near_m: float | None = None,
+    far_m: float | None = None,
+    prefix: NestedKey = (),
+    keys: Mapping[str, NestedKey] | None = None,
+) -> list[Transform]:
+    """Returns the adapters from a simulator's buffers to the sensor keys of `RawFlow` and others.
+
+    They write `("sensor", "depth")`, `"world_from_cam"` and `"prev_from_curr"`; with `body_ids`,
+    `"world_from_body"`, `"instance"` and `"instance_motion"` too; with `flow`, `"raw"`. Buffers are
+    read under the names that `CONVENTIONS[simulator]` lists, beneath `prefix`.
+
+    Args:
+        simulator: a key of `CONVENTIONS`.
+        depth: which of its depth buffers; by default the first.
+        body_ids: ids in the order of the rows of the bodies' poses; the convention's notes say of
+            what. Without them, the world is static, or flow is measured.
+        flow: whether to read the simulator's own flow, if it has any whose convention is known.
+        intrinsics: K `[3, 3]` or its key, for depth along the rays.
+        near_m: the near plane, where depth is a z-buffer.
+        far_m: the far plane, where nothing drawn is there.
+        prefix: the key, or the first parts of it, of all buffers.
+        keys: keys of buffers that are elsewhere, by name.
+
+    Raises:
+        ValueError: an unknown name, an argument that this simulator needs, or one that it doesn't.
+
+    Example:
+        >>> from torchrl.envs import Compose
+        >>> from flowrep.transforms import FlowFactorize, RawFlow
+        >>> K = [[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]]
+        >>> sensors = sensors_from("mujoco", body_ids=[3, 4], far_m=20.0, prefix="camera")
+        >>> _ = Compose(*sensors, RawFlow(K), FlowFactorize(K))
+        >>> sensors[-2]
+        InstanceIds([('adapted', 'segmentation')] -> [('sensor', 'instance')])
+    """
+    if simulator not in CONVENTIONS:
+        raise ValueError(f"unknown simulator {simulator!r}; known are {', '.join(CONVENTIONS)}")
+    row = CONVENTIONS[simulator]
+    chosen = next(iter(row.depth)) if depth is None else depth
+    if chosen not in row.depth:
+        raise ValueError(f"{row.simulator} has no depth {chosen!r}; it has {', '.join(row.depth)}")
+    if flow and not row.flow:
+        raise ValueError(f"{row.simulator} has no flow of a known convention: {row.notes}")
+    arguments = {"intrinsics": intrinsics, "near_m": near_m, "far_m": far_m}
+    options = {name: arguments.get(value, value) for name, value in row.depth[chosen].items()}
+    for name, value in arguments.items():
+        if (name in row.depth[chosen].values()) != (value is not None):
+            verb = "needs" if value is None else "doesn't read"
+            raise ValueError(f"{row.simulator}'s {chosen} {verb} {name}=; {row.notes}")
+
+    named = dict(keys or {})
+    start = (prefix,) if isinstance(prefix, str) else tuple(prefix)
+
+    def key(name: str) -> NestedKey:
+        return named.pop(name, (*start, name) if start else name)
+
+    def plane(name: str, layout: Layout) -> Transform:
+        return Plane(layout, in_keys=key(name), out_keys=(_PARTS, name))
+
+    def poses(names: tuple[str, ...], options: Options, written: NestedKey) -> list[Transform]:
+        if len(names) == 1:
+            return [AdaptPose(**options, in_keys=key(names[0]), out_keys=written)]
+        joined: NestedKey = (_PARTS, written[-1])
+        parts = CatTensors(
+            [key(name) for name in names], joined, dim=-1, del_keys=False, sort=False
+        )
+        return [parts, AdaptPose(**options, in_keys=joined, out_keys=written)]
+
+    made = [plane(chosen, row.layout), AdaptDepth(**options, in_keys=(_PARTS, chosen))]
+    made += [*poses(row.pose, row.pose_options, ("sensor", "world_from_cam")), CameraMotion()]
+    if body_ids is not None:
+        made += poses(row.bodies, row.bodies_options, ("sensor", "world_from_body"))
+        made += [plane(row.ids, row.ids_layout), InstanceIds(body_ids, in_keys=(_PARTS, row.ids))]
+        made.append(InstanceMotion())
+    if flow:
+        is_last = row.layout == "hwc"
+        made.append(AdaptFlow(**row.flow_options, channels_last=is_last, in_keys=key(row.flow)))
+    if named:
+        raise ValueError(f"keys= names {sorted(named)}, which {row.simulator} doesn't read here")
+    return made
+
+
+class Plane(MapTransform):
+    """A picture's first channel, as a map with its channel first.
+
+    | reads | writes | shape | range | unit |
+    | --- | --- | --- | --- | --- |
+    | `[*B, H, W]` or `[*B, H, W, C]` | one key | `[*B, 1, H, W]` | as read | |
+
+    Args:
+        layout: `"hw"` or `"hwc"`.
+    """
+
+    def __init__(self, layout: Layout, *, in_keys: Keys, out_keys: Keys) -> None:
+        shape = ("H", "W") if layout == "hw" else ("H", "W", "C")
+        super().__init__([Reads(shape)], in_keys, out_keys)
+
+    def compute(self, picture: Tensor) -> tuple[Tensor]:
+        """Returns the map."""
+        if len(self.reads[0].shape) == 3:
+            picture = picture[..., 0]
+        return (picture.unsqueeze(-3),)
+
+    def output_specs(self, picture: TensorSpec) -> tuple[TensorSpec]:
+        """Returns an unbounded spec."""
+        *batch, height, width = picture.shape[: picture.ndim - (len(self.reads[0].shape) == 3)]
+        shape = (*batch, 1, height, width)
+        return (Unbounded(shape, device=picture.device, dtype=picture.dtype),)

@@ -1,0 +1,408 @@
+"""Each simulator's row against buffers that are written as that simulator's makers document.
+
+One scene is the truth: a camera that turns about all its axes before two bodies that move by
+themselves. `truth` computes flow from points, in numpy; each writer turns the scene into one
+simulator's buffers, with scipy's rotations. None of flowrep's code is asked for either.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tensordict import TensorDict
+from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.envs import Compose, EnvBase, TransformedEnv, check_env_specs
+
+from flowrep.transforms import CONVENTIONS, FlowFactorize, RawFlow, sensors_from
+
+STEPS, HEIGHT, WIDTH = 4, 5, 7
+K = np.array([[6.0, 0.0, 3.2], [0.0, 5.0, 2.1], [0.0, 0.0, 1.0]])
+FAR_M, NEAR_M = 20.0, 0.1
+IDS = (41, 17)  # of the bodies, in the order of their poses
+GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def rigid(euler_deg, position):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", euler_deg, degrees=True).as_matrix()
+    pose[:3, 3] = position
+    return pose
+
+
+def scene(t):
+    """Depth z (inf is sky), the body of each pixel (-1: none), K's poses and the bodies', at t."""
+    random = np.random.default_rng(7)  # the same picture at all times, as only motion matters here
+    z = np.round(random.uniform(2.0, 6.0, (HEIGHT, WIDTH)), 3) + 0.125 * t
+    body = random.integers(-1, 2, (HEIGHT, WIDTH))
+    z[0, :3], body[0, :3] = np.inf, -1
+    world_from_cam = rigid((-80 + 2 * t, 5 * t, 30 + 4 * t), (1 + 0.2 * t, -2 + 0.3 * t, 1.5))
+    bodies = [
+        rigid((10 * t, 20, 5 * t), (2 + 0.1 * t, 3, 0.5)),
+        rigid((15, -7 * t, 40), (0, 4 - 0.15 * t, 1 + 0.05 * t)),
+    ]
+    return z, body, world_from_cam, np.array(bodies)
+
+
+def truth(t, own_motion=True):
+    """Flow p_t - p_t' [H, W, 2] of each pixel, through the world."""
+    z, body, camera, bodies = scene(t)
+    _, _, camera_before, bodies_before = scene(t - 1)
+    flow = np.zeros((HEIGHT, WIDTH, 2))
+    for j, i in np.ndindex(HEIGHT, WIDTH):
+        p = np.array([i + 0.5, j + 0.5, 1.0])
+        ray = np.linalg.inv(K) @ p
+        point = np.append(ray, 0.0) if np.isinf(z[j, i]) else np.append(ray * z[j, i], 1.0)
+        point = camera @ point
+        if own_motion and body[j, i] >= 0:
+            k = body[j, i]
+            point = bodies_before[k] @ np.linalg.inv(bodies[k]) @ point
+        before = K @ (np.linalg.inv(camera_before) @ point)[:3]
+        flow[j, i] = (p - before / before[2])[:2]
+    return flow
+
+
+# Writers
+
+
+def ray_lengths(z):
+    v, u = np.indices(z.shape) + 0.5
+    return z * np.sqrt(1 + ((u - K[0, 2]) / K[0, 0]) ** 2 + ((v - K[1, 2]) / K[1, 1]) ** 2)
+
+
+def sky_is(value, z):
+    return np.where(np.isinf(z), value, z).astype(np.float32)
+
+
+def xyzw(pose):
+    return Rotation.from_matrix(pose[..., :3, :3]).as_quat()
+
+
+def wxyz(pose):
+    return np.roll(xyzw(pose), 1, axis=-1)
+
+
+def seven(pose, quaternion):
+    return np.concatenate([pose[..., :3, 3], quaternion(pose)], -1).astype(np.float32)
+
+
+def names(body, background):
+    return np.array([*IDS, background])[body]  # -1 is the last
+
+
+def isaac_lab(t, quaternion=xyzw):
+    z, body, camera, bodies = scene(t)
+    u, v = np.moveaxis(truth(t) if t else np.zeros((HEIGHT, WIDTH, 2)), -1, 0)
+    return {
+        "distance_to_image_plane": z[..., None].astype(np.float32),
+        "distance_to_camera": ray_lengths(z)[..., None].astype(np.float32),
+        "pos_w": camera[:3, 3].astype(np.float32),
+        "quat_w_ros": quaternion(camera).astype(np.float32),  # ROS's camera is OpenCV's
+        "body_link_pose_w": seven(bodies, quaternion),
+        "instance_id_segmentation_fast": names(body, 1)[..., None].astype(np.int32),
+        # left and up are positive
+        "motion_vectors": np.stack([-u, -v], -1).astype(np.float32),
+    }
+
+
+def maniskill(t):
+    z, body, camera, bodies = scene(t)
+    return {
+        "depth": np.round(1000 * sky_is(0, z))[..., None].astype(np.int16),
+        "cam2world_gl": (camera @ GL_FROM_CV).astype(np.float32),
+        "body_poses": bodies.astype(np.float32),
+        "segmentation": names(body, 0)[..., None].astype(np.int16),
+    }
+
+
+def mujoco(t):
+    z, body, camera, bodies = scene(t)
+    geom = 5  # mjOBJ_GEOM
+    segmentation = np.stack([names(body, -1), np.where(body < 0, -1, geom)], -1)
+    return {
+        "depth": sky_is(FAR_M * 0.9997, z),  # as float32 leaves it
+        "camera_pose": camera @ GL_FROM_CV,
+        "xpos": bodies[:, :3, 3],
+        "xquat": wxyz(bodies),
+        "segmentation": segmentation.astype(np.int32),
+    }
+
+
+def mjlab(t):
+    z = scene(t)[0]
+    buffers = {name: np.float32(value) for name, value in mujoco(t).items()}
+    buffers["segmentation"] = buffers["segmentation"].astype(np.int32)
+    return buffers | {"depth": sky_is(0, z)[..., None]}
+
+
+def newton(t):
+    z, body, camera, bodies = scene(t)
+    return {
+        "forward_depth": sky_is(0, z),
+        "depth": sky_is(0, ray_lengths(z)),
+        "camera_transforms": seven(camera @ GL_FROM_CV, xyzw),
+        "body_q": seven(bodies, xyzw),
+        "shape_index": names(body, 0xFFFFFFFF).astype(np.uint32),
+    }
+
+
+def genesis(t):
+    z, body, camera, bodies = scene(t)
+    return {
+        "depth": sky_is(FAR_M, z),
+        "transform": camera @ GL_FROM_CV,
+        "links_pos": bodies[:, :3, 3].astype(np.float32),
+        "links_quat": wxyz(bodies).astype(np.float32),
+        "segmentation": names(body, 0).astype(np.int32),
+    }
+
+
+def habitat(t):
+    z, body, camera, bodies = scene(t)
+    y_up = rigid((-90, 0, 0), (0, 0, 0))
+    camera, bodies = y_up @ camera @ GL_FROM_CV, y_up @ bodies
+    return {
+        "depth_sensor": sky_is(0, z),
+        "position": camera[:3, 3],
+        "rotation": wxyz(camera),
+        "object_position": bodies[:, :3, 3],
+        "object_rotation": wxyz(bodies),
+        "semantic_sensor": names(body, 0).astype(np.int32),
+    }
+
+
+def kubric(t):
+    z, body, camera, bodies = scene(t)
+    u, v = np.moveaxis(truth(t) if t else np.zeros((HEIGHT, WIDTH, 2)), -1, 0)
+    camera = camera @ GL_FROM_CV
+    return {
+        "depth": ray_lengths(sky_is(1e10, z))[..., None].astype(np.float32),
+        "z": sky_is(1e10, z)[..., None],
+        "positions": camera[:3, 3],
+        "quaternions": wxyz(camera),
+        "instance_positions": bodies[:, :3, 3],
+        "instance_quaternions": wxyz(bodies),
+        "segmentations": names(body, 0)[..., None].astype(np.uint8),
+        "backward_flow": np.stack([-v, -u], -1).astype(np.float32),  # (row, column), to t - 1
+    }
+
+
+def mirrored(pose, world, own):
+    """A pose in a left-handed world and its own axes, each a signed permutation's matrix."""
+    flip_world, flip_own = np.eye(4), np.eye(4)
+    flip_world[:3, :3], flip_own[:3, :3] = world, own
+    turned = flip_world @ pose @ np.linalg.inv(flip_own)
+    assert np.all(np.linalg.det(turned[..., :3, :3]) > 0)
+    return turned
+
+
+def ai2thor(t):
+    z, body, camera, bodies = scene(t)
+    y_up = np.array([[0, -1, 0], [0, 0, 1], [1, 0, 0]])  # Unity's x right, y up, z ahead
+    camera_axes = np.diag([1.0, -1.0, 1.0])
+    return {
+        "depth_frame": sky_is(FAR_M, z),
+        "camera_pose": mirrored(camera, y_up, camera_axes).astype(np.float32),
+        "object_poses": mirrored(bodies, y_up, y_up).astype(np.float32),
+        "instance_ids": names(body, 0).astype(np.int32),
+    }
+
+
+def carla(t):
+    z, body, camera, bodies = scene(t)
+    y_right = np.diag([1.0, -1.0, 1.0])
+    camera_axes = np.array([[0, 0, 1], [1, 0, 0], [0, -1, 0]])  # x ahead, y right, z up
+    normalised = np.where(np.isinf(z), 1.0, z / 1000)
+    code = np.round(normalised * (256**3 - 1)).astype(np.int64)
+    r, g, b = code % 256, code // 256 % 256, code // 65536
+    return {
+        "depth": (r + 256 * g + 65536 * b).astype(np.int32),
+        "transform": mirrored(camera, y_right, camera_axes),
+        "actor_transforms": mirrored(bodies, y_right, y_right),
+        "instance": names(body, 0).astype(np.int32),
+    }
+
+
+def airsim(t):
+    z, body, camera, bodies = scene(t)
+    ned = rigid((180, 0, 0), (0, 0, 0))  # x ahead, y right, z down
+    camera_axes = np.eye(4)
+    camera_axes[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+    camera, bodies = ned @ camera @ camera_axes.T, ned @ bodies
+    return {
+        "DepthPlanar": sky_is(65504, z),
+        "DepthPerspective": sky_is(65504, ray_lengths(z)),
+        "camera_position": camera[:3, 3],
+        "camera_orientation": wxyz(camera),
+        "object_positions": bodies[:, :3, 3],
+        "object_orientations": wxyz(bodies),
+        "segmentation": names(body, 0).astype(np.int32),
+    }
+
+
+def pybullet(t):
+    z, body, camera, bodies = scene(t)
+    buffer = FAR_M * (1 - NEAR_M / z) / (FAR_M - NEAR_M)
+    buffer[np.isinf(z)] = 1.0
+    return {
+        "depth": buffer.astype(np.float32),
+        "view": np.linalg.inv(camera @ GL_FROM_CV),
+        "positions": bodies[:, :3, 3],
+        "orientations": xyzw(bodies),
+        "segmentation": names(body, -1).astype(np.int32),
+    }
+
+
+WRITERS = {
+    "isaac_lab": isaac_lab,
+    "isaac_lab_2": lambda t: isaac_lab(t, wxyz),
+    "maniskill": maniskill,
+    "mujoco": mujoco,
+    "mjlab": mjlab,
+    "newton": newton,
+    "genesis": genesis,
+    "habitat": habitat,
+    "kubric": kubric,
+    "ai2thor": ai2thor,
+    "carla": carla,
+    "airsim": airsim,
+    "pybullet": pybullet,
+}
+ARGUMENTS = {
+    "mujoco": {"far_m": FAR_M},
+    "genesis": {"far_m": FAR_M},
+    "kubric": {"intrinsics": K},
+    "ai2thor": {"far_m": FAR_M},
+    "airsim": {"far_m": 65504.0},
+    "pybullet": {"near_m": NEAR_M, "far_m": FAR_M},
+}
+
+
+class Replayed(EnvBase):
+    """An env that gives a writer's buffers, under "camera"."""
+
+    def __init__(self, writer):
+        super().__init__()
+        self.write, self.t = writer, 0
+        first = {name: torch.as_tensor(value) for name, value in writer(0).items()}
+        specs = {name: Unbounded(x.shape, dtype=x.dtype) for name, x in first.items()}
+        self.observation_spec = Composite(camera=Composite(specs))
+        self.action_spec, self.reward_spec = Categorical(2), Unbounded(1)
+
+    def _observe(self):
+        buffers = {name: torch.as_tensor(value) for name, value in self.write(self.t).items()}
+        return TensorDict(camera=TensorDict(buffers))
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.t = 0
+        return self._observe()
+
+    def _step(self, tensordict):
+        self.t += 1
+        done = torch.tensor([self.t == STEPS - 1])
+        return self._observe().update({"done": done, "reward": torch.zeros(1)})
+
+    def _set_seed(self, seed):
+        pass
+
+
+def rollout(simulator, writer=None, **options):
+    sensors = sensors_from(simulator, prefix="camera", **options)
+    stack = [RawFlow(K), FlowFactorize(K)]
+    if options.get("flow"):
+        stack = stack[1:]
+    env = TransformedEnv(Replayed(writer or WRITERS[simulator]), Compose(*sensors, *stack))
+    check_env_specs(env)
+    return env.rollout(STEPS)["next"]
+
+
+def assert_is_the_truth(frames, *, bodies=True, pixels=2e-3):
+    assert len(frames) == STEPS - 1
+    for t, seen in enumerate(frames, start=1):
+        z = scene(t)[0]
+        depth = seen["sensor", "depth"][0].numpy()
+        assert np.array_equal(np.isinf(depth), np.isinf(z))
+        np.testing.assert_allclose(depth, z, rtol=1e-4)
+        raw, ego = truth(t), truth(t, own_motion=False)
+        for name, want in (("ego", ego), ("raw", raw), ("obj", raw - ego)):
+            if bodies or name == "ego":
+                got = seen[name].movedim(0, -1)
+                np.testing.assert_allclose(got, want, atol=pixels, err_msg=f"{name} at {t}")
+    assert abs(raw - ego).max() > 0.3
+
+
+@pytest.mark.parametrize("simulator", CONVENTIONS)
+def test_a_simulators_buffers_become_the_scene_that_they_were_made_of(simulator):
+    frames = rollout(simulator, body_ids=IDS, **ARGUMENTS.get(simulator, {}))
+    assert_is_the_truth(frames)
+
+
+DEPTHS = [
+    (simulator, depth)
+    for simulator, row in CONVENTIONS.items()
+    for depth in list(row.depth)[1:]
+    if depth in WRITERS[simulator](0)
+]
+
+
+@pytest.mark.parametrize(("simulator", "depth"), DEPTHS)
+def test_the_other_kinds_of_depth_become_the_same(simulator, depth):
+    needed = {"intrinsics"} & set(CONVENTIONS[simulator].depth[depth].values())
+    given = {k: v for k, v in ARGUMENTS.get(simulator, {}).items() if k != "intrinsics"}
+    given |= dict.fromkeys(needed, K)
+    assert_is_the_truth(rollout(simulator, depth=depth, body_ids=IDS, **given))
+
+
+@pytest.mark.parametrize("simulator", [name for name, row in CONVENTIONS.items() if row.flow])
+def test_measured_flow_becomes_the_truth_without_any_pose_of_a_body(simulator):
+    assert_is_the_truth(rollout(simulator, flow=True, **ARGUMENTS.get(simulator, {})))
+
+
+def test_without_bodies_nothing_else_is_read():
+    sensors = sensors_from("maniskill", prefix=("a", "b"))
+    read = {key for transform in sensors for key in transform.in_keys}
+    assert {key[2] for key in read if key[0] == "a"} == {"depth", "cam2world_gl"}
+    written = {key for transform in sensors for key in transform.out_keys if key[0] == "sensor"}
+    assert {key[1] for key in written} == {"depth", "world_from_cam", "prev_from_curr"}
+
+
+@pytest.mark.parametrize(
+    ("written", "read"), [("isaac_lab", "isaac_lab_2"), ("isaac_lab_2", "isaac_lab")]
+)
+def test_the_quaternions_of_another_version_give_other_flow(written, read):
+    frames = rollout(read, WRITERS[written], body_ids=IDS)
+    assert abs(frames["ego"][0].movedim(0, -1).numpy() - truth(1, own_motion=False)).max() > 0.5
+
+
+def test_keys_may_be_elsewhere():
+    def moved(t):
+        buffers = maniskill(t)
+        return {"z" if name == "depth" else name: value for name, value in buffers.items()}
+
+    frames = rollout("maniskill", moved, body_ids=IDS, keys={"depth": ("camera", "z")})
+    assert_is_the_truth(frames)
+
+
+@pytest.mark.parametrize(
+    ("call", "names"),
+    [
+        (lambda: sensors_from("isaac"), "isaac_lab"),
+        (lambda: sensors_from("newton", depth="z"), "forward_depth"),
+        (lambda: sensors_from("mujoco"), "far_m"),
+        (lambda: sensors_from("maniskill", far_m=9.0), "far_m"),
+        (lambda: sensors_from("kubric"), "intrinsics"),
+        (lambda: sensors_from("carla", flow=True), "flow"),
+        (lambda: sensors_from("newton", keys={"depth": "z"}), "depth"),
+    ],
+)
+def test_mistakes_are_named(call, names):
+    with pytest.raises(ValueError, match=names):
+        call()
+
+
+def test_each_row_names_its_sources_and_a_version():
+    for row in CONVENTIONS.values():
+        assert row.sources
+        assert any(character.isdigit() for character in row.simulator)
+        assert row.K
