@@ -105,13 +105,10 @@ class ManiSkillEnv(EnvBase):
 
 def flow_transforms() -> Compose:
     """Returns the transforms that write raw, ego and obj of a `ManiSkillEnv`."""
-    millimetres, pose, K = (("sensor", name) for name in ("millimetres", "opengl_pose", "K"))
+    named = {"depth": ("sensor", "millimetres"), "cam2world_gl": ("sensor", "opengl_pose")}
+    K = ("sensor", "K")
     return Compose(
-        transforms.AdaptDepth(
-            "z", scale_m=1e-3, nothing=0, channels_last=True, in_keys=[millimetres]
-        ),
-        transforms.AdaptPose(axes="opengl", in_keys=[pose]),
-        transforms.CameraMotion(),
+        *transforms.sensors_from("maniskill", keys=named),
         transforms.InstanceMotion(),
         transforms.RawFlow(K),
         transforms.FlowFactorize(K),

@@ -47,7 +47,7 @@ def adapt_depth(
         nothing: a value, before scaling, that means no measurement; it becomes nan.
         sky: a value, before scaling, that means no surface, as simulators have it where nothing was
             drawn; it becomes inf, as does what is below, or if it is positive (a far plane) what
-            is beyond 0.999 of it. Not for `"z_buffer"`.
+            is beyond 0.999 of it. Not for the two buffers.
 
     >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
     tensor([[[1., 2., inf]]])
@@ -146,5 +146,5 @@ def check_depth_options(
             f"scale_m is metres per unit, positive, and a z-buffer has none; kind is {kind!r}, "
             f"scale_m={scale_m}"
         )
-    if sky is not None and kind == "z_buffer":
-        raise ValueError("a z-buffer's sky is at the far plane: sky is for the other kinds")
+    if sky is not None and is_buffer:
+        raise ValueError(f"a z-buffer's sky is its far plane, not sky={sky}; kind is {kind!r}")

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
+import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
@@ -46,6 +47,7 @@ class Convention:
         bodies: buffers of the bodies' poses.
         bodies_options: of their `AdaptPose`.
         ids: buffer of instance ids.
+        background: ids of what is no body.
         flow: buffer of measured flow, if it has any whose convention is known.
         flow_options: of `AdaptFlow`.
         K: where K comes from.
@@ -63,6 +65,7 @@ class Convention:
     bodies: tuple[str, ...]
     bodies_options: Options
     ids: str
+    background: tuple[int, ...]
     K: str
     flow: str = ""
     flow_options: Options = field(default_factory=dict)
@@ -90,6 +93,7 @@ _ISAAC_3 = Convention(
     bodies=("body_link_pose_w",),
     bodies_options={"layout": "xyz_xyzw"},
     ids="instance_id_segmentation_fast",
+    background=(0, 1),
     flow="motion_vectors",
     flow_options={"direction": "backward", "grid": "current"},
     K="intrinsic_matrices, pixel centres at halves",
@@ -117,6 +121,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("body_link_pose_w",),
         bodies_options={"layout": "xyz_wxyz"},
         ids="instance_id_segmentation_fast",
+        background=(0, 1),
         flow="motion_vectors",
         flow_options={"direction": "backward", "grid": "current"},
         K="intrinsic_matrices, pixel centres at halves",
@@ -135,6 +140,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("body_poses",),
         bodies_options={},
         ids="segmentation",
+        background=(0,),
         K="intrinsic_cv, pixel centres at halves",
         notes="Depth is int16 millimetres: what is farther than 32.7 m wraps round and counts as "
         "sky. flowrep.maniskill.ManiSkillEnv collects the buffers and the poses of "
@@ -152,6 +158,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("xpos", "xquat"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentation",
+        background=(),
         K="intrinsics_from_fov(fovy), with <quality offsamples='0'/>",
         notes="Ids are geoms', so body_ids names geoms, and xpos and xquat have a row for each: "
         "data.xpos[model.geom_bodyid[geoms]]. Where nothing is drawn, depth is the far plane, "
@@ -170,6 +177,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("xpos", "xquat"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentation",
+        background=(),
         K="intrinsics_from_fov(fovy)",
         notes="As MuJoCo's, but depth is 0 where nothing is hit. TorchRL's MJLabWrapper passes on "
         "RGB alone.",
@@ -189,6 +197,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("body_q",),
         bodies_options={"layout": "xyz_xyzw"},
         ids="shape_index",
+        background=(0xFFFFFFFF,),
         K="intrinsics_from_fov(camera_fov), pixel centres at halves",
         notes="Ids are those of shapes, so body_ids names shapes and body_q has a row for each: "
         "state.body_q[model.shape_body[shapes]]. A miss has depth 0, clear_data.clear_depth; "
@@ -206,6 +215,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("links_pos", "links_quat"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentation",
+        background=(0,),
         K="camera.intrinsics",
         notes="far_m is the camera's far. Ids are indices of scene.segmentation_idx_dict, at "
         "VisOptions(segmentation_level='link') one a link. Depth is 4 x multisampled, which mixes "
@@ -223,6 +233,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("object_position", "object_rotation"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="semantic_sensor",
+        background=(0,),
         K="intrinsics_from_fov(hfov, axis='horizontal')",
         notes="Take the sensor's pose, agent.get_state().sensor_states[name], not the agent's. "
         "quaternion.as_float_array gives (w, x, y, z); an object's rotation is a Magnum "
@@ -243,6 +254,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("instance_positions", "instance_quaternions"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentations",
+        background=(0,),
         flow="backward_flow",
         flow_options={"direction": "backward", "grid": "current", "channels": "row_column"},
         K="focal_length / sensor_width * width",
@@ -262,6 +274,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("object_poses",),
         bodies_options={"axes": "unity"},
         ids="instance_ids",
+        background=(0,),
         K="intrinsics_from_fov(fieldOfView)",
         notes="Unity's world is left-handed, with y up: poses are 4 x 4 matrices in it. far_m is "
         "the camera's far plane, 20 m by default. Ids are colours: number them, by "
@@ -279,6 +292,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("actor_transforms",),
         bodies_options={"axes": "unreal"},
         ids="instance",
+        background=(0,),
         K="intrinsics_from_fov(fov, axis='horizontal')",
         notes="Depth is R + 256 G + 65536 B, as int32, and an id G + 256 B of the instance camera; "
         "raw_data is BGRA. Poses are transform.get_matrix(). Set lens_circle_multiplier and lens_k "
@@ -300,6 +314,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("object_positions", "object_orientations"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentation",
+        background=(0,),
         K="intrinsics_from_fov(fov, axis='horizontal')",
         notes="far_m is what the sky has in your world, such as 65504: look at a pixel. Ids are "
         "colours: pack them, R + 256 G + 65536 B, by simGetSegmentationColorMap. OpticalFlow is of "
@@ -317,6 +332,7 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("positions", "orientations"),
         bodies_options={"layout": "xyz_xyzw"},
         ids="segmentation",
+        background=(),
         K="flowrep.pybullet.BulletCamera.K; the software renderer's is centred + (0.5, -0.5)",
         notes="flowrep.pybullet.BulletCamera does all this, links and bodies that come and go "
         "included. The view is np.reshape(viewMatrix, (4, 4)).T. Ids of links are "
@@ -331,6 +347,7 @@ def sensors_from(
     *,
     depth: str | None = None,
     body_ids: Sequence[Any] | None = None,
+    static_ids: Sequence[int] = (),
     flow: bool = False,
     intrinsics: Intrinsics | None = None,
     near_m: float | None = None,
@@ -349,6 +366,7 @@ def sensors_from(
         depth: which of its depth buffers; by default the first.
         body_ids: ids in the order of the rows of the bodies' poses; the convention's notes say of
             what. Without them, the world is static, or flow is measured.
+        static_ids: ids of bodies that stand still and need no pose.
         flow: whether to read the simulator's own flow, if it has any whose convention is known.
         intrinsics: K `[3, 3]` or its key, for depth along the rays.
         near_m: the near plane, where depth is a z-buffer.
@@ -376,8 +394,10 @@ def sensors_from(
         raise ValueError(f"{row.simulator} has no depth {chosen!r}; it has {', '.join(row.depth)}")
     if flow and not row.flow:
         raise ValueError(f"{row.simulator} has no flow of a known convention: {row.notes}")
-    arguments = {"intrinsics": intrinsics, "near_m": near_m, "far_m": far_m}
-    options = {name: arguments.get(value, value) for name, value in row.depth[chosen].items()}
+    arguments: dict[str, Any] = {"intrinsics": intrinsics, "near_m": near_m, "far_m": far_m}
+    options: dict[str, Any] = {}
+    for name, value in row.depth[chosen].items():
+        options[name] = arguments.get(value, value)
     for name, value in arguments.items():
         if (name in row.depth[chosen].values()) != (value is not None):
             verb = "needs" if value is None else "doesn't read"
@@ -405,7 +425,9 @@ def sensors_from(
     made += [*poses(row.pose, row.pose_options, ("sensor", "world_from_cam")), CameraMotion()]
     if body_ids is not None:
         made += poses(row.bodies, row.bodies_options, ("sensor", "world_from_body"))
-        made += [plane(row.ids, row.ids_layout), InstanceIds(body_ids, in_keys=(_PARTS, row.ids))]
+        still = [*row.background, *static_ids]
+        rows = InstanceIds(body_ids, static_ids=still, in_keys=(_PARTS, row.ids))
+        made += [plane(row.ids, row.ids_layout), rows]
         made.append(InstanceMotion())
     if flow:
         is_last = row.layout == "hwc"
@@ -422,6 +444,8 @@ class Plane(MapTransform):
     | --- | --- | --- | --- | --- |
     | `[*B, H, W]` or `[*B, H, W, C]` | one key | `[*B, 1, H, W]` | as read | |
 
+    Unsigned integers of 16 bits and more become int64, as PyTorch hardly computes with them.
+
     Args:
         layout: `"hw"` or `"hwc"`.
     """
@@ -434,10 +458,14 @@ class Plane(MapTransform):
         """Returns the map."""
         if len(self.reads[0].shape) == 3:
             picture = picture[..., 0]
-        return (picture.unsqueeze(-3),)
+        return (picture.to(_signed(picture.dtype)).unsqueeze(-3),)
 
     def output_specs(self, picture: TensorSpec) -> tuple[TensorSpec]:
         """Returns an unbounded spec."""
         *batch, height, width = picture.shape[: picture.ndim - (len(self.reads[0].shape) == 3)]
         shape = (*batch, 1, height, width)
-        return (Unbounded(shape, device=picture.device, dtype=picture.dtype),)
+        return (Unbounded(shape, device=picture.device, dtype=_signed(picture.dtype)),)
+
+
+def _signed(dtype: torch.dtype) -> torch.dtype:
+    return torch.int64 if dtype in (torch.uint16, torch.uint32, torch.uint64) else dtype

@@ -90,7 +90,7 @@ def test_maniskills_conventions_by_hand():
     assert after["ego"][:, 0, 0, 5, 7].tolist() == [-2.0, -2.0]
     assert after["raw"][:, 0, 0, 2, 4].tolist() == [-2.0, 2.0]
     assert after["obj"][:, 0, 0, 2, 4].tolist() == [0.0, 4.0]
-    assert after["sensor", "depth"][0, 0, 0, 0].isnan()[0]  # 0 is nothing
+    assert after["sensor", "depth"][0, 0, 0, 0].isinf()[0]  # 0 is no surface
     assert after["done"][:, :, 0].tolist() == [[False, True, False], [False, False, False]]
     assert (td["raw"][0, 2] == 0).all()  # the first bench alone began anew
     assert td["raw"][1, 2, 0, 5, 7] == -2.0
