@@ -8,7 +8,8 @@ flowrep's transforms compute flow.
     apt-get install libegl1 libgl1-mesa-dri     # off-screen, on a CPU; or libosmesa6
     MUJOCO_GL=egl python examples/mujoco_flow.py strip.png
 
-MuJoCo's conventions, as measured by tests/examples/test_mujoco_flow.py:
+MuJoCo's conventions, which `sensors_from("mujoco")` has, as tests/examples/test_mujoco_flow.py
+measures them:
 
 - depth is already metres along the optical axis; pixels without a surface hold the far plane;
 - pixels are sampled at their centres, so K has cx = W / 2, cy = H / 2 (with `offsamples="0"`);
@@ -32,14 +33,7 @@ from gymnasium import spaces
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
 from flowrep.geometry import intrinsics_from_fov
-from flowrep.transforms import (
-    AdaptPose,
-    CameraMotion,
-    FlowFactorize,
-    InstanceIds,
-    InstanceMotion,
-    RawFlow,
-)
+from flowrep.transforms import FlowFactorize, RawFlow, sensors_from
 
 HEIGHT, WIDTH, FOV_DEG = 96, 144, 60.0
 K = intrinsics_from_fov(FOV_DEG, axis="vertical", height=HEIGHT, width=WIDTH)
@@ -92,17 +86,18 @@ class Yard(gym.Env):
         self.model = mujoco.MjModel.from_xml_string(SCENE)
         self.data = mujoco.MjData(self.model)
         self.renderer = mujoco.Renderer(self.model, HEIGHT, WIDTH)
+        self.far_m = float(self.model.vis.map.zfar * self.model.stat.extent)
         self.body_ids = [self.model.body(name).id for name in BODIES]
-        maps = {
-            "rgb": spaces.Box(0, 255, (3, HEIGHT, WIDTH), np.uint8),
-            "depth": spaces.Box(0.0, np.inf, (1, HEIGHT, WIDTH), np.float32),
-        }
+        self.geom_ids = [int(self.model.body_geomadr[body]) for body in self.body_ids]  # one each
+        anywhere = {"low": -np.inf, "high": np.inf, "dtype": np.float64}
         self.action_space = spaces.Discrete(3)
         self.observation_space = spaces.Dict(
-            sensor=spaces.Dict(maps),
-            segmentation=spaces.Box(-1, self.model.nbody - 1, (1, HEIGHT, WIDTH), np.int16),
-            camera_pose=spaces.Box(-np.inf, np.inf, (4, 4), np.float64),
-            body_poses=spaces.Box(-np.inf, np.inf, (len(BODIES), 7), np.float64),
+            sensor=spaces.Dict(rgb=spaces.Box(0, 255, (3, HEIGHT, WIDTH), np.uint8)),
+            depth=spaces.Box(0.0, np.inf, (HEIGHT, WIDTH), np.float32),
+            segmentation=spaces.Box(-1, 1 << 15, (HEIGHT, WIDTH, 2), np.int32),
+            camera_pose=spaces.Box(shape=(4, 4), **anywhere),
+            xpos=spaces.Box(shape=(len(BODIES), 3), **anywhere),
+            xquat=spaces.Box(shape=(len(BODIES), 4), **anywhere),
         )
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
@@ -129,31 +124,31 @@ class Yard(gym.Env):
 
     def observe(self) -> dict[str, Any]:
         """Returns MuJoCo's maps and poses in its own conventions."""
-        rgb, depth, body = self.pictures()
+        rgb, depth, segmentation = self.pictures()
         eye, moving = self.data.camera("eye"), self.body_ids
         camera_pose = np.eye(4)
         camera_pose[:3, :3], camera_pose[:3, 3] = eye.xmat.reshape(3, 3), eye.xpos
         return {
-            "sensor": {"rgb": np.ascontiguousarray(rgb.transpose(2, 0, 1)), "depth": depth[None]},
-            "segmentation": body[None],
+            "sensor": {"rgb": np.ascontiguousarray(rgb.transpose(2, 0, 1))},
+            "depth": depth,
+            "segmentation": segmentation,
             "camera_pose": camera_pose,
-            "body_poses": np.hstack([self.data.xpos[moving], self.data.xquat[moving]]),
+            "xpos": self.data.xpos[moving],
+            "xquat": self.data.xquat[moving],
         }
 
     def pictures(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns RGB, depth in metres (inf for the sky) and the body that each pixel shows."""
+        """Returns RGB, depth in metres, and (geom id, object type) of each pixel."""
         renderer = self.renderer
         renderer.update_scene(self.data, "eye")
         rgb = renderer.render().copy()
         renderer.enable_segmentation_rendering()
-        geom = renderer.render()[..., 0].copy()
+        segmentation = renderer.render().astype(np.int32)
         renderer.disable_segmentation_rendering()
         renderer.enable_depth_rendering()
         depth = renderer.render().copy()
         renderer.disable_depth_rendering()
-        sky = geom < 0
-        depth[sky] = np.inf
-        return rgb, depth, np.where(sky, -1, self.model.geom_bodyid[geom]).astype(np.int16)
+        return rgb, depth, segmentation
 
     def close(self) -> None:
         self.renderer.close()
@@ -162,12 +157,9 @@ class Yard(gym.Env):
 def make_env() -> TransformedEnv:
     """Returns the yard as a TorchRL env that writes raw, ego and obj beside MuJoCo's data."""
     yard = Yard()
+    standing = [geom for geom in range(yard.model.ngeom) if geom not in yard.geom_ids]
     transforms = Compose(
-        AdaptPose(axes="opengl", in_keys="camera_pose"),
-        AdaptPose(layout="xyz_wxyz", in_keys="body_poses", out_keys=("sensor", "world_from_body")),
-        InstanceIds(yard.body_ids, in_keys="segmentation"),
-        CameraMotion(),
-        InstanceMotion(),
+        *sensors_from("mujoco", body_ids=yard.geom_ids, static_ids=standing, far_m=yard.far_m),
         RawFlow(K),
         FlowFactorize(K),
     )

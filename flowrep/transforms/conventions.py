@@ -147,7 +147,7 @@ CONVENTIONS: dict[str, Convention] = {
         "segmentation_id_map.",
     ),
     "mujoco": Convention(
-        simulator="MuJoCo 3.10",
+        simulator="MuJoCo 3.17",
         sources=("mujoco.readthedocs.io: Python, Renderer; XML reference, body/camera",),
         tried="examples/mujoco_flow.py",
         layout="hw",
@@ -168,7 +168,7 @@ CONVENTIONS: dict[str, Convention] = {
     "mjlab": Convention(
         simulator="mjlab 1.6 (MuJoCo Warp 4.0)",
         sources=("mjlab.sensor.camera_sensor; mujoco_warp._src.render",),
-        tried="",
+        tried="MuJoCo Warp on a CPU, tests/transforms/test_conventions.py; not mjlab",
         layout="hwc",
         ids_layout="hwc",
         depth={"depth": {"kind": "z", "sky": 0.0}},
@@ -185,7 +185,7 @@ CONVENTIONS: dict[str, Convention] = {
     "newton": Convention(
         simulator="Newton 1.8",
         sources=("newton.sensors.SensorCamera; newton.State.body_q",),
-        tried="",
+        tried="tests/transforms/test_conventions.py, on a CPU",
         layout="hw",
         ids_layout="hw",
         depth={

@@ -50,7 +50,9 @@ yard.reset(seed=0)
 roll = 0.3  # so that the floor's depth changes along rows and along columns
 yard.data.mocap_quat[0] = math.cos(roll / 2), 0.0, math.sin(roll / 2), 0.0
 mujoco.mj_forward(yard.model, yard.data)
-_, depth, body = yard.pictures()
+_, depth, segmentation = yard.pictures()
+geom = torch.from_numpy(segmentation[..., 0]).long()
+body = torch.as_tensor(yard.model.geom_bodyid)[geom.clamp(min=0)].where(geom >= 0, -1)
 # MuJoCo's own rotation matrix; from its camera's axes to OpenCV's y and z are turned over.
 eye, world_from_cam = yard.data.camera("eye"), torch.eye(4, dtype=torch.float64)
 world_from_cam[:3, :3] = torch.tensor(eye.xmat.reshape(3, 3) * [1, -1, -1])
@@ -58,7 +60,7 @@ world_from_cam[:3, 3] = torch.tensor(eye.xpos)
 record["rolled"] = {
     "world_from_cam": world_from_cam,
     "depth": torch.from_numpy(depth),
-    "body": torch.from_numpy(body),
+    "body": body,
 }
 yard.close()
 torch.save(record, sys.argv[1])

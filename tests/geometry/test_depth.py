@@ -112,3 +112,20 @@ def test_a_surface_that_the_buffer_tells_from_the_far_plane_is_none_of_the_sky()
     assert z.isinf().tolist() == [True] * 4 + [False] * 4
     expected = near / (4 * 2.0**-24 * (1 - near / far) + near / far)  # 99.98 m
     torch.testing.assert_close(z[4].item(), expected, rtol=1e-6, atol=0)
+
+
+def test_a_simulators_value_for_no_surface_becomes_inf():
+    missed = adapt_depth(depth_of(0.0, -1.0, 0.5), "z", sky=0.0).flatten()
+    assert missed.tolist() == [math.inf, math.inf, 0.5]
+    far = adapt_depth(depth_of(20.0, 19.99, 25.0, 19.97), "z", sky=20.0).flatten()
+    assert far.isinf().tolist() == [True, True, True, False]  # 0.999 of 20 is 19.98
+    codes = torch.tensor([0, 2500, -32000], dtype=torch.int16).reshape(1, 1, 3)  # wrapped round
+    z = adapt_depth(codes, "z", scale_m=1e-3, sky=0.0).flatten()
+    assert z.tolist() == [math.inf, 2.5, math.inf]
+    both = adapt_depth(depth_of(0.0, 9.0, math.nan, 1.0), "z", nothing=0.0, sky=9.0).flatten()
+    assert both.isnan().tolist() == [True, False, True, False]
+    assert both[1] == math.inf
+    rays = adapt_depth(depth_of(1e10, 2.0, 2.0), "ray_length", K=CAMERA, sky=1e10).flatten()
+    assert rays.isinf().tolist() == [True, False, False]
+    with pytest.raises(ValueError, match=r"sky=0.*reversed_z_buffer"):
+        adapt_depth(depth_of(0.0), "reversed_z_buffer", near_m=0.1, far_m=9.0, sky=0.0)

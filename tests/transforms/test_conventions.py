@@ -7,6 +7,10 @@ simulator's buffers, with scipy's rotations. None of flowrep's code is asked for
 
 from __future__ import annotations
 
+import math
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -15,6 +19,8 @@ from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv, check_env_specs
 
+from flowrep.geometry import intrinsics_from_fov
+from flowrep.testing import check_flow
 from flowrep.transforms import CONVENTIONS, FlowFactorize, RawFlow, sensors_from
 
 STEPS, HEIGHT, WIDTH = 4, 5, 7
@@ -406,3 +412,177 @@ def test_each_row_names_its_sources_and_a_version():
         assert row.sources
         assert any(character.isdigit() for character in row.simulator)
         assert row.K
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "in_your_simulator.md"
+
+
+def test_the_page_has_every_row_and_its_python_runs():
+    page = PAGE.read_text("utf-8")
+    table = page.split("## By name")[0]
+    for name, row in CONVENTIONS.items():
+        (line,) = [line for line in table.splitlines() if f'`"{name}"`' in line]
+        assert (line.rstrip(" |").rsplit("| ", 1)[1] == "no") == (not row.tried)
+        assert ("not documented" in line) <= (not row.flow)
+    pytest.importorskip("pybullet")
+    scope: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, scope)
+    assert np.array_equal(scope["sensor"]["prev_from_curr"], np.eye(4))
+    assert len(scope["isaac_lab"]) == len(sensors_from("isaac_lab", flow=True)) + 1
+    scope["pybullet"].disconnect(scope["client"])
+
+
+# On the simulator itself; MuJoCo's and ManiSkill's rows are tried by tests/examples
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", CONVENTIONS["newton"].depth)
+def test_newton_itself(depth):
+    newton = pytest.importorskip("newton", reason="pip install newton; it runs on a CPU")
+    import warp as wp
+
+    size, fov = (60, 90), math.radians(60)
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    bodies = [builder.add_body() for _ in range(2)]
+    shapes = [
+        builder.add_shape_box(bodies[0], hx=0.3, hy=0.2, hz=0.2),
+        builder.add_shape_sphere(bodies[1], radius=0.3),
+    ]
+    model = builder.finalize(device="cpu")
+    state, sensor = model.state(), newton.sensors.SensorCamera(model)
+    rays = sensor.compute_camera_rays_pinhole(*size[::-1], camera_fov=fov, device=model.device)
+    frames = []
+    for t in range(5):
+        poses = state.body_q.numpy()
+        turned = Rotation.from_euler("xyz", [10 * t, 5 * t, 12 * t], degrees=True)
+        poses[0] = [-0.4 + 0.08 * t, 0.1 * t, 0.5, *turned.as_quat()]
+        poses[1] = [0.5, -0.05 * t, 0.5 + 0.03 * t, 0, 0, 0, 1]
+        state.body_q.assign(poses)
+        model.bvh_refit_shapes(state)
+        ahead = Rotation.from_euler("xyz", [70 + t, 0, 60 + 2 * t], degrees=True)
+        camera = np.float32([2.2 - 0.05 * t, -1.2 + 0.08 * t, 1.2, *ahead.as_quat()])
+        images = {
+            "depth_image": sensor.allocate_image_depth(1, *size[::-1]),
+            "forward_depth_image": sensor.allocate_image_depth_forward(1, *size[::-1]),
+            "shape_index_image": sensor.allocate_image_shape_index(1, *size[::-1]),
+        }
+        at = wp.array([wp.transform(*camera)], dtype=wp.transformf, device=model.device)
+        sensor.update(state, at, rays, **images)
+        seen = {name.removesuffix("_image"): x.numpy()[0].copy() for name, x in images.items()}
+        of_shapes = state.body_q.numpy()[model.shape_body.numpy()[shapes]]
+        frames.append(seen | {"camera_transforms": camera, "body_q": of_shapes})
+    K = intrinsics_from_fov(math.degrees(fov), axis="vertical", height=size[0], width=size[1])
+    more = {"intrinsics": K} if depth == "depth" else {}
+    assert_warps("newton", frames, K, depth=depth, body_ids=shapes, static_ids=[0], **more)
+
+
+MUJOCO = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="9 9 .1"/>
+    <body mocap="true" pos="0 0 1.2"><camera name="eye" fovy="60" xyaxes="1 0 0 0 .2 1"/></body>
+    <body pos="-.7 4 .5"><freejoint/><geom type="box" size=".5 .4 .3"/></body>
+    <body pos=".8 3 .5"><freejoint/><geom type="sphere" size=".4"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.slow
+def test_mujoco_warp_itself_which_renders_for_mjlab():
+    mujoco = pytest.importorskip("mujoco", reason="pip install 'flowrep-rl[examples]'")
+    warp = pytest.importorskip("mujoco_warp", reason="pip install mujoco-warp; it runs on a CPU")
+    height, width = 120, 180
+    model = mujoco.MjModel.from_xml_string(MUJOCO)
+    data, geoms = mujoco.MjData(model), [1, 2]
+    frames = []
+    for t in range(5):
+        data.mocap_pos[0] = 0.05 * t, 0.12 * t, 1.2
+        data.mocap_quat[0] = np.roll(
+            Rotation.from_euler("xyz", [0.01 * t, 0, 0.03 * t]).as_quat(), 1
+        )
+        turned = np.roll(Rotation.from_euler("xyz", [0.2 * t, 0.1 * t, 0.2 * t]).as_quat(), 1)
+        data.qpos[:7] = [-0.7 + 0.1 * t, 4, 0.7, *turned]
+        data.qpos[7:] = [0.8, 3 + 0.1 * t, 0.5 + 0.05 * t, 1, 0, 0, 0]
+        mujoco.mj_forward(model, data)
+        on_warp = warp.put_model(model), warp.put_data(model, data)
+        context = warp.create_render_context(
+            model, cam_res=(width, height), render_rgb=False, render_depth=True, render_seg=True
+        )
+        warp.refit_bvh(*on_warp, context)
+        warp.render(*on_warp, context)
+        eye, bodies = data.camera("eye"), model.geom_bodyid[geoms]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = eye.xmat.reshape(3, 3), eye.xpos
+        frames.append(
+            {  # as mjlab's CameraSensor views them
+                "depth": context.depth_data.numpy().reshape(height, width, 1),
+                "segmentation": context.seg_data.numpy().reshape(height, width, 2),
+                "camera_pose": pose,
+                "xpos": data.xpos[bodies].copy(),
+                "xquat": data.xquat[bodies].copy(),
+            }
+        )
+    K = intrinsics_from_fov(60.0, axis="vertical", height=height, width=width)
+    assert_warps("mjlab", frames, K, body_ids=geoms, static_ids=[0])
+
+
+def assert_warps(simulator, frames, K, **options):
+    """Each frame, warped by its flow, is the one before; the sky is where no id is."""
+    buffers = [TensorDict({k: torch.as_tensor(v) for k, v in each.items()}) for each in frames]
+    done = torch.zeros(len(frames), 1, dtype=torch.bool)
+    td = TensorDict({"camera": torch.stack(buffers), "next": {"done": done}}, [len(frames)])
+    td.names = ["time"]
+    sensors = sensors_from(simulator, prefix="camera", **options)
+    td = Compose(*sensors, RawFlow(K), FlowFactorize(K))(td)
+    (background,) = CONVENTIONS[simulator].background or (-1,)
+    sky = td["adapted", CONVENTIONS[simulator].ids][:, 0] == background
+    assert sky.any()
+    assert torch.equal(td["sensor", "depth"].isinf()[:, 0], sky)
+    found = check_flow(td, K)
+    assert found.is_right
+    assert found.agreement > 0.99
+
+
+def test_pybullet_itself():
+    bullet = pytest.importorskip("pybullet")
+    height, width = 120, 180
+    client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
+    sides = ([5, 5, 0.1], [0.4, 0.3, 0.2], [0.2, 0.3, 0.4])
+    boxes = [
+        bullet.createMultiBody(
+            0, -1, bullet.createVisualShape(bullet.GEOM_BOX, halfExtents=half, **client), **client
+        )
+        for half in sides
+    ]
+    projection = bullet.computeProjectionMatrixFOV(60, width / height, NEAR_M, FAR_M)
+    frames = []
+    for t in range(5):
+        turns = [[0, 0, 0], [0.2 * t, 0.1 * t, 0.1], [0.1, 0, -0.2 * t]]
+        places = [[0, 0, -0.1], [0.4 - 0.1 * t, 0.5, 0.6], [-0.6, 0.1 * t, 0.5]]
+        for box, turn, place in zip(boxes, turns, places):
+            quaternion = bullet.getQuaternionFromEuler(turn)
+            bullet.resetBasePositionAndOrientation(box, place, quaternion, **client)
+        view = bullet.computeViewMatrix(
+            [1.5 - 0.06 * t, -2.5 + 0.1 * t, 1.5], [0, 0.04 * t, 0.6], [0.1, 0, 1]
+        )
+        picture = {"renderer": bullet.ER_TINY_RENDERER, **client}
+        _, _, _, buffer, ids = bullet.getCameraImage(width, height, view, projection, **picture)
+        poses = [bullet.getBasePositionAndOrientation(box, **client) for box in boxes[1:]]
+        frames.append(
+            {
+                "depth": np.reshape(buffer, (height, width)),
+                "segmentation": np.reshape(ids, (height, width)),
+                "view": np.reshape(view, (4, 4)).T,
+                "positions": np.array([place for place, _ in poses]),
+                "orientations": np.array([quaternion for _, quaternion in poses]),
+            }
+        )
+    bullet.disconnect(**client)
+    focal = height / 2 / math.tan(math.radians(30))
+    # The software renderer samples pixel (i, j) at u = i, v = j + 1.
+    sampled = np.array([[focal, 0, width / 2 + 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
+    options = {"body_ids": boxes[1:], "static_ids": boxes[:1], "near_m": NEAR_M, "far_m": FAR_M}
+    assert_warps("pybullet", frames, sampled, **options)
