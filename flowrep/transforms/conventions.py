@@ -206,7 +206,7 @@ CONVENTIONS: dict[str, Convention] = {
     "genesis": Convention(
         simulator="Genesis 1.4.5",
         sources=("genesis.vis.camera.Camera: render, transform, intrinsics",),
-        tried="",
+        tried="tests/transforms/test_conventions.py, on a CPU",
         layout="hw",
         ids_layout="hw",
         depth={"depth": {"kind": "z", "sky": "far_m"}},
@@ -218,8 +218,8 @@ CONVENTIONS: dict[str, Convention] = {
         background=(0,),
         K="camera.intrinsics",
         notes="far_m is the camera's far. Ids are indices of scene.segmentation_idx_dict, at "
-        "VisOptions(segmentation_level='link') one a link. Depth is 4 x multisampled, which mixes "
-        "depths at edges. TorchRL's GenesisWrapper doesn't reset the scene.",
+        "VisOptions(segmentation_level='link') one a link. Where a driver multisamples "
+        "depth, it mixes at edges. TorchRL's GenesisWrapper doesn't reset the scene.",
     ),
     "habitat": Convention(
         simulator="Habitat-Sim 0.3.3",
