@@ -53,9 +53,10 @@ class BulletCamera:
         client: a `BulletClient`, the number of a client, or the module `pybullet`.
         width: pixels.
         height: pixels.
-        fov_deg: vertical field of view, as in `computeProjectionMatrixFOV`; needs `near_m` and
-            `far_m`. Beyond `far_m`, nothing is drawn.
+        fov_deg: vertical field of view, as in `computeProjectionMatrixFOV`.
         projection: instead, the 16 numbers of a perspective `computeProjectionMatrix`.
+        near_m: with `fov_deg`, the near plane, by default 0.05.
+        far_m: with `fov_deg`, the far plane, beyond which nothing is drawn, by default 100.
         view: the 16 numbers of `computeViewMatrix`, or a function that returns them at each call.
             Without it, each call needs one.
         link: (body, link) that the camera rides on, link -1 for the base. `view` is then in the
@@ -98,8 +99,8 @@ class BulletCamera:
         *,
         fov_deg: float | None = None,
         projection: View | None = None,
-        near_m: float = 0.05,
-        far_m: float = 100.0,
+        near_m: float | None = None,
+        far_m: float | None = None,
         view: View | Callable[[], View] | None = None,
         link: tuple[int, int] | None = None,
         instances: Literal["links", "bodies"] = "links",
@@ -116,14 +117,15 @@ class BulletCamera:
         self._client = _Client(client) if isinstance(client, int) else client
         self.width, self.height = width, height
         if projection is None:
+            near_m, far_m = 0.05 if near_m is None else near_m, 100.0 if far_m is None else far_m
             if fov_deg is None or not (0 < fov_deg < 180 and 0 < near_m < far_m):
                 raise ValueError(
                     "give fov_deg between 0 and 180, with 0 < near_m < far_m, or projection; got "
                     f"fov_deg={fov_deg}, near_m={near_m}, far_m={far_m}"
                 )
             projection = pybullet.computeProjectionMatrixFOV(fov_deg, width / height, near_m, far_m)
-        elif fov_deg is not None:
-            raise ValueError("give fov_deg or projection, not both")
+        elif (fov_deg, near_m, far_m) != (None, None, None):
+            raise ValueError("give projection, or fov_deg, near_m and far_m; not both")
         self._picture = {"shadow": 0, "renderer": renderer} | picture
         self._picture["projectionMatrix"] = list(projection)
         flags = pybullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
@@ -166,7 +168,7 @@ class BulletCamera:
         motion[absent] = motion[0]
         self._before, self._row_of = (world_from_cam, now), row_of
         motions = motion.astype(np.float32)
-        maps = self._look(world_from_cam, bodies)
+        maps = self._look(world_from_cam)
         return maps | {"prev_from_curr": motions[0].copy(), "instance_motion": motions}
 
     def space(self) -> spaces.Dict:
@@ -257,7 +259,7 @@ class BulletCamera:
             f"{ {each.number: f'{len(each.parents)} links' for each in bodies.values()} }"
         )
 
-    def _look(self, world_from_cam: Array, bodies: Mapping[str, _Body]) -> dict[str, Array]:
+    def _look(self, world_from_cam: Array) -> dict[str, Array]:
         view = gl_view(rigid_inverse(world_from_cam))
         _, _, rgba, zbuffer, ids = self._client.getCameraImage(
             self.width, self.height, view, **self._picture
@@ -272,7 +274,7 @@ class BulletCamera:
         # ids are body + ((link + 1) << 24), of which the sky's -1 is body 0xffffff, link 254
         packed = np.where(is_sky, 0, ids).view(np.uint32)
         body, link = packed & 0xFFFFFF, packed >> 24
-        rows = self._table(bodies, int(body.max()), int(link.max()))
+        rows = self._table(int(body.max()), int(link.max()))
         instance = rows[body, link] if self._has_links else rows[body, 0]
         instance[is_sky] = 0
         if (instance < 0).any():
@@ -293,7 +295,7 @@ class BulletCamera:
             maps["rgb"] = np.ascontiguousarray(colours.transpose(2, 0, 1))
         return maps
 
-    def _table(self, bodies: Mapping[str, _Body], most_body: int, most_link: int) -> Array:
+    def _table(self, most_body: int, most_link: int) -> Array:
         """Returns the row by body and 1 + link, -1 for those that don't exist."""
         table = np.full((1 + most_body, 1 + most_link), -1, dtype=np.int32)
         for (body, link), row in self.rows.items():

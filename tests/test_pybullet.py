@@ -494,7 +494,8 @@ def test_the_flow_of_soft_bodies_is_unknown(world):
     ("options", "names"),
     [
         ({}, "fov_deg.*projection"),
-        ({"fov_deg": 60, "projection": list(range(16))}, "fov_deg or projection"),
+        ({"fov_deg": 60, "projection": list(range(16))}, "not both"),
+        ({"near_m": 0.1, "projection": list(range(16))}, "not both"),
         ({"projection": [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]}, "perspective"),
         ({"fov_deg": 180}, "fov_deg"),
         ({"fov_deg": 60, "near_m": 2, "far_m": 1}, "near_m"),
