@@ -385,6 +385,16 @@ def test_the_quaternions_of_another_version_give_other_flow(written, read):
     assert abs(frames["ego"][0].movedim(0, -1).numpy() - truth(1, own_motion=False)).max() > 0.5
 
 
+@pytest.mark.parametrize("depth", ["distance_to_image_plane", "distance_to_camera"])
+def test_isaac_labs_depth_may_be_clipped_to_zero(depth):
+    def clipped(t):
+        buffers = isaac_lab(t)  # depth_clipping_behavior="zero"
+        return buffers | {depth: np.where(np.isinf(buffers[depth]), 0, buffers[depth])}
+
+    rays = {"intrinsics": K} if depth == "distance_to_camera" else {}
+    assert_is_the_truth(rollout("isaac_lab", clipped, depth=depth, body_ids=IDS, **rays))
+
+
 def test_keys_may_be_elsewhere():
     def moved(t):
         buffers = maniskill(t)
