@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -19,14 +19,8 @@ from flowrep.sequences.recording import Pose, SequenceError
 
 Matrix: TypeAlias = NDArray[np.float64]
 Layout: TypeAlias = Literal["matrix", "xyz_xyzw", "xyz_wxyz", "xyzw_xyz"]
-Axes: TypeAlias = Literal[CameraAxes, "unity", "unreal"]
 Lens: TypeAlias = Literal["opencv", "fisheye"]
 
-# OpenCV's right, down and forward as (axis, sign) of left-handed cameras, whose worlds are too.
-_LEFT_HANDED = {
-    "unity": ((0, 1), (1, -1), (2, 1)),  # x right, y up, z forward
-    "unreal": ((1, 1), (2, -1), (0, 1)),  # x forward, y right, z up
-}
 MIRROR_REMEDY = (
     "fy is positive. Where it is negative (ICL-NUIM) the camera is left-handed, with y up and z "
     "ahead: give fy without its sign, and format.pose_axes=unity mirrors the poses"
@@ -127,13 +121,9 @@ def as_pose(
     *,
     layout: Layout = "matrix",
     direction: PoseDirection = "camera_to_world",
-    axes: Axes = "opencv",
+    axes: CameraAxes = "opencv",
 ) -> Pose:
-    """Returns `world_from_cam` `[*B, 4, 4]` from the 7, 12 or 16 numbers of each pose.
-
-    The worlds of left-handed `axes` are mirrored: motions between their poses are then those of
-    OpenCV's camera.
-    """
+    """Returns `world_from_cam` `[*B, 4, 4]` from the 7, 12 or 16 numbers of each pose."""
     values = torch.from_numpy(np.array(numbers, dtype=np.float64))
     given: PoseLayout = "xyz_xyzw" if layout == "xyzw_xyz" else layout
     if layout == "matrix":
@@ -141,14 +131,10 @@ def as_pose(
         given = "matrix" if values.shape[-2] == 4 else "matrix_3x4"
     elif layout == "xyzw_xyz":
         values = values.roll(3, -1)
-    known: Any = axes if axes in get_args(CameraAxes) else "opencv"
     try:
-        pose = adapt_pose(values, layout=given, direction=direction, axes=known).numpy()
+        pose: Pose = adapt_pose(values, layout=given, direction=direction, axes=axes).numpy()
     except ValueError as error:
         raise SequenceError(source, str(error)) from None
-    if axes in _LEFT_HANDED:
-        columns = [sign * pose[..., axis] for axis, sign in _LEFT_HANDED[axes]]
-        pose = np.diag([1.0, -1.0, 1.0, 1.0]) @ np.stack([*columns, pose[..., 3]], -1)
     return pose
 
 

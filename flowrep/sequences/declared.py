@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -69,7 +69,7 @@ class DeclaredRecording(Recording):
     backwards: bool
     pose_layout: calibration.Layout
     pose_direction: geometry.PoseDirection
-    pose_axes: calibration.Axes
+    pose_axes: geometry.CameraAxes
     marker_from_cam: Sequence[float] | None
     first_pixel_centre: float
     distortion: Sequence[float]
@@ -119,8 +119,8 @@ class DeclaredRecording(Recording):
         self._choose(left_out)
         self._made: dict[Any, tuple[Any, Any]] = {}
         unit_m = self.depth_unit_m or files.usual_unit_m(files.read_array(self._depths[0]))
-        named = ["pose_layout", "pose_direction", "depth_kind", "flow_direction", "flow_channels"]
-        named += ["pose_axes"] if self.pose_axes in get_args(geometry.CameraAxes) else []
+        named = ["pose_layout", "pose_direction", "pose_axes", "depth_kind"]
+        named += ["flow_direction", "flow_channels"]
         self.conventions = {name: getattr(self, name) for name in named}
         self.conventions |= {"depth_unit_m": str(unit_m)}
 
