@@ -54,6 +54,7 @@ _STUDY = {  # in the figure
 }
 UNSEEN = "not seen with this recipe"
 _CLAIMED = {"more": "higher", "less": "lower"}
+_TIED = "\u00a0"  # a space at which no line breaks
 _WIDEST = 80  # points of the figure's axis
 _POWER = 0.8
 _FOUND = 0.5  # a run finds a way if it succeeds in this share of its episodes
@@ -228,7 +229,7 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     for claim in claims:
         effects = "<br>".join(map(_effect_text, claim.contrasts))
         by_scene = "<br>".join(
-            ", ".join(f"{_SHORT[scene]} {signed(e.value)}" for scene, e in c.by_scene.items())
+            ", ".join(f"{_SHORT[scene]}{_TIED}{signed(e.value)}" for scene, e in c.by_scene.items())
             for c in claim.contrasts
         )
         text = f"{claim.text}<br>*{claim.limits}*" if claim.limits else claim.text
@@ -265,7 +266,9 @@ def _effect_text(contrast: Contrast) -> str:
         p = contrast.p_against if is_beyond else p
     text = p_text(p)
     sign = "" if text.startswith("<") else "= "
-    return f"{points(contrast.effect.interval())}, p {sign}{text}{of_what}"
+    # a line breaks between them only
+    parts = points(contrast.effect.interval()), f"p {sign}{text}{of_what}"
+    return ", ".join(part.replace(" ", _TIED) for part in parts)
 
 
 def draw_claims(claims: Sequence[Claim]) -> Figure:

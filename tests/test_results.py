@@ -147,7 +147,7 @@ def test_what_contradicts_alike_is_a_difference_beyond_the_margin_with_its_own_p
     contrast = Contrast(asked, found, {}, 3, *results._p_values(found, asked))
     assert contrast.p_value == pytest.approx(1 - 0.0367, abs=1e-4)
     assert contrast.p_against == pytest.approx(0.0734, abs=1e-4)
-    assert "p = 0.073 of more than ±5" in results._effect_text(contrast)
+    assert results._effect_text(contrast).split()[-7:] == "p = 0.073 of more than ±5".split()
 
 
 def test_what_contradicts_is_corrected_with_the_others():
@@ -248,7 +248,7 @@ def test_a_protocol_stands_beside_the_other_with_its_own_verdict():
     row = results.protocols_table([narrow], [wide], "s_turn").splitlines()[-1]
     p_value = "0.030"  # t = 5.66
     cells = ["1  [ego,obj] − [raw], high", "+50 [+12, +88]", f"−50 [−88, −12], p = {p_value}"]
-    assert row == f"|{'|'.join(cells)}|**contradicted**|"
+    assert row.replace("\u00a0", " ") == f"|{'|'.join(cells)}|**contradicted**|"
 
 
 def test_an_episodes_path_is_the_one_that_it_draws():
