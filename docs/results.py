@@ -325,7 +325,8 @@ def _draw_effect(
 
 def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     """Returns success by stack and speed in one scene, and how many runs find all ways."""
-    header = ["", "low", "normal (training)", "high", "each run, normal"]
+    at = [f"{speed}, {_speed_range(runs[0], speed)}" for speed in SPEEDS]
+    header = ["", *at, f"each run, {runs[0].speed}"]
     header += [f"find all {_paths(runs[0])} ways"] if is_fork else []
     rows = []
     for stack, members in in_stacks(runs).items():
@@ -427,7 +428,13 @@ def rate_table(runs: Sequence[Run]) -> str:
 def variation_table(titles: Mapping[str, str], studies: Studies) -> str:
     """Returns success of the stacks of each further study, with the speeds of its tests."""
     rows = [
-        (title, _stack(stack), _speed_range(runs[0]), *_successes(runs), str(len(runs)))
+        (
+            title,
+            _stack(stack),
+            _speed_range(runs[0], runs[0].speed),
+            *_successes(runs),
+            str(len(runs)),
+        )
         for study, title in titles.items()
         for members in studies[study].values()
         for stack, runs in in_stacks(members).items()
@@ -436,8 +443,12 @@ def variation_table(titles: Mapping[str, str], studies: Studies) -> str:
     return markdown(("", "", "trained at, m/s", *at, "runs"), rows)
 
 
-def _speed_range(run: Run) -> str:
-    return "–".join(map(str, run.config["scene"]["pedestrian_speed_mps"][run.speed]))
+def _trained_at(runs: Sequence[Run]) -> str:
+    return _speed_range(runs[0], runs[0].speed)
+
+
+def _speed_range(run: Run, speed: str) -> str:
+    return "–".join(map(str, run.config["scene"]["pedestrian_speed_mps"][speed]))
 
 
 def estimates_table(titles: Mapping[str, str], studies: Studies) -> str:

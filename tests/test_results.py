@@ -30,6 +30,7 @@ from tests.report.folders import config_of, letters, rows_of
 
 DECLARED = yaml.safe_load(results.CLAIMS.read_text(encoding="utf-8"))
 SCENES = {"straight_road": "sr_*", "s_turn": "st_*"}
+NOTHING = episode_columns({})
 
 
 def run_of(name, ends, *, scene="straight_road", stack="ego+obj", seed=0, paths=1):
@@ -147,7 +148,8 @@ def test_what_contradicts_alike_is_a_difference_beyond_the_margin_with_its_own_p
     contrast = Contrast(asked, found, {}, 3, *results._p_values(found, asked))
     assert contrast.p_value == pytest.approx(1 - 0.0367, abs=1e-4)
     assert contrast.p_against == pytest.approx(0.0734, abs=1e-4)
-    assert results._effect_text(contrast).split()[-7:] == "p = 0.073 of more than ±5".split()
+    words = ["p", "=", "0.073", "of", "more", "than", "±5"]
+    assert results._effect_text(contrast).split()[-7:] == words
 
 
 def test_what_contradicts_is_corrected_with_the_others():
@@ -312,18 +314,19 @@ def test_a_report_on_the_names_of_a_study_has_the_numbers_of_the_page(stored):
     assert seg2[4] == "5 × 192"
 
 
-def configs_of(command):
+def runs_of(command):
     """What identifies each run that a line of shell trains: scene, stack, seed, settings."""
     words = shlex.split(command)
-    overrides = OverridesParser.create().parse_overrides(words[words.index("-m", 3) + 1 :])
-    choices = [
-        list(o.sweep_string_iterator()) if o.is_sweep_override() else [o.get_value_element_as_str()]
-        for o in overrides
-    ]
-    names = [override.key_or_group for override in overrides]
-    for values in product(*choices):
-        asked = [f"{n}={v}" for n, v in zip(names, values) if not n.startswith("hydra.")]
-        yield identity(Run("", plain("train", *asked), episode_columns({}), {}))
+    choices = {}
+    for override in OverridesParser.create().parse_overrides(words[words.index("-m", 3) + 1 :]):
+        is_list, key = override.is_sweep_override(), override.key_or_group
+        values = override.sweep_string_iterator() if is_list else [override.input_line]
+        choices[key] = [f"{key}={value}" if is_list else value for value in values]
+    seeds = [int(text.partition("=")[2]) for text in choices.pop("seed")]
+    asked = [texts for key, texts in choices.items() if not key.startswith("hydra.")]
+    for overrides in product(*asked):
+        scene, stack, _, settings = identity(Run("", plain("train", *overrides), NOTHING, {}))
+        yield from ((scene, stack, seed, settings) for seed in seeds)
 
 
 def identity(run):
@@ -336,5 +339,5 @@ def identity(run):
 @pytest.mark.parametrize("study", DECLARED["studies"])
 def test_the_commands_of_a_study_make_its_stored_runs(stored, study):
     lines = DECLARED["commands"][study].replace("\\\n", "").splitlines()
-    trained = [set(configs_of(line)) for line in lines if "flowrep.train" in line]
+    trained = [set(runs_of(line)) for line in lines if "flowrep.train" in line]
     assert set().union(*trained) == {identity(r) for of in stored[study].values() for r in of}
