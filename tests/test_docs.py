@@ -19,6 +19,7 @@ from torchrl.envs import CatTensors, Compose, TransformedEnv, check_env_specs
 
 from docs import docstrings
 from flowrep import transforms
+from flowrep.config.cli import as_typed
 from flowrep.config.schema import (
     EvaluateConfig,
     ExportConfig,
@@ -35,6 +36,7 @@ from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
+PACKAGE = DOCS.parent / "flowrep"
 
 
 def navigation(entries):
@@ -58,6 +60,14 @@ def test_every_transform_has_its_page():
         config._target_.rsplit(".", 1)[1] for config in (make() for make in CONFIGS.values())
     }
     assert documented <= set(transforms.__all__)
+
+
+def test_the_architecture_names_every_package_and_module():
+    text = (DOCS / "architecture.md").read_text("utf-8")
+    rows = re.findall(r"^\| (`[^|]*`) \|", text, re.MULTILINE)
+    named = re.findall(r"`(\w+)`", " ".join(rows))
+    there = [p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()]
+    assert sorted(named) == sorted({*there} - {"__init__", "conf"})
 
 
 def test_the_navigation_names_every_page_once():
@@ -226,7 +236,7 @@ def test_the_keys_and_values_of_commands_are_known(page):
         name, typed = words[2].partition(".")[2], [word for word in words[3:] if word != "-m"]
         if "--config-dir" in typed:  # with files of the reader's own
             continue
-        typed = [re.sub("[<>]", "", word if "=" in word else f"run={word}") for word in typed]
+        typed = as_typed([re.sub("[<>]", "", word) for word in typed], COMMANDS[name])
         chosen = []
         for override in OverridesParser.create().parse_overrides(typed):
             key = override.key_or_group
