@@ -262,7 +262,7 @@ def _effect_text(contrast: Contrast) -> str:
     if contrast.asked["expect"] == "equal":
         margin = contrast.asked["margin"]
         is_beyond = abs(contrast.effect.value) > margin
-        of_what = f" of {'more' if is_beyond else 'less'} than ±{100 * margin:.0f}"
+        of_what = f" ({'beyond' if is_beyond else 'within'} ±{100 * margin:.0f})"
         p = contrast.p_against if is_beyond else p
     text = p_text(p)
     sign = "" if text.startswith("<") else "= "
