@@ -1,23 +1,42 @@
 """The documentation: every transform has a page, what pages show runs, links lead somewhere."""
 
+import inspect
+import os
 import re
+import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import CatTensors, Compose, TransformedEnv, check_env_specs
 
+from docs import docstrings
 from flowrep import transforms
+from flowrep.config.cli import as_typed
+from flowrep.config.schema import (
+    EvaluateConfig,
+    ExportConfig,
+    FactorizeConfig,
+    ReportConfig,
+    TrainConfig,
+    ViewConfig,
+)
 from flowrep.transforms import RawFlow
 from flowrep.transforms.hydra_configs import CONFIGS
+from tests.config.composing import plain
 from tests.transforms import oracles
 from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
+PACKAGE = DOCS.parent / "flowrep"
 
 
 def navigation(entries):
@@ -43,6 +62,14 @@ def test_every_transform_has_its_page():
     assert documented <= set(transforms.__all__)
 
 
+def test_the_architecture_names_every_package_and_module():
+    text = (DOCS / "architecture.md").read_text("utf-8")
+    rows = re.findall(r"^\| (`[^|]*`) \|", text, re.MULTILINE)
+    named = re.findall(r"`(\w+)`", " ".join(rows))
+    there = [p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()]
+    assert sorted(named) == sorted({*there} - {"__init__", "conf"})
+
+
 def test_the_navigation_names_every_page_once():
     site = yaml.safe_load((DOCS.parent / "mkdocs.yml").read_text("utf-8"))
     named = list(navigation(site["nav"]))
@@ -52,8 +79,10 @@ def test_the_navigation_names_every_page_once():
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_links_to_pages_and_pictures_lead_somewhere(page):
     links = re.findall(r"\]\(([^)#\s]+)(?:#[\w-]+)?\)", page.read_text("utf-8"))
-    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
-    assert missing == []
+    there = [(page.parent / link).resolve() for link in links if "://" not in link]
+    assert [path for path in there if not path.exists()] == []
+    # the site has no other files
+    assert [path for path in there if not path.is_relative_to(DOCS.resolve())] == []
 
 
 class TwoBodies(FakeSensorEnv):
@@ -178,3 +207,98 @@ def test_commands_quote_their_lists_for_every_shell():
     for page in (*PAGES, DOCS.parent / "README.md"):
         for block in re.findall(r"```sh\n(.*?)```", page.read_text("utf-8"), re.DOTALL):
             assert not bare.search(block), f"{page.name}: {block}"
+
+
+COMMANDS = {
+    "train": TrainConfig, "evaluate": EvaluateConfig, "view": ViewConfig, "report": ReportConfig,
+    "export": ExportConfig, "factorize": FactorizeConfig,
+}  # fmt: skip
+
+
+def commands_in(page):
+    """Yields the commands of a page's shell blocks, as lists of words."""
+    for block in re.findall(r"```sh\n(.*?)```", page.read_text("utf-8"), re.DOTALL):
+        for line in block.replace("\\\n", "").splitlines():
+            if words := shlex.split(line, comments=True):
+                yield words
+
+
+# Those of the results are compared with stored runs, in tests/test_results.py.
+WITH_COMMANDS = [*PAGES, DOCS.parent / "README.md"]
+WITH_COMMANDS.remove(DOCS / "results.md")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.stem)
+def test_the_keys_and_values_of_commands_are_known(page):
+    for words in commands_in(page):
+        if words[:2] != ["python", "-m"] or words[2].partition(".")[2] not in COMMANDS:
+            continue
+        name, typed = words[2].partition(".")[2], [word for word in words[3:] if word != "-m"]
+        if "--config-dir" in typed:  # with files of the reader's own
+            continue
+        typed = as_typed([re.sub("[<>]", "", word) for word in typed], COMMANDS[name])
+        chosen = []
+        for override in OverridesParser.create().parse_overrides(typed):
+            key = override.key_or_group
+            if key.startswith("hydra") or override.is_interval_sweep():
+                continue
+            values = override.sweep_string_iterator() if override.is_sweep_override() else None
+            chosen.append(override.input_line if values is None else f"{key}={next(values)}")
+        COMMANDS[name].model_validate(plain(name, *chosen))
+
+
+@pytest.mark.slow
+def test_getting_started_works_as_it_is_pasted(tmp_path):
+    page, root = DOCS / "getting_started.md", DOCS.parent
+    namespace = {}
+    exec(python_of(page), namespace)
+    assert namespace["rollout"]["obj"].shape == (1, 20, 2, 84, 84)
+    (tmp_path / "examples").symlink_to(root / "examples")
+    env = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+    targets = re.findall(r"^([\w-]+):", (root / "Makefile").read_text("utf-8"), re.MULTILINE)
+    for words in commands_in(page):
+        if words[0] == "make":
+            assert words[1] in targets
+        # tests/test_view.py drives, and one training is enough
+        if words[0] != "python" or "flowrep.view" in words or "debug=smoke" in words:
+            continue
+        words = [word.replace("episodes=100", "episodes=1") for word in words]
+        if "flowrep.train" in words:
+            words += ["debug=smoke", "evaluation.baselines=[]", "evaluation.speeds=[normal]"]
+        ran = subprocess.run(
+            [sys.executable, *words[1:]], cwd=tmp_path, env=env, capture_output=True, text=True
+        )
+        assert ran.returncode == 0, (words, ran.stderr)
+    made = ("outputs/first/report/index.html", "out/strip.mp4", "out/flow/obj")
+    assert all((tmp_path / name).exists() for name in made)
+
+
+def test_names_in_docstrings_become_links_to_the_reference():
+    names = {"RawFlow": "flowrep.transforms.RawFlow", "make_env": "flowrep.envs.make_env"}
+    text = "`RawFlow`, `RawFlow.compute`, `make_env()`, `other`\n```python\n>>> `RawFlow`\n```\n"
+    found = docstrings.linked(text, names, own="flowrep.envs.make_env")
+    targets = re.findall(r'<autoref optional identifier="([^"]+)">', found)
+    assert targets == ["flowrep.transforms.RawFlow", "flowrep.transforms.RawFlow.compute"]
+    assert "\n>>> `RawFlow`\n" in found
+    assert docstrings.public_names().items() >= names.items()
+
+
+@pytest.mark.slow
+def test_the_site_has_constructors_with_all_of_their_options_and_links_between_names(tmp_path):
+    pytest.importorskip("zensical", reason="make docs installs it")
+    # a project's files have to lie in one folder, and the site is made in it
+    shutil.copytree(DOCS, tmp_path / "docs")
+    shutil.copy(DOCS.parent / "mkdocs.yml", tmp_path)
+    for name in ("flowrep", "conf", "CONVENTIONS.md"):
+        (tmp_path / name).symlink_to(DOCS.parent / name)
+    build = [sys.executable, "-m", "zensical", "build", "--strict"]
+    built = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True)
+    assert built.returncode == 0, built.stdout
+    page = (tmp_path / "site" / "reference" / "transforms" / "index.html").read_text("utf-8")
+    text = re.sub("<[^>]+>", "", page)
+    for name in ("AdaptDepth", "AdaptPose"):
+        (signature,) = re.findall(rf"^{name}\(\n(.*?)^\)", text, re.MULTILINE | re.DOTALL)
+        options = inspect.signature(getattr(transforms, name)).parameters
+        assert re.findall(r"^ +(\w+):", signature, re.MULTILINE) == list(options)
+    assert 'href="../geometry/#flowrep.geometry.adapt_depth"' in page

@@ -1,6 +1,7 @@
 """The README's Python runs as it stands."""
 
 import re
+from itertools import chain
 from pathlib import Path
 
 from tests.transforms.fake_env import FakeSensorEnv
@@ -41,3 +42,18 @@ def test_the_gallery_shows_every_scene_and_make_gallery_makes_it():
     scenes = {path.stem for path in (README.parent / "conf" / "scene").glob("*.yaml")}
     assert set(listed.split()) == scenes
     assert all(f"{kind}_{scene}.png" in gallery for kind in ("gallery", "plan") for scene in scenes)
+
+
+def test_the_readmes_agent_is_that_of_the_results():
+    rows = README.read_text(encoding="utf-8").split("| pedestrians |")[1].splitlines()[2:5]
+    results = (README.parent / "docs" / "results.md").read_text(encoding="utf-8")
+    (road,) = re.findall(r"^### Straight Road\n(.*?)^###", results, re.DOTALL | re.MULTILINE)
+    (row,) = re.findall(r"^\|`\[ego,obj\]`\|.*", road, re.MULTILINE)
+    assert [line.split("|")[2].strip() for line in rows] == row.split("|")[2:5]
+
+
+def test_every_page_and_make_install_the_same_torch():
+    pages = (README, README.parent / "docs" / "getting_started.md", README.parent / "Makefile")
+    asked = [re.findall(r"torch==[\d.]+", page.read_text(encoding="utf-8")) for page in pages]
+    assert all(asked)
+    assert len(set(chain(*asked))) == 1

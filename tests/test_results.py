@@ -1,24 +1,36 @@
 """The page of results: verdicts worked by hand, and a page that says what the stored runs say."""
 
 import re
+import shlex
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 pytest.importorskip("scipy", reason="reports are an extra")
 pytest.importorskip("jinja2", reason="reports are an extra")
 
 from docs import results
 from docs.results import Claim, Contrast, rate_table, scores
-from flowrep.report.runs import Run
+from flowrep.report.runs import Run, groups_of
+from flowrep.report.sections import assemble
 from flowrep.report.statistics import Effect
-from flowrep.report.storage import episode_columns, is_archive, read_archive
+from flowrep.report.storage import (
+    episode_columns,
+    is_archive,
+    read_archive,
+    read_runs,
+    without_repeats,
+)
+from tests.config.composing import plain
 from tests.report.folders import config_of, letters, rows_of
 
 DECLARED = yaml.safe_load(results.CLAIMS.read_text(encoding="utf-8"))
 SCENES = {"straight_road": "sr_*", "s_turn": "st_*"}
+NOTHING = episode_columns({})
 
 
 def run_of(name, ends, *, scene="straight_road", stack="ego+obj", seed=0, paths=1):
@@ -72,9 +84,9 @@ def test_a_studys_runs_have_names_like_any_of_its_patterns():
         ("more", (6, 7), (2, 3), "holds"),  # +50, error 6.3 points
         ("less", (6, 7), (2, 3), "contradicted"),
         ("less", (2, 3), (6, 7), "holds"),
-        ("more", (2, 8), (3, 4), "not seen"),
-        ("more", (6,), (2, 3), "can't be tested here"),
-        ("more", (), (2, 3), "can't be tested here"),
+        ("more", (2, 8), (3, 4), results.UNSEEN),
+        ("more", (6,), (2, 3), "can't be tested"),
+        ("more", (), (2, 3), "can't be tested"),
     ],
 )
 def test_a_contrast_is_judged_by_its_test_and_its_direction(expect, both, raw, verdict):
@@ -109,15 +121,15 @@ def test_primary_contrasts_are_corrected_together_and_others_are_not():
     ("value", "error", "verdict"),
     [
         (0.01, 0.01, "holds"),  # 90 % interval inside ±0.05
-        (0.01, 0.05, "not seen"),
+        (0.01, 0.05, results.UNSEEN),
         (0.2, 0.01, "contradicted"),  # all of it beyond the margin
-        (0.07, 0.02, "not seen"),
+        (0.07, 0.02, results.UNSEEN),
     ],
 )
 def test_alike_means_within_the_margin(value, error, verdict):
     asked = HIGH | {"expect": "equal", "margin": 0.05}
     found = Effect(value, error, 10.0)
-    contrast = Contrast(asked, found, {}, 3, results._p_value(found, asked))
+    contrast = Contrast(asked, found, {}, 3, *results._p_values(found, asked))
     assert contrast.verdict == verdict
 
 
@@ -125,12 +137,33 @@ def test_two_one_sided_tests_have_the_larger_of_their_p_values():
     # 0.01 within ±0.05: the nearer side is (0.01 − 0.05) / 0.02 = −2, of 10 degrees p = 0.0367
     asked = HIGH | {"expect": "equal", "margin": 0.05}
     for value in (0.01, -0.01):
-        p = results._p_value(Effect(value, 0.02, 10.0), asked)
-        assert p == pytest.approx(0.0367, abs=1e-4)
+        alike, apart = results._p_values(Effect(value, 0.02, 10.0), asked)
+        assert (alike, apart) == (pytest.approx(0.0367, abs=1e-4), 1)
+
+
+def test_what_contradicts_alike_is_a_difference_beyond_the_margin_with_its_own_p():
+    # 0.09 is 0.04 beyond ±0.05, two errors: two-sided p of 10 degrees 0.0734
+    asked = HIGH | {"expect": "equal", "margin": 0.05}
+    found = Effect(0.09, 0.02, 10.0)
+    contrast = Contrast(asked, found, {}, 3, *results._p_values(found, asked))
+    assert contrast.p_value == pytest.approx(1 - 0.0367, abs=1e-4)
+    assert contrast.p_against == pytest.approx(0.0734, abs=1e-4)
+    assert results._effect_text(contrast).split()[-4:] == ["=", "0.073", "(beyond", "±5)"]
+
+
+def test_what_contradicts_is_corrected_with_the_others():
+    asked = HIGH | {"expect": "equal", "margin": 0.05}
+    claim = {"claim": "c", "contrasts": [asked], "limits": ""}
+    primary, (other,) = claims(
+        runs_with(both=(6, 7), raw=(2, 3)), primary=[claim, claim], secondary=[claim]
+    )
+    alone = other.contrasts[0].p_against
+    assert 0 < alone < 0.05
+    assert primary[0].contrasts[0].p_against == pytest.approx(2 * alone)
 
 
 def test_a_claim_of_several_contrasts_may_hold_in_part():
-    held = Contrast(HIGH, Effect(0.5, 0.01, 5.0), {}, 3, 0.001)
+    held = Contrast(HIGH, Effect(0.5, 0.01, 5.0), {}, 3, 0.001, 0.001)
     unseen, against = replace(held, p_value=0.5), replace(held, effect=Effect(-0.5, 0.01, 5.0))
     for contrasts, verdict in (
         ((held, unseen), "holds in part"),
@@ -216,7 +249,7 @@ def test_a_protocol_stands_beside_the_other_with_its_own_verdict():
     row = results.protocols_table([narrow], [wide], "s_turn").splitlines()[-1]
     p_value = "0.030"  # t = 5.66
     cells = ["1  [ego,obj] − [raw], high", "+50 [+12, +88]", f"−50 [−88, −12], p = {p_value}"]
-    assert row == f"|{'|'.join(cells)}|**contradicted**|"
+    assert row.replace("\u00a0", " ") == f"|{'|'.join(cells)}|**contradicted**|"
 
 
 def test_an_episodes_path_is_the_one_that_it_draws():
@@ -249,5 +282,61 @@ def test_the_primary_contrasts_are_those_of_the_protocol():
 def test_the_page_says_what_the_stored_runs_say():
     text, _ = results.render(DECLARED, read_archive(results.DATA))
     assert text == results.PAGE.read_text(encoding="utf-8"), "run `make results`"
-    assert len(text.split()) <= 2500
     assert (results.PAGE.parent / results.FIGURE).is_file()
+
+
+@pytest.fixture(scope="module")
+def stored():
+    if not is_archive(results.DATA):
+        pytest.skip("source distributions have no runs")
+    return results.studies_of(DECLARED, read_archive(results.DATA))
+
+
+@pytest.mark.slow
+def test_runs_of_one_study_and_scene_may_be_compared(stored):
+    for study, of_scenes in stored.items():
+        for scene, runs in of_scenes.items():
+            assert len(groups_of(runs)) == 1, (study, scene)
+            assert without_repeats(runs)[1] == [], (study, scene)
+
+
+@pytest.mark.slow
+def test_a_report_on_the_names_of_a_study_has_the_numbers_of_the_page(stored):
+    names = DECLARED["studies"]["main"]["s_turn"].split()
+    runs, _ = read_runs([results.DATA / name for name in names])
+    assert {run.name for run in runs} == {run.name for run in stored["main"]["s_turn"]}
+    tables = [table for section in assemble(runs, []).sections for table in section.tables]
+    (line,) = re.findall(r"^\|`\[seg2\]`\|.*", results.scene_table(runs, False), re.M)
+    (told,) = [table for table in tables if table.name == "complementary_success"]
+    (seg2,) = [row for _, rows in told.blocks for row in rows if row[0] == "seg2"]
+    assert line.split("|")[2:5] == [*seg2[1:4]]
+    assert seg2[4] == "5 × 192"
+
+
+def runs_of(command):
+    """What identifies each run that a line of shell trains: scene, stack, seed, settings."""
+    words = shlex.split(command)
+    choices = {}
+    for override in OverridesParser.create().parse_overrides(words[words.index("-m", 3) + 1 :]):
+        is_list, key = override.is_sweep_override(), override.key_or_group
+        values = override.sweep_string_iterator() if is_list else [override.input_line]
+        choices[key] = [f"{key}={value}" if is_list else value for value in values]
+    seeds = [int(text.partition("=")[2]) for text in choices.pop("seed")]
+    asked = [texts for key, texts in choices.items() if not key.startswith("hydra.")]
+    for overrides in product(*asked):
+        scene, stack, _, settings = identity(Run("", plain("train", *overrides), NOTHING, {}))
+        yield from ((scene, stack, seed, settings) for seed in seeds)
+
+
+def identity(run):
+    # a run stores what was asked for, "auto", and its machine what came of it
+    settings = {k: v for k, v in run.settings.items() if k != "algorithm.precision"}
+    return run.scene, run.stack, run.seed, tuple(sorted(settings.items()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", DECLARED["studies"])
+def test_the_commands_of_a_study_make_its_stored_runs(stored, study):
+    lines = DECLARED["commands"][study].replace("\\\n", "").splitlines()
+    trained = [set(runs_of(line)) for line in lines if "flowrep.train" in line]
+    assert set().union(*trained) == {identity(r) for of in stored[study].values() for r in of}

@@ -433,7 +433,6 @@ class ReportConfig(Command):
     run: Annotated[list[Text], Field(min_length=1), OneOrMore]
     output: Text | None
     policy: Acting
-    resamples: Count
     trajectories: CountOrZero
     videos: CountOrZero
 

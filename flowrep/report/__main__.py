@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 def report(config: ReportConfig) -> Path:
     """Writes figures, tables and a page of runs; returns the page's path."""
     from flowrep.report.page import drives_of, render_page, summary
-    from flowrep.report.sections import Settings, assemble, write_files
-    from flowrep.report.statistics import Bootstrap
+    from flowrep.report.sections import assemble, write_files
     from flowrep.report.storage import is_archive, read_runs, without_repeats
 
     folders = list(map(Path, config.run))
@@ -38,7 +37,7 @@ def report(config: ReportConfig) -> Path:
     if not runs:
         raise UsageError("none of the runs can be read, see above")
     print(summary(runs))
-    assembled = assemble(runs, warnings, Settings(config.policy, Bootstrap(config.resamples)))
+    assembled = assemble(runs, warnings, config.policy)
     for warning in assembled.warnings[len(warnings) :]:
         print(f"in part: {warning}")
     for section in assembled.sections:

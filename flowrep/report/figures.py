@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from flowrep.report.runs import SCENES, Curve, Grid, mean_curve
-from flowrep.report.statistics import Estimate, rates
+from flowrep.report.statistics import Estimate
 
 # Okabe and Ito's colours for single maps and for the two flows. A map added to the flows has its
 # own hue, darker, and a hatch or a dashed line.
@@ -195,8 +195,8 @@ def _bars(axes: Axes, grid: Grid) -> None:
             style = {"facecolor": look.colour, "hatch": look.hatch, "edgecolor": edge}
             axes.bar(at, height, 0.92 * width, linewidth=0, **style)
             axes.errorbar(at, height, lengths, color=_TEXT, linewidth=0.9, **_CAPS)
-            if len(cell.matrix.outcomes) > 1:
-                dots = (100 * rates(cell.matrix.outcomes)).tolist()
+            if len(cell.rates) > 1:
+                dots = (100 * cell.rates).tolist()
                 ring: Any = {"facecolor": "white", "edgecolor": _TEXT, "linewidth": 0.5}
                 beside = [at + 0.24 * width] * len(dots)
                 axes.scatter(beside, dots, s=5, zorder=4, clip_on=False, **ring)

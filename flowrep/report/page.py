@@ -1,9 +1,9 @@
 """One self-contained HTML page of a report, with drives and films that evaluations left.
 
-`drives.npz` beside evaluation.csv holds where the vehicle was in each evaluated episode:
-`positions` [sum of T, 2] in world metres, `starts` [N + 1] (episode n is
-`positions[starts[n]:starts[n + 1]]`), and for each episode `evaluation`, `policy`, `speed`, `fps`,
-`frames`, `episode_seed` and `outcome` as in evaluation.csv.
+`drives.npz` beside evaluation.csv holds where the vehicle was in each evaluated episode, before its
+first and after each of its T steps: `positions` [sum of T + 1, 2] in world metres, `starts` [N + 1]
+(episode n is `positions[starts[n]:starts[n + 1]]`), and for each episode `evaluation`, `policy`,
+`speed`, `fps`, `frames`, `episode_seed` and `outcome` as in evaluation.csv.
 """
 
 import base64
@@ -20,9 +20,9 @@ from flowrep.report.figures import encoded, words
 from flowrep.report.runs import Run, groups_of, scenes_of
 from flowrep.report.sections import Report
 from flowrep.report.tables import listed
-from flowrep.scenes import load_scene
+from flowrep.scenes import SceneError, load_scene
 from flowrep.scenes.layout import Layout
-from flowrep.viz.plan import Track, draw_plan
+from flowrep.viz.plan import OUTCOME_COLOURS, Track, draw_plan
 
 DRIVES = "drives.npz"
 TEMPLATES = Environment(
@@ -63,19 +63,23 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
         scene, title = words(run.scene), f"{run.stack}, seed {run.seed} ({Path(run.name).name})"
         tracks = tracks_of(run, trajectories)
         if tracks:
-            ends = Counter(track.outcome.replace("_", " ") for track in tracks)
-            ended = ", ".join(f"{number} {outcome}" for outcome, number in ends.items())
-            png = encoded(draw_plan(Layout(load_scene(run.config["scene"])), tracks), "png", 100)
-            plan = Picture(title, f"drives: {ended}", data_uri("image/png", png))
-            drives.plans.setdefault(scene, []).append(plan)
+            try:
+                layout = Layout(load_scene(run.config["scene"]))
+            except SceneError as error:
+                drives.warnings.append(f"{run.name} has no plan: {error}")
+            else:
+                ends = Counter(track.outcome.replace("_", " ") for track in tracks)
+                ended = ", ".join(f"{number} {outcome}" for outcome, number in ends.items())
+                uri = data_uri("image/png", encoded(draw_plan(layout, tracks), "png", 100))
+                drives.plans.setdefault(scene, []).append(Picture(title, f"drives: {ended}", uri))
         elif trajectories:
             drives.warnings.append(f"{run.name} has no {DRIVES} with greedy drives: no plan")
-        films = sorted(run.folder.glob("videos/*.mp4"))[:videos] if run.folder else []
+        films = films_of(run)[:videos]
         for film in films:
             picture = Picture(title, film.name, data_uri("video/mp4", film.read_bytes()))
             drives.films.setdefault(f"{scene}, {words(film.stem)}", []).append(picture)
         if videos and not films:
-            remedy = f"python -m flowrep.evaluate run={run.name} video=true"
+            remedy = f"python -m flowrep.evaluate run={run.name} video=1"
             drives.warnings.append(f"{run.name} has no films: {remedy}")
     return drives
 
@@ -89,13 +93,23 @@ def tracks_of(run: Run, count: int) -> list[Track]:
             ours = (saved["policy"] == "greedy") & (saved["speed"] == run.speed)
             ours &= (saved["fps"] == run.fps) & (saved["frames"] >= run.total_frames)
             ours &= saved["evaluation"] != "training"
+            ours &= np.isin(saved["outcome"], [*OUTCOME_COLOURS])
             chosen = np.flatnonzero(ours)
             chosen = chosen[np.argsort(saved["episode_seed"][chosen], kind="stable")][:count]
-            positions, starts, outcomes = saved["positions"], saved["starts"], saved["outcome"]
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+            positions = saved["positions"].reshape(-1, 2).astype(float)
+            starts, outcomes = saved["starts"], saved["outcome"][chosen].tolist()
+        tracks = [positions[starts[n] : starts[n + 1]] for n in chosen]
+    except (OSError, ValueError, LookupError, TypeError, EOFError, BadZipFile):
         return []
-    tracks = [positions[starts[n] : starts[n + 1]].astype(float) for n in chosen]
-    return list(map(Track, tracks, outcomes[chosen].tolist()))
+    return list(map(Track, tracks, outcomes))
+
+
+def films_of(run: Run) -> list[Path]:
+    """Returns the films in a run's folder; not what a link there leads to outside of it."""
+    if run.folder is None:
+        return []
+    home, found = run.folder.resolve(), sorted(run.folder.glob("videos/*.mp4"))
+    return [film for film in found if film.is_file() and film.resolve().is_relative_to(home)]
 
 
 def data_uri(kind: str, data: bytes) -> str:

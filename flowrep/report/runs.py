@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.experiment.run import origin_of
-from flowrep.report.statistics import Array, Bootstrap, Estimate
+from flowrep.report.statistics import Array, Estimate, mean_share
 
 Columns = dict[str, NDArray[Any]]
-Metric = Callable[[NDArray[Any]], Array]
+# of a run, from its episodes' outcomes under each condition
+Score = Callable[[Sequence[NDArray[Any]]], float]
 SPEEDS = ("low", "normal", "high")  # of pedestrians
 # The paper's scenes and stacks, in the order of its figures.
 SCENES = ("straight_road", "s_turn", "h_shaped_pathways", "three_way_junction")
@@ -166,93 +167,82 @@ def _can_have(run: Run, key: str) -> bool:
     return place != "scene" or part in (*_OF_EVERY_SCENE, run.scene)
 
 
-def success(outcomes: NDArray[Any]) -> Array:
-    """Returns 1 for each success, else 0."""
-    return (outcomes == "success").astype(float)
+def success_rate(outcomes: Sequence[NDArray[Any]]) -> float:
+    """Returns the share of episodes that succeed."""
+    return float((np.concatenate(outcomes) == "success").mean())
 
 
-def out_of_bounds_of_both(outcomes: NDArray[Any]) -> Array:
-    """Returns 1 out of bounds, 0 for a collision, else nan: the paper's Table III."""
-    failed = np.where(outcomes == "collision", 0.0, np.nan)
-    return np.where(outcomes == "out_of_bounds", 1.0, failed)
+def departures(outcomes: Sequence[NDArray[Any]]) -> float:
+    """Returns the share of departures from the road in them and collisions: the paper's Table III.
+
+    It is nan without either.
+    """
+    ends = np.concatenate(outcomes)
+    out, hit = (ends == "out_of_bounds").sum(), (ends == "collision").sum()
+    return float(out / (out + hit)) if out + hit else float("nan")
 
 
-class OutcomeMatrix(NamedTuple):
-    """The metric of each run and episode `[R, E]`, nan where it was not driven."""
+def own_scores(
+    runs: Iterable[Run], conditions: Sequence[Condition], score: Score = success_rate
+) -> Array:
+    """Returns the score of each run `[R]`, of all its episodes, by seed.
 
-    episodes: Array
-    outcomes: Array
-
-    @property
-    def counts(self) -> str:
-        """The numbers of seeds and episodes, as text: `3 × 192`."""
-        of_each = (~np.isnan(self.outcomes)).sum(axis=1)
-        low, high = of_each.min(), of_each.max()
-        return f"{len(self.outcomes)} × {low}" + (f"–{high}" if high > low else "")
-
-    def on(self, episodes: Array) -> Array:
-        """Returns the outcomes in these episodes, which it must have."""
-        return self.outcomes[:, np.searchsorted(self.episodes, episodes)]
+    Runs that lack a condition are left out, and those whose score is nan.
+    """
+    ours = [r for r in sorted(runs, key=lambda r: r.seed) if r.conditions.issuperset(conditions)]
+    found = np.array([score([run.under(c)["outcome"] for c in conditions]) for run in ours])
+    return found[~np.isnan(found)]
 
 
-def outcomes_of(
-    runs: Iterable[Run], condition: Condition, metric: Metric = success
-) -> OutcomeMatrix | None:
-    """Returns the outcomes of runs of one stack and scene; None if the condition has none."""
-    driven = [run.under(condition) for run in sorted(runs, key=lambda run: run.seed)]
-    return _matrix([(e["episode_seed"], metric(e["outcome"])) for e in driven])
+def paired_scores(
+    sides: Sequence[Sequence[Run]], conditions: Sequence[Condition], score: Score = success_rate
+) -> tuple[list[Array], int] | None:
+    """Returns the score of each run of each side, of the episodes that all of them drove.
 
-
-def _matrix(of_runs: Iterable[tuple[Array, Array]]) -> OutcomeMatrix | None:
-    # an episode has one column, whichever runs drove it
-    found = [(seeds, values) for seeds, values in of_runs if len(seeds)]
-    if not found:
+    An episode's difficulty is so no part of a difference. The number is that of those episodes;
+    None if there are none. Runs that lack a condition are left out.
+    """
+    ours = [[run for run in side if run.conditions.issuperset(conditions)] for side in sides]
+    if not all(ours):
         return None
-    episodes = np.unique(np.concatenate([seeds for seeds, _ in found]))
-    outcomes = np.full((len(found), len(episodes)), np.nan)
-    for row, (seeds, values) in zip(outcomes, found):
-        row[np.searchsorted(episodes, seeds)] = values
-    return OutcomeMatrix(episodes, outcomes)
+    driven = [[[run.under(c) for c in conditions] for run in side] for side in ours]
+    seeds = (columns["episode_seed"] for side in driven for found in side for columns in found)
+    shared = reduce(np.intersect1d, seeds)
+    if not len(shared):
+        return None
+
+    def scored(found: Sequence[Columns]) -> float:
+        return score([c["outcome"][np.isin(c["episode_seed"], shared)] for c in found])
+
+    return [np.array([scored(found) for found in side]) for side in driven], len(shared)
 
 
-def pooled(runs: Sequence[Run], conditions: Sequence[Condition], metric: Metric) -> Array | None:
-    """Returns `[R, E]` of the runs that drove under all conditions; None if none did."""
-    ours = [run for run in runs if run.conditions.issuperset(conditions)]
-    found = [outcomes_of(ours, condition, metric) for condition in conditions]
-    parts = [matrix.outcomes for matrix in found if matrix is not None]
-    return np.hstack(parts) if parts else None
+def changes(runs: Iterable[Run], before: Condition, after: Condition) -> Array:
+    """Returns each run's change of success `[R]`, in the episodes that it drove under both."""
+
+    def change(outcomes: Sequence[NDArray[Any]]) -> float:
+        return success_rate(outcomes[1:]) - success_rate(outcomes[:1])
+
+    found = [paired_scores([[run]], (before, after), change) for run in runs]
+    return np.array([pair[0][0][0] for pair in found if pair])
 
 
-def side_by_side(first: OutcomeMatrix, second: OutcomeMatrix) -> tuple[Array, Array]:
-    """Returns the outcomes of two matrices in the episodes that every run of both drove."""
-    ours, theirs = (m.episodes[~np.isnan(m.outcomes).any(axis=0)] for m in (first, second))
-    shared = np.intersect1d(ours, theirs)
-    return first.on(shared), second.on(shared)
-
-
-def change(runs: Iterable[Run], before: Condition, after: Condition) -> Array | None:
-    """Returns `[R, E]`, the change of success in the episodes that a run drove under both."""
-    found = []
-    for run in runs:
-        first, second = outcomes_of([run], before), outcomes_of([run], after)
-        if first and second:
-            episodes = np.intersect1d(first.episodes, second.episodes)
-            found.append((episodes, (second.on(episodes) - first.on(episodes))[0]))
-    changes = _matrix(found)
-    return changes and changes.outcomes
-
-
-def baseline_share(runs: Sequence[Run], condition: Condition) -> float | None:
+def baseline_share(runs: Iterable[Run], condition: Condition) -> float | None:
     """Returns the success rate of a baseline, the condition's policy; None if it did not drive."""
-    driven = outcomes_of(runs, condition)
+    driven = [run.under(condition) for run in runs]
+    seeds, outcomes = (
+        np.concatenate([c[name] for c in driven]) for name in ("episode_seed", "outcome")
+    )
     # its drive of an episode doesn't depend on the agent beside it: each episode counts once
-    return None if driven is None else float(np.nanmax(driven.outcomes, axis=0).mean())
+    _, first = np.unique(seeds, return_index=True)
+    return success_rate([outcomes[first]]) if len(first) else None
 
 
 class Cell(NamedTuple):
-    """The outcomes of one series in one scene and condition, and their mean success."""
+    """The success of one series in one scene and condition."""
 
-    matrix: OutcomeMatrix
+    rates: Array  # of its runs [R]
+    counts: str  # the numbers of seeds and episodes, as text: `3 × 192`
     score: Estimate
 
 
@@ -269,19 +259,29 @@ class Grid(NamedTuple):
     baselines: Mapping[tuple[str, Condition], float]
 
 
+def cell_of(runs: Sequence[Run], condition: Condition) -> Cell | None:
+    """Returns the success of runs of one scene; None if none drove under the condition."""
+    lengths = [len(run.under(condition)["outcome"]) for run in runs]
+    driven = [number for number in lengths if number]
+    if not driven:
+        return None
+    rates, fewest, most = own_scores(runs, [condition]), min(driven), max(driven)
+    counts = f"{len(rates)} × {fewest}" + (f"–{most}" if most > fewest else "")
+    return Cell(rates, counts, mean_share([rates], fewest))
+
+
 def grid_of(
     scene: str,
     series: Mapping[str, Sequence[Run]],
     conditions: Sequence[Condition],
-    bootstrap: Bootstrap,
     baselines: Sequence[str] = BASELINES,
 ) -> Grid:
     """Returns the success of several series of runs in a scene; those of others are left out."""
     here = {name: [run for run in runs if run.scene == scene] for name, runs in series.items()}
     cells = {
-        (name, condition): Cell(matrix, bootstrap.success([matrix.outcomes]))
+        (name, condition): cell
         for name, condition in product(series, conditions)
-        if (matrix := outcomes_of(here[name], condition)) is not None
+        if (cell := cell_of(here[name], condition)) is not None
     }
     everybody = [run for runs in here.values() for run in runs]
     shares = {
@@ -307,9 +307,9 @@ def curve_of(run: Run) -> Curve:
     evaluated: dict[int, float] = {}
     for kind in ("training", "final"):  # at the final frames that one alone: other episodes
         chosen = own & (e["evaluation"] == kind)
-        frames, outcomes = e["frames"][chosen], success(e["outcome"][chosen])
+        frames, outcomes = e["frames"][chosen], e["outcome"][chosen]
         at = np.unique(frames).tolist()
-        evaluated |= {f: float(outcomes[frames == f].mean()) for f in at}
+        evaluated |= {f: success_rate([outcomes[frames == f]]) for f in at}
     logged = zip(run.metrics.get("frames", ()), run.metrics.get("success", ()))
     training = [(int(frames), float(share)) for frames, share in logged if not np.isnan(share)]
     return Curve(sorted(evaluated.items()), training)

@@ -6,7 +6,6 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from flowrep.report.figures import draw_bars, draw_curves, draw_rates, encoded, words
@@ -20,23 +19,23 @@ from flowrep.report.runs import (
     Grid,
     Group,
     Run,
-    change,
+    changes,
     curve_of,
+    departures,
     grid_of,
     groups_of,
     in_order,
     in_stacks,
-    out_of_bounds_of_both,
-    pooled,
+    own_scores,
+    paired_scores,
     scenes_of,
-    side_by_side,
 )
-from flowrep.report.statistics import FEWEST_RUNS, Bootstrap, Comparison, Estimate, holm
+from flowrep.report.statistics import Estimate, effect, holm, improvement, mean_share
 from flowrep.report.tables import MISSING, Table, listed, p_text, percent, points, ratio
 
 INTERVALS = (
-    "the mean over seeds with 95 % intervals, by a bootstrap over seeds and episodes; of a single "
-    "seed, or where all resamples agree, Wilson's over the episodes"
+    "the mean over seeds with its 95 % t interval; of a single seed, or of seeds that all end "
+    "alike, Wilson's over the episodes"
 )
 _MOST_PAIRS = 15  # in a table
 _LONGEST_LABEL = 30  # of a config, in a legend
@@ -53,13 +52,6 @@ _EXPERIMENTS = (
     ("complementary", "Flow beside segmentation and depth", COMPLEMENTARY_STACKS, _OF_ADDED),
 )
 _TABLE_III = ("ego+obj", "depth2", "seg2", "ego+obj+depth2", "ego+obj+seg2", _ALL)
-
-
-class Settings(NamedTuple):
-    """A report's choice of evaluations, "greedy" or "sampled", and of intervals."""
-
-    policy: str
-    bootstrap: Bootstrap
 
 
 class Section(NamedTuple):
@@ -82,17 +74,21 @@ class Report(NamedTuple):
     sections: tuple[Section, ...]
 
 
-def assemble(runs: Sequence[Run], warnings: Sequence[str], settings: Settings) -> Report:
-    """Returns the sections for runs, group by group, and the problems found in runs."""
+def assemble(runs: Sequence[Run], warnings: Sequence[str], policy: str = "greedy") -> Report:
+    """Returns the sections for runs, group by group, and the problems found in runs.
+
+    Args:
+        policy: whose evaluations are counted, "greedy" or "sampled".
+    """
     groups = groups_of(runs)
-    wrong = [*warnings, *(w for w in (_unusable(run, settings) for run in runs) if w)]
+    wrong = [*warnings, *(w for w in (_unusable(run, policy) for run in runs) if w)]
     sections = []
     for number, group in enumerate(groups, start=1):
         prefix = f"{number}_" if len(groups) > 1 else ""
-        for section in _group_sections(group, settings):
+        for section in _group_sections(group, policy):
             sections.append(section._replace(folder=prefix + section.name, label=group.label))
     if len(groups) > 1:
-        sections.append(_configs_section(groups, settings)._replace(folder="configs"))
+        sections.append(_configs_section(groups, policy)._replace(folder="configs"))
     return Report(tuple(runs), tuple(wrong), tuple(sections))
 
 
@@ -110,9 +106,9 @@ def write_files(report: Report, folder: Path) -> list[Path]:
     return [folder / section.folder for section in report.sections]
 
 
-def _unusable(run: Run, settings: Settings) -> str | None:
+def _unusable(run: Run, policy: str) -> str | None:
     """Returns why a run fills no cell, None if it does."""
-    policy, unused = settings.policy, "only its learning curve is used"
+    unused = "only its learning curve is used"
     if not run.is_finished:
         reached = f"{run.frames:,} of {run.total_frames:,} frames"
         return f"{run.name} is not finished, at {reached}: {unused}"
@@ -122,23 +118,23 @@ def _unusable(run: Run, settings: Settings) -> str | None:
     return None
 
 
-def _group_sections(group: Group, settings: Settings) -> list[Section]:
-    runs = [run for run in group.runs if _unusable(run, settings) is None]
+def _group_sections(group: Group, policy: str) -> list[Section]:
+    runs = [run for run in group.runs if _unusable(run, policy) is None]
     if not runs:
         return _curves(group.runs)
     found = in_stacks(runs)
     sections, shown = [], set[str]()
     for name, title, stacks, pairs in _EXPERIMENTS:
         if len({*found} & {*stacks}) > 1:
-            series = {stack: found.get(stack, []) for stack in stacks}
-            sections.append(_success_section(name, title, series, pairs, settings))
+            series = {stack: found[stack] for stack in stacks if stack in found}
+            sections.append(_success_section(name, title, series, pairs, policy))
             shown |= {*stacks}
     if {*found} - shown:
         every = list(combinations(reversed(found), 2))
-        sections.append(_success_section("success", "Success", found, every, settings))
-    sections.append(_failure_section(runs, settings))
-    if len(_rates(runs, settings.policy)) > 1:
-        sections.append(_rate_section(runs, settings))
+        sections.append(_success_section("success", "Success", found, every, policy))
+    sections.append(_failure_section(runs, policy))
+    if len(_rates(runs, policy)) > 1:
+        sections.append(_rate_section(runs, policy))
     return [*sections, *_curves(group.runs)]
 
 
@@ -160,21 +156,21 @@ def _success_section(
     title: str,
     series: Mapping[str, Sequence[Run]],
     pairs: Sequence[tuple[str, str]],
-    settings: Settings,
+    policy: str,
     baselines: Sequence[str] = BASELINES,
 ) -> Section:
     runs = [run for members in series.values() for run in members]
-    policy, bootstrap = settings
-    conditions = _at_speeds(runs, policy)
-    grids = [grid_of(s, series, conditions, bootstrap, baselines) for s in scenes_of(runs)]
+    conditions, scenes = _at_speeds(runs, policy), scenes_of(runs)
+    grids = [grid_of(scene, series, conditions, baselines) for scene in scenes]
     trained = listed(sorted({run.speed for run in runs}))
     caption = (
         f"Success of agents trained at {trained} speed, {policy} actions, {runs[0].fps:g} frames "
         f"per second: {INTERVALS}; dots are the seeds."
     )
-    tables = [_success_table(name, grids, caption, bootstrap)]
-    tables += _difference_tables(name, grids, pairs, bootstrap)
-    return Section(name, title, tuple(tables), draw_bars(grids), caption)
+    table = _success_table(name, grids, caption)
+    differences = _differences_table(name, series, scenes, conditions, pairs)
+    tables = (table, differences) if differences.blocks else (table,)
+    return Section(name, title, tables, draw_bars(grids), caption)
 
 
 def _shares(grid: Grid, series: str) -> list[str]:
@@ -182,14 +178,14 @@ def _shares(grid: Grid, series: str) -> list[str]:
     return [percent(cell.score) if cell else MISSING for cell in cells]
 
 
-def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bootstrap) -> Table:
+def _success_table(name: str, grids: Sequence[Grid], caption: str) -> Table:
     _, series, conditions, *_ = grids[0]
     blocks = []
     for grid in grids:
         rows = []
         for one in series:
             cells = [grid.cells[one, c] for c in conditions if (one, c) in grid.cells]
-            counts = dict.fromkeys(cell.matrix.counts for cell in cells)
+            counts = dict.fromkeys(cell.counts for cell in cells)
             rows.append((one, *_shares(grid, one), ", ".join(counts) or "0"))
         for baseline in dict.fromkeys(baseline for baseline, _ in grid.baselines):
             shares = [grid.baselines.get((baseline, c)) for c in conditions]
@@ -199,8 +195,8 @@ def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bo
     if len(grids) > 1:
 
         def over_all(place: tuple[str, Condition]) -> str:
-            found = [g.cells[place].matrix.outcomes for g in grids if place in g.cells]
-            return percent(bootstrap.success(found)) if len(found) == len(grids) else MISSING
+            found = [grid.cells[place].rates for grid in grids if place in grid.cells]
+            return percent(mean_share(found)) if len(found) == len(grids) else MISSING
 
         rows = [(one, *(over_all((one, c)) for c in conditions), "") for one in series]
         blocks.append((f"All {len(grids)} scenes", tuple(rows)))
@@ -208,72 +204,67 @@ def _success_table(name: str, grids: Sequence[Grid], caption: str, bootstrap: Bo
     return Table(f"{name}_success", f"In %. {caption}", header, tuple(blocks))
 
 
-def _difference_tables(
-    name: str, grids: Sequence[Grid], pairs: Sequence[tuple[str, str]], bootstrap: Bootstrap
-) -> list[Table]:
-    chosen = pairs[:_MOST_PAIRS]
-    places = [(words(grid.scene), [grid]) for grid in grids]
-    if len(grids) > 1:
-        places.append((f"All {len(grids)} scenes", list(grids)))
+def _differences_table(
+    name: str,
+    series: Mapping[str, Sequence[Run]],
+    scenes: Sequence[str],
+    conditions: Sequence[Condition],
+    pairs: Sequence[tuple[str, str]],
+) -> Table:
+    asked = [pair for pair in pairs if {*pair} <= {*series}]
+    chosen = asked[:_MOST_PAIRS]
+    places = [(words(scene), [scene]) for scene in scenes]
+    if len(scenes) > 1:
+        places.append((f"All {len(scenes)} scenes", list(scenes)))
     blocks = []
-    for heading, members in places:
-        found = [
-            (f"{first} − {second}", c.speed, *compared)
-            for (first, second), c in product(chosen, grids[0].conditions)
-            if (compared := _compared(members, (first, c), (second, c), bootstrap)) is not None
-        ]
-        corrected = holm([c.p_value for _, _, c, _ in found])
+    for heading, here in places:
+        found = []
+        for pair, condition in product(chosen, conditions):
+            sides = [[[r for r in series[s] if r.scene == scene] for s in pair] for scene in here]
+            scored = [paired_scores(of_scene, [condition]) for of_scene in sides]
+            known = [(ours, theirs, number) for (ours, theirs), number in filter(None, scored)]
+            if len(known) == len(here):
+                found.append((pair, condition.speed, known))
+        effects = [effect([sides[:2] for sides in known]) for *_, known in found]
+        corrected = holm([effect.p_value for effect in effects])
         rows = []
-        for (pair, speed, c, shared), p in zip(found, corrected):
-            cells = (points(c.difference), c.verdict(p), percent(c.improvement))
-            rows.append((pair, speed, *cells, p_text(c.p_value), p_text(p), str(shared)))
+        for (pair, speed, known), difference, p in zip(found, effects, corrected):
+            better = f"{100 * improvement([sides[:2] for sides in known]):.0f}"
+            verdict, shared = difference.verdict(p), sum(number for *_, number in known)
+            p_values = p_text(difference.p_value), p_text(p)
+            cells = (speed, points(difference.interval()), verdict, *p_values, better, str(shared))
+            rows.append((" − ".join(pair), *cells))
         if rows:
             blocks.append((heading, tuple(rows)))
     caption = (
         "First minus second in percentage points, on the episodes that all runs of both drove, "
-        "with 95 % bootstrap intervals over seeds and episodes; the probability that a run of the "
-        "first beats one of the second (a tie counts half); p of Welch's t-test over seeds, and "
-        "corrected by Holm for the comparisons of its block. A difference is told from noise where "
-        "its interval leaves out 0 and the corrected p < 0.05; of fewer than "
-        f"{FEWEST_RUNS} seeds a side it is one of these agents."
+        "with 95 % intervals and p of Welch's t-test over seeds; p (Holm) is corrected for the "
+        "comparisons of its block, and a difference counts if it is below 0.05. P(first better) "
+        "is how often a run of the first beats one of the second, a tie counting half."
     )
-    if len(chosen) < len(pairs):
-        caption += f" The first {len(chosen)} of {len(pairs)} pairs."
-    columns = ("speed", "points", "verdict", "P(first better) (%)", "p", "p (Holm)", "shared")
+    if len(chosen) < len(asked):
+        caption += f" The first {len(chosen)} of {len(asked)} pairs."
+    columns = ("speed", "points", "verdict", "p", "p (Holm)", "P(first better) (%)", "shared")
     header = ("first − second", *columns)
-    return [Table(f"{name}_differences", caption, header, tuple(blocks), (1, 3))] if blocks else []
+    return Table(f"{name}_differences", caption, header, tuple(blocks), (1, 3))
 
 
-def _compared(
-    grids: Sequence[Grid],
-    first: tuple[str, Condition],
-    second: tuple[str, Condition],
-    bootstrap: Bootstrap,
-) -> tuple[Comparison, int] | None:
-    # A comparison over scenes, and the number of its episodes; None where a side has none.
-    if not all({first, second} <= {*grid.cells} for grid in grids):
-        return None
-    sides = [side_by_side(grid.cells[first].matrix, grid.cells[second].matrix) for grid in grids]
-    shared = [ours.shape[1] for ours, _ in sides]
-    return (bootstrap.compare(sides), sum(shared)) if all(shared) else None
-
-
-def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
+def _failure_section(runs: Sequence[Run], policy: str) -> Section:
     # The paper's Table III, which is of low and high speed together.
-    fps, driven = runs[0].fps, {c.speed for c in _at_speeds(runs, settings.policy)}
+    fps, driven = runs[0].fps, {c.speed for c in _at_speeds(runs, policy)}
     speeds = ["low", "high"] if {"low", "high"} <= driven else [runs[0].speed]
-    conditions = [Condition(settings.policy, speed, fps) for speed in speeds]
+    conditions = [Condition(policy, speed, fps) for speed in speeds]
     stacks = in_order([run.stack for run in runs], _TABLE_III)
     blocks = []
     for scene in in_order(scenes_of(runs), ("s_turn",)):
         here = in_stacks([run for run in runs if run.scene == scene])
-        rows = [(s, *_failure_cells(here.get(s, []), conditions, settings)) for s in stacks]
+        rows = [(stack, *_failure_cells(here.get(stack, []), conditions)) for stack in stacks]
         blocks.append((words(scene), tuple(rows)))
     caption = (
-        "Causes of failure in % of collisions and departures from the road together, of all seeds; "
-        "time-outs are left out. 95 % intervals by a bootstrap over seeds and episodes, of a "
-        f"single seed Wilson's. {words(' and '.join(speeds))} speed, {fps:g} frames per second, "
-        f"{settings.policy} actions."
+        "Causes of failure in % of a run's collisions and departures from the road together, "
+        "time-outs left out: the mean over seeds with its 95 % t interval; of a single seed, or of "
+        f"seeds that all end alike, Wilson's. {words(' and '.join(speeds))} speed, {fps:g} frames "
+        f"per second, {policy} actions."
     )
     header = ("representations", "out of bounds (%)", "collision (%)", "out of bounds to collision")
     counts = ("failures", "time-outs", "episodes")
@@ -281,36 +272,35 @@ def _failure_section(runs: Sequence[Run], settings: Settings) -> Section:
     return Section("failure_causes", "Causes of failure", (table,))
 
 
-def _failure_cells(
-    runs: Sequence[Run], conditions: Sequence[Condition], settings: Settings
-) -> tuple[str, ...]:
-    outcomes = pooled(runs, conditions, out_of_bounds_of_both)
-    timeouts = pooled(runs, conditions, lambda ends: (ends == "timeout").astype(float))
-    if outcomes is None or timeouts is None:
+def _failure_cells(runs: Sequence[Run], conditions: Sequence[Condition]) -> tuple[str, ...]:
+    ours = [run for run in runs if run.conditions.issuperset(conditions)]
+    if not ours:
         return (*[MISSING] * 3, "0", "0", "0")
-    share = settings.bootstrap.pooled_share(outcomes)
-    counts = ((~np.isnan(outcomes)).sum(), np.nansum(timeouts), (~np.isnan(timeouts)).sum())
-    counted = tuple(str(int(number)) for number in counts)
-    if np.isnan(share.value):
+    ends = Counter(str(end) for r in ours for c in conditions for end in r.under(c)["outcome"])
+    failures = ends["out_of_bounds"] + ends["collision"]
+    counted = (str(failures), str(ends["timeout"]), str(ends.total()))
+    shares = own_scores(ours, conditions, departures)
+    if not len(shares):
         return (*["no failures"] * 3, *counted)
+    share = mean_share([shares], failures // len(shares))
     collisions = Estimate(1 - share.value, 1 - share.high, 1 - share.low)
     return (percent(share, 1), percent(collisions, 1), ratio(share), *counted)
 
 
-def _rate_section(runs: Sequence[Run], settings: Settings) -> Section:
-    policy, speed, trained = settings.policy, runs[0].speed, runs[0].fps
+def _rate_section(runs: Sequence[Run], policy: str) -> Section:
+    speed, trained = runs[0].speed, runs[0].fps
     ours = [run for run in runs if len(_rates([run], policy)) > 1]
     conditions = [Condition(policy, speed, rate) for rate in _rates(ours, policy)]
     low, high = conditions[0], conditions[-1]
     series = in_stacks(ours)
-    grids = [grid_of(scene, series, conditions, settings.bootstrap) for scene in scenes_of(ours)]
+    grids = [grid_of(scene, series, conditions) for scene in scenes_of(ours)]
     blocks = []
     for grid in grids:
         rows = []
         for name, members in series.items():
-            changes = change([run for run in members if run.scene == grid.scene], high, low)
-            lost = MISSING if changes is None else points(settings.bootstrap.mean([changes]))
-            rows.append((name, *_shares(grid, name), lost))
+            lost = changes([run for run in members if run.scene == grid.scene], high, low)
+            told = points(effect([(lost,)]).interval()) if len(lost) else MISSING
+            rows.append((name, *_shares(grid, name), told))
         blocks.append((words(grid.scene), tuple(rows)))
     caption = (
         f"Success over the frame rate of the evaluation, trained at {trained:g} frames per second, "
@@ -339,7 +329,7 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
     return [Section("learning_curves", "Learning curves", (), draw_curves(panels), caption)]
 
 
-def _configs_section(groups: Sequence[Group], settings: Settings) -> Section:
+def _configs_section(groups: Sequence[Group], policy: str) -> Section:
     # Stacks that have runs of several configs, side by side and never pooled.
     keys = dict.fromkeys(key for group in groups for key in group.differences)
     labels = [group.label for group in groups]
@@ -351,7 +341,7 @@ def _configs_section(groups: Sequence[Group], settings: Settings) -> Section:
     table = Table("configs", caption, ("key", *configs), (("", tuple(rows)),), columns)
 
     series: dict[tuple[str, str], list[Run]] = {}  # of a stack and a config
-    usable = [[run for run in g.runs if _unusable(run, settings) is None] for g in groups]
+    usable = [[run for run in g.runs if _unusable(run, policy) is None] for g in groups]
     places = Counter(place for runs in usable for place in {(r.scene, r.stack) for r in runs})
     shared = [place for place, configs_there in places.items() if configs_there > 1]
     for stack in in_order([stack for _, stack in shared], STACKS):
@@ -362,5 +352,5 @@ def _configs_section(groups: Sequence[Group], settings: Settings) -> Section:
         return Section("configs", "Configs that differ", (table,))
     named = {", ".join(place): runs for place, runs in series.items()}
     pairs = [(", ".join(b), ", ".join(a)) for a, b in combinations(series, 2) if a[0] == b[0]]
-    section = _success_section("configs", "Configs that differ", named, pairs, settings, ())
+    section = _success_section("configs", "Configs that differ", named, pairs, policy, ())
     return section._replace(tables=(table, *section.tables))

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.run import RunFolder, RunFolderError
 from flowrep.report.runs import Columns, Run
 from flowrep.tables import TableError
@@ -28,6 +29,8 @@ from flowrep.tables import TableError
 RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
 Cells = Mapping[str, Sequence[str]]
 _MACHINE = ("commit", "precision", "cpu")
+_OUTCOMES = OUTCOMES[1:]  # the first is that of an episode that goes on
+_MOST_VALUES = 100_000  # of a config, which has a few hundred
 _EPISODES: dict[str, type] = {
     "scene": str, "scene_id": str, "frames": int, "evaluation": str, "policy": str, "speed": str,
     "fps": float, "episode_seed": int, "outcome": str, "hit": str, "length": int,
@@ -66,14 +69,32 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
 def read_run(path: Path) -> Run:
     """Returns the run in a folder; raises RunFolderError or TableError for a damaged one."""
     folder = RunFolder.existing(path)
-    config, tables = folder.read_config(), (folder.read_episodes(), folder.read_metrics())
-    episodes, metrics = ({k: [row[k] for row in t] for k in (t[0] if t else ())} for t in tables)
     try:
+        config = folder.read_config()
+        _check_size(config)
+        tables = folder.read_episodes(), folder.read_metrics()
+        episodes, metrics = (
+            {k: [row[k] for row in t] for k in (t[0] if t else ())} for t in tables
+        )
         columns = episode_columns(episodes), _metric_columns(metrics)
         return Run(str(path), config, *columns, path, _machine(path / "machine.json"))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (RunFolderError, TableError):
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         what = f"config.yaml or a table is not what a run leaves ({error!r})"
         raise RunFolderError(f"{path}: {what}; restore the file that the run wrote") from None
+
+
+def _check_size(config: Any) -> None:
+    # YAML's references make a few lines stand for more values than any loop gets through.
+    waiting, values = [config], 0
+    while waiting:
+        part, values = waiting.pop(), values + 1
+        if values > _MOST_VALUES:
+            raise ValueError(f"it has more than {_MOST_VALUES:,} values")
+        waiting += (
+            part.values() if isinstance(part, dict) else part if isinstance(part, list) else []
+        )
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
@@ -91,7 +112,15 @@ def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
 def episode_columns(cells: Cells) -> Columns:
     """Returns the columns of evaluation.csv that a report reads, "" in those that it lacks."""
     empty = [""] * len(cells.get("frames", ()))
-    return {name: np.array(cells.get(name, empty), kind) for name, kind in _EPISODES.items()}
+    columns: Columns = {
+        name: np.array(cells.get(name, empty), kind) for name, kind in _EPISODES.items()
+    }
+    # A misspelt success would count as a failure.
+    unknown = {*columns["outcome"].tolist()} - {*_OUTCOMES}
+    if unknown:
+        names = ", ".join(map(repr, sorted(unknown)))
+        raise ValueError(f"unknown outcome {names} of an episode; known: {', '.join(_OUTCOMES)}")
+    return columns
 
 
 def _metric_columns(cells: Cells) -> Columns:
@@ -119,7 +148,10 @@ def read_archive(folder: Path, pattern: str = "*") -> list[Run]:
         name, machine = entry["run"], {key: entry[key] for key in _MACHINE}
         if fnmatch(name, pattern):
             driven, logged = episodes.get(name, {}), training.get(name, {})
-            columns = episode_columns(driven), _metric_columns(logged)
+            try:
+                columns = episode_columns(driven), _metric_columns(logged)
+            except ValueError as error:
+                raise RunFolderError(f"{folder}, run {name}: {error}") from None
             runs.append(Run(name, entry["config"], *columns, machine=machine))
     return runs
 

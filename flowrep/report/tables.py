@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from flowrep.report.statistics import Estimate
 
 MISSING = "missing"
+_NUMBERS = re.compile(r"[-+−0-9.,–\[\] ]+")
 _LATEX: dict[str, str] = {character: rf"\{character}" for character in "&%$#_{}"} | {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     "–": "--", "−": "$-$", "×": r"$\times$", "→": r"$\to$", "∞": r"$\infty$", "≥": r"$\ge$",
@@ -59,10 +61,15 @@ class Table(NamedTuple):
         text = io.StringIO(newline="")
         writer = csv.writer(text, lineterminator="\n")
         first = 0 if any(heading for heading, _ in self.blocks) else 1
-        writer.writerow(["group", *self.header][first:])
-        for heading, rows in self.blocks:
-            writer.writerows([heading, *row][first:] for row in rows)
+        for heading, rows in (("group", (self.header,)), *self.blocks):
+            writer.writerows(map(_inert, (heading, *row)[first:]) for row in rows)
         return text.getvalue()
+
+
+def _inert(cell: str) -> str:
+    # Spreadsheets compute what begins like a formula, such as a folder's name "=1+1".
+    begins = cell.startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{cell}" if begins and not _NUMBERS.fullmatch(cell) else cell
 
 
 def latex_text(text: str) -> str:
@@ -75,15 +82,17 @@ def _latex_row(row: Sequence[str]) -> str:
 
 
 def percent(estimate: Estimate, digits: int = 0) -> str:
-    """Returns a share with its interval in %, as "85 [79–90]"."""
+    """Returns a share with its interval, if it is known, in %, as "85 [79–90]"."""
     value, low, high = (100 * number for number in estimate)
-    return f"{value:.{digits}f} [{low:.0f}–{high:.0f}]"
+    interval = "" if np.isnan(low) else f" [{low:.0f}–{high:.0f}]"
+    return f"{value:.{digits}f}{interval}"
 
 
 def points(estimate: Estimate) -> str:
-    """Returns a difference of shares with its interval in percentage points, as "+12 [−3, +20]"."""
-    value, low, high = (signed(number) for number in estimate)
-    return f"{value} [{low}, {high}]"
+    """Returns a difference with its interval, if it is known, in points, as "+12 [−3, +20]"."""
+    value, low, high = estimate
+    interval = "" if np.isnan(low) else f" [{signed(low)}, {signed(high)}]"
+    return signed(value) + interval
 
 
 def ratio(share: Estimate) -> str:

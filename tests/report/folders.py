@@ -24,6 +24,7 @@ def config_of(scene="straight_road", stack="ego+obj", seed=0, **changes):
             "frame_rate_hz": 12.0,
             "time_limit_steps": {"straight_road": 200}.get(scene, 250),
             "camera": {"height_px": 48, "width_px": 64},
+            "pedestrian_speed_mps": {"low": [0.6, 1], "normal": [1.2, 1.8], "high": [2, 2.4]},
         },
         "algorithm": {"_target_": "flowrep.agent.DiscreteSAC", "tau": 0.02},
     }

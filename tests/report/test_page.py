@@ -17,7 +17,6 @@ from flowrep.report.__main__ import main, report, show
 from flowrep.report.figures import draw_bars, encoded
 from flowrep.report.page import DRIVES, drives_of, tracks_of
 from flowrep.report.runs import Condition, grid_of
-from flowrep.report.statistics import Bootstrap
 from flowrep.report.storage import read_run, read_runs
 from flowrep.report.tables import Table
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
@@ -45,7 +44,7 @@ def sweep(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(sweep):
-    numbers = {"resamples": 20, "trajectories": 1, "videos": 1}
+    numbers = {"trajectories": 1, "videos": 1}
     return report(ReportConfig(run=[str(sweep)], output=None, policy="greedy", **numbers))
 
 
@@ -79,7 +78,7 @@ def test_a_figure_drawn_again_is_the_same_byte_for_byte(tmp_path):
     run = run_in(tmp_path, "run", 3)
     conditions = [Condition("greedy", "normal", 12.0)]
     series = {"ego+obj": [read_run(run)], "ego+obj+seg2": []}
-    grid = grid_of("straight_road", series, conditions, Bootstrap(50))
+    grid = grid_of("straight_road", series, conditions)
     first, second = draw_bars([grid]), draw_bars([grid])
     for kind in ("svg", "pdf"):
         assert encoded(first, kind) == encoded(second, kind)
@@ -181,3 +180,44 @@ def test_a_plan_and_films_of_one_agent_of_each_stack(tmp_path):
     ((episode, (film,)),) = drives.films.items()
     assert (episode, film.data) == ("Straight Road, A", "data:video/mp4;base64,ZmlsbQ==")
     assert drives.warnings == []
+
+
+def test_a_run_whose_scene_is_unknown_is_a_line_and_the_others_have_their_plan(tmp_path):
+    scene = yaml.safe_load((CONF_DIR / "scene" / "straight_road.yaml").read_text())
+    for stack, changes in (("raw", {}), ("ego", {"paths": "nowhere"})):
+        config = config_of(stack=stack) | {"scene": scene | changes}
+        write_drives(write_run(tmp_path / stack, config, rows_of(config, "sco")))
+    runs, _ = read_runs([tmp_path])
+    drives = drives_of(runs, trajectories=1, videos=0)
+    assert [plan.title.split(",")[0] for plan in drives.plans["Straight Road"]] == ["raw"]
+    (warning,) = drives.warnings
+    assert str(tmp_path / "ego") in warning
+    assert "paths" in warning
+
+
+def test_drives_with_an_unknown_outcome_or_of_another_shape_are_not_drawn(tmp_path):
+    run = run_in(tmp_path, "run", "sco")
+    write_drives(run, outcome=np.array(["success", "won", "crash"]))
+    (track,) = tracks_of(read_run(run), 3)
+    assert track.outcome == "success"
+    for changes in ({"positions": np.zeros(5)}, {"starts": np.array([0])}):
+        write_drives(run, **changes)
+        assert tracks_of(read_run(run), 3) == []
+
+
+@pytest.mark.parametrize("linked", ["film", "folder"])
+def test_a_film_that_lies_outside_of_the_run_is_not_embedded(tmp_path, linked):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "a.mp4").write_bytes(b"secret")
+    run = run_in(tmp_path, "run", "sco")
+    if linked == "folder":
+        (run / "videos").symlink_to(tmp_path / "elsewhere")
+    else:
+        (run / "videos").mkdir()
+        (run / "videos" / "a.mp4").symlink_to(tmp_path / "elsewhere" / "a.mp4")
+    drives = drives_of([read_run(run)], trajectories=0, videos=1)
+    assert drives.films == {}
+    (warning,) = drives.warnings
+    # the remedy is one that the command takes
+    command, _, value = warning.rpartition(" ")[2].partition("=")
+    assert (command, value) == ("video", "1")

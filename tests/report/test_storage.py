@@ -13,6 +13,10 @@ from flowrep.experiment.run import RunFolderError
 from flowrep.report.storage import EPISODES, read_run, read_runs, without_repeats, write_archive
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
+BOMB = "a0: &a0 [x]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 12)
+)
+
 
 def names(runs):
     return [run.folder.name for run in runs]
@@ -37,6 +41,11 @@ def test_runs_are_found_wherever_they_lie_and_once(tmp_path, name):
         ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
+        ("machine.json", "{", "bad"),
+        ("config.yaml", "a: " + "[" * 5000, "config.yaml"),
+        # each line stands for ten times as many values as the one before
+        ("config.yaml", BOMB, "values"),
+        ("config.yaml", "scene: &again [*again]\n", "values"),
     ],
 )
 def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, text, expected):
@@ -105,3 +114,23 @@ def test_packed_runs_are_chosen_by_name(tmp_path):
     assert [run.name for run in runs] == ["ab", "ac"]
     with pytest.raises(RunFolderError):
         read_runs([tmp_path / "p" / "z*"])
+
+
+def test_an_outcome_that_is_not_known_is_named_and_its_run_left_out(tmp_path):
+    run_in(tmp_path, "good")
+    config = config_of(seed=1)
+    rows = rows_of(config, "sss")
+    rows[1]["outcome"] = "sucess"  # as a failure it would make this 2 of 3
+    write_run(tmp_path / "bad", config, rows)
+    runs, (warning,) = read_runs([tmp_path])
+    assert names(runs) == ["good"]
+    assert "/bad" in warning
+    assert "'sucess'" in warning
+
+
+def test_a_packed_run_with_an_unknown_outcome_is_named(tmp_path):
+    run = read_run(run_in(tmp_path, "a"))
+    run.episodes["outcome"][0] = "won"
+    write_archive([run], tmp_path / "packed")
+    with pytest.raises(RunFolderError, match=r"run a: .*'won'"):
+        read_runs([tmp_path / "packed"])
