@@ -18,7 +18,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from tqdm.auto import tqdm
 
 from flowrep.baselines import BaselinePolicy
 from flowrep.config import UsageError
@@ -30,6 +29,7 @@ from flowrep.experiment.evaluation import Episode, Policy, evaluate, print_table
 from flowrep.experiment.film import Maps, draw_frames, film_episode, make_filmed, maps_of
 from flowrep.palette import CATEGORY_ID
 from flowrep.policies import load_agent
+from flowrep.progress import progress_bar
 from flowrep.scenes import Scene
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.scene import NO_OP, TURN_LEFT, TURN_RIGHT
@@ -84,10 +84,11 @@ def view(
 ) -> None:
     """Drives episodes and writes their pictures, plan, video and tables into a folder."""
     scene, fps = env.base_env.scene, env.base_env.frame_rate_hz
-    with tqdm(desc="driving", unit="frame") as bar:
+    with progress_bar(what="driving", desc="driving", unit="frame") as bar:
         frames, episode = film_episode(env, agent.policy, options[0], lambda _: bar.update())
     episodes = [episode, *drive_on(config, agent, options[1:])]
-    strips = list(draw_frames(tqdm(frames, desc="drawing", unit="frame"), env))
+    shown = progress_bar(frames, what="drawing", desc="drawing", unit="frame")
+    strips = list(draw_frames(shown, env))
     chosen = moments([moving_pixels(maps) for maps in frames], config.sheet_rows)
     folder.mkdir(parents=True, exist_ok=True)
     write_png(folder / "sheet.png", contact_sheet(strips[i] for i in chosen))
@@ -116,7 +117,8 @@ def drive_on(config: ViewConfig, agent: Agent, options: list[dict[str, Any]]) ->
         return []
     env = make_env_of(config, agent)(num_envs=min(ENVS, len(options)))
     found = evaluate(env, agent.policy, options)
-    episodes = list(tqdm(found, desc="driving on", unit="episode", total=len(options)))
+    counted = {"desc": "driving on", "unit": "episode", "total": len(options)}
+    episodes = list(progress_bar(found, what="driving on", **counted))
     env.close()
     return sorted(episodes, key=lambda episode: episode.seed)
 
