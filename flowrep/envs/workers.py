@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +21,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory, read_from_shared_memory
 from numpy.typing import NDArray
 
+from flowrep.progress import STOP_SIGNALS, StopRequest
+
 Arrays = dict[str, Any]  # arrays, nested like a Dict space
 EnvFactory = Callable[[], gym.Env]
 VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
@@ -27,8 +30,13 @@ VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
 
+PATIENCE_S, PATIENCE_AFTER_STOP_S = 300.0, 10.0
+"""How long a worker may take to answer: it starts in seconds and steps in milliseconds, but the
+machine may be busy. Once a signal asked the process to stop, what ends it may soon be SIGKILL."""
+
+
 class WorkerError(RuntimeError):
-    """A worker process failed or died; the message names it."""
+    """A worker process failed, died or doesn't answer; the message names it."""
 
 
 class WorkerVectorEnv(VectorEnv):
@@ -40,8 +48,8 @@ class WorkerVectorEnv(VectorEnv):
     workers.
 
     Observations come back through shared memory, everything else through pipes. Workers don't react
-    to SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, and end when
-    the caller closes them or dies.
+    to SIGINT, SIGTERM and SIGHUP, which terminals and schedulers send to whole process groups, and
+    end when the caller closes them or dies.
 
     Args:
         env_factories: one picklable factory for each environment, from a module that can be
@@ -50,7 +58,8 @@ class WorkerVectorEnv(VectorEnv):
         in_each: makes a vector env without autoreset from the environments of one worker.
 
     Raises:
-        WorkerError: if a worker could not start; any method raises it if a worker has stopped.
+        WorkerError: if a worker could not start; any method raises it if a worker has ended, or
+            does not answer.
     """
 
     def __init__(
@@ -177,11 +186,23 @@ class _Worker:
         self._owes_answer = True
 
     def receive(self) -> Any:
-        result, failure = self._talk(self.pipe.recv)
+        result, failure = self._talk(self._receive_within_patience)
         self._owes_answer = False
         if failure:
             raise WorkerError(f"the worker process of {self.name} failed:\n{failure}")
         return result
+
+    def _receive_within_patience(self) -> Any:
+        begun = time.monotonic()
+        while not self.pipe.poll(1.0):
+            waited = time.monotonic() - begun
+            if waited > (PATIENCE_AFTER_STOP_S if StopRequest.was_received else PATIENCE_S):
+                pid = self.process.pid
+                raise WorkerError(
+                    f"the worker process of {self.name} has not answered for {waited:.0f} s: if "
+                    f"process {pid} is suspended, 'kill -CONT {pid}' lets it go on"
+                )
+        return self.pipe.recv()
 
     def _talk(self, act: Callable[..., Any], *args: Any) -> Any:
         try:
@@ -198,8 +219,9 @@ def _end(workers: list[_Worker]) -> None:
     """Closes the pipes, upon which workers end, and waits for that."""
     for worker in workers:
         worker.pipe.close()
+    deadline = time.monotonic() + 5.0
     for worker in workers:
-        worker.process.join(timeout=5.0)
+        worker.process.join(timeout=max(0.0, deadline - time.monotonic()))
         if worker.process.is_alive():
             worker.process.kill()
             worker.process.join()
@@ -254,7 +276,7 @@ def sheltered() -> Iterator[None]:
     resource_tracker.ensure_running()  # which unblocks signals when it starts
     # A process inherits the mask of blocked signals, so there is no moment at which Ctrl-C could
     # print a traceback from each worker.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     # Running the main module again, as multiprocessing does, would import PyTorch in each.
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")

@@ -13,7 +13,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from flowrep.envs import WorkerError, WorkerVectorEnv
+from flowrep.envs import WorkerError, WorkerVectorEnv, workers
+from flowrep.progress import StopRequest
 
 pytestmark = pytest.mark.slow
 
@@ -165,8 +166,28 @@ def test_signals_of_terminals_and_schedulers_reach_no_worker_from_its_first_mome
     worker = make(2, 2)._workers[0]
     with open(f"/proc/{worker.process.pid}/status") as file:
         blocked = int(dict(line.split(":") for line in file)["SigBlk"], 16)
-    assert all(blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM))
-    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & {signal.SIGINT, signal.SIGTERM}
+    asked = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    assert all(blocked >> (number - 1) & 1 for number in asked)
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & asked
+
+
+@pytest.mark.parametrize("is_asked_to_stop", [False, True])
+def test_a_suspended_worker_is_named_and_neither_waited_for_nor_left_behind(
+    make, monkeypatch, is_asked_to_stop
+):
+    short = "PATIENCE_AFTER_STOP_S" if is_asked_to_stop else "PATIENCE_S"
+    env = make(4, 2)
+    env.reset(seed=0)
+    process = env._workers[1].process
+    os.kill(process.pid, signal.SIGSTOP)
+    monkeypatch.setattr(workers, short, 0.5)
+    with StopRequest():
+        if is_asked_to_stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(WorkerError, match=rf"environments 2 to 3 .*CONT {process.pid}'"):
+            env.step(np.array([1, 1, 1, 1]))
+    env.close()
+    assert process.exitcode == -signal.SIGKILL
 
 
 HOLDER = """
