@@ -15,10 +15,9 @@ from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.workers import available_cores
-from flowrep.experiment.evaluation_pool import EvaluationPool, can_travel
 from flowrep.simulator.camera import choose_renderer
 
-ENVS_PER_PROCESS = 24  # of an evaluation: a step of few costs as much as one of many
+ENVS_PER_WORKER = 24  # of an evaluation: fewer aren't worth the start of a process
 
 
 def device(name: str) -> torch.device:
@@ -74,12 +73,11 @@ def _workers_help(config: EnvConfig) -> bool:
     return config.flow.source != "exact" or choose_renderer(config.renderer) == "pybullet"
 
 
-def evaluation_pool(config: EnvConfig, policy: Any, num_envs: int) -> EvaluationPool | None:
-    """Returns processes that evaluate a policy; None if this one alone does, with its workers."""
-    if device(config.device).type != "cpu" or not can_travel(policy):
-        return None
-    count = min(worker_count(config.num_workers, config.num_envs), num_envs // ENVS_PER_PROCESS)
-    return EvaluationPool(count) if count > 1 else None
+def evaluation_workers(config: EnvConfig, num_envs: int) -> int:
+    """Returns the number of processes that step an evaluation's environments."""
+    if isinstance(config.num_workers, int):
+        return min(config.num_workers, num_envs)
+    return worker_count("auto", num_envs // ENVS_PER_WORKER)
 
 
 def agent(config: TrainConfig, env: EnvBase) -> Algorithm:

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from flowrep.agent import (
     DivergenceError,
@@ -27,9 +26,8 @@ from flowrep.envs.workers import available_cores
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import OUTCOMES, Comparison, print_results
-from flowrep.experiment.evaluation_pool import EvaluationPool
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
-from flowrep.progress import Every, StopRequest, Stopwatch
+from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
 
 EVALUATION_ENVS = 96  # side by side at least: more make a step of each cheaper
 EVALUATION_SEED = 1_000_000  # of the first episode evaluated during training
@@ -55,7 +53,6 @@ class Runner:
         self.observation: TensorDictBase | None = None  # what is acted on next
         self.evaluation_pending = False  # the last one was interrupted and has to be run again
         self.metrics, self.recent = Means(), RecentEpisodes()
-        self._pool: EvaluationPool | None = None
 
     def train(self, stop: StopRequest) -> None:
         """Trains until `total_frames` or until a stop is requested, and saves the last state."""
@@ -73,7 +70,9 @@ class Runner:
         if self.evaluation_pending:
             self.evaluation_pending = not self.evaluate("training", stop)
         progress = {"total": total, "initial": self.frames, "unit": "frame", "unit_scale": True}
-        with tqdm(**progress, miniters=0, mininterval=0.5, dynamic_ncols=True) as bar:
+        with progress_bar(
+            what="training", **progress, miniters=0, mininterval=0.5, dynamic_ncols=True
+        ) as bar:
             while self.frames < total and not stop:
                 with self.clock("policy"):
                     acted = self.act()
@@ -116,7 +115,7 @@ class Runner:
                 f"({cause})"
             ) from error
 
-    def learn(self, bar: tqdm) -> None:
+    def learn(self, bar: Any) -> None:
         """Takes the updates that are due after the frames so far."""
         for _ in range(self.agent.updates_due(self.frames)):
             bar.update(0)  # its clock goes on: an update of the paper's size takes a second
@@ -151,10 +150,7 @@ class Runner:
         agent = Agent(self.agent.policy, config, self.frames)
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
-            if self._pool is None:
-                most = min(num_envs, max(asked.episodes, asked.final_total))
-                self._pool = build.evaluation_pool(config, agent.policy, most)
-            comparison.run(agent.make_env, agent.policy, num_envs, stop=stop, pool=self._pool)
+            comparison.run(agent.make_env, agent.policy, num_envs, stop=stop)
         if comparison.done < comparison.total:
             return False
         rows = comparison.rows(**agent.origin(kind))
@@ -182,10 +178,7 @@ class Runner:
             print(f"video: {path}")
 
     def close(self) -> None:
-        """Ends the processes of environments and evaluation."""
-        if self._pool is not None:
-            self._pool.close()
-            self._pool = None
+        """Ends the processes of the environments."""
         if not self.env.is_closed:
             self.env.close()
 
