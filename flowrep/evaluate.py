@@ -12,9 +12,11 @@ from flowrep.extras import require
 
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
+from flowrep.agent import keep_freed_memory
 from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
 from flowrep.config.schema import EvaluateConfig
+from flowrep.experiment import build
 from flowrep.experiment.agents import Agent, load_trained
 from flowrep.experiment.evaluation import Comparison, print_results
 from flowrep.experiment.film import record_episode
@@ -37,6 +39,7 @@ def run(config: EvaluateConfig) -> None:
     A folder in use, or an agent that can't be evaluated or saved, is reported and does not stop the
     others; the exit code is then 1. Baselines drive once in each scene.
     """
+    keep_freed_memory()
     targets = targets_of(config)
     comparisons: dict[str, Comparison] = {}
     failed: list[str] = []
@@ -84,6 +87,8 @@ def evaluate_one(
 ) -> None:
     """Runs an agent's episodes, keeps finished ones even if interrupted, and films some."""
     agent, folder = target.load(), target.folder
+    if not config.own_policies:  # whose networks may be large
+        build.share_cores(agent.config)
     origin = agent.origin("evaluate")
     # agents of one scene share the baselines' episodes
     episodes = config.speed, config.fps, config.episodes, config.seed

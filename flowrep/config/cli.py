@@ -32,7 +32,7 @@ from flowrep.config.schema import Section, validated
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output")
 """Keys whose values are folders, which may have any name."""
-OF_THE_MACHINE = ("device", "num_workers")
+OF_THE_MACHINE = ("device", "num_workers", "threads")
 """Keys that don't define a run and may change when it is resumed."""
 IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
 
@@ -223,12 +223,14 @@ def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
         if text.startswith("--") and key[2:] in {*keys, *config_groups()}:
             raise UsageError(f"'{text}': write {key[2:]}=<value>, without --")
         may_be_bare = "run" in keys and text[:1] not in "-~+" and not previous.startswith("-")
-        if may_be_bare and (text == key or Path(text).exists()):
+        # the rest of a list that the shell split at a space; Hydra refuses its beginning
+        in_list = re.match(r"[^=]+=\[[^\]]*$", previous) is not None
+        if may_be_bare and not in_list and (text == key or Path(text).exists()):
             folders.append(text)
         else:
             is_name = key in FOLDERS and value and _is_misread(key, value)
             others.append(override(key, value) if is_name else text)
-        previous = text
+        previous = f"{previous} {text}" if in_list else text
     if not folders:
         return others
     if any(text.startswith("run=") for text in others):

@@ -11,6 +11,7 @@ import torch
 from torchrl.envs import EnvBase, InitTracker
 
 from flowrep.agent import Algorithm
+from flowrep.agent.observation import resolved_precision
 from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
 from flowrep.envs import make_env, make_mirror
@@ -53,6 +54,27 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
         num_workers = 0
     arguments["num_workers"] = worker_count(num_workers, arguments["num_envs"])
     return make_env(**arguments).append_transform(InitTracker())
+
+
+def share_cores(config: EnvConfig) -> None:
+    """Has this process use one thread on a CPU, except for updates and estimated flow.
+
+    Nothing else is large enough to gain by a second one, and beside another program's work, threads
+    that wait for each other make a step take up to a hundred times as long.
+    """
+    if device(config.device).type == "cpu" and config.flow.source == "exact":
+        torch.set_num_threads(1)
+
+
+def with_precision(config: TrainConfig) -> TrainConfig:
+    """Returns a new run's config with the number format that `precision=auto` is here."""
+    section = config.algorithm
+    options = algorithm_class(section).options()
+    if "precision" not in options:  # an algorithm of the user's own
+        return config
+    asked = section.options().get("precision", options["precision"].default)
+    chosen = {"precision": resolved_precision(asked, device(config.device))}
+    return config.model_copy(update={"algorithm": section.model_copy(update=chosen)})
 
 
 def worker_count(num_workers: int | str, num_envs: int) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from statistics import fmean
 from typing import Any
 
@@ -15,14 +14,14 @@ from torch import Tensor
 
 from flowrep.agent import (
     DivergenceError,
-    FasterThreads,
     keep_freed_memory,
     load_checkpoint,
     save_checkpoint,
+    torch_threads,
 )
+from flowrep.agent.observation import has_bf16
 from flowrep.config.schema import TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
-from flowrep.envs.workers import available_cores
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import OUTCOMES, Comparison, print_results
@@ -43,12 +42,11 @@ class Runner:
     def __init__(self, config: TrainConfig, folder: RunFolder) -> None:
         self.config, self.folder, self.clock = config, folder, Stopwatch()
         keep_freed_memory()
-        threads = share_cores(config)
+        build.share_cores(config)
         torch.manual_seed(config.seed)
         self.env = build.env(config, compiled=config.compiled)
         self.env.set_seed(config.seed * config.num_envs)
         self.agent = build.agent(config, self.env)
-        self.agent.threads = threads
         self.frames = 0  # of the environment, so far
         self.observation: TensorDictBase | None = None  # what is acted on next
         self.evaluation_pending = False  # the last one was interrupted and has to be run again
@@ -64,7 +62,7 @@ class Runner:
         # processes and cores of their own step meanwhile, which TorchRL's sequential `Trainer` does
         # not support. The order of operations, and so the result, is the same where they don't.
         is_on_gpu = self.agent.device.type == "cuda"
-        steps_meanwhile = is_on_gpu or has_spare_cores(self.env, torch.get_num_threads())
+        steps_meanwhile = is_on_gpu or has_spare_cores(self.env, self.config.threads)
         if self.observation is None:
             self.observation = self.env.reset()
         if self.evaluation_pending:
@@ -121,7 +119,7 @@ class Runner:
             bar.update(0)  # its clock goes on: an update of the paper's size takes a second
             with self.clock("memory"):
                 batch = self.agent.sample()
-            with self.clock("update"):
+            with self.clock("update"), torch_threads(self.config.threads):
                 self.metrics.add(self.agent.update(batch))
 
     def log(self, rate: float | None) -> dict[str, float]:
@@ -209,6 +207,9 @@ class Runner:
             return
         state = load_checkpoint(path)
         check_origin(state["origin"], origin_of(config.plain()), path)
+        device = self.agent.device
+        if getattr(config.algorithm, "precision", None) == "bf16" and not has_bf16(device):
+            print(f"note: this run computes in bf16, which this machine's {device.type} emulates")
         env = self.env
         env.reset()
         self.frames = state["frames"]
@@ -241,16 +242,6 @@ class Runner:
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all(),
         }
-
-
-def share_cores(config: TrainConfig) -> AbstractContextManager[None]:
-    """Returns the context of the updates, which may use as many threads as PyTorch would."""
-    if build.device(config.device).type != "cpu":
-        return nullcontext()
-    most = min(torch.get_num_threads(), available_cores())
-    if config.flow.source == "exact":  # all but updates and estimated flow is small
-        torch.set_num_threads(1)
-    return FasterThreads(most)
 
 
 def progress_text(row: Mapping[str, float]) -> str:

@@ -64,6 +64,9 @@ MISTAKES = [
     ("report", ["run"]),
     # what Hydra can't read
     ("train 'representations=[ego,' 'obj]'", ["representations=[ego,", "without spaces"]),
+    ("evaluate run=x 'speed=[low,' 'high]'", ["speed=[low,", "without spaces"]),
+    ("evaluate 'run=[a,' b, 'c]'", ["run=[a,", "without spaces"]),
+    ("report 'run=[a,' 'b]'", ["run=[a,", "without spaces"]),
     ("train hydra.run.dir=/home/josé/x", ["'hydra.run.dir='\"'\"'/home/josé/x'\"'\"''"]),
     ("train outputs", ["outputs", "key=value"]),
     ("train --preset laptop", ["preset=<value>"]),
