@@ -105,7 +105,8 @@ def test_a_run_on_estimated_flow_is_trained_evaluated_and_filmed(tmp_path):
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
 
 
-def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder, number):
     line = [
         sys.executable, "-m", "flowrep.train", "debug=smoke", "total_frames=1000000",
         "log_every_frames=16", "checkpoint_every_frames=1000000", "num_workers=2",
@@ -114,7 +115,7 @@ def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder):
     process = subprocess.Popen(
         line,
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
         env=ENVIRONMENT | {"TMPDIR": str(short_folder)},
         start_new_session=True,
@@ -122,9 +123,10 @@ def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder):
     deadline = time.monotonic() + 120
     while not (tmp_path / "run" / "metrics.csv").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)  # as terminals do, the workers too
-    printed, _ = process.communicate(timeout=120)
-    assert process.returncode == 130
+    os.killpg(process.pid, number)  # as terminals do, the workers too
+    printed, errors = process.communicate(timeout=120)
+    assert process.returncode == 128 + number
+    assert "Traceback" not in errors
     assert f"python -m flowrep.train resume={tmp_path}/run" in printed
     assert (tmp_path / "run" / "checkpoint" / "latest.safetensors").exists()
     assert not list(short_folder.glob("pymp-*"))  # what workers are told by

@@ -1,6 +1,7 @@
 """Environments stepped in parallel in several processes, several in each."""
 
 import os
+import pickle
 import signal
 import sys
 import time
@@ -58,6 +59,7 @@ class WorkerVectorEnv(VectorEnv):
         in_each: makes a vector env without autoreset from the environments of one worker.
 
     Raises:
+        ValueError: if there are more workers than environments, or a factory can't be pickled.
         WorkerError: if a worker could not start; any method raises it if a worker has ended, or
             does not answer.
     """
@@ -96,8 +98,15 @@ class WorkerVectorEnv(VectorEnv):
             forkserver.ensure_running()
             memory = create_shared_memory(space, self.num_envs, context)
             for rows in self._rows:
-                own = _Worker(context, rows, env_factories[rows], memory, self.num_envs, in_each)
-                self._workers.append(own)
+                made_of = env_factories[rows], memory, self.num_envs, in_each
+                try:
+                    self._workers.append(_Worker(context, rows, *made_of))
+                except (pickle.PicklingError, AttributeError, TypeError) as error:
+                    raise ValueError(
+                        f"an environment's factory can't be sent to a worker process ({error}): "
+                        "define it at the top of a module that can be imported, not in the script "
+                        "that is run, or step it in this process"
+                    ) from error
         self._shared: Any = read_from_shared_memory(space, memory, self.num_envs)
         for worker in self._workers:
             worker.receive()
@@ -209,9 +218,12 @@ class _Worker:
             return act(*args)
         except (EOFError, OSError) as error:
             self.process.join(timeout=1.0)
+            code = self.process.exitcode
+            why = "perhaps the system killed it for want of memory"
+            if code != -signal.SIGKILL:
+                why = "what it printed says why"
             raise WorkerError(
-                f"the worker process of {self.name} is gone (exit code {self.process.exitcode}): "
-                "perhaps the system killed it for want of memory"
+                f"the worker process of {self.name} is gone (exit code {code}): {why}"
             ) from error
 
 
@@ -273,10 +285,11 @@ def write_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: Any) 
 @contextmanager
 def sheltered() -> Iterator[None]:
     """Starts processes that signals don't reach and that do not run the main module again."""
-    resource_tracker.ensure_running()  # which unblocks signals when it starts
     # A process inherits the mask of blocked signals, so there is no moment at which Ctrl-C could
-    # print a traceback from each worker.
+    # print a traceback from each worker, or a hang-up end multiprocessing's resource tracker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    resource_tracker.ensure_running()  # which unblocks some of them when it starts
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     # Running the main module again, as multiprocessing does, would import PyTorch in each.
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")

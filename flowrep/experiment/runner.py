@@ -28,7 +28,7 @@ from flowrep.experiment.evaluation import OUTCOMES, Comparison, print_results
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
 
-EVALUATION_ENVS = 96  # side by side at least: more make a step of each cheaper
+EVALUATION_ENVS = 192  # side by side at least: more make a step of each cheaper
 EVALUATION_SEED = 1_000_000  # of the first episode evaluated during training
 FINAL_SEED = 1_500_000  # not the episodes evaluated during training
 

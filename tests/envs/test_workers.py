@@ -147,6 +147,35 @@ def test_a_worker_that_failed_or_was_killed_is_told(make, action, told):
         env.step(np.array([1, 1, 1, 1]))
 
 
+class EndsWhatUnpicklesIt:
+    def __call__(self):
+        return Counter()
+
+    def __reduce__(self):
+        return os._exit, (3,)
+
+
+def test_a_worker_that_ends_by_itself_is_not_taken_for_one_that_was_killed():
+    with pytest.raises(WorkerError, match=r"exit code 3\)") as caught:
+        WorkerVectorEnv([EndsWhatUnpicklesIt()] * 2, 2)
+    assert "memory" not in str(caught.value)
+
+
+@pytest.mark.parametrize("how", ["lambda", "local class", "open file"])
+def test_a_factory_that_can_not_be_sent_is_refused_with_what_to_do(how, tmp_path):
+    class Local(Counter):
+        pass
+
+    with (tmp_path / "file").open("w") as file:
+        factory = {
+            "lambda": lambda: Counter(),
+            "local class": Local,
+            "open file": partial(Counter, number=file),
+        }[how]
+        with pytest.raises(ValueError, match=r"module that can be imported"):
+            WorkerVectorEnv([factory, factory], 2)
+
+
 def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make):
     env, other = make(3, 2), in_process(3)
     for each in (env, other):
