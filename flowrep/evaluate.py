@@ -17,6 +17,7 @@ from flowrep.extras import require
 
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
+from flowrep.agent import keep_freed_memory
 from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
 from flowrep.config.schema import EvaluateConfig
@@ -42,6 +43,7 @@ def run(config: EvaluateConfig) -> None:
     A folder in use, or an agent that can't be evaluated or saved, is reported and does not stop the
     others; the exit code is then 1. Baselines drive once in each scene.
     """
+    keep_freed_memory()
     targets = targets_of(config)
     comparisons: dict[str, Comparison] = {}
     failed: list[str] = []
@@ -96,6 +98,8 @@ def evaluate_one(
     from flowrep.experiment.evaluation import Comparison, print_results
 
     agent, folder = target.load(), target.folder
+    if not config.own_policies:  # whose networks may be large
+        build.share_cores(agent.config)
     origin = agent.origin("evaluate")
     # agents of one scene share the baselines' episodes
     episodes = config.speed, config.fps, config.episodes, config.seed
@@ -104,20 +108,15 @@ def evaluate_one(
         Comparison(*episodes, target.policies, config.baselines),
     )
     table = folder.read_episodes()
-    num_envs = min(agent.config.num_envs, comparison.total)
-    pool = build.evaluation_pool(agent.config, agent.policy, num_envs)
+    num_envs = agent.config.num_envs
 
     def try_to_save() -> None:
         with suppress(OSError):  # the last time, it is reported
             folder.save_episodes(comparison.rows(**origin), table)
 
     try:
-        comparison.run(
-            agent.make_env, agent.policy, num_envs, stop=stop, save=try_to_save, pool=pool
-        )
+        comparison.run(agent.make_env, agent.policy, num_envs, stop=stop, save=try_to_save)
     finally:
-        if pool is not None:
-            pool.close()
         if rows := comparison.rows(**origin):
             try:
                 positions = [episode.positions for _, episode in comparison.results()]
@@ -129,8 +128,15 @@ def evaluate_one(
                     "evaluate again"
                 ) from error
             print(folder.path)
-            print_results(rows)
-            print(f"{len(rows)} episodes are in {folder.evaluation_path}")
+            if whole := comparison.rows(only_whole=True, **origin):
+                print_results(whole)
+            if len(whole) < len(rows):
+                print(
+                    f"{len(rows) - len(whole)} episodes are of a policy, speed and frame rate that "
+                    "lack others. Short episodes end first: compare them after the same command "
+                    "has run to its end"
+                )
+            print(f"{len(rows)} of {comparison.total} episodes are in {folder.evaluation_path}")
     film(config, agent, folder, stop)
 
 

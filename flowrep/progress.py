@@ -1,21 +1,69 @@
-"""How a long loop is stopped, what happens in it at intervals, and where its time goes."""
+"""How a long loop shows its progress, is stopped, acts at intervals, and spends its time."""
 
+import io
+import os
+import select
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any
+from typing import Any, ClassVar
+
+LINE_EVERY_S = 30.0
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
+    """Returns a tqdm bar; where stderr is no terminal, it is a plain line every half minute.
+
+    Args:
+        iterable: what the bar counts, as for tqdm; None to count with `update`.
+        what: begins the plain lines; a terminal's bar begins with tqdm's `desc`, if given.
+        options: those of tqdm.
+    """
+    from tqdm.asyncio import tqdm_asyncio  # here, as envs import this module and need no tqdm
+    from tqdm.auto import tqdm
+
+    is_notebook = tqdm is not tqdm_asyncio
+    if sys.stderr.isatty() or is_notebook:
+        return tqdm(iterable, **options)
+    line = what + ": {n_fmt} {unit}s, {rate_fmt}{postfix}"
+    if options.get("total") is not None or hasattr(iterable, "__len__"):
+        line = what + ": {n_fmt} of {total_fmt} {unit}s, {rate_fmt}, {remaining} left{postfix}"
+    return tqdm(iterable, **options | {"file": _Lines(), "bar_format": line})
+
+
+class _Lines(io.TextIOBase):
+    """A bar's file: passes on its text as a line every half minute, without the cursor's moves."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._written_at = time.monotonic()
+
+    def write(self, text: str) -> int:
+        line, now = text.strip("\r\n "), time.monotonic()
+        # a bar that is below another one moves the cursor first
+        if line and not line.startswith("\x1b") and now - self._written_at >= LINE_EVERY_S:
+            self._written_at = now
+            sys.stderr.write(f"{line}\n")
+            sys.stderr.flush()
+        return len(text)
 
 
 class StopRequest:
-    """Turns SIGINT and SIGTERM into a flag that the loop checks between two steps.
+    """Turns SIGINT, SIGTERM and SIGHUP into a flag that the loop checks between two steps.
 
     The first signal sets `received` and calls `then`. Another Ctrl-C ends the process at once;
     another SIGTERM doesn't, since schedulers send it to each process of a job and more than once.
-    The previous handlers are restored when its context ends.
+    SIGHUP stays ignored where it is, as under `nohup`. The previous handlers are restored when its
+    context ends.
     """
+
+    was_received: ClassVar[bool] = False
+    """Whether a request whose context has not ended yet was made: waits should be short then."""
 
     def __init__(self, then: Callable[[], Any] = lambda: None) -> None:
         self.received: signal.Signals | None = None
@@ -31,19 +79,35 @@ class StopRequest:
         return self.received is not None
 
     def __enter__(self) -> "StopRequest":
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._receive)
+        for number in STOP_SIGNALS:
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._previous[number] = signal.signal(number, self._receive)
         return self
 
     def __exit__(self, *_: object) -> None:
+        StopRequest.was_received = False
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
     def _receive(self, number: int, _: FrameType | None) -> None:
+        if number == signal.SIGHUP:
+            _leave_closed_terminal()
         if self.received is None:
             self.received = signal.Signals(number)
+            StopRequest.was_received = True
             self._then()
         signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
+
+
+def _leave_closed_terminal() -> None:
+    """Sends output to nowhere if its terminal was closed, where printing would raise an error."""
+    for descriptor in (1, 2):
+        poll = select.poll()
+        poll.register(descriptor, 0)  # hang-ups and errors are always reported
+        if poll.poll(0):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, descriptor)
+            os.close(nowhere)
 
 
 @dataclass

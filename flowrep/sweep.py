@@ -28,7 +28,7 @@ from omegaconf import DictConfig
 
 from flowrep.config import UsageError, cli
 from flowrep.config.schema import TrainConfig, validated, validated_run
-from flowrep.progress import StopRequest
+from flowrep.progress import STOP_SIGNALS, StopRequest
 from flowrep.tables import read_rows
 
 cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
@@ -192,7 +192,7 @@ def attempted(
         code = _exit_code(line, folder / LOG, should_stop)
     if is_finished(folder, config):
         return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
-    if code in (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM):
+    if code in {ended for number in STOP_SIGNALS for ended in (128 + number, -number)}:
         return _say(folder, STOPPED)
     return _say(folder, f"{FAILED}: {_reason(folder / LOG, begin, code)}")
 
@@ -247,7 +247,10 @@ def _check_is_same(folder: Path, config: TrainConfig) -> None:
     if not path.is_file():
         return
     stored = validated_run(yaml.safe_load(path.read_text(encoding="utf-8")), str(path)).plain()
-    for key, value in config.plain().items():
+    asked = config.plain()
+    if asked["algorithm"].get("precision", "auto") == "auto":  # which the run has resolved
+        asked["algorithm"] |= {k: v for k, v in stored["algorithm"].items() if k == "precision"}
+    for key, value in asked.items():
         if key not in (*cli.OF_THE_MACHINE, "resume") and stored.get(key) != value:
             raise UsageError(
                 f"'{folder}' holds a run with {key}={stored.get(key)}, the sweep asks for {value}: "

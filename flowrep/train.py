@@ -55,6 +55,7 @@ def run(config: TrainConfig) -> float:
 
     Returns its final success, which a sweeper such as Optuna maximises.
     """
+    from flowrep.experiment import build
     from flowrep.experiment.run import RunFolder
 
     job = HydraConfig.get()
@@ -66,6 +67,7 @@ def run(config: TrainConfig) -> float:
     folder = RunFolder(job.runtime.output_dir)
     with folder.held("training"):
         folder.check_is_new()
+        config = build.with_precision(config)
         folder.write_config(config.plain(), typed)
         announce(config, str(job.runtime.choices.get("preset")))
         return finish(config, folder)
@@ -130,7 +132,8 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
             runner.load()
         folder.log_to_wandb(config.wandb, config.plain())
         precision = getattr(config.algorithm, "precision", "fp32")
-        folder.note_machine(machine_of(compute_dtype(precision, runner.agent.device)))
+        machine = machine_of(compute_dtype(precision, runner.agent.device))
+        folder.note_machine(machine | {"threads": config.threads})
         print(f"run folder: {folder.path}")
         try:
             is_evaluated = complete(runner, stop)

@@ -18,12 +18,12 @@ require("viewing", "train", "hydra", "pydantic", module=__name__)
 
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
-from tqdm.auto import tqdm
 
 from flowrep.config import UsageError
 from flowrep.config.cli import folder_name, run_command
 from flowrep.config.schema import ViewConfig
 from flowrep.palette import CATEGORY_ID
+from flowrep.progress import progress_bar
 from flowrep.tables import write_rows
 from flowrep.viz import contact_sheet, write_png, write_video
 
@@ -93,7 +93,7 @@ def view(
     from flowrep.viz.plan import Track, draw_plan
 
     scene = film.street.scene
-    with tqdm(desc="driving", unit="frame") as bar:
+    with progress_bar(what="driving", desc="driving", unit="frame") as bar:
         frames, episode = film.drive(options[0], lambda _: bar.update())
     episodes = [episode, *drive_on(config, agent, options[1:])]
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
@@ -107,7 +107,8 @@ def view(
     with TemporaryDirectory(dir=folder, prefix=".new") as name:
         new = Path(name)
         if config.video:
-            pictures = tqdm(film.pictures(frames, episode), desc="drawing", unit="frame")
+            pictures = film.pictures(frames, episode)
+            pictures = progress_bar(pictures, what="drawing", desc="drawing", unit="frame")
             write_video(new / "episode.mp4", pictures, fps=episode.fps)
         chosen = moments([moving_pixels(frame.maps) for frame in frames], config.sheet_rows)
         write_png(new / "sheet.png", contact_sheet(film.draw(frames[i]) for i in chosen))
@@ -139,7 +140,8 @@ def drive_on(config: ViewConfig, agent: Agent, options: list[dict[str, Any]]) ->
         return []
     with closing(agent.make_env(**street_of(config), num_envs=min(ENVS, len(options)))) as env:
         ended = evaluate(env, agent.policy, options)
-        episodes = list(tqdm(ended, desc="driving on", unit="episode", total=len(options)))
+        counted = {"desc": "driving on", "unit": "episode", "total": len(options)}
+        episodes = list(progress_bar(ended, what="driving on", **counted))
     return sorted(episodes, key=lambda episode: episode.seed)
 
 

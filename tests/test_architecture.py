@@ -20,7 +20,8 @@ FLOWREP_IMPORTS_ALLOWED = {
     "palette": set(),
     "scenes": {"scenes", "config", "extras", "palette"},
     "simulator": {"simulator", "scenes", "palette", "extras"},
-    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette", "extras"},
+    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette", "extras"}
+    | {"progress"},
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}

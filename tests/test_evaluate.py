@@ -15,7 +15,7 @@ pytest.importorskip("pybullet", reason="agents are evaluated in the simulated st
 from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, validated
-from flowrep.envs import WorkerError
+from flowrep.envs import WorkerError, workers
 from flowrep.evaluate import run as evaluate
 from flowrep.evaluate import targets_of
 from flowrep.experiment.agents import Agent, PolicyError
@@ -126,20 +126,34 @@ def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypa
 # Agents that go straight on, in folders of which the good ones can be evaluated.
 
 
-def straight_on(tensordict):
-    return tensordict.set("action", torch.zeros(tensordict.batch_size, dtype=torch.int64))
+class StraightOn:
+    """Before one of its steps, it does something else."""
+
+    def __init__(self):
+        self.steps, self.at, self.act = 0, 0, lambda: None
+
+    def __call__(self, tensordict):
+        self.steps += 1
+        if self.steps == self.at:
+            self.act()
+        return tensordict.set("action", torch.zeros(tensordict.batch_size, dtype=torch.int64))
 
 
 @pytest.fixture
-def some(tmp_path, monkeypatch):
+def driver():
+    return StraightOn()
+
+
+@pytest.fixture
+def some(tmp_path, monkeypatch, driver):
     """Makes runs, and the config that evaluates them."""
     tiny = ["representations=[obj]", "scene.camera.height_px=12", "scene.camera.width_px=20", SHORT]
-    config = composed(*tiny, "device=cpu", "num_envs=2", "num_workers=0")
+    config = composed(*tiny, "device=cpu")
 
     def load(folder, *, scene=None, **machine):
         if not folder.path.name.startswith("good"):
             raise CheckpointError(f"no checkpoint in {folder.path}")
-        return Agent(straight_on, config, 64, "straight_road")
+        return Agent(driver, config.model_copy(update=machine), 64, "straight_road")
 
     def make(*names, overrides=()):
         monkeypatch.setattr("flowrep.experiment.agents.load_trained", load)
@@ -197,15 +211,60 @@ def test_a_run_that_can_not_be_evaluated_is_named_and_the_others_are(some, capsy
         evaluate(config)
 
 
-def test_a_worker_that_dies_is_one_line_and_what_was_run_is_kept(some, monkeypatch):
-    def dies(name, env):
-        raise WorkerError("the worker process of environment 0 is gone (SIGKILL)")
+@pytest.fixture
+def worker_processes(monkeypatch):
+    """The ids of the workers that were started."""
+    started, whole = [], workers._Worker.__init__
 
-    monkeypatch.setattr("flowrep.experiment.evaluation.BaselinePolicy", dies)
-    (folder,), config = some("good", overrides=["baselines=[random]"])
-    with pytest.raises(WorkerError):
-        evaluate(config)
-    assert [row["policy"] for row in folder.read_episodes()] == ["greedy"] * 2
+    def start(worker, *arguments):
+        whole(worker, *arguments)
+        started.append(worker.process.pid)
+
+    monkeypatch.setattr(workers._Worker, "__init__", start)
+    return started
+
+
+MANY = ["speed=[low,high]", "episodes=8", "num_envs=4", "baselines=[never_turn]"]
+
+
+@pytest.mark.parametrize(
+    ("number", "num_workers"), [(signal.SIGINT, 0), (signal.SIGTERM, 2), (signal.SIGHUP, 2)]
+)
+def test_an_evaluation_that_was_stopped_keeps_what_ended_and_leaves_no_trace_once_it_is_run_again(
+    some, driver, worker_processes, number, num_workers
+):
+    (whole, folder), config = some("good_1", "good_2", overrides=MANY)
+    config = config.model_copy(update={"num_workers": num_workers})
+    evaluate(config.model_copy(update={"run": [str(whole.path)]}))
+    rows = whole.read_episodes()
+    assert len(rows) == 32
+
+    def signal_all():  # as terminals and schedulers do
+        for process in (*worker_processes, os.getpid()):
+            os.kill(process, number)
+
+    driver.at, driver.act = driver.steps + 60, signal_all
+    again = config.model_copy(update={"run": [str(folder.path)]})
+    worker_processes.clear()
+    with pytest.raises(SystemExit) as ended:
+        evaluate(again)
+    assert len(worker_processes) == num_workers
+    assert ended.value.code == 128 + number
+    kept = folder.read_episodes()
+    assert 0 < len(kept) < 16
+    assert kept == [row for row in rows if row in kept]
+    evaluate(again)
+    assert folder.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
+
+
+def test_a_worker_that_is_killed_is_named_and_what_ended_before_is_kept(
+    some, driver, worker_processes
+):
+    (folder,), config = some("good", overrides=MANY)
+    driver.at, driver.act = 60, lambda: os.kill(worker_processes[0], signal.SIGKILL)
+    with pytest.raises(WorkerError, match=r"environments 0 to 1 is gone \(exit code -9\)"):
+        evaluate(config.model_copy(update={"num_workers": 2}))
+    assert 0 < len(folder.read_episodes()) < 16
 
 
 def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(some, monkeypatch):
@@ -220,7 +279,7 @@ def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(some, monkeypatch):
     with pytest.raises(SystemExit) as ended:
         evaluate(config)
     assert ended.value.code == 130
-    assert [row["policy"] for row in folder.read_episodes()] == ["greedy", "random"]
+    assert [row["policy"] for row in folder.read_episodes()] == ["greedy"]
     assert not (folder.path / "videos").exists()
 
 

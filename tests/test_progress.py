@@ -1,20 +1,41 @@
+import fcntl
 import os
+import pty
+import re
 import signal
+import struct
+import subprocess
+import sys
+import termios
 
 import pytest
 
-from flowrep.progress import Every, StopRequest
+from flowrep.progress import Every, StopRequest, progress_bar
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["ctrl-c", "sigterm"]
+    ("number", "code"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)],
+    ids=["ctrl-c", "sigterm", "sighup"],
 )
 def test_a_signal_asks_and_the_shell_gets_its_exit_code(number, code):
     with StopRequest() as stop:
         assert not stop
         os.kill(os.getpid(), number)
         assert stop
+        assert StopRequest.was_received
         assert stop.exit_code == code
+    assert not StopRequest.was_received
+
+
+def test_a_hang_up_that_nohup_ignores_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopRequest() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture
@@ -51,3 +72,110 @@ def test_every_fires_once_for_each_multiple_that_a_jump_passes():
 def test_every_continues_after_a_resume_without_firing_again():
     assert not Every(100, last=130)(150)
     assert Every(100, last=130)(201)
+
+
+# What a bar writes, to a terminal and to a file.
+
+NESTED = """
+import sys, time
+from flowrep import progress
+
+progress.LINE_EVERY_S = 0.2
+options = {"miniters": 0, "mininterval": 0.01}
+with progress.progress_bar(what="training", total=4_000, unit="frame", **options) as bar:
+    bar.set_postfix_str("success 3%")
+    for number in range(20):
+        bar.update(100)
+        time.sleep(0.05)
+    inner = {"desc": "evaluating", "unit": "episode", "leave": False} | options
+    for _ in progress.progress_bar(range(20), what="evaluating", **inner):
+        time.sleep(0.05)
+for _ in progress.progress_bar(iter(range(3)), what="quick", unit="frame"):
+    pass
+"""
+
+
+def test_in_a_log_progress_is_now_and_then_a_line_of_what_how_far_how_fast_how_long():
+    ran = subprocess.run([sys.executable, "-c", NESTED], capture_output=True, text=True, check=True)
+    assert ran.stdout == ""
+    assert ran.stderr.replace("\n", "").isprintable()  # no return and no move of a cursor
+    training = [line for line in ran.stderr.splitlines() if line.startswith("training: ")]
+    inner = [line for line in ran.stderr.splitlines() if line.startswith("evaluating: ")]
+    assert len(training) + len(inner) == len(ran.stderr.splitlines())
+    assert training
+    assert inner
+    line = r"training: (\d+) of 4000 frames, [\d.]+frame/s, [\d:]+ left, success 3%"
+    frames = [int(re.fullmatch(line, text)[1]) for text in training]
+    assert frames == sorted(frames)
+    assert all(re.match(r"evaluating: \d+ of 20 episodes, ", text) for text in inner)
+
+
+def test_a_line_comes_every_half_minute(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr("flowrep.progress.time.monotonic", lambda: now[0])
+    with progress_bar(what="training", total=100, unit="frame", miniters=0, mininterval=0) as bar:
+        for now[0] in range(1, 101):  # a second each
+            bar.update()
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(" of ")[0] for line in lines] == [
+        "training: 30", "training: 60", "training: 90"
+    ]  # fmt: skip
+
+
+def run_in_a_terminal(code):
+    """A process that runs code in a terminal of its own, and the other end of that terminal."""
+    end, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+
+    def take():
+        os.setsid()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), terminal)
+    process = subprocess.Popen([sys.executable, "-c", code], **streams, preexec_fn=take)
+    os.close(terminal)
+    return process, end
+
+
+def test_in_a_terminal_it_is_a_bar_that_is_drawn_again_in_place():
+    process, end = run_in_a_terminal(NESTED)
+    shown = b""
+    while True:
+        try:
+            shown += os.read(end, 4096)
+        except OSError:  # all of it has been read, and the process has ended
+            break
+    assert process.wait() == 0
+    os.close(end)
+    text = shown.decode()
+    assert text.count("\r") > 20
+    assert "\x1b[A" in text  # the inner bar is below the other
+    assert re.search(r"\r +50%\|.*\| 2000/4000 \[.*frame/s, success 3%\]", text)
+    assert re.search(r"evaluating: +50%\|.*\| 10/20 ", text)
+
+
+HANGS_UP = """
+import sys, time
+from pathlib import Path
+from flowrep.progress import StopRequest, progress_bar
+
+with StopRequest() as stop, progress_bar(what="x", total=9, mininterval=0, miniters=0) as bar:
+    print("ready", flush=True)
+    while not stop:
+        bar.update(0)
+        time.sleep(0.01)
+    bar.update(1)
+print("stopped; continue with ...", flush=True)
+Path(sys.argv[1]).write_text(str(stop.exit_code))
+"""
+
+
+def test_a_closed_terminal_stops_as_sigterm_does_and_printing_to_it_is_no_error(tmp_path):
+    saved = tmp_path / "saved"
+    code = HANGS_UP.replace("sys.argv[1]", repr(str(saved)))
+    process, end = run_in_a_terminal(code)
+    while b"ready" not in os.read(end, 4096):
+        pass
+    os.close(end)
+    assert process.wait(timeout=60) == 0
+    assert saved.read_text() == str(128 + signal.SIGHUP)

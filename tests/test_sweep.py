@@ -101,6 +101,11 @@ time.sleep(60)
 """
 
 
+@pytest.mark.parametrize("code", [129, 130, 143])
+def test_a_run_that_saved_after_a_signal_is_stopped(attempt, code):
+    assert attempt(f"sys.exit({code})") == "stopped"
+
+
 def test_a_run_is_told_to_save_when_the_sweep_is_stopped(attempt, tmp_path):
     assert attempt(SAVES, should_stop=(tmp_path / "ready").exists) == "stopped"
     assert (tmp_path / "saved").exists()
@@ -128,6 +133,17 @@ def test_a_folder_with_another_run_is_not_taken_for_the_one_asked_for(attempt, t
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(CONFIG.plain() | {"seed": 9}))
     with pytest.raises(UsageError, match="seed=9"):
         attempt(FINISHES)
+
+
+def test_a_run_has_resolved_what_its_sweep_leaves_to_the_machine(attempt, tmp_path, monkeypatch):
+    algorithm = CONFIG.plain()["algorithm"]
+    assert algorithm["precision"] == "auto"
+    stored = CONFIG.plain() | {"algorithm": algorithm | {"precision": "bf16"}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(stored))
+    assert attempt(FINISHES).startswith("finished")
+    other = CONFIG.algorithm.model_copy(update={"precision": "fp32"})
+    with pytest.raises(UsageError, match="precision"):
+        sweep._check_is_same(tmp_path, CONFIG.model_copy(update={"algorithm": other}))
 
 
 def test_the_line_of_a_run_begins_or_resumes_it(tmp_path, monkeypatch):

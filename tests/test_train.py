@@ -7,6 +7,7 @@ import sys
 import time
 
 import pytest
+import yaml
 
 pytest.importorskip("pybullet", reason="training drives the simulated street")
 
@@ -74,7 +75,10 @@ def test_a_device_that_is_not_there_leaves_no_folder(tmp_path):
 
 def test_a_run_leaves_a_folder_that_a_person_can_open(smoke_run):
     run, _ = smoke_run
-    assert (run / "config.yaml").read_text().startswith("seed: 3")
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["seed"] == 3
+    assert config["threads"] == 1
+    assert config["algorithm"]["precision"] in ("bf16", "fp32")  # as measured, not auto
     assert [row["frames"] for row in read_rows(run / "metrics.csv")] == ["64", "128", "192", "256"]
     assert list(run.glob("tensorboard/events.out.tfevents.*"))
     assert (run / "checkpoint" / "latest.safetensors").stat().st_size > 1e6
@@ -143,7 +147,8 @@ def test_a_run_on_estimated_flow_is_trained_evaluated_and_filmed(tmp_path):
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
 
 
-def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder, number):
     line = [
         sys.executable, "-m", "flowrep.train", "debug=smoke", "total_frames=1000000",
         "log_every_frames=16", "checkpoint_every_frames=1000000", "num_workers=2",
@@ -152,7 +157,7 @@ def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder):
     process = subprocess.Popen(
         line,
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
         env=ENVIRONMENT | {"TMPDIR": str(short_folder)},
         start_new_session=True,
@@ -160,9 +165,10 @@ def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder):
     deadline = time.monotonic() + 120
     while not (tmp_path / "run" / "metrics.csv").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)  # as terminals do, the workers too
-    printed, _ = process.communicate(timeout=120)
-    assert process.returncode == 130
+    os.killpg(process.pid, number)  # as terminals do, the workers too
+    printed, errors = process.communicate(timeout=120)
+    assert process.returncode == 128 + number
+    assert "Traceback" not in errors
     assert f"python -m flowrep.train resume={tmp_path}/run" in printed
     assert (tmp_path / "run" / "checkpoint" / "latest.safetensors").exists()
     assert not list(short_folder.glob("pymp-*"))  # what workers are told by

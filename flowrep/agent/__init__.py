@@ -6,7 +6,7 @@ require("flowrep.agent", "train", "safetensors")
 
 from flowrep.agent.algorithm import Algorithm, DivergenceError
 from flowrep.agent.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from flowrep.agent.cpu import FasterThreads, keep_freed_memory
+from flowrep.agent.cpu import keep_freed_memory, torch_threads
 from flowrep.agent.dqn import DoubleDQN
 from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.dsac_v import DiscreteSACWithValue
@@ -15,6 +15,6 @@ from flowrep.agent.replay import ReplayMemory
 
 __all__ = [
     "PPO", "Algorithm", "CheckpointError", "DiscreteSAC", "DiscreteSACWithValue", "DivergenceError",
-    "DoubleDQN", "FasterThreads", "ReplayMemory", "keep_freed_memory", "load_checkpoint",
-    "save_checkpoint",
+    "DoubleDQN", "ReplayMemory", "keep_freed_memory", "load_checkpoint", "save_checkpoint",
+    "torch_threads",
 ]  # fmt: skip

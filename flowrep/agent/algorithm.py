@@ -6,7 +6,6 @@ import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
 import torch
@@ -67,8 +66,6 @@ class Algorithm(ABC):
     policy: Any
     memory: Any
     """What it learns from, with `extend`, `state_dict` and `load_state_dict`."""
-    threads: AbstractContextManager[Any]
-    """Entered for each update; `FasterThreads` on a CPU whose cores are free."""
 
     def __init__(
         self,
@@ -102,7 +99,6 @@ class Algorithm(ABC):
         self.divergence = DivergenceWatch([*losses, "grad_norm"], others, self.device)
         # the fused optimizer skips its step if this is 1, which it reads on the device
         self.optimizer.found_inf = self.divergence.is_bad  # type: ignore[attr-defined]
-        self.threads = nullcontext()
         self.updates = 0
         self._is_eager = not self.CAPTURABLE
         self._capture()
@@ -221,8 +217,7 @@ class Algorithm(ABC):
         learning_rate = self.learning_rate * max(0.0, 1 - self.updates / self.total_updates)
         for group in self.optimizer.param_groups:
             group["lr"].fill_(learning_rate * group["factor"])
-        with self.threads:
-            metrics = dict(self._step(batch).items())
+        metrics = dict(self._step(batch).items())
         self.updates += 1
         return metrics | {"learning_rate": torch.tensor(learning_rate)}
 

@@ -32,23 +32,31 @@ _FLOAT16_MAX = torch.finfo(torch.float16).max
 def compute_dtype(precision: str, device: torch.device) -> torch.dtype:
     """Returns the dtype of activations; weights, losses and optimizer stay in float32.
 
-    `precision` is `"bf16"`, `"fp32"`, or `"auto"`: bfloat16 where the device multiplies it faster
-    than float32, float32 elsewhere.
+    `precision` is `"bf16"`, `"fp32"`, or `"auto"`, see `resolved_precision`.
+    """
+    return {"bf16": torch.bfloat16, "fp32": torch.float32}[resolved_precision(precision, device)]
+
+
+def resolved_precision(precision: str, device: torch.device) -> str:
+    """Returns `"bf16"` or `"fp32"`; for `"auto"` bfloat16 where it is faster than float32.
+
+    On a CPU, time tells: a run resolves "auto" once and keeps the answer, so that it computes the
+    same when it is resumed.
     """
     if precision not in PRECISIONS:
         raise ValueError(f"precision={precision!r}: expected one of {', '.join(PRECISIONS)}")
-    if precision == "auto":
-        return torch.bfloat16 if has_fast_bf16(device) else torch.float32
-    return torch.bfloat16 if precision == "bf16" else torch.float32
+    if precision != "auto":
+        return precision
+    is_faster = has_bf16(device) and (device.type == "cuda" or _bf16_products_are_faster())
+    return "bf16" if is_faster else "fp32"
 
 
-def has_fast_bf16(device: torch.device) -> bool:
-    """Returns whether `device` multiplies bfloat16 faster than float32."""
+def has_bf16(device: torch.device) -> bool:
+    """Returns whether `device` has instructions for bfloat16; others emulate it."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     instructions = torch.cpu.get_capabilities() if device.type == "cpu" else {}
-    has_bf16 = instructions.get("avx512_bf16") or instructions.get("amx_bf16")
-    return bool(has_bf16) and _bf16_products_are_faster()
+    return bool(instructions.get("avx512_bf16") or instructions.get("amx_bf16"))
 
 
 @cache

@@ -35,7 +35,7 @@ from flowrep.config.yaml_file import check_yaml, checked_yaml
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir")
 """Keys whose values are folders, which may have any name."""
-OF_THE_MACHINE = ("device", "num_workers")
+OF_THE_MACHINE = ("device", "num_workers", "threads")
 """Keys that don't define a run and may change when it is resumed."""
 IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
 

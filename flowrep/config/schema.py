@@ -330,6 +330,7 @@ class TrainConfig(EnvConfig):
     """The whole config of `flowrep.train`."""
 
     total_frames: Count
+    threads: Count = 1  # not in runs before it
     compiled: bool
     log_every_frames: Count
     checkpoint_every_frames: Count

@@ -1,8 +1,10 @@
 """Environments stepped in parallel in several processes, several in each."""
 
 import os
+import pickle
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +22,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space, create_shared_memory, read_from_shared_memory
 from numpy.typing import NDArray
 
+from flowrep.progress import STOP_SIGNALS, StopRequest
+
 Arrays = dict[str, Any]  # arrays, nested like a Dict space
 EnvFactory = Callable[[], gym.Env]
 VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
@@ -27,8 +31,13 @@ VectorFactory = Callable[[Sequence[EnvFactory]], SyncVectorEnv]
 _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.DISABLED)
 
 
+PATIENCE_S, PATIENCE_AFTER_STOP_S = 300.0, 10.0
+"""How long a worker may take to answer: it starts in seconds and steps in milliseconds, but the
+machine may be busy. Once a signal asked the process to stop, what ends it may soon be SIGKILL."""
+
+
 class WorkerError(RuntimeError):
-    """A worker process failed or died; the message names it."""
+    """A worker process failed, died or doesn't answer; the message names it."""
 
 
 class WorkerVectorEnv(VectorEnv):
@@ -40,8 +49,8 @@ class WorkerVectorEnv(VectorEnv):
     workers.
 
     Observations come back through shared memory, everything else through pipes. Workers don't react
-    to SIGINT and SIGTERM, which terminals and schedulers send to whole process groups, and end when
-    the caller closes them or dies.
+    to SIGINT, SIGTERM and SIGHUP, which terminals and schedulers send to whole process groups, and
+    end when the caller closes them or dies.
 
     Args:
         env_factories: one picklable factory for each environment, from a module that can be
@@ -50,7 +59,9 @@ class WorkerVectorEnv(VectorEnv):
         in_each: makes a vector env without autoreset from the environments of one worker.
 
     Raises:
-        WorkerError: if a worker could not start; any method raises it if a worker has stopped.
+        ValueError: if there are more workers than environments, or a factory can't be pickled.
+        WorkerError: if a worker could not start; any method raises it if a worker has ended, or
+            does not answer.
     """
 
     def __init__(
@@ -87,8 +98,15 @@ class WorkerVectorEnv(VectorEnv):
             forkserver.ensure_running()
             memory = create_shared_memory(space, self.num_envs, context)
             for rows in self._rows:
-                own = _Worker(context, rows, env_factories[rows], memory, self.num_envs, in_each)
-                self._workers.append(own)
+                made_of = env_factories[rows], memory, self.num_envs, in_each
+                try:
+                    self._workers.append(_Worker(context, rows, *made_of))
+                except (pickle.PicklingError, AttributeError, TypeError) as error:
+                    raise ValueError(
+                        f"an environment's factory can't be sent to a worker process ({error}): "
+                        "define it at the top of a module that can be imported, not in the script "
+                        "that is run, or step it in this process"
+                    ) from error
         self._shared: Any = read_from_shared_memory(space, memory, self.num_envs)
         for worker in self._workers:
             worker.receive()
@@ -177,20 +195,35 @@ class _Worker:
         self._owes_answer = True
 
     def receive(self) -> Any:
-        result, failure = self._talk(self.pipe.recv)
+        result, failure = self._talk(self._receive_within_patience)
         self._owes_answer = False
         if failure:
             raise WorkerError(f"the worker process of {self.name} failed:\n{failure}")
         return result
+
+    def _receive_within_patience(self) -> Any:
+        begun = time.monotonic()
+        while not self.pipe.poll(1.0):
+            waited = time.monotonic() - begun
+            if waited > (PATIENCE_AFTER_STOP_S if StopRequest.was_received else PATIENCE_S):
+                pid = self.process.pid
+                raise WorkerError(
+                    f"the worker process of {self.name} has not answered for {waited:.0f} s: if "
+                    f"process {pid} is suspended, 'kill -CONT {pid}' lets it go on"
+                )
+        return self.pipe.recv()
 
     def _talk(self, act: Callable[..., Any], *args: Any) -> Any:
         try:
             return act(*args)
         except (EOFError, OSError) as error:
             self.process.join(timeout=1.0)
+            code = self.process.exitcode
+            why = "perhaps the system killed it for want of memory"
+            if code != -signal.SIGKILL:
+                why = "what it printed says why"
             raise WorkerError(
-                f"the worker process of {self.name} is gone (exit code {self.process.exitcode}): "
-                "perhaps the system killed it for want of memory"
+                f"the worker process of {self.name} is gone (exit code {code}): {why}"
             ) from error
 
 
@@ -198,8 +231,9 @@ def _end(workers: list[_Worker]) -> None:
     """Closes the pipes, upon which workers end, and waits for that."""
     for worker in workers:
         worker.pipe.close()
+    deadline = time.monotonic() + 5.0
     for worker in workers:
-        worker.process.join(timeout=5.0)
+        worker.process.join(timeout=max(0.0, deadline - time.monotonic()))
         if worker.process.is_alive():
             worker.process.kill()
             worker.process.join()
@@ -251,10 +285,11 @@ def write_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: Any) 
 @contextmanager
 def sheltered() -> Iterator[None]:
     """Starts processes that signals don't reach and that do not run the main module again."""
-    resource_tracker.ensure_running()  # which unblocks signals when it starts
     # A process inherits the mask of blocked signals, so there is no moment at which Ctrl-C could
-    # print a traceback from each worker.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    # print a traceback from each worker, or a hang-up end multiprocessing's resource tracker.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    resource_tracker.ensure_running()  # which unblocks some of them when it starts
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     # Running the main module again, as multiprocessing does, would import PyTorch in each.
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")

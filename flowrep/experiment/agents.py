@@ -8,7 +8,6 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -48,10 +47,11 @@ class Agent:
     frames: int = 0  # that it was trained for; 0 if unknown
     trained_in: str | None = None  # the name of a scene, None if unknown
 
-    @property
-    def make_env(self) -> Callable[..., EnvBase]:
-        """Makes envs of its config; arguments override those of `make_env`."""
-        return partial(build.env, self.config)
+    def make_env(self, **changes: Any) -> EnvBase:
+        """Returns an env of its config, with changes of `make_env`'s arguments."""
+        num_envs = changes.get("num_envs", self.config.num_envs)
+        workers = {"num_workers": build.evaluation_workers(self.config, num_envs)}
+        return build.env(self.config, **workers | changes)
 
     def origin(self, evaluation: str) -> dict[str, Any]:
         """Returns the columns of evaluation.csv that tell which agent drove where."""

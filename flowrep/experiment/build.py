@@ -11,15 +11,15 @@ import torch
 from torchrl.envs import EnvBase, InitTracker
 
 from flowrep.agent import Algorithm
+from flowrep.agent.observation import resolved_precision
 from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
 from flowrep.envs.workers import available_cores
-from flowrep.experiment.evaluation_pool import EvaluationPool, can_travel
 from flowrep.simulator.camera import choose_renderer
 
-ENVS_PER_PROCESS = 24  # of an evaluation: a step of few costs as much as one of many
+ENVS_PER_WORKER = 24  # of an evaluation: fewer aren't worth the start of a process
 
 
 def device(name: str) -> torch.device:
@@ -53,6 +53,27 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
     return make_env(**arguments).append_transform(InitTracker())
 
 
+def share_cores(config: EnvConfig) -> None:
+    """Has this process use one thread on a CPU, except for updates and estimated flow.
+
+    Nothing else is large enough to gain by a second one, and beside another program's work, threads
+    that wait for each other make a step take up to a hundred times as long.
+    """
+    if device(config.device).type == "cpu" and config.flow.source == "exact":
+        torch.set_num_threads(1)
+
+
+def with_precision(config: TrainConfig) -> TrainConfig:
+    """Returns a new run's config with the number format that `precision=auto` is here."""
+    section = config.algorithm
+    options = algorithm_class(section).options()
+    if "precision" not in options:  # an algorithm of the user's own
+        return config
+    asked = section.options().get("precision", options["precision"].default)
+    chosen = {"precision": resolved_precision(asked, device(config.device))}
+    return config.model_copy(update={"algorithm": section.model_copy(update=chosen)})
+
+
 def worker_count(num_workers: int | str, num_envs: int) -> int:
     """Returns the number of worker processes; for "auto" one per core, if there are several."""
     if isinstance(num_workers, int):
@@ -71,12 +92,11 @@ def _workers_help(config: EnvConfig) -> bool:
     return config.flow.source != "exact" or choose_renderer(config.renderer) == "pybullet"
 
 
-def evaluation_pool(config: EnvConfig, policy: Any, num_envs: int) -> EvaluationPool | None:
-    """Returns processes that evaluate a policy; None if this one alone does, with its workers."""
-    if device(config.device).type != "cpu" or not can_travel(policy):
-        return None
-    count = min(worker_count(config.num_workers, config.num_envs), num_envs // ENVS_PER_PROCESS)
-    return EvaluationPool(count) if count > 1 else None
+def evaluation_workers(config: EnvConfig, num_envs: int) -> int:
+    """Returns the number of processes that step an evaluation's environments."""
+    if isinstance(config.num_workers, int):
+        return min(config.num_workers, num_envs)
+    return worker_count("auto", num_envs // ENVS_PER_WORKER)
 
 
 def agent(config: TrainConfig, env: EnvBase) -> Algorithm:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from itertools import product, takewhile
+from itertools import product
 from statistics import NormalDist
 from typing import Any
 
@@ -23,12 +23,11 @@ from rich.table import Table
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from tqdm.auto import tqdm
 
 from flowrep.baselines import BaselinePolicy
 from flowrep.envs import Outcome
 from flowrep.envs.episode import hit_name
-from flowrep.progress import StopRequest
+from flowrep.progress import StopRequest, progress_bar
 from flowrep.scenes import Scene
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -92,6 +91,7 @@ def evaluate(
     *,
     greedy: bool = True,
     on_frame: Callable[[TensorDictBase], Any] | None = None,
+    stop: StopRequest | None = None,
 ) -> Iterator[Episode]:
     """Yields finished episodes, in the order in which they end.
 
@@ -105,6 +105,7 @@ def evaluate(
         episodes: options of `StreetEnv.reset`, `episode_seed` among them.
         greedy: whether the likeliest action is taken, or one is drawn.
         on_frame: called with the env's TensorDict after each reset and each step.
+        stop: ends the evaluation between two steps.
     """
     if isinstance(policy, str):
         policy = BaselinePolicy(policy, env)
@@ -113,7 +114,7 @@ def evaluate(
     running: dict[int, _Running] = {}  # by place
     tensordict: TensorDictBase | None = None
     free = list(range(env.batch_size[0]))
-    while True:
+    while not stop:
         if free:
             begun = {place: _Running(waiting.popleft()) for place in free if waiting}
             running |= begun
@@ -260,29 +261,28 @@ class Comparison:
         *,
         stop: StopRequest | None = None,
         save: Callable[[], Any] = lambda: None,
-        pool: Any = None,
     ) -> None:
         """Runs the episodes; finished ones are kept even if it is interrupted.
 
         A second run, of another agent in the same scene, keeps the baselines' episodes. `save` is
-        called when all of a policy at one speed and frame rate have been run. The processes of
-        `pool`, an `EvaluationPool`, drive if there is one.
+        called when all of a policy at one speed and frame rate have been run.
         """
         for (_, _, name), episodes in self._found.items():
             if name in self.policies:
                 episodes.clear()
-        with tqdm(
-            total=self.total, initial=self.done, unit="episode", desc="evaluating", leave=False,
-            miniters=0, mininterval=0.5,
+        with progress_bar(
+            what="evaluating", desc="evaluating", total=self.total, initial=self.done,
+            unit="episode", leave=False, miniters=0, mininterval=0.5,
         ) as bar:  # fmt: skip
-            for name, episode in self._episodes(make_env, policy, num_envs, stop, bar, pool):
+            # the bar's clock goes on: the first episodes take seconds
+            for name, episode in self._episodes(
+                make_env, policy, num_envs, stop, on_frame=lambda _: bar.update(0)
+            ):
                 found = self._found[episode.speed, episode.fps, name]
                 found[episode.seed] = episode
                 bar.update()
                 if len(found) == len(self._seeds):
                     save()
-                if stop:
-                    return
 
     def _episodes(
         self,
@@ -290,8 +290,7 @@ class Comparison:
         policy: Policy | str,
         num_envs: int,
         stop: StopRequest | None,
-        bar: tqdm,
-        pool: Any,
+        on_frame: Callable[[TensorDictBase], Any],
     ) -> Iterator[tuple[str, Episode]]:
         """Yields the missing episodes, each with its policy's name."""
         for rate in self.fps:
@@ -301,14 +300,9 @@ class Comparison:
                 if stop or not most:
                     continue
                 make = partial(make_env, **changes, frame_rate_hz=rate)
-                side_by_side = min(num_envs, most)
-                if pool is not None:
-                    yield from pool.evaluate(make, side_by_side, jobs, stop)
-                    continue
-                with closing(make(num_envs=side_by_side)) as env:
+                with closing(make(num_envs=min(num_envs, most))) as env:
                     for name, job in jobs.items():
-                        # the bar's clock goes on: the first episodes take seconds
-                        for episode in evaluate(env, **job, on_frame=lambda _: bar.update(0)):
+                        for episode in evaluate(env, **job, on_frame=on_frame, stop=stop):
                             yield name, episode
 
     def _job(self, name: str, policy: Policy | str, rate: float) -> dict[str, Any]:
@@ -322,19 +316,25 @@ class Comparison:
         driver = name if name in self.baselines else policy
         return {"policy": driver, "episodes": missing, "greedy": name != "sampled"}
 
-    def results(self) -> list[tuple[str, Episode]]:
-        """Returns each episode with its policy's name, by speed, frame rate, policy and seed."""
-        # Of an incomplete group, only those before the first gap: short episodes finish first, so
-        # taking all that are done would bias the result.
+    def results(self, *, only_whole: bool = False) -> list[tuple[str, Episode]]:
+        """Returns each ended episode with its policy's name.
+
+        They are in the order of speed, frame rate, policy and seed. Of an evaluation that was
+        interrupted, shares are not to be taken of a policy at a speed and a frame rate that lacks
+        episodes: short ones end first. `only_whole` leaves those out.
+        """
         return [
             (name, found[seed])
             for (_, _, name), found in self._found.items()
-            for seed in takewhile(found.__contains__, self._seeds)
+            if not only_whole or len(found) == len(self._seeds)
+            for seed in self._seeds
+            if seed in found
         ]
 
-    def rows(self, **origin: Any) -> list[Row]:
+    def rows(self, *, only_whole: bool = False, **origin: Any) -> list[Row]:
         """Returns the rows of `results` for evaluation.csv, after the columns of their origin."""
-        return [{**origin, "policy": name, **episode.row()} for name, episode in self.results()]
+        results = self.results(only_whole=only_whole)
+        return [{**origin, "policy": name, **episode.row()} for name, episode in results]
 
 
 def scene_id(scene: Scene) -> str:

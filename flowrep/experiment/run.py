@@ -358,13 +358,13 @@ class RunFolder:
         """Adds evaluated episodes to evaluation.csv, or to a table that replaces it.
 
         An episode that is there already, with the same policy, frames, speed and frame rate, is
-        replaced in place. With the rows from before an evaluation as the table, episodes can be
-        saved as they end and still stand in order.
+        replaced in place, and others follow the one that they follow in `rows`. So an evaluation
+        that was interrupted and run again leaves the table of one that was not.
         """
         before = self.read_episodes() if table is None else table
         new = [{name: str(row[name]) for name in EVALUATION_COLUMNS} for row in rows]
-        by_episode = {tuple(row[name] for name in _EPISODE): row for row in (*before, *new)}
-        write_rows(self.evaluation_path, by_episode.values(), EVALUATION_COLUMNS)
+        merged = _merged(*({_identity(row): row for row in part} for part in (before, new)))
+        write_rows(self.evaluation_path, merged, EVALUATION_COLUMNS)
 
     def _save_drives(
         self, rows: Iterable[Mapping[str, Any]], positions: Iterable[NDArray[np.float32]]
@@ -388,6 +388,23 @@ class RunFolder:
     def write_failures(self) -> None:
         """Writes the causes of failure in evaluation.csv, in place of an older table."""
         write_rows(self.failures_path, failure_causes(self.read_episodes()))
+
+
+def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
+    return tuple(row[name] for name in _EPISODE)
+
+
+def _merged(
+    before: Mapping[Any, Mapping[str, str]], new: Mapping[Any, Mapping[str, str]]
+) -> list[Mapping[str, str]]:
+    """Returns the rows of both by their keys, each new one after its predecessor in `new`."""
+    places = {key: (number, 0) for number, key in enumerate(before)}
+    known = [places[key][0] for key in new if key in places]
+    last = known[0] - 1 if known else len(before)  # the first ones stand before their successor
+    for number, key in enumerate(new, 1):
+        last, _ = places.setdefault(key, (last, number))
+    rows = {**before, **new}
+    return [rows[key] for key in sorted(rows, key=places.__getitem__)]
 
 
 def replace_file(path: Path, write: Callable[[Path], Any]) -> None:

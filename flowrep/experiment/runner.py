@@ -5,33 +5,30 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from statistics import fmean
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from flowrep.agent import (
     DivergenceError,
-    FasterThreads,
     keep_freed_memory,
     load_checkpoint,
     save_checkpoint,
+    torch_threads,
 )
+from flowrep.agent.observation import has_bf16
 from flowrep.config.schema import TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
-from flowrep.envs.workers import available_cores
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import OUTCOMES, Comparison, print_results
-from flowrep.experiment.evaluation_pool import EvaluationPool
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
-from flowrep.progress import Every, StopRequest, Stopwatch
+from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
 
-EVALUATION_ENVS = 96  # side by side at least: more make a step of each cheaper
+EVALUATION_ENVS = 192  # side by side at least: more make a step of each cheaper
 EVALUATION_SEED = 1_000_000  # of the first episode evaluated during training
 FINAL_SEED = 1_500_000  # not the episodes evaluated during training
 
@@ -45,17 +42,15 @@ class Runner:
     def __init__(self, config: TrainConfig, folder: RunFolder) -> None:
         self.config, self.folder, self.clock = config, folder, Stopwatch()
         keep_freed_memory()
-        threads = share_cores(config)
+        build.share_cores(config)
         torch.manual_seed(config.seed)
         self.env = build.env(config, compiled=config.compiled)
         self.env.set_seed(config.seed * config.num_envs)
         self.agent = build.agent(config, self.env)
-        self.agent.threads = threads
         self.frames = 0  # of the environment, so far
         self.observation: TensorDictBase | None = None  # what is acted on next
         self.evaluation_pending = False  # the last one was interrupted and has to be run again
         self.metrics, self.recent = Means(), RecentEpisodes()
-        self._pool: EvaluationPool | None = None
 
     def train(self, stop: StopRequest) -> None:
         """Trains until `total_frames` or until a stop is requested, and saves the last state."""
@@ -67,13 +62,15 @@ class Runner:
         # processes and cores of their own step meanwhile, which TorchRL's sequential `Trainer` does
         # not support. The order of operations, and so the result, is the same where they don't.
         is_on_gpu = self.agent.device.type == "cuda"
-        steps_meanwhile = is_on_gpu or has_spare_cores(self.env, torch.get_num_threads())
+        steps_meanwhile = is_on_gpu or has_spare_cores(self.env, self.config.threads)
         if self.observation is None:
             self.observation = self.env.reset()
         if self.evaluation_pending:
             self.evaluation_pending = not self.evaluate("training", stop)
         progress = {"total": total, "initial": self.frames, "unit": "frame", "unit_scale": True}
-        with tqdm(**progress, miniters=0, mininterval=0.5, dynamic_ncols=True) as bar:
+        with progress_bar(
+            what="training", **progress, miniters=0, mininterval=0.5, dynamic_ncols=True
+        ) as bar:
             while self.frames < total and not stop:
                 with self.clock("policy"):
                     acted = self.act()
@@ -116,13 +113,13 @@ class Runner:
                 f"({cause})"
             ) from error
 
-    def learn(self, bar: tqdm) -> None:
+    def learn(self, bar: Any) -> None:
         """Takes the updates that are due after the frames so far."""
         for _ in range(self.agent.updates_due(self.frames)):
             bar.update(0)  # its clock goes on: an update of the paper's size takes a second
             with self.clock("memory"):
                 batch = self.agent.sample()
-            with self.clock("update"):
+            with self.clock("update"), torch_threads(self.config.threads):
                 self.metrics.add(self.agent.update(batch))
 
     def log(self, rate: float | None) -> dict[str, float]:
@@ -151,10 +148,7 @@ class Runner:
         agent = Agent(self.agent.policy, config, self.frames)
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
-            if self._pool is None:
-                most = min(num_envs, max(asked.episodes, asked.final_total))
-                self._pool = build.evaluation_pool(config, agent.policy, most)
-            comparison.run(agent.make_env, agent.policy, num_envs, stop=stop, pool=self._pool)
+            comparison.run(agent.make_env, agent.policy, num_envs, stop=stop)
         if comparison.done < comparison.total:
             return False
         rows = comparison.rows(**agent.origin(kind))
@@ -183,10 +177,7 @@ class Runner:
             print(f"video: {path}")
 
     def close(self) -> None:
-        """Ends the processes of environments and evaluation."""
-        if self._pool is not None:
-            self._pool.close()
-            self._pool = None
+        """Ends the processes of the environments."""
         if not self.env.is_closed:
             self.env.close()
 
@@ -217,6 +208,9 @@ class Runner:
             return
         state = load_checkpoint(path)
         check_origin(state["origin"], origin_of(config.plain()), path)
+        device = self.agent.device
+        if getattr(config.algorithm, "precision", None) == "bf16" and not has_bf16(device):
+            print(f"note: this run computes in bf16, which this machine's {device.type} emulates")
         env = self.env
         env.reset()
         self.frames = state["frames"]
@@ -249,16 +243,6 @@ class Runner:
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all(),
         }
-
-
-def share_cores(config: TrainConfig) -> AbstractContextManager[None]:
-    """Returns the context of the updates, which may use as many threads as PyTorch would."""
-    if build.device(config.device).type != "cpu":
-        return nullcontext()
-    most = min(torch.get_num_threads(), available_cores())
-    if config.flow.source == "exact":  # all but updates and estimated flow is small
-        torch.set_num_threads(1)
-    return FasterThreads(most)
 
 
 def progress_text(row: Mapping[str, float]) -> str:

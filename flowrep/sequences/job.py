@@ -8,9 +8,8 @@ from itertools import count, islice
 from typing import Any
 
 import numpy as np
-from tqdm.auto import tqdm
 
-from flowrep.progress import StopRequest, Stopwatch
+from flowrep.progress import StopRequest, Stopwatch, progress_bar
 from flowrep.sequences import factorization
 from flowrep.sequences.doctor import Diagnosis, Doctor
 from flowrep.sequences.output import Output
@@ -66,7 +65,8 @@ class Job:
         """Factorises all frames; returns 0, or the exit code for the signal that stopped it."""
         is_recording = isinstance(self.stream, Recording)
         total = len(self._indices) if is_recording else None
-        with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
+        bar = progress_bar(what="factorising", total=total, unit="frame")
+        with StopRequest() as interrupted, bar:
             indices, pairs = count(self.start, self.stride), factorization.pairs(self._frames())
             for index, (previous, current) in zip(indices, pairs):
                 if previous is not None:

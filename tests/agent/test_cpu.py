@@ -5,7 +5,7 @@ import sys
 import pytest
 import torch
 
-from flowrep.agent import FasterThreads, cpu
+from flowrep.agent import torch_threads
 
 COUNT_PAGE_FAULTS = """
 import resource
@@ -31,30 +31,10 @@ def test_a_freed_block_is_reused_without_page_faults():
     assert kept < 0.1 * by_default
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """A clock on which an update takes as many seconds as `seconds` says for its threads."""
-    seconds, now = {}, [0.0]
-
-    def read():
-        now[0] += seconds.get(torch.get_num_threads(), 0.0) / 2
-        return now[0]
-
-    monkeypatch.setattr(cpu.time, "perf_counter", read)
+def test_torch_has_so_many_threads_inside_and_as_many_as_before_afterwards():
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield seconds
-    torch.set_num_threads(before)
-
-
-def test_updates_take_the_number_of_threads_that_was_faster_of_late(clock):
-    threads, used = FasterThreads(2), []
-    for seconds in ({1: 3.0, 2: 2.0}, {1: 3.0, 2: 7.0}, {1: 3.0, 2: 2.0}):  # idle, busy, idle
-        clock.update(seconds)
-        for _ in range(cpu.PERIOD):
-            with threads:
-                used.append(torch.get_num_threads())
-            assert torch.get_num_threads() == 1  # as before
-    later = [set(used[i * cpu.PERIOD + 2 * cpu.TRIALS : (i + 1) * cpu.PERIOD]) for i in range(3)]
-    assert later == [{2}, {1}, {2}]
-    assert used[: 2 * cpu.TRIALS] == [1, 2] * cpu.TRIALS
+    with torch_threads(before + 1):
+        assert torch.get_num_threads() == before + 1
+    with pytest.raises(ZeroDivisionError), torch_threads(before + 2):
+        raise ZeroDivisionError
+    assert torch.get_num_threads() == before

@@ -14,6 +14,7 @@ def test_auto_takes_bfloat16_where_it_is_fast(monkeypatch):
         assert compute_dtype("auto", cpu) is dtype
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx2": True})
     assert compute_dtype("auto", cpu) is torch.float32
+    assert not observation.has_bf16(cpu)
     assert compute_dtype("bf16", cpu) is torch.bfloat16
     assert compute_dtype("auto", torch.device("meta")) is torch.float32
     assert compute_dtype("fp32", cpu) is torch.float32

@@ -65,6 +65,8 @@ MISTAKES = [
     # what Hydra can't read, or a shell has split
     ("train 'representations=[ego,' 'obj]'", ["representations=[ego,", "representations=[a,b]"]),
     ("evaluate run=a 'speed=[low,' 'high]'", ["speed=[low,", "speed=[a,b]"]),
+    ("evaluate 'run=[a,' b, 'c]'", ["run=[a,"]),
+    ("report 'run=[a,' 'b]'", ["run=[a,"]),
     ("train outputs", ["outputs"]),
     ("train --preset laptop", ["preset=<value>"]),
     ("train seed=0,1", ["seed=0,1"]),

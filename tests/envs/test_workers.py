@@ -13,7 +13,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from flowrep.envs import WorkerError, WorkerVectorEnv
+from flowrep.envs import WorkerError, WorkerVectorEnv, workers
+from flowrep.progress import StopRequest
 
 pytestmark = pytest.mark.slow
 
@@ -146,6 +147,35 @@ def test_a_worker_that_failed_or_was_killed_is_told(make, action, told):
         env.step(np.array([1, 1, 1, 1]))
 
 
+class EndsWhatUnpicklesIt:
+    def __call__(self):
+        return Counter()
+
+    def __reduce__(self):
+        return os._exit, (3,)
+
+
+def test_a_worker_that_ends_by_itself_is_not_taken_for_one_that_was_killed():
+    with pytest.raises(WorkerError, match=r"exit code 3\)") as caught:
+        WorkerVectorEnv([EndsWhatUnpicklesIt()] * 2, 2)
+    assert "memory" not in str(caught.value)
+
+
+@pytest.mark.parametrize("how", ["lambda", "local class", "open file"])
+def test_a_factory_that_can_not_be_sent_is_refused_with_what_to_do(how, tmp_path):
+    class Local(Counter):
+        pass
+
+    with (tmp_path / "file").open("w") as file:
+        factory = {
+            "lambda": lambda: Counter(),
+            "local class": Local,
+            "open file": partial(Counter, number=file),
+        }[how]
+        with pytest.raises(ValueError, match=r"module that can be imported"):
+            WorkerVectorEnv([factory, factory], 2)
+
+
 def test_an_answer_that_was_not_waited_for_is_no_answer_to_what_comes_next(make):
     env, other = make(3, 2), in_process(3)
     for each in (env, other):
@@ -165,8 +195,28 @@ def test_signals_of_terminals_and_schedulers_reach_no_worker_from_its_first_mome
     worker = make(2, 2)._workers[0]
     with open(f"/proc/{worker.process.pid}/status") as file:
         blocked = int(dict(line.split(":") for line in file)["SigBlk"], 16)
-    assert all(blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM))
-    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & {signal.SIGINT, signal.SIGTERM}
+    asked = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    assert all(blocked >> (number - 1) & 1 for number in asked)
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & asked
+
+
+@pytest.mark.parametrize("is_asked_to_stop", [False, True])
+def test_a_suspended_worker_is_named_and_neither_waited_for_nor_left_behind(
+    make, monkeypatch, is_asked_to_stop
+):
+    short = "PATIENCE_AFTER_STOP_S" if is_asked_to_stop else "PATIENCE_S"
+    env = make(4, 2)
+    env.reset(seed=0)
+    process = env._workers[1].process
+    os.kill(process.pid, signal.SIGSTOP)
+    monkeypatch.setattr(workers, short, 0.5)
+    with StopRequest():
+        if is_asked_to_stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(WorkerError, match=rf"environments 2 to 3 .*CONT {process.pid}'"):
+            env.step(np.array([1, 1, 1, 1]))
+    env.close()
+    assert process.exitcode == -signal.SIGKILL
 
 
 HOLDER = """

@@ -6,10 +6,12 @@ import pytest
 
 pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
-from flowrep.agent import DoubleDQN
+from flowrep.agent import DoubleDQN, observation
 from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, AnyAlgorithm
-from flowrep.experiment.build import algorithm_class, device
+from flowrep.experiment import build
+from flowrep.experiment.build import algorithm_class, device, evaluation_workers, with_precision
+from tests.config.composing import composed
 
 
 @pytest.fixture
@@ -20,6 +22,9 @@ def own_module(tmp_path, monkeypatch):
         "class Learner(DoubleDQN):\n"
         "    def __init__(self, observation_spec, action_spec, keys, *, total_frames, device,\n"
         "                 patience, mood=1.0): ...\n"
+        "class Other(DoubleDQN):\n"
+        "    def __init__(self, observation_spec, action_spec, keys, *, total_frames, device,\n"
+        "                 patience, precision='auto'): ...\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     yield
@@ -35,6 +40,25 @@ def test_an_algorithm_is_found_by_its_name():
     assert algorithm_class(named("flowrep.agent.DoubleDQN")) is DoubleDQN
     assert all(algorithm_class(named(target)) for target in ALGORITHMS)
     assert algorithm_class(named("someones.Learner", patience=3)).__name__ == "Learner"
+
+
+@pytest.mark.parametrize(("faster", "chosen"), [(True, "bf16"), (False, "fp32")])
+@pytest.mark.usefixtures("own_module")
+def test_a_new_run_s_config_says_in_which_format_it_computes(monkeypatch, faster, chosen):
+    monkeypatch.setattr(observation, "has_bf16", lambda device: True)
+    monkeypatch.setattr(observation, "_bf16_products_are_faster", lambda: faster)
+
+    def precision(algorithm):
+        config = composed("device=cpu").model_copy(update={"algorithm": algorithm})
+        return with_precision(config).plain()["algorithm"].get("precision")
+
+    section = composed("device=cpu").algorithm
+    assert section.precision == "auto"
+    assert precision(section) == chosen
+    for given in ("bf16", "fp32"):
+        assert precision(section.model_copy(update={"precision": given})) == given
+    assert precision(named("someones.Learner", patience=3)) is None  # has no such option
+    assert precision(named("someones.Other", patience=3)) == chosen  # has it, with a default
 
 
 @pytest.mark.parametrize(
@@ -59,3 +83,23 @@ def test_a_device_that_is_not_there_is_named():
     assert device("cpu").type == "cpu"
     with pytest.raises(ValueError, match="device=cuda:99"):
         device("cuda:99")
+
+
+@pytest.mark.parametrize(
+    ("cores", "asked", "num_envs", "workers"),
+    [
+        (2, "auto", 96, 2),
+        (2, "auto", 47, 0),  # one process would have fewer than 24
+        (16, "auto", 96, 4),
+        (1, "auto", 96, 0),
+        (2, 0, 96, 0),
+        (2, 3, 96, 3),
+        (2, 3, 2, 2),  # the last episodes of many workers
+    ],
+)
+def test_an_evaluation_is_stepped_by_a_process_a_core_if_each_has_enough_to_do(
+    monkeypatch, cores, asked, num_envs, workers
+):
+    monkeypatch.setattr(build, "available_cores", lambda: cores)
+    config = composed("device=cpu").model_copy(update={"num_workers": asked})
+    assert evaluation_workers(config, num_envs) == workers

@@ -184,19 +184,24 @@ def test_another_agents_run_keeps_the_baselines_episodes(comparison, scene):
     assert len(made) == 2  # an env for each frame rate, none for baselines
 
 
-def test_of_what_was_stopped_the_episodes_before_the_first_gap_are_kept(scene):
-    stopped = Comparison(**ASKED | {"episodes": 6, "speeds": ["low"], "fps": [12]})
+@pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_every_episode_that_ended_before_a_stop_is_kept_in_its_order(scene, num_workers):
+    few = ASKED | {"episodes": 6, "fps": [12]}
+    whole, stopped = Comparison(**few), Comparison(**few)
 
-    class AfterThree:
+    class OnceThreeOfTheSecondSpeedEnded:
         def __bool__(self):
-            return stopped.done == 3
+            return stopped.done >= 6 + 3
 
-    make = partial(make_env, scene, representations=["obj"])
-    stopped.run(make, weigher("obj"), num_envs=6, stop=AfterThree())
-    assert stopped.done == 3
-    (found,) = stopped._found.values()
-    gap = next(k for k in range(6) if 5 + k not in found)
-    assert [row["episode_seed"] for row in stopped.rows()] == [5 + k for k in range(gap)]
+    make = partial(make_env, scene, representations=["obj"], num_workers=num_workers)
+    whole.run(make, weigher("obj"), num_envs=6)
+    stopped.run(make, weigher("obj"), num_envs=6, stop=OnceThreeOfTheSecondSpeedEnded())
+    rows = stopped.rows()
+    assert 9 <= stopped.done == len(rows) < 12
+    assert rows == [row for row in whole.rows() if row in rows]
+    seeds = [row["episode_seed"] for row in rows if row["speed"] == "high"]
+    assert seeds != list(range(5, 5 + len(seeds)))  # short ones end first: there is a gap
+    assert stopped.rows(only_whole=True) == [row for row in rows if row["speed"] == "low"]
 
 
 def test_what_is_complete_is_saved_before_the_rest_is_run(scene):

@@ -284,10 +284,31 @@ def test_an_episode_that_is_evaluated_again_takes_its_place(tmp_path):
     before = run.evaluation_path.read_bytes()
     run.log_episodes([episode(8), episode(9)])
     assert run.evaluation_path.read_bytes() == before
-    run.log_episodes([episode(8, "timeout"), episode(8, evaluation="final")])
+    run.log_episodes([episode(8, "timeout")])
+    run.log_episodes([episode(8, evaluation="final")])
     assert [(row["episode_seed"], row["outcome"]) for row in run.read_episodes()] == [
         ("7", "collision"), ("8", "timeout"), ("9", "collision"), ("8", "collision"),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("there", "new", "then"),
+    [
+        ([1, 3, 9], [1, 2, 3, 4], [1, 2, 3, 4, 9]),  # two were missing after an interruption
+        ([3, 9], [1, 2, 3], [1, 2, 3, 9]),
+        ([1, 2, 9], [2], [1, 2, 9]),
+        ([8, 9], [1, 2], [8, 9, 1, 2]),
+        ([], [2, 1], [2, 1]),
+    ],
+)
+def test_new_episodes_stand_where_an_uninterrupted_evaluation_has_them(tmp_path, there, new, then):
+    run = RunFolder(tmp_path)
+    run.save_episodes([episode(seed) for seed in there])
+    run.save_episodes([episode(seed, "timeout") for seed in new])
+    rows = run.read_episodes()
+    assert [int(row["episode_seed"]) for row in rows] == then
+    again = {int(row["episode_seed"]) for row in rows if row["outcome"] == "timeout"}
+    assert again == set(new)
 
 
 HEADER = ",".join(EVALUATION_COLUMNS)

@@ -146,6 +146,24 @@ def test_a_resumed_run_keeps_its_machine_settings_unless_others_are_given(tmp_pa
     assert folder.read_config()["num_workers"] == 2
 
 
+def test_updates_use_the_threads_of_the_config_and_all_else_one(tmp_path):
+    runner = new_run(tmp_path, more=["threads=2"])
+    used, act, update = [], runner.agent.act, runner.agent.update
+    runner.agent.act = lambda *of: used.append(("act", torch.get_num_threads())) or act(*of)
+    runner.agent.update = lambda *of: used.append(("up", torch.get_num_threads())) or update(*of)
+    trained(runner, StopAfter(runner, 40))
+    assert {*used} == {("act", 1), ("up", 2)}
+
+
+def test_a_machine_that_emulates_the_run_s_number_format_says_so(tmp_path, monkeypatch, capsys):
+    given = {"resume": True, "more": ["algorithm.precision=bf16"]}
+    trained(new_run(tmp_path, more=given["more"]), lambda: True)
+    for is_there in (True, False):
+        monkeypatch.setattr("flowrep.experiment.runner.has_bf16", lambda device, i=is_there: i)
+        new_run(tmp_path, **given).close()
+        assert ("bf16" in capsys.readouterr().out) is not is_there
+
+
 @pytest.mark.slow
 def test_a_finished_run_is_made_longer_and_its_learning_rate_follows(tmp_path):
     short = trained(new_run(tmp_path))
