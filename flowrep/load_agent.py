@@ -1,6 +1,8 @@
 """Loads an agent trained by flowrep, with torch alone, from agent.pt2 and agent.json beside it."""
 
+import io
 import json
+import zlib
 from pathlib import Path
 
 import torch
@@ -14,7 +16,11 @@ def make(task=None, device="cpu"):
 
     The maps are on `device`, or on that of flowrep's task.
     """
-    names = [each["name"] for each in json.loads((HERE / "agent.json").read_text())["maps"]]
-    program = torch.export.load(HERE / "agent.pt2")
+    card = json.loads((HERE / "agent.json").read_text())
+    saved = (HERE / "agent.pt2").read_bytes()
+    if zlib.crc32(saved) != card["crc32"]["agent.pt2"]:
+        raise ValueError(f"{HERE / 'agent.pt2'} is damaged, or of another export than agent.json")
+    program = torch.export.load(io.BytesIO(saved))
     network = move_to_device_pass(program, task.device if task else device).module()
+    names = [each["name"] for each in card["maps"]]
     return lambda maps: network(*(maps[name] for name in names)).argmax(-1)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
 from types import SimpleNamespace
 
 import pytest
@@ -15,7 +16,7 @@ import yaml
 from flowrep import sweep
 from flowrep.config import UsageError, cli, group_choices
 from flowrep.config.schema import TrainConfig
-from flowrep.tables import read_rows
+from flowrep.tables import TableError, read_rows
 from tests.config.composing import composed, plain
 
 
@@ -56,7 +57,7 @@ FINISHES = """
 open(folder + "/times", "a").write("x")
 with open(folder + "/evaluation.csv", "w") as table:
     print("evaluation,frames,policy,outcome", file=table)
-    for policy, end in ("greedy", "success"), ("sampled", "timeout"), ("a", "b"), ("c", "d"):
+    for policy, end in zip(("greedy", "sampled", "a", "b"), ("success", *["timeout"] * 3)):
         print(f"final,256,{policy},{end}", file=table)
 """
 
@@ -85,9 +86,10 @@ def test_a_run_that_finishes_gives_its_success_and_is_not_run_again(attempt, tmp
 )
 def test_a_run_that_fails_says_why_and_is_tried_again(attempt, tmp_path, code, expected):
     attempt("print('error: old'); sys.exit(2)")
+    sweep._begin(tmp_path, "s1")
     state = attempt(code)
     assert re.match(f"failed: {expected}", state)
-    assert sweep._states(tmp_path.parent)[tmp_path.name] == state
+    assert sweep._states(tmp_path.parent, "s1")[tmp_path.name] == state
     assert attempt(FINISHES).startswith("finished")
 
 
@@ -104,6 +106,18 @@ time.sleep(60)
 @pytest.mark.parametrize("code", [129, 130, 143])
 def test_a_run_that_saved_after_a_signal_is_stopped(attempt, code):
     assert attempt(f"sys.exit({code})") == "stopped"
+
+
+def test_an_outcome_that_is_none_is_no_failure_and_no_success(attempt):
+    with pytest.raises(TableError, match=r"evaluation\.csv.*'succes'"):
+        attempt(FINISHES.replace('"success"', '"succes"'))
+
+
+def test_outcomes_are_those_of_the_simulator():
+    pytest.importorskip("pybullet", reason="the simulator has them")
+    from flowrep.experiment.evaluation import OUTCOMES
+
+    assert OUTCOMES[1:] == sweep.OUTCOMES
 
 
 def test_a_run_is_told_to_save_when_the_sweep_is_stopped(attempt, tmp_path):
@@ -154,7 +168,7 @@ def test_the_line_of_a_run_begins_or_resumes_it(tmp_path, monkeypatch):
         job=SimpleNamespace(config_name="train"),
     )
     monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra)
-    config, odd = SimpleNamespace(num_workers="auto"), tmp_path / "josé (2)"
+    config, odd = composed("num_workers=auto"), tmp_path / "josé (2)"
     line = sweep._line(odd, config, is_worker=True)
     assert line[0].startswith("hydra.run.dir='")
     assert {"seed=1", "device=cpu", "num_workers=0", "hydra.searchpath=[x]"} <= {*line}
@@ -162,6 +176,57 @@ def test_the_line_of_a_run_begins_or_resumes_it(tmp_path, monkeypatch):
     odd.mkdir()
     (odd / "config.yaml").touch()
     assert sweep._line(odd, config, is_worker=False) == [f"resume='{odd}'", "device=cpu"]
+    others = composed("algorithm._target_=mine.Own")
+    assert sweep._line(odd, others, is_worker=False)[-1] == "algorithm._target_=mine.Own"
+
+
+def test_of_two_sweeps_in_a_folder_ctrl_c_stops_one_and_each_sums_up_its_own_runs(
+    monkeypatch, tmp_path, capsys
+):
+    ids, both = {}, {}
+
+    def run(name, meanwhile=lambda: None):
+        """A sweep of one run, which asks whether it should stop after something happened."""
+
+        def hydra(*_):
+            ids[name] = next(x for x in sys.argv if "env_set" in x).rpartition("=")[2]
+            folder = tmp_path / name
+            folder.mkdir()
+            job = SimpleNamespace(env_set={sweep._ID: ids[name]})
+            dirs = {"output_dir": str(folder), "dir": str(tmp_path)}
+            config = SimpleNamespace(
+                runtime=SimpleNamespace(**dirs), sweep=SimpleNamespace(**dirs), job=job,
+                sweeper={"_target_": "BasicSweeper"},
+            )  # fmt: skip
+
+            def attempted(folder, config, line, should_stop):
+                meanwhile()
+                both[name] = should_stop()
+                return sweep._say(folder, sweep.STOPPED if both[name] else "finished, success 0%")
+
+            monkeypatch.setattr(sweep.HydraConfig, "get", lambda: config)
+            monkeypatch.setattr(sweep, "attempted", attempted)
+            sweep.job({})
+
+        monkeypatch.setattr(sys, "argv", ["train", "-m", f"hydra.sweep.dir={tmp_path}", "seed=1,2"])
+        monkeypatch.setattr(cli, "run_hydra", hydra)
+        with pytest.raises(SystemExit) as ended:
+            sweep.run_sweep()
+        return ended.value.code
+
+    monkeypatch.setattr(sweep, "_line", lambda *_: [])
+    monkeypatch.setattr(cli, "plain_config", lambda config: CONFIG.plain())
+    codes = []
+
+    def stop_the_other():
+        codes.append(run("second", meanwhile=lambda: signal.raise_signal(signal.SIGINT)))
+        capsys.readouterr()
+
+    codes.append(run("first", meanwhile=stop_the_other))
+    assert codes == [130, 0]
+    assert both == {"first": False, "second": True}
+    assert "1 of 1 runs finished" in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == []  # no mark is left
 
 
 @pytest.mark.parametrize("sweeper", ["x.BasicSweeper", "elsewhere.OptunaSweeper"])
@@ -171,6 +236,7 @@ def test_a_failed_run_stops_a_sweeper_that_needs_its_result_and_no_grid(
     hydra = SimpleNamespace(
         runtime=SimpleNamespace(output_dir=str(tmp_path)),
         sweep=SimpleNamespace(dir=str(tmp_path)),
+        job=SimpleNamespace(env_set={"FLOWREP_SWEEP": "s1"}),
         sweeper={"_target_": sweeper},
     )
     monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra)
@@ -181,6 +247,18 @@ def test_a_failed_run_stops_a_sweeper_that_needs_its_result_and_no_grid(
     else:
         with pytest.raises(sweep.RunFailedError, match="failed: error: seed"):
             sweep.job({})
+
+
+def test_a_killed_worker_of_a_launcher_is_no_traceback(monkeypatch, tmp_path, capsys):
+    def killed(config):
+        raise BrokenProcessPool("A worker process was unexpectedly terminated")
+
+    monkeypatch.setattr(sys, "argv", ["train", "-m", f"hydra.sweep.dir={tmp_path}"])
+    with pytest.raises(SystemExit):
+        cli.run_hydra("train", killed, TrainConfig)
+    said = capsys.readouterr().err
+    assert "error: A worker process" in said
+    assert "Traceback" not in said
 
 
 def test_a_sweep_of_one_run_to_continue_is_refused(monkeypatch, capsys):

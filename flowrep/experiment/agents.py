@@ -2,9 +2,12 @@
 
 import json
 import math
+import re
+import shlex
 import sys
 import sysconfig
 import traceback
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +24,7 @@ from torchrl.data import Categorical, Composite, TensorSpec
 from torchrl.envs import EnvBase
 
 from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.config.schema import EnvConfig, TrainConfig, validated_run
+from flowrep.config.schema import EnvConfig, TrainConfig
 from flowrep.envs import street_envs
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import Policy, scene_id
@@ -68,13 +71,18 @@ class Agent:
 
 
 def load_trained(
-    run: RunFolder, *, scene: Mapping[str, Any] | None = None, **machine: Any
+    run: RunFolder,
+    *,
+    scene: Mapping[str, Any] | None = None,
+    algorithm: str | None = None,
+    **machine: Any,
 ) -> Agent:
     """Returns a run's agent, to act in the given scene, or in its own if None.
 
-    `machine` is `device`, `num_envs` and `num_workers`, in place of the run's.
+    `machine` is `device`, `num_envs` and `num_workers`, in place of the run's; `algorithm` is one
+    that it may name besides flowrep's own.
     """
-    own = validated_run(run.read_config(), f"{run.path}/config.yaml")
+    own = run.config(algorithm)
     path = run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(own.plain()), path)
@@ -266,9 +274,15 @@ def _card(reference: str) -> Any:
     if path is None or not path.is_file():
         return None
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        card = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise PolicyError(f"{path} is damaged: {error}; export the agent again") from error
+    digests = card.pop("crc32", {})  # exports of earlier versions have none
+    for name in digests.keys() & {CARD, PROGRAM}:
+        data = json.dumps(card).encode() if name == CARD else path.with_name(name).read_bytes()
+        if zlib.crc32(data) != digests[name]:
+            raise PolicyError(f"{path.with_name(name)} is not as exported; export the agent again")
+    return card
 
 
 def _settings(card: Mapping[str, Any], task: Task) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -298,5 +312,7 @@ def _camera(shape: Sequence[int], K: Sequence[Sequence[float]]) -> dict[str, Any
 
 def _overrides(settings: Mapping[str, Any], keys: Sequence[str]) -> str:
     """Returns settings as on the command line, `representations=[ego,obj] scene=s_turn`."""
-    texts = {key: json.dumps(settings[key], separators=(",", ":")) for key in keys}
-    return " ".join(f"{key}={text}" for key, text in texts.items()).replace('"', "")
+    texts = [f"{key}={json.dumps(settings[key], separators=(',', ':'))}" for key in keys]
+    plain = [text.replace('"', "") for text in texts]
+    # what a card from somebody else says may be pasted into a shell
+    return " ".join(x if re.fullmatch(r"[\w.=,\[\]-]+", x) else shlex.quote(x) for x in plain)

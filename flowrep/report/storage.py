@@ -23,6 +23,7 @@ import numpy as np
 
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.files import replace_files
 from flowrep.report.runs import Columns, Run
 from flowrep.tables import TableError
 
@@ -30,7 +31,6 @@ RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
 Cells = Mapping[str, Sequence[str]]
 _MACHINE = ("commit", "precision", "cpu")
 _OUTCOMES = OUTCOMES[1:]  # the first is that of an episode that goes on
-_MOST_VALUES = 100_000  # of a config, which has a few hundred
 _EPISODES: dict[str, type] = {
     "scene": str, "scene_id": str, "frames": int, "evaluation": str, "policy": str, "speed": str,
     "fps": float, "episode_seed": int, "outcome": str, "hit": str, "length": int,
@@ -71,7 +71,6 @@ def read_run(path: Path) -> Run:
     folder = RunFolder.existing(path)
     try:
         config = folder.read_config()
-        _check_size(config)
         tables = folder.read_episodes(), folder.read_metrics()
         episodes, metrics = (
             {k: [row[k] for row in t] for k in (t[0] if t else ())} for t in tables
@@ -83,18 +82,6 @@ def read_run(path: Path) -> Run:
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         what = f"config.yaml or a table is not what a run leaves ({error!r})"
         raise RunFolderError(f"{path}: {what}; restore the file that the run wrote") from None
-
-
-def _check_size(config: Any) -> None:
-    # YAML's references make a few lines stand for more values than any loop gets through.
-    waiting, values = [config], 0
-    while waiting:
-        part, values = waiting.pop(), values + 1
-        if values > _MOST_VALUES:
-            raise ValueError(f"it has more than {_MOST_VALUES:,} values")
-        waiting += (
-            part.values() if isinstance(part, dict) else part if isinstance(part, list) else []
-        )
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
@@ -129,8 +116,11 @@ def _metric_columns(cells: Cells) -> Columns:
 
 def _machine(path: Path) -> dict[str, str]:
     # Several machines where it was resumed on another.
-    noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    of_each = {key: dict.fromkeys(str(machine.get(key)) for machine in noted) for key in _MACHINE}
+    try:
+        noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+        of_each = {key: dict.fromkeys(str(each.get(key)) for each in noted) for key in _MACHINE}
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path.name}: {error}") from error
     return {key: " | ".join(found) or "unknown" for key, found in of_each.items()}
 
 
@@ -141,6 +131,16 @@ def is_archive(folder: Path) -> bool:
 
 def read_archive(folder: Path, pattern: str = "*") -> list[Run]:
     """Returns the packed runs of a folder with such names, in their order."""
+    try:
+        return _read_archive(folder, pattern)
+    except RunFolderError:
+        raise
+    except Exception as error:  # gzip, csv and json fail on garbage in a dozen ways
+        what = f"{type(error).__name__}: {error}"
+        raise RunFolderError(f"'{folder}': damaged packed runs ({what}): restore them") from error
+
+
+def _read_archive(folder: Path, pattern: str) -> list[Run]:
     episodes, training = _of_runs(folder / EPISODES), _of_runs(folder / TRAINING)
     runs = []
     for line in (folder / RUNS).read_text(encoding="utf-8").splitlines():
@@ -171,17 +171,18 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
     before = read_archive(folder) if is_archive(folder) else []
     kept = dict(sorted({Path(run.name).name: run for run in (*before, *runs)}.items()))
     logged = list(dict.fromkeys(name for run in kept.values() for name in run.metrics))
-    _write(folder / EPISODES, [*_EPISODES], {name: run.episodes for name, run in kept.items()})
-    _write(folder / TRAINING, logged, {name: run.metrics for name, run in kept.items()})
+    episodes = _packed([*_EPISODES], {name: run.episodes for name, run in kept.items()})
+    training = _packed(logged, {name: run.metrics for name, run in kept.items()})
     lines = []
     for name, run in kept.items():
         machine = {key: run.machine.get(key, "unknown") for key in _MACHINE}
         entry = {"run": name, **machine, "config": run.config}
         lines.append(json.dumps(entry, ensure_ascii=False) + "\n")
-    (folder / RUNS).write_text("".join(lines), encoding="utf-8")
+    files = {EPISODES: episodes, TRAINING: training, RUNS: "".join(lines).encode("utf-8")}
+    replace_files(folder, files)
 
 
-def _write(path: Path, names: Sequence[str], tables: Mapping[str, Columns]) -> None:
+def _packed(names: Sequence[str], tables: Mapping[str, Columns]) -> bytes:
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("run", *names))
@@ -189,9 +190,7 @@ def _write(path: Path, names: Sequence[str], tables: Mapping[str, Columns]) -> N
         absent = np.full(max(map(len, columns.values()), default=0), np.nan)
         cells = [map(_text, columns.get(name, absent).tolist()) for name in names]
         writer.writerows((run, *row) for row in zip(*cells))
-    whole = path.with_suffix(".tmp")
-    whole.write_bytes(gzip.compress(text.getvalue().encode("utf-8"), mtime=0))
-    whole.replace(path)
+    return gzip.compress(text.getvalue().encode("utf-8"), mtime=0)
 
 
 def _text(value: Any) -> str:
