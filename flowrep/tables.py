@@ -2,33 +2,52 @@
 
 import csv
 import io
-import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from flowrep.files import naming, open_to_append, replace_file
 
 
 class TableError(ValueError):
     """A table is not what was written."""
 
 
-def read_rows(path: Path, columns: Iterable[str] = ()) -> list[dict[str, str]]:
+def read_rows(
+    path: Path,
+    columns: Iterable[str] = (),
+    checks: Mapping[str, Callable[[str], Any]] | None = None,
+) -> list[dict[str, str]]:
     """Returns a table's rows, none if there is no file; an incomplete last line is left out.
 
-    A table without one of `columns` is refused, as after a spreadsheet saved it with semicolons.
+    A table without one of `columns` is refused, as after a spreadsheet saved it with semicolons,
+    and one with a cell for which its column's check raises a ValueError.
     """
     if not path.is_file():
         return []
     data = path.read_bytes()
     text = data[: data.rfind(b"\n") + 1].decode("utf-8-sig", errors="replace")
     table = csv.DictReader(io.StringIO(text, newline=""))
-    rows = list(table)
+    try:
+        rows = list(table)
+    except csv.Error as error:
+        raise TableError(f"{path} is no table: {error}; move it aside") from None
     missing = [name for name in columns if name not in (table.fieldnames or ())]
     if rows and (missing or any(None in row.values() or None in row for row in rows)):
         raise TableError(
             f"{path} lacks {', '.join(missing) or 'cells in a line'}: perhaps another program or "
             "version wrote it; move it aside, or export it again with commas"
         )
+    for number, row in enumerate(rows, start=1):
+        for name, check in (checks or {}).items():
+            try:
+                check(row[name])
+            except ValueError:
+                raise TableError(
+                    f"{path}: {name} is {row[name]!r} in row {number}, which is never written: "
+                    "restore the table, or move it aside"
+                ) from None
     return rows
 
 
@@ -41,19 +60,10 @@ def write_rows(
     path: Path, rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:
     """Replaces a whole table, or leaves the old one; without rows, the file is removed."""
-    rows = list(rows)
-    if not rows:
+    if rows := list(rows):
+        replace_file(path, partial(append_rows, rows=rows, columns=columns))
+    else:
         path.unlink(missing_ok=True)
-        return
-    fresh = path.with_suffix(".tmp")
-    fresh.unlink(missing_ok=True)
-    try:
-        append_rows(fresh, rows, columns)
-        with fresh.open("rb") as file:
-            os.fsync(file.fileno())
-        fresh.replace(path)
-    finally:
-        fresh.unlink(missing_ok=True)
 
 
 def append_rows(
@@ -75,7 +85,7 @@ def append_rows(
         writer.writeheader()
     writer.writerows(rows)
     # in one call, so that a killed process leaves all of them or none
-    with path.open("ab", buffering=0) as raw:
+    with naming(path), open_to_append(path) as raw:
         data = text.getvalue().encode("utf-8")
         written = raw.write(data)
         while written < len(data):  # a nearly full disk takes a part, then raises

@@ -16,7 +16,8 @@ FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry", "extras"},
     "transforms": {"transforms", "geometry", "extras"},
     "testing": {"geometry"},
-    "agent": {"agent", "extras"},
+    "agent": {"agent", "extras", "files"},
+    "files": set(),
     "palette": set(),
     "scenes": {"scenes", "config", "extras", "palette"},
     "simulator": {"simulator", "scenes", "palette", "extras"},
@@ -25,19 +26,20 @@ FLOWREP_IMPORTS_ALLOWED = {
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
-    | {"transforms", "geometry", "palette", "progress", "tables", "config", "extras", "viz"},
+    | {"transforms", "geometry", "palette", "progress", "tables", "config", "extras", "viz"}
+    | {"files", "load_agent"},
     "progress": set(),
-    "tables": set(),
+    "tables": {"files"},
     "viz": {"viz", "scenes", "geometry", "palette"},
     "load_agent": set(),
     "pretrained": {"experiment", "agent", "config"},
     "policies": {"pretrained", "experiment", "baselines", "config"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
     | {"transforms", "geometry", "viz"},
-    "sweep": {"config", "progress", "tables"},
+    "sweep": {"config", "progress", "tables", "files"},
     "config": {"config"},
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
-    | {"extras", "tables"},
+    | {"extras", "tables", "files"},
 }
 THIRD_PARTY_ONLY_IN = {
     "pybullet": {"simulator/bullet.py", "pybullet.py"},

@@ -23,6 +23,7 @@ import numpy as np
 
 from flowrep.experiment.evaluation import OUTCOMES
 from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.files import replace_files
 from flowrep.report.runs import Columns, Run
 from flowrep.tables import TableError
 
@@ -129,8 +130,11 @@ def _metric_columns(cells: Cells) -> Columns:
 
 def _machine(path: Path) -> dict[str, str]:
     # Several machines where it was resumed on another.
-    noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    of_each = {key: dict.fromkeys(str(machine.get(key)) for machine in noted) for key in _MACHINE}
+    try:
+        noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+        of_each = {key: dict.fromkeys(str(each.get(key)) for each in noted) for key in _MACHINE}
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path.name}: {error}") from error
     return {key: " | ".join(found) or "unknown" for key, found in of_each.items()}
 
 
@@ -141,6 +145,16 @@ def is_archive(folder: Path) -> bool:
 
 def read_archive(folder: Path, pattern: str = "*") -> list[Run]:
     """Returns the packed runs of a folder with such names, in their order."""
+    try:
+        return _read_archive(folder, pattern)
+    except RunFolderError:
+        raise
+    except Exception as error:  # gzip, csv and json fail on garbage in a dozen ways
+        what = f"{type(error).__name__}: {error}"
+        raise RunFolderError(f"'{folder}': damaged packed runs ({what}): restore them") from error
+
+
+def _read_archive(folder: Path, pattern: str) -> list[Run]:
     episodes, training = _of_runs(folder / EPISODES), _of_runs(folder / TRAINING)
     runs = []
     for line in (folder / RUNS).read_text(encoding="utf-8").splitlines():
@@ -171,17 +185,18 @@ def write_archive(runs: Sequence[Run], folder: Path) -> None:
     before = read_archive(folder) if is_archive(folder) else []
     kept = dict(sorted({Path(run.name).name: run for run in (*before, *runs)}.items()))
     logged = list(dict.fromkeys(name for run in kept.values() for name in run.metrics))
-    _write(folder / EPISODES, [*_EPISODES], {name: run.episodes for name, run in kept.items()})
-    _write(folder / TRAINING, logged, {name: run.metrics for name, run in kept.items()})
+    episodes = _packed([*_EPISODES], {name: run.episodes for name, run in kept.items()})
+    training = _packed(logged, {name: run.metrics for name, run in kept.items()})
     lines = []
     for name, run in kept.items():
         machine = {key: run.machine.get(key, "unknown") for key in _MACHINE}
         entry = {"run": name, **machine, "config": run.config}
         lines.append(json.dumps(entry, ensure_ascii=False) + "\n")
-    (folder / RUNS).write_text("".join(lines), encoding="utf-8")
+    files = {EPISODES: episodes, TRAINING: training, RUNS: "".join(lines).encode("utf-8")}
+    replace_files(folder, files)
 
 
-def _write(path: Path, names: Sequence[str], tables: Mapping[str, Columns]) -> None:
+def _packed(names: Sequence[str], tables: Mapping[str, Columns]) -> bytes:
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("run", *names))
@@ -189,9 +204,7 @@ def _write(path: Path, names: Sequence[str], tables: Mapping[str, Columns]) -> N
         absent = np.full(max(map(len, columns.values()), default=0), np.nan)
         cells = [map(_text, columns.get(name, absent).tolist()) for name in names]
         writer.writerows((run, *row) for row in zip(*cells))
-    whole = path.with_suffix(".tmp")
-    whole.write_bytes(gzip.compress(text.getvalue().encode("utf-8"), mtime=0))
-    whole.replace(path)
+    return gzip.compress(text.getvalue().encode("utf-8"), mtime=0)
 
 
 def _text(value: Any) -> str:

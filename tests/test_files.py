@@ -1,0 +1,167 @@
+"""Files are written whole or not at all, under no name that somebody else chose."""
+
+import errno
+import os
+import stat
+
+import pytest
+
+from flowrep import files
+from flowrep.files import open_to_append, replace_file, replace_files, replace_text, set_aside
+
+
+@pytest.fixture
+def victim(tmp_path):
+    """A file of the user's, which links point at."""
+    path = tmp_path / "elsewhere" / "victim"
+    path.parent.mkdir()
+    path.write_text("precious")
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    path = tmp_path / "folder"
+    path.mkdir()
+    return path
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def fails(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_replaced_file_is_like_any_new_one(folder):
+    path = folder / "a.txt"
+    path.write_text("old")
+    path.chmod(0o600)
+    umask = os.umask(0o027)
+    try:
+        replace_text(path, "é")
+        with path.with_name("b.txt").open("w") as other:
+            assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE(
+                os.fstat(other.fileno()).st_mode
+            )
+    finally:
+        os.umask(umask)
+    assert path.read_bytes() == "é".encode()
+
+
+@pytest.mark.parametrize("step", ["write", "_flush", "_rename"])
+def test_whatever_fails_the_file_is_the_old_one_and_the_error_names_it(folder, monkeypatch, step):
+    path = folder / "a.txt"
+    path.write_text("old")
+    if step != "write":
+        monkeypatch.setattr(files, step, fails)
+
+    def write(partial):
+        partial.write_text("half")
+        if step == "write":
+            fails()
+
+    with pytest.raises(OSError, match=r"a\.txt'$") as caught:
+        replace_file(path, write)
+    assert caught.value.errno == errno.ENOSPC
+    assert (names(folder), path.read_text()) == (["a.txt"], "old")
+
+
+def test_an_interrupted_writer_leaves_nothing(folder):
+    def write(partial):
+        partial.write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        replace_file(folder / "a.txt", write)
+    assert names(folder) == []
+
+
+def test_a_file_is_on_disk_before_it_has_its_name_and_the_name_is_on_disk_too(folder, monkeypatch):
+    order = []
+    monkeypatch.setattr(
+        os, "fsync", lambda file: order.append(os.readlink(f"/proc/self/fd/{file}"))
+    )
+    rename = files._rename
+    monkeypatch.setattr(files, "_rename", lambda *names: (order.append("renamed"), rename(*names)))
+    replace_text(folder / "a.txt", "new")
+    partial, renamed, last = order
+    assert partial.endswith("/a.txt")
+    assert (renamed, last) == ("renamed", str(folder))
+
+
+def test_links_are_replaced_and_not_followed(folder, victim):
+    (folder / "a.txt").symlink_to(victim)
+    for name in (".a.txt.tmp", "a.tmp", "a.tmp.txt", ".a.txt.partial", ".a.txt.0.partial"):
+        (folder / name).symlink_to(victim.parent)  # whatever a temporary file may be called
+    replace_text(folder / "a.txt", "new")
+    assert not (folder / "a.txt").is_symlink()
+    assert (folder / "a.txt").read_text() == "new"
+    assert names(victim.parent) == ["victim"]
+    assert victim.read_text() == "precious"
+
+
+def test_nothing_is_appended_through_a_link_or_to_a_pipe(folder, victim):
+    (folder / "a.csv").symlink_to(victim)
+    (folder / "b.csv").symlink_to(victim.with_name("new"))
+    os.mkfifo(folder / "c.csv")
+    for name in ("a.csv", "b.csv", "c.csv"):
+        with pytest.raises(OSError, match=name):
+            open_to_append(folder / name)
+    assert names(victim.parent) == ["victim"]
+    assert victim.read_text() == "precious"
+
+
+def test_a_folder_that_is_a_link_to_another_disk_is_used(folder, tmp_path):
+    there = tmp_path / "other"
+    there.mkdir()
+    (folder / "link").symlink_to(there)
+    replace_text(folder / "link" / "a.txt", "new")
+    assert names(there) == ["a.txt"]
+
+
+OLD, NEW = {"a": b"1", "b": b"1", "c": b"1"}, {"a": b"2", "b": b"2", "c": b"2"}
+
+
+@pytest.mark.parametrize("as_one", [True, False])
+def test_of_several_files_a_full_disk_replaces_none(folder, monkeypatch, as_one):
+    replace_files(folder, OLD, as_one=as_one)
+    monkeypatch.setattr(files, "_flush", fails)
+    with pytest.raises(OSError, match="c'"):
+        replace_files(folder, NEW, as_one=as_one)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == OLD
+
+
+@pytest.mark.parametrize("count", range(3))
+def test_files_that_are_one_are_never_there_beside_older_ones(folder, monkeypatch, count):
+    """As after a kill once so many have been renamed."""
+    replace_files(folder, OLD, as_one=True)
+    rename, left = files._rename, [count]
+
+    def killed(*paths):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        rename(*paths)
+
+    monkeypatch.setattr(files, "_rename", killed)
+    with pytest.raises(KeyboardInterrupt):
+        replace_files(folder, NEW, as_one=True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == dict(
+        [*NEW.items()][:count]
+    )
+
+
+def test_a_damaged_file_is_kept_under_a_name_of_its_own(folder, capsys):
+    kept = set()
+    for text in ("one", "two"):
+        (folder / "a.npz").write_text(text)
+        set_aside(folder / "a.npz", "bad\nzip")
+        (line,) = capsys.readouterr().err.splitlines()
+        assert str(folder / "a.npz") in line
+        assert "bad zip" in line
+        (name,) = {*names(folder)} - kept
+        assert name in line
+        assert (folder / name).read_text() == text
+        kept.add(name)
