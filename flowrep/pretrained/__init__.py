@@ -6,17 +6,14 @@
 torch.Size([2, 3])
 """
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from flowrep.agent import load_checkpoint
+from flowrep.agent import load_checkpoint, save_checkpoint
 from flowrep.config import UsageError
 from flowrep.config.schema import validated_run
 from flowrep.experiment.agents import Agent, with_weights
@@ -37,26 +34,25 @@ def load(scene: str | Mapping[str, Any], **machine: Any) -> Agent:
         UsageError: there is none for this scene.
     """
     name = scene if isinstance(scene, str) else scene["name"]
-    path = FOLDER / f"{name}.safetensors"
-    if not path.is_file():
-        there = ", ".join(sorted(file.stem for file in FOLDER.glob("*.safetensors")))
+    files = {file.stem: file for file in FOLDER.glob("*.safetensors")}
+    if name not in files:
+        there = ", ".join(sorted(files))
         raise UsageError(f"no agent for scene '{name}' comes with flowrep; there are: {there}")
-    with safe_open(path, framework="pt") as file:
-        about = file.metadata()
-        weights = unpacked({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
-    config = validated_run(json.loads(about["config"]), path.name)
+    stored = load_checkpoint(files[name])
+    config = validated_run(stored["config"], files[name].name)
     here: dict[str, Any] = {"device": "auto", "num_workers": 0} | machine
     if not isinstance(scene, str):
         here["scene"] = scene
-    return with_weights(config, weights, int(about["frames"]), "the trained agent", **here)
+    weights = unpacked(stored["policy"])
+    return with_weights(config, weights, stored["frames"], "the trained agent", **here)
 
 
 def pack(run: str | Path, path: Path) -> None:
     """Writes the policy of a run and its config into one file, at a byte for each weight."""
     folder = RunFolder.existing(run)
     state = load_checkpoint(folder.checkpoint_path, ["frames", "policy"])
-    about = {"config": json.dumps(folder.read_config()), "frames": str(state["frames"])}
-    save_file(packed(state["policy"]), path, metadata=about)
+    stored = {"config": folder.read_config(), "policy": packed(state["policy"])}
+    save_checkpoint(path, {"frames": state["frames"], **stored})
 
 
 def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

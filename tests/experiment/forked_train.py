@@ -23,6 +23,7 @@ import matplotlib.pyplot  # noqa: F401
 import torch.utils.tensorboard  # noqa: F401
 
 import flowrep.agent.checkpoint as checkpoint
+import flowrep.files as files
 import flowrep.train
 from flowrep.config.schema import validated_run
 from flowrep.experiment.run import RunFolder
@@ -41,17 +42,18 @@ def killed_at(stage: str, save: int) -> None:
     """Arranges that the process kills itself in that stage of writing its nth checkpoint."""
     steps = {"write": "save_file", "half": "save_file", "flush": "_flush"}
     name, left = steps.get(stage, "_rename"), [save]
-    whole = getattr(checkpoint, name)
+    module = checkpoint if name == "save_file" else files
+    whole = getattr(module, name)
 
     def counted(*arguments, **options):
-        left[0] -= 1
+        left[0] -= any(str(each).endswith(".safetensors") for each in arguments)
         if left[0]:
             return whole(*arguments, **options)
         if stage == "renamed":
             whole(*arguments, **options)
         return half_a_file(*arguments) if stage == "half" else die()
 
-    setattr(checkpoint, name, counted)
+    setattr(module, name, counted)
 
 
 def child(request: dict, output) -> None:
