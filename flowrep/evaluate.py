@@ -76,7 +76,8 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
         for path in config.run or []:
             for run in RunFolder.all_in(path):
                 runs.setdefault(run.path.resolve(), run)
-        load = partial(load_trained, scene=config.scene, **machine)
+        trusted = config.algorithm.target
+        load = partial(load_trained, scene=config.scene, algorithm=trusted, **machine)
         return [Target(run, partial(load, run), config.policy) for run in runs.values()]
     keys = ("scene", "representations", "flow", "motion", "noise")
     seen = {key: getattr(config, key) for key in keys}

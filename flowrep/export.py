@@ -6,8 +6,9 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 from __future__ import annotations
 
 import copy
+import io
 import json
-import shutil
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,8 @@ require("an export", "train", "hydra", "pydantic", module=__name__)
 
 from flowrep import __version__
 from flowrep.config.cli import run_command
-from flowrep.config.schema import ExportConfig, TrainConfig, validated_run
+from flowrep.config.schema import ExportConfig, TrainConfig
+from flowrep.files import replace_files
 
 if TYPE_CHECKING:
     import torch
@@ -35,26 +37,27 @@ def run(config: ExportConfig) -> None:
     """Writes the agent of a run as files that can be used without flowrep."""
     from flowrep.experiment.run import RunFolder
 
-    folder = export(RunFolder.existing(config.run), config.output)
+    folder = export(RunFolder.existing(config.run), config.output, config.algorithm.target)
     print(f"the agent is in {folder}; load_agent.py there shows how to run it")
 
 
-def export(run: RunFolder, output: str | None = None) -> Path:
+def export(run: RunFolder, output: str | None = None, algorithm: str | None = None) -> Path:
     """Writes a run's agent, which computes in float32 on any machine; returns the folder.
 
-    This is `output`, or `export` in the run's folder if None.
+    This is `output`, or `export` in the run's folder if None. `algorithm` is one that the run may
+    name besides flowrep's own.
     """
     from flowrep.agent import load_checkpoint
     from flowrep.experiment import build
     from flowrep.experiment.run import check_origin, origin_of
 
-    own = validated_run(run.read_config(), f"{run.path}/config.yaml")
+    own = run.config(algorithm)
     state = load_checkpoint(run.checkpoint_path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(own.plain()), run.checkpoint_path)
-    algorithm = own.algorithm
-    if "precision" in algorithm.options():
-        algorithm = algorithm.model_copy(update={"precision": "fp32"})
-    config = own.model_copy(update={"algorithm": algorithm, "device": "cpu"})
+    section = own.algorithm
+    if "precision" in section.options():
+        section = section.model_copy(update={"precision": "fp32"})
+    config = own.model_copy(update={"algorithm": section, "device": "cpu"})
     env = build.env(config, num_envs=1, num_workers=0)
     policy = build.policy(config, env)
     policy.load_state_dict(state["policy"])
@@ -125,19 +128,24 @@ def acting_program(policy: torch.nn.Module, observation_spec: Composite) -> Expo
 
 
 def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any]) -> None:
-    """Writes the program, its weights, its card, and the loader that needs only torch."""
+    """Writes the program, its weights, the loader that needs only torch, and last the card."""
     import torch
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     from flowrep import load_agent
     from flowrep.experiment.agents import CARD, LOADER, PROGRAM
 
-    folder.mkdir(parents=True, exist_ok=True)
-    torch.export.save(program, folder / PROGRAM)
+    traced = io.BytesIO()
+    torch.export.save(program, traced)
     weights = {name: weight.detach().contiguous() for name, weight in program.state_dict.items()}
-    save_file(weights, folder / "agent.safetensors")
-    (folder / CARD).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
-    shutil.copyfile(load_agent.__file__, folder / LOADER)
+    files = {PROGRAM: traced.getvalue(), "agent.safetensors": save(weights)}
+    # a damaged file is noticed by it: torch.export.load takes what it finds
+    digests = {name: zlib.crc32(data) for name, data in files.items()}
+    digests[CARD] = zlib.crc32(json.dumps(dict(card)).encode())
+    files[LOADER] = Path(load_agent.__file__).read_bytes()  # without one, as it may be edited
+    files[CARD] = (json.dumps({**card, "crc32": digests}, indent=2) + "\n").encode()
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_files(folder, files, as_one=True)
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """Loads an agent trained by flowrep, with torch alone, from agent.pt2 and agent.json beside it."""
 
 import json
+import zlib
 from pathlib import Path
 
 import torch
@@ -14,7 +15,19 @@ def make(task=None, device="cpu"):
 
     The maps are on `device`, or on that of flowrep's task.
     """
-    names = [each["name"] for each in json.loads((HERE / "agent.json").read_text())["maps"]]
+    card = json.loads((HERE / "agent.json").read_text())
+    if wrong := damaged(HERE, card):
+        raise ValueError(f"{HERE}: {', '.join(wrong)} not as exported; export the agent again")
     program = torch.export.load(HERE / "agent.pt2")
     network = move_to_device_pass(program, task.device if task else device).module()
+    names = [each["name"] for each in card["maps"]]
     return lambda maps: network(*(maps[name] for name in names)).argmax(-1)
+
+
+def damaged(folder, card):
+    """Returns the names of files in the folder that are not what the card has the CRC-32 of."""
+    rest = {key: value for key, value in card.items() if key != "crc32"}
+    digests = card.get("crc32", {})  # exports of earlier versions have none
+    here = {name: (folder / name).read_bytes() for name in digests if (folder / name).is_file()}
+    here["agent.json"] = json.dumps(rest).encode()
+    return [name for name in digests if name in here and zlib.crc32(here[name]) != digests[name]]

@@ -20,19 +20,20 @@ def load_agent(
     flow: Any = None,
     motion: str | None = None,
     noise: Noise | None = None,
+    algorithm: str | None = None,
     **machine: Any,
 ) -> Agent:
     """Returns the agent that `policy=` names, in a scene, or in its run's own if None.
 
     It is a baseline, "pretrained", the folder of a run, or a policy of the user's own, for which
-    `representations` are needed; None is exact flow and motion, and no noise. `machine` is
-    `device`, `num_envs` and `num_workers`.
+    `representations` are needed; None is exact flow and motion, and no noise. `algorithm` is one
+    that a run may name besides flowrep's own. `machine` is `device`, `num_envs` and `num_workers`.
     """
     is_baseline, is_own = name in BASELINES, ":" in name or name.endswith(".pt2")
     if name == "pretrained":
         return pretrained.load(scene or {}, **machine)
     if Path(name).is_dir() and not is_baseline:
-        return load_trained(RunFolder.existing(name), scene=scene, **machine)
+        return load_trained(RunFolder.existing(name), scene=scene, algorithm=algorithm, **machine)
     if not (is_baseline or is_own):
         raise UsageError(
             f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "

@@ -12,6 +12,7 @@ import ctypes
 import multiprocessing
 import os
 import re
+import secrets
 import shlex
 import signal
 import subprocess
@@ -20,26 +21,33 @@ import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from flowrep.config import UsageError, cli
-from flowrep.config.schema import TrainConfig, validated, validated_run
+from flowrep.config import UsageError, cli, read_config
+from flowrep.config.schema import ALGORITHMS, TrainConfig, validated, validated_run
+from flowrep.files import open_to_append
 from flowrep.progress import STOP_SIGNALS, StopRequest
 from flowrep.tables import read_rows
 
 cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
 
 LOG = "job.log"
-STOP = ".stop"
-"""A file in the sweep's folder that tells its jobs, on whatever machine, to save and stop."""
+STOP = ".stop_"
+"""The file that tells the jobs of a sweep, on whatever machine, to save and stop, without its id.
+
+Two sweeps may share a folder, so each has an id, which jobs get as `_ID` of `hydra.job.env_set`.
+"""
+_ID = "FLOWREP_SWEEP"
+_BEGUN = "--- sweep "
 POLL_S = 0.5
 PARENT = os.getppid()
 TRAIN = (sys.executable, "-m", "flowrep.train")
 FINISHED, FAILED, STOPPED = "finished", "failed", "stopped"
+OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
+"""Those of episodes, written out, as the simulator that has them takes seconds to import."""
 _ONLY_SHOWS = {"--cfg", "-c", "--info", "-i", "--help", "-h", "--hydra-help", "--version"}
 _NEEDED_BY = {
     # finished jobs take no time, so batches would grow and delay the unfinished ones
@@ -75,24 +83,27 @@ def run_sweep() -> NoReturn:
     places = [cli.value_of(text) for text in sys.argv[1:] if text not in typed]
     new = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
     folder = Path(places[-1] if places else new).absolute()
-    (folder / STOP).unlink(missing_ok=True)
+    sweep_id = f"s{secrets.token_hex(4)}"  # not digits alone, which Hydra reads as a number
     given = cli.override("hydra.sweep.dir", str(folder))
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
-    sys.argv[1:] = [*typed, given, *(o for o in needed if o.partition("=")[0] not in keys)]
-    begun, is_whole = time.time(), True
+    needed = [option for option in needed if option.partition("=")[0] not in keys]
+    sys.argv[1:] = [*typed, given, *needed, f"+hydra.job.env_set.{_ID}={sweep_id}"]
+    stopped, is_whole = folder / f"{STOP}{sweep_id}", True
 
     def mark() -> None:
         if folder.is_dir():
-            (folder / STOP).touch()
+            stopped.touch()
 
     with StopRequest(then=mark) as stop:
         try:
             cli.run_hydra("train", job, TrainConfig)
         except SystemExit:
-            if not _states(folder, since=begun):
+            if not _states(folder, sweep_id):
                 raise  # a mistake on the command line, which has been printed
             is_whole = False
-    states = _states(folder)
+    if is_whole:  # no job is left to read it
+        stopped.unlink(missing_ok=True)
+    states = _states(folder, sweep_id)
     _sum_up(folder, states)
     if stop or not is_whole or not all(state.startswith(FINISHED) for state in states.values()):
         again = shlex.join(["python", "-m", "flowrep.train", *typed, given])
@@ -101,14 +112,15 @@ def run_sweep() -> NoReturn:
     sys.exit(0)
 
 
-def _states(sweep: Path, since: float = 0.0) -> dict[str, str]:
-    """Returns what the last line of each run's log says of it, by name."""
+def _states(sweep: Path, sweep_id: str) -> dict[str, str]:
+    """Returns what the last line of the log of each of a sweep's runs says of it, by name."""
     states = {}
     for log in sorted(sweep.glob(f"*/{LOG}")):
-        if log.stat().st_mtime >= since:
-            last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-1:]
-            is_state = bool(last) and last[0].startswith("--- ")
-            states[log.parent.name] = last[0].removeprefix("--- ") if is_state else STOPPED
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+        if any(line.startswith(f"{_BEGUN}{sweep_id} ") for line in lines):
+            last = lines[-1]
+            is_state = last.startswith("--- ") and not last.startswith(_BEGUN)
+            states[log.parent.name] = last.removeprefix("--- ") if is_state else STOPPED
     return states
 
 
@@ -138,13 +150,16 @@ def job(config: DictConfig) -> float:
     if is_worker:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launching process leaves a `.stop`
 
+    sweep_id = hydra.job.env_set[_ID]
+    stopped = sweep / f"{STOP}{sweep_id}"
+
     def should_stop() -> bool:
-        return (sweep / STOP).exists() or (is_worker and os.getppid() != PARENT)
+        return stopped.exists() or (is_worker and os.getppid() != PARENT)
 
     try:
-        line = _line(folder, config, is_worker)
+        _begin(folder, sweep_id)
         asked = validated(TrainConfig, cli.plain_config(config))
-        state = attempted(folder, asked, line, should_stop)
+        state = attempted(folder, asked, _line(folder, asked, is_worker), should_stop)
     except Exception as error:  # the other runs go on
         state = _say(folder, f"{FAILED}: error: {' '.join(str(error).split())}")
     print(f"{folder.name}: {state}", flush=True)
@@ -157,7 +172,7 @@ def job(config: DictConfig) -> float:
     raise RunFailedError(f"{folder} {state}")
 
 
-def _line(folder: Path, config: DictConfig, is_worker: bool) -> list[str]:
+def _line(folder: Path, config: TrainConfig, is_worker: bool) -> list[str]:
     """Returns the arguments of `flowrep.train` for a job's run."""
     hydra = HydraConfig.get()
     typed = list(hydra.overrides.task)
@@ -165,7 +180,9 @@ def _line(folder: Path, config: DictConfig, is_worker: bool) -> list[str]:
     if is_worker and config.num_workers == "auto":  # it has only its own core
         machine = [*(text for text in machine if "device" in text), "num_workers=0"]
     if (folder / "config.yaml").is_file():
-        return [cli.override("resume", str(folder)), *machine]
+        target = config.algorithm.target
+        trusted = [] if target in ALGORITHMS else [cli.override("algorithm._target_", target)]
+        return [cli.override("resume", str(folder)), *machine, *trusted]
     line = [cli.override("hydra.run.dir", str(folder)), *typed, *machine]
     line += [text for text in hydra.overrides.hydra if text.startswith("hydra.searchpath=")]
     for source in hydra.runtime.config_sources:
@@ -187,8 +204,7 @@ def attempted(
         if should_stop():
             return STOPPED
         print(f"{folder.name}: running", flush=True)
-        _say(folder, f"{datetime.now():%Y-%m-%d %H:%M:%S}")
-        begin = (folder / LOG).stat().st_size
+        begin = (folder / LOG).stat().st_size if (folder / LOG).exists() else 0
         code = _exit_code(line, folder / LOG, should_stop)
     if is_finished(folder, config):
         return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
@@ -200,7 +216,7 @@ def attempted(
 def _exit_code(line: list[str], log: Path, should_stop: Callable[[], bool]) -> int:
     """Runs `flowrep.train` to its end and returns its exit code, minus the signal that ended it."""
     environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"}
-    with log.open("ab", buffering=0) as file:
+    with open_to_append(log) as file:
         run = subprocess.Popen(
             [*TRAIN, *line], stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=environment,
             preexec_fn=_end_with_parent,
@@ -223,10 +239,16 @@ def _end_with_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
+def _begin(folder: Path, sweep_id: str) -> None:
+    """Adds a line to a run's log that tells which sweep attempts it."""
+    with open_to_append(folder / LOG) as log:
+        log.write(f"{_BEGUN}{sweep_id} {datetime.now():%Y-%m-%d %H:%M:%S}\n".encode())
+
+
 def _say(folder: Path, state: str) -> str:
     """Adds a line to a run's log, whose last such line is how the run stands, and returns it."""
-    with (folder / LOG).open("a", encoding="utf-8") as log:
-        log.write(f"--- {state}\n")
+    with open_to_append(folder / LOG) as log:
+        log.write(f"--- {state}\n".encode())
     return state
 
 
@@ -246,7 +268,7 @@ def _check_is_same(folder: Path, config: TrainConfig) -> None:
     path = folder / "config.yaml"
     if not path.is_file():
         return
-    stored = validated_run(yaml.safe_load(path.read_text(encoding="utf-8")), str(path)).plain()
+    stored = validated_run(read_config(path), str(path), config.algorithm.target).plain()
     asked = config.plain()
     if asked["algorithm"].get("precision", "auto") == "auto":  # which the run has resolved
         asked["algorithm"] |= {k: v for k, v in stored["algorithm"].items() if k == "precision"}
@@ -275,5 +297,6 @@ def success_of(folder: Path) -> float:
 
 def _final(folder: Path) -> list[dict[str, str]]:
     columns = ("evaluation", "policy", "frames", "outcome")
-    rows = read_rows(folder / "evaluation.csv", columns)
+    checks: dict[str, Callable[[str], Any]] = {"frames": int, "outcome": OUTCOMES.index}
+    rows = read_rows(folder / "evaluation.csv", columns, checks)
     return [row for row in rows if row["evaluation"] == "final"]

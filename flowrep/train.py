@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from flowrep import sweep
 from flowrep.config import UsageError
 from flowrep.config.cli import OF_THE_MACHINE, checked, end_with, exit_with, line_for, run_command
-from flowrep.config.schema import TrainConfig, validated_run
+from flowrep.config.schema import TrainConfig
 from flowrep.progress import StopRequest
 
 if TYPE_CHECKING:
@@ -75,13 +75,19 @@ def run(config: TrainConfig) -> float:
 
 def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainConfig:
     """Returns the config of the run to resume, which keeps a larger `total_frames`."""
-    own = validated_run(folder.read_config(), f"{folder.path}/config.yaml")
     given = [text.partition("=")[0] for text in typed if not text.startswith("resume=")]
-    allowed = (*OF_THE_MACHINE, "total_frames")
+    trusted = "algorithm._target_"
+    own = folder.config(config.algorithm.target if trusted in given else None)
+    allowed = (*OF_THE_MACHINE, "total_frames", trusted)
     if others := [key for key in given if key not in allowed]:
         raise UsageError(
             f"resume= continues a run with its own config, so '{others[0]}=' would be ignored: "
             f"leave it out ({', '.join(allowed)} may be given)"
+        )
+    if trusted in given and own.algorithm.target != config.algorithm.target:
+        raise UsageError(
+            f"the run in '{folder.path}' is of {trusted}={own.algorithm.target}: leave out "
+            f"{trusted}={config.algorithm.target}, or start a new run with it"
         )
     frames = config.total_frames if "total_frames" in given else own.total_frames
     if frames < own.total_frames:
@@ -91,7 +97,7 @@ def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainCo
         )
     if frames > own.total_frames:
         folder.write_config(own.plain() | {"total_frames": frames})
-    changes = {key: getattr(config, key) for key in given}
+    changes = {key: getattr(config, key) for key in given if key != trusted}
     return own.model_copy(update=changes | {"resume": str(folder.path)})
 
 
@@ -139,7 +145,7 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
             is_evaluated = complete(runner, stop)
         except (CheckpointError, DivergenceError, WorkerError, OSError) as error:
             free = ". Free some space or make the folder writable" * isinstance(error, OSError)
-            may_go_on = isinstance(error, OSError | WorkerError)
+            may_go_on = not isinstance(error, DivergenceError)
             exit_with(
                 f"after {runner.frames} frames: {error}{free}",
                 f"Continue with: {how_to_go_on}" if may_go_on else "",

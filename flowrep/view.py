@@ -60,6 +60,7 @@ def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
     is_at_home = Path(config.policy).is_dir() and not is_scene_given
     scene, maps = None if is_at_home else config.scene, config.representations
     here: dict[str, Any] = {"device": "cpu", "num_envs": 1, "num_workers": 0}
+    here["algorithm"] = config.algorithm.target
     return load_agent(config.policy, scene=scene, representations=maps, **here)
 
 

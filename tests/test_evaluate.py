@@ -184,7 +184,7 @@ def test_a_run_in_trouble_costs_no_other_its_episodes(some, capsys, trouble):
     folders, config = some("good_1", "good_2")
     in_use = folders[0].held("training") if trouble == "it is in use" else nullcontext()
     if trouble == "it can not be saved":
-        (folders[0].path / "evaluation.tmp").mkdir()
+        (folders[0].path / "evaluation.csv").mkdir()
     with in_use, pytest.raises(SystemExit) as ended:
         evaluate(config)
     assert ended.value.code == 1

@@ -56,7 +56,7 @@ FINISHES = """
 open(folder + "/times", "a").write("x")
 with open(folder + "/evaluation.csv", "w") as table:
     print("evaluation,frames,policy,outcome", file=table)
-    for policy, end in ("greedy", "success"), ("sampled", "timeout"), ("a", "b"), ("c", "d"):
+    for policy, end in zip(("greedy", "sampled", "a", "b"), ("success", *["timeout"] * 3)):
         print(f"final,256,{policy},{end}", file=table)
 """
 
@@ -85,9 +85,10 @@ def test_a_run_that_finishes_gives_its_success_and_is_not_run_again(attempt, tmp
 )
 def test_a_run_that_fails_says_why_and_is_tried_again(attempt, tmp_path, code, expected):
     attempt("print('error: old'); sys.exit(2)")
+    sweep._begin(tmp_path, "s1")
     state = attempt(code)
     assert re.match(f"failed: {expected}", state)
-    assert sweep._states(tmp_path.parent)[tmp_path.name] == state
+    assert sweep._states(tmp_path.parent, "s1")[tmp_path.name] == state
     assert attempt(FINISHES).startswith("finished")
 
 
@@ -154,7 +155,7 @@ def test_the_line_of_a_run_begins_or_resumes_it(tmp_path, monkeypatch):
         job=SimpleNamespace(config_name="train"),
     )
     monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra)
-    config, odd = SimpleNamespace(num_workers="auto"), tmp_path / "josé (2)"
+    config, odd = composed("num_workers=auto"), tmp_path / "josé (2)"
     line = sweep._line(odd, config, is_worker=True)
     assert line[0].startswith("hydra.run.dir='")
     assert {"seed=1", "device=cpu", "num_workers=0", "hydra.searchpath=[x]"} <= {*line}
@@ -162,6 +163,8 @@ def test_the_line_of_a_run_begins_or_resumes_it(tmp_path, monkeypatch):
     odd.mkdir()
     (odd / "config.yaml").touch()
     assert sweep._line(odd, config, is_worker=False) == [f"resume='{odd}'", "device=cpu"]
+    others = composed("algorithm._target_=mine.Own")
+    assert sweep._line(odd, others, is_worker=False)[-1] == "algorithm._target_=mine.Own"
 
 
 @pytest.mark.parametrize("sweeper", ["x.BasicSweeper", "elsewhere.OptunaSweeper"])
@@ -171,6 +174,7 @@ def test_a_failed_run_stops_a_sweeper_that_needs_its_result_and_no_grid(
     hydra = SimpleNamespace(
         runtime=SimpleNamespace(output_dir=str(tmp_path)),
         sweep=SimpleNamespace(dir=str(tmp_path)),
+        job=SimpleNamespace(env_set={"FLOWREP_SWEEP": "s1"}),
         sweeper={"_target_": sweeper},
     )
     monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra)

@@ -172,6 +172,8 @@ class Target(Section):
 class AnyAlgorithm(Target):
     """A user's own algorithm."""
 
+    target: Annotated[str, Field(pattern=r"^\w+(\.\w+)+$")] = Field(alias="_target_")
+
     def first_update(self, num_envs: int) -> tuple[str, int]:
         """Returns the option that delays learning, and the frames until something is learnt."""
         return "", 0
@@ -283,6 +285,12 @@ _TAGS = {
 }
 
 
+class TrustedAlgorithm(Section):
+    """The algorithm that a run's config may name, if it is not one of flowrep's own."""
+
+    target: Text | None = Field(alias="_target_")
+
+
 # The commands.
 
 
@@ -357,6 +365,7 @@ class EvaluateConfig(Command):
     """The whole config of `flowrep.evaluate`."""
 
     run: Annotated[list[Text] | None, OneOrMore]
+    algorithm: TrustedAlgorithm
     scene: dict[str, Any] | None = None
     representations: Stack | None = None
     flow: Flow | None = None
@@ -408,6 +417,7 @@ class ExportConfig(Command):
     """The whole config of `flowrep.export`."""
 
     run: Text
+    algorithm: TrustedAlgorithm
     output: Text | None
 
 
@@ -417,6 +427,7 @@ class ViewConfig(Command):
     scene: dict[str, Any]
     representations: Stack | None = None
     policy: Text
+    algorithm: TrustedAlgorithm
     speed: SpeedMode
     frame_rate_hz: FrameRate | None
     path: Text | None
@@ -498,11 +509,22 @@ def validated(schema: type[Model], plain: Mapping[str, Any], source: str = "") -
         raise UsageError("\n".join(f"{source}: {x}" if source else x for x in lines)) from None
 
 
-def validated_run(plain: Any, source: str) -> TrainConfig:
-    """Returns the config of a run's folder."""
+def validated_run(plain: Any, source: str, algorithm: str | None = None) -> TrainConfig:
+    """Returns the config that a run stored.
+
+    Its algorithm is one of flowrep's own, or `algorithm`, which the user typed: a file that may
+    come from somebody else must not name what is imported.
+    """
     if not isinstance(plain, Mapping):
         raise UsageError(f"{source} holds no run's config: restore the file")
-    return validated(TrainConfig, plain, source)
+    config = validated(TrainConfig, plain, source)
+    target = config.algorithm.target
+    if target not in (*ALGORITHMS, algorithm):
+        raise UsageError(
+            f"{source} names code that isn't flowrep's own, {target}: if you trust it, add "
+            f"algorithm._target_={target}"
+        )
+    return config
 
 
 def check_options(maker: type, options: Mapping[str, Any], section: str) -> None:

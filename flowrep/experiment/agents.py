@@ -20,8 +20,9 @@ from torch.export.passes import move_to_device_pass
 from torchrl.data import Categorical, Composite, TensorSpec
 from torchrl.envs import EnvBase
 
+from flowrep import load_agent
 from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.config.schema import EnvConfig, TrainConfig, validated_run
+from flowrep.config.schema import EnvConfig, TrainConfig
 from flowrep.envs import street_envs
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import Policy, scene_id
@@ -68,13 +69,18 @@ class Agent:
 
 
 def load_trained(
-    run: RunFolder, *, scene: Mapping[str, Any] | None = None, **machine: Any
+    run: RunFolder,
+    *,
+    scene: Mapping[str, Any] | None = None,
+    algorithm: str | None = None,
+    **machine: Any,
 ) -> Agent:
     """Returns a run's agent, to act in the given scene, or in its own if None.
 
-    `machine` is `device`, `num_envs` and `num_workers`, in place of the run's.
+    `machine` is `device`, `num_envs` and `num_workers`, in place of the run's; `algorithm` is one
+    that it may name besides flowrep's own.
     """
-    own = validated_run(run.read_config(), f"{run.path}/config.yaml")
+    own = run.config(algorithm)
     path = run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(own.plain()), path)
@@ -266,7 +272,10 @@ def _card(reference: str) -> Any:
     if path is None or not path.is_file():
         return None
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        card = json.loads(path.read_text(encoding="utf-8"))
+        if damaged := load_agent.damaged(path.parent, card):
+            raise ValueError(f"{', '.join(damaged)} not as exported")
+        return card
     except ValueError as error:
         raise PolicyError(f"{path} is damaged: {error}; export the agent again") from error
 

@@ -5,18 +5,20 @@ import fcntl
 import json
 import os
 import platform
+import re
 import shutil
+import stat
 import subprocess
 import sys
 import time
 import uuid
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import datetime
 from pathlib import Path
 from statistics import fmean
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,9 +28,11 @@ from torchrl.record.loggers import TensorboardLogger
 
 from flowrep import __version__
 from flowrep.agent import CheckpointError
-from flowrep.config.schema import ALGORITHMS, EstimatedFlow
+from flowrep.config import UsageError, read_config
+from flowrep.config.schema import ALGORITHMS, EstimatedFlow, TrainConfig, validated_run
 from flowrep.experiment.evaluation import OUTCOMES, failure_causes
 from flowrep.extras import require
+from flowrep.files import naming, replace_file, replace_text, set_aside
 from flowrep.tables import append_rows, is_whole, read_rows, write_rows
 
 Rows = Sequence[Mapping[str, str]]
@@ -41,6 +45,10 @@ _EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps
 """The columns that identify a row's policy and episode."""
 _DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed", "outcome")
 """The columns in drives.npz."""
+_CHECKS: dict[str, Callable[[str], Any]] = {
+    "frames": int, "fps": float, "outcome": OUTCOMES[1:].index,
+}  # fmt: skip
+"""Of cells in evaluation.csv: an outcome that is none would count as a failure."""
 
 _IDENTITY = (
     "scene", "representations", "flow", "motion", "noise", "algorithm", "speed", "seed", "num_envs",
@@ -52,33 +60,102 @@ class RunFolderError(ValueError):
     """A folder is not that of a run, or holds a run where none is wanted."""
 
 
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some network file systems
-
-
 class FolderInUseError(OSError):
     """Another process works in the folder."""
 
 
-def _locked(file: IO[str]) -> bool:
-    """Locks a file; returns False if another process holds it."""
+class _Lock:
+    """The file by which a process holds a folder, and in which it describes itself.
+
+    The kernel's lock is on the open file and ends with the process, in whatever way. The file
+    stays: if holders removed it, another could lock a new one of that name beside them.
+    """
+
+    _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some network disks
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._path, self._text = folder, folder / ".lock", b""
+        # through no link, and not waiting for the other end of a named pipe
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+        try:
+            self._file = os.open(self._path, flags, 0o666)
+            found = os.fstat(self._file)
+            is_plain = stat.S_ISREG(found.st_mode) and found.st_nlink < 2
+        except OSError as error:
+            if error.errno != errno.ELOOP:
+                raise
+            is_plain = False
+        if not is_plain:
+            raise RunFolderError(f"'{self._path}' is a link or no file; no run made it: remove it")
+
+    def take(self, doing: str) -> bool:
+        """Locks the file; returns False if another process holds it."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            if error.errno not in self._NO_LOCKS:
+                raise
+            if platform.node() in self.holder():  # which is alive
+                return False
+            print(f"warning: no locks on the disk of '{self._path}' ({error})", file=sys.stderr)
+        if not self._is_at_its_path():  # replaced since it was opened
+            return False
+        now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+        text = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
+        text["note"] = "it is free once the process has ended; without this file two could run"
+        self._text = json.dumps(text).encode()
+        with naming(self._path):
+            os.ftruncate(self._file, 0)
+            os.pwrite(self._file, self._text, 0)
+        return True
+
+    def check(self) -> None:
+        """Checks that no other process can have taken the folder since."""
+        if not (self._is_at_its_path() and self._is_ours()):
+            raise RunFolderError(
+                f"'{self._path}' was removed or replaced, so that another process can work in "
+                f"'{self._folder}', too: this one stops, and has saved nothing since"
+            )
+
+    def holder(self) -> str:
+        """Describes the process that wrote the file; empty if that has ended."""
+        try:
+            found = json.loads(os.pread(self._file, 4096, 0))
+            pid, host = int(found["pid"]), found["host"]
+            text = f"process {pid} on {host} has been {found['doing']} in it since {found['since']}"
+        except (ValueError, KeyError, TypeError):  # nothing yet, or not its text
+            return ""
+        if host == platform.node() and not _is_alive(pid):
+            return ""
+        return "".join(filter(str.isprintable, text))
+
+    def close(self) -> None:
+        """Lets others take it."""
+        if self._text and self._is_ours():
+            os.ftruncate(self._file, 0)
+        os.close(self._file)
+
+    def _is_at_its_path(self) -> bool:
+        try:
+            return os.path.samestat(os.fstat(self._file), os.lstat(self._path))
+        except FileNotFoundError:
+            return False
+
+    def _is_ours(self) -> bool:
+        # on a disk without locks, another process may have written to the same file
+        return os.pread(self._file, len(self._text) + 1, 0) == self._text
+
+
+def _is_alive(pid: int) -> bool:
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
         return False
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise
-        print(f"warning: no locks on the disk of '{file.name}' ({error})", file=sys.stderr)
+    except PermissionError:  # of another user
+        pass
     return True
-
-
-def _holder(lock: str) -> str:
-    """Describes the process that wrote a lock file."""
-    try:
-        holder = json.loads(Path(lock).read_text(encoding="utf-8"))
-        return "process {pid} on {host} has been {doing} in it since {since}".format(**holder)
-    except ValueError:  # it has not written its description yet
-        return "another process has just begun in it"
 
 
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -170,12 +247,18 @@ def _scalars(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     return {title: fmean(found) for title, found in values.items()}
 
 
+class _Dumper(yaml.SafeDumper):
+    """Writes what is there twice two times, as `read_config` refuses aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
 class RunFolder:
     """The files of one run, by name; docs/runs.md says what is in them."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.path.mkdir(parents=True, exist_ok=True)
         self.config_path = self.path / "config.yaml"
         self.metrics_path = self.path / "metrics.csv"
         self.checkpoint_path = self.path / "checkpoint" / "latest.safetensors"
@@ -184,6 +267,7 @@ class RunFolder:
         self.failures_path = self.path / "failures.csv"
         self.curve_path = self.path / "learning_curve.png"
         self._loggers: list[Any] = []
+        self._lock: _Lock | None = None
 
     @classmethod
     def existing(cls, path: str | Path) -> "RunFolder":
@@ -217,24 +301,33 @@ class RunFolder:
     @contextmanager
     def held(self, doing: str, patience_s: float = 0.0) -> Iterator[None]:
         """Locks the folder against other processes, until the process ends in whatever way."""
-        with (self.path / ".lock").open("a+", encoding="utf-8") as file:
-            until = time.monotonic() + patience_s
-            while not _locked(file):
+        self.path.mkdir(parents=True, exist_ok=True)
+        until = time.monotonic() + patience_s
+        while True:
+            with closing(_Lock(self.path)) as lock:
+                if lock.take(doing):
+                    self._lock = lock
+                    try:
+                        yield
+                    finally:
+                        self._lock = None
+                    return
                 if time.monotonic() >= until:
+                    holder = lock.holder() or "another process has just begun in it"
                     raise FolderInUseError(
-                        f"'{self.path}' is in use: {_holder(file.name)}. Wait until it has ended, "
-                        "or stop it"
+                        f"'{self.path}' is in use: {holder}. Wait until it has ended, or stop it"
                     )
-                time.sleep(0.5)
-            file.truncate(0)
-            now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-            holder = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
-            json.dump(holder, file)
-            file.flush()
-            try:
-                yield
-            finally:
-                file.truncate(0)
+            time.sleep(0.5)
+
+    def check_held(self) -> None:
+        """Checks that the folder, if this process has locked it, still is."""
+        if self._lock is not None:
+            self._lock.check()
+
+    def _prepare(self) -> None:
+        """Checks that the folder may be written to, and makes a new one."""
+        self.check_held()
+        self.path.mkdir(parents=True, exist_ok=True)
 
     def video_path(self, name: str) -> Path:
         """The file for a video of that name."""
@@ -243,39 +336,52 @@ class RunFolder:
 
     def write_config(self, config: Mapping[str, Any], overrides: Iterable[str] = ()) -> None:
         """Writes the resolved config, and the typed overrides where Hydra keeps them."""
+        self._prepare()
         (self.path / ".hydra").mkdir(exist_ok=True)
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
-        _write_text(self.path / ".hydra" / "overrides.yaml", typed)
-        _write_text(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
+        replace_text(self.path / ".hydra" / "overrides.yaml", typed)
+        replace_text(self.config_path, yaml.dump(dict(config), Dumper=_Dumper, sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:
-        """Returns the resolved config as plain data, see `flowrep.config.schema.validated_run`."""
-        problem: object = "it holds no config"
+        """Returns the resolved config as plain data."""
         try:
-            config = yaml.safe_load(self.config_path.read_text(encoding="utf-8"))
-            if isinstance(config, dict):
-                return config
-        except (yaml.YAMLError, ValueError) as error:
-            problem = " ".join(str(error).split())
-        raise RunFolderError(f"{self.config_path} can't be read: {problem}; restore the file")
+            return read_config(self.config_path)
+        except UsageError as error:
+            raise RunFolderError(str(error)) from None
+
+    def config(self, algorithm: str | None = None) -> TrainConfig:
+        """Returns the resolved config as its model; see `validated_run` for `algorithm`."""
+        return validated_run(self.read_config(), str(self.config_path), algorithm)
 
     def note_machine(self, machine: Mapping[str, Any]) -> None:
         """Adds what the run is computed with to machine.json, unless it was there last."""
         path = self.path / "machine.json"
-        noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+        noted: list[Any] = []
+        if path.is_file():
+            try:
+                noted = json.loads(path.read_text(encoding="utf-8"))
+                if not isinstance(noted, list):
+                    raise ValueError("no list of machines")
+            except (ValueError, RecursionError) as error:
+                set_aside(path, error)
+                noted = []
         if noted[-1:] != [machine]:
-            _write_text(path, json.dumps([*noted, machine], indent=1) + "\n")
+            replace_text(path, json.dumps([*noted, machine], indent=1) + "\n")
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
         """Appends one row to metrics.csv and logs the same values to TensorBoard and wandb."""
+        self._prepare()
         append_rows(self.metrics_path, [{"frames": frames, **metrics}])
         self._plot(frames, metrics)
 
     def _plot(self, frames: int, values: Mapping[str, float]) -> None:
-        if not any(isinstance(logger, TensorboardLogger) for logger in self._loggers):
-            self._loggers.append(TensorboardLogger("tensorboard", str(self.path)))
-        for logger in self._loggers:
-            logger.log_metrics(dict(values), frames)
+        folder = self.path / "tensorboard"
+        if not folder.is_dir():  # not yet, or somebody removed it: then its writer fails
+            others = [each for each in self._loggers if not isinstance(each, TensorboardLogger)]
+            self._loggers = [TensorboardLogger(folder.name, str(self.path)), *others]
+        with naming(folder):
+            for logger in self._loggers:
+                logger.log_metrics(dict(values), frames)
 
     def log_to_wandb(self, mode: str, config: Mapping[str, Any]) -> None:
         """Sends everything logged from now on to Weights & Biases too, unless `mode` is "off".
@@ -289,12 +395,15 @@ class RunFolder:
 
         kept = self.path / "wandb_id"
         if not kept.is_file():
-            _write_text(kept, uuid.uuid4().hex[:12])
+            replace_text(kept, uuid.uuid4().hex[:12])
+        name = kept.read_text(encoding="utf-8")
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):  # it becomes a part of paths
+            raise RunFolderError(f"{kept} holds no id of a wandb run: restore it, or remove it")
         logger = WandbLogger(
             self.path.name,
             project="flowrep",
             save_dir=str(self.path),
-            id=kept.read_text(encoding="utf-8"),
+            id=name,
             mode=mode,
             config=dict(config),
             log_env_packages=False,
@@ -329,13 +438,14 @@ class RunFolder:
 
     def read_metrics(self) -> list[dict[str, str]]:
         """Returns the rows of metrics.csv, none if there is no such file."""
-        return read_rows(self.metrics_path, ["frames"])
+        return read_rows(self.metrics_path, ["frames"], {"frames": int})
 
     def read_episodes(self) -> list[dict[str, str]]:
         """Returns the rows of evaluation.csv, none if there is no such file."""
         # runs of earlier versions have no scene_id
         needed = [name for name in EVALUATION_COLUMNS if name != "scene_id"]
-        return [{"scene_id": ""} | row for row in read_rows(self.evaluation_path, needed)]
+        rows = read_rows(self.evaluation_path, needed, _CHECKS)
+        return [{"scene_id": ""} | row for row in rows]
 
     def log_episodes(
         self,
@@ -348,10 +458,9 @@ class RunFolder:
         They are of one agent after some frames. `positions` are where the vehicle was in each,
         `[T + 1, 2]`; not kept if empty.
         """
-        # first, as a final evaluation whose rows are in the table is not run again
+        self.save_episodes(rows, table)  # first: they took hours, and drives are only for pictures
         if positions:
             self._save_drives(rows, positions)
-        self.save_episodes(rows, table)
         self._plot(int(rows[0]["frames"]), _scalars(rows))
 
     def save_episodes(self, rows: Iterable[Mapping[str, Any]], table: Rows | None = None) -> None:
@@ -361,6 +470,7 @@ class RunFolder:
         replaced in place, and others follow the one that they follow in `rows`. So an evaluation
         that was interrupted and run again leaves the table of one that was not.
         """
+        self._prepare()
         before = self.read_episodes() if table is None else table
         new = [{name: str(row[name]) for name in EVALUATION_COLUMNS} for row in rows]
         merged = _merged(*({_identity(row): row for row in part} for part in (before, new)))
@@ -374,16 +484,25 @@ class RunFolder:
         It holds `positions` [sum of T + 1, 2], x and y in metres; `starts` [N + 1], so that episode
         n is `positions[starts[n]:starts[n + 1]]`; and the columns that name each episode.
         """
-        drives: dict[tuple[Any, ...], NDArray[np.float32]] = {}
-        if self.drives_path.is_file():
-            with np.load(self.drives_path, allow_pickle=False) as saved:
-                names = zip(*(saved[column].tolist() for column in _DRIVE))
-                drives = dict(zip(names, np.split(saved["positions"], saved["starts"][1:-1])))
+        drives = self._read_drives()
         drives |= {tuple(row[c] for c in _DRIVE): driven for row, driven in zip(rows, positions)}
         arrays: dict[str, Any] = {name: np.array(all_) for name, all_ in zip(_DRIVE, zip(*drives))}
         arrays["positions"] = np.concatenate([*drives.values()])
         arrays["starts"] = np.cumsum([0, *map(len, drives.values())])
         replace_file(self.drives_path, lambda path: np.savez_compressed(path, **arrays))
+
+    def _read_drives(self) -> dict[tuple[Any, ...], NDArray[np.float32]]:
+        """Returns the drives in drives.npz by what identifies them; sets a damaged file aside."""
+        if not self.drives_path.is_file():
+            return {}
+        try:
+            with np.load(self.drives_path, allow_pickle=False) as saved:
+                names = zip(*(saved[column].tolist() for column in _DRIVE), strict=True)
+                driven = np.split(saved["positions"], saved["starts"][1:-1])
+                return dict(zip(names, driven, strict=True))
+        except Exception as error:  # zip, zlib and numpy fail on garbage in a dozen ways
+            set_aside(self.drives_path, error)
+            return {}
 
     def write_failures(self) -> None:
         """Writes the causes of failure in evaluation.csv, in place of an older table."""
@@ -405,14 +524,3 @@ def _merged(
         last, _ = places.setdefault(key, (last, number))
     rows = {**before, **new}
     return [rows[key] for key in sorted(rows, key=places.__getitem__)]
-
-
-def replace_file(path: Path, write: Callable[[Path], Any]) -> None:
-    """Writes a file; if it is interrupted, `path` is the old one or the new one."""
-    whole = path.with_name(f"{path.stem}.tmp{path.suffix}")
-    write(whole)
-    whole.replace(path)
-
-
-def _write_text(path: Path, text: str) -> None:
-    replace_file(path, lambda whole: whole.write_text(text, encoding="utf-8"))

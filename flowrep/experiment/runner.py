@@ -196,6 +196,7 @@ class Runner:
     def save(self) -> None:
         """Writes the checkpoint; the previous one stays intact until the new one is complete."""
         self.check()
+        self.folder.check_held()
         with self.clock("checkpoint"):
             save_checkpoint(self.folder.checkpoint_path, self.state())
 

@@ -88,6 +88,7 @@ def test_a_full_disk_ends_in_one_line_and_leaves_the_last_checkpoint(tmp_path, c
     (line,) = [line for line in reply["printed"].splitlines() if "error" in line.lower()]
     assert line.startswith("error: after ")
     assert "File too large" in line
+    assert f"resume={run.path}" in reply["printed"]
     assert "Traceback" not in reply["printed"]
     assert differing(before, load_checkpoint(run.checkpoint_path)) == []
     assert carry_on(run)["code"] == 0

@@ -1,14 +1,18 @@
 """A run's folder: one owner, tables that survive, a checkpoint that belongs to its config."""
 
 import copy
+import fcntl
 import json
 import os
+import pickle
 import platform
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -62,14 +66,153 @@ def test_it_is_given_back_whatever_happens_in_it(tmp_path):
             pass
 
 
-def test_a_disk_without_locks_is_said_so_and_used(tmp_path, monkeypatch, capsys):
+def ended_process():
+    """The number of a process that has ended."""
+    with subprocess.Popen(["true"]) as process:
+        return process.pid
+
+
+def description(**changes):
+    found = {"pid": ended_process(), "host": platform.node(), "doing": "training", "since": "now"}
+    return json.dumps(found | changes)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [description(), description(pid=2**80), "", "[]", "{}", '{"pid": "x"}'],
+)
+def test_a_process_that_has_ended_is_never_named(tmp_path, text):
+    """As in the moment after another took the folder of a killed one, before it says who it is."""
+    (tmp_path / ".lock").write_text(text)
+    with (tmp_path / ".lock").open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(FolderInUseError) as refused, RunFolder(tmp_path).held("training"):
+            pass
+    assert "process " not in str(refused.value).replace("another process ", "")
+
+
+def test_what_a_killed_process_left_in_the_lock_is_in_nobodys_way(tmp_path):
+    (tmp_path / ".lock").write_text(description())
+    with RunFolder(tmp_path).held("training"):
+        assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
+
+
+def moved(run):
+    run.path.rename(run.path.with_name("moved"))
+
+
+def removed(run):
+    (run.path / ".lock").unlink()
+
+
+def replaced(run):
+    removed(run)
+    (run.path / ".lock").touch()
+
+
+def put_back(run):
+    text = (run.path / ".lock").read_text()
+    removed(run)
+    (run.path / ".lock").write_text(text)
+
+
+@pytest.mark.parametrize("change", [moved, removed, replaced, put_back])
+def test_a_run_whose_lock_is_gone_stops_before_it_writes(tmp_path, change):
+    run = RunFolder(tmp_path / "run")
+    writes = [
+        lambda: run.log_metrics(20, {"alpha": 0.5}),
+        lambda: run.log_episodes([episode(2)]),
+        lambda: run.write_config({}),
+        run.check_held,
+    ]
+    with run.held("training"):
+        run.log_metrics(10, {"alpha": 0.5})
+        run.log_episodes([episode(1)])
+        before = (run.metrics_path.read_text(), run.evaluation_path.read_text())
+        change(run)
+        for write in writes:
+            with pytest.raises(RunFolderError, match=r"\.lock"):
+                write()
+    if change is moved:
+        assert not run.path.exists()
+        run = RunFolder(tmp_path / "moved")
+    assert (run.metrics_path.read_text(), run.evaluation_path.read_text()) == before
+    assert not run.config_path.exists()
+
+
+def test_one_that_takes_the_folder_of_a_removed_lock_keeps_it(tmp_path):
+    first, second = RunFolder(tmp_path), RunFolder(tmp_path)
+    with first.held("training"):
+        removed(first)
+        with second.held("training"):
+            with pytest.raises(RunFolderError, match=r"\.lock"):
+                first.check_held()
+            second.check_held()
+            with pytest.raises(FolderInUseError), RunFolder(tmp_path).held("evaluating"):
+                pass
+    with first.held("training"):
+        first.check_held()
+
+
+def test_a_lock_that_is_replaced_while_it_is_taken_is_not_held(tmp_path, monkeypatch):
+    run, flock = RunFolder(tmp_path), fcntl.flock
+
+    def replace_then_lock(*arguments):
+        replaced(run)
+        return flock(*arguments)
+
+    monkeypatch.setattr("flowrep.experiment.run.fcntl.flock", replace_then_lock)
+    with pytest.raises(FolderInUseError), run.held("training"):
+        pass
+
+
+@pytest.fixture
+def no_locks(monkeypatch):
+    """A disk such as a network's, where nothing can be locked."""
+
     def no_locks(*_):
         raise OSError(37, "No locks available")
 
     monkeypatch.setattr("flowrep.experiment.run.fcntl.flock", no_locks)
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_a_disk_without_locks_is_said_so_and_used(tmp_path, capsys):
+    (tmp_path / ".lock").write_text(description())  # of a killed process
     with RunFolder(tmp_path).held("training"):
         pass
     assert "No locks" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_on_a_disk_without_locks_one_process_of_a_machine_has_the_folder(tmp_path):
+    refused = pytest.raises(FolderInUseError, match=rf"process {os.getpid()} ")
+    with RunFolder(tmp_path).held("training"), refused, RunFolder(tmp_path).held("evaluating"):
+        pass
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_on_a_disk_without_locks_the_last_machine_has_the_folder(tmp_path, monkeypatch):
+    here, there = RunFolder(tmp_path), RunFolder(tmp_path)
+    with here.held("training"):
+        monkeypatch.setattr("flowrep.experiment.run.platform.node", lambda: "another")
+        with there.held("training"):
+            there.check_held()
+            with pytest.raises(RunFolderError, match=r"\.lock"):
+                here.check_held()
+        there_text = (tmp_path / ".lock").read_text()
+    assert there_text == ""
+
+
+@pytest.mark.usefixtures("no_locks")
+def test_the_first_machine_does_not_release_what_the_last_one_holds(tmp_path, monkeypatch):
+    here, there = RunFolder(tmp_path), RunFolder(tmp_path)
+    first, second = here.held("training"), there.held("training")
+    first.__enter__()
+    monkeypatch.setattr("flowrep.experiment.run.platform.node", lambda: "another")
+    with second:
+        first.__exit__(None, None, None)
+        there.check_held()
 
 
 PATH = Path("run/checkpoint/latest.safetensors")
@@ -260,6 +403,8 @@ def test_a_clone_on_a_machine_without_git_has_no_commit(tmp_path, monkeypatch):
 def test_a_folder_without_a_run_is_named(tmp_path):
     with pytest.raises(RunFolderError, match="holds no run"):
         RunFolder.existing(tmp_path / "nothing")
+    run = RunFolder(tmp_path / "nothing")
+    assert run.read_episodes() == run.read_metrics() == []
     assert not (tmp_path / "nothing").exists()
 
 
@@ -314,6 +459,8 @@ def test_new_episodes_stand_where_an_uninterrupted_evaluation_has_them(tmp_path,
 HEADER = ",".join(EVALUATION_COLUMNS)
 ROW = ",".join(episode(1).values())
 DAMAGED = {
+    "an outcome that is none": f"{HEADER}\n{ROW.replace('collision', 'collisiom')}\n",
+    "frames that are no number": f"{HEADER}\n{','.join(episode(1, frames='1O').values())}\n",
     "semicolons": f"{HEADER}\n{ROW}\n".replace(",", ";"),
     "a column less": f"{HEADER.replace(',hit', '')}\n{ROW.rpartition(',')[0]}\n",
     "a short row": f"{HEADER}\n{ROW}\n{ROW.rpartition(',')[0]}\n",
@@ -328,3 +475,106 @@ def test_a_damaged_table_is_refused_and_stays_as_it_is(tmp_path, text):
         with pytest.raises(TableError, match=r"evaluation\.csv"):
             touch()
     assert run.evaluation_path.read_text() == text
+
+
+def test_a_cell_that_can_not_be_is_named_with_its_row(tmp_path):
+    run = RunFolder(tmp_path)
+    run.evaluation_path.write_text(f"{HEADER}\n{ROW}\n{ROW.replace('collision', 'succesr')}\n")
+    with pytest.raises(TableError, match=r"evaluation\.csv.*outcome.*'succesr'.* 2\b"):
+        run.read_episodes()
+
+
+# Drives are pictures' data; what they cost must not be the episodes.
+
+ROAD = np.array([[0.0, 0.0], [1.0, 2.0]], dtype=np.float32)
+
+
+def drives(run):
+    with np.load(run.drives_path) as saved:
+        ends = zip(saved["starts"], saved["starts"][1:])
+        driven = [saved["positions"][a:b].tolist() for a, b in ends]
+        return dict(zip(saved["episode_seed"].tolist(), driven))
+
+
+def without(run, name):
+    with np.load(run.drives_path) as saved:
+        kept = {key: saved[key] for key in saved if key != name}
+    np.savez_compressed(run.drives_path, **kept)
+
+
+def flip(run, place, bit=16):
+    data = bytearray(run.drives_path.read_bytes())
+    data[place] ^= bit
+    run.drives_path.write_bytes(data)
+
+
+DAMAGES = {
+    "empty": lambda run: run.drives_path.write_bytes(b""),
+    "text": lambda run: run.drives_path.write_text("something else"),
+    "cut": lambda run: run.drives_path.write_bytes(run.drives_path.read_bytes()[:-40]),
+    "a pickle": lambda run: run.drives_path.write_bytes(pickle.dumps({"a": 1})),
+    "no column": lambda run: without(run, "outcome"),
+    "no positions": lambda run: without(run, "positions"),
+    # of the first file in the zip: flags (encrypted), method of compression, and its contents
+    "a flag": lambda run: flip(run, run.drives_path.read_bytes().index(b"PK\x01\x02") + 8, 1),
+    "a method": lambda run: flip(run, run.drives_path.read_bytes().index(b"PK\x01\x02") + 10),
+    "a bit": lambda run: flip(run, 80),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_damaged_drives_cost_no_episode_and_are_set_aside(tmp_path, capsys, damage):
+    run = RunFolder(tmp_path)
+    run.log_episodes([episode(1)], [ROAD])
+    damage(run)
+    before = run.drives_path.read_bytes()
+    capsys.readouterr()
+    run.log_episodes([episode(2)], [2 * ROAD])
+    assert [row["episode_seed"] for row in run.read_episodes()] == ["1", "2"]
+    assert drives(run) == {"2": (2 * ROAD).tolist()}
+    (aside,) = (path for path in tmp_path.glob("drives*") if path != run.drives_path)
+    assert aside.read_bytes() == before
+    (said,) = capsys.readouterr().err.splitlines()
+    assert str(run.drives_path) in said
+    assert aside.name in said
+
+
+def test_whole_drives_are_added_to(tmp_path):
+    run = RunFolder(tmp_path)
+    run.log_episodes([episode(1)], [ROAD])
+    run.log_episodes([episode(2), episode(1)], [2 * ROAD, 3 * ROAD])
+    assert drives(run) == {"1": (3 * ROAD).tolist(), "2": (2 * ROAD).tolist()}
+
+
+def test_episodes_are_saved_before_their_drives(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    run = RunFolder(tmp_path)
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match=r"drives\.npz"):
+        run.log_episodes([episode(1)], [ROAD])
+    assert len(run.read_episodes()) == 1
+
+
+@pytest.mark.parametrize("text", ["[{", "", "{}", "null", "\x00", "[" * 20_000])
+def test_a_damaged_list_of_machines_is_set_aside(tmp_path, capsys, text):
+    (tmp_path / "machine.json").write_text(text)
+    RunFolder(tmp_path).note_machine({"cpu": "x"})
+    assert json.loads((tmp_path / "machine.json").read_text()) == [{"cpu": "x"}]
+    assert str(tmp_path / "machine.json") in capsys.readouterr().err
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_run_goes_on_where_its_tensorboard_is_removed(tmp_path):
+    run = RunFolder(tmp_path)
+    for frames in range(30):
+        if frames == 10:
+            shutil.rmtree(tmp_path / "tensorboard")
+        run.log_metrics(frames, {f"metric{k}": float(frames) for k in range(20)})
+        (logger,) = run._loggers
+        logger.experiment.flush()
+    events = EventAccumulator(str(next(tmp_path.rglob("events.out.tfevents.*"))))
+    events.Reload()
+    assert [event.step for event in events.Scalars("metric3")] == list(range(10, 30))
+    assert len(run.read_metrics()) == 30

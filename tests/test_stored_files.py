@@ -1,0 +1,267 @@
+"""A run's folder or an agent from somebody else runs no code and writes to no other file."""
+
+import json
+import os
+import sys
+from contextlib import suppress
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import save_file
+
+pytest.importorskip("pybullet", reason="the commands build the simulated street")
+
+from flowrep import pretrained, sweep
+from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
+from flowrep.config import UsageError
+from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
+from flowrep.evaluate import targets_of
+from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolder, RunFolderError
+from flowrep.export import export
+from flowrep.train import resumed
+from flowrep.view import agent_of
+from tests.config.composing import composed, plain
+
+EVIL = "import pathlib; pathlib.Path(__file__).with_name('PWNED').touch()\nclass A: pass\n"
+
+
+@pytest.fixture
+def stranger(tmp_path, monkeypatch):
+    """Makes a run whose config names an algorithm in its folder, which can be imported."""
+    monkeypatch.syspath_prepend(tmp_path)  # as the working directory is with python -m
+    (tmp_path / "evil.py").write_text(EVIL)
+
+    def make(target="evil.A"):
+        config = plain("train", "debug=smoke", "device=cpu")
+        config["algorithm"] = {"_target_": target}
+        run = RunFolder(tmp_path)
+        run.write_config(config)
+        return run
+
+    yield make
+    for name in [name for name in sys.modules if name.partition(".")[0] == "evil"]:
+        del sys.modules[name]
+
+
+def resume(run, *typed):
+    return resumed(composed("resume=here", *typed), run, ["resume=here", *typed])
+
+
+def evaluate(run, *typed):
+    config = validated(EvaluateConfig, plain("evaluate", f"run={run.path}", *typed))
+    return targets_of(config)[0].load()
+
+
+def view(run, *typed):
+    return agent_of(validated(ViewConfig, plain("view", f"policy={run.path}", *typed)), False)
+
+
+def exported(run, *typed):
+    return export(run, algorithm=typed[0].partition("=")[2] if typed else None)
+
+
+def repeated_sweep(run, *typed):
+    asked = composed("debug=smoke", "device=cpu", *typed)
+    return sweep.attempted(run.path, asked, [], lambda: True)
+
+
+def packed(run, *_):
+    config = run.read_config()
+    save_checkpoint(run.path / "x.safetensors", {"config": config, "frames": 1, "policy": {}})
+    return pretrained.load("x")
+
+
+USES = [resume, evaluate, view, exported, repeated_sweep, packed]
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("target", ["evil.A", "os.system", "flowrep.agent.load_checkpoint"])
+def test_a_stored_run_names_no_code(stranger, monkeypatch, use, target):
+    run = stranger(target)
+    monkeypatch.setattr(pretrained, "FOLDER", run.path)
+    with pytest.raises(UsageError) as refused:
+        use(run)
+    assert f"algorithm._target_={target}" in str(refused.value).split()  # what to type
+    assert not (run.path / "PWNED").exists()
+    assert "evil" not in sys.modules
+
+
+@pytest.mark.parametrize("use", USES[:3])
+def test_another_name_on_the_command_line_is_not_the_stored_one(stranger, use):
+    run = stranger()
+    with pytest.raises(UsageError, match=r"algorithm\._target_=evil\.A$"):
+        use(run, "algorithm._target_=evil.B")
+    assert not (run.path / "PWNED").exists()
+
+
+def test_what_the_user_typed_is_imported(stranger):
+    run = stranger()
+    for use in (evaluate, view, exported):
+        # past the config: there is no checkpoint
+        with pytest.raises(CheckpointError, match=r"latest\.safetensors"):
+            use(run, "algorithm._target_=evil.A")
+    config = resume(run, "algorithm._target_=evil.A")
+    assert config.algorithm.target == "evil.A"
+    assert config.plain()["algorithm"] == {"_target_": "evil.A"}  # and no option of another
+
+
+def test_an_algorithm_typed_for_a_run_that_has_another_is_not_ignored(tmp_path):
+    run = RunFolder(tmp_path)
+    run.write_config(plain("train", "debug=smoke"))
+    with pytest.raises(UsageError, match=r"flowrep\.agent\.DiscreteSAC"):
+        resume(run, "algorithm._target_=mine.Own")
+
+
+@pytest.mark.parametrize(
+    "target", ["a b.C", "a.B; rm -rf x", "a.B\x1b[2J", "evil:A", "evil", "$(x).y"]
+)
+def test_a_name_that_is_none_is_never_printed_to_be_pasted(stranger, target):
+    with pytest.raises(UsageError) as refused:
+        evaluate(stranger(target))
+    assert "algorithm._target_=" not in str(refused.value)
+    assert str(refused.value).isprintable()
+
+
+CONFIGS = {
+    "a tag that calls": "!!python/object/apply:os.system ['touch PWNED']",
+    "a tag of a module": "a: !!python/name:os.system",
+    "a date that is none": "a: !!timestamp x",
+    "a truth that is none": "a: !!bool x",
+    "aliases": "a: &a [1]\nb: [*a, *a]",
+    "an endless alias": "a: &a [*a]",
+    "depth": "[" * 20_000,
+}
+
+
+@pytest.mark.parametrize("text", CONFIGS.values(), ids=CONFIGS)
+def test_yaml_that_no_run_wrote_is_refused_in_a_line(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(RunFolderError, match=r"config\.yaml") as refused:
+        RunFolder(tmp_path).read_config()
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "PWNED").exists()
+
+
+def test_nothing_in_a_stored_config_is_resolved(tmp_path, monkeypatch):
+    monkeypatch.setenv("SECRET", "xyzzy")
+    config = plain("train", "debug=smoke") | {"note": "${oc.env:SECRET}", "experiment": "${seed}"}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    own = RunFolder(tmp_path).config().plain()
+    assert (own["note"], own["experiment"]) == ("${oc.env:SECRET}", "${seed}")
+
+
+def test_the_config_of_every_run_can_be_read_again(tmp_path):
+    """Shared lists would be written as aliases, which are refused."""
+    run, ends = RunFolder(tmp_path), [1.0, 2.0]
+    run.write_config({"a": ends, "b": ends})
+    assert run.read_config() == {"a": ends, "b": ends}
+
+
+# Links.
+
+
+@pytest.fixture
+def victim(tmp_path):
+    path = tmp_path / "elsewhere" / "victim"
+    path.parent.mkdir()
+    path.write_text("frames,alpha\n1,2\n")
+    return path
+
+
+ROW = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"outcome": "success"}
+WRITES = {
+    "metrics.csv": lambda run: run.log_metrics(10, {"alpha": 0.5}),
+    "evaluation.csv": lambda run: run.save_episodes([ROW]),
+    "failures.csv": lambda run: run.write_failures(),
+    "machine.json": lambda run: run.note_machine({"cpu": "x"}),
+    "config.yaml": lambda run: run.write_config({"seed": 1}),
+    "checkpoint/latest.safetensors": lambda run: save_checkpoint(run.checkpoint_path, {"a": 1}),
+    "job.log": lambda run: sweep._say(run.path, "failed"),
+}
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+@pytest.mark.parametrize("name", WRITES)
+def test_no_file_of_a_run_is_written_through_a_link(tmp_path, victim, name, is_there):
+    run = RunFolder(tmp_path / "run")
+    link = run.path / name
+    link.parent.mkdir(parents=True)
+    link.symlink_to(victim if is_there else victim.with_name("new"))
+    before = victim.read_text()
+    with suppress(OSError, ValueError):  # refused, or the link is replaced
+        WRITES[name](run)
+    assert victim.read_text() == before
+    assert os.listdir(victim.parent) == ["victim"]
+
+
+@pytest.mark.parametrize("kind", ["link", "link to nothing", "hard link", "pipe"])
+def test_a_lock_that_is_a_link_is_refused_and_its_target_kept(tmp_path, victim, kind):
+    run = RunFolder(tmp_path / "run")
+    run.path.mkdir()
+    lock, before = run.path / ".lock", victim.read_text()
+    {
+        "link": lambda: lock.symlink_to(victim),
+        "link to nothing": lambda: lock.symlink_to(victim.with_name("new")),
+        "hard link": lambda: lock.hardlink_to(victim),
+        "pipe": lambda: os.mkfifo(lock),
+    }[kind]()
+    with pytest.raises(RunFolderError, match=r"\.lock"), run.held("training"):
+        pass
+    assert victim.read_text() == before
+    assert os.listdir(victim.parent) == ["victim"]
+
+
+@pytest.mark.parametrize("text", ["../../x", "a/b", "", "x" * 65, "a\nb"])
+def test_a_wandb_id_that_is_a_path_is_refused(tmp_path, monkeypatch, text):
+    monkeypatch.setattr("flowrep.experiment.run.require", lambda *_: None)
+    monkeypatch.setitem(sys.modules, "wandb", object())
+    (tmp_path / "wandb_id").write_text(text)
+    with pytest.raises(RunFolderError, match="wandb_id"):
+        RunFolder(tmp_path).log_to_wandb("offline", {})
+
+
+# Checkpoints that were made to be read.
+
+STATES = {
+    "no state": {},
+    "no JSON": {"state": "{", "crc32": "{}"},
+    "a list": {"state": '{"dict": [1]}', "crc32": "{}"},
+    "a number": {"state": "3", "crc32": "{}"},
+    "depth": {"state": '{"dict": {"a": ' + "[" * 20_000 + "]" * 20_000 + "}}", "crc32": "{}"},
+    "no such tensor": {"state": '{"dict": {"a": {"tensor": "b"}}}', "crc32": '{"a": 0}'},
+    "neither": {"state": '{"dict": {"a": {"call": "os.system"}}}', "crc32": '{"a": 0}'},
+    "no digests": {"state": '{"dict": {"a": 1}}', "crc32": "{}"},
+    "digests that are none": {"state": '{"dict": {"a": 1}}', "crc32": "[1]"},
+}
+
+
+@pytest.mark.parametrize("metadata", STATES.values(), ids=STATES)
+def test_a_checkpoint_with_other_contents_is_one_error(tmp_path, metadata):
+    path = tmp_path / "c.safetensors"
+    about = {"format": checkpoint.FORMAT, **metadata}
+    save_file({"x": torch.ones(2)}, path, metadata=about)
+    with pytest.raises(CheckpointError, match=r"c\.safetensors"):
+        load_checkpoint(path)
+    with pytest.raises(CheckpointError, match=r"c\.safetensors"):
+        load_checkpoint(path, ["a"])
+
+
+@pytest.mark.parametrize("name", ["../x", "/tmp/x", "."])
+def test_a_pretrained_agent_is_one_of_the_files_that_come_with_flowrep(tmp_path, monkeypatch, name):
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "folder")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "x.safetensors").write_text("")
+    with pytest.raises(UsageError, match="comes with flowrep"):
+        pretrained.load(name)
+
+
+def test_the_process_in_a_lock_is_plain_text(tmp_path):
+    run = RunFolder(tmp_path)
+    with run.held("training"):
+        found = json.loads((tmp_path / ".lock").read_text())
+        (tmp_path / ".lock").write_text(json.dumps(found | {"doing": "\x1b[2J\nerror: x"}))
+        with pytest.raises(OSError, match=rf"{os.getpid()}") as caught, run.held("evaluating"):
+            pass
+    assert str(caught.value).isprintable()
