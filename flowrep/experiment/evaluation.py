@@ -413,4 +413,6 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         )
     for row in rows:
         table.add_row(*map(str, row.values()))
-    Console(width=max(100, Console().width)).print(table)
+    # names are text: a[b] is no markup, :car: no emoji
+    console = Console(width=max(100, Console().width), markup=False, emoji=False)
+    console.print(table)
