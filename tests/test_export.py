@@ -1,16 +1,20 @@
 """An exported agent gives what the agent gives, with torch alone."""
 
+import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
+from flowrep import files
 from flowrep.agent import PPO, DiscreteSAC, DoubleDQN
 from flowrep.agent.networks import PolicyNetwork
-from flowrep.experiment.agents import Task, load_policy
+from flowrep.experiment.agents import PolicyError, Task, load_policy
 from flowrep.export import ExportError, acting_program, write_agent
 from tests.agent.plain import encode, head
 
@@ -145,3 +149,79 @@ def test_the_weights_are_those_of_ordinary_layers(exported):
 def test_a_policy_of_another_making_is_refused_by_name():
     with pytest.raises(ExportError, match="Sequential"):
         acting_program(torch.nn.Sequential(torch.nn.Linear(2, 3)), SPEC)
+
+
+# Its files are of one export, and damage is noticed.
+
+
+@pytest.fixture
+def copied(exported, tmp_path):
+    """A copy of the exported agent, whose files a test may change."""
+    return Path(shutil.copytree(exported[1], tmp_path / "copy"))
+
+
+def refused(folder, name):
+    """What is said where the agent is used; None if it is used."""
+    maps_of = dict.fromkeys(KEYS)
+    task = Task("s_turn", maps_of, SPEC[0], Categorical(3), torch.eye(3), torch.device("cpu"))
+    try:
+        load_policy(f"{folder / name}", task)
+    except PolicyError as error:
+        return str(error)
+    return None
+
+
+@pytest.mark.parametrize("name", ["agent.pt2", "load_agent.py:make"])
+@pytest.mark.parametrize("file", ["agent.pt2", "agent.json"])
+def test_a_damaged_export_is_named(copied, name, file):
+    assert refused(copied, name) is None
+    data = (copied / file).read_bytes()
+    place = data.index(b'"ego"') + 1 if file == "agent.json" else len(data) // 2
+    changed = bytearray(data)
+    changed[place] ^= 2
+    (copied / file).write_bytes(changed)
+    assert file in refused(copied, name)
+
+
+@pytest.mark.parametrize("name", ["agent.pt2", "load_agent.py:make"])
+def test_the_program_of_another_export_is_noticed(copied, name):
+    torch.manual_seed(4)
+    other = DiscreteSAC.make_policy(SPEC, Categorical(3, (1,)), KEYS, **SMALL)
+    torch.export.save(acting_program(other, SPEC), copied / "agent.pt2")
+    assert "agent.pt2" in refused(copied, name)
+
+
+def test_an_export_from_before_there_were_digests_is_used(copied):
+    card = json.loads((copied / "agent.json").read_text())
+    del card["crc32"]
+    (copied / "agent.json").write_text(json.dumps(card))
+    assert refused(copied, "agent.pt2") is None
+
+
+def test_the_files_of_an_export_are_like_any_others_and_the_loader_may_be_edited(copied):
+    copied.joinpath("plain").touch()
+    assert {path.stat().st_mode for path in copied.iterdir()} == {
+        copied.joinpath("plain").stat().st_mode
+    }
+    with copied.joinpath("load_agent.py").open("a") as loader:
+        loader.write("# changed\n")
+    assert refused(copied, "load_agent.py:make") is None
+
+
+@pytest.mark.parametrize("step", ["_flush", "_rename"])
+def test_an_export_that_fails_leaves_the_last_one_or_none(exported, copied, monkeypatch, step):
+    policy, _ = exported
+    before = {path.name: path.read_bytes() for path in copied.iterdir()}
+    calls = []
+
+    def fail(*arguments):
+        calls.append(arguments)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files, step, fail)
+    card = {"maps": [{"name": name} for name in KEYS], "frames": 2}
+    with pytest.raises(OSError, match=r"agent\.json"):
+        write_agent(copied, acting_program(policy, SPEC), card)
+    after = {path.name: path.read_bytes() for path in copied.iterdir()}
+    assert after == (before if step == "_flush" else {})
+    assert calls

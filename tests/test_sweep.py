@@ -15,7 +15,7 @@ import yaml
 from flowrep import sweep
 from flowrep.config import UsageError, cli, group_choices
 from flowrep.config.schema import TrainConfig
-from flowrep.tables import read_rows
+from flowrep.tables import TableError, read_rows
 from tests.config.composing import composed, plain
 
 
@@ -107,6 +107,18 @@ def test_a_run_that_saved_after_a_signal_is_stopped(attempt, code):
     assert attempt(f"sys.exit({code})") == "stopped"
 
 
+def test_an_outcome_that_is_none_is_no_failure_and_no_success(attempt):
+    with pytest.raises(TableError, match=r"evaluation\.csv.*'succes'"):
+        attempt(FINISHES.replace('"success"', '"succes"'))
+
+
+def test_outcomes_are_those_of_the_simulator():
+    pytest.importorskip("pybullet", reason="the simulator has them")
+    from flowrep.experiment.evaluation import OUTCOMES
+
+    assert OUTCOMES[1:] == sweep.OUTCOMES
+
+
 def test_a_run_is_told_to_save_when_the_sweep_is_stopped(attempt, tmp_path):
     assert attempt(SAVES, should_stop=(tmp_path / "ready").exists) == "stopped"
     assert (tmp_path / "saved").exists()
@@ -165,6 +177,55 @@ def test_the_line_of_a_run_begins_or_resumes_it(tmp_path, monkeypatch):
     assert sweep._line(odd, config, is_worker=False) == [f"resume='{odd}'", "device=cpu"]
     others = composed("algorithm._target_=mine.Own")
     assert sweep._line(odd, others, is_worker=False)[-1] == "algorithm._target_=mine.Own"
+
+
+def test_of_two_sweeps_in_a_folder_ctrl_c_stops_one_and_each_sums_up_its_own_runs(
+    monkeypatch, tmp_path, capsys
+):
+    ids, both = {}, {}
+
+    def run(name, meanwhile=lambda: None):
+        """A sweep of one run, which asks whether it should stop after something happened."""
+
+        def hydra(*_):
+            ids[name] = next(x for x in sys.argv if "env_set" in x).rpartition("=")[2]
+            folder = tmp_path / name
+            folder.mkdir()
+            job = SimpleNamespace(env_set={sweep._ID: ids[name]})
+            dirs = {"output_dir": str(folder), "dir": str(tmp_path)}
+            config = SimpleNamespace(
+                runtime=SimpleNamespace(**dirs), sweep=SimpleNamespace(**dirs), job=job,
+                sweeper={"_target_": "BasicSweeper"},
+            )  # fmt: skip
+
+            def attempted(folder, config, line, should_stop):
+                meanwhile()
+                both[name] = should_stop()
+                return sweep._say(folder, sweep.STOPPED if both[name] else "finished, success 0%")
+
+            monkeypatch.setattr(sweep.HydraConfig, "get", lambda: config)
+            monkeypatch.setattr(sweep, "attempted", attempted)
+            sweep.job({})
+
+        monkeypatch.setattr(sys, "argv", ["train", "-m", f"hydra.sweep.dir={tmp_path}", "seed=1,2"])
+        monkeypatch.setattr(cli, "run_hydra", hydra)
+        with pytest.raises(SystemExit) as ended:
+            sweep.run_sweep()
+        return ended.value.code
+
+    monkeypatch.setattr(sweep, "_line", lambda *_: [])
+    monkeypatch.setattr(cli, "plain_config", lambda config: CONFIG.plain())
+    codes = []
+
+    def stop_the_other():
+        codes.append(run("second", meanwhile=lambda: signal.raise_signal(signal.SIGINT)))
+        capsys.readouterr()
+
+    codes.append(run("first", meanwhile=stop_the_other))
+    assert codes == [130, 0]
+    assert both == {"first": False, "second": True}
+    assert "1 of 1 runs finished" in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == []  # no mark is left
 
 
 @pytest.mark.parametrize("sweeper", ["x.BasicSweeper", "elsewhere.OptunaSweeper"])

@@ -142,3 +142,71 @@ def test_a_folder_that_cannot_be_written_is_one_error(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(CheckpointError, match=r"file/c"):
         save_checkpoint(tmp_path / "file" / "c", {"a": 1})
+
+
+def flipped(data, bit):
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def loaded(path, *parts):
+    try:
+        return load_checkpoint(path, *parts)
+    except CheckpointError:
+        return None
+
+
+def test_a_bit_that_flips_anywhere_is_noticed(tmp_path):
+    path = tmp_path / "c.safetensors"
+    state = STATE | {"half": torch.ones(2).bfloat16(), "frames": 1234, "rate": 0.5, "none": None}
+    save_checkpoint(path, state)
+    data = path.read_bytes()
+    for byte in range(len(data)):
+        path.write_bytes(flipped(data, 8 * byte + byte % 8))
+        found = loaded(path)
+        assert found is None or same(found, state), byte  # such as in the padding of the header
+    tensors = 8 + int.from_bytes(data[:8], "little")  # where the header ends
+    for bit in range(8 * tensors, 8 * len(data)):
+        path.write_bytes(flipped(data, bit))
+        assert loaded(path) is None, bit
+
+
+def test_a_part_is_checked_alone(tmp_path):
+    """An agent is read without the gigabytes of a replay memory."""
+    path = tmp_path / "c.safetensors"
+    memory, weight = (
+        torch.full((50,), 7, dtype=torch.uint8),
+        torch.full((50,), 9, dtype=torch.uint8),
+    )
+    save_checkpoint(path, {"memory": memory, "policy": {"weight": weight}, "frames": 3})
+    data = path.read_bytes()
+    path.write_bytes(flipped(data, 8 * data.index(bytes([7] * 50)) + 40))
+    assert loaded(path) is None
+    assert same(loaded(path, ["policy", "frames"]), {"policy": {"weight": weight}, "frames": 3})
+    path.write_bytes(flipped(data, 8 * data.index(bytes([9] * 50)) + 40))
+    assert loaded(path, ["policy"]) is None
+    assert loaded(path, ["frames"]) == {"frames": 3}
+
+
+def test_tensors_of_one_size_that_changed_places_are_noticed(tmp_path):
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(
+        path, {"a": torch.zeros(2, 3), "b": torch.zeros(3, 2), "c": torch.zeros(6).int()}
+    )
+    data = path.read_bytes()
+    for old, new in ((b"[2,3]", b"[3,2]"), (b"I32", b"F32"), (b"[6]", b"[6]")):
+        path.write_bytes(data.replace(old, new))
+        assert (loaded(path) is None) == (old != new)
+
+
+def test_a_checkpoint_from_before_there_were_digests_is_read(tmp_path):
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, STATE)
+    with safe_open(path, framework="pt") as file:
+        tensors, about = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    del about["crc32"]
+    save_file(tensors, path, metadata=about | {"format": "flowrep checkpoint 6"})
+    assert same(load_checkpoint(path), STATE)
+    save_file(tensors, path, metadata=about)  # but no later one may lack them
+    assert loaded(path) is None

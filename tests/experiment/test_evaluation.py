@@ -221,7 +221,8 @@ def test_a_scene_is_known_by_all_that_it_is(scene):
 def test_drives_are_kept_by_episode_and_replaced_when_driven_again(tmp_path):
     folder = RunFolder(tmp_path)
     same = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"frames": 9, "fps": 12.0, "length": 3}
-    rows = [same | {"policy": "greedy", "episode_seed": seed} for seed in (1, 2)]
+    same |= {"policy": "greedy", "outcome": "success"}
+    rows = [same | {"episode_seed": seed} for seed in (1, 2)]
     first, second, other = (np.full((n, 2), n, np.float32) for n in (3, 4, 5))
     folder.log_episodes(rows, [first, second])
     folder.log_episodes(rows[:1], [other])
@@ -283,6 +284,12 @@ def test_tables_show_shares_with_intervals_and_causes_and_nothing_is_cut_off(cap
     assert "20 [6–51]" in text  # Wilson's interval of 2 in 10, by hand: 0.057 to 0.510
     for word in ("never_turn", "bounds", "pedestrian", "timeout", "8 of 10", "38", "0 of 8"):
         assert word in text
+
+
+@pytest.mark.parametrize("name", ["a[/b]c", "x[red]y", "[link=x]z", "a:car:b"])
+def test_the_name_of_a_policy_is_printed_as_it_is(capsys, name):
+    print_results(failed_rows(name))
+    assert capsys.readouterr().out.count(name) == 2  # in both tables
 
 
 def test_the_table_of_causes_is_replaced(tmp_path):

@@ -301,6 +301,20 @@ def poison(runner, updates):
 
 
 @pytest.mark.slow
+def test_a_run_whose_lock_is_removed_saves_nothing_more(tmp_path):
+    runner = new_run(tmp_path, more=["log_every_frames=1000"])
+    runner.observation = runner.env.reset()
+    with runner.folder.held("training"):
+        runner.save()
+        before = runner.folder.checkpoint_path.read_bytes()
+        (tmp_path / ".lock").unlink()
+        with pytest.raises(RunFolderError, match=r"\.lock"):
+            trained(runner)
+    runner.close()
+    assert runner.folder.checkpoint_path.read_bytes() == before
+
+
+@pytest.mark.slow
 def test_a_loss_that_is_no_number_ends_the_run_before_it_is_saved(tmp_path):
     runner = new_run(tmp_path, more=["log_every_frames=1000"])
     poison(runner, updates=7)  # after the checkpoint at 60 frames

@@ -9,8 +9,18 @@ import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
+from flowrep import files
 from flowrep.experiment.run import RunFolderError
-from flowrep.report.storage import EPISODES, read_run, read_runs, without_repeats, write_archive
+from flowrep.report.storage import (
+    EPISODES,
+    RUNS,
+    TRAINING,
+    read_archive,
+    read_run,
+    read_runs,
+    without_repeats,
+    write_archive,
+)
 from tests.report.folders import config_of, letters, rows_of, run_in, write_run
 
 BOMB = "a0: &a0 [x]\n" + "".join(
@@ -41,7 +51,8 @@ def test_runs_are_found_wherever_they_lie_and_once(tmp_path, name):
         ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
-        ("machine.json", "{", "bad"),
+        ("machine.json", "[{", "machine.json"),
+        ("machine.json", "[1]", "machine.json"),
         ("config.yaml", "a: " + "[" * 5000, "config.yaml"),
         # each line stands for ten times as many values as the one before
         ("config.yaml", BOMB, "values"),
@@ -106,6 +117,34 @@ def test_packing_again_adds_and_replaces_and_gives_the_same_bytes(tmp_path):
     rows = gzip.decompress((tmp_path / "packed" / EPISODES).read_bytes()).decode().splitlines()
     assert sum(row.startswith("a,") and ",success," in row for row in rows) == 5
     assert sum(row.startswith("b,") for row in rows) == 8
+
+
+@pytest.mark.parametrize("name", [RUNS, EPISODES, TRAINING])
+@pytest.mark.parametrize("damage", ["cut", "text", "gone"])
+def test_damaged_packed_runs_are_named(tmp_path, name, damage):
+    packed = tmp_path / "packed"
+    write_archive([read_run(run_in(tmp_path, "a"))], packed)
+    data = (packed / name).read_bytes()
+    (packed / name).write_bytes({"cut": data[: len(data) // 2], "text": b"}{\n"}.get(damage, data))
+    if damage == "gone":
+        (packed / name).unlink()
+    with pytest.raises(RunFolderError, match="packed"):
+        read_archive(packed)
+
+
+@pytest.mark.parametrize("step", ["_flush", "_rename"])
+def test_packing_that_fails_leaves_what_was_there(tmp_path, monkeypatch, step):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    packed = tmp_path / "packed"
+    write_archive([read_run(run_in(tmp_path, "a"))], packed)
+    before = {path.name: path.read_bytes() for path in packed.iterdir()}
+    other = read_run(run_in(tmp_path, "b"))
+    monkeypatch.setattr(files, step, fail)
+    with pytest.raises(OSError, match=r"runs\.jsonl"):
+        write_archive([other], packed)
+    assert {path.name: path.read_bytes() for path in packed.iterdir()} == before
 
 
 def test_packed_runs_are_chosen_by_name(tmp_path):
