@@ -47,7 +47,7 @@ def _replace(
 ) -> None:
     # A new folder holds no link under any name, and what writers leave beside their file goes too.
     partial = folder / f".{names[-1]}.{secrets.token_hex(4)}.partial"
-    with naming(folder / names[-1]):
+    with naming(folder if names[1:] else folder / names[0]):
         for left in folder.glob(f".{escape(names[-1])}.*partial"):  # by writers that were killed
             shutil.rmtree(left, ignore_errors=True)
         try:

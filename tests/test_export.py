@@ -220,7 +220,7 @@ def test_an_export_that_fails_leaves_the_last_one_or_none(exported, copied, monk
 
     monkeypatch.setattr(files, step, fail)
     card = {"maps": [{"name": name} for name in KEYS], "frames": 2}
-    with pytest.raises(OSError, match=r"agent\.json"):
+    with pytest.raises(OSError, match=f"'{copied}'"):
         write_agent(copied, acting_program(policy, SPEC), card)
     after = {path.name: path.read_bytes() for path in copied.iterdir()}
     assert after == (before if step == "_flush" else {})

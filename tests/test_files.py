@@ -128,7 +128,7 @@ OLD, NEW = {"a": b"1", "b": b"1", "c": b"1"}, {"a": b"2", "b": b"2", "c": b"2"}
 def test_of_several_files_a_full_disk_replaces_none(folder, monkeypatch, as_one):
     replace_files(folder, OLD, as_one=as_one)
     monkeypatch.setattr(files, "_flush", fails)
-    with pytest.raises(OSError, match="c'"):
+    with pytest.raises(OSError, match=f"'{folder}'"):
         replace_files(folder, NEW, as_one=as_one)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == OLD
 

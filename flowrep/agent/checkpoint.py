@@ -28,7 +28,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from flowrep.files import replace_file
+from flowrep.files import naming, replace_file
 
 FORMAT = "flowrep checkpoint 7"
 _WITHOUT_DIGESTS = "flowrep checkpoint 6"
@@ -56,13 +56,14 @@ def save_checkpoint(path: str | os.PathLike[str], state: Mapping[str, Any]) -> N
     digests = {name: _read(part, tensors.__getitem__)[1] for name, part in document["dict"].items()}
     metadata = {"format": FORMAT, "state": json.dumps(document), "crc32": json.dumps(digests)}
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        with naming(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, partial(_write, tensors, metadata))
     except OSError as error:
         kept = "; the previous checkpoint is untouched" if path.exists() else ""
         raise CheckpointError(
-            f"cannot write the checkpoint {path}: {error}{kept}. Free some space or make the "
-            "folder writable"
+            f"cannot write the checkpoint: {error}{kept}. Free some space or make the folder "
+            "writable"
         ) from error
 
 

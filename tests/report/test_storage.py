@@ -142,7 +142,7 @@ def test_packing_that_fails_leaves_what_was_there(tmp_path, monkeypatch, step):
     before = {path.name: path.read_bytes() for path in packed.iterdir()}
     other = read_run(run_in(tmp_path, "b"))
     monkeypatch.setattr(files, step, fail)
-    with pytest.raises(OSError, match=r"runs\.jsonl"):
+    with pytest.raises(OSError, match=f"'{packed}'"):
         write_archive([other], packed)
     assert {path.name: path.read_bytes() for path in packed.iterdir()} == before
 
