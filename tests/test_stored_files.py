@@ -123,6 +123,16 @@ def test_a_name_that_is_none_is_never_printed_to_be_pasted(stranger, target):
     assert str(refused.value).isprintable()
 
 
+@pytest.mark.parametrize(
+    "algorithm", [3, "evil.A", None, [], {}, {"_target_": {"_target_": "evil.A"}}]
+)
+def test_an_algorithm_that_is_no_section_is_refused(tmp_path, algorithm):
+    run = RunFolder(tmp_path)
+    run.write_config(plain("train", "debug=smoke") | {"algorithm": algorithm})
+    with pytest.raises(UsageError, match="algorithm"):
+        evaluate(run)
+
+
 CONFIGS = {
     "a tag that calls": "!!python/object/apply:os.system ['touch PWNED']",
     "a tag of a module": "a: !!python/name:os.system",

@@ -264,8 +264,9 @@ ALGORITHMS: dict[str, type[AnyAlgorithm]] = {
 
 
 def _algorithm_tag(value: Any) -> str:
-    target = value.get("_target_") if isinstance(value, Mapping) else value.target
-    return ALGORITHMS[target].__name__ if target in ALGORITHMS else "AnyAlgorithm"
+    target = value.get("_target_") if isinstance(value, Mapping) else getattr(value, "target", "")
+    is_ours = isinstance(target, str) and target in ALGORITHMS
+    return ALGORITHMS[target].__name__ if is_ours else "AnyAlgorithm"
 
 
 Algorithm = Annotated[

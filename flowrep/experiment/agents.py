@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+import shlex
 import sys
 import sysconfig
 import traceback
@@ -307,5 +309,7 @@ def _camera(shape: Sequence[int], K: Sequence[Sequence[float]]) -> dict[str, Any
 
 def _overrides(settings: Mapping[str, Any], keys: Sequence[str]) -> str:
     """Returns settings as on the command line, `representations=[ego,obj] scene=s_turn`."""
-    texts = {key: json.dumps(settings[key], separators=(",", ":")) for key in keys}
-    return " ".join(f"{key}={text}" for key, text in texts.items()).replace('"', "")
+    texts = [f"{key}={json.dumps(settings[key], separators=(',', ':'))}" for key in keys]
+    plain = [text.replace('"', "") for text in texts]
+    # what a card from somebody else says may be pasted into a shell
+    return " ".join(x if re.fullmatch(r"[\w.=,\[\]-]+", x) else shlex.quote(x) for x in plain)

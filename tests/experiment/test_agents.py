@@ -1,6 +1,7 @@
 """Policies of somebody else's: what they see, and what is said of those that can't be used."""
 
 import json
+import shlex
 from dataclasses import replace
 
 import pytest
@@ -204,6 +205,15 @@ def test_other_maps_are_refused_with_the_overrides_for_its_own(agent, shown, her
     assert message.startswith(f"policy '{agent}'")
     assert message.endswith(f" {here}; give {give}")
     assert "\n" not in message
+
+
+def test_a_card_does_not_say_what_a_shell_would_run(agent, tmp_path):
+    maps = [{**CARD["maps"][0], "name": "ego]; touch PWNED; $(id) '"}]
+    (tmp_path / "agent.json").write_text(json.dumps(CARD | {"maps": maps}))
+    with pytest.raises(PolicyError) as caught:
+        check_card(agent, task())
+    words = shlex.split(str(caught.value).partition("; give ")[2], posix=True)
+    assert words == ["representations=[ego]; touch PWNED; $(id) ']"]
 
 
 def test_policies_that_flowrep_did_not_export_are_left_alone(tmp_path):
