@@ -1,5 +1,6 @@
 """Loads an agent trained by flowrep, with torch alone, from agent.pt2 and agent.json beside it."""
 
+import io
 import json
 import zlib
 from pathlib import Path
@@ -16,18 +17,10 @@ def make(task=None, device="cpu"):
     The maps are on `device`, or on that of flowrep's task.
     """
     card = json.loads((HERE / "agent.json").read_text())
-    if wrong := damaged(HERE, card):
-        raise ValueError(f"{HERE}: {', '.join(wrong)} not as exported; export the agent again")
-    program = torch.export.load(HERE / "agent.pt2")
+    saved = (HERE / "agent.pt2").read_bytes()
+    if zlib.crc32(saved) != card["crc32"]["agent.pt2"]:
+        raise ValueError(f"{HERE / 'agent.pt2'} is damaged, or of another export than agent.json")
+    program = torch.export.load(io.BytesIO(saved))
     network = move_to_device_pass(program, task.device if task else device).module()
     names = [each["name"] for each in card["maps"]]
     return lambda maps: network(*(maps[name] for name in names)).argmax(-1)
-
-
-def damaged(folder, card):
-    """Returns the names of files in the folder that are not what the card has the CRC-32 of."""
-    rest = {key: value for key, value in card.items() if key != "crc32"}
-    digests = card.get("crc32", {})  # exports of earlier versions have none
-    here = {name: (folder / name).read_bytes() for name in digests if (folder / name).is_file()}
-    here["agent.json"] = json.dumps(rest).encode()
-    return [name for name in digests if name in here and zlib.crc32(here[name]) != digests[name]]

@@ -27,7 +27,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
     | {"transforms", "geometry", "palette", "progress", "tables", "config", "extras", "viz"}
-    | {"files", "load_agent"},
+    | {"files"},
     "progress": set(),
     "tables": {"files"},
     "viz": {"viz", "scenes", "geometry", "palette"},

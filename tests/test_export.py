@@ -14,7 +14,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from flowrep import files
 from flowrep.agent import PPO, DiscreteSAC, DoubleDQN
 from flowrep.agent.networks import PolicyNetwork
-from flowrep.experiment.agents import PolicyError, Task, load_policy
+from flowrep.experiment.agents import PolicyError, Task, check_card, load_policy
 from flowrep.export import ExportError, acting_program, write_agent
 from tests.agent.plain import encode, head
 
@@ -26,6 +26,12 @@ SPEC = Composite(
     shape=(1,),
 )
 KEYS = ["ego", "seg", "rgb"]
+CARD = {
+    "maps": [{"name": key, "shape": list(SPEC[key].shape[1:]), "options": {}} for key in KEYS],
+    "intrinsics": torch.eye(3).tolist(),
+    "num_classes": CLASSES,
+    "scene": "s_turn",
+}
 SMALL = {"device": "cpu", "precision": "fp32", "hidden_size": 24}
 
 
@@ -57,8 +63,7 @@ def maps(count):
 def exported(tmp_path_factory):
     """A policy and the folder that it was written to."""
     policy, folder = build(DiscreteSAC), tmp_path_factory.mktemp("agent") / "new"
-    card = {"maps": [{"name": name} for name in KEYS]}
-    write_agent(folder, acting_program(policy, SPEC), card)
+    write_agent(folder, acting_program(policy, SPEC), CARD)
     return policy, folder
 
 
@@ -162,9 +167,10 @@ def copied(exported, tmp_path):
 
 def refused(folder, name):
     """What is said where the agent is used; None if it is used."""
-    maps_of = dict.fromkeys(KEYS)
+    maps_of = {key: {} for key in KEYS}
     task = Task("s_turn", maps_of, SPEC[0], Categorical(3), torch.eye(3), torch.device("cpu"))
     try:
+        check_card(f"{folder / name}", task)
         load_policy(f"{folder / name}", task)
     except PolicyError as error:
         return str(error)
@@ -219,9 +225,8 @@ def test_an_export_that_fails_leaves_the_last_one_or_none(exported, copied, monk
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files, step, fail)
-    card = {"maps": [{"name": name} for name in KEYS], "frames": 2}
     with pytest.raises(OSError, match=f"'{copied}'"):
-        write_agent(copied, acting_program(policy, SPEC), card)
+        write_agent(copied, acting_program(policy, SPEC), CARD | {"frames": 2})
     after = {path.name: path.read_bytes() for path in copied.iterdir()}
     assert after == (before if step == "_flush" else {})
     assert calls

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
 from types import SimpleNamespace
 
 import pytest
@@ -246,6 +247,18 @@ def test_a_failed_run_stops_a_sweeper_that_needs_its_result_and_no_grid(
     else:
         with pytest.raises(sweep.RunFailedError, match="failed: error: seed"):
             sweep.job({})
+
+
+def test_a_killed_worker_of_a_launcher_is_no_traceback(monkeypatch, tmp_path, capsys):
+    def killed(config):
+        raise BrokenProcessPool("A worker process was unexpectedly terminated")
+
+    monkeypatch.setattr(sys, "argv", ["train", "-m", f"hydra.sweep.dir={tmp_path}"])
+    with pytest.raises(SystemExit):
+        cli.run_hydra("train", killed, TrainConfig)
+    said = capsys.readouterr().err
+    assert "error: A worker process" in said
+    assert "Traceback" not in said
 
 
 def test_a_sweep_of_one_run_to_continue_is_refused(monkeypatch, capsys):

@@ -12,6 +12,7 @@ import shlex
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from hashlib import sha1
 from io import StringIO
@@ -118,7 +119,8 @@ def end_with(error: Exception, schema: type[Section]) -> NoReturn:
 
 def is_a_mistake(error: Exception) -> bool:
     """Returns whether an error is about something that a user can change."""
-    kinds = HydraException, OmegaConfBaseException, ValueError, ImportError, OSError
+    # BrokenExecutor: of a launcher whose worker was killed, as for want of memory
+    kinds = HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, BrokenExecutor
     is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
     return isinstance(error, kinds) or is_plugin or type(error).__module__.startswith("flowrep.")
 

@@ -265,8 +265,8 @@ ALGORITHMS: dict[str, type[AnyAlgorithm]] = {
 
 def _algorithm_tag(value: Any) -> str:
     target = value.get("_target_") if isinstance(value, Mapping) else getattr(value, "target", "")
-    is_ours = isinstance(target, str) and target in ALGORITHMS
-    return ALGORITHMS[target].__name__ if is_ours else "AnyAlgorithm"
+    section = ALGORITHMS.get(target) if isinstance(target, str) else None
+    return section.__name__ if section else "AnyAlgorithm"
 
 
 Algorithm = Annotated[

@@ -7,6 +7,7 @@ import shlex
 import sys
 import sysconfig
 import traceback
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +23,6 @@ from torch.export.passes import move_to_device_pass
 from torchrl.data import Categorical, Composite, TensorSpec
 from torchrl.envs import EnvBase
 
-from flowrep import load_agent
 from flowrep.agent import CheckpointError, load_checkpoint
 from flowrep.config.schema import EnvConfig, TrainConfig
 from flowrep.envs import street_envs
@@ -275,11 +275,14 @@ def _card(reference: str) -> Any:
         return None
     try:
         card = json.loads(path.read_text(encoding="utf-8"))
-        if damaged := load_agent.damaged(path.parent, card):
-            raise ValueError(f"{', '.join(damaged)} not as exported")
-        return card
     except ValueError as error:
         raise PolicyError(f"{path} is damaged: {error}; export the agent again") from error
+    digests = card.pop("crc32", {})  # exports of earlier versions have none
+    for name in digests.keys() & {CARD, PROGRAM}:
+        data = json.dumps(card).encode() if name == CARD else path.with_name(name).read_bytes()
+        if zlib.crc32(data) != digests[name]:
+            raise PolicyError(f"{path.with_name(name)} is not as exported; export the agent again")
+    return card
 
 
 def _settings(card: Mapping[str, Any], task: Task) -> tuple[dict[str, Any], dict[str, Any]]:
