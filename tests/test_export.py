@@ -197,6 +197,14 @@ def test_the_program_of_another_export_is_noticed(copied, name):
     assert "agent.pt2" in refused(copied, name)
 
 
+def test_the_loader_alone_notices_a_damaged_program(copied):
+    data = bytearray((copied / "agent.pt2").read_bytes())
+    data[len(data) // 2] ^= 2
+    (copied / "agent.pt2").write_bytes(data)
+    with pytest.raises(PolicyError, match=r"agent\.pt2"):
+        loaded(copied / "load_agent.py:make", "cpu")
+
+
 def test_an_export_from_before_there_were_digests_is_used(copied):
     card = json.loads((copied / "agent.json").read_text())
     del card["crc32"]
