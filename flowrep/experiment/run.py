@@ -74,7 +74,7 @@ class _Lock:
     _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some network disks
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._path, self._text = folder, folder / ".lock", b""
+        self._path, self._text = folder / ".lock", b""
         # through no link, and not waiting for the other end of a named pipe
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
@@ -104,7 +104,7 @@ class _Lock:
             return False
         now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
         text = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
-        text["note"] = "it is free once the process has ended; without this file two could run"
+        text["note"] = "free once that process has ended; if this file is removed, two can run"
         self._text = json.dumps(text).encode()
         with naming(self._path):
             os.ftruncate(self._file, 0)
@@ -115,8 +115,8 @@ class _Lock:
         """Checks that no other process can have taken the folder since."""
         if not (self._is_at_its_path() and self._is_ours()):
             raise RunFolderError(
-                f"'{self._path}' was removed or replaced, so that another process can work in "
-                f"'{self._folder}', too: this one stops, and has saved nothing since"
+                f"'{self._path}' was removed or replaced, so another process can take the folder: "
+                "this one stops, and has written nothing since. Leave that file alone during a run"
             )
 
     def holder(self) -> str:
