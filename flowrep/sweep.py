@@ -26,8 +26,9 @@ from typing import Any, NoReturn
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from flowrep.config import UsageError, cli, read_config
+from flowrep.config import UsageError, cli
 from flowrep.config.schema import ALGORITHMS, TrainConfig, validated, validated_run
+from flowrep.config.yaml_file import read_yaml
 from flowrep.files import open_to_append
 from flowrep.progress import STOP_SIGNALS, StopRequest
 from flowrep.tables import read_rows
@@ -268,7 +269,7 @@ def _check_is_same(folder: Path, config: TrainConfig) -> None:
     path = folder / "config.yaml"
     if not path.is_file():
         return
-    stored = validated_run(read_config(path), str(path), config.algorithm.target).plain()
+    stored = validated_run(read_yaml(path), str(path), config.algorithm.target).plain()
     asked = config.plain()
     if asked["algorithm"].get("precision", "auto") == "auto":  # which the run has resolved
         asked["algorithm"] |= {k: v for k, v in stored["algorithm"].items() if k == "precision"}

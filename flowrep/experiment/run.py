@@ -28,8 +28,9 @@ from torchrl.record.loggers import TensorboardLogger
 
 from flowrep import __version__
 from flowrep.agent import CheckpointError
-from flowrep.config import UsageError, read_config
+from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, EstimatedFlow, TrainConfig, validated_run
+from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment.evaluation import OUTCOMES, failure_causes
 from flowrep.extras import require
 from flowrep.files import naming, replace_file, replace_text, set_aside
@@ -247,13 +248,6 @@ def _scalars(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     return {title: fmean(found) for title, found in values.items()}
 
 
-class _Dumper(yaml.SafeDumper):
-    """Writes what is there twice two times, as `read_config` refuses aliases."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
 class RunFolder:
     """The files of one run, by name; docs/runs.md says what is in them."""
 
@@ -340,14 +334,17 @@ class RunFolder:
         (self.path / ".hydra").mkdir(exist_ok=True)
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
         replace_text(self.path / ".hydra" / "overrides.yaml", typed)
-        replace_text(self.config_path, yaml.dump(dict(config), Dumper=_Dumper, sort_keys=False))
+        replace_text(self.config_path, yaml.safe_dump(dict(config), sort_keys=False))
 
     def read_config(self) -> dict[str, Any]:
         """Returns the resolved config as plain data."""
         try:
-            return read_config(self.config_path)
+            config = read_yaml(self.config_path)
         except UsageError as error:
-            raise RunFolderError(str(error)) from None
+            raise RunFolderError(f"{error}; restore the file") from None
+        if not isinstance(config, dict):
+            raise RunFolderError(f"{self.config_path} holds no config; restore the file")
+        return config
 
     def config(self, algorithm: str | None = None) -> TrainConfig:
         """Returns the resolved config as its model; see `validated_run` for `algorithm`."""

@@ -31,7 +31,6 @@ RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
 Cells = Mapping[str, Sequence[str]]
 _MACHINE = ("commit", "precision", "cpu")
 _OUTCOMES = OUTCOMES[1:]  # the first is that of an episode that goes on
-_MOST_VALUES = 100_000  # of a config, which has a few hundred
 _EPISODES: dict[str, type] = {
     "scene": str, "scene_id": str, "frames": int, "evaluation": str, "policy": str, "speed": str,
     "fps": float, "episode_seed": int, "outcome": str, "hit": str, "length": int,
@@ -72,7 +71,6 @@ def read_run(path: Path) -> Run:
     folder = RunFolder.existing(path)
     try:
         config = folder.read_config()
-        _check_size(config)
         tables = folder.read_episodes(), folder.read_metrics()
         episodes, metrics = (
             {k: [row[k] for row in t] for k in (t[0] if t else ())} for t in tables
@@ -84,18 +82,6 @@ def read_run(path: Path) -> Run:
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         what = f"config.yaml or a table is not what a run leaves ({error!r})"
         raise RunFolderError(f"{path}: {what}; restore the file that the run wrote") from None
-
-
-def _check_size(config: Any) -> None:
-    # YAML's references make a few lines stand for more values than any loop gets through.
-    waiting, values = [config], 0
-    while waiting:
-        part, values = waiting.pop(), values + 1
-        if values > _MOST_VALUES:
-            raise ValueError(f"it has more than {_MOST_VALUES:,} values")
-        waiting += (
-            part.values() if isinstance(part, dict) else part if isinstance(part, list) else []
-        )
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:

@@ -56,7 +56,7 @@ def test_runs_are_found_wherever_they_lie_and_once(tmp_path, name):
         ("config.yaml", "a: " + "[" * 5000, "config.yaml"),
         # each line stands for ten times as many values as the one before
         ("config.yaml", BOMB, "values"),
-        ("config.yaml", "scene: &again [*again]\n", "values"),
+        ("config.yaml", "scene: &again [*again]\n", "alias"),
     ],
 )
 def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, text, expected):
