@@ -20,6 +20,7 @@ require("an export", "train", "hydra", "pydantic", module=__name__)
 from flowrep import __version__
 from flowrep.config.cli import run_command
 from flowrep.config.schema import ExportConfig, TrainConfig
+from flowrep.files import replace_files
 
 if TYPE_CHECKING:
     import torch

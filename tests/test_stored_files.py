@@ -4,7 +4,9 @@ import json
 import os
 import sys
 from contextlib import suppress
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -17,6 +19,7 @@ from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_che
 from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
 from flowrep.evaluate import targets_of
+from flowrep.experiment import film
 from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolder, RunFolderError
 from flowrep.export import export
 from flowrep.train import resumed
@@ -138,9 +141,9 @@ CONFIGS = {
     "a tag of a module": "a: !!python/name:os.system",
     "a date that is none": "a: !!timestamp x",
     "a truth that is none": "a: !!bool x",
-    # each line stands for ten times as many values as the one before
-    "aliases": "a0: &a0 [x]\n"
-    + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 12)),
+    "aliases of aliases": "".join(
+        f"a{n}: &a{n} [{'1' if n == 0 else ', '.join([f'*a{n - 1}'] * 20)}]\n" for n in range(9)
+    ),
     "an endless alias": "a: &a [*a]",
     "depth": "[" * 20_000,
 }
@@ -164,8 +167,7 @@ def test_nothing_in_a_stored_config_is_resolved(tmp_path, monkeypatch):
     assert (own["note"], own["experiment"]) == ("${oc.env:SECRET}", "${seed}")
 
 
-def test_the_config_of_every_run_can_be_read_again(tmp_path):
-    """Shared lists are written as aliases."""
+def test_a_list_that_a_config_holds_twice_is_read_again(tmp_path):
     run, ends = RunFolder(tmp_path), [1.0, 2.0]
     run.write_config({"a": ends, "b": ends})
     assert run.read_config() == {"a": ends, "b": ends}
@@ -206,6 +208,23 @@ def test_no_file_of_a_run_is_written_through_a_link(tmp_path, victim, name, is_t
         WRITES[name](run)
     assert victim.read_text() == before
     assert os.listdir(victim.parent) == ["victim"]
+
+
+def test_a_film_is_written_through_no_link(tmp_path, victim, monkeypatch):
+    """FFmpeg follows those of its temporary files, too, whose names a stranger may know."""
+    frames = [np.zeros((16, 16, 3), np.uint8)] * 3
+    made = SimpleNamespace(
+        drive=lambda _: ([], SimpleNamespace(fps=12.0)), pictures=lambda *_: frames,
+        close=lambda: None,
+    )  # fmt: skip
+    monkeypatch.setattr(film, "Film", lambda agent: made)
+    before = victim.read_text()
+    for name in ("a.mp4", "a.tmp.mp4", ".a.mp4.partial"):
+        (tmp_path / name).symlink_to(victim)
+    film.record_episode(None, tmp_path / "a.mp4", episode_seed=1)
+    assert victim.read_text() == before
+    assert not (tmp_path / "a.mp4").is_symlink()
+    assert (tmp_path / "a.mp4").stat().st_size > 500
 
 
 @pytest.mark.parametrize("kind", ["link", "link to nothing", "hard link", "pipe"])

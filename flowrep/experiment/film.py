@@ -18,7 +18,7 @@ from flowrep.baselines import BaselinePolicy
 from flowrep.envs import street_envs
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import Episode, evaluate, outcome_shares
-from flowrep.experiment.run import replace_file
+from flowrep.files import replace_file
 from flowrep.palette import OUTCOME_COLOURS
 from flowrep.scenes.scene import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer
@@ -219,7 +219,8 @@ def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: An
     """Writes the film of one greedy episode; `changes` are of the arguments of `make_env`."""
     with closing(Film(agent, **changes)) as film:
         frames, episode = film.drive({"episode_seed": episode_seed})
-        write_video(path, film.pictures(frames, episode), fps=episode.fps)
+        pictures = film.pictures(frames, episode)
+        replace_file(path, partial(write_video, frames=pictures, fps=episode.fps))
     return episode
 
 

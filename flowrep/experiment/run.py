@@ -75,7 +75,7 @@ class _Lock:
     _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some network disks
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._path, self._text = folder, folder / ".lock", b""
+        self._path, self._text = folder / ".lock", b""
         # through no link, and not waiting for the other end of a named pipe
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
@@ -105,7 +105,7 @@ class _Lock:
             return False
         now = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
         text = {"pid": os.getpid(), "host": platform.node(), "doing": doing, "since": now}
-        text["note"] = "it is free once the process has ended; without this file two could run"
+        text["note"] = "free once that process has ended; if this file is removed, two can run"
         self._text = json.dumps(text).encode()
         with naming(self._path):
             os.ftruncate(self._file, 0)
@@ -116,8 +116,8 @@ class _Lock:
         """Checks that no other process can have taken the folder since."""
         if not (self._is_at_its_path() and self._is_ours()):
             raise RunFolderError(
-                f"'{self._path}' was removed or replaced, so that another process can work in "
-                f"'{self._folder}', too: this one stops, and has saved nothing since"
+                f"'{self._path}' was removed or replaced, so another process can take the folder: "
+                "this one stops, and has written nothing since. Leave that file alone during a run"
             )
 
     def holder(self) -> str:
@@ -343,7 +343,7 @@ class RunFolder:
         except UsageError as error:
             raise RunFolderError(f"{error}; restore the file") from None
         if not isinstance(config, dict):
-            raise RunFolderError(f"{self.config_path} holds no config: restore the file")
+            raise RunFolderError(f"{self.config_path} holds no config; restore the file")
         return config
 
     def config(self, algorithm: str | None = None) -> TrainConfig:

@@ -51,13 +51,12 @@ def test_runs_are_found_wherever_they_lie_and_once(tmp_path, name):
         ("config.yaml", yaml.safe_dump(config_of(total_frames=None)), "config.yaml"),
         ("evaluation.csv", "scene;fps\n1;2\n", "evaluation.csv"),
         ("metrics.csv", "frames,success\nmany,0.5\n", "'many'"),
-        ("machine.json", "{", "bad"),
+        ("machine.json", "[{", "machine.json"),
+        ("machine.json", "[1]", "machine.json"),
         ("config.yaml", "a: " + "[" * 5000, "config.yaml"),
         # each line stands for ten times as many values as the one before
         ("config.yaml", BOMB, "values"),
-        ("config.yaml", "scene: &again [*again]\n", "config.yaml"),
-        ("machine.json", "[{", "machine.json"),
-        ("machine.json", "[1]", "machine.json"),
+        ("config.yaml", "scene: &again [*again]\n", "alias"),
     ],
 )
 def test_a_damaged_folder_is_one_line_and_the_others_are_read(tmp_path, file, text, expected):
