@@ -5,6 +5,7 @@ import os
 import select
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from types import FrameType
 from typing import Any, ClassVar
 
 LINE_EVERY_S = 30.0
+_LOCK = threading.RLock()
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -27,6 +29,9 @@ def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
     from tqdm.asyncio import tqdm_asyncio  # here, as envs import this module and need no tqdm
     from tqdm.auto import tqdm
 
+    # tqdm's own is one between processes, for which multiprocessing starts another process, whose
+    # traceback a hang-up would print
+    tqdm.set_lock(_LOCK)
     is_notebook = tqdm is not tqdm_asyncio
     if sys.stderr.isatty() or is_notebook:
         return tqdm(iterable, **options)

@@ -110,6 +110,23 @@ def test_in_a_log_progress_is_now_and_then_a_line_of_what_how_far_how_fast_how_l
     assert all(re.match(r"evaluating: \d+ of 20 episodes, ", text) for text in inner)
 
 
+CHILDREN = """
+import multiprocessing, os
+from flowrep.progress import progress_bar
+
+multiprocessing.set_start_method("spawn")  # as TorchRL does
+for _ in progress_bar(range(3), what="counting"):
+    pass
+print(open(f"/proc/self/task/{os.getpid()}/children").read())
+"""
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="looks into /proc")
+def test_a_bar_starts_no_process_that_a_hang_up_would_end():
+    command = [sys.executable, "-c", CHILDREN]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "\n"
+
+
 def test_a_line_comes_every_half_minute(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr("flowrep.progress.time.monotonic", lambda: now[0])
