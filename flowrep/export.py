@@ -134,7 +134,6 @@ def write_agent(folder: Path, program: ExportedProgram, card: Mapping[str, Any])
 
     from flowrep import load_agent
     from flowrep.experiment.agents import CARD, LOADER, PROGRAM
-    from flowrep.files import replace_files
 
     traced = io.BytesIO()
     torch.export.save(program, traced)

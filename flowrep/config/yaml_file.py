@@ -88,5 +88,3 @@ def checked_yaml(path: str | Path, text: str, load: Callable[[str], Any]) -> Any
     # the last two are PyYAML's at `!!bool x` and `!!timestamp x`
     except (OSError, ValueError, yaml.YAMLError, KeyError, AttributeError) as error:
         raise UsageError(f"{path}: can't be read: {' '.join(str(error).split())}") from error
-    except (KeyError, AttributeError) as error:  # of PyYAML, at a value that its tag doesn't fit
-        raise UsageError(f"{path}: can't be read: {type(error).__name__}: {error}") from error
