@@ -72,12 +72,12 @@ def test_a_preset_asks_of_one_algorithm_what_others_do_not_have():
     ("cores", "device", "change", "workers"),
     [
         (1, "cpu", "renderer=auto", 0),
-        (2, "cpu", "renderer=auto", 0),
-        (2, "cpu", "num_workers=1", 1),
-        (2, "cpu", "renderer=pybullet", 2),
-        (2, "cpu", "flow=estimated", 2),
+        (2, "cpu", "threads=1", 1),
+        (2, "cpu", "threads=2", 0),
+        (2, "cpu", "num_workers=2", 2),
         (2, "cuda", "renderer=auto", 2),
-        (3, "cpu", "renderer=auto", 3),
+        (3, "cpu", "threads=1", 2),
+        (16, "cpu", "threads=1", 4),  # one for each environment
     ],
 )
 def test_workers_step_environments_where_cores_are_free(
@@ -85,7 +85,6 @@ def test_workers_step_environments_where_cores_are_free(
 ):
     from flowrep.experiment import build
 
-    pytest.importorskip("numba", reason="without it PyBullet always renders")
     made = Mock()
     monkeypatch.setattr(build, "make_env", made)
     monkeypatch.setattr(build, "available_cores", lambda: cores)

@@ -17,7 +17,6 @@ from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConf
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
 from flowrep.envs.workers import available_cores
-from flowrep.simulator.camera import choose_renderer
 
 ENVS_PER_WORKER = 24  # of an evaluation: fewer aren't worth the start of a process
 
@@ -47,9 +46,9 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
     }
     arguments |= changes
     num_workers = changes.get("num_workers", config.num_workers)
-    if num_workers == "auto" and not _workers_help(config):
-        num_workers = 0
-    arguments["num_workers"] = worker_count(num_workers, arguments["num_envs"])
+    if num_workers == "auto":
+        num_workers = worker_count(arguments["num_envs"], busy_cores=_threads(config))
+    arguments["num_workers"] = num_workers
     return make_env(**arguments).append_transform(InitTracker())
 
 
@@ -74,29 +73,26 @@ def with_precision(config: TrainConfig) -> TrainConfig:
     return config.model_copy(update={"algorithm": section.model_copy(update=chosen)})
 
 
-def worker_count(num_workers: int | str, num_envs: int) -> int:
-    """Returns the number of worker processes; for "auto" one per core, if there are several."""
-    if isinstance(num_workers, int):
-        return num_workers
-    cores = available_cores()
+def worker_count(num_envs: int, busy_cores: int = 0) -> int:
+    """Returns the number of worker processes: one for each core that isn't busy."""
     # in a process of a pool, such as that of hydra/launcher=joblib, others use the other cores
     is_in_pool = multiprocessing.current_process().name != "MainProcess"
-    return 0 if is_in_pool or min(cores, num_envs) < 2 else min(cores, num_envs)
+    cores = available_cores()
+    return 0 if is_in_pool or min(cores, num_envs) < 2 else min(cores - busy_cores, num_envs)
 
 
-def _workers_help(config: EnvConfig) -> bool:
-    """Returns whether training is faster if other processes step the environments."""
-    # A learner on a CPU of two cores needs both, and the rasteriser makes steps cheap.
-    if available_cores() > 2 or device(config.device).type != "cpu":
-        return True
-    return config.flow.source != "exact" or choose_renderer(config.renderer) == "pybullet"
+def _threads(config: EnvConfig) -> int:
+    """Returns the number of cores that the updates of a training need."""
+    if not isinstance(config, TrainConfig) or device(config.device).type != "cpu":
+        return 0
+    return min(config.threads, available_cores())
 
 
 def evaluation_workers(config: EnvConfig, num_envs: int) -> int:
     """Returns the number of processes that step an evaluation's environments."""
     if isinstance(config.num_workers, int):
         return min(config.num_workers, num_envs)
-    return worker_count("auto", num_envs // ENVS_PER_WORKER)
+    return worker_count(num_envs // ENVS_PER_WORKER)
 
 
 def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
