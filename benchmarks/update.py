@@ -27,7 +27,7 @@ from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
 from flowrep.agent import DiscreteSAC, keep_freed_memory
 from flowrep.agent.algorithm import WARM_UP
-from flowrep.agent.observation import has_fast_bf16
+from flowrep.agent.observation import has_bf16
 
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3
@@ -52,7 +52,7 @@ def random_steps(side: int, batch: int, device: torch.device) -> TensorDict:
 
 def dtypes_of(device: torch.device) -> dict[str, torch.dtype]:
     """Returns the precisions worth measuring: emulated bfloat16 takes minutes for an update."""
-    fast = {"bf16": torch.bfloat16} if has_fast_bf16(device) else {}
+    fast = {"bf16": torch.bfloat16} if has_bf16(device) else {}
     return fast | {"fp32": torch.float32}
 
 
