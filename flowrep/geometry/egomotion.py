@@ -5,11 +5,17 @@ point that p shows was seen at the projection of R x + q T. The residual is this
 flow's p', in pixels. Sky has q = 0 and so constrains the rotation alone, without a case of its own.
 
 Moving bodies are outliers. The start is the best of many motions, each from four pixels; then
-Gauss-Newton steps on more pixels with Geman-McClure weights, whose scale follows the residuals.
+Gauss-Newton steps on more pixels with Geman-McClure weights, whose scale follows the residuals. Few
+pixels can't tell 49 % from 51 %: the motion of what the best one leaves unexplained is a candidate
+too, and all pixels choose between the two.
+
+The pixels are in an order like that of chance, fixed for a size of picture. In any regular one,
+some columns would stand for the picture, and a body that fills these would win.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import random
 from typing import NamedTuple
@@ -19,15 +25,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrep.geometry.checks import check_shape, common_batch
-from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, known_camera
-from flowrep.geometry.pose import rotation_from_vector
+from flowrep.geometry.closed_form import LARGEST, MIN_DEPTH_RATIO, SMALLEST, known_camera
 
+VOTERS = 1 << 15  # all pixels of smaller pictures; more would change 1 % of votes by chance
 PIXELS = 1536  # used in a Gauss-Newton step; more gain nothing
-CANDIDATES = 4 * PIXELS  # looked at for known ones
 SCORED_PIXELS = 320
 HYPOTHESES, PIXELS_EACH = 64, 4
 MIN_PIXELS = 32  # fewer known ones tell no motion: four of them fit any
-_HYPOTHESIS_STEPS, _STEPS = 3, 6
+_HYPOTHESIS_STEPS, _STEPS = 3, 4
 
 # Which of the known pixels a hypothesis is from, as shares of their number. Drawn once, so that the
 # same frame has the same motion in every batch, process and replay.
@@ -36,7 +41,12 @@ _DRAWS = [[_random.random() for _ in range(PIXELS_EACH)] for _ in range(HYPOTHES
 
 _SCORE_SCALES, _LEAST_SCORE_PX = 1.5, 0.02  # where a pixel's cost in a score is half of its bound
 _PRIORS_LEAD = 0.25  # share of the pixels: a body may fill that much more than the static world
-_REFINED, _REFINING_STEPS = 6, 3  # the best hypotheses, each led to its own optimum
+_REFINED, _REFINING_STEPS = 6, 2  # the best hypotheses, each led to its own optimum
+_RIVAL_STEPS = 3  # of the motion of what the best one leaves unexplained
+_INLIER_SCALES = 2.5  # standard deviations, within which 96 % of normal errors are
+_STILL_PX = 0.2  # standard deviation of flow that counts as a camera's at rest, whatever it shows
+_LEAST_STRENGTH = 0.1  # of a motion's squared flow, in squared deviations from it
+_CHANCES = 16  # times what chance shows, which is 3 / N in that unit: fewer may be noise
 _LEAST_SCALE_PX = 2e-3  # far above float32's rounding of exact flow, far below any measured flow's
 _SCALES = 1.5  # standard deviations at which a pixel's weight is a quarter
 _QUANTILE = 1 / 3  # of all residuals, for their scale: half of the pixels may be outliers
@@ -52,7 +62,8 @@ _LEAST_EIGENVALUE = 1e-5  # of the scaled normal matrix: less is a direction tha
 class MotionEstimate(NamedTuple):
     """The camera's motion `[*B, 4, 4]` and how well the flow tells it.
 
-    `inlier_share` `[*B]` is the share of the known pixels that move as the camera's motion says.
+    `inlier_share` `[*B]` is the share of the known pixels that move as the camera's motion says,
+    within 2.5 standard deviations of their errors, or 0.2 px if flow is noise.
     `covariance` `[*B, 6, 6]` is that of (rotation vector in rad, translation in m), a small motion
     of the previous camera after the estimate; a variance is inf where nothing tells it. `valid`
     is bool `[*B]`.
@@ -80,6 +91,11 @@ class _Samples(NamedTuple):
         known = self.known.gather(-1, at).reshape(-1, index.shape[-1])
         focal, number = (x.repeat_interleave(index.shape[1], 0) for x in (self.focal, self.number))
         return _Samples(focal, values, known, number)
+
+    def every_few(self, count: int, shift: float) -> _Samples:
+        """Returns `count` of the known pixels of each frame, spread over all of them."""
+        shares = (torch.arange(count, device=self.number.device) + shift) / count
+        return self.part((shares * self.number.unsqueeze(-1)).long().unsqueeze(1))
 
     def in_pixels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Returns how far a shift of rays at z = 1 is in the picture, `[B, ..., N]`."""
@@ -109,9 +125,12 @@ def camera_motion(
 
     It fails, without a sign in the result, where more than half of the known pixels move as one
     body: the motion is then relative to that body. A prior helps there. `valid` is False, and the
-    motion the prior, where fewer than 32 pixels are known or they leave a direction open: nan, no
-    texture, sky alone (which tells the rotation only). The covariance counts the pixels' own
-    errors, as if independent; it is several times too small for errors that neighbours share.
+    motion the prior, where fewer than 32 pixels are known or they leave a direction open (nan, no
+    texture, sky alone, which tells the rotation only), where flow is noise, and where a K or the
+    prior isn't finite, which has the identity. Noise is flow that fits no motion to 0.2 px and
+    shows none that it may not have by chance; errors that neighbours share may look like one. The
+    covariance counts the pixels' own errors, as if independent; it is several times too small for
+    errors that neighbours share.
 
     Args:
         flow: `[*B, 2, H, W]`, pixels per step, nan where it isn't known.
@@ -149,25 +168,28 @@ def camera_motion(
         **{name: tensor.shape[: -len(trailing)] for name, (tensor, trailing) in given.items()}
     )
     dtype = torch.promote_types(torch.promote_types(flow.dtype, depth.dtype), torch.float32)
+    if 0 in flow.shape[-2:]:  # a picture without pixels knows as much as one unknown pixel
+        flow, depth = (x.new_full((*x.shape[:-2], 1, 1), math.nan) for x in (flow, depth))
+        picture = None
 
     def flat(tensor: Tensor, dims: int, to: torch.dtype = dtype) -> Tensor:
         size = tensor.shape[-dims:]
         return tensor.to(to).expand(*batch, *size).reshape(-1, *size)
 
-    K_now, K_before = (flat(x, 2, torch.float64) for x in (K, K if prev_K is None else prev_K))
-    expected = torch.eye(4) if prior is None else prior
-    expected = flat(expected.to(depth.device), 2, torch.float64)
-    (K_now, _, known), (K_before, _, known_before) = (
-        known_camera(each, 1.0) for each in (K_now, K_before)
-    )
-    has_prior = expected.isfinite().flatten(1).all(-1, keepdim=True).unsqueeze(-1)
-    expected = torch.where(has_prior, expected, torch.eye(4, device=depth.device).double())
-    known = known & known_before & has_prior.flatten()
-    # a frame that misses one of them has no known pixel
-    flow = torch.where(known[:, None, None, None], flat(flow, 3), math.nan)
+    K_now, _, known = known_camera(flat(K, 2, torch.float64), 1.0)
+    K_before = K_now
+    if prev_K is not None:
+        K_before, _, known_before = known_camera(flat(prev_K, 2, torch.float64), 1.0)
+        known = known & known_before
+    expected = flat(torch.eye(4, device=depth.device), 2, torch.float64)
+    if prior is not None:
+        prior = flat(prior, 2, torch.float64)
+        has_prior = (prior.abs() <= LARGEST).flatten(1).all(-1)  # nan compares False
+        expected, known = torch.where(has_prior[:, None, None], prior, expected), known & has_prior
     structure = None if picture is None else structure_tensor(flat(picture, 3))
-    samples = _samples(flow, flat(depth, 3), K_now, K_before, structure)
-    motion = _best_hypothesis(samples, expected, has_prior=prior is not None)
+    voters = _voters(flat(flow, 3), flat(depth, 3), K_now, K_before, structure, known)
+    samples = _samples(voters)
+    motion = _best_hypothesis(voters, samples, expected, has_prior=prior is not None)
     motion = _descended(samples, motion, _STEPS)
     share, covariance, valid = _described(samples, motion)
     motion = torch.where(valid[:, None, None], motion, expected)
@@ -195,47 +217,65 @@ def structure_tensor(picture: Tensor) -> Tensor:
     return torch.stack([own + noise * xx, noise * xy, own + noise * yy], -3) / det.unsqueeze(-3)
 
 
-def _samples(
-    flow: Tensor, depth: Tensor, K: Tensor, prev_K: Tensor, structure: Tensor | None
+@functools.lru_cache(maxsize=16)
+def _shuffled(height: int, width: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Returns the numbers of up to `VOTERS` pixels as if drawn, and their centres `[2, N]`."""
+    bits = (1 << 32) - 1
+    key = torch.arange(height * width, device=device)
+    for _ in range(2):  # a one-to-one hash of 32 bits
+        key = ((key ^ (key >> 16)) * 0x45D9F3B) & bits
+    pixel = (key ^ (key >> 16)).argsort()[:VOTERS]
+    return pixel, torch.stack([pixel % width, pixel // width]) + 0.5
+
+
+def _voters(
+    flow: Tensor,
+    depth: Tensor,
+    K: Tensor,
+    prev_K: Tensor,
+    structure: Tensor | None,
+    known_frame: Tensor,
 ) -> _Samples:
-    """Returns up to `PIXELS` known pixels of each frame, spread over the picture.
+    """Returns all pixels of small pictures, `VOTERS` of others, shuffled; none of unknown frames.
 
     Their flow is that which the previous camera's pixels tell of the rays' motion: without the part
     that a change of K causes by itself.
     """
-    batch, _, height, width = flow.shape
-    size = height * width
-    looked_at = min(size, CANDIDATES)
-    # Steps of the golden ratio spread any number of pixels evenly; coprime steps meet each once.
-    step = int(size / 1.618033988749895) + 1
-    while math.gcd(step, size) > 1:
-        step += 1
-    pixel = torch.arange(looked_at, device=flow.device) * step % size
+    shuffled = _shuffled.__wrapped__ if torch.compiler.is_compiling() else _shuffled
+    pixel, centres = shuffled(*flow.shape[-2:], flow.device)
+    column, row = centres.to(flow.dtype)
     maps = [flow, depth] if structure is None else [flow, depth, structure]
-    values = torch.cat([each.flatten(-2)[..., pixel] for each in maps], 1)  # [B, 3 or 6, M]
+    # gathered, as indexing takes five times as long
+    each = (m.flatten(-2).gather(-1, pixel.expand(*m.shape[:2], -1)) for m in maps)
+    values = torch.cat([*each], 1)  # [B, 3 or 6, N]
     u, v, z = values[:, :3].unbind(1)
     known = u.isfinite() & v.isfinite() & (z >= SMALLEST)  # nan compares False
+    known &= known_frame.unsqueeze(-1)
     if structure is not None:
         known &= values[:, 3] + values[:, 5] > _LEAST_TEXTURE
-    # The known ones move to the front.
-    rank = known.long().cumsum(-1) - 1
-    slot = torch.where(known & (rank < PIXELS), rank, PIXELS)
-    order = torch.zeros(batch, PIXELS + 1, dtype=torch.long, device=flow.device)
-    order.scatter_(1, slot, torch.arange(looked_at, device=flow.device).expand(batch, -1))
-    order = order[:, :PIXELS]
-    number = known.sum(-1).clamp(max=PIXELS)
-    is_known = torch.arange(PIXELS, device=flow.device) < number.unsqueeze(-1)
-    values = values.gather(-1, order.unsqueeze(1).expand(-1, values.shape[1], -1))
-    values = torch.where(is_known.unsqueeze(1), values, 1.0)
-    place = pixel[order]
     (fx, skew, cx), (_, fy, cy), _ = _entries(K, values.dtype)
-    y = (place // width + 0.5 - cy) / fy
-    x = (place % width + 0.5 - cx - skew * y) / fx
+    y = (row - cy) / fy
+    x = (column - cx - skew * y) / fx
     (fx, skew, cx), (_, fy, cy), _ = _entries(prev_K - K, values.dtype)
     moved = values[:, :2] + torch.stack([fx * x + skew * y + cx, fy * y + cy], 1)
     ray = torch.stack([x, y, torch.ones_like(x), values[:, 2].reciprocal()], 1)
     focal = prev_K[:, [0, 0, 1], [0, 1, 1]]
-    return _Samples(focal, torch.cat([ray, moved, values[:, 3:]], 1), is_known, number)
+    values = torch.cat([ray, moved, values[:, 3:]], 1)
+    return _Samples(focal, values, known, known.sum(-1))
+
+
+def _samples(voters: _Samples) -> _Samples:
+    """Returns the first `PIXELS` known ones of the pixels, before unknown ones."""
+    batch, looked_at = voters.known.shape
+    rank = voters.known.long().cumsum(-1) - 1
+    slot = torch.where(voters.known & (rank < PIXELS), rank, PIXELS)
+    order = torch.zeros(batch, PIXELS + 1, dtype=torch.long, device=slot.device)
+    order.scatter_(1, slot, torch.arange(looked_at, device=slot.device).expand(batch, -1))
+    number = voters.number.clamp(max=PIXELS)
+    known = torch.arange(PIXELS, device=slot.device) < number.unsqueeze(-1)
+    chosen = voters.part(order[:, None, :PIXELS])
+    values = torch.where(known.unsqueeze(1), chosen.values, 1.0)  # no nan, which weights of 0 keep
+    return chosen._replace(values=values, known=known, number=number)
 
 
 def _entries(K: Tensor, dtype: torch.dtype) -> list[list[Tensor]]:
@@ -243,7 +283,9 @@ def _entries(K: Tensor, dtype: torch.dtype) -> list[list[Tensor]]:
     return [list(row.unbind(-1)) for row in K.to(dtype).unsqueeze(1).unbind(-2)]
 
 
-def _best_hypothesis(samples: _Samples, expected: Tensor, *, has_prior: bool) -> Tensor:
+def _best_hypothesis(
+    voters: _Samples, samples: _Samples, expected: Tensor, *, has_prior: bool
+) -> Tensor:
     """Returns the best of the expected motion and those that four pixels tell, `[B, 4, 4]`."""
     batch = len(expected)
     draws = torch.tensor(_DRAWS, dtype=torch.float64, device=expected.device)
@@ -259,31 +301,48 @@ def _best_hypothesis(samples: _Samples, expected: Tensor, *, has_prior: bool) ->
         step = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)[0]
         step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0).clamp(-10.0, 10.0)
         motion = _after(motion, -step)
-    shares = torch.arange(SCORED_PIXELS, device=expected.device) / SCORED_PIXELS
-    scored = samples.part((shares * samples.number.unsqueeze(-1)).long().unsqueeze(1))
+    scored, others = (samples.every_few(SCORED_PIXELS, shift) for shift in (0.0, 0.5))
     first = _descended(scored, expected, _STEPS) if has_prior else expected
     motions = torch.cat([first.unsqueeze(1), motion.unflatten(0, (batch, HYPOTHESES))], 1)
-    # What the expected motion is ahead of others: of none but exact ties, unless it is a prior.
+    # What the expected motion is ahead of others, as a share of the pixels: of none but exact ties,
+    # unless it is a prior.
     lead = torch.zeros(1 + HYPOTHESES, device=expected.device)
-    lead[0] = _PRIORS_LEAD * SCORED_PIXELS if has_prior else 1e-6
+    lead[0] = _PRIORS_LEAD if has_prior else 1e-6 / SCORED_PIXELS
     # Neighbouring hypotheses lead to different optima: the best ones are refined and scored again.
-    best = (_costs(scored, motions) - lead).topk(_REFINED, largest=False).indices
+    best = (_costs(scored, motions)[0] - lead).topk(_REFINED, largest=False).indices
     motions = motions.gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
     repeated = _Samples(*(part.repeat_interleave(_REFINED, 0) for part in scored))
     motions = _descended(repeated, motions, _REFINING_STEPS).unflatten(0, (batch, _REFINED))
-    choice = (_costs(scored, motions) - lead[best]).argmin(-1)
-    return motions[torch.arange(batch, device=expected.device), choice]
+    lead = lead[best]
+    costs, scale = _costs(scored, motions, final=True)
+    choice = (costs - lead).argmin(-1, keepdim=True)
+    motion = motions.gather(1, choice[..., None, None].expand(-1, -1, 4, 4)).squeeze(1)
+    # What it leaves unexplained may be the world, of which the few pixels showed too little.
+    ru, rv, in_front, *_ = _residuals(others, motion)
+    is_rest = _squared(others, ru, rv) > (_INLIER_SCALES * scale).square().unsqueeze(-1)
+    unexplained = others._replace(known=others.known & in_front & is_rest)
+    rival = _descended(unexplained, motion, _RIVAL_STEPS)
+    two = torch.stack([motion, rival], 1)
+    lead = torch.cat([lead.gather(1, choice), torch.zeros_like(lead[:, :1])], 1)
+    choice = (_costs(voters, two, final=True)[0] - lead).argmin(-1)
+    return two[torch.arange(batch, device=expected.device), choice]
 
 
-def _costs(samples: _Samples, motions: Tensor) -> Tensor:
-    """Returns the truncated costs `[B, M]` of motions `[B, M, 4, 4]` of each frame."""
+def _costs(samples: _Samples, motions: Tensor, *, final: bool = False) -> tuple[Tensor, Tensor]:
+    """Returns truncated costs a pixel, -1 to 0, of motions `[B, M, 4, 4]`, `[B, M]`, and the scale.
+
+    A final choice is among motions at their optima. There, what lies between two bodies' motions
+    and explains both by half must not win over the one that explains a body.
+    """
     ru, rv, in_front, *_ = _residuals(samples, motions)
     known = in_front & samples.known.unsqueeze(1)
     squared = torch.where(known, _squared(samples, ru, rv), torch.inf)
     number = samples.known.sum(-1, keepdim=True)
     # truncated at a few standard deviations of the residuals of the motion that fits best
-    scale = (_SCORE_SCALES * _scale(squared, number).amin(-1)).clamp(min=_LEAST_SCORE_PX)
-    return -(1 + squared / scale.square()[:, None, None]).reciprocal().sum(-1)
+    scale = _scale(squared, number).amin(-1) * (1.0 if final else _SCORE_SCALES)
+    scale = scale.clamp(min=_LEAST_SCORE_PX)
+    kept = (1 + squared / scale.square()[:, None, None]).reciprocal()
+    return -(kept.square() if final else kept).sum(-1) / number.clamp(min=1), scale
 
 
 def _residuals(samples: _Samples, motion: Tensor) -> tuple[Tensor, ...]:
@@ -319,8 +378,9 @@ def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
 
 def _scale(squared: Tensor, number: Tensor) -> Tensor:
     """Returns a robust standard deviation of residuals per channel, px, from `[..., N]` squares."""
-    squared = squared[..., ::4]  # enough; unknown ones are inf and come last
-    rank = (number * (_QUANTILE / 4)).long().unsqueeze(-1).expand(*squared.shape[:-1], 1)
+    every = max(4, squared.shape[-1] // 384)  # enough
+    squared = squared[..., ::every]  # unknown ones are inf and come last
+    rank = (number * (_QUANTILE / every)).long().unsqueeze(-1).expand(*squared.shape[:-1], 1)
     return squared.sort(-1).values.gather(-1, rank).squeeze(-1).sqrt() / _RAYLEIGH
 
 
@@ -359,9 +419,14 @@ def _normal_equations(samples: _Samples, at: _Linear, weight: Tensor) -> tuple[T
 
 def _after(motion: Tensor, step: Tensor) -> Tensor:
     """Returns the motion followed by a small one, (rotation vector, translation) `[..., 6]`."""
-    turn, shift = step.split([3, 3], -1)
-    moved = rotation_from_vector(turn) @ motion[..., :3, :]
-    moved = torch.cat([moved[..., :3], moved[..., 3:] + shift.unsqueeze(-1)], -1)
+    turn, shift = step.unsqueeze(-1).split([3, 3], -2)
+    # Rodrigues, as in `rotation_from_vector`, whose matrix would cost half of a step for one frame.
+    turns = turn.norm(dim=-2, keepdim=True) / math.pi
+    rows = motion[..., :3, :]
+    crossed = torch.linalg.cross(turn, rows, dim=-2)
+    twice = torch.linalg.cross(turn, crossed, dim=-2)
+    moved = rows + torch.sinc(turns) * crossed + 0.5 * torch.sinc(turns / 2).square() * twice
+    moved = moved + functional.pad(shift, (3, 0))
     return torch.cat([moved, motion[..., 3:, :]], -2)
 
 
@@ -375,6 +440,7 @@ class _Weighted(NamedTuple):
 
     at: _Linear
     squared: Tensor
+    scale: Tensor  # a few standard deviations, px, [B]
     ratio: Tensor  # squared over the scale's square
     weight: Tensor
     right: Tensor  # J^T W r, [B, 6]
@@ -389,14 +455,16 @@ def _weighted(samples: _Samples, motion: Tensor) -> _Weighted:
     usable = samples.known & at.in_front
     squared = torch.where(usable, _squared(samples, at.ru, at.rv), torch.inf)
     scale = _SCALES * _scale(squared, samples.known.sum(-1))
-    ratio = squared / scale.clamp(min=_LEAST_SCALE_PX, max=1e4).square().unsqueeze(-1)
+    scale = scale.clamp(min=_LEAST_SCALE_PX, max=1e4)
+    ratio = squared / scale.square().unsqueeze(-1)
     weight = (1 + ratio).square().reciprocal()
     normal, right = _normal_equations(samples, at, weight)
     moves = (weight.unsqueeze(1) * (at.Ju.square() + at.Jv.square())).sum(-1).double()
     unit = torch.where(moves > 1e-12, moves, torch.inf).rsqrt()
-    values, vectors = torch.linalg.eigh(unit.unsqueeze(-1) * normal * unit.unsqueeze(-2))
+    scaled = (unit.unsqueeze(-1) * normal * unit.unsqueeze(-2)).nan_to_num(0.0, 0.0, 0.0)
+    values, vectors = torch.linalg.eigh(scaled)  # which would raise for the whole batch
     seen = values > _LEAST_EIGENVALUE
-    return _Weighted(at, squared, ratio, weight, right, unit, values, vectors, seen)
+    return _Weighted(at, squared, scale, ratio, weight, right, unit, values, vectors, seen)
 
 
 def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
@@ -429,6 +497,24 @@ def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tenso
     variance = torch.where(is_open, torch.inf, variance)
     diagonal = torch.eye(6, dtype=torch.bool, device=motion.device)
     covariance = torch.where(diagonal, variance.unsqueeze(-1), covariance)
-    share = (ratio < 1).sum(-1) / samples.number.clamp(min=1)
+    told = _is_told(samples, now)
+    within = torch.where(told, _INLIER_SCALES / _SCALES * now.scale, _STILL_PX)
+    share = (now.squared < within.square().unsqueeze(-1)).sum(-1) / samples.number.clamp(min=1)
     enough = (samples.number >= MIN_PIXELS) & seen.all(-1) & motion.flatten(1).isfinite().all(-1)
-    return share, covariance, enough
+    return share, covariance, enough & told
+
+
+def _is_told(samples: _Samples, now: _Weighted) -> Tensor:
+    """Returns whether flow is more than noise: it fits no motion at all, or one that it shows.
+
+    Noise has a motion that fits best, too. It shows it as much as chance does: the squared flow of
+    that motion is 6 / 2 N of the noise's, for N pixels and six parameters, and some more for the
+    choice of one among many. Noise of `_STILL_PX` can't be told from a camera that stands.
+    """
+    ego = _squared(samples, samples.values[:, 4] - now.at.ru, samples.values[:, 5] - now.at.rv)
+    ego = (now.weight * ego).sum(-1) / now.weight.sum(-1).clamp(min=1e-12)
+    deviation = now.scale / _SCALES
+    strength = ego / (2 * deviation.square())
+    by_chance = 3 / (samples.number - MIN_PIXELS).clamp(min=1)
+    is_shown = (strength > _LEAST_STRENGTH) & (strength > _CHANCES * by_chance)
+    return (deviation <= _STILL_PX) | is_shown

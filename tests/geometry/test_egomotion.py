@@ -184,6 +184,170 @@ def test_noise_of_a_third_of_a_pixel_and_a_covariance_that_says_so():
     assert 0.7 < said_shift / shift.square().mean().sqrt() < 1.4
 
 
+def scene_of(height: int, width: int, count: int) -> tuple[torch.Tensor, ...]:
+    """Returns depth, K, the camera's flow and a body's, each `count` times."""
+    camera = torch.tensor([[0.9 * width, 0, 0.48 * width], [0, 0.8 * width, 0.53 * height]])
+    camera = torch.cat([camera, torch.tensor([[0.0, 0.0, 1.0]])])
+    depth = torch.nn.functional.interpolate(blocks(count), size=(height, width))
+    motion = motions(count)
+    own = motions(count, seed=2)
+    own[:, :2, 3] *= 3.0
+    return depth, camera, *(g.ego_flow(depth, camera, m).flow for m in (motion, motion @ own))
+
+
+def bodies(height: int, width: int, share: float) -> dict[str, torch.Tensor]:
+    """Returns bool [H, W] of bodies of many shapes, each over `share` of the pixels."""
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    keys = {"left": x, "right": -x, "top": y, "bottom": -y}
+    keys["block"] = torch.maximum((x / width - 0.4).abs(), (y / height - 0.6).abs())
+    keys["corner"] = torch.maximum(x / width, y / height)
+    along = (x + width * y) / (width * height)  # which of equal ones come first
+    for period in (2, 3, 4, 8, 12):
+        half = max(1, period // 2)
+        keys |= {f"columns {period}": x % period + along, f"rows {period}": y % period + along}
+        keys[f"squares {period}"] = (x // half + y // half) % 2 + along
+    keys["dust"] = torch.rand(height, width, generator=seeded())
+    number = int(share * height * width)
+    masks = {}
+    for name, key in keys.items():
+        mask = torch.zeros(height * width, dtype=torch.bool)
+        mask[key.flatten().double().argsort(stable=True)[:number]] = True
+        masks[name] = mask.reshape(height, width)
+    return masks
+
+
+SIZES = [(40, 48), (48, 48), (84, 84), (60, 80), (480, 640)]
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_a_body_over_49_percent_of_the_picture_is_never_the_world(size):
+    depth, camera, world, body = scene_of(*size, count=4 if size[0] < 480 else 1)
+    for name, mask in bodies(*size, share=0.49).items():
+        got = g.camera_motion(torch.where(mask, body, world), depth, camera)
+        miss = g.ego_flow(depth, camera, got.prev_from_curr).flow - world
+        assert miss.norm(dim=1).max() < 0.05, name
+        assert got.valid.all(), name
+        assert (got.inlier_share - 0.51).abs().max() < 0.05, name  # of 1,536 pixels
+
+
+def test_a_body_on_the_very_pixels_that_are_scored_is_not_the_world():
+    height, width = 40, 48
+    depth, camera, world, body = scene_of(height, width, count=4)
+    pixel, _ = g.egomotion._shuffled(height, width, torch.device("cpu"))
+    mask = torch.zeros(height * width, dtype=torch.bool)
+    scored = g.egomotion.SCORED_PIXELS
+    mask[pixel[(torch.arange(scored) / scored * g.egomotion.PIXELS).long()]] = True  # 17 % of all
+    flow = torch.where(mask.reshape(height, width), body, world)
+    got = g.camera_motion(flow, depth, camera)
+    miss = g.ego_flow(depth, camera, got.prev_from_curr).flow - world
+    assert miss.norm(dim=1).max() < 0.05
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("size", SIZES[:4], ids=str)
+def test_movers_over_40_percent_and_noise_of_a_third_of_a_pixel(size):
+    depth, camera, world, body = scene_of(*size, count=4)
+    wrong, noise = [], seeded(7)
+    for mask in bodies(*size, share=0.4).values():
+        flow = torch.where(mask, body, world)
+        flow = flow + 0.3 * torch.randn(flow.shape, generator=noise)
+        got = g.camera_motion(flow, depth, camera)
+        miss = (g.ego_flow(depth, camera, got.prev_from_curr).flow - world).norm(dim=1)
+        size_px = world.norm(dim=1).flatten(1).median(-1).values
+        wrong.append((miss.flatten(1).median(-1).values > 0.5 * size_px) | ~got.valid)
+    assert torch.stack(wrong).float().mean() <= 1 / 40
+
+
+@pytest.mark.slow_after_first
+@pytest.mark.parametrize("deviation_px", [0.5, 1.0, 3.0, 20.0])
+@pytest.mark.parametrize("size", SIZES[::2], ids=str)
+def test_flow_that_is_noise_is_no_motion_and_looks_like_none(size, deviation_px):
+    count = 8 if size[0] < 480 else 2
+    depth, camera, world, _ = scene_of(*size, count=count)
+    noise = torch.randn(world.shape, generator=seeded(8))
+    picture = 255 * torch.rand(count, 3, *size, generator=seeded(9))
+    for options in ({}, {"picture": picture}):
+        of_noise = g.camera_motion(deviation_px * noise, depth, camera, **options)
+        assert not of_noise.valid.any()
+        assert torch.equal(of_noise.prev_from_curr, torch.eye(4).expand(count, 4, 4))
+        assert (of_noise.inlier_share < 0.3).all()
+        right = g.camera_motion(world + 0.3 * noise, depth, camera, **options)
+        assert right.valid.all()
+        assert (right.inlier_share > 0.9).all()
+
+
+def test_a_camera_that_stands_is_told_from_noise_by_its_size():
+    depth, camera, world, _ = scene_of(84, 84, count=16)
+    noise = 0.1 * torch.randn(world.shape, generator=seeded(8))
+    got = g.camera_motion(noise, depth, camera)
+    assert got.valid.all()
+    assert (got.inlier_share > 0.9).all()
+    assert g.ego_flow(depth, camera, got.prev_from_curr).flow.abs().max() < 0.1
+
+
+SPOILT = {
+    "K": (1, 1, math.nan),
+    "K of 0": (0, 0, 0.0),
+    "prev_K": (0, 2, math.inf),
+    "prior": (2, 3, math.nan),
+    "prior without bound": (0, 0, 1e30),
+}
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_what_is_not_known_of_a_frame_makes_it_alone_invalid(what):
+    depth, camera, world, _ = scene_of(40, 48, count=3)
+    given = {"K": camera.repeat(3, 1, 1), "prior": motions(3)}
+    given["prev_K"] = given["K"].clone()
+    right = g.camera_motion(world, depth, **given)
+    row, column, value = SPOILT[what]
+    given[what.split()[0]][1, row, column] = value
+    got = g.camera_motion(world, depth, **given)
+    assert got.valid.tolist() == [True, False, True]
+    assert got.inlier_share[1] == 0
+    for part, expected in zip(got, right):
+        torch.testing.assert_close(part[::2], expected[::2])
+    expected = torch.eye(4) if "prior" in what else given["prior"][1]
+    assert torch.equal(got.prev_from_curr[1], expected)
+
+
+@pytest.mark.parametrize("size", [(0, 48), (40, 0), (0, 0), (1, 1)])
+@pytest.mark.parametrize("batch", [(), (2,), (0,)])
+def test_pictures_of_no_pixels_or_one_tell_no_motion(size, batch):
+    flow, depth = torch.zeros(*batch, 2, *size), torch.ones(*batch, 1, *size)
+    got = g.camera_motion(flow, depth, CAMERA, picture=torch.zeros(*batch, 3, *size))
+    assert got.valid.shape == batch
+    assert not got.valid.any()
+    assert torch.equal(got.prev_from_curr, torch.eye(4).expand(*batch, 4, 4))
+
+
+def test_no_input_raises_or_reaches_another_frame():
+    depth, camera, world, _ = scene_of(40, 48, count=64)
+    right = g.camera_motion(world, depth, camera)
+    generator = seeded(10)
+
+    def wild(tensor: torch.Tensor) -> torch.Tensor:
+        """Returns every second frame with numbers of every size, nan and inf here and there."""
+        sizes = 10 ** (70 * torch.rand(tensor.shape, generator=generator) - 35)
+        special = torch.tensor([math.nan, math.inf, -math.inf, 0.0, -1.0])
+        pick = torch.randint(0, 15, tensor.shape, generator=generator)
+        values = torch.where(pick < 5, special[pick.clamp(max=4)], sizes)
+        spoilt = tensor.clone()
+        share = torch.rand(len(tensor), *[1] * (tensor.ndim - 1), generator=generator)
+        chosen = torch.rand(tensor.shape, generator=generator) < share
+        spoilt[::2] = torch.where(chosen, values, tensor)[::2]
+        return spoilt
+
+    cameras = wild(camera.repeat(64, 1, 1))
+    for given in ((wild(world), depth, camera), (world, wild(depth), cameras)):
+        got = g.camera_motion(*given)
+        assert all(not part.isnan().any() for part in got)
+        torch.testing.assert_close(
+            got.prev_from_curr[1::2], right.prev_from_curr[1::2], rtol=0, atol=1e-5
+        )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_estimated_flow_of_a_street_gives_nearly_the_motion(scene):
