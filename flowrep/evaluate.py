@@ -17,7 +17,6 @@ from flowrep.extras import require
 
 require("evaluation", "train", "hydra", "pydantic", module=__name__)
 
-from flowrep.agent import keep_freed_memory
 from flowrep.config import UsageError
 from flowrep.config.cli import EXIT_USAGE, folder_name, is_a_mistake, print_error, run_command
 from flowrep.config.schema import EvaluateConfig
@@ -43,6 +42,8 @@ def run(config: EvaluateConfig) -> None:
     A folder in use, or an agent that can't be evaluated or saved, is reported and does not stop the
     others; the exit code is then 1. Baselines drive once in each scene.
     """
+    from flowrep.agent import keep_freed_memory
+
     keep_freed_memory()
     targets = targets_of(config)
     comparisons: dict[str, Comparison] = {}
