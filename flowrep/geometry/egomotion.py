@@ -40,7 +40,7 @@ _random = random.Random(0)
 _DRAWS = [[_random.random() for _ in range(PIXELS_EACH)] for _ in range(HYPOTHESES)]
 
 _SCORE_SCALES, _LEAST_SCORE_PX = 1.5, 0.02  # where a pixel's cost in a score is half of its bound
-_PRIORS_LEAD = 0.25  # share of the pixels: a body may fill that much more than the static world
+_PRIORS_FAVOUR = 1.5  # a body may fill 1.5 times as much as the static world, three fifths
 _REFINED, _REFINING_STEPS = 6, 2  # the best hypotheses, each led to its own optimum
 _RIVAL_STEPS = 3  # of the motion of what the best one leaves unexplained
 _INLIER_SCALES = 2.5  # standard deviations, within which 96 % of normal errors are
@@ -304,18 +304,18 @@ def _best_hypothesis(
     scored, others = (samples.every_few(SCORED_PIXELS, shift) for shift in (0.0, 0.5))
     first = _descended(scored, expected, _STEPS) if has_prior else expected
     motions = torch.cat([first.unsqueeze(1), motion.unflatten(0, (batch, HYPOTHESES))], 1)
-    # What the expected motion is ahead of others, as a share of the pixels: of none but exact ties,
-    # unless it is a prior.
-    lead = torch.zeros(1 + HYPOTHESES, device=expected.device)
-    lead[0] = _PRIORS_LEAD if has_prior else 1e-6 / SCORED_PIXELS
+    # How much a pixel that a motion explains counts: the expected motion wins exact ties, a prior
+    # more.
+    favour = torch.ones(1 + HYPOTHESES, device=expected.device)
+    favour[0] = _PRIORS_FAVOUR if has_prior else 1 + 1e-6
     # Neighbouring hypotheses lead to different optima: the best ones are refined and scored again.
-    best = (_costs(scored, motions)[0] - lead).topk(_REFINED, largest=False).indices
+    best = (_costs(scored, motions)[0] * favour).topk(_REFINED, largest=False).indices
     motions = motions.gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
     repeated = _Samples(*(part.repeat_interleave(_REFINED, 0) for part in scored))
     motions = _descended(repeated, motions, _REFINING_STEPS).unflatten(0, (batch, _REFINED))
-    lead = lead[best]
+    favour = favour[best]
     costs, scale = _costs(scored, motions, final=True)
-    choice = (costs - lead).argmin(-1, keepdim=True)
+    choice = (costs * favour).argmin(-1, keepdim=True)
     motion = motions.gather(1, choice[..., None, None].expand(-1, -1, 4, 4)).squeeze(1)
     # What it leaves unexplained may be the world, of which the few pixels showed too little.
     ru, rv, in_front, *_ = _residuals(others, motion)
@@ -323,8 +323,8 @@ def _best_hypothesis(
     unexplained = others._replace(known=others.known & in_front & is_rest)
     rival = _descended(unexplained, motion, _RIVAL_STEPS)
     two = torch.stack([motion, rival], 1)
-    lead = torch.cat([lead.gather(1, choice), torch.zeros_like(lead[:, :1])], 1)
-    choice = (_costs(voters, two, final=True)[0] - lead).argmin(-1)
+    favour = torch.cat([favour.gather(1, choice), torch.ones_like(favour[:, :1])], 1)
+    choice = (_costs(voters, two, final=True)[0] * favour).argmin(-1)
     return two[torch.arange(batch, device=expected.device), choice]
 
 

@@ -448,6 +448,17 @@ def test_a_prior_decides_for_the_world_against_a_body_that_fills_more():
     assert (errors(guided.prev_from_curr, motion, depth, CAMERA)[2] < 0.05).all()
 
 
+@pytest.mark.parametrize("noise_px", [0.0, 0.1])
+def test_a_prior_that_is_a_smaller_body_s_motion_does_not_win(noise_px):
+    depth, motion = blocks(8), motions(8)
+    body = motion @ rigid((0.02, 0.0, 0.01), (0.15, 0.1, 0.0)).float()
+    flow = g.ego_flow(depth, CAMERA, motion).flow
+    flow[..., 56:] = g.ego_flow(depth, CAMERA, body).flow[..., 56:]  # a third of the picture
+    flow += noise_px * torch.randn(flow.shape, generator=seeded(6))
+    got = g.camera_motion(flow, depth, CAMERA, prior=body)
+    assert (errors(got.prev_from_curr, motion, depth, CAMERA)[2] < 0.05).all()
+
+
 @pytest.mark.slow
 def test_it_compiles_to_one_graph_and_has_no_gradient(monkeypatch):
     for steps in ("_HYPOTHESIS_STEPS", "_REFINING_STEPS", "_STEPS"):
