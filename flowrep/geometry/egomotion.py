@@ -313,19 +313,19 @@ def _best_hypothesis(
     motions = motions.gather(1, best[..., None, None].expand(-1, -1, 4, 4)).flatten(0, 1)
     repeated = _Samples(*(part.repeat_interleave(_REFINED, 0) for part in scored))
     motions = _descended(repeated, motions, _REFINING_STEPS).unflatten(0, (batch, _REFINED))
-    favour = favour[best]
     costs, scale = _costs(scored, motions, final=True)
-    choice = (costs * favour).argmin(-1, keepdim=True)
+    choice = (costs * favour[best]).argmin(-1, keepdim=True)
     motion = motions.gather(1, choice[..., None, None].expand(-1, -1, 4, 4)).squeeze(1)
     # What it leaves unexplained may be the world, of which the few pixels showed too little.
     ru, rv, in_front, *_ = _residuals(others, motion)
     is_rest = _squared(others, ru, rv) > (_INLIER_SCALES * scale).square().unsqueeze(-1)
     unexplained = others._replace(known=others.known & in_front & is_rest)
     rival = _descended(unexplained, motion, _RIVAL_STEPS)
-    two = torch.stack([motion, rival], 1)
-    favour = torch.cat([favour.gather(1, choice), torch.ones_like(favour[:, :1])], 1)
-    choice = (_costs(voters, two, final=True)[0] * favour).argmin(-1)
-    return two[torch.arange(batch, device=expected.device), choice]
+    finalists = torch.stack([motion, rival, *([first] if has_prior else [])], 1)
+    costs, _ = _costs(voters, finalists, final=True)
+    if has_prior:
+        costs[:, 2] *= _PRIORS_FAVOUR
+    return finalists[torch.arange(batch, device=expected.device), costs.argmin(-1)]
 
 
 def _costs(samples: _Samples, motions: Tensor, *, final: bool = False) -> tuple[Tensor, Tensor]:
