@@ -85,46 +85,43 @@ class CameraTransform(MapTransform):
         self.register_buffer("K", K, persistent=False)
         self.camera_keys = keys
         self._calls = 0
-        self._checked: dict[str, tuple[tuple[int, int], Tensor | None]] = {}
+        self._checked: dict[NestedKey, tuple[tuple[int, int], Tensor]] = {}
 
     def _inputs(self, source: TensorDictBase | Composite) -> list[Any]:
         maps = super()._inputs(source)
-        self._check_cameras(maps)
+        if self.K is not None or self.camera_keys:
+            self._check_cameras(maps)
         return maps
 
     def _check_cameras(self, maps: Sequence[Tensor | TensorSpec]) -> None:
         """Raises ValueError for a K that no camera of these maps has, where it is a new one."""
-        if self.K is None and not self.camera_keys:
-            return
         size = _map_size(maps, self.reads)
-        if self.K is not None and self._checked.get("intrinsics") != (size, None):
+        if self.K is not None and ("K" not in self._checked or self._checked["K"][0] != size):
             geometry.check_intrinsics("intrinsics", self.K, size)
-            self._checked["intrinsics"] = size, None
+            self._checked["K"] = size, self.K
         for key, K in zip(self.camera_keys, maps[len(maps) - len(self.camera_keys) :]):
             if not isinstance(K, Tensor) or not self._looks_at(K):
                 continue
-            name = f"key {key!r}"
-            checked_size, checked = self._checked.get(name, (None, None))
-            if checked_size == size and checked is not None and torch.equal(checked, K):
-                continue
-            geometry.check_intrinsics(name, K, size, allow_unknown=True)
-            self._checked[name] = size, K.detach().clone()
+            checked = self._checked.get(key)
+            if checked is None or checked[0] != size or not _is_equal(checked[1], K):
+                geometry.check_intrinsics(f"key {key!r}", K, size, allow_unknown=True)
+                self._checked[key] = size, K.detach().clone()
 
     def _looks_at(self, K: Tensor) -> bool:
         """Returns whether K's values are to be read now: on a GPU that waits for it."""
         if torch.compiler.is_compiling() or K.is_meta:
             return False
-        return K.device.type == "cpu" or self._calls % _CALLS_PER_LOOK == 0
+        return K.is_cpu or self._calls % _CALLS_PER_LOOK < 2  # at the first reset and call, too
 
     def _check_one_camera(
-        self, before: Tensor | None, now: Tensor | None, ended: Tensor | None
+        self, before: Tensor | None, now: Tensor | None, done: Callable[[], Tensor | None]
     ) -> None:
-        """Raises ValueError if K changes from frame to frame where no episode has `ended`."""
+        """Raises ValueError if K changes from frame to frame where no episode is `done`."""
         if before is None or now is None or not self._looks_at(now) or torch.equal(before, now):
             return
         # more than rounding; what isn't known compares False
         changes = (now - before).abs().amax((-2, -1)) > _SAME_CAMERA * now[..., 0, 0].abs()
-        if ended is not None:
+        if (ended := done()) is not None:
             changes &= ~expand_as_right(ended, changes)
         if bool(changes.any()):
             where, index = first_wrong(f"key {self.camera_keys[0]!r}", changes)
@@ -141,10 +138,11 @@ class CameraTransform(MapTransform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._calls += 1
         if self._needs_one_camera:
-            key, done = self.camera_keys[0], next_tensordict.get("done", None)
-            ended = None if done is None else flags_of_batch(done, next_tensordict)
+            before, now = (
+                td.get(self.camera_keys[0], None) for td in (tensordict, next_tensordict)
+            )
             # the last frame of an episode may be the next one's first
-            self._check_one_camera(tensordict.get(key, None), next_tensordict.get(key, None), ended)
+            self._check_one_camera(before, now, lambda: _ended(next_tensordict, "done"))
         return super()._step(tensordict, next_tensordict)
 
     @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
@@ -152,15 +150,14 @@ class CameraTransform(MapTransform):
         """Writes the outputs for a batch of any shape, at its root and under `"next"`."""
         self._calls += 1
         if self._needs_one_camera:
-            key, done = self.camera_keys[0], tensordict.get(("next", "done"), None)
-            ended = None if done is None else flags_of_batch(done, tensordict)
-            now, later = tensordict.get(key, None), tensordict.get(("next", key), None)
-            if now is not None and later is None and "time" in tensordict.names:
-                time = tensordict.names.index("time")
-                length = tensordict.shape[time] - 1
-                now, later = now.narrow(time, 0, length), now.narrow(time, 1, length)
-                ended = None if ended is None else ended.narrow(time, 0, length)
-            self._check_one_camera(now, later, ended)
+            key, frames = self.camera_keys[0], tensordict
+            now = tensordict.get(("next", key), None)
+            if now is None and "time" in tensordict.names:
+                before_time = (slice(None),) * tensordict.names.index("time")
+                frames = tensordict[(*before_time, slice(None, -1))]
+                now = tensordict[(*before_time, slice(1, None))].get(key, None)
+            before = frames.get(key, None)
+            self._check_one_camera(before, now, lambda: _ended(frames, ("next", "done")))
         return super().forward(tensordict)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
@@ -419,6 +416,16 @@ class FlowFactorize(FlowTransform):
         if "raw" in self.outputs:
             made["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
         return self._written(made, valid)
+
+
+def _is_equal(a: Tensor, b: Tensor) -> bool:
+    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
+
+
+def _ended(tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
+    """Returns where an episode is over, bool of the TensorDict's batch; None if nothing says it."""
+    done = tensordict.get(key, None)
+    return None if done is None else flags_of_batch(done, tensordict)
 
 
 def _map_size(maps: Sequence[Tensor | TensorSpec], reads: Sequence[Reads]) -> tuple[int, int]:
