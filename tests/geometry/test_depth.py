@@ -49,6 +49,10 @@ def test_an_opengl_z_buffer_becomes_metres():
     torch.testing.assert_close(z[:2], torch.tensor([0.5, 2.0]))
     assert z[2] == math.inf  # nothing was drawn
     assert z[3:].isnan().all()
+    # rounding beyond a plane is no hole: a step of float32 before the near one, either way round
+    before = adapt_depth(depth_of(-6e-8), "z_buffer", near_m=0.5, far_m=8.0)
+    reverse = adapt_depth(depth_of(1.0000001), "reversed_z_buffer", near_m=0.5, far_m=8.0)
+    torch.testing.assert_close([before.item(), reverse.item()], [0.5, 0.5])
     # Without a far plane b = 1 - near / z: 0.75 at four times the near plane.
     endless = adapt_depth(depth_of(0.75), "z_buffer", near_m=0.5, far_m=math.inf)
     assert endless.item() == 2.0

@@ -259,6 +259,20 @@ def test_movers_over_40_percent_and_noise_of_a_third_of_a_pixel(size):
     assert torch.stack(wrong).float().mean() <= 1 / 40
 
 
+def test_a_motion_between_two_bodies_does_not_win_the_final_choice():
+    # A wall at 4 m, f = 40 px: 0.1 m sideways is 1 px. It stands, 40 % of it moved by 1 px. What
+    # lies 0.2 px from the one and 0.8 px from the other explains some of both.
+    camera = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]]).double()[None]
+    flow = 0.3 * torch.randn(1, 2, 40, 48, generator=seeded())
+    flow[0, 0, :, 29:] += 1.0
+    between = torch.eye(4).double().repeat(1, 3, 1, 1)
+    between[0, :, 0, 3] = torch.tensor([0.0, -0.02, -0.1])
+    depth, known = torch.full((1, 1, 40, 48), 4.0), torch.ones(1, dtype=torch.bool)
+    voters = g.egomotion._voters(flow, depth, camera, camera, None, known)
+    costs, _ = g.egomotion._costs(voters, between, final=True)
+    assert costs[0].argsort().tolist() == [0, 1, 2]
+
+
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize("deviation_px", [0.5, 1.0, 3.0, 20.0])
 @pytest.mark.parametrize("size", SIZES[::2], ids=str)

@@ -22,7 +22,13 @@ from flowrep.transforms import (
     RawFlow,
     representation_stack,
 )
-from tests.transforms.fake_env import INTRINSICS, WALKER, FakeSensorEnv, frame
+from tests.transforms.fake_env import (
+    INTRINSICS,
+    WALKER,
+    FakeSensorEnv,
+    SelfResettingEnv,
+    frame,
+)
 
 # fx = 40, fy = 20, cx = 2, cy = 1: pixel (column 1, row 0) sits at x~ = -0.5, y~ = -0.5.
 K = [[40.0, 0.0, 2.0], [0.0, 20.0, 1.0], [0.0, 0.0, 1.0]]
@@ -311,7 +317,43 @@ def test_a_k_that_changes_is_seen_in_whatever_batch_shows_it():
             raw(td.clone())
     raw(alone.reshape(-1))  # frames that nothing connects
     raw(ZoomingEnv((2,), zoom=1e-8).rollout(6, break_when_any_done=False))  # rounding
-    raw(ZoomingEnv((2,), zoom=0.0).rollout(9, break_when_any_done=False))  # another K an episode
+    another_an_episode = ZoomingEnv((2,), zoom=0.0).rollout(9, break_when_any_done=False)
+    raw(another_an_episode.clone())
+    raw(another_an_episode.exclude(("next", "sensor")))
+
+
+class SelfResettingZoom(ZoomingEnv, SelfResettingEnv):
+    """Has another K in each episode, and begins one in the step that ends another."""
+
+
+def test_an_episode_may_begin_with_another_k_in_the_step_that_ends_one():
+    env = TransformedEnv(SelfResettingZoom((2,), zoom=0.0), RawFlow(("sensor", "K")))
+    td = env.rollout(9, break_when_any_done=False)
+    assert len(td["sensor", "K"][..., 0, 0].unique()) > 1
+
+
+def test_the_camera_s_motion_and_estimated_flow_are_those_of_a_zoom():
+    nothing = torch.zeros(1, 2, 5, 7)
+    env = TransformedEnv(
+        ZoomingEnv((2,)),
+        Compose(
+            PreviousIntrinsics(),
+            RawFlow(**CAMERA),
+            EstimateCameraMotion(**CAMERA, outputs=["motion"], out_keys=["motion"]),
+            FlowFactorize(**CAMERA, outputs=["ego"]),
+            FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"]),
+            EstimatedFlow(
+                lambda a, b: nothing.expand(len(a), -1, -1, -1), **CAMERA, out_keys="own"
+            ),
+        ),
+    )
+    frames = env.rollout(6, break_when_any_done=False)["next"]
+    torch.testing.assert_close(
+        frames["motion"], frames["sensor", "prev_from_curr"], atol=1e-4, rtol=0
+    )
+    # nothing moved in the warped picture: flow is ego flow, wherever that is known
+    known = (frames["sensor", "depth"] > 0).expand_as(frames["ego"])
+    torch.testing.assert_close(frames["own"][known], frames["ego"][known])
 
 
 SIZE = torch.tensor([[7.0], [5.0], [1.0]])
