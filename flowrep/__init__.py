@@ -2,6 +2,7 @@
 
 import warnings
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 __version__ = "0.2.0"
 
@@ -16,3 +17,12 @@ else:
         "as flowrep. Run: pip uninstall flowrep flowrep-rl, then install flowrep-rl again",
         stacklevel=2,
     )
+
+
+def __getattr__(name: str) -> Any:
+    """Imports `flowrep.diagnose`, and with it PyTorch, when it is asked for."""
+    if name == "diagnose":
+        from flowrep.diagnosis import diagnose
+
+        return diagnose
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -13,9 +13,11 @@ import pytest
 
 
 def pytest_configure():
-    """Lets Ctrl-C be heard where a shell in the background has it ignored."""
+    """Lets signals be heard that a shell in the background, or `nohup`, has ignored."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.hookimpl(tryfirst=True)
