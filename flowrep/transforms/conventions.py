@@ -7,7 +7,7 @@ the simulator itself.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 import torch
@@ -105,26 +105,16 @@ _ISAAC_3 = Convention(
 
 CONVENTIONS: dict[str, Convention] = {
     "isaac_lab": _ISAAC_3,
-    "isaac_lab_2": Convention(
+    "isaac_lab_2": replace(
+        _ISAAC_3,
         simulator="Isaac Lab 2.3",
         sources=(
             "isaac-sim.github.io/IsaacLab/v2.3.2: isaaclab.sensors.camera.camera_data; "
             "isaaclab.sensors.camera.tiled_camera",
             "Omniverse Replicator, Annotators Information: Motion Vectors",
         ),
-        tried="",
-        layout="hwc",
-        ids_layout="hwc",
-        depth=_ISAAC_DEPTH,
-        pose=("pos_w", "quat_w_ros"),
         pose_options={"layout": "xyz_wxyz", "axes": "opencv"},
-        bodies=("body_link_pose_w",),
         bodies_options={"layout": "xyz_wxyz"},
-        ids="instance_id_segmentation_fast",
-        background=(0, 1),
-        flow="motion_vectors",
-        flow_options={"direction": "backward", "grid": "current"},
-        K="intrinsic_matrices, pixel centres at halves",
         notes="Quaternions are (w, x, y, z). A TiledCamera's pose is that of its start unless its "
         "config has update_latest_camera_pose=True (return_latest_camera_pose before 2.1).",
     ),
