@@ -15,7 +15,7 @@ OF_AN_ENV = [
 
 
 def only(source, mistake):
-    (cell,) = cells(1, sources=[source], mistakes=[mistake])
+    (cell,) = cells([source], [mistake])
     return cell
 
 

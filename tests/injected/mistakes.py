@@ -198,8 +198,13 @@ def zooming(shots: Shots, share: float = 0.008) -> Shots:
     """A focal length that grows and shrinks (an autofocus), while K stays that of the first."""
     cx, cy = shots.K[0][0, 2], shots.K[0][1, 2]
     zoom = 1 + share * np.cumsum(np.where(np.arange(len(shots.depth)) % 4 < 2, 1.0, -0.7))
-    target = lambda t, u, v: (cx + (u - cx) * zoom[t], cy + (v - cy) * zoom[t])
-    source = lambda t, u, v: (cx + (u - cx) / zoom[t], cy + (v - cy) / zoom[t])
+
+    def target(t, u, v):
+        return cx + (u - cx) * zoom[t], cy + (v - cy) * zoom[t]
+
+    def source(t, u, v):
+        return cx + (u - cx) / zoom[t], cy + (v - cy) / zoom[t]
+
     return resampled(shots, source, target)
 
 

@@ -154,9 +154,8 @@ def room(seed: int = 0, frames: int = 16, movers: int = 0) -> Shots:
         back = poses[max(t - 1, 0)]
         seen = projected(back[:3, :3].T @ (before - back[:3, 3]).T, K, SIZE)
         maps["flow"].append(np.stack([u, v]) - seen if t else np.full((2, *SIZE), np.nan))
-        on_body = points - sum(
-            (ids.ravel() == i + 1)[:, None] * places[i][t] for i in range(movers)
-        )
+        centre = sum((ids.ravel() == i + 1)[:, None] * places[i][t] for i in range(movers))
+        on_body = points - centre
         maps["rgb"].append(painted(on_body, seed).reshape(*SIZE, 3))
         maps["depth"].append(z)
         maps["ids"].append(ids)
@@ -221,10 +220,8 @@ def street(seed: int = 0, frames: int = 14, size: tuple[int, int] = (120, 160)) 
 def of_rows(depth, poses, camera_matrix, rgb, ids, rows) -> Shots:
     """Returns shots of an env's data, with flow by its rows of motions."""
     frames, shape = len(depth), depth.shape[1:]
-    flow, moved = (
-        np.full((frames, 2, *shape), np.nan),
-        np.tile(np.eye(4), (frames, rows.shape[1], 1, 1)),
-    )
+    flow = np.full((frames, 2, *shape), np.nan)
+    moved = np.tile(np.eye(4), (frames, rows.shape[1], 1, 1))
     u, v = centres(*shape)
     rays = np.linalg.inv(camera_matrix) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
     for t in range(1, frames):
@@ -257,9 +254,8 @@ def doom(seed: int = 0) -> Shots | None:
     depth, ids = (sensor[name][:, 0].numpy() for name in ("depth", "instance"))
     rgb, poses = sensor["rgb"].permute(0, 2, 3, 1).numpy(), sensor["world_from_cam"].numpy()
     rows = sensor["instance_motion"].double().numpy()
-    return of_rows(
-        depth.astype(float), poses, camera_matrix.double().numpy(), rgb, ids.astype(int), rows
-    )
+    K = camera_matrix.double().numpy()
+    return of_rows(depth.astype(float), poses, K, rgb, ids.astype(int), rows)
 
 
 def seven_scenes(seed: int = 0) -> Shots | None:
@@ -270,9 +266,8 @@ def seven_scenes(seed: int = 0) -> Shots | None:
 
     frames = [*open_recording(SEVEN_SCENES, "sevenscenes")]
     depth, rgb = np.array([f.depth for f in frames], float), np.array([f.rgb for f in frames])
-    return Shots(
-        depth, *(np.array([getattr(f, n) for f in frames]) for n in ("world_from_cam", "K")), rgb
-    )
+    poses, cameras = np.array([f.world_from_cam for f in frames]), np.array([f.K for f in frames])
+    return Shots(depth, poses, cameras, rgb)
 
 
 def estimated(make: Callable[[int], Shots | None]) -> Callable[[int], Shots | None]:

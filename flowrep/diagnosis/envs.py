@@ -1,0 +1,241 @@
+"""The diagnosis of an env's rollout or of a replay batch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from flowrep import geometry
+from flowrep.diagnosis.recordings import nothing, why_not
+from flowrep.diagnosis.rivals import rivals_of
+from flowrep.diagnosis.verdict import Diagnosis, diagnosed
+from flowrep.diagnosis.witness import (
+    EYE,
+    LEAST_MOVEMENT_PX,
+    LEAST_PIXELS,
+    median,
+    px_of,
+    sampled,
+)  # fmt: skip
+
+_PAIRS = 8
+_SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
+_SAME_DEPTH = 0.03  # relative
+_ONE_SEES, _BETTER = 0.5, 0.03  # shares of bodies' pixels: the least, and a lead that tells
+
+
+@torch.no_grad()
+def diagnose(
+    frames: TensorDictBase, intrinsics: Any = None, *, raw_key: str = "raw", ego_key: str = "ego",
+    obj_key: str = "obj",
+) -> Diagnosis:  # fmt: skip
+    """Returns the diagnosis of an env's rollout or of a replay batch.
+
+    The depth of the frame before is the witness, since raw flow that comes from recorded motions
+    agrees with them whatever they are; raw flow itself, where it was measured. What transforms
+    wrote is computed again from what they read.
+
+    Args:
+        frames: successive frames `[*B, T]`, or steps `[*B]` in any order with their "next". Holds
+            `("sensor", "depth")` and `("sensor", "prev_from_curr")`, and, where the env has them,
+            instance, instance_motion, world_from_cam, rgb, and raw, ego and obj in px per step.
+        intrinsics: K `[3, 3]` of the maps; None takes each frame's, `("sensor", "K")`.
+        raw_key: the key of raw flow, as `ego_key` and `obj_key` of its parts.
+
+    Raises:
+        ValueError: there are no successive frames, no depth or no motions, or K is no camera's.
+
+    >>> from tensordict import TensorDict
+    >>> K = torch.tensor([[50.0, 0.0, 30.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]])
+    >>> slope, prev_from_curr = 1 + (torch.arange(60) + 0.5 - 30) / 100, torch.eye(4)
+    >>> prev_from_curr[2, 3] = 0.1  # the camera moves ahead, to a wall that is oblique
+    >>> depth = torch.stack([(2 - 0.1 * t) / slope.expand(1, 40, 60) for t in range(4)])
+    >>> sensor = {"depth": depth, "prev_from_curr": prev_from_curr.repeat(4, 1, 1)}
+    >>> diagnose(TensorDict({"sensor": sensor}, [4]), K).verdict
+    'right'
+    """
+    now, before, earlier, later = _successive(frames)
+    both = (x["sensor", "K"] if intrinsics is None else intrinsics for x in (now, before))
+    K, prev_K = (torch.as_tensor(each).float().expand(len(now), 3, 3) for each in both)
+    geometry.check_intrinsics("K", K)
+    kept = _motion(now).isfinite().flatten(1).all(1).nonzero()[:, 0]
+    kept = kept[_spread(len(kept), 3 * _PAIRS)]
+    seen = _Seen(now[kept], before[kept], K[kept], prev_K[kept], raw_key)
+    if bool((seen.depth < 0).double().mean() > 0.5):
+        why = "depth is negative: give its opposite"
+        return Diagnosis("wrong", why, suspects=("depth times -1",))
+    first, second = EYE.expand_as(seen.motion), seen.motion
+    absolute = now.get(("sensor", "world_from_cam"), None) is not None
+    if absolute:
+        first, second = (x["sensor", "world_from_cam"].double() for x in (seen.previous, seen.now))
+    path = [first @ torch.linalg.inv_ex(earlier[kept])[0], first, second, second @ later[kept]]
+    static = torch.where(seen.ids == 0, seen.depth, math.nan).squeeze(1)
+    raw, picture = None, None
+    if not seen.is_derived:
+        raw, picture = seen.raw, seen.now["sensor"].get("rgb", None)
+    maps = (static, seen.before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
+    pairs = sampled(raw, *maps)
+    reasons = why_not(pairs)
+    able = torch.tensor([i for i, why in enumerate(reasons) if not why], dtype=torch.long)
+    if not len(able):
+        return nothing(reasons)
+    able = able[_spread(len(able), _PAIRS)]
+    rivals = rivals_of({}, of_flow=raw is not None, absolute=absolute)
+    names = [str(index) for index in kept[able].tolist()]
+    found = diagnosed(pairs.of(able), [], rivals, names, _call)
+    faults, odd = _recomputed(seen, ego_key, obj_key)
+    fault, unseen, doubt = _bodies(seen, pairs.depth_step)
+    faults, notes = [*faults, *fault], (*found.notes, *odd, *unseen)
+    if doubt and found.is_right:
+        found = replace(found, verdict="can't tell", words=f"{doubt[0]}; else {found.words}")
+    if not faults:
+        return replace(found, notes=notes)
+    words = "; ".join([found.words, *faults] if found.is_wrong else faults)
+    verdict = found.verdict if found.is_wrong else "wrong"
+    return replace(found, verdict=verdict, words=words, notes=notes)
+
+
+def _spread(count: int, most: int) -> Tensor:
+    return torch.linspace(0, count - 1, min(count, most)).long()
+
+
+def _motion(frames: TensorDictBase) -> Tensor:
+    motion, rows = (frames.get(("sensor", k), None) for k in ("prev_from_curr", "instance_motion"))
+    if motion is None and rows is None:
+        raise ValueError('frames lack ("sensor", "prev_from_curr")')
+    return (rows[..., 0, :, :] if motion is None else motion).double()
+
+
+def _successive(frames: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase, Tensor, Tensor]:
+    """Returns frames, those before them, and the motions before and after, nan where unknown."""
+    if frames.get(("sensor", "depth"), None) is None:
+        raise ValueError('frames lack ("sensor", "depth")')
+    if frames.get("next", None) is not None:
+        frames = frames if frames.ndim else frames.unsqueeze(0)
+        before, now = frames.exclude("next"), frames["next"]
+        depths = (x["sensor", "depth"].flatten(now.ndim) for x in (before[..., 1:], now[..., :-1]))
+        goes_on = torch.stack([z.nan_to_num(-1.0) for z in depths]).diff(dim=0)[0] == 0
+        kept, goes_on = torch.ones(now.shape, dtype=torch.bool), goes_on.all(-1)
+    else:
+        if frames.ndim == 0 or frames.shape[-1] < 2:
+            raise ValueError(f"frames have to be successive, [*B, T]; got {list(frames.shape)}")
+        before, now = frames[..., :-1], frames[..., 1:]
+        ended = frames.get("done", torch.zeros(*frames.shape, 1, dtype=torch.bool)).squeeze(-1)
+        kept, goes_on = ~ended[..., :-1], ~ended[..., 1:-1]
+    motion, later = _motion(now), torch.full_like(_motion(now), math.nan)
+    later[..., :-1, :, :] = torch.where(goes_on[..., None, None], motion[..., 1:, :, :], math.nan)
+    kept = kept.flatten()
+    motions = (x.reshape(-1, 4, 4)[kept] for x in (_motion(before), later))
+    return now.reshape(-1)[kept], before.reshape(-1)[kept], *motions
+
+
+class _Seen:
+    """What an env recorded of P frames and of those before them, and the flow that follows."""
+
+    def __init__(self, now: Any, previous: Any, K: Tensor, prev_K: Tensor, raw_key: str) -> None:
+        self.now, self.previous, self.K, self.prev_K = now, previous, K.double(), prev_K.double()
+        sensor, self.motion, both = now["sensor"], _motion(now), (now["sensor"], previous["sensor"])
+        self.depth, self.before = (
+            sensor["depth"].double(),
+            previous["sensor", "depth"][:, 0].double(),
+        )
+        nobody = torch.zeros_like(self.depth, dtype=torch.long)
+        self.ids, self.ids_before = (x.get("instance", nobody).long()[:, 0] for x in both)
+        self.ids = self.ids.unsqueeze(1)
+        self.rows = sensor.get("instance_motion", self.motion.unsqueeze(1)).double()
+        rows = self.ids.clamp(0, self.rows.shape[1] - 1)
+        self.flow = geometry.rigid_flow(self.depth, rows, self.K, self.rows, prev_K=self.prev_K)
+        self.ego = self.flow_of(self.motion)
+        self.raw, self.is_derived = now.get(raw_key, None), True
+        if self.raw is not None:
+            valid = now.get(f"{raw_key}_valid", torch.ones_like(self.flow.valid))
+            self.raw = torch.where(valid, self.raw.double(), math.nan)
+            expected = torch.where(self.flow.valid, self.flow.flow, math.nan)
+            self.is_derived = not median(px_of((self.raw - expected).flatten(2))) > 0.01
+
+    def flow_of(self, motion: Tensor) -> geometry.Flow:
+        """Returns the flow of a static world."""
+        return geometry.ego_flow(self.depth, self.K, motion.double(), prev_K=self.prev_K)
+
+
+def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], list[str]]:
+    """Returns what is wrong with what an env or its transforms computed, and what is odd."""
+    faults, odd, ego = [], [], torch.where(seen.ego.valid, seen.ego.flow, math.nan)
+    of_poses, raw = ego, seen.flow.flow if seen.raw is None else seen.raw
+    if seen.now.get(("sensor", "world_from_cam"), None) is not None:
+        poses = (x["sensor", "world_from_cam"] for x in (seen.previous, seen.now))
+        of_poses = seen.flow_of(geometry.relative_motion(*poses, dtype=torch.float64)).flow
+    for says, found, right in (
+        ("row 0 of instance_motion isn't prev_from_curr", seen.flow_of(seen.rows[:, 0]).flow, ego),
+        ("prev_from_curr isn't the motion of world_from_cam", ego, of_poses),
+        (f"{ego_key} isn't the flow of depth, K and prev_from_curr", seen.now.get(ego_key), ego),
+        (f"{obj_key} isn't raw flow without ego flow", seen.now.get(obj_key), raw - ego),
+    ):
+        if found is None:
+            continue
+        right, found = (x.double().movedim(1, -1).flatten(0, -2) for x in (right, found))
+        counts = (right.norm(dim=-1) > 0.05) & right.isfinite().all(-1) & found.isfinite().all(-1)
+        right, found = right[counts], found[counts]
+        if not len(right):
+            continue
+        factor = float((found * right).sum() / right.square().sum())
+        px, as_factor_px, size_px = (
+            float(x.norm(dim=-1).median()) for x in (found - right, found - factor * right, right)
+        )
+        if px <= _SAME_PX + _SAME_SHARE * size_px:
+            continue
+        if 1e-3 < factor < 1e3 and as_factor_px < px / 20:
+            odd.append(f"{says}, but {factor:.3g} times that (a scale, or px/s)")
+        else:
+            faults.append(f"{says} ({px:.2g} px off)")
+    return faults, odd
+
+
+def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[str]]:
+    """Returns what is wrong with ids and motions of bodies, what isn't tested, what is in doubt."""
+    count, ids = seen.rows.shape[1], seen.ids[:, 0]
+    if int(ids.min()) < 0 or int(ids.max()) >= count:
+        found = f"{int(ids.min())} to {int(ids.max())}"
+        return [f"instance has ids {found}, but instance_motion rows 0 to {count - 1}"], [], []
+    moved = (seen.rows - seen.motion.unsqueeze(1)).abs().flatten(2).amax(-1) > 1e-4
+    moving = moved.any(0).nonzero()[:, 0].tolist()  # rows that are nan don't count
+    if moving and not (ids > 0).any():
+        doubt = f"bodies {moving[0]} to {moving[-1]} move, but no pixel of instance has their ids"
+        return [], [], [doubt]
+    shift = (seen.flow.flow - seen.ego.flow).norm(dim=1)
+    known = seen.flow.valid & seen.ego.valid & seen.depth.isfinite()
+    of = ((ids > 0) & known[:, 0] & (shift > LEAST_MOVEMENT_PX)).nonzero()
+    if len(of) < LEAST_PIXELS // 4:
+        return [], ["no moving body is seen: ids and motions of bodies are not tested"], []
+    frame, own, z = of[:, 0], ids[*of.T], seen.depth[:, 0][*of.T]
+    points = geometry.unproject(seen.depth, seen.K)[*of.T].unsqueeze(-1)
+    rows, size = seen.rows[frame, own], torch.tensor(seen.before.shape[:0:-1])
+    tries = {"as recorded": rows, "inverted": geometry.invert_rigid(rows)}
+    tries["if they stand still"], shares = seen.motion[frame], {}
+    for says, motions in tries.items():  # shares of pixels that show a body, and are right then
+        then = (motions[:, :3, :3] @ points).squeeze(-1) + motions[:, :3, 3]
+        place = seen.prev_K[frame] @ (then / then[:, 2:].clamp(1e-6)).unsqueeze(-1)
+        place = place[:, :2, 0].nan_to_num(-1.0).long().minimum(size - 1).clamp(min=0)
+        at = (frame, place[:, 1], place[:, 0])
+        fits = (then[:, 2] / seen.before[at] - 1).abs() < _SAME_DEPTH + 1.5 * depth_step / z
+        shares[says] = float((fits & (seen.ids_before[at] == own)).double().mean())
+    share, best = shares["as recorded"], max(shares.values())
+    if share >= _ONE_SEES and best <= share + _BETTER:
+        return [], [], []
+    listing = ", ".join(f"{part:.0%} {says}" for says, part in shares.items())
+    says = "instance_motion or ids don't fit the bodies: pixels that were where these say"
+    return [f"{says}: {listing}"], [], []
+
+
+def _call(typed: str) -> str:
+    """Returns the transform that an option is one of."""
+    transforms = {"pose": "AdaptPose", "depth": "AdaptDepth", "flow": "AdaptFlow"}
+    keys = {"direction", "axes", "layout", "kind", "channels"}
+    options = [option.replace("=", "_").split("_", 2) for option in typed.split(" ")]
+    calls = [f'{transforms[o[0]]}({o[1]}="{o[2]}")' for o in options if len(o) > 2 and o[1] in keys]
+    return " ".join(calls) or typed

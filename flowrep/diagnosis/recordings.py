@@ -1,0 +1,119 @@
+"""The diagnosis of recorded frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from flowrep import geometry
+from flowrep.diagnosis.rivals import rivals_of
+from flowrep.diagnosis.verdict import Diagnosis, diagnosed
+from flowrep.diagnosis.witness import (
+    EYE,
+    LEAST_MOVEMENT_PX,
+    LEAST_PIXELS,
+    Pairs,
+    px_of,
+    sampled,
+    seen_before,
+)  # fmt: skip
+
+
+@dataclass
+class Examination:
+    """Collects pairs of a recording's frames, and gives their diagnosis.
+
+    Args:
+        conventions: the options that the data were read with, see `Recording.conventions`.
+        flow_is_recorded: whether raw flow belongs to the data. Flow that flowrep estimated has no
+            options that may be wrong.
+    """
+
+    conventions: Mapping[str, str] = field(default_factory=dict)
+    flow_is_recorded: bool = True
+    _parts: list[Pairs] = field(default_factory=list)
+    _starts: list[Tensor] = field(default_factory=list)
+    _names: list[str] = field(default_factory=list)
+    _reasons: list[str] = field(default_factory=list)
+    _intervals_s: list[float] = field(default_factory=list)
+
+    @torch.no_grad()
+    def add(
+        self, previous: Any, current: Any, raw: Any, earlier: Any = None,
+        later: Any = None,
+    ) -> bool:  # fmt: skip
+        """Takes two `Frame`s and the raw flow between them; returns whether they tell something.
+
+        Args:
+            raw: `[2, H, W]`, pixels, nan where unknown.
+            earlier: world_from_cam `[4, 4]` of the frame before `previous`; as `later`, of that
+                after `current`, it tells whether poses are late.
+        """
+        flow, now, before = (torch.as_tensor(x)[None] for x in (raw, current.depth, previous.depth))
+        K, prev_K = (torch.as_tensor(frame.K)[None] for frame in (current, previous))
+        poses = (earlier, previous.world_from_cam, current.world_from_cam, later)
+        unknown = torch.full_like(EYE, math.nan)
+        path = torch.stack([unknown if p is None else torch.as_tensor(p) for p in poses])
+        picture = None
+        if current.rgb is not None and raw is not current.raw:
+            picture = torch.as_tensor(current.rgb).movedim(-1, 0)[None]
+        pairs = sampled(flow, now, before, K, prev_K, path[None], picture)
+        (why,) = why_not(pairs)
+        if why:
+            self._reasons.append(why)
+            return False
+        options: Any = {"prev_K": prev_K.float(), "picture": picture}
+        motion = geometry.camera_motion(flow, now[:, None], K.float(), **options).prev_from_curr
+        self._parts.append(pairs)
+        self._starts.append(motion.double())
+        self._names.append(current.name)
+        if previous.timestamp_s is not None and current.timestamp_s is not None:
+            self._intervals_s.append(current.timestamp_s - previous.timestamp_s)
+        return True
+
+    @torch.no_grad()
+    def diagnosis(self) -> Diagnosis:
+        """Returns the diagnosis of all pairs so far."""
+        if not self._parts:
+            return nothing(self._reasons)
+        first = self._parts[0]
+        maps = [torch.cat(parts) for parts in zip(*(part[:10] for part in self._parts))]
+        pairs = Pairs._make([*maps, *first[10:]])
+        pairs = pairs._replace(depth_step=max(part.depth_step for part in self._parts))
+        rivals = rivals_of(self.conventions, of_flow=self.flow_is_recorded, absolute=True)
+        return diagnosed(pairs, [torch.cat(self._starts)], rivals, self._names, self._remedy)
+
+    def _remedy(self, typed: str) -> str:
+        words, given = typed.split(" "), self.conventions
+        if typed.startswith("depth times ") and "depth_unit_m" in given:
+            typed = f"depth_unit_m={float(words[-1]) * float(given['depth_unit_m']):.3g}"
+        elif typed.endswith(" frames later") and self._intervals_s:
+            interval_s = sorted(self._intervals_s)[len(self._intervals_s) // 2]
+            typed = f"pose_offset_s={-float(words[1]) * interval_s:.3g}"
+        if "=" not in typed:
+            return typed
+        options = [f"format.{option}" for option in typed.split(" ")]
+        return " ".join(options if given else ["format=frames", *options])
+
+
+def why_not(pairs: Pairs) -> list[str]:
+    """Returns why each pair tells nothing, "" if it does."""
+    ego = px_of(pairs.place - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
+    moves = torch.maximum(px_of(pairs.raw).nan_to_num(0.0), ego) >= LEAST_MOVEMENT_PX
+    number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
+    return [
+        "depth is nowhere known" if not d else "too few pixels are known" if n < LEAST_PIXELS else
+        "" if m else "hardly anything moves"
+        for d, n, m in zip(has_depth.tolist(), number.tolist(), moves.tolist())
+    ]  # fmt: skip
+
+
+def nothing(reasons: Sequence[str]) -> Diagnosis:
+    """Returns the diagnosis without pairs that tell something."""
+    why = max(reasons, key=reasons.count) if reasons else "there are no two successive frames"
+    return Diagnosis("can't tell", f"{why}; record frames in which the camera moves and turns")

@@ -1,0 +1,281 @@
+"""The usual mistakes: a table of what data may be instead, and what makes right data of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import product
+from typing import Any, Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from flowrep import geometry
+from flowrep.diagnosis.witness import (
+    EYE,
+    Change,
+    Pairs,
+    homogeneous,
+    looked_up,
+    motion_vector,
+    skew_part,
+    small_motion,
+)  # fmt: skip
+
+
+class Rival(NamedTuple):
+    """A mistake.
+
+    `typed` is the option that mends it, or what to do; both texts may hold the numbers that are
+    learnt, by Gauss-Newton steps from each `start`. `each` pair may have its own. `usual` are the
+    numbers of a mistake that should show.
+    """
+
+    of: Literal["poses", "flow", "camera", "depth"]
+    typed: str
+    says: str
+    change: Change
+    start: tuple[tuple[float, ...], ...] = ((),)
+    usual: tuple[float, ...] = ()
+    each: bool = False
+
+
+def rivals_of(given: Mapping[str, str], *, of_flow: bool, absolute: bool) -> list[Rival]:
+    """Returns the table, relative to the options in force.
+
+    Args:
+        given: these options, see `Recording.conventions`.
+        of_flow: whether raw flow is the data's.
+        absolute: whether poses in the world are known, not the motions alone.
+    """
+    given = {"pose_direction": "camera_to_world", "pose_axes": "opencv", "depth_kind": "z",
+             "flow_direction": "forward", "flow_channels": "uv"} | {**given}  # fmt: skip
+    table, of = [], Rival
+    directions = get_args(geometry.PoseDirection) if absolute else [given["pose_direction"]]
+    for direction, axes in product(directions, get_args(geometry.CameraAxes)):
+        says = {}
+        if direction != given["pose_direction"]:
+            says[f"pose_direction={direction}"] = f"the poses are {direction.replace('_', '-')}"
+        if axes != given["pose_axes"]:
+            says[f"pose_axes={axes}"] = f"the camera's axes are {axes}"
+        if says:
+            change = _path(partial(_readapted, given, direction, axes))
+            table.append(of("poses", " ".join(says), " and ".join(says.values()), change))
+    table += [
+        # Mirrored in y, a camera's axes are Unity's.
+        of("poses", "mirrored in x", "the world is mirrored in x", _path(partial(_mirrored, 0))),
+        of("poses", "mirrored in z", "the world is mirrored in z", _path(partial(_mirrored, 2))),
+        of("poses", "motions inverted", "motions are curr_from_prev (time runs backwards)",
+           _path(lambda path: path.flip(1))),
+        of("poses", "pose_lag_frames=1", "poses are a frame late",
+           _path(lambda path: path[:, [1, 2, 3, 3]])),
+        of("poses", "pose_lag_frames=-1", "poses are a frame early",
+           _path(lambda path: path[:, [0, 0, 1, 2]])),
+        of("poses", "poses {0:.2f} frames later", "the times of poses are {0:.2f} frames late",
+           _later, ((0.0,),), (0.5,)),
+        of("poses", "marker_from_cam={matrix}", "poses are a marker's, {degrees:.1f} degrees off",
+           lambda p, n: p._replace(path=p.path @ small_motion(n)[:, None]),
+           ((0.0,) * 6,), (0.1,) * 6),
+        of("camera", "K's numbers in another order", "K's numbers are fx, cx, fy, cy",
+           _camera(lambda fx, cx, fy, cy, w, h, n: (fx, fy, cx, cy))),
+        of("camera", "K in pixels", "K is in widths and heights",
+           _camera(lambda fx, cx, fy, cy, w, h, n: (w * fx, w * cx, h * fy, h * cy))),
+        of("camera", "K times {0:.3g}", "K is of pictures {inverse:.3g} times as large",
+           _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.5,), (2.0,)), (1.25,)),
+        of("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
+           _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
+           ((0.0, 0.0),), (0.1, 0.1)),
+        of("camera", "fx times {0:.3g}, fy times {1:.3g}, cx and cy moved by {px}",
+           "K is another camera's", _camera(lambda fx, cx, fy, cy, w, h, n: (
+               fx * n[0].clamp(0.01), cx + w * n[2], fy * n[1].clamp(0.01), cy + w * n[3])),
+           ((1.0, 1.0, 0.0, 0.0),)),
+        of("camera", "a K for each frame", "K changes from frame to frame",
+           _zoomed, ((1.0, 1.0),), (1.01, 1.0), each=True),
+        of("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
+           lambda p, n: p._replace(distortion=n), ((0.0,),), (-0.2,)),
+        of("depth", "depth times {0:.3g}", "depth, or the poses' unit, is {inverse:.3g} as long",
+           _depth(lambda z, n: z / n.clamp(1e-6)), ((1.0,), (1e-3,), (1e3,)), (2.0,)),
+        of("depth", "{0:.3g} / depth", "depth is {0:.3g} / z, a disparity",
+           _depth(lambda d, n: n.clamp(1e-6) / d), ((1.0,), (100.0,))),
+        of("depth", "depth_kind=z_buffer near_m={inverse:.3g} far_m={far:.3g}",
+           "depth is a buffer's", _depth(_from_buffer), ((5.0, -5.0),)),
+    ]  # fmt: skip
+    if given["depth_kind"] == "ray_length":
+        says, change = {"depth_kind=z": "depth is z, not the ray's length"}, partial(_along_ray, 1)
+    else:
+        says, change = (
+            {"depth_kind=ray_length": "depth is the ray's length"},
+            partial(_along_ray, -1),
+        )
+    table += [of("depth", typed, text, change) for typed, text in says.items()]
+    if absolute:
+        first, last = (_path(partial(_rolled, places)) for places in (-1, 1))
+        table += [
+            of("poses", "pose_layout=xyz_wxyz", "quaternions have w first", first),
+            of("poses", "pose_layout=xyz_xyzw", "quaternions have w last", last),
+            of("poses", "rotations transposed", "rotations are by columns", _path(_transposed)),
+        ]
+    if of_flow:
+        other = {"backward": "forward", "forward": "backward"}[given["flow_direction"]]
+        order = {"uv": "row_column", "row_column": "uv"}[given["flow_channels"]]
+        direction, channels = f"flow_direction={other}", f"flow_channels={order}"
+        table += [
+            of("flow", direction, f"flow points {other}", _gain(-1, 0, 0, -1)),
+            of("flow", channels, f"flow's channels are {order}", _gain(0, 1, 1, 0)),
+            of("flow", f"{direction} {channels}", f"flow is {other}, {order}", _gain(0, -1, -1, 0)),
+            of("flow", "u negated", "flow's u points left", _gain(-1, 0, 0, 1)),
+            of("flow", "v negated", "flow's v points up", _gain(1, 0, 0, -1)),
+            of("flow", "flow times the size", "flow is divided by the size", partial(_in_sizes, 1)),
+            of("flow", "flow times half the size", "flow is in half sizes", partial(_in_sizes, 2)),
+            of("flow", "flow divided by {0:.3g}", "flow is of pictures {0:.3g} times as large",
+               lambda p, n: p._replace(gain=p.gain * n.median()), ((1.0,),), (1.5,)),
+            of("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next),
+            of("flow", "flow on this frame's grid", "flow is on the previous one's", _of_previous),
+            of("depth", "depth moved by {px}", "depth isn't registered to the pictures",
+               _moved_depth, ((0.0, 0.0), (0.06, 0.0), (-0.06, 0.0)), (0.05, 0.0)),
+            of("depth", "depth of the next frame", "depth is a frame late", _late_depth),
+        ]  # fmt: skip
+    return table
+
+
+def _path(change: Callable[[Tensor], Tensor]) -> Change:
+    return lambda pairs, n: pairs._replace(path=change(pairs.path))
+
+
+def _readapted(given: Mapping[str, str], direction: Any, axes: Any, path: Tensor) -> Tensor:
+    """Undoes the options in force and applies others to `world_from_cam`."""
+    in_force: Any = given["pose_axes"]
+    ones = torch.where(torch.arange(4) == 3, 1.0, EYE)
+    taken = geometry.adapt_pose(ones, axes=in_force, check=False)
+    world = taken[:, 3].diag()  # left-handed worlds have an axis turned over
+    stored = world @ path @ torch.cat([(world @ taken)[:, :3], EYE[:, 3:]], -1).mT
+    if direction != given["pose_direction"]:
+        stored = geometry.invert_rigid(stored)
+    return geometry.adapt_pose(stored, axes=axes, check=False)
+
+
+def _mirrored(axis: int, path: Tensor) -> Tensor:
+    """F @ pose @ F, with F's `axis` negative."""
+    sign = torch.where(torch.arange(4) == axis, -1.0, 1.0).double()
+    return path * sign * sign.unsqueeze(-1)
+
+
+def _transposed(path: Tensor) -> Tensor:
+    of_rotation = torch.arange(4) < torch.tensor([3, 3, 3, 0]).unsqueeze(-1)
+    return torch.where(of_rotation, path.mT, path)
+
+
+def _rolled(places: int, path: Tensor) -> Tensor:
+    """Poses whose quaternion's numbers are moved by one place."""
+    known = path.isfinite().flatten(-2).all(-1)[..., None, None]
+    R = torch.where(known, path, EYE)[..., :3, :3]
+    # A rotation's quaternion, but for its sign, is the last eigenvector of this.
+    axis, trace = skew_part(R).unsqueeze(-1), R.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    upper = torch.cat([R + R.mT - trace * EYE[:3, :3], axis], -1)
+    of_quaternion = torch.cat([upper, torch.cat([axis.mT, trace], -1)], -2)
+    xyzw = torch.linalg.eigh(of_quaternion)[1][..., -1].roll(places, -1)
+    pose = torch.cat([path[..., :3, 3].nan_to_num(), xyzw], -1)
+    pose = geometry.pose_from_quaternion(pose, "xyz_xyzw", check=False)
+    return torch.where(known, pose, math.nan)
+
+
+def _later(pairs: Pairs, share: Tensor) -> Pairs:
+    """Poses at times between those recorded, some share of a frame later."""
+    poses = [torch.full_like(pairs.path[:, 0], math.nan)] * 4
+    for i in (1, 2):
+        start, end = (
+            torch.where(share[..., None] >= 0, pairs.path[:, i + j], pairs.path[:, i + j - 1])
+            for j in (0, 1)
+        )
+        step = motion_vector(geometry.invert_rigid(start) @ end)
+        poses[i] = start @ small_motion(step * torch.where(share >= 0, share, 1 + share))
+    return pairs._replace(path=torch.stack(poses, 1))
+
+
+def _camera(change: Callable[..., Sequence[Tensor]]) -> Change:
+    """Changes fx, cx, fy, cy of both frames, given the picture's width, height and the numbers."""
+
+    def changed(pairs: Pairs, n: Tensor) -> Pairs:
+        (height, width), both = pairs.now.shape[-2:], []
+        for K in (pairs.K, pairs.prev_K):
+            numbers = (K[:, 0, 0], K[:, 0, 2], K[:, 1, 1], K[:, 1, 2])
+            fx, cx, fy, cy = change(*numbers, width, height, n.unbind(-1))
+            rows = torch.stack([fx, K[:, 0, 1], cx, 0 * fx, fy, cy], -1).unflatten(-1, (2, 3))
+            both.append(torch.cat([rows, K[:, 2:]], 1))
+        return pairs._replace(K=both[0], prev_K=both[1])
+
+    return changed
+
+
+def _zoomed(pairs: Pairs, factors: Tensor) -> Pairs:
+    """Focal lengths times a number of the current frame and one of the previous."""
+    change = _camera(lambda fx, cx, fy, cy, w, h, n: (fx * n[0], cx, fy * n[0], cy))
+    now, before = (change(pairs, by) for by in factors.split(1, -1))
+    return pairs._replace(K=now.K, prev_K=before.prev_K)
+
+
+def _depth(change: Callable[[Tensor, Tensor], Tensor]) -> Change:
+    def changed(pairs: Pairs, n: Tensor) -> Pairs:
+        before = pairs.before  # large, and not used beside flow
+        if not pairs.by_flow:
+            before = change(before.reciprocal(), n.unsqueeze(-1)).reciprocal()
+        return pairs._replace(depth=change(pairs.depth, n), before=before)
+
+    return changed
+
+
+def _from_buffer(buffer: Tensor, line: Tensor) -> Tensor:
+    """Inverse depth falls along a line over the buffer's values, which are none beyond 1."""
+    near, slope = (line.movedim(1, 0)[i].unsqueeze(1) for i in (0, 1))
+    inverse = near + slope.clamp(max=0.0) * buffer
+    depth = torch.where(inverse > 1e-4, inverse.reciprocal(), math.inf)
+    return torch.where(buffer <= 1, depth, -buffer)
+
+
+def _along_ray(power: int, pairs: Pairs, n: Tensor) -> Pairs:
+    """Depth times the length of the ray per metre of z, or divided by it."""
+
+    def per_z(K: Tensor, place: Tensor) -> Tensor:
+        return (torch.linalg.inv_ex(K)[0] @ homogeneous(place)).norm(dim=1) ** power
+
+    before, (height, width) = pairs.before, pairs.now.shape[-2:]
+    if not pairs.by_flow:
+        v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        everywhere = torch.stack([u, v]).double().flatten(1)
+        before = before / per_z(pairs.prev_K, everywhere).unflatten(-1, (height, width))
+    return pairs._replace(depth=pairs.depth * per_z(pairs.K, pairs.place), before=before)
+
+
+def _moved_depth(pairs: Pairs, shares: Tensor) -> Pairs:
+    place = pairs.place + (shares * pairs.now.shape[-1]).unsqueeze(-1)
+    return pairs._replace(depth=looked_up(pairs.now, place).reciprocal())
+
+
+def _gain(uu: float, uv: float, vu: float, vv: float) -> Change:
+    gain = torch.tensor([[uu, uv], [vu, vv]], dtype=torch.float64)
+    return lambda pairs, n: pairs._replace(gain=gain @ pairs.gain)
+
+
+def _in_sizes(parts: float, pairs: Pairs, n: Tensor) -> Pairs:
+    size = torch.tensor(pairs.now.shape[:0:-1], dtype=torch.float64)
+    return pairs._replace(gain=torch.diag(parts / size) @ pairs.gain)
+
+
+def _to_next(pairs: Pairs, n: Tensor) -> Pairs:
+    return pairs._replace(path=pairs.path[:, [3, 3, 2, 1]], gain=-pairs.gain)
+
+
+def _reversed(pairs: Pairs, place: Tensor, maps: Tensor) -> Pairs:
+    """Flow from the frame before to this one, at places there, as if time ran back."""
+    other: Any = {"path": pairs.path.flip(1), "K": pairs.prev_K, "prev_K": pairs.K}
+    other["gain"] = -pairs.gain
+    return pairs._replace(place=place, depth=looked_up(maps, place).reciprocal(), **other)
+
+
+def _of_previous(pairs: Pairs, n: Tensor) -> Pairs:
+    return _reversed(pairs, pairs.place, pairs.before)
+
+
+def _late_depth(pairs: Pairs, n: Tensor) -> Pairs:
+    return _reversed(pairs, pairs.place - torch.linalg.solve(pairs.gain, pairs.raw), pairs.now)

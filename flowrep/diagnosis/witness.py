@@ -1,0 +1,297 @@
+"""What any motion of the camera leaves of a pair of frames, in pixels, and the motion of least."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from flowrep import geometry
+from flowrep.geometry.egomotion import structure_tensor
+from flowrep.geometry.pose import rotation_from_vector
+
+EYE = torch.eye(4, dtype=torch.float64)
+PIXELS, FITTED = 1000, 400  # of a pair, and of these, those that motions and numbers are fitted to
+LEAST_PIXELS, LEAST_MOVEMENT_PX = 64, 0.25  # pairs with less say nothing
+_LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2
+_BEHIND_PX = 1e3  # left of a point that a motion puts behind the camera
+_STEP = 1e-6  # of numeric derivatives
+
+
+class Pairs(NamedTuple):
+    """P pairs of frames as N pixels each, float64, nan where unknown."""
+
+    place: Tensor  # [P, 2, N], centres
+    raw: Tensor  # [P, 2, N]
+    depth: Tensor  # [P, N], of the current frame
+    texture: Tensor  # [P, 3, N], the root of the structure tensor: xx, xy, yy
+    coarseness: Tensor  # [P, N], depth's step over depth
+    K: Tensor  # [P, 3, 3]
+    prev_K: Tensor
+    path: Tensor  # [P, 4, 4, 4], world_from_cam at t - 2 to t + 1
+    now: Tensor  # [P, H, W], inverse depth of the current frame
+    before: Tensor  # the same of the previous one
+    by_flow: bool  # the witness is raw flow, not the depth of the frame before
+    is_estimated: bool  # from pictures
+    depth_step: float  # of coarse depth, metres
+    scale_px: float  # the least scale of what is left
+    gain: Tensor = torch.eye(2, dtype=torch.float64)  # raw is this times flow
+    distortion: Tensor = torch.zeros(1, 1, dtype=torch.float64)  # [P, 1], of the radius' square
+
+    def of(self, pairs: Any = slice(None), pixels: Any = slice(None)) -> Pairs:
+        """Returns some pairs, or some of each one's pixels."""
+        maps = [tensor[pairs][..., pixels] for tensor in self[:5]]
+        return Pairs._make([*maps, *(tensor[pairs] for tensor in self[5:10]), *self[10:]])
+
+    @property
+    def motion(self) -> Tensor:
+        """The recorded one, `prev_from_curr` [P, 4, 4]."""
+        return geometry.relative_motion(self.path[:, 1], self.path[:, 2], dtype=torch.float64)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether the recorded motions are known."""
+        return bool(self.motion.isfinite().all())
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether depth has steps that hide errors."""
+        return self.depth_step > 0.01 * median(self.depth)
+
+
+def sampled(
+    raw: Tensor | None, now: Tensor, before: Tensor, K: Tensor, prev_K: Tensor, path: Tensor,
+    picture: Tensor | None = None,
+) -> Pairs:  # fmt: skip
+    """Returns pairs of maps `[P, ..., H, W]`: pixels that are known, spread evenly.
+
+    With a picture, raw flow is of pixels with texture: elsewhere an estimator gives 0 or a guess.
+    """
+    count, width, size = len(now), now.shape[-1], now.shape[-2] * now.shape[-1]
+    step = int(size / 1.618033988749895) + 1  # coprime steps of the golden ratio meet each once
+    while math.gcd(step, size) > 1:
+        step += 1
+    index = torch.arange(min(size, 8 * PIXELS)) * step % size
+    place = torch.stack([index % width, index // width]).double() + 0.5
+
+    def at(maps: Tensor) -> Tensor:
+        return maps.flatten(-2)[..., index].double()
+
+    depth = at(now)
+    depth = torch.where(depth == 0, math.nan, depth)
+    flow = torch.zeros(count, 2, len(index)).double() if raw is None else at(raw)
+    known = flow.isfinite().all(1) & (depth.isfinite() if raw is None else ~depth.isnan())
+    texture = torch.tensor([[1.0], [0.0], [1.0]]).double().expand(count, 3, len(index))
+    if picture is not None:
+        xx, xy, yy = at(structure_tensor(picture.float())).unbind(1)
+        det = (xx * yy - xy * xy).clamp(min=0).sqrt()
+        norm = (xx + yy + 2 * det).clamp(1e-9).sqrt().unsqueeze(1)
+        texture = torch.stack([xx + det, xy, yy + det], 1) / norm
+        known &= xx + yy > _LEAST_TEXTURE
+    order = (~known).long().argsort(dim=-1, stable=True)[:, :PIXELS]
+
+    def first(maps: Tensor) -> Tensor:
+        maps = torch.where(known.unsqueeze(1), maps, math.nan)
+        return maps.gather(-1, order.unsqueeze(1).expand(-1, maps.shape[1], -1))
+
+    values = depth[depth.isfinite()].unique()  # there are few of 8 or 16 bits
+    is_coarse = 1 < len(values) < 0.1 * depth.numel()
+    depth_step = float(values.diff().median()) if is_coarse else 0.0
+    z = first(depth.unsqueeze(1)).squeeze(1)
+    maps = [first(place.expand(count, -1, -1)), first(flow), z, first(texture), depth_step / z]
+    whole = [K.double(), prev_K.double(), path.double()]
+    whole += [depths.double().reciprocal() for depths in (now, before)]
+    scale_px = 0.5 if raw is None else 1e-4
+    numbers = (raw is not None, picture is not None, depth_step, scale_px)
+    given = Pairs._field_defaults
+    return Pairs._make([*maps, *whole, *numbers, given["gain"], given["distortion"]])
+
+
+def seen_before(pairs: Pairs, motion: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns where pixels were before, `[..., P, 2, N]`, and their depth then over that now."""
+    rays = torch.linalg.inv_ex(pairs.K)[0] @ homogeneous(pairs.place)
+    bent, by = bool(pairs.distortion.any()), pairs.distortion[..., None]
+    if bent:
+        straight = rays[:, :2]
+        for _ in range(6):
+            straight = rays[:, :2] / (1 + by * straight.square().sum(1, keepdim=True)).clamp(0.2)
+        rays = homogeneous(straight)
+    q = torch.where(pairs.depth > 0, pairs.depth.reciprocal(), math.nan).unsqueeze(-2)
+    moved = motion[..., :3, :3] @ rays + motion[..., :3, 3:] * q
+    ratio = torch.where(moved[..., 2, :] > 0.01, moved[..., 2, :], math.nan)
+    at = moved[..., :2, :] / ratio.unsqueeze(-2)
+    if bent:
+        at = at * (1 + by * at.square().sum(-2, keepdim=True))
+    return pairs.prev_K[:, :2, :2] @ at + pairs.prev_K[:, :2, 2:], ratio
+
+
+def homogeneous(points: Tensor) -> Tensor:
+    """Returns points `[..., 2, N]` with a third coordinate of 1."""
+    return torch.cat([points, torch.ones_like(points[..., :1, :])], -2)
+
+
+def residual(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
+    """Returns what a motion `[..., P, 4, 4]` leaves, px `[..., P, 2 or 1, N]`, nan where unknown.
+
+    Of flow, along the directions that have texture unless `plain`. Of depth, beyond its steps, how
+    far a surface at 45 degrees would have to move to be as near as the frame before shows it.
+    """
+    place, ratio = seen_before(pairs, motion)
+    is_motion = motion.isfinite().flatten(-2).all(-1)[..., None, None]
+    if not pairs.by_flow:
+        left = looked_up(pairs.before, place) * pairs.depth * ratio - 1
+        left = left.sign() * (left.abs() - pairs.coarseness).clamp(min=0.0)
+        left = pairs.K[:, 0, :1] * left
+        left = left.masked_fill(ratio.isnan() & pairs.depth.isfinite(), _BEHIND_PX).unsqueeze(-2)
+        return torch.where(is_motion, left, math.nan)
+    left = (pairs.raw - pairs.gain @ (pairs.place - place)).nan_to_num(nan=_BEHIND_PX)
+    known = pairs.raw.isfinite() & ~pairs.depth.isnan().unsqueeze(-2) & is_motion
+    if not plain:  # the texture is the picture's, whatever axes the flow has
+        xx, xy, yy = pairs.texture.unbind(1)
+        u, v = (torch.linalg.inv(pairs.gain) @ left).unbind(-2)
+        left = torch.stack([xx * u + xy * v, xy * u + yy * v], -2) * pairs.gain.det().abs().sqrt()
+    return torch.where(known, left, math.nan)
+
+
+def looked_up(maps: Tensor, place: Tensor) -> Tensor:
+    """Returns maps `[P, H, W]` at places `[..., P, 2, N]`, bilinear, nan outside."""
+    size = torch.tensor([maps.shape[-1], maps.shape[-2]], dtype=torch.float64).unsqueeze(-1)
+    inside = ((place >= 0.5) & (place <= size - 0.5)).all(-2)
+    grid = torch.where(inside.unsqueeze(-2), 2 * place / size - 1, 0.0)
+    grid = grid.reshape(-1, *grid.shape[-3:]).permute(1, 0, 3, 2)  # [P, ..., N, 2]
+    found = functional.grid_sample(maps.unsqueeze(1), grid, align_corners=False)
+    return torch.where(inside, found[:, 0].transpose(0, 1).reshape(inside.shape), math.nan)
+
+
+def px_of(left: Tensor, share: float | None = None) -> Tensor:
+    """Returns a quantile of each pair's lengths of what is left, `[..., P, C, N]`.
+
+    Of flow the median, since half of the picture may move by itself. Of depth, of what is known to
+    stand still, 0.8: roads and walls along the way are as far wherever the camera is on them.
+    """
+    lengths = left.square().sum(-2).sqrt().sort(-1).values  # nan comes last
+    share = share or (0.5 if left.shape[-2] == 2 else 0.8)
+    rank = (share * (~lengths.isnan()).sum(-1, keepdim=True)).long().clamp(max=left.shape[-1] - 1)
+    return lengths.gather(-1, rank).squeeze(-1)
+
+
+def apart(pairs: Pairs, one: Tensor, other: Tensor) -> Tensor:
+    """Returns the difference between what two motions leave, which has no noise, px `[P]`."""
+    left = residual(pairs, one, plain=True) - residual(pairs, other, plain=True)
+    return px_of(left, None if pairs.by_flow else 0.95)
+
+
+def median(values: Tensor) -> float:
+    """Returns the median of known values, inf if most are not."""
+    unknown = int(values.isnan().sum())
+    return math.inf if 2 * unknown > values.numel() else float(values.nanmedian())
+
+
+def small_motion(step: Tensor) -> Tensor:
+    """Returns rigid transforms `[..., 4, 4]` of (rotation vector, translation) `[..., 6]`."""
+    upper = torch.cat([rotation_from_vector(step[..., :3]), step[..., 3:, None]], -1)
+    return torch.cat([upper, EYE[3:].expand(*upper.shape[:-2], 1, 4)], -2)
+
+
+def motion_vector(motion: Tensor) -> Tensor:
+    """Returns (rotation vector, translation) `[..., 6]` of turns well below half of one."""
+    sine = skew_part(motion[..., :3, :3]) / 2
+    length, trace = sine.norm(dim=-1, keepdim=True), motion.diagonal(dim1=-2, dim2=-1).sum(-1)
+    angle = torch.atan2(length, (trace.unsqueeze(-1) - 2) / 2)
+    turn = sine * torch.where(length > 1e-9, angle / length, 1.0)
+    return torch.cat([turn, motion[..., :3, 3]], -1)
+
+
+def skew_part(R: Tensor) -> Tensor:
+    """Returns a rotation's axis times twice its sine, `[..., 3]`."""
+    off = R - R.mT
+    return torch.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]], -1)
+
+
+Change = Callable[[Pairs, Tensor], Pairs]  # of pairs, with numbers [P, k]
+
+
+def descended(
+    pairs: Pairs,
+    motion: Tensor | None,
+    change: Change,
+    n: Tensor,
+    *,
+    steps: int,
+    each: bool = False,
+) -> tuple[Tensor | None, Tensor]:
+    """Returns motions, and the numbers n [P, k] of a change, that leave less: Gauss-Newton steps.
+
+    Weights are Geman and McClure's. Without `motion` the recorded ones are kept. The numbers are
+    the same for all pairs unless `each`.
+    """
+    tries = small_motion(_STEP * torch.cat([torch.zeros(1, 6), torch.eye(6)]).double()).unsqueeze(1)
+    for _ in range(steps):
+        changed = change(pairs, n)
+        moved = changed.motion.unsqueeze(0) if motion is None else tries @ motion
+        left, *columns = residual(changed, moved)
+        for one in _STEP * torch.eye(n.shape[-1], dtype=torch.float64):
+            changed = change(pairs, n + one)
+            columns.append(residual(changed, changed.motion if motion is None else motion))
+        J = (torch.stack(columns, -1) - left.unsqueeze(-1)) / _STEP  # [P, C, N, 6 + k]
+        known = (left.isfinite() & J.isfinite().all(-1)).all(-2)
+        squared = torch.where(known, left.square().sum(-2), math.inf)
+        scale = scale_of(squared, pairs).square().unsqueeze(-1)
+        root = (scale.rsqrt() / (1 + squared / scale)).unsqueeze(1)
+        left = torch.where(known.unsqueeze(1), left * root, 0.0).flatten(1)
+        J = torch.where(known[:, None, :, None], J * root.unsqueeze(-1), 0.0).flatten(1, 2)
+        A, b = J.mT @ J, (J.mT @ left.unsqueeze(-1)).squeeze(-1)
+        # In units of what each parameter moves, and damped where the pixels tell nothing.
+        unit = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12).rsqrt()
+        A = A * unit.unsqueeze(-1) * unit.unsqueeze(-2) + 1e-6 * torch.eye(A.shape[-1])
+        d, b = A.shape[-1] - n.shape[-1], (b * unit).unsqueeze(-1)
+        solved = torch.linalg.solve_ex(A[:, :d, :d], torch.cat([b[:, :d], A[:, :d, d:]], -1))[0]
+        step, across = solved[..., :1], solved[..., 1:]
+        if n.shape[-1]:
+            # Schur's complement: the equations of the numbers alone, for all pairs together.
+            S, g = A[:, d:, d:] - A[:, d:, :d] @ across, b[:, d:] - A[:, d:, :d] @ step
+            back = unit[:, d:].reciprocal().unsqueeze(-1)
+            S, g = S * back * back.mT, g * back
+            S, g = (S, g) if each else (S.sum(0, keepdim=True), g.sum(0, keepdim=True))
+            S = S + torch.diag_embed(1e-6 * S.diagonal(dim1=-2, dim2=-1) + 1e-12)
+            further = torch.linalg.solve_ex(S, g)[0]
+            n, step = n - further.squeeze(-1), step - across @ (further * back)
+        if motion is not None:
+            step = (unit[:, :d] * step.squeeze(-1)).nan_to_num()
+            motion = small_motion(-step.clamp(-0.5, 0.5)) @ motion
+    return motion, n
+
+
+def scale_of(squared: Tensor, pairs: Pairs) -> Tensor:
+    """Returns 1.5 standard deviations of residuals by their lower third, inf where unknown."""
+    rank = squared.isfinite().sum(-1, keepdim=True) // 3
+    third = squared.sort(-1).values.gather(-1, rank.clamp(max=squared.shape[-1] - 1)).squeeze(-1)
+    scale = 1.5 * (third / (-2 * math.log(2 / 3))).sqrt()
+    return scale.nan_to_num(1.0, 1.0).clamp(pairs.scale_px, 1e4)
+
+
+def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
+    """Returns the motions that leave least, from whichever start each is reached."""
+    few, none, motions = pairs.of(pixels=slice(FITTED)), pairs.depth[:, :0], [*starts]
+    # Edges of depth first tell the way, and then, being interpolated, don't count any more.
+    rounds = [few] if pairs.by_flow else [few, few._replace(scale_px=1e-3)]
+    for end in starts:
+        for each in rounds:
+            found, _ = descended(each, end, lambda p, n: p, none, steps=steps)
+            end = end if found is None else found
+        motions.append(end)
+    return least_costly(few, torch.stack(motions))
+
+
+def least_costly(few: Pairs, motions: Tensor) -> Tensor:
+    """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
+    squared = residual(few, motions).square().sum(-2).nan_to_num(math.inf)
+    scale = torch.stack([scale_of(each, few) for each in squared]).amin(0).square().unsqueeze(-1)
+    agreement = (1 / (1 + squared / scale)).mean(-1)
+    if not few.by_flow:  # no interpolated edge is a reason to leave the first
+        agreement[0] += 0.01
+    return motions[agreement.argmax(0), torch.arange(squared.shape[1])]
