@@ -101,7 +101,7 @@ def view(
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = episode.path if all(each.path == episode.path for each in episodes) else None
     tables = {
-        "episodes": [{"path": each.path, **each.row()} for each in episodes],
+        "episodes": [each.row() for each in episodes],
         "categories": category_rows(scene.categories, (frame.maps["seg"] for frame in frames)),
     }
     folder.mkdir(parents=True, exist_ok=True)

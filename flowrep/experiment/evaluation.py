@@ -50,7 +50,7 @@ class Episode:
     """One finished episode."""
 
     seed: int  # identifies it, see `StreetEnv.reset`
-    path: str
+    path: str  # the name of the scene's path that it was to follow
     speed: Any  # the pedestrians', as asked for; "" for the env's own
     fps: float
     outcome: str  # one of `OUTCOMES`
@@ -66,6 +66,7 @@ class Episode:
             "speed": self.speed,
             "fps": self.fps,
             "episode_seed": self.seed,
+            "path": self.path,
             "outcome": self.outcome,
             "hit": self.hit,
             "return": round(self.total_reward, 4),

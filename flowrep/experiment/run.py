@@ -40,7 +40,7 @@ Rows = Sequence[Mapping[str, str]]
 
 EVALUATION_COLUMNS = (
     "scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation",
-    "policy", "speed", "fps", "episode_seed", "outcome", "hit", "return", "length",
+    "policy", "speed", "fps", "episode_seed", "path", "outcome", "hit", "return", "length",
 )  # fmt: skip
 _EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
 """The columns that identify a row's policy and episode."""
@@ -439,10 +439,9 @@ class RunFolder:
 
     def read_episodes(self) -> list[dict[str, str]]:
         """Returns the rows of evaluation.csv, none if there is no such file."""
-        # runs of earlier versions have no scene_id
-        needed = [name for name in EVALUATION_COLUMNS if name != "scene_id"]
-        rows = read_rows(self.evaluation_path, needed, _CHECKS)
-        return [{"scene_id": ""} | row for row in rows]
+        later = dict.fromkeys(("scene_id", "path"), "")  # columns that older tables lack
+        needed = [name for name in EVALUATION_COLUMNS if name not in later]
+        return [later | row for row in read_rows(self.evaluation_path, needed, _CHECKS)]
 
     def log_episodes(
         self,

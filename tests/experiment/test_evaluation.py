@@ -79,7 +79,8 @@ def test_an_episode_is_that_of_the_gymnasium_env(make_street):
             positions.append(street.episode.now.vehicle[:2])
             total += reward
         assert (episode.outcome, episode.hit) == (info["outcome"], info["hit"])
-        assert (episode.path, episode.speed, episode.fps) == ("right", "low", 12.0)
+        row = episode.row()
+        assert (row["path"], row["speed"], row["fps"]) == ("right", "low", 12.0)
         assert episode.length == street.episode.steps
         assert episode.total_reward == pytest.approx(total, abs=1e-5)
         np.testing.assert_allclose(episode.positions, positions, atol=1e-4)

@@ -27,7 +27,7 @@ from flowrep.experiment.run import (
     machine_of,
     origin_of,
 )
-from flowrep.tables import TableError
+from flowrep.tables import TableError, write_rows
 from tests.config.composing import plain
 
 HOLD = """
@@ -472,6 +472,15 @@ def test_a_damaged_table_is_refused_and_stays_as_it_is(tmp_path, text):
         with pytest.raises(TableError, match=r"evaluation\.csv"):
             touch()
     assert run.evaluation_path.read_text() == text
+
+
+def test_a_table_from_before_a_column_is_read_with_empty_cells_and_goes_on(tmp_path):
+    run, older = RunFolder(tmp_path), episode(1)
+    del older["scene_id"], older["path"]
+    write_rows(run.evaluation_path, [older])
+    assert run.read_episodes() == [episode(1, scene_id="", path="")]
+    run.log_episodes([episode(2, path="left")])
+    assert [row["path"] for row in run.read_episodes()] == ["", "left"]
 
 
 def test_a_cell_that_can_not_be_is_named_with_its_row(tmp_path):
