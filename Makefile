@@ -97,16 +97,16 @@ format: $(DEVELOPED)  ## Mend style and formatting
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Without the one that needs a GPU.
-BENCHMARKS = $(filter-out benchmarks/gpu.py,$(wildcard benchmarks/*.py))
-
 bench: $(INSTALLED)  ## Run the benchmarks, one after the other
 	$(PIP) --editable ".[bench]"
-	for script in $(BENCHMARKS); do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+	for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
 
-bench-gpu: $(INSTALLED)  ## Measure everything on a GPU into outputs/gpu/
+bench-gpu: $(INSTALLED)  ## Measure updates, factorising flow, envs and a short training on a GPU
 	$(PIP) --editable ".[bench]"
-	$(BIN)/python benchmarks/gpu.py $(ARGS)
+	$(BIN)/python benchmarks/update.py --device cuda --rounds 20
+	$(BIN)/python benchmarks/factorize.py --device cuda
+	$(BIN)/python benchmarks/frames.py --device cuda --scenes straight_road --sizes 84 --workers 0 1 4 8 16
+	$(BIN)/python benchmarks/training.py --alone --rounds 1 --frames 20_000 preset=paper device=cuda
 
 docs: $(INSTALLED)  ## Build the documentation into site/
 	$(PIP) --editable ".[docs]"

@@ -1,18 +1,21 @@
-"""Time of one env's step beside PyBullet's picture, and frames per second of 32 envs together.
+"""What a frame costs: PyBullet's picture beside the rasteriser's maps, and steps of whole envs.
 
     python benchmarks/frames.py [--scenes straight_road ...] [--sizes 84 48] [--num-envs 32]
 
-First a table of single envs: a planner drives, and each view is also drawn by PyBullet. Then 32 in
-one process with ego and obj and random actions, without policy and replay memory, in two ways that
-take turns: the rasteriser drawing all envs at once, and PyBullet drawing each on its own. Times are
-CPU times, so that other work on the machine does not count.
+1. One view: a planner drives, and every view is drawn by both renderers, with all people in place.
+2. A frame of 32 envs in one process with ego and obj and random actions, without policy and replay
+   memory. The rasteriser draws all envs at once, PyBullet each on its own; the two take turns.
+3. Frames per second by number of worker processes, with `--workers 0 1 4`; 0 is this process alone.
+
+The first two are CPU times, so that other work on the machine does not count; the third is by the
+clock. With `--device cuda` only the third runs.
 """
 
 import argparse
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 from unittest.mock import patch
 
@@ -22,12 +25,15 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from flowrep.baselines import Planner
 from flowrep.envs import StreetEnv, make_env
 from flowrep.envs.episode import Episode
+from flowrep.envs.sensing import Sensing
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.scene import Scene
+from flowrep.simulator.street import Street
 
-MAPS = ("ego", "obj")
-SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion")
+REPRESENTATIONS = ("ego", "obj")
+MAPS = ("depth", "semantic", "instance")
+SENSORS = (*MAPS, "prev_from_curr", "instance_motion")
 
 
 def in_size(name: str, size: int) -> Scene:
@@ -38,38 +44,47 @@ def in_size(name: str, size: int) -> Scene:
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    """Returns the CPU time of a call in ms, and its result."""
     started = time.process_time()
     result = call()
-    return time.process_time() - started, result
+    return 1e3 * (time.process_time() - started), result
 
 
-def single_row(name: str, size: int, count: int) -> str:
-    """Times steps of one env; the planner's own time is not counted."""
-    scene = in_size(name, size)
-    env = StreetEnv(scene, sensors=SENSORS)
-    planner, steps, pictures = Planner(), [], []
+def view_times(scene: Scene, count: int) -> Iterator[dict[str, float]]:
+    """Yields the ms of a step and of drawing its view, `count` times."""
+    env, planner = StreetEnv(scene, sensors=SENSORS), Planner()
+    street = Street.shared(scene)
+    pictured = Sensing(street, MAPS, "pybullet", 1)
+    rasterise = env.sensing._rasteriser(1)
     env.reset(seed=0)
-    while len(steps) < count:
-        action = planner(env)
-        seconds, (*_, terminated, _, _) = timed(lambda action=action: env.step(action))
-        steps.append(seconds)
-        env.sensing.rgb(env.episode)  # puts everyone where they are
-        pictures.append(timed(lambda: env.sensing.look(env.episode))[0])
+    for _ in range(count):
+        action = planner(env)  # not counted
+        step, (*_, terminated, _, _) = timed(lambda action=action: env.step(action))
+        # PyBullet draws bodies where they were last placed, and a step with the rasteriser places
+        # only those that the vehicle may hit: `observe` places all, then the picture is timed.
+        pictured.observe(env.episode)
+        poses = env.sensing.views([env.episode])
+        yield {
+            "step": step,
+            "picture": timed(lambda: pictured.look(env.episode))[0],
+            "maps": timed(lambda: rasterise(*poses))[0],  # noqa: B023
+            "colours": timed(lambda: rasterise(*poses, rgb=True))[0],  # noqa: B023
+        }
         if terminated:
             env.reset()
     env.close()
-    step, picture = statistics.median(steps), statistics.median(pictures)
-    paired = statistics.median(p / s for s, p in zip(steps, pictures))
-    cells = f"{1e3 * step:.2f} | {1e3 * picture:.2f} | {paired:.1f} | {1 / step:.0f}"
-    return f"| {name} | {size} | {scene.num_pedestrians} | {cells} |"
 
 
-def together(scene: Scene, num_envs: int) -> EnvBase:
-    return make_env(scene, MAPS, num_envs=num_envs, seed=0)
-
-
-def one_by_one(scene: Scene, num_envs: int) -> EnvBase:
-    return make_env(scene, MAPS, num_envs=num_envs, seed=0, renderer="pybullet")
+def view_row(name: str, size: int, count: int) -> str:
+    scene = in_size(name, size)
+    times = list(view_times(scene, count))
+    median = {key: statistics.median(each[key] for each in times) for key in times[0]}
+    triangles = sum(len(body.triangles) for body in Street.shared(scene).bodies)
+    cells = f"{scene.num_pedestrians} | {triangles} | {median['picture']:.2f}"
+    for key in ("maps", "colours"):
+        ratio = statistics.median(each["picture"] / each[key] for each in times)
+        cells += f" | {median[key]:.3f} | {ratio:.1f}"
+    return f"| {name} | {size} | {cells} | {median['step']:.2f} |"
 
 
 def stepper(env: EnvBase, clock: Callable[[], float] = time.process_time) -> Callable[[int], float]:
@@ -80,14 +95,19 @@ def stepper(env: EnvBase, clock: Callable[[], float] = time.process_time) -> Cal
         started = clock()
         for _ in range(steps):
             _, observation[0] = env.step_and_maybe_reset(env.rand_action(observation[0]))
+        if env.device is not None and env.device.type == "cuda":
+            torch.cuda.synchronize()
         return 1e3 * (clock() - started) / (steps * env.batch_size.numel())
 
     return take
 
 
-def batch_row(name: str, size: int, num_envs: int, steps: int, rounds: int) -> str:
+def frame_row(name: str, size: int, num_envs: int, steps: int, rounds: int) -> str:
     scene = in_size(name, size)
-    envs = [make(scene, num_envs) for make in (together, one_by_one)]
+    envs = [
+        make_env(scene, REPRESENTATIONS, num_envs=num_envs, seed=0, renderer=renderer)
+        for renderer in ("rasteriser", "pybullet")
+    ]
     takers = [stepper(env) for env in envs]
     times = [[take(steps) for take in takers] for _ in range(rounds + 1)][1:]  # one to warm up
     parts = shares(envs[0], takers[0], steps)
@@ -100,7 +120,7 @@ def batch_row(name: str, size: int, num_envs: int, steps: int, rounds: int) -> s
 
 
 def shares(env: EnvBase, take: Callable[[int], float], steps: int) -> list[float]:
-    """Returns milliseconds per frame for driving, sensing, representations and TorchRL."""
+    """Returns ms per frame for driving, sensing, representations and the rest, mostly TorchRL."""
     owners = [
         (Episode, "step"), (StreetVectorEnv, "_observe"), (Compose, "_step"),
         (TransformedEnv, "_step"),
@@ -109,8 +129,8 @@ def shares(env: EnvBase, take: Callable[[int], float], steps: int) -> list[float
 
     def watched(key: tuple, method: Callable) -> Callable:
         def wrapped(*args, **kwargs):
-            seconds, result = timed(lambda: method(*args, **kwargs))
-            spent[key] += 1e3 * seconds
+            ms, result = timed(lambda: method(*args, **kwargs))
+            spent[key] += ms
             return result
 
         return wrapped
@@ -126,29 +146,56 @@ def shares(env: EnvBase, take: Callable[[int], float], steps: int) -> list[float
     return [drive, see, represent, whole - drive - see - represent]
 
 
+def worker_row(
+    name: str, size: int, num_envs: int, workers: int, steps: int, device: torch.device
+) -> str:
+    env = make_env(
+        in_size(name, size), REPRESENTATIONS, num_envs=num_envs, num_workers=workers,
+        device=device, seed=0,
+    )  # fmt: skip
+    take = stepper(env, time.perf_counter)
+    take(steps)  # warms up
+    rate = 1e3 / take(6 * steps)
+    env.close()
+    return f"| {name} | {size} | {workers} | {rate:.0f} |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", nargs="+", default=scene_names())
     parser.add_argument("--sizes", type=int, nargs="+", default=[84, 48])
     parser.add_argument("--num-envs", type=int, default=32)
+    parser.add_argument("--views", type=int, default=300, help="of each scene and size")
     parser.add_argument("--steps", type=int, default=10, help="of every env in each round")
     parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--workers", type=int, nargs="*", default=[])
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
     args = parser.parse_args()
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    print("| scene | pixels | people | step, ms | picture, ms | picture / step | steps/s |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
-    for name in args.scenes:
-        print(single_row(name, args.sizes[0], 60 * args.steps), flush=True)
-    print(f"\n{args.num_envs} envs in one process, one thread, ms per frame")
-    print(
-        "| scene | pixels | PyBullet | flowrep | ratio | frames/s "
-        "| drive | see | represent | the rest |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name in args.scenes:
-        for size in args.sizes:
-            print(batch_row(name, size, args.num_envs, args.steps, args.rounds), flush=True)
+    rows = [(name, size) for name in args.scenes for size in args.sizes]
+    if args.device.type == "cpu":
+        print(
+            "| scene | pixels | people | triangles | getCameraImage, ms | maps, ms | ratio "
+            "| with colours, ms | ratio | env's step, ms |"
+        )
+        print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+        for row in rows:
+            print(view_row(*row, args.views), flush=True)
+        print(f"\n{args.num_envs} envs in one process, one thread, ms per frame")
+        print(
+            "| scene | pixels | PyBullet | flowrep | ratio | frames/s "
+            "| drive | see | represent | the rest |"
+        )
+        print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+        for row in rows:
+            print(frame_row(*row, args.num_envs, args.steps, args.rounds), flush=True)
+    if args.workers:
+        print(f"\n{args.num_envs} envs, {args.device}\n| scene | pixels | workers | frames/s |")
+        print("| --- | --- | --- | --- |")
+        for row in rows:
+            for workers in args.workers:
+                print(worker_row(*row, args.num_envs, workers, args.steps, args.device), flush=True)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,11 @@ from flowrep.agent.observation import has_bf16
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3
 GAMMA, TAU, TARGET_ENTROPY_WEIGHT = 0.99, 0.005, 0.2
-SIZES = {"48 px, batch 128": (48, 128), "48 px, batch 256": (48, 256), "paper": (84, 1024)}
+# (pixels a side, batch); "tiny" tries the script
+SIZES = {
+    "48 px, batch 128": (48, 128), "48 px, batch 256": (48, 256), "paper": (84, 1024),
+    "tiny": (40, 8),
+}  # fmt: skip
 STOCK = "TorchRL stock, separate fp32"
 
 
@@ -227,7 +231,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=[*SIZES])
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=[*SIZES][:-1])
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--default-malloc", action="store_true")
     parser.add_argument("--cpu-time", action="store_true")
@@ -241,10 +245,15 @@ def main() -> None:
         torch.manual_seed(0)
         steps = random_steps(side, batch, args.device)
         dtypes = dtypes_of(args.device)
+        # On CUDA an update is a graph from the fourth on, unless eager is asked for.
+        kinds = {"": False} | ({", eager": True} if args.device.type == "cuda" else {})
         updates = {
-            f"flowrep {encoder} {precision}": flowrep_update(steps, encoder, precision)
+            f"flowrep {encoder} {precision}{kind}": flowrep_update(
+                steps, encoder, precision, eager=eager
+            )
             for precision in dtypes
             for encoder in ("shared", "separate")
+            for kind, eager in kinds.items()
         }
         counts = {name: operations(update) for name, update in updates.items()}
         plain = {f"plain shared {name}": plain_update(steps, t) for name, t in dtypes.items()}

@@ -10,8 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from itertools import chain, count, product
-from operator import attrgetter
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,7 +39,7 @@ from flowrep.report.runs import (
 )
 from flowrep.report.statistics import LEVEL, Array, Effect, effect, holm, mean_share
 from flowrep.report.storage import read_archive
-from flowrep.report.tables import p_text, percent, points, signed
+from flowrep.report.tables import Table, p_text, percent, points, signed
 
 HERE = Path(__file__).parent
 DATA, PAGE = HERE.parent / "outputs" / "reference", HERE / "results.md"
@@ -217,10 +216,8 @@ def _conditions(run: Run, names: Iterable[str | int]) -> list[Condition]:
     return [Condition("greedy", *condition) for condition in of]
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Returns a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"|{'|'.join(cells)}|" for cells in lines)
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return Table("", "", tuple(header), (("", tuple(map(tuple, rows))),)).to_markdown()
 
 
 def claims_table(claims: Sequence[Claim], p_name: str) -> str:
@@ -235,7 +232,7 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
         text = f"{claim.text}<br>*{claim.limits}*" if claim.limits else claim.text
         rows.append((str(claim.number), text, f"**{claim.verdict}**", effects, by_scene))
     header = ("", "claim, *what limits it*", "verdict", f"effect [95 %], {p_name}", "by scene")
-    return markdown(header, rows)
+    return _table(header, rows)
 
 
 def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) -> str:
@@ -250,7 +247,7 @@ def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) 
         for first, second in zip(narrow, wide)
     ]
     header = ("row", "1.2–1.8 m/s", "0.6–2.4 m/s, p (Holm)", "verdict on the latter")
-    return markdown(header, rows)
+    return _table(header, rows)
 
 
 def _effect_text(contrast: Contrast) -> str:
@@ -327,7 +324,7 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     """Returns success by stack and speed in one scene, and how many runs find all ways."""
     at = [f"{speed}, {_speed_range(runs[0], speed)}" for speed in SPEEDS]
     header = ["", *at, f"each run, {runs[0].speed}"]
-    header += [f"find all {_paths(runs[0])} ways"] if is_fork else []
+    header += [f"find all {len(runs[0].config['scene']['paths'])} ways"] if is_fork else []
     rows = []
     for stack, members in in_stacks(runs).items():
         rows.append([_stack(stack), *_successes(members), _each_run(members)])
@@ -338,7 +335,7 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     never = ["" if share is None else f"{100 * share:.0f}" for share in shares]
     if any(never):
         rows.append(["never turning", *never, *[""] * (len(header) - 4)])
-    return markdown(header, rows)
+    return _table(header, rows)
 
 
 def all_ways_found(runs: Sequence[Run]) -> str:
@@ -359,21 +356,11 @@ def missed_ways(runs: Iterable[Run]) -> list[str]:
     return [f"{name} ({'; '.join(seeds)})" for name, seeds in missed.items()]
 
 
-def drawn_paths(episode_seeds: Iterable[int], paths: int) -> Array:
-    """Returns the path of each episode: the first draw of its generator, as an episode makes it."""
-    return np.array([np.random.default_rng(seed).integers(paths) for seed in episode_seeds])
-
-
-def _paths(run: Run) -> int:
-    return len(run.config["scene"]["paths"])
-
-
 def _ends_by_way(run: Run) -> list[Array]:
     """Returns how episodes end on each path, greedy and at the run's training speed."""
     driven = run.under(Condition("greedy", run.speed, run.fps))
-    drawn = drawn_paths(driven["episode_seed"], _paths(run))
     ends = np.where(driven["hit"] == "", driven["outcome"], driven["hit"])
-    return [ends[drawn == path] for path in range(_paths(run))]
+    return [ends[driven["path"] == path["name"]] for path in run.config["scene"]["paths"]]
 
 
 def _share(ends: Array) -> float:
@@ -404,7 +391,7 @@ def failure_table(papers: Mapping[str, float], runs: Sequence[Run]) -> str:
             found = own_scores(members, _conditions(members[0], speeds), departures)
             shares.append(percent(mean_share([found])) if len(found) else "")
         rows.append((_stack(stack), f"{papers[stack]:.1f}", *shares, str(len(members))))
-    return markdown(("", "the paper", "low and high", "training", "runs"), rows)
+    return _table(("", "the paper", "low and high", "training", "runs"), rows)
 
 
 def rate_table(runs: Sequence[Run]) -> str:
@@ -422,7 +409,7 @@ def rate_table(runs: Sequence[Run]) -> str:
         rows.append((_stack(stack), *cells, lost, f"{means[0] / means[-1]:.2f}", str(len(members))))
     first, last = f"{frame_rates[-1]:g}", f"{frame_rates[0]:g}"
     header = ("", *(f"{r:g} Hz" for r in frame_rates), f"{first} → {last}, points", "kept", "runs")
-    return markdown(header, rows)
+    return _table(header, rows)
 
 
 def variation_table(titles: Mapping[str, str], studies: Studies) -> str:
@@ -440,11 +427,7 @@ def variation_table(titles: Mapping[str, str], studies: Studies) -> str:
         for stack, runs in in_stacks(members).items()
     ]
     at = ("low, 0.6–1.0", "as trained", "high, 2.0–2.4")
-    return markdown(("", "", "trained at, m/s", *at, "runs"), rows)
-
-
-def _trained_at(runs: Sequence[Run]) -> str:
-    return _speed_range(runs[0], runs[0].speed)
+    return _table(("", "", "trained at, m/s", *at, "runs"), rows)
 
 
 def _speed_range(run: Run, speed: str) -> str:
@@ -463,7 +446,7 @@ def estimates_table(titles: Mapping[str, str], studies: Studies) -> str:
                 cells += [_successes(runs)[1], _each_run(runs)] if runs else ["", ""]
             rows.append((title, _stack(stack), *cells))
     header = [x for scene in scenes for x in (words(scene), "each run")]
-    return markdown(("", "", *header), rows)
+    return _table(("", "", *header), rows)
 
 
 def runs_table(studies: Studies) -> str:
@@ -476,7 +459,7 @@ def runs_table(studies: Studies) -> str:
     stacks = in_order([run.stack for members in places.values() for run in members], STACKS)
     counts = [[sum(r.stack == stack for r in of) for of in places.values()] for stack in stacks]
     rows = [(_stack(s), *(str(n or "") for n in of)) for s, of in zip(stacks, counts)]
-    return markdown(("", *places), rows)
+    return _table(("", *places), rows)
 
 
 def smallest_differences(claims: Sequence[Claim]) -> list[float]:
@@ -488,21 +471,6 @@ def smallest_differences(claims: Sequence[Claim]) -> list[float]:
     errors = [(x.error, stats.t(x.freedom)) for x in found if not np.isnan(x.error)]
     level = LEVEL / max(len(errors), 1)
     return [100 * error * float(t.ppf(1 - level / 2) + t.ppf(_POWER)) for error, t in errors]
-
-
-def repeats(main: Sequence[Run], runs: Sequence[Run]) -> list[float]:
-    """Returns how much better runs are that repeat one of the main study, in points."""
-    found = []
-    what_it_is = attrgetter("scene", "stack", "seed", "settings")
-    for run, other in product(main, runs):
-        if what_it_is(run) != what_it_is(other):
-            continue
-        sides = scores([[other], [run]], {"success": dict.fromkeys(SPEEDS, 1 / 3)})
-        low = _conditions(run, ["low"])[0]
-        first, second = (r.under(low)["outcome"].tolist() for r in (run, other))
-        if sides is not None and first != second:  # else it is the same run under another name
-            found.append(100 * float(sides[0][0] - sides[1][0]))
-    return found
 
 
 def of_bfloat16(runs: Sequence[Run]) -> tuple[int, Array]:
@@ -518,21 +486,6 @@ def of_bfloat16(runs: Sequence[Run]) -> tuple[int, Array]:
             rates = scores(sides, asked)
             found += [] if rates is None else [100 * (rates[0].mean() - rates[1].mean())]
     return sum(is_short.values()), np.array(found)
-
-
-def collapses(runs: Sequence[Run]) -> dict[bool, list[float]]:
-    """Returns success at high speed of runs with several flow maps, by whether entropy collapsed.
-
-    That is so if it falls below 0.1 nat within the first 10,000 frames.
-    """
-    found: dict[bool, list[float]] = {True: [], False: []}
-    for run in runs:
-        flows = {"raw", "ego", "obj"} & {*run.stack.split("+")}
-        ends = run.under(Condition("greedy", "high", run.fps))["outcome"]
-        if len(flows) > 1 and len(ends) and "entropy" in run.metrics:
-            early = run.metrics["entropy"][run.metrics["frames"] <= 10_000]
-            found[bool(np.nanmin(early) < 0.1)].append(100 * success_rate([ends]))
-    return found
 
 
 def sampled_minus_greedy(runs: Sequence[Run]) -> list[list[float]]:
@@ -597,11 +550,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             episodes=sum(len(run.episodes["outcome"]) for run in runs),
             fewest=min(c.fewest for claim in primary for c in claim.contrasts),
             smallest=f"{min(smallest):.0f} to {max(smallest):.0f}",
-            repeats=repeats(every, [run for run in runs if run not in every]),
             sampled=sampled_minus_greedy(every),
             short=of_bfloat16(every),
             main_runs=len(every),
-            collapsed=collapses(main.get("straight_road", [])),
             np=np,
         )
     )

@@ -33,7 +33,7 @@ _MACHINE = ("commit", "precision", "cpu")
 _OUTCOMES = OUTCOMES[1:]  # the first is that of an episode that goes on
 _EPISODES: dict[str, type] = {
     "scene": str, "scene_id": str, "frames": int, "evaluation": str, "policy": str, "speed": str,
-    "fps": float, "episode_seed": int, "outcome": str, "hit": str, "length": int,
+    "fps": float, "episode_seed": int, "path": str, "outcome": str, "hit": str, "length": int,
 }  # fmt: skip
 
 

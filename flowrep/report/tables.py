@@ -56,6 +56,12 @@ class Table(NamedTuple):
 \end{{table}}
 """
 
+    def to_markdown(self) -> str:
+        """Returns a Markdown table, without the caption and the blocks' headings."""
+        rows = [row for _, block in self.blocks for row in block]
+        lines = [self.header, ["---"] * len(self.header), *rows]
+        return "\n".join(f"|{'|'.join(cells)}|" for cells in lines)
+
     def to_csv(self) -> str:
         """Returns a CSV table; a block's heading is its rows' first cell."""
         text = io.StringIO(newline="")
