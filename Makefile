@@ -86,9 +86,10 @@ test-python:  ## Run the fast tests on another Python, in an environment of its 
 schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
 	$(BIN)/python -c 'from flowrep.scenes.load import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
 
-lint: $(DEVELOPED)  ## Check style and formatting
+lint: $(DEVELOPED)  ## Check style, formatting and spelling
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 
 types: $(DEVELOPED)  ## Check types
 	$(BIN)/mypy
