@@ -67,8 +67,7 @@ gallery: $(INSTALLED)  ## Make the README's gallery anew
 	  cp outputs/gallery/$$scene/sheet.png docs/images/gallery_$$scene.png; \
 	  cp outputs/gallery/$$scene/plan.png docs/images/plan_$$scene.png; \
 	done
-	$(BIN)/python examples/filmstrip.py docs/images
-	$(BIN)/python examples/transform_pictures.py docs/images/transforms
+	$(BIN)/python -m docs.pictures docs/images
 
 # A process a core, one thread each. A file stays in one process,
 # since its tests share what they prepare.
