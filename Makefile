@@ -67,8 +67,7 @@ gallery: $(INSTALLED)  ## Make the README's gallery anew
 	  cp outputs/gallery/$$scene/sheet.png docs/images/gallery_$$scene.png; \
 	  cp outputs/gallery/$$scene/plan.png docs/images/plan_$$scene.png; \
 	done
-	$(BIN)/python examples/filmstrip.py docs/images
-	$(BIN)/python examples/transform_pictures.py docs/images/transforms
+	$(BIN)/python -m docs.pictures docs/images
 
 # A process a core, one thread each. A file stays in one process,
 # since its tests share what they prepare.
@@ -86,9 +85,10 @@ test-python:  ## Run the fast tests on another Python, in an environment of its 
 schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
 	$(BIN)/python -c 'from flowrep.scenes.load import json_schema; print(json_schema(), end="")' > docs/scene.schema.json
 
-lint: $(DEVELOPED)  ## Check style and formatting
+lint: $(DEVELOPED)  ## Check style, formatting and spelling
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 
 types: $(DEVELOPED)  ## Check types
 	$(BIN)/mypy

@@ -79,7 +79,7 @@ def test_the_policy_of_ones_own_keeps_clear_of_a_person_and_comes_back(side):
 
 def test_flow_estimated_from_larger_pictures_is_drawn_beside_the_maps():
     pytest.importorskip("cv2", reason="the example estimates flow: pip install 'flowrep-rl[flow]'")
-    from examples.transform_pictures import SIZE_PX, of_estimates
+    from docs.pictures import SIZE_PX, of_estimates
 
     still = {"rgb": torch.zeros(3, 2 * SIZE_PX, 2 * SIZE_PX, dtype=torch.uint8)}
     still["instance_motion"] = torch.eye(4).unsqueeze(0)

@@ -1,6 +1,10 @@
-"""Writes a picture of each transform's output, for its page in docs/.
+"""Draws the pictures of the README and of the documentation: `make gallery`.
 
-python examples/transform_pictures.py docs/images/transforms
+    python -m docs.pictures docs/images
+
+`agent.gif` is a trained agent's drive. Of one step of a planner's drive, `strip.png` has the
+representations side by side and `obj_scale.png` explains the scale of object flow. `transforms/`
+has the output of each transform, for its page.
 """
 
 import sys
@@ -10,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
-from flowrep.experiment.film import Film
+from flowrep import pretrained
+from flowrep.experiment.film import OUTCOME_S, Film
 from flowrep.geometry import ego_flow, unproject
 from flowrep.policies import load_agent
 from flowrep.scenes import load_scene
@@ -24,39 +30,78 @@ from flowrep.viz import (
     depth_to_rgb,
     flow_note,
     flow_to_rgb,
+    representation_strip,
     strip,
     write_png,
 )
 
-SCENE, SEED, SIZE_PX = "h_shaped_pathways", 1560023975, 160
+SIZE_PX = 160  # of the transforms' pictures
 NOTES = {name: flow_note(scale) for name, scale in FLOW_SCALE_PX.items()}
 NOTES |= {"depth": partial(depth_bar, DEPTH_RANGE_M), "z": partial(depth_bar, DEPTH_RANGE_M)}
 PARTS = np.array([(235, 235, 235), (222, 40, 60), (46, 64, 196), (60, 160, 90)], dtype=np.uint8)
 
 
-def main(folder: str) -> None:
-    scene = load_scene(SCENE)
+def main(folder: Path) -> None:
+    """Writes all pictures into a folder."""
+    maps, *_ = drive(load_scene("straight_road"), 561807780)
+    chosen = maps[liveliest(maps, 6)]
+    write_png(folder / "strip.png", representation_strip(chosen))
+    write_png(folder / "obj_scale.png", three_ways(chosen))
+    write_gif(folder / "agent.gif")
+    scene = load_scene("h_shaped_pathways")
     camera = replace(scene.camera, height_px=SIZE_PX, width_px=SIZE_PX)
-    scene = asdict(replace(scene, camera=camera))
-    film = Film(load_agent("planner", scene=scene, device="cpu", num_envs=1, num_workers=0))
-    K, steps = torch.as_tensor(film.street.K), []
-    frames, _ = film.drive(
-        {"episode_seed": SEED}, lambda tensordict: steps.append(tensordict["sensor"][0])
-    )
-    film.close()
-    maps = [frame.maps for frame in frames]
-    # The step with the most motion, but nobody right in front of the camera.
-    motion = [int(((frame["obj"] != 0) & (frame["depth"] > 5)).sum()) for frame in maps]
-    at = max(range(1, len(maps)), key=lambda i: motion[i])
-    for name, images in pictures(steps[at - 1], steps[at], maps[at - 1], maps[at], K).items():
-        path = Path(folder) / f"{name}.png"
+    maps, steps, K = drive(replace(scene, camera=camera), 1560023975)
+    at = liveliest(maps, 5)
+    for name, images in of_transforms(steps[at - 1], steps[at], maps[at - 1], maps[at], K).items():
         notes = {name: note for name, note in NOTES.items() if name in images}
+        path = folder / "transforms" / f"{name}.png"
         write_png(path, strip(images, wheel_for=FLOW_SCALE_PX, notes=notes))
-        print(path)
 
 
-def pictures(step_before, step, before, now, K):
-    """Returns the pictures of each page, by label."""
+def drive(scene, seed):
+    """Returns the maps and the sensors of each step of a planner's drive, and K."""
+    agent = load_agent("planner", scene=asdict(scene), device="cpu", num_envs=1, num_workers=0)
+    film, steps = Film(agent), []
+    K = torch.as_tensor(film.street.K)
+    frames, _ = film.drive({"episode_seed": seed}, lambda step: steps.append(step["sensor"][0]))
+    film.close()
+    return [frame.maps for frame in frames], steps, K
+
+
+def liveliest(maps, beyond_m):
+    """Returns the step with the most moving pixels, without those right in front of the camera."""
+    moving = [int(((each["obj"] != 0) & (each["depth"] > beyond_m)).sum()) for each in maps]
+    return moving.index(max(moving))
+
+
+def three_ways(maps):
+    """Returns raw and object flow at raw's scale, and object flow at its own."""
+    raws, own = FLOW_SCALE_PX["raw"], FLOW_SCALE_PX["obj"]
+    shown = {"raw": ("raw", raws), "obj, as raw": ("obj", raws), "obj, its own": ("obj", own)}
+    images = {"RGB": maps["rgb"].numpy().transpose(1, 2, 0)}
+    images |= {label: flow_to_rgb(maps[name], scale) for label, (name, scale) in shown.items()}
+    notes = {label: flow_note(scale) for label, (_, scale) in shown.items()}
+    return strip(images, wheel_for=shown, notes=notes)
+
+
+def write_gif(path: Path, seed: int = 1, last: int = 72, every: int = 2) -> None:
+    """Films the end of a trained agent's drive: the picture, the classes, and what it reads."""
+    film = Film(pretrained.load("straight_road", device="cpu"))
+    film.tiles = {name: film.tiles[name] for name in ("rgb", "seg", "obj")}
+    frames, episode = film.drive({"episode_seed": seed})
+    film.close()
+    images = [film.draw(frame) for frame in frames[-1 - last : -1 : every]]
+    images.append(film.draw(frames[-1], episode))
+    # One palette for all frames, with the rare colours too; without dithering: a sixth of the size.
+    sample = np.concatenate([*images[::3], images[-1]])
+    palette = Image.fromarray(sample).quantize(96, Image.Quantize.MAXCOVERAGE)
+    first, *others = [Image.fromarray(each).quantize(palette=palette, dither=0) for each in images]
+    durations = [1000 * every / episode.fps] * len(others) + [1000 * OUTCOME_S]
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def of_transforms(step_before, step, before, now, K):
+    """Returns the pictures of each transform's page, by label."""
     flows = {name: flow_to_rgb(now[name], scale) for name, scale in FLOW_SCALE_PX.items()}
     rgb = now["rgb"].numpy().transpose(1, 2, 0)
     return {
@@ -82,6 +127,7 @@ def pictures(step_before, step, before, now, K):
 
 
 def of_camera_motions(depth, K):
+    """Returns the flow that three motions of the camera cause."""
     ahead, aside, turned = (torch.eye(4) for _ in range(3))
     ahead[2, 3], aside[0, 3] = 0.8, 0.3
     angle = torch.tensor(0.05)
@@ -95,11 +141,13 @@ def of_camera_motions(depth, K):
 
 
 def of_parts(instance):
+    """Returns ids coloured by the part of a person: body, left leg, right leg."""
     ids = instance[0].long()
     return PARTS[torch.where(ids > 0, (ids - 1) % 3 + 1, 0).numpy()]
 
 
 def of_estimates(step_before, step, now, K):
+    """Returns object flow, exact and from estimated flow, with the camera compensated or not."""
     pair = torch.cat([step_before["rgb"], step["rgb"]])
     size = {"picture_scale": pair.shape[-1] // SIZE_PX}
     plain = EstimatedFlow(**size).compute(pair)[0]
@@ -114,6 +162,7 @@ def of_estimates(step_before, step, now, K):
 
 
 def of_depth_kinds(depth, K):
+    """Returns depth along the axis, the length of the ray beyond it, and a z-buffer."""
     points = unproject(depth.double(), K)
     ray = points.norm(dim=-1)[None]
     error = torch.where(depth.isinf(), 0.0, ray - depth.double())
@@ -128,8 +177,9 @@ def of_depth_kinds(depth, K):
 
 
 def grey(values):
+    """Returns values from 0 to 1 as a grey picture."""
     return (255 * values[0].clamp(0, 1)).to(torch.uint8).numpy()[..., None].repeat(3, -1)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(Path(sys.argv[1]))
