@@ -20,7 +20,7 @@ import shapely
 from flowrep.envs import StreetEnv
 from flowrep.envs.episode import Moment
 from flowrep.scenes import load_scene, scene_names
-from flowrep.scenes.scene import VehicleState
+from flowrep.scenes.vehicle import VehicleState
 
 MAPS = ("depth", "semantic", "instance")
 VIEWS_AN_EPISODE = 10

@@ -18,7 +18,8 @@ from flowrep.envs.episode import Episode
 from flowrep.envs.street_env import StreetEnv
 from flowrep.scenes.layout import Layout, free_ground
 from flowrep.scenes.pedestrians import RADIUS_M as PERSON_RADIUS_M
-from flowrep.scenes.scene import NO_OP, YAW_SIGN, Path, VehicleState, footprint_corners, roll, turn
+from flowrep.scenes.scene import Path
+from flowrep.scenes.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
 
 Array = NDArray[Any]
 _ACTIONS = np.array([0, 1, 2])

@@ -13,7 +13,8 @@ from flowrep.envs.episode import Episode, Moment, Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import FRAME_RATES_HZ, YAW_SIGN, Range, Scene, SpeedMode, VehicleState
+from flowrep.scenes.scene import FRAME_RATES_HZ, Range, Scene, SpeedMode
+from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
 from flowrep.simulator.street import Street
 
 _OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz")

@@ -18,7 +18,8 @@ from flowrep.envs.street_env import StreetEnv
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import YAW_SIGN, Range, Scene, SpeedMode
+from flowrep.scenes.scene import Range, Scene, SpeedMode
+from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer, sampled_intrinsics
 from flowrep.transforms import Mirror, representation_stack
 from flowrep.transforms.stack import FLOWS
