@@ -5,19 +5,128 @@ apt-get install mesa-vulkan-drivers        # on a CPU, in version 25 or newer
 python examples/maniskill_flow.py strip.png
 """
 
+from __future__ import annotations
+
 import sys
+from typing import Any
 
 import gymnasium as gym
-import mani_skill.envs  # noqa: F401 - registers the envs
 import torch
-from torchrl.envs import TransformedEnv
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from flowrep.maniskill import ManiSkillEnv, flow_transforms
+from flowrep import transforms
 from flowrep.testing import check_flow
+
+
+class ManiSkillEnv(EnvBase):
+    """A batch of ManiSkill's environments, with one camera's maps and the poses of all bodies.
+
+    TorchRL's `GymWrapper` takes a ManiSkill env of one environment for an unbatched one.
+
+    | writes under `"sensor"` | shape | from |
+    | --- | --- | --- |
+    | `rgb` | uint8 `[N, 3, H, W]` | |
+    | `millimetres` | int16 `[N, H, W, 1]`, 0 is nothing | `depth` |
+    | `instance` | int16 `[N, 1, H, W]`, 0 is the background | `segmentation` |
+    | `world_from_body` | float32 `[N, M, 4, 4]`, row i - 1 of id i | `segmentation_id_map` |
+    | `opengl_pose` | float32 `[N, 4, 4]`, camera to world | `cam2world_gl` |
+    | `K` | float32 `[N, 3, 3]`, pixel centres at halves | `intrinsic_cv` |
+
+    `flow_transforms()` makes raw, ego and obj of them. A part of the robot that moves with the
+    camera stands still in the picture, so its object flow is minus the ego flow.
+
+    Args:
+        env: made with `obs_mode="rgb+depth+segmentation"`.
+        camera: a sensor's name, e.g. `"base_camera"`.
+    """
+
+    def __init__(self, env: Any, camera: str) -> None:
+        self.env, self.camera = env, camera
+        batch = torch.Size([env.unwrapped.num_envs])
+        super().__init__(device=env.unwrapped.device, batch_size=batch)
+        observation, _ = env.reset(seed=0)
+        sensor = self._sensor(observation)
+        spec: dict[str, Any] = {
+            name: Unbounded(x.shape, dtype=x.dtype, device=self.device)
+            for name, x in sensor.items()
+        }
+        spec["rgb"] = Bounded(0, 255, sensor["rgb"].shape, dtype=torch.uint8, device=self.device)
+        self.observation_spec = Composite(sensor=Composite(spec, shape=batch), shape=batch)
+        space = env.unwrapped.single_action_space
+        low, high = (
+            torch.as_tensor(bound, device=self.device).expand(*batch, -1)
+            for bound in (space.low, space.high)
+        )
+        self.action_spec = Bounded(low, high, low.shape, dtype=low.dtype, device=self.device)
+        self.reward_spec = Unbounded((*batch, 1), device=self.device)
+        flag = Binary(1, (*batch, 1), dtype=torch.bool, device=self.device)
+        ends = {name: flag.clone() for name in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(ends, shape=batch)
+
+    def _sensor(self, observation: dict[str, Any]) -> dict[str, Tensor]:
+        maps = observation["sensor_data"][self.camera]
+        camera = observation["sensor_param"][self.camera]
+        bodies = self.env.unwrapped.segmentation_id_map
+        poses = torch.eye(4, device=self.device).repeat(*self.batch_size, max(bodies), 1, 1)
+        for number, body in bodies.items():
+            poses[:, number - 1] = body.pose.to_transformation_matrix()
+        return {
+            "rgb": maps["rgb"].movedim(-1, -3),
+            "millimetres": maps["depth"].clone(),
+            "instance": maps["segmentation"].movedim(-1, -3).clone(),
+            "world_from_body": poses,
+            "opengl_pose": camera["cam2world_gl"].clone(),
+            "K": camera["intrinsic_cv"].clone(),
+        }
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        options = {}
+        if tensordict is not None and "_reset" in tensordict:
+            options["env_idx"] = tensordict["_reset"].flatten().nonzero().flatten()
+        observation, _ = self.env.reset(options=options)
+        return self._tensordict(sensor=self._sensor(observation))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        observation, reward, terminated, truncated, _ = self.env.step(tensordict["action"])
+        return self._tensordict(
+            sensor=self._sensor(observation),
+            reward=reward.float().unsqueeze(-1),
+            terminated=terminated.unsqueeze(-1),
+            truncated=truncated.unsqueeze(-1),
+            done=(terminated | truncated).unsqueeze(-1),
+        )
+
+    def _tensordict(self, **values: Any) -> TensorDictBase:
+        return TensorDict(values, self.batch_size, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.env.reset(seed=seed)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Closes the env."""
+        super().close(raise_if_closed=raise_if_closed)
+        self.env.close()
+
+
+def flow_transforms() -> Compose:
+    """Returns the transforms that write raw, ego and obj of a `ManiSkillEnv`."""
+    named = {"depth": ("sensor", "millimetres"), "cam2world_gl": ("sensor", "opengl_pose")}
+    K = ("sensor", "K")
+    return Compose(
+        *transforms.sensors_from("maniskill", keys=named),
+        transforms.InstanceMotion(),
+        transforms.RawFlow(K),
+        transforms.FlowFactorize(K),
+    )
 
 
 def make_env(task: str = "PickCube-v1", camera: str = "hand_camera") -> TransformedEnv:
     """Returns a task as a TorchRL env that writes raw, ego and obj as its camera sees them."""
+    import mani_skill.envs  # noqa: F401 - registers the envs
+
     robot = {"robot_uids": "panda_wristcam"} if camera == "hand_camera" else {}
     env = gym.make(task, obs_mode="rgb+depth+segmentation", max_episode_steps=50, **robot)
     return TransformedEnv(ManiSkillEnv(env, camera), flow_transforms())

@@ -32,7 +32,7 @@ def camera(fx=4.0, cx=1.5, fy=8.0, cy=1.0) -> torch.Tensor:
 
 
 def test_world_axes_and_yaw():
-    motion = pytest.importorskip("flowrep.envs.sensing", exc_type=ImportError)
+    motion = pytest.importorskip("flowrep.simulator.motion", exc_type=ImportError)
     at_yaw_0, left = motion.planar(5.0, 7.0, 0.0), motion.planar(5.0, 7.0, torch.pi / 2)
     one_ahead = [1.0, 0.0, 0.0, 1.0]
     assert (at_yaw_0 @ one_ahead).tolist() == [6.0, 7.0, 0.0, 1.0]

@@ -9,7 +9,7 @@ from torchrl.envs import TransformedEnv
 
 from flowrep.baselines.planner import Planner
 from flowrep.envs import StreetEnv, street_envs
-from flowrep.scenes.scene import NO_OP
+from flowrep.scenes.vehicle import NO_OP
 
 __all__ = ["BASELINES", "Baseline", "BaselinePolicy", "Planner", "RandomActions", "never_turn"]
 

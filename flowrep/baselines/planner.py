@@ -1,7 +1,7 @@
 """A privileged baseline that knows every pose, present and future, and searches ahead.
 
-It is not an agent but an upper bound for a scene: a beam search that simulates the episode from
-the present to the ending zone and keeps only drives without a collision.
+It is no agent but an upper bound for a scene: a beam search that simulates the rest of the episode
+up to the ending zone and keeps only drives without a collision.
 """
 
 import heapq
@@ -18,16 +18,24 @@ from flowrep.envs.episode import Episode
 from flowrep.envs.street_env import StreetEnv
 from flowrep.scenes.layout import Layout, free_ground
 from flowrep.scenes.pedestrians import RADIUS_M as PERSON_RADIUS_M
-from flowrep.scenes.scene import NO_OP, YAW_SIGN, Path, VehicleState, footprint_corners, roll, turn
+from flowrep.scenes.scene import Path
+from flowrep.scenes.vehicle import NO_OP, YAW_SIGN, VehicleState, footprint_corners, roll, turn
 
 Array = NDArray[Any]
 _ACTIONS = np.array([0, 1, 2])
-_HOLD_STEPS = 2  # steps for which each decision of the search is held
+_HOLD_STEPS = 2  # steps that each decision of the search holds for
 _MARGIN_M = 0.1  # distance kept from people and from the road's edge
-_LOOK_AHEAD_M = 6.0
-# States in the same cell are interchangeable: x, y in metres, yaw and yaw rate in degrees.
+# States in the same cell are interchangeable: x, y in metres, yaw and yaw rate in degrees. Only the
+# best of a cell is kept, so that a beam holds different drives and not variants of one.
 _CELL = np.array([0.5, 0.5, 4.0, 6.0])
-_GRID_M = 0.5  # of the distances to the ending zone
+# A state's cost is the way to the ending zone from two points ahead of it, at half of this distance
+# and at all of it, so that a vehicle which faces the right way is ahead of one which does not.
+_LOOK_AHEAD_M = 6.0
+_TURNING_M_PER_DPS = 0.02  # added to the cost: of two equal ways the straighter one wins
+_OFF_ROAD_M = (
+    1e6  # most that a cost counts; off the road it is inf, beside which turning is nothing
+)
+_GRID_M = 0.5  # cells of the distances to the ending zone
 _NEIGHBOURS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 
 
@@ -80,7 +88,8 @@ class GoalDistance:
         is_open = np.pad(shapely.contains_xy(free, *grid), 1)
         is_goal = is_open & np.pad(shapely.contains_xy(goal, *grid), 1)
         self._way = np.where(is_goal, 0.0, np.inf)
-        # Dijkstra's algorithm, outwards from the ending zone.
+        # Dijkstra's algorithm, outwards from all cells of the ending zone at once. scipy's would
+        # need as many lines to build the graph, and nothing else in the simulation needs scipy.
         queue = [(0.0, i, j) for i, j in np.argwhere(is_goal).tolist()]
         while queue:
             way, i, j = heapq.heappop(queue)
@@ -99,14 +108,14 @@ class GoalDistance:
         return self._way[cell[..., 0], cell[..., 1]]
 
 
-@lru_cache(maxsize=16)  # it takes a second, and planners of one scene share it
+@lru_cache(maxsize=16)  # takes a second, and all planners of a scene share it
 def _ground(layout: Layout, path: Path) -> tuple[shapely.Geometry, GoalDistance]:
     free = free_ground(layout, path)
     return free, GoalDistance(free, layout.zones[path.end])
 
 
 class _Search:
-    """Simulates one episode for many vehicles at once."""
+    """Simulates one episode for V vehicles at once; states hold arrays [V]."""
 
     def __init__(self, episode: Episode) -> None:
         self.episode, self.vehicle = episode, episode.layout.scene.vehicle
@@ -136,7 +145,7 @@ class _Search:
     def drive(
         self, state: VehicleState, actions: Array, ticks: int
     ) -> tuple[VehicleState, Array, Array]:
-        """Returns the states after one decision, and which are unharmed and which have arrived."""
+        """Returns the states after one decision, which of them are unharmed and which arrived."""
         alive, arrived = np.ones(actions.size, dtype=bool), np.zeros(actions.size, dtype=bool)
         signs = np.array(YAW_SIGN)[actions]
         for _ in range(_HOLD_STEPS):
@@ -157,7 +166,8 @@ class _Search:
         x, y, yaw, rate = (value[index] for value in state)
         ahead = [_LOOK_AHEAD_M * share for share in (0.5, 1.0)]
         to_go = sum(self.way(x + d * np.cos(yaw), y + d * np.sin(yaw)) for d in ahead)
-        order = np.argsort(np.minimum(to_go, 1e6) + 0.02 * np.abs(np.degrees(rate)), kind="stable")
+        turning = _TURNING_M_PER_DPS * np.abs(np.degrees(rate))
+        order = np.argsort(np.minimum(to_go, _OFF_ROAD_M) + turning, kind="stable")
         features = np.stack([x, y, np.degrees(yaw), np.degrees(rate)], axis=-1)[order]
         cells = np.round(features / _CELL).astype(np.int64)
         _, first = np.unique(cells, axis=0, return_index=True)
@@ -165,11 +175,13 @@ class _Search:
 
     def _touches(self, state: VehicleState, ticks: int) -> Array:
         people = self.episode.crowd.positions(ticks * self.episode.tick_s)
+        # Only people within reach of the box around all vehicles of the beam.
         reach = self.vehicle.length_m + self.vehicle.width_m
         low = np.array([state.x_m.min(), state.y_m.min()]) - reach
         high = np.array([state.x_m.max(), state.y_m.max()]) + reach
         people = people[((people > low) & (people < high)).all(axis=-1)]
-        # Distance of each person from each footprint, in the vehicle's axes.
+        # Distance [V, P] of each person from each footprint, in the vehicles' axes: how far the
+        # person is beyond the footprint's front or back, and beyond its sides.
         dx, dy = people[:, 0] - state.x_m[:, None], people[:, 1] - state.y_m[:, None]
         cosine, sine = np.cos(state.yaw_rad)[:, None], np.sin(state.yaw_rad)[:, None]
         ahead = np.abs(cosine * dx + sine * dy) - self.vehicle.length_m / 2

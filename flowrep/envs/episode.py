@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.pedestrians import Crowd, draw_crowd
-from flowrep.scenes.scene import YAW_SIGN, Range, Scene, VehicleState, footprint_corners, roll, turn
+from flowrep.scenes.scene import Range, Scene
+from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
 from flowrep.simulator.street import Street
 
 

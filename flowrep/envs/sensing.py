@@ -1,7 +1,8 @@
-"""What an env's camera senses: maps, and the motion of bodies and camera since the last step."""
+"""What a street's camera senses: maps, and the motion of bodies and camera since the last step."""
 
 from collections.abc import Sequence, Set
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from gymnasium import spaces
@@ -12,23 +13,10 @@ from flowrep.palette import CLASS_COLOURS, num_classes
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
 from flowrep.simulator import camera
 from flowrep.simulator.bullet import Picture
-from flowrep.simulator.motion import instance_motion, relative_motion, rigid_inverse
+from flowrep.simulator.motion import instance_motion, planar, relative_motion, rigid_inverse
 from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
-
-
-def planar(x_m: Any, y_m: Any, yaw_rad: Any) -> Array:
-    """Returns the transforms [..., 4, 4] of planar poses, from body to world axes."""
-    sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
-    transforms = np.zeros((*np.shape(yaw_rad), 4, 4))
-    transforms[..., 0, 0] = transforms[..., 1, 1] = cosine
-    transforms[..., 0, 1], transforms[..., 1, 0] = -sine, sine
-    transforms[..., 0, 3], transforms[..., 1, 3] = x_m, y_m
-    transforms[..., 2, 2] = transforms[..., 3, 3] = 1.0
-    return transforms
-
-
 Arrays = dict[str, Array]
 SENSORS = ("depth", "semantic", "instance", "prev_from_curr", "instance_motion", "rgb", "frame")
 _MAPS = frozenset({"depth", "semantic", "instance"})
@@ -36,7 +24,20 @@ _DRAWN = _MAPS | {"rgb"}
 
 
 class Sensing:
-    """The camera of one environment and the requested sensors."""
+    """The camera of a street and the requested sensors; it draws any number of episodes at once.
+
+    It has no state of an episode, so all environments of a process with one street and the same
+    options share it.
+    """
+
+    @classmethod
+    def shared(cls, street: Street, sensors: Sequence[str], renderer: str, scale: int) -> "Sensing":
+        """Returns the one that all environments of the process with these options share."""
+        key = street, tuple(sensors), renderer, scale
+        sensing = _SHARED.get(key)
+        if sensing is None:
+            sensing = _SHARED[key] = cls(*key)
+        return sensing
 
     def __init__(self, street: Street, sensors: Sequence[str], renderer: str, scale: int) -> None:
         if unknown := [name for name in sensors if name not in SENSORS]:
@@ -47,7 +48,7 @@ class Sensing:
         self._size = config.height_px, config.width_px
         self._range_m = config.near_m, config.far_m
         pinhole = config.focal_px, config.focal_px, *self._size
-        self.K = camera.sampled_intrinsics(*pinhole)
+        self.K = camera.sensor_intrinsics(config)
         self._projection = camera.gl_projection(*pinhole, *self._range_m)
         self._vehicle_from_cam = camera.vehicle_from_camera(config)
         self._ids_by_number = street.ids_by_number()
@@ -155,3 +156,6 @@ class Sensing:
         """Returns world_from_cam [N, 4, 4]."""
         x_m, y_m, yaw_rad, _ = np.array([moment.vehicle for moment in moments]).T
         return planar(x_m, y_m, yaw_rad) @ self._vehicle_from_cam
+
+
+_SHARED: WeakValueDictionary[tuple[Any, ...], Sensing] = WeakValueDictionary()

@@ -13,7 +13,8 @@ from flowrep.envs.episode import Episode, Moment, Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
 from flowrep.palette import num_classes
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import FRAME_RATES_HZ, YAW_SIGN, Range, Scene, SpeedMode, VehicleState
+from flowrep.scenes.scene import FRAME_RATES_HZ, Range, Scene, SpeedMode
+from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
 from flowrep.simulator.street import Street
 
 _OPTIONS = ("episode_seed", "path", "vehicle_speed_mps", "speed", "frame_rate_hz")
@@ -71,12 +72,12 @@ class StreetEnv(gym.Env):
             )
         self.scene = load_scene(scene)
         self.speed_mps = _speed_range(self.scene, speed)
-        self.frame_rate_hz = _frame_rate(self.scene, frame_rate_hz)
+        self.frame_rate_hz = checked_frame_rate(self.scene, frame_rate_hz)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.frame_rate_hz}
         self.num_classes = num_classes(self.scene.categories)
         self._street = Street.shared(self.scene)
-        self.sensing = Sensing(self._street, sensors, renderer, picture_scale)
+        self.sensing = Sensing.shared(self._street, sensors, renderer, picture_scale)
         self.K = self.sensing.K
         self._episode: Episode | None = None
         self.action_space = spaces.Discrete(len(YAW_SIGN))
@@ -175,7 +176,7 @@ class StreetEnv(gym.Env):
             raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 to stand")
         self._episode = Episode(
             self._street.layout,
-            _frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),
+            checked_frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),
             operator.index(options["episode_seed"]),
             _speed_range(self.scene, options.get("speed", self.speed_mps)),
             float(vehicle_speed_mps),
@@ -204,7 +205,8 @@ def _speed_range(scene: Scene, speed: SpeedMode | Range) -> Range:
     return low, high
 
 
-def _frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
+def checked_frame_rate(scene: Scene, frame_rate_hz: float | None) -> float:
+    """Returns a frame rate in 1/s, the scene's own for None; ValueError if it is out of range."""
     rate = scene.frame_rate_hz if frame_rate_hz is None else float(frame_rate_hz)
     lowest, highest = FRAME_RATES_HZ
     if not lowest <= rate <= highest:

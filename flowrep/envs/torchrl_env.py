@@ -10,18 +10,19 @@ import torch
 from gymnasium.vector import VectorEnv
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
-from torchrl.envs import Compose, ExcludeTransform, GymWrapper, TransformedEnv
+from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
 from flowrep.envs.sensing import SENSORS
-from flowrep.envs.street_env import StreetEnv
+from flowrep.envs.street_env import StreetEnv, checked_frame_rate
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
+from flowrep.palette import num_classes
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import YAW_SIGN, Range, Scene, SpeedMode
-from flowrep.simulator.camera import choose_renderer, sampled_intrinsics
+from flowrep.scenes.scene import Range, Scene, SpeedMode
+from flowrep.scenes.vehicle import YAW_SIGN
+from flowrep.simulator.camera import choose_renderer, sensor_intrinsics
 from flowrep.transforms import Mirror, representation_stack
-from flowrep.transforms.stack import FLOWS
+from flowrep.transforms.stack import FLOWS, DropKeys
 
 
 def usable_device(device: str | torch.device) -> torch.device:
@@ -85,18 +86,6 @@ class VectorWrapper(GymWrapper):
         return kwargs | {"options": {**(kwargs.get("options") or {}), **mask}}
 
 
-class DropSensor(ExcludeTransform):
-    """Drops all ("sensor", ...) keys after the representations have been computed from them."""
-
-    def __init__(self) -> None:
-        super().__init__("sensor")
-
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Returns the specs without "sensor", which TorchRL's own looks for among their leaves."""
-        del output_spec["full_observation_spec"]["sensor"]
-        return output_spec
-
-
 def make_env(
     scene: str | Path | Mapping[str, Any] | Scene = "straight_road",
     representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None] = (),
@@ -156,33 +145,31 @@ def make_env(
         picture_scale = flow.get("picture_scale", picture_scale)
     drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}
     street = partial(StreetEnv, loaded, speed, frame_rate_hz, **drawn)
-    # An environment without sensors gives the transforms K, classes and frame rate.
-    probe = street(sensors=())
+    frame_rate_hz = checked_frame_rate(loaded, frame_rate_hz)
     transforms = Compose()
     if representations:
         transforms = representation_stack(
             representations,
-            intrinsics=torch.from_numpy(probe.K),
-            num_classes=probe.num_classes,
-            dt_s=1.0 / probe.frame_rate_hz,
+            intrinsics=torch.from_numpy(sensor_intrinsics(loaded.camera)),
+            num_classes=num_classes(loaded.categories),
+            dt_s=1.0 / frame_rate_hz,
             compiled=compiled,
             flow=flow,
             motion=motion,
             noise=noise,
         )
-    probe.close()
     sensors = sensors_read(transforms)
     if keep_sensor:  # these two only if something reads them
         sensors = [name for name in SENSORS if name in sensors or name not in ("rgb", "frame")]
     elif sensors:
-        transforms.append(DropSensor())
+        transforms.append(DropKeys("sensor"))
     factories = [partial(street, sensors=sensors)] * num_envs
     base = VectorWrapper(
         WorkerVectorEnv(factories, num_workers, in_each=StreetVectorEnv)
         if num_workers
         else StreetVectorEnv(factories),
         loaded,
-        probe.frame_rate_hz,
+        frame_rate_hz,
         transforms,
         device=device,
         categorical_action_encoding=True,
@@ -205,8 +192,7 @@ def make_mirror(
     >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
     tensor([0, 2, 1])
     """
-    camera, names = load_scene(scene).camera, list(representations)
-    K = sampled_intrinsics(camera.focal_px, camera.focal_px, camera.height_px, camera.width_px)
+    names, K = list(representations), sensor_intrinsics(load_scene(scene).camera)
     flows = [name for name in names if name in FLOWS]
     swapped = [YAW_SIGN.index(-sign) for sign in YAW_SIGN]
     return Mirror(names, flow_keys=flows, swapped_actions=swapped, intrinsics=K.tolist())

@@ -44,6 +44,13 @@ class StreetVectorEnv(SyncVectorEnv):
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]]) -> None:
         super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
         self._streets: list[Any] = [env.unwrapped for env in self.envs]
+        cameras = {street.sensing for street in self._streets}
+        if len(cameras) != 1:
+            raise ValueError(
+                "environments that are drawn together need the same scene, sensors, renderer and "
+                "picture_scale; make a vector env for each"
+            )
+        (self._sensing,) = cameras
         sensor: Any = self.single_observation_space
         nested: dict[str, spaces.Space] = {"sensor": sensor} if sensor.spaces else {}
         self.single_observation_space = spaces.Dict(nested | _STATUS)
@@ -86,12 +93,17 @@ class StreetVectorEnv(SyncVectorEnv):
             rewards[i], ended[i] = reward(outcome), outcome != Outcome.RUNNING
         return self._observe(driven), rewards, ended, np.zeros_like(ended), {}
 
+    def close_extras(self, **kwargs: Any) -> None:
+        """Closes the environments, with the last of which the street's simulator goes."""
+        super().close_extras(**kwargs)
+        del self._sensing
+
     def _observe(self, rows: list[int]) -> dict[str, Any]:
         """Renders some environments; the others keep their last observation, at first zeros."""
         if not rows:
             return deepcopy(self._latest)
         episodes = [self._streets[row].episode for row in rows]
-        sensor = self._streets[rows[0]].sensing.observe_all(episodes)
+        sensor = self._sensing.observe_all(episodes)
         observation = ({"sensor": sensor} if sensor else {}) | _status(episodes)
         if len(rows) < self.num_envs:
             # Arrays returned before belong to the caller: copy them instead of writing to them.

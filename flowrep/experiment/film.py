@@ -20,7 +20,7 @@ from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import Episode, evaluate, outcome_shares
 from flowrep.files import replace_file
 from flowrep.palette import OUTCOME_COLOURS
-from flowrep.scenes.scene import YAW_SIGN
+from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import representation_stack
 from flowrep.transforms.stack import FLOWS, representation_options

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from flowrep.config import UsageError
 from flowrep.experiment.evaluation import Policy, evaluate
 from flowrep.experiment.film import Film, Frame, how_it_ended
-from flowrep.scenes.scene import NO_OP, TURN_LEFT, TURN_RIGHT
+from flowrep.scenes.vehicle import NO_OP, TURN_LEFT, TURN_RIGHT
 
 
 class NewEpisode(Exception):

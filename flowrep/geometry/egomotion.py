@@ -1,16 +1,23 @@
 """The camera's motion from flow and depth: the robust inverse of ego flow.
 
 With x the ray of pixel p (z = 1), q the inverse of its depth and `prev_from_curr` = (R, T), the
-point that p shows was seen at the projection of R x + q T. The residual is this place minus raw
+point that p shows was seen at the projection of R x + q T. The residual is this point minus raw
 flow's p', in pixels. Sky has q = 0 and so constrains the rotation alone, without a case of its own.
 
-Moving bodies are outliers. The start is the best of many motions, each from four pixels; then
-Gauss-Newton steps on more pixels with Geman-McClure weights, whose scale follows the residuals. Few
-pixels can't tell 49 % from 51 %: the motion of what the best one leaves unexplained is a candidate
-too, and all pixels choose between the two.
+Moving bodies are outliers, so the motion is found in three stages:
 
-The pixels are in an order like that of chance, fixed for a size of picture. In any regular one,
-some columns would stand for the picture, and a body that fills these would win.
+1. Hypotheses: many motions, each from four pixels (RANSAC), scored on some hundred pixels by a
+   truncated cost. The best few are refined and scored again (`_best_hypothesis`).
+2. Some hundred pixels can't tell 49 % from 51 %. The motion of what the best hypothesis leaves
+   unexplained is therefore a candidate too, and all pixels choose between the two.
+3. Gauss-Newton steps on more pixels with Geman-McClure weights, whose scale follows the residuals
+   (`_descended`), and the covariance of the result (`_described`).
+
+Pixels are taken in a pseudo-random order, fixed for a size of picture. In a regular order, such as
+every tenth column, a body that fills those columns would win.
+
+Shapes: B is the number of frames, N of pixels, M of motions. Values of pixels are `[B, channels,
+N]`, so that the sums over pixels in the normal equations are matrix products.
 """
 
 from __future__ import annotations
@@ -29,17 +36,21 @@ from flowrep.geometry.closed_form import LARGEST, MIN_DEPTH_RATIO, SMALLEST, kno
 
 VOTERS = 1 << 15  # all pixels of smaller pictures; more would change 1 % of votes by chance
 PIXELS = 1536  # used in a Gauss-Newton step; more gain nothing
-SCORED_PIXELS = 320
+SCORED_PIXELS = 320  # that score a hypothesis
+# Four pixels, eight equations for six unknowns. If half of the pixels move with bodies, one draw in
+# 16 has static ones alone: 64 draws miss with a probability of 0.94^64 = 2 %.
 HYPOTHESES, PIXELS_EACH = 64, 4
 MIN_PIXELS = 32  # fewer known ones tell no motion: four of them fit any
-_HYPOTHESIS_STEPS, _STEPS = 3, 4
+_HYPOTHESIS_STEPS, _STEPS = 3, 4  # Gauss-Newton steps of a hypothesis, and of the final motion
 
 # Which of the known pixels a hypothesis is from, as shares of their number. Drawn once, so that the
 # same frame has the same motion in every batch, process and replay.
 _random = random.Random(0)
 _DRAWS = [[_random.random() for _ in range(PIXELS_EACH)] for _ in range(HYPOTHESES)]
 
-_SCORE_SCALES, _LEAST_SCORE_PX = 1.5, 0.02  # where a pixel's cost in a score is half of its bound
+# A pixel's cost in a score is half of its bound at 1.5 standard deviations, and not below 0.02 px:
+# exact flow leaves residuals of rounding alone, by which no two motions can be compared.
+_SCORE_SCALES, _LEAST_SCORE_PX = 1.5, 0.02
 _PRIORS_FAVOUR = 1.5  # a body may fill 1.5 times as much as the static world, three fifths
 _REFINED, _REFINING_STEPS = 6, 2  # the best hypotheses, each led to its own optimum
 _RIVAL_STEPS = 3  # of the motion of what the best one leaves unexplained
@@ -53,6 +64,7 @@ _QUANTILE = 1 / 3  # of all residuals, for their scale: half of the pixels may b
 # That quantile of the length of a vector of two standard normal numbers.
 _RAYLEIGH = math.sqrt(-2 * math.log(1 - _QUANTILE))
 
+# For flow that is estimated from pictures.
 _WINDOW = 3  # side of the structure tensor's window, pixels
 _GRADIENT_NOISE = 12.0  # grey levels per pixel, of 255, from which a gradient counts as texture
 _LEAST_TEXTURE = 0.25  # of the structure's trace, 0 to 2, below which a pixel isn't known
@@ -213,8 +225,10 @@ def structure_tensor(picture: Tensor) -> Tensor:
     xx, xy, yy = functional.avg_pool2d(products, _WINDOW, 1, _WINDOW // 2).unbind(-3)
     noise = _GRADIENT_NOISE**2
     det = (xx + noise) * (yy + noise) - xy * xy
-    own = xx * yy - xy * xy
-    return torch.stack([own + noise * xx, noise * xy, own + noise * yy], -3) / det.unsqueeze(-3)
+    # S (S + n I)^-1, written out for 2 x 2: the inverse is the adjugate over the determinant.
+    det_S = xx * yy - xy * xy
+    rows = [det_S + noise * xx, noise * xy, det_S + noise * yy]
+    return torch.stack(rows, -3) / det.unsqueeze(-3)
 
 
 @functools.lru_cache(maxsize=16)
@@ -222,7 +236,7 @@ def _shuffled(height: int, width: int, device: torch.device) -> tuple[Tensor, Te
     """Returns the numbers of up to `VOTERS` pixels as if drawn, and their centres `[2, N]`."""
     bits = (1 << 32) - 1
     key = torch.arange(height * width, device=device)
-    for _ in range(2):  # a one-to-one hash of 32 bits
+    for _ in range(2):  # a hash that is one to one on 32 bits: distinct keys, so a fixed order
         key = ((key ^ (key >> 16)) * 0x45D9F3B) & bits
     pixel = (key ^ (key >> 16)).argsort()[:VOTERS]
     return pixel, torch.stack([pixel % width, pixel // width]) + 0.5
@@ -238,14 +252,13 @@ def _voters(
 ) -> _Samples:
     """Returns all pixels of small pictures, `VOTERS` of others, shuffled; none of unknown frames.
 
-    Their flow is that which the previous camera's pixels tell of the rays' motion: without the part
-    that a change of K causes by itself.
+    Their flow is without the part that a change of K causes by itself.
     """
     shuffled = _shuffled.__wrapped__ if torch.compiler.is_compiling() else _shuffled
     pixel, centres = shuffled(*flow.shape[-2:], flow.device)
     column, row = centres.to(flow.dtype)
     maps = [flow, depth] if structure is None else [flow, depth, structure]
-    # gathered, as indexing takes five times as long
+    # Gathered, as indexing takes five times as long.
     each = (m.flatten(-2).gather(-1, pixel.expand(*m.shape[:2], -1)) for m in maps)
     values = torch.cat([*each], 1)  # [B, 3 or 6, N]
     u, v, z = values[:, :3].unbind(1)
@@ -256,6 +269,7 @@ def _voters(
     (fx, skew, cx), (_, fy, cy), _ = _entries(K, values.dtype)
     y = (row - cy) / fy
     x = (column - cx - skew * y) / fx
+    # With another K before, a pixel moves although its ray does not; that part is added back.
     (fx, skew, cx), (_, fy, cy), _ = _entries(prev_K - K, values.dtype)
     moved = values[:, :2] + torch.stack([fx * x + skew * y + cx, fy * y + cy], 1)
     ray = torch.stack([x, y, torch.ones_like(x), values[:, 2].reciprocal()], 1)
@@ -267,6 +281,8 @@ def _voters(
 def _samples(voters: _Samples) -> _Samples:
     """Returns the first `PIXELS` known ones of the pixels, before unknown ones."""
     batch, looked_at = voters.known.shape
+    # Compaction without a loop or a sort: each known pixel is written to the slot of its rank among
+    # the known ones, all others to a slot beyond the end, which is cut off.
     rank = voters.known.long().cumsum(-1) - 1
     slot = torch.where(voters.known & (rank < PIXELS), rank, PIXELS)
     order = torch.zeros(batch, PIXELS + 1, dtype=torch.long, device=slot.device)
@@ -288,6 +304,8 @@ def _best_hypothesis(
 ) -> Tensor:
     """Returns the best of the expected motion and those that four pixels tell, `[B, 4, 4]`."""
     batch = len(expected)
+    # All hypotheses of all frames at once, as B * H frames of four pixels, in float64: four pixels
+    # in a row make normal equations that are nearly singular.
     draws = torch.tensor(_DRAWS, dtype=torch.float64, device=expected.device)
     drawn = samples.part((draws * samples.number[:, None, None]).long())  # [B, H, 4]
     each = _Samples(drawn.focal, drawn.values.double(), drawn.known, drawn.number)
@@ -295,7 +313,8 @@ def _best_hypothesis(
     for _ in range(_HYPOTHESIS_STEPS):
         at = _linearised(each, motion)
         normal, right = _normal_equations(each, at, at.in_front.double())
-        # Damped, so that four pixels in a row don't throw the motion away.
+        # Damped, relative to each parameter's own size and to the largest, so that a direction that
+        # four pixels don't tell leaves the motion where it is.
         diagonal = normal.diagonal(dim1=-2, dim2=-1)
         damping = 1e-9 * diagonal + 1e-12 * diagonal.amax(-1, keepdim=True) + 1e-30
         step = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)[0]
@@ -316,7 +335,8 @@ def _best_hypothesis(
     costs, scale = _costs(scored, motions, final=True)
     choice = (costs * favour[best]).argmin(-1, keepdim=True)
     motion = motions.gather(1, choice[..., None, None].expand(-1, -1, 4, 4)).squeeze(1)
-    # What it leaves unexplained may be the world, of which the few pixels showed too little.
+    # What it leaves unexplained may be the world, of which the few pixels showed too little. Looked
+    # for among other pixels than those that chose the motion.
     ru, rv, in_front, *_ = _residuals(others, motion)
     is_rest = _squared(others, ru, rv) > (_INLIER_SCALES * scale).square().unsqueeze(-1)
     unexplained = others._replace(known=others.known & in_front & is_rest)
@@ -338,9 +358,10 @@ def _costs(samples: _Samples, motions: Tensor, *, final: bool = False) -> tuple[
     known = in_front & samples.known.unsqueeze(1)
     squared = torch.where(known, _squared(samples, ru, rv), torch.inf)
     number = samples.known.sum(-1, keepdim=True)
-    # truncated at a few standard deviations of the residuals of the motion that fits best
+    # Truncated at a few standard deviations of the residuals of the motion that fits best.
     scale = _scale(squared, number).amin(-1) * (1.0 if final else _SCORE_SCALES)
     scale = scale.clamp(min=_LEAST_SCORE_PX)
+    # What a pixel is explained by, from 1 for no residual to 0: Geman-McClure's 1 - r² / (s² + r²).
     kept = (1 + squared / scale.square()[:, None, None]).reciprocal()
     return -(kept.square() if final else kept).sum(-1) / number.clamp(min=1), scale
 
@@ -378,7 +399,7 @@ def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
 
 def _scale(squared: Tensor, number: Tensor) -> Tensor:
     """Returns a robust standard deviation of residuals per channel, px, from `[..., N]` squares."""
-    every = max(4, squared.shape[-1] // 384)  # enough
+    every = max(4, squared.shape[-1] // 384)  # some 384 tell a quantile well enough, and sort fast
     squared = squared[..., ::every]  # unknown ones are inf and come last
     rank = (number * (_QUANTILE / every)).long().unsqueeze(-1).expand(*squared.shape[:-1], 1)
     return squared.sort(-1).values.gather(-1, rank).squeeze(-1).sqrt() / _RAYLEIGH
@@ -395,6 +416,9 @@ class _Linear(NamedTuple):
 
 
 def _linearised(samples: _Samples, motion: Tensor) -> _Linear:
+    # A small rotation w and shift t after the motion move a point P = (n, m, 1) / q, now in the
+    # previous camera, by w × P + t. The rows are the derivatives of n = x / z and m = y / z, first
+    # by the three angles, then by the three shifts.
     ru, rv, in_front, dn, dm, per_z = _residuals(samples, motion)
     n, m = samples.values[:, 0] + dn, samples.values[:, 1] + dm
     q = samples.values[:, 3] * per_z
@@ -462,7 +486,7 @@ def _weighted(samples: _Samples, motion: Tensor) -> _Weighted:
     moves = (weight.unsqueeze(1) * (at.Ju.square() + at.Jv.square())).sum(-1).double()
     unit = torch.where(moves > 1e-12, moves, torch.inf).rsqrt()
     scaled = (unit.unsqueeze(-1) * normal * unit.unsqueeze(-2)).nan_to_num(0.0, 0.0, 0.0)
-    values, vectors = torch.linalg.eigh(scaled)  # which would raise for the whole batch
+    values, vectors = torch.linalg.eigh(scaled)  # raises for the whole batch if one holds nan
     seen = values > _LEAST_EIGENVALUE
     return _Weighted(at, squared, scale, ratio, weight, right, unit, values, vectors, seen)
 
@@ -471,6 +495,8 @@ def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
     """Returns the motion after Gauss-Newton steps, along the directions that the pixels tell."""
     for _ in range(steps):
         now = _weighted(samples, motion)
+        # The step in the eigenbasis: a direction that no pixel tells keeps its value, where a
+        # solver would divide by nearly 0.
         along = (now.vectors.mT @ (now.unit * now.right).unsqueeze(-1)).squeeze(-1)
         along = torch.where(now.seen, along / now.values, 0.0)
         motion = _after(motion, -now.unit * (now.vectors @ along.unsqueeze(-1)).squeeze(-1))
@@ -480,17 +506,18 @@ def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
 def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Returns a motion's inlier share, its covariance and whether the pixels tell all of it."""
     now = _weighted(samples, motion)
-    # An M-estimator's covariance is A^-1 B A^-1, A the derivative of its equations: that of
-    # w(r^2) r is w (1 - 2 ratio / (1 + ratio)), averaged over the directions of r.
+    # An M-estimator's covariance is the sandwich A^-1 B A^-1: A is the derivative of its equations,
+    # B the covariance of their noise. A is the normal matrix times the mean slope of w(r^2) r,
+    # which is w (1 - 2 ratio / (1 + ratio)), averaged over the directions of r.
     weight, ratio, seen = now.weight, now.ratio, now.seen
     slope = torch.where(weight > 0, weight * (1 - 2 * ratio / (1 + ratio)), 0.0).sum(-1)
     slope = (slope / weight.sum(-1).clamp(min=1e-12)).clamp(min=0.1).double()
     spread = torch.where(weight > 0, weight.square() * now.squared / 2, 0.0)
-    own, _ = _normal_equations(samples, now.at, spread)
+    middle, _ = _normal_equations(samples, now.at, spread)
     scaled = now.unit[..., None] * now.vectors * torch.where(seen, now.values.rsqrt(), 0.0)[:, None]
     inverse = scaled @ scaled.mT
-    covariance = inverse @ own @ inverse / slope.square()[:, None, None]
-    # A parameter that a direction without information has a part in is not known at all.
+    covariance = inverse @ middle @ inverse / slope.square()[:, None, None]
+    # A parameter that has a part in a direction which no pixel tells is not known at all.
     is_open = (now.vectors.square() * ~seen.unsqueeze(-2)).sum(-1) > 1e-6  # [B, 6]
     covariance = torch.where(is_open.unsqueeze(-1) | is_open.unsqueeze(-2), 0.0, covariance)
     variance = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)  # of exact flow, rounding

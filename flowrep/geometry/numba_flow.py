@@ -1,8 +1,9 @@
 """Flow of large maps on a CPU in a single pass over the pixels; importing this needs numba.
 
-PyTorch needs some twenty passes for `closed_form.flow_planes`, each through memory. Here numba's
-machine code does the same operations in the same order, each rounded to float32, so that the
-results are bitwise equal. `flow` decides which maps are computed here.
+PyTorch needs some twenty passes for `closed_form.flow_planes`, each through memory: 11.3 ms for a
+step of 96 environments at 84 × 84, where these kernels take 3.7. They do the same operations in the
+same order, each rounded to float32, so that the results are bitwise equal. Change one only together
+with the other. `flow` decides which maps are computed here.
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ from flowrep.extras import compiled
 from flowrep.geometry.checks import check_rows
 from flowrep.geometry.closed_form import MIN_DEPTH_RATIO, SMALLEST, Planes, largest_raw
 
+# numpy's float32 scalars: a Python float would make numba compute in float64.
 _LEAST_DEPTH, _LEAST_RATIO = np.float32(SMALLEST), np.float32(MIN_DEPTH_RATIO)
 _LARGEST_RAW = np.float32(largest_raw(torch.float32))
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
-# "numpy": a division by 0 is inf, as in PyTorch, and leaves no branch in the loop
+# "numpy": a division by 0 is inf, as in PyTorch, without the branch that would raise. No fastmath,
+# as it may fuse or reorder operations, and the last bits would differ from PyTorch's.
 _compiled = compiled(error_model="numpy")
 
 
@@ -42,6 +45,7 @@ def planes_of_motions(
     *batch, height, width = depth.shape
     maps, motions = math.prod(batch), coefficients.shape[-2]
 
+    # Any batch becomes one of `maps` maps: all broadcast, flattened, without a copy if possible.
     def array(tensor: Tensor, *sizes: int) -> Any:
         rows = tensor.detach().expand((*batch, *sizes)).reshape((maps, *sizes))
         return rows.contiguous().numpy()
@@ -101,10 +105,15 @@ def _flow(z, x, y, far, near, dt):
 
 @_compiled
 def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
-    """Fills u, v and valid; returns the lowest and the highest id."""
+    """Fills u, v and valid `[N, H, W]`; returns the lowest and the highest id.
+
+    `depth` is `[N, H, W]`, `ids` the same or `[0, H, W]` without ids, `coefficients` `[N, M, 12]`,
+    `xs` `[N, W]`, `ys` `[N, H]` and `dts` `[N]`.
+    """
     lowest, highest = np.int64(0), np.int64(0)
     maps, height, width = depth.shape
     motions = coefficients.shape[1]
+    # First every pixel with its frame's motion 0, that of the static world ...
     for n in range(maps):
         c = coefficients[n, 0]
         near = (c[9], c[10], c[11])
@@ -117,7 +126,8 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
                 u[n, i, j], v[n, i, j], valid[n, i, j] = _flow(
                     depth[n, i, j], x, y, far, near, dts[n]
                 )
-    # Apart from the loop above, which has no branches and so computes many pixels at once.
+    # ... then again those of moving bodies, which are few. In one loop, the branch on the id would
+    # keep the compiler from computing many pixels at once.
     for n in range(len(ids)):
         for i in range(height):
             y = ys[n, i]
@@ -127,7 +137,7 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
                     continue
                 lowest, highest = min(lowest, number), max(highest, number)
                 if number < 0 or number >= motions:
-                    continue
+                    continue  # the caller refuses such ids
                 x, c = xs[n, j], coefficients[n, number]
                 far = (
                     c[0] * x + (c[1] * y + c[2]),
@@ -142,7 +152,7 @@ def _fill(depth, ids, coefficients, xs, ys, dts, u, v, valid):
 
 @_compiled
 def _subtract(raw, u, v, valid, obj, known):
-    """Fills obj and known."""
+    """Fills obj `[N, 2, H, W]` and known `[N, H, W]`."""
     for n in range(len(raw)):
         for i in range(raw.shape[2]):
             for j in range(raw.shape[3]):

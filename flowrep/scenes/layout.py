@@ -26,10 +26,9 @@ from flowrep.scenes.scene import (
     Path,
     Road,
     Scene,
-    VehicleState,
     Walk,
-    footprint_corners,
 )
+from flowrep.scenes.vehicle import VehicleState, footprint_corners
 
 Array = NDArray[np.float64]
 _ARC_STEP_DEG = 5.0

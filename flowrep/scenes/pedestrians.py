@@ -18,9 +18,9 @@ Array = NDArray[Any]
 
 RADIUS_M, HEIGHT_M = 0.3, 1.75  # of the collision cylinder
 APART_M = 2 * RADIUS_M  # between the centres of two who touch
-LANE_M = APART_M + 0.01  # between the middles of neighbouring lanes
+LANE_M = APART_M + 0.01  # least distance of neighbouring lanes: rounding must not make people touch
 PARTS = ("upper body", "left leg", "right leg")
-HIP_M, _HIP_ASIDE_M = 0.82, 0.1
+HIP_M, _HIP_ASIDE_M = 0.82, 0.1  # height of the hips, and their distance from the middle
 _SIDES = np.array([1.0, -1.0])  # of the legs: left is +y
 
 
@@ -31,7 +31,7 @@ def world_from_parts(poses: Array) -> Array:
     sine, cosine = np.sin(yaw), np.cos(yaw)
     angle = np.concatenate([np.zeros_like(swing), swing * _SIDES], axis=-1)
     sine_y, cosine_y = np.sin(angle), np.cos(angle)
-    # Rz(yaw) · Ry(angle)
+    # Rz(yaw) · Ry(angle): a leg swings about the axis of the hips, then the person turns.
     transforms[..., 0, 0] = cosine * cosine_y
     transforms[..., 0, 1] = -sine
     transforms[..., 0, 2] = cosine * sine_y
@@ -97,7 +97,8 @@ def least_spread_m(count: int) -> float:
 def draw_lanes(count: int, spread_m: float, rng: np.random.Generator) -> Array:
     """Returns each person's lane [P] as its distance in metres to the left of the walk."""
     # All placements within `spread_m` that are at least `LANE_M` apart are equally likely, and so
-    # are all orders of the people.
+    # are all orders of the people. Sorted uniform numbers on the width that is left, each moved
+    # aside by the lanes before it, have that distribution without a draw that must be repeated.
     free = max(spread_m - least_spread_m(count), 0.0)
     lanes = np.sort(rng.uniform(0.0, 1.0, count)) * free + LANE_M * np.arange(count)
     return rng.permutation(lanes - spread_m / 2)
@@ -110,11 +111,19 @@ _OUT_OF_STEP_RAD = 2.4  # offset between neighbours, so that a group does not ma
 
 
 class Crowd:
-    """All people of one episode, each begins at a phase in [0, 1) of the way there and back."""
+    """All people of one episode, whose poses at any time have a closed form.
+
+    Each walks a line to its end and back for ever, from a phase in [0, 1) of that round trip.
+
+    Args:
+        lines: everyone's line, points [M, 2] in metres.
+        speeds_mps: [P]; who has 0 stands.
+        phases: [P].
+    """
 
     def __init__(self, lines: list[Array], speeds_mps: Array, phases: Array) -> None:
         most = max((len(line) for line in lines), default=2)
-        # Shorter lines are padded with copies of their last point, which add no length.
+        # One array for all lines: shorter ones repeat their last point, which adds no length.
         padded = [line[np.minimum(np.arange(most), len(line) - 1)] for line in lines]
         self._points = np.array(padded).reshape(len(lines), most, 2)  # [P, M, 2]
         steps = np.diff(self._points, axis=1)
@@ -133,12 +142,12 @@ class Crowd:
 
     def positions(self, time_s: float | Array) -> Array:
         """Returns everyone's position [P, 2] at a time, or [T, P, 2] at times [T, 1]."""
-        return self._places(self._along(time_s))[0]
+        return self._on_lines(self._along(time_s))[0]
 
     def poses(self, time_s: float | Array) -> Array:
         """Returns everyone's pose [P, 4] at a time, or [T, P, 4] at times [T, 1]."""
         along = self._along(time_s)
-        positions, headings = self._places(along)
+        positions, headings = self._on_lines(along)
         poses = np.empty((*along.shape, 4))
         poses[..., :2] = positions
         poses[..., 2] = headings + self._facing(along)
@@ -152,7 +161,8 @@ class Crowd:
         # Metres walked since the near end, in [0, length of the round trip).
         return (self._start + self._speeds * time_s) % self._there_and_back
 
-    def _places(self, along: Array) -> tuple[Array, Array]:
+    def _on_lines(self, along: Array) -> tuple[Array, Array]:
+        # Positions [..., P, 2], and headings of the way out [..., P].
         at = np.minimum(along, self._there_and_back - along)
         pieces = (at[..., None] >= self._marks[:, 1:-1]).sum(axis=-1)
         here = self._people, np.minimum(pieces, self._last_piece)
@@ -160,7 +170,9 @@ class Crowd:
         return points + (at - self._marks[here])[..., None] * directions, self._headings[here]
 
     def _facing(self, along: Array) -> Array:
-        # 0 on the way out, π on the way back, with a uniform turn over _TURN_S at either end.
+        # The angle to the heading of the way out: 0 on it, π on the way back. At either end a
+        # person turns uniformly over _TURN_S, half of it before the end and half after, while
+        # walking on.
         past_far_end = along - self._length
         is_back = past_far_end > 0
         past_near_end = along - is_back * self._there_and_back
@@ -177,15 +189,16 @@ def draw_crowd(layout: Layout, speed_mps: Range, rng: np.random.Generator) -> Cr
     for group in layout.scene.pedestrian_groups:
         low, high = group.speed_mps or speed_mps
         draws = 1 if group.draw == "group" else group.count
-        # A uniform phase over the round trip draws the direction too.
+        # A uniform phase of the round trip also draws the direction. A group that is drawn as one
+        # shares phase and speed, and its people start up to half of `spread_m` ahead or behind.
         phase = np.resize(rng.uniform(0.0, 1.0, draws), group.count)
         speed = np.resize(rng.uniform(low, high, draws), group.count)
         lateral = draw_lanes(group.count, group.spread_m, rng)
         ahead = rng.uniform(-0.5, 0.5, group.count) * group.spread_m
-        own = [layout.walk_line(group.walk, aside) for aside in lateral.tolist()]
-        there_and_back = [2 * np.hypot(*np.diff(line, axis=0).T).sum() for line in own]
+        lanes = [layout.walk_line(group.walk, aside) for aside in lateral.tolist()]
+        there_and_back = [2 * np.hypot(*np.diff(lane, axis=0).T).sum() for lane in lanes]
         speed[: group.standing] = 0.0
-        lines += own
+        lines += lanes
         speeds.append(speed)
         phases.append((phase + ahead / there_and_back) % 1.0)
     return Crowd(lines, np.concatenate(speeds), np.concatenate(phases))

@@ -33,6 +33,11 @@ def sampled_intrinsics(fx_px: float, fy_px: float, height_px: int, width_px: int
     return np.array(rows)
 
 
+def sensor_intrinsics(camera: CameraConfig) -> Matrix:
+    """Returns the K [3, 3] of a scene's depth, class, instance and flow maps."""
+    return sampled_intrinsics(camera.focal_px, camera.focal_px, camera.height_px, camera.width_px)
+
+
 def gl_projection(
     fx_px: float, fy_px: float, height_px: int, width_px: int, near_m: float, far_m: float
 ) -> list[float]:

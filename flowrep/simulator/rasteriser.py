@@ -1,9 +1,10 @@
-"""A fast rasteriser for depth, class and instance maps and colours, instead of PyBullet's renderer.
+"""A fast rasteriser for depth, class, instance and colour maps, ten times as fast as PyBullet's.
 
-A vertex becomes q = z · (u, v, 1): pixel coordinates times depth. In this frame the edges of a
-triangle are planes through the camera, e_a = q_b × q_c, and pixel r = (u, v, 1) lies inside if
-e_a · r ≥ 0 for all three. With d = q_a · e_a the inverse depth is (e_a + e_b + e_c) · r / d, affine
-in u and v. This also holds for corners behind the camera, so nothing needs to be clipped.
+It draws by edge functions in homogeneous coordinates (Olano and Greer, 1997). A corner becomes
+q = z · (u, v, 1), pixel coordinates times depth. In these coordinates the edges of a triangle are
+planes through the camera, e_a = q_b × q_c, and pixel r = (u, v, 1) lies inside if e_a · r ≥ 0 for
+all three. With d = q_a · e_a the inverse depth is (e_a + e_b + e_c) · r / d, affine in u and v.
+Both also hold for corners behind the camera, so no triangle has to be clipped.
 """
 
 import math
@@ -25,7 +26,8 @@ _FRONT_LEVELS = FRONT_SIZE.bit_length()
 _NO_TABLES = np.empty((0, 0, 2), np.float32), np.empty((0, 0, 0, 3), np.float32)
 
 
-# numpy's error model saves a branch at each division: a tenth of the time of large scenes
+# numpy's error model saves a branch at each division: a tenth of the time of large scenes.
+# fastmath is for colours alone: it reorders sums, and maps must not depend on the compiler.
 _compiled = compiled(error_model="numpy")
 _shading = compiled(error_model="numpy", fastmath=True)
 _inlined = compiled(error_model="numpy", fastmath=True, inline="always")
@@ -50,10 +52,10 @@ class Rasteriser:
         size: tuple[int, int],  # height, width
         range_m: tuple[float, float],  # of the visible depths
     ) -> None:
-        # Column i is sampled at u = i + 0.5.
+        # Kernels count pixels by index, and column i is sampled at u = i + 0.5.
         K_of_index = K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
         shape = triangles[: triangles._fields.index("poses") + 1]
-        # Triangles are what is drawn, so classes, instances and poses are looked up by triangle.
+        # A pixel knows its triangle, so classes, instances and poses are stored by triangle.
         counts = np.diff(triangles.corner_bounds)
         owners, poses = np.repeat(triangles.bodies, counts), np.repeat(triangles.poses, counts)
         ids = triangles.semantic[owners], triangles.instance[owners]
@@ -90,13 +92,16 @@ def _draw(
     K, near_m, far_m, look, cam_from_world, world_from_body, is_shown,
     depth, semantic, instance, rgb,
 ):  # fmt: skip
+    # `inverse` is a z-buffer of inverse depths: nearer is larger. It starts with the far plane's,
+    # and `number`, the triangle that a pixel shows, with the sky's -1. Each triangle takes the
+    # pixels where it is nearer; ids and colours are looked up once, when all triangles are drawn.
     views, height, width = depth.shape
     planes = _side_planes(K, height, width)
     most = (point_bounds[1:] - point_bounds[:-1]).max()
     q = np.empty((most, 3))
     inverse = np.empty((height, width))
     number = np.empty((height, width), dtype=np.int32)
-    into = np.empty((3, 4))
+    into = np.empty((3, 4))  # cam_from_body, written anew for each chunk
     for n in range(views):
         inverse[:] = 1.0 / far_m
         number[:] = -1
@@ -104,6 +109,7 @@ def _draw(
             if not is_shown[n, bodies[c]]:
                 continue
             _compose(cam_from_world[n], world_from_body[n], poses[c], into)
+            # Chunks of up to 24 triangles have a bounding sphere: most are out of view.
             if _is_outside(into, centres[c], radii[c], planes, near_m, far_m):
                 continue
             first = point_bounds[c]
@@ -119,7 +125,8 @@ def _draw(
 
 @_compiled
 def _side_planes(K, height, width):
-    # Inward unit normals of the four planes through the outermost samples.
+    # Inward unit normals [4, 3] of the planes through the camera and the outermost samples: of the
+    # columns 0 and width - 1 (x / z at `left` and `right`) and the rows 0 and height - 1.
     left, right = -K[0, 2] / K[0, 0], (width - 1 - K[0, 2]) / K[0, 0]
     top, bottom = -K[1, 2] / K[1, 1], (height - 1 - K[1, 2]) / K[1, 1]
     sides = [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
@@ -131,6 +138,8 @@ def _side_planes(K, height, width):
 
 @_compiled
 def _compose(cam_from_world, world_from_body, pose, into):
+    # cam_from_body [3, 4]; pose -1 is the static world, whose points are in world axes already.
+    # Written out, since numba's `@` calls the BLAS of scipy, which isn't installed here.
     for i in range(3):
         for j in range(4):
             if pose < 0:
@@ -161,6 +170,7 @@ def _moved(m, p):
 
 @_compiled
 def _project(K, cam_from_body, point, q):
+    # q = z · (u, v, 1), without a division; K has no skew.
     x, y, z = _moved(cam_from_body, point)
     q[0] = K[0, 0] * x + K[0, 2] * z
     q[1] = K[1, 1] * y + K[1, 2] * z
@@ -174,15 +184,20 @@ def _cross(p, q):
 
 @_compiled
 def _fill(p, q, r, near_m, far_m, triangle, inverse, number):
-    # p, q, r are clockwise in an image whose y points down.
+    # Edge functions: the planes through the camera and the edges opposite p, q and r. The corners
+    # are counter-clockwise to the eye, which with v downwards is clockwise in (u, v): hence r × q
+    # and not q × r, so that visible triangles have det > 0 and positive edge functions inside.
     e, f, g = _cross(r, q), _cross(p, r), _cross(q, p)
     det = p[0] * e[0] + p[1] * e[1] + p[2] * e[2]
     if det <= 0.0:
         return  # facing away, or edge-on
     height, width = inverse.shape
+    # The pixels to look at: the bounds of the corners' pixels, if all are in front of the camera.
+    # A corner behind it has no pixel; then edges alone decide, over the whole picture.
     x0, x1, y0, y1 = 0.0, width - 1.0, 0.0, height - 1.0
     nearest = min(p[2], q[2], r[2])
     if nearest >= near_m:
+        # det / (z_p z_q z_r) is twice the area in pixels.
         if det <= _LEAST_AREA_PX * (p[2] * q[2] * r[2]):
             return
         i, j, k = 1.0 / p[2], 1.0 / q[2], 1.0 / r[2]
@@ -191,13 +206,16 @@ def _fill(p, q, r, near_m, far_m, triangle, inverse, number):
         y0 = max(y0, math.ceil(min(p[1] * i, q[1] * j, r[1] * k)))
         y1 = min(y1, math.floor(max(p[1] * i, q[1] * j, r[1] * k)))
     elif max(p[2], q[2], r[2]) < near_m:
-        return
+        return  # all of it is nearer than the near plane
     if x0 > x1 or y0 > y1:
         return
     most = 1.0 / near_m
+    # Inverse depth, affine in the pixel's index: base + dx · x + dy · y.
     dx, dy = (e[0] + f[0] + g[0]) / det, (e[1] + f[1] + g[1]) / det
     base = (e[2] + f[2] + g[2]) / det
     for y in range(int(y0), int(y1) + 1):
+        # Of each row the columns in which all three edge functions are >= 0: an edge bounds them on
+        # the left or on the right by the sign of its slope in x, so no pixel is tested for itself.
         low, high = x0, x1
         for edge in (e, f, g):
             rest = edge[1] * y + edge[2]
@@ -205,13 +223,14 @@ def _fill(p, q, r, near_m, far_m, triangle, inverse, number):
                 low = max(low, math.ceil(-rest / edge[0]))
             elif edge[0] < 0.0:
                 high = min(high, math.floor(-rest / edge[0]))
-            elif rest < 0.0:
+            elif rest < 0.0:  # the edge is level and the row outside of it
                 high = -1.0
         if low > high:
             continue
         row = base + dy * y
         for x in range(int(low), int(high) + 1):
             w = row + dx * x
+            # Nearer than what is drawn there, at first the far plane, but not than the near plane.
             if inverse[y, x] < w <= most:
                 inverse[y, x] = w
                 number[y, x] = triangle
@@ -232,7 +251,7 @@ def _look_up(inverse, number, classes, instances, depth, semantic, instance):
 
 @_shading
 def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
-    # When all triangles are drawn: paint times grain times light, filtered to a pixel's size. A row
+    # Paint times grain times light, filtered to a pixel's size, once all triangles are drawn. A row
     # consists of runs of pixels of one triangle. `_find_texels` goes through a run first, so that
     # the compiler can use vector instructions, which the look-ups after it rule out.
     poses, normals, colours, contrast, grain_axes, front_of, front_axes, grain, fronts = look
@@ -261,6 +280,8 @@ def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
                     rgb[0, y, x], rgb[1, y, x], rgb[2, y, x] = _SKY
                 continue
             if t != last:
+                # What a triangle's pixels share: its normal in camera axes, its shade, and the map
+                # from points in camera axes to texels.
                 last, k, front = t, poses[t], front_of[t]
                 nx, ny, nz = _turned(cam_from_body, k, normals[t, 0], normals[t, 1], normals[t, 2])
                 shade = np.float32(AMBIENT + DIFFUSE * max(0.0, nx * lx + ny * ly + nz * lz))
@@ -315,7 +336,7 @@ def _turned(m, k, x, y, z):
 
 @_inlined
 def _seen_from_cam(axes, t, cam_from_body, k, into):
-    # axes · (R, t)⁻¹, for a rotation R
+    # The map from points to texels in camera axes, [2, 4]: axes · (R, t)⁻¹, for a rotation R.
     for i in range(2):
         x, y, z = _turned(cam_from_body, k, axes[t, i, 0], axes[t, i, 1], axes[t, i, 2])
         into[i, 0], into[i, 1], into[i, 2], into[i, 3] = x, y, z, axes[t, i, 3]
@@ -331,8 +352,8 @@ def _find_texels(count, axes, a, b, du, dv, w, wu, wv, is_front, us, vs, levels)
     right or further down adds. Levels of house fronts are to be rounded, those of the grain, which
     blends two, are not.
     """
-    # float32 throughout, 16 to a vector. With more than three arrays to write, LLVM would have to
-    # check more pairs for overlaps than it is willing to, and leave the loop as it is.
+    # All in float32, of which a vector register holds 16. Three arrays are written, no more: LLVM
+    # checks each pair for overlaps, and with a fourth it gives up and leaves the loop scalar.
     s0 = np.float32(axes[0, 0] * a + axes[0, 1] * b + axes[0, 2])
     t0 = np.float32(axes[1, 0] * a + axes[1, 1] * b + axes[1, 2])
     s_u, t_u = np.float32(axes[0, 0] * du), np.float32(axes[1, 0] * du)
@@ -345,38 +366,44 @@ def _find_texels(count, axes, a, b, du, dv, w, wu, wv, is_front, us, vs, levels)
         step = np.float32(np.int32(i))
         z = np.float32(1.0) / (w + step * wu)
         s, t = s0 + step * s_u, t0 + step * t_u
-        # d(z r)/du = z (e_x / fx - r w_u / w), and so for v.
+        # How many texels the point on the surface moves for a pixel to the right or further down:
+        # d(z r)/du = z (e_x / fx - r w_u / w), and likewise for v. The longer one decides the
+        # level.
         su, tu = s_u - s * z * wu, t_u - t * z * wu
         sv, tv = s_v - s * z * wv, t_v - t * z * wv
         square = np.float32(z * z * max(su * su + tu * tu, sv * sv + tv * tv))
-        # Half of log2 of the square: a float's bits are its log2, linear between powers of two.
+        # Half of log2 of the square. A float's bits, read as an integer, are 2^23 times its log2
+        # plus the exponent's bias of 127, linear between powers of two; 63.5 is half of the bias.
         level = np.float32(square.view(np.int32)) * np.float32(0.5 / (1 << 23)) + extra
         us[i], vs[i], levels[i] = z * s + u0, z * t + v0, min(max(level, np.float32(0.0)), most)
 
 
 @_inlined
 def _around(u, v, level, size, half):
-    """Returns columns and rows of the four texels around a place, and where it is between them.
+    """Returns columns and rows of the four texels around (u, v), and the weights between them.
 
-    The last value is what rounding `level` down leaves. The centre of texel 0 is at `half`.
+    The last value is the part of `level` after the point, the weight of the next level. The centre
+    of texel 0 is at `half`.
     """
     n = np.uint32(level)
-    own, one = size >> n, np.uint32(1)  # numba checks unsigned indices for no sign
-    scale = np.float32(own) / np.float32(size)
+    # Unsigned, since numba has to check signed indices for being negative. Sizes are powers of two,
+    # so that `& (side - one)` repeats the pattern.
+    side, one = size >> n, np.uint32(1)
+    scale = np.float32(side) / np.float32(size)
     u, v = u * scale - half, v * scale - half
     i, j = np.floor(u), np.floor(v)
-    left, up = np.uint32(np.int32(i)) & (own - one), np.uint32(np.int32(j)) & (own - one)
-    first = np.uint32(2) * (size - own)  # levels lie below each other
-    right, down = (left + one) & (own - one), first + ((up + one) & (own - one))
+    left, up = np.uint32(np.int32(i)) & (side - one), np.uint32(np.int32(j)) & (side - one)
+    first = np.uint32(2) * (size - side)  # levels lie below each other
+    right, down = (left + one) & (side - one), first + ((up + one) & (side - one))
     return left, right, first + up, down, u - i, v - j, level - np.float32(n)
 
 
 @_inlined
-def _byte(x):
+def _byte(x):  # a colour from 0 to 255
     return np.uint8(min(np.float32(255.0), max(np.float32(0.0), x)))
 
 
 @_inlined
-def _mixed(a, b, c, d, right, down):
+def _mixed(a, b, c, d, right, down):  # bilinear: a and b above, c and d below
     top, bottom = a + right * (b - a), c + right * (d - c)
     return top + down * (bottom - top)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from flowrep.palette import CATEGORY_ID, CLASS_COLOURS
 from flowrep.scenes import pedestrians
 from flowrep.scenes.layout import Box, Layout
-from flowrep.scenes.scene import Scene, VehicleState
+from flowrep.scenes.scene import Scene
+from flowrep.scenes.vehicle import VehicleState
 from flowrep.simulator import meshes
 from flowrep.simulator.bullet import Simulator
 from flowrep.simulator.meshes import Body, Mesh, gather, person_meshes

@@ -133,7 +133,7 @@ CONVENTIONS: dict[str, Convention] = {
         background=(0,),
         K="intrinsic_cv, pixel centres at halves",
         notes="Depth is int16 millimetres: what is farther than 32.7 m wraps round and counts as "
-        "sky. flowrep.maniskill.ManiSkillEnv collects the buffers and the poses of "
+        "sky. ManiSkillEnv of the example collects the buffers and the poses of "
         "segmentation_id_map.",
     ),
     "mujoco": Convention(

@@ -133,7 +133,6 @@ class RAFT(nn.Module):
         weights: a file with the network's state dict, `.safetensors` or `.pth`, read without
             unpickling objects. The weights published by torchvision fit.
         network: `"raft_small"` or `"raft_large"`, matching the weights.
-        updates: number of refinements of the flow; more are slower and more accurate.
         min_side_px: as `DIS`'s, at least 128.
     """
 
@@ -141,17 +140,15 @@ class RAFT(nn.Module):
         self,
         weights: str | Path,
         network: str = "raft_small",
-        updates: int = 12,
         min_side_px: int = SMALLEST_SIDE_PX,
     ) -> None:
         super().__init__()
         check_name("network", network, Network)
-        if min_side_px < SMALLEST_SIDE_PX or updates < 1:
+        if min_side_px < SMALLEST_SIDE_PX:
             raise ValueError(
-                f"RAFT needs min_side_px of at least {SMALLEST_SIDE_PX} and at least one update, "
-                f"got {min_side_px} and {updates}"
+                f"RAFT needs min_side_px of at least {SMALLEST_SIDE_PX}, got {min_side_px}"
             )
-        self.updates, self.min_side_px = int(updates), int(min_side_px)
+        self.min_side_px = int(min_side_px)
         state = _read_weights(Path(weights))
         self.network = getattr(_optical_flow(), network)(weights=None)
         try:
@@ -168,7 +165,7 @@ class RAFT(nn.Module):
         height, width = first.shape[-2:]
         factor = whole_factor(height, width, self.min_side_px)
         first, second = (self._prepared(picture, factor) for picture in (first, second))
-        flow = self.network(first, second, num_flow_updates=self.updates)[-1]
+        flow = self.network(first, second)[-1]  # after torchvision's 12 refinements, the last
         flow = flow[..., : height * factor, : width * factor]
         return functional.avg_pool2d(flow, factor) / factor if factor > 1 else flow
 

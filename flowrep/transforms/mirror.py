@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, expand_as_right
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
@@ -29,7 +29,7 @@ class Mirror(Transform):
     | --- | --- | --- |
     | a map | `[*B, C, H, W]` | column i is column 2·cx - 1 - i |
     | a flow (`flow_keys`) | `[*B, 2·k, H, W]`, u and v of k frames | the same, with u negated |
-    | the action | `[*B]` or one-hot `[*B, n]` | `swapped_actions[action]` |
+    | `"action"` | `[*B]` or one-hot `[*B, n]` | `swapped_actions[action]` |
 
     Convention: pixel (0, 0)'s centre is (0.5, 0.5), so that column i sees x / z = (i + 0.5 - cx) /
     fx, and the column that sees the opposite is 2·cx - 1 - i. With cx = W / 2 that is the last for
@@ -71,7 +71,6 @@ class Mirror(Transform):
         flow_keys: Keys | None = None,
         intrinsics: Tensor | Sequence[Sequence[float]] | None = None,
         images: Images = "half",
-        action_key: NestedKey = "action",
     ) -> None:
         keys = as_keys(in_keys)
         super().__init__(in_keys=keys, out_keys=keys)
@@ -90,7 +89,6 @@ class Mirror(Transform):
         self.register_buffer("swapped_actions", swapped, persistent=False)
         self.twice_cx = None if intrinsics is None else _twice_cx(intrinsics)
         self.images = images
-        self.action_key: NestedKey = as_keys([action_key])[0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns a batch of transitions with the images in their place, or behind them."""
@@ -106,10 +104,10 @@ class Mirror(Transform):
 
     def _mirror(self, tensordict: TensorDictBase, chosen: Tensor) -> TensorDictBase:
         """Writes the images of the `chosen` [*B] transitions over them."""
-        action, swapped = tensordict[self.action_key], self.swapped_actions.to(chosen.device)
+        action, swapped = tensordict["action"], self.swapped_actions.to(chosen.device)
         is_one_hot = action.ndim > chosen.ndim and action.shape[-1] == len(swapped)
         image = action[..., swapped] if is_one_hot else swapped[action.long()].to(action.dtype)
-        tensordict[self.action_key] = torch.where(expand_as_right(chosen, action), image, action)
+        tensordict["action"] = torch.where(expand_as_right(chosen, action), image, action)
         following = tensordict.get("next", None)
         for key in self.in_keys:
             is_flow = key in self.flow_keys

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torchrl.data import Composite
 from torchrl.envs.transforms import Compose, ExcludeTransform, Transform
 
 from flowrep.transforms.estimated_flow import EstimatedFlow
@@ -144,12 +145,18 @@ def representation_stack(
 
 
 class DropKeys(ExcludeTransform):
-    """Drops intermediate results of other transforms, at the root and under `"next"`."""
+    """Drops keys that no one needs any more, at the root and under `"next"`; nested ones whole."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns a batch without the keys."""
         keys = self.excluded_keys
         return tensordict.exclude(*keys, *(("next", key) for key in keys))
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Returns the specs without the keys; TorchRL's own looks for them among leaves alone."""
+        for key in self.excluded_keys:
+            del output_spec["full_observation_spec"][key]
+        return output_spec
 
 
 def _check_known(what: str, names: Iterable[object], known: Collection[str]) -> None:

@@ -18,7 +18,7 @@ from flowrep.envs.episode import Moment
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.layout import Layout, free_ground
-from flowrep.scenes.scene import VehicleState
+from flowrep.scenes.vehicle import VehicleState
 from flowrep.simulator.meshes import kerb, lane_marks
 
 PEOPLE = {"across", "along", "standing"}

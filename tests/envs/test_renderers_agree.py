@@ -17,7 +17,7 @@ from flowrep.envs import StreetEnv
 from flowrep.envs.episode import Moment
 from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
-from flowrep.scenes.scene import VehicleState
+from flowrep.scenes.vehicle import VehicleState
 
 MAPS = ("depth", "semantic", "instance")
 VIEWS_AN_EPISODE = 10

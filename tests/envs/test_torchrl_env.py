@@ -1,6 +1,7 @@
 """The TorchRL env: its specs, partial resets, the same episodes in one process and in two."""
 
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from flowrep import envs
+from flowrep.config import CONF_DIR
+from flowrep.config.yaml_file import read_yaml
 from flowrep.envs import (
     Outcome,
     begin_step,
@@ -22,6 +25,7 @@ from flowrep.envs import (
 )
 from flowrep.envs.sensing import SENSORS
 from flowrep.palette import CATEGORY_ID
+from flowrep.scenes import SceneError, load_scene
 from flowrep.transforms import Depth, FlowFactorize, RawFlow
 
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
@@ -106,6 +110,23 @@ def test_a_transform_of_dropped_sensors_says_how_to_keep_them(make):
     with pytest.raises(KeyError) as caught:
         TransformedEnv(make(representations=["seg"]), Depth(in_keys="metres")).reset()
     assert "keep_sensor" not in str(caught.value)
+
+
+def test_a_scene_is_given_by_name_by_file_as_a_mapping_or_parsed(make):
+    file = CONF_DIR / "scene" / "straight_road.yaml"
+    scene = load_scene("straight_road")
+    for given in ("straight_road", file, str(file), read_yaml(file), scene):
+        env = make(given, ["seg"], seed=3)
+        assert env.base_env.scene == scene
+    # One that no file has: the camera's size is what the maps have.
+    small = replace(scene, camera=replace(scene.camera, height_px=20, width_px=30))
+    env = make(small, ["seg", "ego"])
+    assert env.reset()["seg"].shape == (1, 1, 20, 30)
+    assert env.base_env.scene == small
+    with pytest.raises(SceneError, match="straight_roed"):
+        make("straight_roed")
+    with pytest.raises(SceneError, match=r"roads"):
+        make(replace(scene, roads=()))
 
 
 @pytest.mark.slow_after_first

@@ -71,6 +71,16 @@ def test_steps_and_partial_resets_are_those_of_streets_alone(make_street, argume
     assert resets > 1
 
 
+def test_environments_with_different_cameras_are_not_drawn_together():
+    one, other = (
+        partial(StreetEnv, scene, sensors=("prev_from_curr",))
+        for scene in ("straight_road", "h_shaped_pathways")
+    )
+    StreetVectorEnv([one, one]).close()
+    with pytest.raises(ValueError, match="scene"):
+        StreetVectorEnv([one, other])
+
+
 @pytest.mark.parametrize("mask", [(True, False, False), (False, False, False)])
 def test_a_reset_of_some_or_none_returns_what_was_last_seen_as_the_callers_own(mask):
     ours = make(sensors=("depth",))

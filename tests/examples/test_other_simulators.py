@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv, check_env_specs
 
-from flowrep.maniskill import ManiSkillEnv, flow_transforms
+from examples.maniskill_flow import ManiSkillEnv, flow_transforms
 from flowrep.testing import check_flow
 
 

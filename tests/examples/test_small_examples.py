@@ -53,7 +53,7 @@ def test_the_tensors_example_prints_what_a_hand_gets(capsys):
 def test_the_policy_of_ones_own_keeps_clear_of_a_person_and_comes_back(side):
     from examples.own_policy import make
     from flowrep.scenes import load_scene
-    from flowrep.scenes.scene import YAW_SIGN, VehicleState, roll, turn
+    from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, roll, turn
 
     vehicle, device = load_scene("straight_road").vehicle, torch.device("cpu")
     K = torch.tensor([[40.0, 0.0, 21.0], [0.0, 40.0, 15.0], [0.0, 0.0, 1.0]])

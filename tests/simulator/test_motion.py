@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 
-from flowrep.envs.sensing import planar
 from flowrep.scenes.scene import CameraConfig
 from flowrep.simulator.camera import vehicle_from_camera
-from flowrep.simulator.motion import instance_motion, relative_motion, rigid_inverse
+from flowrep.simulator.motion import instance_motion, planar, relative_motion, rigid_inverse
 
 MOUNT = vehicle_from_camera(CameraConfig(48, 60, 70.0, 1.5, 0.4, -10.0, 0.2, 100.0))
 BEFORE = planar(3.0, -1.0, 0.3) @ MOUNT

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from flowrep.scenes.scene import (
+from flowrep.scenes.scene import VehicleConfig
+from flowrep.scenes.vehicle import (
     NO_OP,
     TURN_LEFT,
     TURN_RIGHT,
     YAW_SIGN,
-    VehicleConfig,
     VehicleState,
     footprint_corners,
     roll,
