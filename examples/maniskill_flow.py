@@ -12,8 +12,8 @@ import mani_skill.envs  # noqa: F401 - registers the envs
 import torch
 from torchrl.envs import TransformedEnv
 
+from flowrep import diagnose
 from flowrep.maniskill import ManiSkillEnv, flow_transforms
-from flowrep.testing import check_flow
 
 
 def make_env(task: str = "PickCube-v1", camera: str = "hand_camera") -> TransformedEnv:
@@ -27,7 +27,7 @@ def main(path: str | None = None) -> None:
     env = make_env()
     env.set_seed(1)
     frames = env.rollout(25)["next"]
-    print(check_flow(frames, frames["sensor", "K"][0, 0]))
+    print(diagnose(frames))
     if path is not None:
         from flowrep.viz import representation_strip, write_png
 

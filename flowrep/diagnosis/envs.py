@@ -26,7 +26,7 @@ from flowrep.diagnosis.witness import (
 _PAIRS = 8
 _SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
 _SAME_DEPTH = 0.03  # relative
-_ONE_SEES, _BETTER = 0.5, 0.03  # shares of bodies' pixels: the least, and a lead that tells
+_ONE_SEES, _BETTER = 0.3, 0.03  # shares of bodies' pixels: the least, and a lead that tells
 
 
 @torch.no_grad()
