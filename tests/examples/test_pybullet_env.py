@@ -1,6 +1,7 @@
 """Flow in a PyBullet env that others wrote; tests/test_pybullet.py has the pictures' own truth."""
 
 import pytest
+import torch
 
 pytest.importorskip("panda_gym", reason="pip install 'flowrep-rl[examples]'")
 
@@ -13,6 +14,7 @@ from flowrep import diagnose
 def test_each_frame_warps_into_the_one_before(camera):
     env = make_env(camera=camera)
     env.set_seed(3)
+    torch.manual_seed(3)  # of the random actions
     frames = env.rollout(8)["next"]
     assert diagnose(frames, env.get_wrapper_attr("K")).is_right
     moving = frames["obj"].abs().amax(-3, keepdim=True) > 0
