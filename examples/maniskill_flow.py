@@ -17,8 +17,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from flowrep import transforms
-from flowrep.testing import check_flow
+from flowrep import diagnose, transforms
 
 
 class ManiSkillEnv(EnvBase):
@@ -136,7 +135,7 @@ def main(path: str | None = None) -> None:
     env = make_env()
     env.set_seed(1)
     frames = env.rollout(25)["next"]
-    print(check_flow(frames, frames["sensor", "K"][0, 0]))
+    print(diagnose(frames))
     if path is not None:
         from flowrep.viz import representation_strip, write_png
 

@@ -111,11 +111,11 @@ def drive(env: TransformedEnv, steps: int = 18) -> TensorDictBase:
 
 
 def main(path: str | None = None) -> None:
-    from flowrep.testing import check_flow
+    from flowrep import diagnose
 
     env = make_env()
     frames = drive(env)
-    print(check_flow(frames, K))
+    print(diagnose(frames, K))
     if path is not None:
         from flowrep.viz import representation_strip, write_png
 

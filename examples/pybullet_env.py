@@ -16,8 +16,8 @@ import panda_gym  # noqa: F401 - registers the envs
 import torch
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
+from flowrep import diagnose
 from flowrep.pybullet import BulletCamera, BulletFlow
-from flowrep.testing import check_flow
 from flowrep.transforms import FlowFactorize, RawFlow
 
 HEIGHT, WIDTH, DEG_PER_STEP = 120, 180, 1.5
@@ -50,7 +50,7 @@ def main(path: str | None = None) -> None:
     env.set_seed(3)
     torch.manual_seed(3)
     frames = env.rollout(20)["next"]
-    print(check_flow(frames, env.get_wrapper_attr("K")))
+    print(diagnose(frames, env.get_wrapper_attr("K")))
     speed, rows = frames["obj"].norm(dim=-3, keepdim=True), env.get_wrapper_attr("camera").rows
     for name, body in env.unwrapped.sim._bodies_idx.items():
         links = torch.tensor([row for (number, _), row in rows.items() if number == body])

@@ -60,7 +60,10 @@ def factorize_recording(config: FactorizeConfig) -> int:
         job = Job(stream, flow_source, motion_source, output, start=start, stop=stop, stride=stride)
         diagnosis = job.examine()
         if diagnosis is not None:
-            print(f"{'warning: ' if diagnosis.suspects else ''}{diagnosis.words}")
+            print(diagnosis)
+            if diagnosis.is_wrong and config.check == "error":
+                print("nothing is written; check=warn factorises all the same", file=sys.stderr)
+                return 2
         if stopped_by := job.run():
             print(f"stopped after {len(output.rows)} frames, which are in {output.partial}")
             return stopped_by

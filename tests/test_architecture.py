@@ -15,7 +15,7 @@ PACKAGE = Path(flowrep.__file__).parent
 FLOWREP_IMPORTS_ALLOWED = {
     "geometry": {"geometry", "extras"},
     "transforms": {"transforms", "geometry", "extras"},
-    "testing": {"geometry"},
+    "diagnosis": {"diagnosis", "geometry"},
     "agent": {"agent", "extras", "files"},
     "files": set(),
     "palette": set(),
@@ -35,7 +35,7 @@ FLOWREP_IMPORTS_ALLOWED = {
     "pretrained": {"experiment", "agent", "config"},
     "policies": {"pretrained", "experiment", "baselines", "config"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
-    | {"transforms", "geometry", "viz"},
+    | {"transforms", "geometry", "viz", "diagnosis"},
     "sweep": {"config", "progress", "tables", "files"},
     "config": {"config"},
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
@@ -62,7 +62,7 @@ LAZILY = {
 PACKAGES_LIMITED_TO = {
     "geometry": {"torch"},
     "transforms": {"torch", "tensordict", "torchrl"},
-    "testing": {"torch", "tensordict"},
+    "diagnosis": {"torch", "tensordict"},
     "agent": {"torch", "tensordict", "torchrl", "safetensors", "numpy"},
     "scenes": {"numpy", "shapely", "yaml", "pydantic", "pydantic_core"},
     "simulator": {"numpy", "pybullet", "shapely"},

@@ -120,14 +120,27 @@ def test_without_rerun_the_package_is_named_and_nothing_is_left(tmp_path, monkey
     assert not list(tmp_path.iterdir())
 
 
-def test_a_wrong_convention_is_said(moments, tmp_path, capsys):
+def test_a_wrong_convention_ends_the_job_unless_a_warning_will_do(moments, tmp_path, capsys):
     wrong = ["format.pose_direction=world_to_camera", "video=false", "flow_files=[]"]
-    _, out = factorize(tmp_path, "flow=exact", *wrong, "pictures_every=0")
-    said = capsys.readouterr().out
-    assert said.startswith("warning: ")
-    assert "format.pose_direction=camera_to_world" in said
+    wrong += ["flow=exact", "pictures_every=0"]
+    code, out = factorize(tmp_path, *wrong)
+    said = capsys.readouterr()
+    assert code == 2
+    assert "format.pose_direction=camera_to_world" in said.out
+    assert "check=warn" in said.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+    code, out = factorize(tmp_path, *wrong, "check=warn")
+    assert code == 0
+    assert capsys.readouterr().out.startswith("wrong: ")
     summary = json.loads((out / "summary.json").read_text())
     assert summary["suspects"][0] == "pose_direction=camera_to_world"
+    assert summary["diagnosis"].startswith("wrong: ")
+
+
+def test_poses_that_are_not_used_are_not_judged(moments, tmp_path):
+    wrong = ["format.pose_direction=world_to_camera", "poses=estimated", "flow=exact"]
+    code, _ = factorize(tmp_path, *wrong, "video=false")
+    assert code == 0
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

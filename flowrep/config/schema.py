@@ -479,6 +479,7 @@ class FactorizeConfig(Command):
     format: Reader
     flow: Flow
     poses: Literal["recorded", "estimated"] | None
+    check: Literal["error", "warn"]
     start: CountOrZero
     stop: CountOrZero | None
     stride: Count

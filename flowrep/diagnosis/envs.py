@@ -26,7 +26,7 @@ from flowrep.diagnosis.witness import (
 _PAIRS = 8
 _SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
 _SAME_DEPTH = 0.03  # relative
-_ONE_SEES, _BETTER = 0.5, 0.03  # shares of bodies' pixels: the least, and a lead that tells
+_ONE_SEES, _BETTER = 0.3, 0.03  # shares of bodies' pixels: the least, and a lead that tells
 
 
 @torch.no_grad()
@@ -74,7 +74,7 @@ def diagnose(
     if absolute:
         first, second = (x["sensor", "world_from_cam"].double() for x in (seen.previous, seen.now))
     path = [first @ torch.linalg.inv_ex(earlier[kept])[0], first, second, second @ later[kept]]
-    static = torch.where(seen.ids == 0, seen.depth, math.nan).squeeze(1)
+    static = torch.where(seen.is_static, seen.depth, math.nan).squeeze(1)
     raw, picture = None, None
     if not seen.is_derived:
         raw, picture = seen.raw, seen.now["sensor"].get("rgb", None)
@@ -115,7 +115,7 @@ def _successive(frames: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase,
     """Returns frames, those before them, and the motions before and after, nan where unknown."""
     if frames.get(("sensor", "depth"), None) is None:
         raise ValueError('frames lack ("sensor", "depth")')
-    if frames.get("next", None) is not None:
+    if frames.get(("next", "sensor", "depth"), None) is not None:
         frames = frames if frames.ndim else frames.unsqueeze(0)
         before, now = frames.exclude("next"), frames["next"]
         depths = (x["sensor", "depth"].flatten(now.ndim) for x in (before[..., 1:], now[..., :-1]))
@@ -125,7 +125,8 @@ def _successive(frames: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase,
         if frames.ndim == 0 or frames.shape[-1] < 2:
             raise ValueError(f"frames have to be successive, [*B, T]; got {list(frames.shape)}")
         before, now = frames[..., :-1], frames[..., 1:]
-        ended = frames.get("done", torch.zeros(*frames.shape, 1, dtype=torch.bool)).squeeze(-1)
+        done = frames.get("done", torch.zeros(*frames.shape, 1, dtype=torch.bool))
+        ended = frames.get(("next", "done"), done).squeeze(-1)
         kept, goes_on = ~ended[..., :-1], ~ended[..., 1:-1]
     motion, later = _motion(now), torch.full_like(_motion(now), math.nan)
     later[..., :-1, :, :] = torch.where(goes_on[..., None, None], motion[..., 1:, :, :], math.nan)
@@ -149,6 +150,9 @@ class _Seen:
         self.ids = self.ids.unsqueeze(1)
         self.rows = sensor.get("instance_motion", self.motion.unsqueeze(1)).double()
         rows = self.ids.clamp(0, self.rows.shape[1] - 1)
+        # Many simulators number what stands still, too.
+        stands = (self.rows - self.rows[:, :1]).abs().flatten(2).amax(-1) < 1e-6
+        self.is_static = stands.gather(1, rows.flatten(1)).view_as(rows)
         self.flow = geometry.rigid_flow(self.depth, rows, self.K, self.rows, prev_K=self.prev_K)
         self.ego = self.flow_of(self.motion)
         self.raw, self.is_derived = now.get(raw_key, None), True

@@ -29,7 +29,7 @@ from flowrep.diagnosis.witness import (
 # No error: rounding, a share of the noise, and of flow that was estimated, which is too short.
 EXACT_PX, _OF_NOISE, _OF_ESTIMATED = 2e-3, 0.3, 0.03
 # What explains an error leaves several times less, or clearly less in most of many pairs.
-SEVERAL, CLEARLY, _MANY_PAIRS = 3.0, 1.5, 8
+SEVERAL, CLEARLY, _MANY_PAIRS = 3.0, 1.7, 8
 _STRUCTURED = 0.1  # of raw flow: more structure than an estimator's own
 _AS_IT_IS = Rival("poses", "", "", lambda pairs, n: pairs)
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
@@ -59,7 +59,14 @@ class Found(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The error below which there is none: how far two halves of the picture differ, and more.
+        """The error below which there is none."""
+        pairs = self.pairs
+        bias = _OF_ESTIMATED * median(px_of(pairs.raw)) if pairs.is_estimated else 0.0
+        return max(self.floor, bias)
+
+    @property
+    def floor(self) -> float:
+        """The error below which errors are alike, by how far two halves of the picture differ.
 
         The halves are every other block of it, since neighbouring pixels err alike.
         """
@@ -70,9 +77,8 @@ class Found(NamedTuple):
             best_motion(pairs._replace(depth=pairs.depth.masked_fill(half, math.nan)), self.motion)
             for half in (is_even, ~is_even)
         ]
-        floor = SEVERAL * median(apart(pairs, *halves)) / 2
-        bias = _OF_ESTIMATED * median(px_of(pairs.raw)) if pairs.is_estimated else 0.0
-        return max(EXACT_PX, floor, _OF_NOISE * median(self.spread), bias)
+        halves_px = SEVERAL * median(apart(pairs, *halves)) / 2
+        return max(EXACT_PX, halves_px, _OF_NOISE * median(self.spread))
 
     @property
     def is_unexplained(self) -> bool:

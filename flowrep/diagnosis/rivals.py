@@ -94,7 +94,7 @@ def rivals_of(given: Mapping[str, str], *, of_flow: bool, absolute: bool) -> lis
            _zoomed, ((1.0, 1.0),), (1.01, 1.0), each=True),
         of("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
            lambda p, n: p._replace(distortion=n), ((0.0,),), (-0.2,)),
-        of("depth", "depth times {0:.3g}", "depth, or the poses' unit, is {inverse:.3g} as long",
+        of("depth", "depth times {inverse:.3g}", "depth is {0:.3g} times as long as poses say",
            _depth(lambda z, n: z / n.clamp(1e-6)), ((1.0,), (1e-3,), (1e3,)), (2.0,)),
         of("depth", "{0:.3g} / depth", "depth is {0:.3g} / z, a disparity",
            _depth(lambda d, n: n.clamp(1e-6) / d), ((1.0,), (100.0,))),

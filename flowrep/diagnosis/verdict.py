@@ -21,7 +21,7 @@ _EXPLAINED = 0.25  # what an explanation leaves at most
 _ROUGH, _ROUGH_WIDTHS, _TIMES_THE_NOISE, _LITTLE = 0.25, 1 / 1280, 20.0, 0.02
 _UNSURE = 0.2  # right data would be right to that alone
 _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's estimator failed
-_STRAY = 6.0  # times the median error of a pair
+_STRAY = 6.0  # times what the median pair leaves
 
 
 @dataclass(frozen=True)
@@ -140,9 +140,9 @@ def diagnosed(
     notes = []
     if pairs.is_coarse:
         notes.append(f"depth has steps of {pairs.depth_step:.2g} m, which hide smaller errors")
-    stray = [
-        n for n, px in zip(names, errors.tolist()) if px > max(_STRAY * error, _ROUGH * raw_px)
-    ]
+    alone = recorded.beyond(torch.zeros_like(noise))
+    most = max(_STRAY * median(alone), _ROUGH * raw_px)
+    stray = [name for name, px in zip(names, alone.tolist()) if px > most]
     if stray:
         notes.append(f"poses that don't fit the others: {', '.join(stray)}")
     if not pairs.has_poses:
@@ -166,7 +166,7 @@ def _able(others: Sequence[Found], before: Tensor, noise: Tensor, raw_px: float)
     able = [each for each in able if is_better(each.beyond(noise), before)]
     if not able:
         return []
-    enough = CLEARLY * after[id(able[0])] + able[0].least
+    enough = min(CLEARLY * after[id(able[0])] + able[0].floor, error / CLEARLY)
     able = [each for each in ranked if after[id(each)] <= enough]
     # One that learns more numbers than another of its kind says the same with more words.
     fewest = {each.rival.of: len(each.n) for each in sorted(able, key=lambda e: -len(e.n))}

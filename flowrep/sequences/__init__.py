@@ -1,4 +1,4 @@
-"""Recorded RGB-D sequences: readers, registration, factorisation, a doctor."""
+"""Recorded RGB-D sequences: readers, registration, factorisation."""
 
 from flowrep.extras import require
 
@@ -6,7 +6,6 @@ require("flowrep.sequences", "factorize", "cv2", "pydantic")
 
 from flowrep.sequences.calibration import Registration, Undistortion
 from flowrep.sequences.declared import DeclaredRecording, open_recording
-from flowrep.sequences.doctor import Diagnosis, Doctor, diagnose
 from flowrep.sequences.factorization import (
     EstimatedFlowSource,
     FactorizedFrame,
@@ -23,9 +22,8 @@ from flowrep.sequences.recording import Frame, Recording, SequenceError, Stream
 from flowrep.sequences.video import StillVideo
 
 __all__ = [
-    "DeclaredRecording", "Diagnosis", "Doctor", "EstimatedFlowSource", "FactorizedFrame", "Frame",
-    "Kitti", "Motion", "Recording", "Registration", "SequenceError", "StillVideo", "Stream",
-    "Undistortion", "diagnose", "estimated_motion", "factorize_frames", "factorize_pair",
-    "open_recording", "read_flow", "recorded_flow", "recorded_motion", "write_flo",
-    "write_kitti_flow",
+    "DeclaredRecording", "EstimatedFlowSource", "FactorizedFrame", "Frame", "Kitti", "Motion",
+    "Recording", "Registration", "SequenceError", "StillVideo", "Stream", "Undistortion",
+    "estimated_motion", "factorize_frames", "factorize_pair", "open_recording", "read_flow",
+    "recorded_flow", "recorded_motion", "write_flo", "write_kitti_flow",
 ]  # fmt: skip

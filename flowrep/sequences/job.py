@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import KW_ONLY, dataclass
-from itertools import count, islice
+from dataclasses import KW_ONLY, dataclass, replace
+from itertools import count, islice, pairwise
 from typing import Any
 
 import numpy as np
+from tqdm.auto import tqdm
 
-from flowrep.progress import StopRequest, Stopwatch, progress_bar
+from flowrep.diagnosis import Diagnosis, Examination
+from flowrep.progress import StopRequest, Stopwatch
 from flowrep.sequences import factorization
-from flowrep.sequences.doctor import Diagnosis, Doctor
 from flowrep.sequences.output import Output
 from flowrep.sequences.recording import Frame, Recording, Stream
 
-DOCTOR_PAIRS, DOCTOR_TRIES = 10, 3
+# Pairs follow each other in runs, so that poses that are late or early show.
+EXAMINED_RUNS, EXAMINED_PAIRS = 4, 5
 
 
 @dataclass
@@ -42,31 +44,35 @@ class Job:
             self._indices = range(len(self.stream))[self.start : self.stop : self.stride]
 
     def examine(self) -> Diagnosis | None:
-        """Returns what the doctor says of pairs spread over the recording, None without poses."""
-        if not isinstance(self.stream, Recording) or not self.stream.has_poses:
+        """Returns the diagnosis of pairs in runs spread over the recording, None of a stream."""
+        if not isinstance(self.stream, Recording):
             return None
         is_recorded = self.flow_source is factorization.recorded_flow
-        doctor = Doctor(self.stream.conventions, flow_is_recorded=is_recorded)
+        uses_poses = self.motion_source is factorization.recorded_motion
+        found = Examination(self.stream.conventions, flow_is_recorded=is_recorded)
         used = self._indices
-        places = np.linspace(1, len(used), DOCTOR_PAIRS, endpoint=False).astype(int)
-        with self.clock("doctor"):
-            for first, end in zip(places, [*places[1:], len(used)]):
-                # A pair that hardly moves, or repeats a picture, is passed over for the next one.
-                for place in range(first, min(end, first + DOCTOR_TRIES)):
-                    both = (self.stream[i] for i in used[place - 1 : place + 1])
-                    _, (previous, current) = factorization.pairs(both)
-                    if previous is None or factorization.repeats(previous, current):
-                        continue
-                    if doctor.look(previous, current, self.flow_source(previous, current)):
-                        break
-        return doctor.diagnosis()
+        ends = np.linspace(0, len(used), EXAMINED_RUNS + 1).astype(int).tolist()
+        with self.clock("diagnosis"):
+            for start, end in pairwise(ends):
+                run = used[max(start - 1, 0) : end][: EXAMINED_PAIRS + 1]
+                frames = [self.stream[i] for i in run]
+                if not uses_poses:
+                    frames = [replace(frame, world_from_cam=None) for frame in frames]
+                poses = [None, *(frame.world_from_cam for frame in frames), None]
+                around = {f.name: (poses[i], poses[i + 2]) for i, f in enumerate(frames)}
+                for previous, current in factorization.pairs(frames):
+                    # A picture that repeats the one before has the flow of none.
+                    if previous is not None and not factorization.repeats(previous, current):
+                        raw = self.flow_source(previous, current)
+                        earlier, later = around[previous.name][0], around[current.name][1]
+                        found.add(previous, current, raw, earlier, later)
+            return found.diagnosis()
 
     def run(self) -> int:
         """Factorises all frames; returns 0, or the exit code for the signal that stopped it."""
         is_recording = isinstance(self.stream, Recording)
         total = len(self._indices) if is_recording else None
-        bar = progress_bar(what="factorising", total=total, unit="frame")
-        with StopRequest() as interrupted, bar:
+        with StopRequest() as interrupted, tqdm(total=total, unit="frame") as bar:
             indices, pairs = count(self.start, self.stride), factorization.pairs(self._frames())
             for index, (previous, current) in zip(indices, pairs):
                 if previous is not None:
@@ -97,11 +103,11 @@ class Job:
             yield frame
 
     def summary(self, diagnosis: Diagnosis | None) -> dict[str, Any]:
-        """Returns medians over the frames, the doctor's diagnosis and the times."""
+        """Returns medians over the frames, the diagnosis and the times."""
         return {
             "frames": len(self.output.rows),
             "medians": self.output.medians(),
-            "doctor": None if diagnosis is None else diagnosis.words,
+            "diagnosis": None if diagnosis is None else str(diagnosis),
             "suspects": [] if diagnosis is None else list(diagnosis.suspects),
             "notes": list(self.stream.notes),
             "seconds": {name: round(spent, 3) for name, spent in self.clock.seconds.items()},

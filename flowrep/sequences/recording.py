@@ -82,7 +82,7 @@ class Recording(ABC):
     Attributes:
         no_flow: why it has no flow of its own, and what to do.
         notes: a sentence each, for the user.
-        conventions: the options about conventions that it was opened with, for the doctor's advice.
+        conventions: the options about conventions that it was opened with, for the diagnosis.
     """
 
     count: int

@@ -13,8 +13,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from flowrep import diagnose
 from flowrep.geometry import transform_points, unproject
-from flowrep.testing import check_flow
 
 pytest.importorskip("gymnasium", reason="the example wraps a gymnasium env")
 if importlib.util.find_spec("mujoco") is None:
@@ -118,7 +118,7 @@ def test_mujoco_samples_pixels_at_their_centres_in_metres_along_z(record):
 
 def test_each_frame_warps_into_the_one_before_and_only_what_moves_lights_up(record):
     frames = TensorDict(record["frames"], [10])
-    assert check_flow(frames, record["K"]).is_right
+    assert diagnose(frames, record["K"]).is_right
     speed, body = frames["obj"].norm(dim=-3, keepdim=True), frames["sensor", "instance"]
     assert (speed[body == 0] == 0).all()
     assert body.unique().tolist() == [0, 1, 2, 3]  # the ball, the door and the crate

@@ -7,7 +7,7 @@ import torch
 from torchrl.envs import TransformedEnv, check_env_specs
 
 from examples.maniskill_flow import ManiSkillEnv, flow_transforms
-from flowrep.testing import check_flow
+from flowrep import diagnose
 
 
 def test_a_sliding_box_in_miniworld(monkeypatch):
@@ -18,9 +18,7 @@ def test_a_sliding_box_in_miniworld(monkeypatch):
     env = make_env()
     frames = drive(env)
     env.close()
-    found = check_flow(frames, K)
-    assert found.is_right
-    assert found.agreement > 0.99
+    assert diagnose(frames, K).is_right
     box = frames["sensor", "instance"] == 1
     assert box.any()
     assert (frames["obj"].abs().amax(-3, keepdim=True)[~box] == 0).all()
@@ -36,9 +34,7 @@ def test_a_robots_hand_in_maniskill():
     env.set_seed(1)
     frames = env.rollout(15)["next"]
     env.close()
-    found = check_flow(frames, frames["sensor", "K"][0, 0])
-    assert found.is_right
-    assert found.agreement > 0.98
+    assert diagnose(frames).is_right
 
 
 class Bench:

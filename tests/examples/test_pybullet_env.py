@@ -1,11 +1,12 @@
 """Flow in a PyBullet env that others wrote; tests/test_pybullet.py has the pictures' own truth."""
 
 import pytest
+import torch
 
 pytest.importorskip("panda_gym", reason="pip install 'flowrep-rl[examples]'")
 
 from examples.pybullet_env import make_env, on_hand, orbiting
-from flowrep.testing import check_flow
+from flowrep import diagnose
 
 
 @pytest.mark.slow_after_first
@@ -13,10 +14,9 @@ from flowrep.testing import check_flow
 def test_each_frame_warps_into_the_one_before(camera):
     env = make_env(camera=camera)
     env.set_seed(3)
+    torch.manual_seed(3)  # of the random actions
     frames = env.rollout(8)["next"]
-    found = check_flow(frames, env.get_wrapper_attr("K"))
-    assert found.agreement > 0.98
-    assert found.agreement > max(found.suspects.values())
+    assert diagnose(frames, env.get_wrapper_attr("K")).is_right
     moving = frames["obj"].abs().amax(-3, keepdim=True) > 0
     rows = env.get_wrapper_attr("camera").rows
     robot = [row for (body, _), row in rows.items() if body == 0]

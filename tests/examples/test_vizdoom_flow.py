@@ -5,7 +5,7 @@ import pytest
 pytest.importorskip("vizdoom", reason="ViZDoom is not installed: pip install '.[examples]'")
 
 from examples.vizdoom_flow import K, make_env
-from flowrep.testing import check_flow
+from flowrep import diagnose
 
 
 @pytest.fixture(scope="module")
@@ -19,10 +19,12 @@ def frames(tmp_path_factory):
     return frames
 
 
-def test_each_frame_warps_into_the_one_before(frames):
-    found = check_flow(frames, K, tolerance=0.1)  # depth has steps of 22 cm
-    assert found.is_right
-    assert found.agreement > 0.98
+def test_depth_of_a_byte_contradicts_nothing_and_hides_much(frames):
+    # tests/injected has a walk whose pictures tell more: there the conventions are right.
+    found = diagnose(frames, K)
+    assert found.verdict == "can't tell"
+    assert "steps" in found.words
+    assert found.left_px < 0.1
 
 
 def test_monsters_alone_have_object_flow(frames):

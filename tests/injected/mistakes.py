@@ -263,7 +263,7 @@ LISTED: dict[str, tuple[Mistake, tuple[str, ...]]] = {
     "flow of twice the size": (of_flow(lambda f: 2 * f), ("flow divided by",)),
     "flow times 0.7": (of_flow(lambda f: 0.7 * f), ("flow divided by",)),
     "flow to the next frame": (to_next, ("flow_to=next",)),
-    "flow on the previous grid": (on_previous_grid, ("flow_grid=previous",)),
+    "flow on the previous grid": (on_previous_grid, ("this frame's grid",)),
     "K of twice the size": (of_camera(lambda K, h, w: scaled(K, 2.0)), ("K times",)),
     "K of half the size": (of_camera(lambda K, h, w: scaled(K, 0.5)), ("K times",)),
     "K before a resize": (of_camera(lambda K, h, w: scaled(K, 4 / 3)), ("K times",)),

@@ -23,8 +23,8 @@ from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv, check_env_specs
 
+from flowrep import diagnose
 from flowrep.geometry import intrinsics_from_fov
-from flowrep.testing import check_flow
 from flowrep.transforms import CONVENTIONS, FlowFactorize, RawFlow, sensors_from
 
 STEPS, HEIGHT, WIDTH = 4, 5, 7
@@ -556,9 +556,8 @@ def assert_warps(simulator, frames, K, differing=0.0, **options):
     is_inf = td["sensor", "depth"].isinf()[:, 0]
     assert sky.any()
     assert (is_inf != sky).float().mean() <= differing
-    found = check_flow(td, K)
-    assert found.is_right
-    assert found.agreement > 0.99
+    found = diagnose(td, K)
+    assert found.is_right, found
 
 
 def test_pybullet_itself():
