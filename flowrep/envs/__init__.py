@@ -3,7 +3,7 @@
 Importing this registers them with gymnasium, which from 1.0 on finds no plugins by itself.
 `gymnasium.make("flowrep.envs:flowrep/StraightRoad-v0")` imports it first.
 
-What needs PyTorch is imported when it is first asked for: workers step environments without it.
+Names that need PyTorch are imported on first use: worker processes step environments without it.
 """
 
 from importlib import import_module
@@ -62,9 +62,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Returns what is public and was not imported above."""
+    """Returns a public name that was not imported above."""
     if name not in __all__:
         raise AttributeError(f"module 'flowrep.envs' has no attribute '{name}'")
     is_wrapper = name in ("NumericInfo", "RepresentationObservation")
-    home = import_module(f"flowrep.envs.{'gym_wrappers' if is_wrapper else 'torchrl_env'}")
-    return getattr(home, name)
+    module = import_module(f"flowrep.envs.{'gym_wrappers' if is_wrapper else 'torchrl_env'}")
+    return getattr(module, name)

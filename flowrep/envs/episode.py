@@ -34,7 +34,7 @@ class Outcome(IntEnum):
         return self.name.lower()
 
 
-NOTHING_HIT = 255  # the code of `hit` if nothing was hit; no class has this id
+NOTHING_HIT = 255  # the code of `hit` without a collision; no class has this id
 
 
 def reward(outcome: Outcome) -> float:
@@ -48,22 +48,22 @@ def hit_name(code: int) -> str:
 
 
 Array = NDArray[Any]
-# Between two checks of the footprint neither the vehicle nor anyone moves more than 0.42 m, as the
-# vehicle does at 10 m/s, nor a shorter vehicle its length: it can't skip anyone or anything.
+# Between two checks of the footprint neither the vehicle nor a person moves more than 0.42 m (the
+# vehicle at 10 m/s), nor a shorter vehicle more than its length, so it can't jump over anything.
 _CHECKS_HZ = 24.0
 _CHECKS_PER_M = 2.4
-_STEPS_FORESEEN = 16  # people ignore the vehicle, so their positions are computed in batches
+_STEPS_AHEAD = 16  # people ignore the vehicle, so their poses are computed for many steps at once
 
 
 class Moment(NamedTuple):
-    """The vehicle's state and the pedestrians' clock; ticks count the footprint's checks."""
+    """The vehicle's state and the pedestrians' clock, in ticks: checks of the footprint."""
 
     vehicle: VehicleState
     ticks: int
 
 
 def ticks_for(scene: Scene, frame_rate_hz: float, speed_mps: Range, driven_mps: float) -> int:
-    """Returns how often the footprint is checked in a step, for the speeds of an episode."""
+    """Returns how many times a step checks the footprint, at the speeds of an episode."""
     groups = [group for group in scene.pedestrian_groups if group.standing < group.count]
     fastest_mps = max(((group.speed_mps or speed_mps)[1] for group in groups), default=0.0)
     driven_hz = driven_mps * max(_CHECKS_PER_M, 1.0 / scene.vehicle.length_m)
@@ -72,7 +72,17 @@ def ticks_for(scene: Scene, frame_rate_hz: float, speed_mps: Range, driven_mps: 
 
 
 class Episode:
-    """The constants and the state of one drive."""
+    """The constants and the state of one drive.
+
+    Args:
+        frame_rate_hz: steps a second.
+        episode_seed: of all that is drawn: the path, and people's walks.
+        speed_mps: lowest and highest speed of people whose group has none of its own.
+        path: the name of the path; None draws one.
+
+    Raises:
+        ValueError: the scene has no such path.
+    """
 
     def __init__(
         self,
@@ -88,12 +98,11 @@ class Episode:
         if path is not None and path not in paths:
             raise ValueError(f"unknown path {path!r}; the scene has {[*paths]}")
         rng = np.random.default_rng(episode_seed)
-        # Drawn even where a path is given, so that a seed has the same people on every path.
+        # Drawn even if a path is given, so that a seed has the same people on every path.
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
         self.layout, self.seed = layout, episode_seed
         self.speed_mps, self.vehicle_speed_mps = speed_mps, vehicle_speed_mps
         self.frame_rate_hz, self.dt_s = frame_rate_hz, 1.0 / frame_rate_hz
-        # Ticks are the checks of the footprint within a step; people's clock counts them.
         self.ticks_per_step = ticks_for(scene, frame_rate_hz, speed_mps, vehicle_speed_mps)
         self.tick_s = self.dt_s / self.ticks_per_step
         # Rounding must not add a step: 200 / 12 · 15 is 250.00000000000003.
@@ -104,8 +113,8 @@ class Episode:
         self.now = self.before = Moment(layout.start_state(self.path.start), 0)
         self.steps, self.outcome, self.hit = 0, Outcome.RUNNING, ""
         self.poses = self.poses_before = self.crowd.poses(0.0)
-        # Poses at the ticks from a first one on: [ticks, P, 4].
-        self._foreseen_from, self._foreseen = 0, self.poses[:0, None]
+        # Poses of people at some ticks in a row, [ticks, P, 4], and the first of these ticks.
+        self._ahead_from, self._ahead = 0, self.poses[:0, None]
 
     def status(self) -> dict[str, int]:
         """Returns outcome, hit, seed and path as numbers, as TensorDicts hold them."""
@@ -130,7 +139,7 @@ class Episode:
         poses = self._poses_ahead()
         is_near = street.is_anyone_near(track, poses).tolist()
         for i, vehicle in enumerate(track):
-            # PyBullet and shapely are asked only where something can have happened.
+            # PyBullet and shapely are asked only where a collision or an end is possible.
             if is_near[i] or not street.is_safe(vehicle.x_m, vehicle.y_m):
                 self._end_where_due(vehicle, poses[i], street)
             if self.outcome:
@@ -143,12 +152,12 @@ class Episode:
 
     def _poses_ahead(self) -> Array:  # at the checks of the next step, [T, P, 4]
         count, first = self.ticks_per_step, self.now.ticks + 1
-        at = first - self._foreseen_from
-        if not 0 <= at <= len(self._foreseen) - count:
-            ticks = first + np.arange(count * _STEPS_FORESEEN)
-            self._foreseen = self.crowd.poses(ticks[:, None] * self.tick_s)
-            self._foreseen_from, at = first, 0
-        return self._foreseen[at : at + count]
+        at = first - self._ahead_from
+        if not 0 <= at <= len(self._ahead) - count:
+            ticks = first + np.arange(count * _STEPS_AHEAD)
+            self._ahead = self.crowd.poses(ticks[:, None] * self.tick_s)
+            self._ahead_from, at = first, 0
+        return self._ahead[at : at + count]
 
     def _end_where_due(self, vehicle: VehicleState, poses: Array, street: Street) -> None:
         self.hit = street.hit(vehicle, poses, self.path.closures)

@@ -29,12 +29,18 @@ class RepresentationObservation(gym.Wrapper):
 
     If joined, the observation is one `Box` `[C, H, W]`: float32, with the representations' channels
     in the given order, ids one-hot and colours divided by 255; rgb alone stays uint8. If not
-    joined, it is a `Dict` of maps by name, as `make_env` gives them.
+    joined, it is a `Dict` of maps by name, as in `make_env`.
 
     Args:
-        env: gives a dict of sensor maps and motions, as `StreetEnv` does; its `K` `[3, 3]`,
-            `num_classes` and `frame_rate_hz`, where it has them, are the defaults of what follows.
+        env: its observation is a dict of sensor maps and motions, as `StreetEnv`'s.
         representations: names, or a mapping from name to options.
+        intrinsics: K `[3, 3]` of the maps; the env's `K` by default.
+        num_classes: the number of semantic classes; the env's `num_classes` by default.
+        dt_s: seconds a step; 1 over the env's `frame_rate_hz` by default.
+
+    Raises:
+        ValueError: the observation is no dict, or a representation needs what neither the env nor
+            an argument gives.
 
     >>> env = gym.make("flowrep/StraightRoad-v0", representations=["ego", "obj"])
     >>> observation, info = env.reset(seed=0)
@@ -104,7 +110,7 @@ class RepresentationObservation(gym.Wrapper):
 
 
 class NumericInfo(gym.Wrapper):
-    """Reduces `info` to numbers, and optionally reports time-outs as truncations.
+    """Replaces `info` by numbers, and optionally reports time-outs as truncations.
 
     `outcome` is a code of `Outcome`, `hit` a class id or 255, `path` an index into the scene's
     paths; `is_success` is what Stable-Baselines3 reads.
@@ -142,12 +148,18 @@ def make_street(
     truncate_timeouts: bool = False,
     **options: Any,
 ) -> gym.Env:
-    """Returns a `StreetEnv` of the options, or its representations, for `gymnasium.make`.
+    """Returns a `StreetEnv`, wrapped if it should give representations; for `gymnasium.make`.
 
-    With representations or `truncate_timeouts` its `info` holds numbers, see `NumericInfo`.
+    Args:
+        representations: as for `RepresentationObservation`; without any, observations are the
+            `StreetEnv`'s. With some, or with `truncate_timeouts`, `info` holds numbers, see
+            `NumericInfo`.
+        joined: see `RepresentationObservation`.
+        truncate_timeouts: see `NumericInfo`.
+        options: further arguments of `StreetEnv`.
     """
     if representations and "sensors" not in options:
-        # which sensors are read doesn't depend on K and classes
+        # Which sensors are read doesn't depend on K, the number of classes or the frame rate.
         any_camera: dict[str, Any] = {"intrinsics": torch.eye(3), "num_classes": 1, "dt_s": 1.0}
         options["sensors"] = sensors_read(representation_stack(representations, **any_camera))
     env: gym.Env = StreetEnv(scene, **options)
@@ -159,7 +171,7 @@ def make_street(
 
 
 def _onehot(representations: Representations) -> dict[str, dict[str, Any]]:
-    """Returns the representations with one-hot ids: a class id is not an intensity."""
+    """Returns the representations with one-hot ids, as a class id is no intensity."""
     given = representations if isinstance(representations, Mapping) else {}
     onehot = {"encoding": "onehot"}
     return {

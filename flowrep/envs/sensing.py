@@ -58,14 +58,14 @@ class Sensing:
             raise ValueError(f"picture_scale={scale} {remedy}")
         self._rasterisers: dict[int, Any] = {}  # by scale
         if self.renderer != "pybullet" and not _DRAWN.isdisjoint(sensors):
-            self._rasteriser(1)  # compiled before the first step
+            self._rasteriser(1)  # so that it is compiled before the first step
 
     def observe(self, episode: Episode) -> dict[str, Any]:
         """Returns an episode's current observation."""
         return {name: stack[0] for name, stack in self.observe_all([episode]).items()}
 
     def observe_all(self, episodes: Sequence[Episode]) -> Arrays:
-        """Returns the current observations of N episodes, [N, ...], each as if it were alone."""
+        """Returns the current observations of N episodes, [N, ...], equal to each one alone."""
         names = _DRAWN.intersection(self.names)
         observation = self._draw(episodes, names) if names else {}
         if not {"prev_from_curr", "instance_motion"}.isdisjoint(self.names):
@@ -108,7 +108,7 @@ class Sensing:
         return spaces.Dict({name: every[name] for name in self.names})
 
     def _draw(self, episodes: Sequence[Episode], names: Set[str]) -> Arrays:
-        """Returns at least the named maps and colours, [N, ...]."""
+        """Returns at least the named maps and colours of N episodes, [N, ...]."""
         if self.renderer == "pybullet":
             pictured = [self._pictured(episode) for episode in episodes]
             return {name: np.stack([maps[name] for maps in pictured]) for name in pictured[0]}
@@ -122,7 +122,7 @@ class Sensing:
         return arrays
 
     def views(self, episodes: Sequence[Episode]) -> tuple[Array, Array, Array]:
-        """Returns the poses of cameras and people's parts and what is shown, of N episodes."""
+        """Returns cam_from_world, people's parts, and which bodies are there, of N episodes."""
         return (
             rigid_inverse(self._camera_poses([episode.now for episode in episodes])),
             world_from_parts(np.stack([episode.poses for episode in episodes])),
@@ -130,11 +130,12 @@ class Sensing:
         )
 
     def _rasteriser(self, scale: int) -> Any:
-        """Returns a rasteriser of pictures so many times the maps' size."""
+        """Returns the rasteriser of pictures of `scale` times the maps' size."""
         if scale not in self._rasterisers:
             from flowrep.simulator.rasteriser import Rasteriser  # which imports numba
 
             height, width = self._size
+            # Pixel centres at halves scale like all other coordinates.
             K, size = np.diag([scale, scale, 1.0]) @ self.K, (scale * height, scale * width)
             self._rasterisers[scale] = Rasteriser(self._street.triangles, K, size, self._range_m)
         return self._rasterisers[scale]

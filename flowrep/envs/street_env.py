@@ -35,21 +35,26 @@ class StreetEnv(gym.Env):
     | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
     | `instance_motion` | [1 + 3·P, 4, 4] | float32 | the same by instance; row 0: static world |
     | `rgb` | [3, k·H, k·W] | uint8 | colours, k = `picture_scale` |
-    | `frame` | [2] | int64 | its identifier: the episode's seed, and the steps since its start |
+    | `frame` | [2] | int64 | identifies the frame: the episode's seed, the steps since its start |
 
-    At reset the previous pose is the current one. `info` holds `outcome`, `hit` (the category hit,
-    or ""), `episode_seed` and `path`.
+    At reset the previous pose is the current one. `info` holds `outcome`, `hit` (the category that
+    the vehicle hit, or ""), `episode_seed` and `path`.
 
     Args:
         scene: a scene's name, file, mapping, or `Scene`.
         speed: the pedestrians' speed mode, or their (lowest, highest) speed in m/s.
-        frame_rate_hz: steps a second; the scene's own if None. The time limit keeps its seconds.
-        sensors: the keys of the observation; nothing is rendered if empty.
+        frame_rate_hz: steps a second; None for the scene's. The time limit stays the same in
+            seconds.
+        sensors: the keys of the observation; without any, nothing is rendered.
         render_mode: "rgb_array" or None.
-        renderer: "rasteriser", whose colours are textured, "pybullet", or "auto", which is the
-            rasteriser if numba is installed.
-        picture_scale: size of `rgb` and of rendered pictures in sizes of the maps. Flow estimated
-            from larger pictures and averaged down is more accurate.
+        renderer: "rasteriser", whose colours are textured, "pybullet", or "auto": the rasteriser if
+            numba is installed.
+        picture_scale: size of `rgb` and of rendered pictures, as a multiple of the maps'. Flow
+            estimated from larger pictures and averaged is more accurate.
+
+    Raises:
+        SceneError: the scene is invalid.
+        ValueError: another argument is.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012
@@ -98,9 +103,9 @@ class StreetEnv(gym.Env):
         Args:
             seed: seeds the generator that draws the episodes' seeds.
             options: `episode_seed` (int) selects the episode and `path` (str) its path;
-                `vehicle_speed_mps` (float) replaces the scene's speed, with 0 for a still camera;
+                `vehicle_speed_mps` (float) replaces the scene's speed, 0 for a still camera;
                 `speed` and `frame_rate_hz` replace the env's for this episode. Or `state` alone, of
-                `get_state`, with which an episode goes on.
+                `get_state`, which resumes an episode.
         """
         self.begin(seed=seed, options=options)
         return self.sensing.observe(self.episode), self._info()
@@ -115,7 +120,7 @@ class StreetEnv(gym.Env):
             self._begin({"episode_seed": int(self.np_random.integers(1 << 31))} | options)
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drives one step; every end of an episode is `terminated`, including the time-out."""
+        """Drives one step; every end of an episode is `terminated`, the time-out included."""
         outcome = self.drive(action)
         observation = self.sensing.observe(self.episode)
         return observation, reward(outcome), outcome != Outcome.RUNNING, False, self._info()
@@ -137,7 +142,7 @@ class StreetEnv(gym.Env):
         return None if self.render_mode is None else self.sensing.rgb(self.episode)
 
     def close(self) -> None:
-        """Leaves the street, whose simulator is gone with the last environment."""
+        """Releases the street; its simulator closes with the last environment that uses it."""
         self.sensing = self._street = None  # type: ignore[assignment]
 
     def get_state(self) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from flowrep.transforms.stack import FLOWS, DropKeys
 
 
 def usable_device(device: str | torch.device) -> torch.device:
-    """Returns a device on which tensors can be made.
+    """Returns a device, once a tensor could be created on it.
 
     Raises:
         ValueError: there is no such device, or this PyTorch can't use it.
@@ -47,7 +47,7 @@ def sensors_read(transforms: Iterable[Any]) -> list[str]:
 def check_rate(
     transforms: Iterable[Any], options: Mapping[str, Any] | None, frame_rate_hz: float
 ) -> None:
-    """Refuses a reset to another frame rate than that for which flow in px/s was set up."""
+    """Raises ValueError for a reset to another frame rate than flow in px/s was set up for."""
     asked = (options or {}).get("frame_rate_hz")
     if asked is None or not any(getattr(t, "is_per_second", False) for t in transforms):
         return
@@ -59,7 +59,7 @@ def check_rate(
 
 
 class VectorWrapper(GymWrapper):
-    """TorchRL's wrapper, with reset masks moved to the CPU and optional, and options checked."""
+    """TorchRL's wrapper; reset masks are optional and moved to the CPU, reset options checked."""
 
     def __init__(
         self,
@@ -106,31 +106,36 @@ def make_env(
 ) -> TransformedEnv:
     """Returns a batched TorchRL env, always of batch size [num_envs].
 
-    Reads action (categorical: 0 NO_OP, 1 TURN_LEFT, 2 TURN_RIGHT). Writes the representations,
-    `outcome` and `hit` uint8 [1], `episode_seed` int64 [1], `reward` [1] and the done keys. Env
-    i's k-th episode does not depend on the policy.
+    It reads `action` (categorical: 0 keep the yaw rate, 1 turn left, 2 turn right) and writes the
+    representations, `outcome` and `hit` uint8 [1], `episode_seed` and `path` int64 [1], `vehicle`
+    float32 [3] (see `StreetVectorEnv`), `reward` [1] and the done keys. Which episodes an env gets,
+    and in which order, depends on its seed alone, not on the policy.
 
     Args:
-        scene: see `StreetEnv`, as for `speed`, `frame_rate_hz`, `renderer` and `picture_scale`.
-        representations: names, or a mapping from name to options; only the sensors that they need
+        scene: a scene's name, YAML file, mapping, or `Scene`.
+        representations: names, or a mapping from name to options. Only the sensors that they need
             are rendered, none for an empty list.
-        num_workers: number of processes that step them, see `WorkerVectorEnv`; 0 steps them in this
-            process. The results are the same.
-        seed: seeds the envs, which draw their episodes from it; None leaves that to `set_seed`.
-        keep_sensor: whether the ("sensor", ...) keys are kept; rgb and frame are kept only if a
+        num_envs: the batch size.
+        num_workers: number of processes that step the envs, see `WorkerVectorEnv`; 0 steps them in
+            this process. The results are the same.
+        device: of the TensorDicts; streets are simulated on the CPU.
+        speed: see `StreetEnv`, as for `frame_rate_hz`, `renderer` and `picture_scale`.
+        seed: of the envs, which draw their episodes from it; None leaves that to `set_seed`.
+        keep_sensor: whether to keep the ("sensor", ...) keys; rgb and frame are kept only if a
             representation needs them.
         flow: "exact" or "estimated", the source of raw and obj; a mapping gives options, see
             `flowrep.transforms.representation_stack`.
         motion: "exact" or "estimated" from flow and depth, the source of the camera's motion behind
             ego and obj.
-        noise: errors of the depth camera and of odometry, see `representation_stack`; a
-            repeated episode has the same.
+        noise: errors of the depth camera and of odometry, see `representation_stack`; the same
+            whenever an episode is repeated.
         compiled: whether flow is computed through `torch.compile`: up to two and a half times as
             fast on a CPU and equal up to rounding, after up to a minute of compilation.
 
     Raises:
-        SceneError: if the scene is invalid.
-        ValueError: if the device can't be used, or if `compiled=True` and no C++ compiler is found.
+        SceneError: the scene is invalid.
+        ValueError: an argument is invalid, the device can't be used, or `compiled=True` without a
+            C++ compiler.
 
     >>> env = make_env("straight_road", ["ego", "obj"], num_envs=2, seed=0)
     >>> env.rollout(3)["next", "obj"].shape
@@ -159,7 +164,7 @@ def make_env(
             noise=noise,
         )
     sensors = sensors_read(transforms)
-    if keep_sensor:  # these two only if something reads them
+    if keep_sensor:  # rgb and frame only if a transform reads them
         sensors = [name for name in SENSORS if name in sensors or name not in ("rgb", "frame")]
     elif sensors:
         transforms.append(DropKeys("sensor"))
@@ -186,8 +191,8 @@ def make_mirror(
     """Returns the transform that replaces half of a replay batch by its left-right images.
 
     Args:
-        scene: as for `make_env`; its camera says which columns see opposite directions.
-        representations: the keys of the maps, named as in `make_env`.
+        scene: as for `make_env`; its camera determines which columns see opposite directions.
+        representations: the keys of the maps, as in `make_env`.
 
     >>> make_mirror("straight_road", ["ego", "seg2"]).swapped_actions
     tensor([0, 2, 1])
@@ -207,8 +212,8 @@ def begin_step(env: TransformedEnv, acted: TensorDictBase) -> None:
 
 def has_spare_cores(env: TransformedEnv, threads: int) -> bool:
     """Returns whether the env's workers and `threads` threads of the caller have a core each."""
-    # If not, running both at once is slower than one after the other: threads that synchronise at
-    # every operation all wait when one of them loses its core.
+    # If not, running both at once takes longer than one after the other: threads synchronise at
+    # every operation, and all of them wait when one loses its core.
     return _vector(env).num_workers + threads <= available_cores()
 
 
@@ -216,7 +221,7 @@ def street_envs(env: TransformedEnv) -> list[StreetEnv]:
     """Returns the `StreetEnv`s of an env made by `make_env`, in the order of its batch.
 
     Raises:
-        ValueError: if they are in worker processes.
+        ValueError: the environments are in worker processes.
     """
     vector = _vector(env)
     if vector.num_workers:
@@ -230,7 +235,7 @@ def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
 
 
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
-    """Restores states from `get_states`; continue with the TensorDict of the same time."""
+    """Restores states from `get_states`; continue with the TensorDict of the same step."""
     vector = _vector(env)
     if len(states) != (count := vector.num_envs):
         raise ValueError(f"{len(states)} states for {count} environments; give one for each")

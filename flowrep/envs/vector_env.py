@@ -24,7 +24,9 @@ _STATUS: dict[str, Any] = {
 
 
 class StreetVectorEnv(SyncVectorEnv):
-    """`StreetEnv`s that are drawn together, with the status of their episodes, without autoreset.
+    """`StreetEnv`s that are drawn together; the status of their episodes is in the observation.
+
+    Without autoreset.
 
     | key | shape | dtype | meaning |
     | --- | --- | --- | --- |
@@ -35,8 +37,10 @@ class StreetVectorEnv(SyncVectorEnv):
     | `path` | [1] | int64 | index of the episode's path in the scene |
     | `vehicle` | [3] | float32 | x and y in metres and yaw in radians, in the world |
 
-    Observations are identical, bit for bit, to those of the environments alone, and belong to the
-    caller.
+    Observations are bitwise equal to those of the environments alone, and belong to the caller.
+
+    Raises:
+        ValueError: the environments differ in scene, sensors, renderer or `picture_scale`.
     """
 
     num_workers = 0
@@ -66,9 +70,9 @@ class StreetVectorEnv(SyncVectorEnv):
 
         Args:
             seed: of the first environment, with consecutive seeds for the others; or one for each.
-            options: of every episode, see `StreetEnv.reset`. `episodes` holds more for each
-                environment, or None to leave it idle until its next reset: it then ignores actions,
-                gets no reward, and keeps its last observation.
+            options: of every episode, see `StreetEnv.reset`. `episodes` holds further options for
+                each environment, or None to leave it idle until its next reset: it then ignores
+                actions, gets no reward, and keeps its last observation.
         """
         options = dict(options or {})
         mask = options.pop("reset_mask", np.ones(self.num_envs, dtype=bool))
@@ -78,8 +82,8 @@ class StreetVectorEnv(SyncVectorEnv):
         for i in due:
             self._is_idle[i] = episodes[i] is None
             if not self._is_idle[i]:
-                own_seed = None if seeds is None else seeds[i]
-                self._streets[i].begin(seed=own_seed, options=options | episodes[i])
+                seed_of_env = None if seeds is None else seeds[i]
+                self._streets[i].begin(seed=seed_of_env, options=options | episodes[i])
         return self._observe([i for i in due if not self._is_idle[i]]), {}
 
     def step(
@@ -106,7 +110,7 @@ class StreetVectorEnv(SyncVectorEnv):
         sensor = self._sensing.observe_all(episodes)
         observation = ({"sensor": sensor} if sensor else {}) | _status(episodes)
         if len(rows) < self.num_envs:
-            # Arrays returned before belong to the caller: copy them instead of writing to them.
+            # The arrays belong to the caller of an earlier step: copy them before writing to them.
             self._latest = deepcopy(self._latest)
             write_rows(observation, self._latest, rows)
         else:

@@ -1,4 +1,4 @@
-"""Environments stepped in parallel in several processes, several in each."""
+"""Environments stepped in parallel by several processes, several environments in each."""
 
 import os
 import pickle
@@ -32,24 +32,25 @@ _SIDE_BY_SIDE = partial(SyncVectorEnv, copy=False, autoreset_mode=AutoresetMode.
 
 
 PATIENCE_S, PATIENCE_AFTER_STOP_S = 300.0, 10.0
-"""How long a worker may take to answer: it starts in seconds and steps in milliseconds, but the
-machine may be busy. Once a signal asked the process to stop, what ends it may soon be SIGKILL."""
+"""How long a worker may take to answer. It starts in seconds and steps in milliseconds, but the
+machine may be busy. After a signal to stop there is less time: SIGKILL may follow soon."""
 
 
 class WorkerError(RuntimeError):
-    """A worker process failed, died or doesn't answer; the message names it."""
+    """A worker process failed, died or doesn't answer; the message names its environments."""
 
 
 class WorkerVectorEnv(VectorEnv):
     """Several environments in each of several processes, behind gymnasium's vector interface.
 
     It behaves like a `SyncVectorEnv` with autoreset disabled: the same seeds and actions give the
-    same numbers, bit for bit, for any number of workers. Infos are not passed on. Gymnasium's
-    `AsyncVectorEnv` made 386 to 403 frames/s where this one made 464 to 524, and Ctrl-C kills its
-    workers.
+    same numbers, bit for bit, for any number of workers. Infos are not passed on.
 
-    Observations come back through shared memory, everything else through pipes. Workers don't react
-    to SIGINT, SIGTERM and SIGHUP, which terminals and schedulers send to whole process groups, and
+    Gymnasium's `AsyncVectorEnv` has a process for each environment. It stepped 386 to 403 frames/s
+    where this one stepped 464 to 524, and Ctrl-C kills its workers.
+
+    Observations come back through shared memory, everything else through pipes. Workers ignore
+    SIGINT, SIGTERM and SIGHUP, which terminals and schedulers send to whole process groups. They
     end when the caller closes them or dies.
 
     Args:
@@ -59,9 +60,9 @@ class WorkerVectorEnv(VectorEnv):
         in_each: makes a vector env without autoreset from the environments of one worker.
 
     Raises:
-        ValueError: if there are more workers than environments, or a factory can't be pickled.
-        WorkerError: if a worker could not start; any method raises it if a worker has ended, or
-            does not answer.
+        ValueError: there are more workers than environments, or a factory can't be pickled.
+        WorkerError: a worker could not start; any method raises it if a worker has ended or does
+            not answer.
     """
 
     def __init__(
@@ -88,19 +89,20 @@ class WorkerVectorEnv(VectorEnv):
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
         self._rows = [slice(*ends) for ends in pairwise(bounds)]
         self._workers: list[_Worker] = []
-        # At exit, multiprocessing would wait for ever for processes that SIGTERM does not reach.
+        # At exit, multiprocessing sends SIGTERM and waits. Workers ignore it, so they are closed
+        # before.
         self._end = util.Finalize(self, _end, args=(self._workers,), exitpriority=10)
-        # fork would copy the locks of PyTorch's threads as they are; spawn would import gymnasium,
-        # numpy and PyBullet anew in each worker, not once in the server that they are forked from.
+        # fork would copy the locks that PyTorch's threads hold at the moment. spawn would import
+        # gymnasium, numpy and PyBullet in each worker; a fork server imports them once.
         context: Any = get_context("forkserver")
         context.set_forkserver_preload(["flowrep.envs.vector_env"])
         with sheltered():
             forkserver.ensure_running()
             memory = create_shared_memory(space, self.num_envs, context)
             for rows in self._rows:
-                made_of = env_factories[rows], memory, self.num_envs, in_each
+                arguments = env_factories[rows], memory, self.num_envs, in_each
                 try:
-                    self._workers.append(_Worker(context, rows, *made_of))
+                    self._workers.append(_Worker(context, rows, *arguments))
                 except (pickle.PicklingError, AttributeError, TypeError) as error:
                     raise ValueError(
                         f"an environment's factory can't be sent to a worker process ({error}): "
@@ -119,18 +121,18 @@ class WorkerVectorEnv(VectorEnv):
     ) -> tuple[Arrays, dict[str, Any]]:
         """Begins episodes as `SyncVectorEnv` does; the outcome of a step under way is dropped.
 
-        Of the options each worker gets its own part of `reset_mask`, bool [num_envs], and of
-        `episodes`, see `StreetVectorEnv.reset`.
+        The options `reset_mask`, bool [num_envs], and `episodes`, see `StreetVectorEnv.reset`, are
+        split among the workers; all others go to each.
         """
-        each = {"reset_mask": np.ones(self.num_envs, dtype=bool), **(options or {})}
-        apart = [name for name in ("reset_mask", "episodes") if each.get(name) is not None]
+        shared = {"reset_mask": np.ones(self.num_envs, dtype=bool), **(options or {})}
+        split = [name for name in ("reset_mask", "episodes") if shared.get(name) is not None]
         if isinstance(seed, int):
             seed = range(seed, seed + self.num_envs)
         seeds = [None] * self.num_envs if seed is None else list(seed)
 
         def arguments(rows: slice) -> dict[str, Any]:
-            own = {name: each[name][rows] for name in apart}
-            return {"seed": seeds[rows], "options": each | own}
+            part = {name: shared[name][rows] for name in split}
+            return {"seed": seeds[rows], "options": shared | part}
 
         self._call("reset", arguments)
         return deepcopy(self._shared), {}
@@ -159,7 +161,7 @@ class WorkerVectorEnv(VectorEnv):
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Returns the result of a method, or the value of an attribute, for each environment."""
         results = self._call("call", lambda rows: {"name": name, "args": args, "kwargs": kwargs})
-        return tuple(result for own in results for result in own)
+        return tuple(result for of_worker in results for result in of_worker)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the workers."""
@@ -180,16 +182,16 @@ class WorkerVectorEnv(VectorEnv):
 class _Worker:
     """The caller's side of a process that steps environments."""
 
-    def __init__(self, context: Any, rows: slice, *made_of: Any) -> None:
+    def __init__(self, context: Any, rows: slice, *arguments: Any) -> None:
         self.name = f"environments {rows.start} to {rows.stop - 1}"
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, rows, *made_of), daemon=True)
+        self.process = context.Process(target=_work, args=(theirs, rows, *arguments), daemon=True)
         self.process.start()
         theirs.close()
-        self._owes_answer = True  # that its environments are made
+        self._owes_answer = True  # once its environments exist
 
     def send(self, method: str, arguments: dict[str, Any]) -> None:
-        if self._owes_answer:  # that of a step which was dropped, or of a call that was interrupted
+        if self._owes_answer:  # of a step that was dropped, or of a call that was interrupted
             self.receive()
         self._talk(self.pipe.send, (method, arguments))
         self._owes_answer = True
@@ -284,9 +286,10 @@ def write_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: Any) 
 
 @contextmanager
 def sheltered() -> Iterator[None]:
-    """Starts processes that signals don't reach and that do not run the main module again."""
-    # A process inherits the mask of blocked signals, so there is no moment at which Ctrl-C could
-    # print a traceback from each worker, or a hang-up end multiprocessing's resource tracker.
+    """Within it, processes start with signals blocked and without running the main module again."""
+    # A process inherits the mask of blocked signals. If it blocked them itself, Ctrl-C in the
+    # moment before would print a traceback from each worker, or end multiprocessing's resource
+    # tracker.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     resource_tracker.ensure_running()  # which unblocks some of them when it starts
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)

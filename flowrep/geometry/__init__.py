@@ -1,8 +1,11 @@
 """Cameras, rigid motions and the flow they cause, as pure batched functions on torch tensors.
 
-`*B` is any leading batch; those of several arguments broadcast. Every function raises ValueError
-for a shape, a name or a number that does not fit and TypeError for an argument that holds no floats
-(or no integers, where ids are wanted), and names it.
+`*B` is any leading batch; the batches of several arguments broadcast. Every function raises
+ValueError for a wrong shape, name or number, and TypeError for an argument that holds no floats (or
+no integers, where ids are expected). The message names the argument.
+
+The paper is Yang et al., "Investigation of Factorized Optical Flows as Mid-Level Representations"
+(IROS 2022); equations are numbered as there.
 """
 
 from flowrep.geometry.camera import (

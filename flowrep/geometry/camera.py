@@ -1,4 +1,4 @@
-"""The pinhole camera: points to pixels and back, and its intrinsics K from what others give."""
+"""The pinhole camera: points to pixels and back, and its intrinsics K from other conventions."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from flowrep.geometry.checks import check_name, check_shape, common_batch, first
 
 FovAxis: TypeAlias = Literal["horizontal", "vertical"]
 
-# A camera's focal length, in sizes of its picture's longer side, and how far within the picture its
-# principal point lies, as a share of width or height: see `check_intrinsics`.
+# Bounds of `check_intrinsics`: on the focal length, as a multiple of the picture's longer side, and
+# on the principal point's distance from the border, as a share of the width or the height.
 SHORTEST, LONGEST, BORDER = 0.2, 20.0, 0.1
 
 
 def project(points_cam: Tensor, K: Tensor) -> Tensor:
-    """Returns the pixel coordinates (u, v) at which a camera sees points.
+    """Returns the pixel coordinates (u, v) at which a camera sees points, `[*B, ..., 2]`.
 
     Convention: OpenCV camera (x right, y down, z forward), metres; u right, v down, pixels, the
     centre of pixel (0, 0) at (0.5, 0.5). A point that is not in front of the camera (z <= 0) has
@@ -39,7 +39,7 @@ def project(points_cam: Tensor, K: Tensor) -> Tensor:
     K = over_points("K", K, "points_cam", points_cam)
     x, y, z = points_cam.unbind(-1)
     in_front = z > 0
-    z = torch.where(in_front, z, 1.0)
+    z = torch.where(in_front, z, 1.0)  # no division by 0, whose gradient would be nan
     x, y = x / z, y / z
     u = K[..., 0, 0] * x + K[..., 0, 1] * y + K[..., 0, 2]
     v = K[..., 1, 1] * y + K[..., 1, 2]
@@ -50,9 +50,9 @@ def project(points_cam: Tensor, K: Tensor) -> Tensor:
 def unproject(depth: Tensor, K: Tensor) -> Tensor:
     """Returns the point that each pixel shows, in the camera's frame, `[*B, H, W, 3]`.
 
-    Convention: as in `project`; depth is z along the optical axis (not the ray's length), and pixel
-    (column i, row j) is seen through its centre (i + 0.5, j + 0.5). Where depth is inf or nan the
-    point is not finite.
+    Convention: as in `project`. Depth is z along the optical axis (not the ray's length), and the
+    pixel in column i, row j is seen through its centre (i + 0.5, j + 0.5). Where depth is inf or
+    nan the point is not finite.
 
     Equation 10 of the paper, with separate focal lengths and skew.
 
@@ -100,13 +100,16 @@ def intrinsics_from_fov(
 ) -> Tensor:
     """Returns K `[3, 3]` of a camera with a centred principal point.
 
-    Convention: `axis` is the side of the picture that `fov_deg` spans from border to border:
-    `"horizontal"` its width (Habitat's hfov), `"vertical"` its height (MuJoCo's fovy, OpenGL's
-    perspective).
+    Convention: the field of view spans the picture from border to border, along `axis`:
+    `"horizontal"` across its width (Habitat's hfov), `"vertical"` across its height (MuJoCo's fovy,
+    OpenGL's perspective).
 
     Args:
+        fov_deg: the field of view, degrees, between 0 and 180.
+        axis: `"horizontal"` or `"vertical"`.
         height: of the picture, pixels; as `width`.
         pixel_aspect: a pixel's width over its height, fy / fx; 1 for square pixels.
+        dtype: of K.
 
     >>> intrinsics_from_fov(90.0, axis="vertical", height=4, width=6)
     tensor([[2., 0., 3.],
@@ -129,9 +132,10 @@ def intrinsics_from_fov(
 
 
 def intrinsics_from_opencv(K_opencv: Tensor) -> Tensor:
-    """Returns K with pixel (0, 0)'s centre at (0.5, 0.5), given one with it at (0, 0).
+    """Returns K `[*B, 3, 3]` with pixel (0, 0)'s centre at (0.5, 0.5): half a pixel more cx and cy.
 
-    The latter, `[*B, 3, 3]`, is the convention of OpenCV's calibration and most data sets.
+    Convention: `K_opencv` `[*B, 3, 3]` has that centre at (0, 0), as OpenCV's calibration and most
+    data sets have it.
 
     >>> intrinsics_from_opencv(torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 2.0], [0.0, 0.0, 1.0]]))
     tensor([[4.0000, 0.0000, 1.5000],
@@ -149,14 +153,22 @@ def check_intrinsics(
 ) -> None:
     """Checks that every K `[*B, 3, 3]` is a camera's, with pictures of `size` (height, width).
 
-    ValueError says which K, the argument called `name`, is the first that has other rows than
-    (fx, skew, cx), (0, fy, cy), (0, 0, 1), nan or inf, or a focal length that is not positive; or,
-    if the size is given, that no camera has whose picture this is. Bounds on that are wide: a focal
-    length of 0.2 to 20 times the longer side, that is, fields of view of 136 to 3 degrees, and a
-    principal point a tenth of the picture from its border or more. Lenses are centred to a few per
-    cent, and a crop may lose four ninths of the picture on one side. K of a picture of twice the
-    size has it at the border. With `allow_unknown`, a K with nan, inf or without focal length
-    passes, as the flow functions mark its frame invalid. The check waits for a GPU.
+    The bounds on a K for a size are wide: a focal length of 0.2 to 20 times the longer side, that
+    is, fields of view of 136 to 3 degrees, and a principal point a tenth of the picture from its
+    border or more. Lenses are centred to a few per cent, and a crop may lose four ninths of the
+    picture on one side. K of a picture of twice the size has its principal point at the border.
+
+    The check waits for a GPU.
+
+    Args:
+        name: of the argument, for the message.
+        allow_unknown: whether a K with nan, inf or a focal length of 0 passes; the flow functions
+            mark its frame invalid.
+
+    Raises:
+        ValueError: the first K that has other rows than (fx, skew, cx), (0, fy, cy), (0, 0, 1),
+            nan, inf, or a focal length that is not positive, or that no camera has whose picture is
+            of that size.
 
     >>> check_intrinsics("K", torch.tensor([[4.0, 0.0, 0.0], [0.0, 8.0, 0.0], [1.5, 2.5, 1.0]]))
     Traceback (most recent call last):

@@ -1,4 +1,4 @@
-"""Shape and dtype checks of arguments; they are static, so compiled code doesn't run them."""
+"""Checks of arguments. Those of shapes and dtypes are static: compiled code doesn't run them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def check_shape(
 ) -> None:
     """Checks that `tensor` holds floats (integers if `ids`) and that its last dims are `trailing`.
 
-    Of those, a string is the name of a dim of any size. Raises TypeError or ValueError.
+    In `trailing`, a string is the name of a dim of any size. Raises TypeError or ValueError.
     """
     if not isinstance(tensor, Tensor):
         raise TypeError(

@@ -13,8 +13,8 @@ from flowrep.geometry.checks import check_name, check_shape, common_batch
 
 DepthKind: TypeAlias = Literal["z", "ray_length", "z_buffer", "reversed_z_buffer"]
 
-# What renderers in float32 make of a buffer's 1 where nothing is drawn: up to three times the
-# spacing of numbers below 1 off, in the products of which PyBullet's software renderer composes it.
+# How far a depth buffer may be from 1 where nothing is drawn: PyBullet's software renderer composes
+# it of float32 products and is off by up to three times the spacing of numbers below 1.
 _ROUNDING = 3 * 2.0**-24
 
 
@@ -31,23 +31,28 @@ def adapt_depth(
 ) -> Tensor:
     """Returns depth along the optical axis, `[*B, 1, H, W]`, metres.
 
-    Convention: `"z"` is depth along the optical axis and returned unchanged; `"ray_length"` is the
-    distance from the camera's centre to the surface, metres (lidar, "distance to camera");
+    Convention: `"z"` is depth along the optical axis and returned unchanged. `"ray_length"` is the
+    distance from the camera's centre to the surface, metres (lidar, "distance to camera").
     `"z_buffer"` is OpenGL's depth buffer in [0, 1], 0 at `near_m` and 1 at `far_m` or where nothing
-    was drawn; `"reversed_z_buffer"` is 1 at `near_m` and 0 there (MuJoCo's `mjDEPTH_ZEROFAR`, many
-    game engines). Where nothing was drawn depth is inf. inf stays inf and nan stays nan.
+    was drawn. `"reversed_z_buffer"` is 1 at `near_m` and 0 at `far_m` or where nothing was drawn
+    (MuJoCo's `mjDEPTH_ZEROFAR`, many game engines). Where nothing was drawn the result is inf; inf
+    stays inf and nan stays nan.
 
     Args:
         depth: `[*B, 1, H, W]`, of that `kind`.
+        kind: `"z"`, `"ray_length"`, `"z_buffer"` or `"reversed_z_buffer"`.
         K: `[*B, 3, 3]`, pixels; only for `"ray_length"`.
         near_m: the near plane; only for the two buffers.
         far_m: the far plane, `math.inf` if the projection has none; only for the two buffers.
         scale_m: metres per unit of `depth`, 1 if it is float; whole numbers, such as uint16
             millimetres (0.001), need it. Not for the two buffers.
         nothing: a value, before scaling, that means no measurement; it becomes nan.
-        sky: a value, before scaling, that means no surface, as simulators have it where nothing was
-            drawn; it becomes inf, as does what is below, or if it is positive (a far plane) what
-            is beyond 0.999 of it. Not for the two buffers.
+        sky: a value, before scaling, that means no surface; it becomes inf. A positive one is a far
+            plane, and whatever is beyond 0.999 of it becomes inf too; otherwise whatever is below.
+            Not for the two buffers.
+
+    Raises:
+        ValueError: an argument that `kind` needs is missing, or one that it doesn't read is given.
 
     >>> adapt_depth(torch.tensor([[[0.0, 0.75, 1.0]]]), "z_buffer", near_m=1.0, far_m=3.0)
     tensor([[[1., 2., inf]]])
@@ -58,7 +63,7 @@ def adapt_depth(
     is_sky = None if sky is None else _is_sky(depth, sky)
     unmeasured = None if nothing is None else depth == nothing
     if scale_m is not None:
-        # Divided, since 1 / 0.001 is exact and 0.001 isn't: 3,000 mm are 3 m, not 3.0000002.
+        # Divided, since 1 / 0.001 is exact and 0.001 isn't: 3,000 mm become 3 m, not 3.0000002.
         depth = (depth if depth.is_floating_point() else depth.float()) / (1.0 / scale_m)
     if unmeasured is not None:
         depth = torch.where(unmeasured, torch.nan, depth)
@@ -80,7 +85,9 @@ def _is_sky(depth: Tensor, sky: float) -> Tensor:
 
 
 def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
-    """Returns depth along the optical axis from the length of each pixel's ray, see `adapt_depth`.
+    """Returns depth along the optical axis from ray lengths, `[*B, 1, H, W]`, metres.
+
+    Convention: see `adapt_depth`, as for K `[*B, 3, 3]`.
 
     >>> K = torch.tensor([[4.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]])
     >>> z_from_ray_length(torch.full((1, 1, 1), 5.0), K)  # it looks along (0.75, 0, 1)
@@ -98,12 +105,12 @@ def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
 def z_from_z_buffer(
     z_buffer: Tensor, *, near_m: float, far_m: float, is_reversed: bool = False
 ) -> Tensor:
-    """Returns depth along the optical axis from the depth buffer of a perspective camera.
+    """Returns depth along the optical axis from a perspective camera's depth buffer, metres.
 
-    The result is inf where nothing was drawn and nan where the buffer is outside [0, 1], both up to
-    rounding: PyBullet's software renderer has 0.9999999 or 1.0000001 where nothing was drawn, so a
-    surface that close to the far plane counts as none. A reversed buffer is exactly 0 there, as
-    numbers near 0 are exact. See `adapt_depth`.
+    Convention: see `adapt_depth`; both are `[*B, 1, H, W]`. The result is inf where nothing was
+    drawn and nan where the buffer is outside [0, 1], both up to rounding: PyBullet's software
+    renderer has 0.9999999 or 1.0000001 where nothing was drawn, so a surface that close to the far
+    plane counts as none. A reversed buffer is exactly 0 there, since numbers near 0 are exact.
 
     >>> z_from_z_buffer(torch.tensor([[[0.5]]]), near_m=0.5, far_m=torch.inf)
     tensor([[[1.]]])

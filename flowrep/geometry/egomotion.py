@@ -72,13 +72,13 @@ _LEAST_EIGENVALUE = 1e-5  # of the scaled normal matrix: less is a direction tha
 
 
 class MotionEstimate(NamedTuple):
-    """The camera's motion `[*B, 4, 4]` and how well the flow tells it.
+    """The camera's motion `prev_from_curr` `[*B, 4, 4]`, and how well the flow determines it.
 
     `inlier_share` `[*B]` is the share of the known pixels that move as the camera's motion says,
-    within 2.5 standard deviations of their errors, or 0.2 px if flow is noise.
-    `covariance` `[*B, 6, 6]` is that of (rotation vector in rad, translation in m), a small motion
-    of the previous camera after the estimate; a variance is inf where nothing tells it. `valid`
-    is bool `[*B]`.
+    within 2.5 standard deviations of their errors, or 0.2 px if flow is noise. `covariance`
+    `[*B, 6, 6]` is that of (rotation vector in rad, translation in m), a small motion of the
+    previous camera after the estimate; a variance is inf where no pixel determines it. `valid` is
+    bool `[*B]`.
     """
 
     prev_from_curr: Tensor
@@ -105,7 +105,7 @@ class _Samples(NamedTuple):
         return _Samples(focal, values, known, number)
 
     def every_few(self, count: int, shift: float) -> _Samples:
-        """Returns `count` of the known pixels of each frame, spread over all of them."""
+        """Returns `count` of each frame's known pixels, spread evenly over all of them."""
         shares = (torch.arange(count, device=self.number.device) + shift) / count
         return self.part((shares * self.number.unsqueeze(-1)).long().unsqueeze(1))
 
@@ -127,22 +127,23 @@ def camera_motion(
 ) -> MotionEstimate:
     """Returns the camera's motion between two frames of a mostly static world.
 
-    Convention: `flow` is p_t - p_t' per step on the current frame's grid, as that of `rigid_flow`
-    or an estimator's, and `prev_from_curr` takes a point from the current camera's frame into the
-    previous camera's, so that `ego_flow(depth, K, prev_from_curr)` is the flow without what moves
-    by itself. The result depends on the frame alone (the draws are fixed) and has no gradient.
+    Convention: `flow` is p_t - p_t' per step on the current frame's grid, that of `rigid_flow` or
+    an estimator's, and `prev_from_curr` takes a point from the current camera's frame into the
+    previous camera's, so that `ego_flow(depth, K, prev_from_curr)` is the flow of the static world.
+    The result depends on the frame alone (random draws are fixed) and has no gradient.
 
-    Estimated flow of plain surfaces says nothing, or 0. With `picture` each residual is weighted by
-    the local structure tensor: not at all where there is no texture, only across an edge.
+    Flow estimated on plain surfaces is a guess, or 0. With `picture`, each residual is weighted by
+    the local structure tensor: not at all without texture, and only across an edge.
 
-    It fails, without a sign in the result, where more than half of the known pixels move as one
-    body: the motion is then relative to that body. A prior helps there. `valid` is False, and the
-    motion the prior, where fewer than 32 pixels are known or they leave a direction open (nan, no
-    texture, sky alone, which tells the rotation only), where flow is noise, and where a K or the
-    prior isn't finite, which has the identity. Noise is flow that fits no motion to 0.2 px and
-    shows none that it may not have by chance; errors that neighbours share may look like one. The
-    covariance counts the pixels' own errors, as if independent; it is several times too small for
-    errors that neighbours share.
+    `valid` is False, and the motion the prior, where fewer than 32 pixels are known, where they
+    leave a direction open (sky alone, for instance, determines only rotation), and where flow is
+    noise: it fits no motion to 0.2 px, and none better than chance allows. Where a K or the prior
+    isn't finite, the motion is the identity.
+
+    Two failures don't show in the result. Where more than half of the known pixels move as one
+    body, the motion is relative to that body; a prior helps. And the covariance takes errors for
+    independent: if neighbouring pixels share errors, as estimators' do, it is several times too
+    small, and errors that look like a motion may pass for one.
 
     Args:
         flow: `[*B, 2, H, W]`, pixels per step, nan where it isn't known.
@@ -150,7 +151,10 @@ def camera_motion(
         K: `[*B, 3, 3]`, pixels.
         prev_K: K of the previous frame, `[*B, 3, 3]`, if it was another.
         picture: the current picture `[*B, C, H, W]`, 0 to 255; give it if flow is estimated.
-        prior: the motion expected `[*B, 4, 4]`, the last one or odometry's; identity by default.
+        prior: the expected motion `[*B, 4, 4]`, the last one or odometry's; identity by default.
+
+    Raises:
+        ValueError: flow, depth and picture differ in size.
 
     >>> from flowrep.geometry import ego_flow
     >>> K = torch.tensor([[40.0, 0.0, 10.0], [0.0, 50.0, 8.0], [0.0, 0.0, 1.0]])
@@ -212,10 +216,11 @@ def camera_motion(
 
 
 def structure_tensor(picture: Tensor) -> Tensor:
-    """Returns what surroundings tell of a shift: xx, xy, yy, `[B, 3, H, W]` from `[B, C, H, W]`.
+    """Returns how well surroundings determine a shift: xx, xy, yy, `[B, 3, H, W]`.
 
-    Its eigenvalues are 0 without texture and tend to 1 across a contrast: S (S + n I)^-1, with S
-    the mean of the gradients' products around the pixel and n that of a gradient that is noise.
+    S (S + n I)^-1 for pictures `[B, C, H, W]`, with S the mean of the gradients' products around
+    the pixel and n that of a gradient that is noise. The eigenvalues are 0 without texture and tend
+    to 1 across a contrast.
     """
     grey = picture.mean(-3)
     dx, dy = torch.zeros_like(grey), torch.zeros_like(grey)
@@ -302,7 +307,7 @@ def _entries(K: Tensor, dtype: torch.dtype) -> list[list[Tensor]]:
 def _best_hypothesis(
     voters: _Samples, samples: _Samples, expected: Tensor, *, has_prior: bool
 ) -> Tensor:
-    """Returns the best of the expected motion and those that four pixels tell, `[B, 4, 4]`."""
+    """Returns the best of the expected motion and the hypotheses from four pixels, `[B, 4, 4]`."""
     batch = len(expected)
     # All hypotheses of all frames at once, as B * H frames of four pixels, in float64: four pixels
     # in a row make normal equations that are nearly singular.
@@ -323,8 +328,7 @@ def _best_hypothesis(
     scored, others = (samples.every_few(SCORED_PIXELS, shift) for shift in (0.0, 0.5))
     first = _descended(scored, expected, _STEPS) if has_prior else expected
     motions = torch.cat([first.unsqueeze(1), motion.unflatten(0, (batch, HYPOTHESES))], 1)
-    # How much a pixel that a motion explains counts: the expected motion wins exact ties, a prior
-    # more.
+    # Factors on the scores: the expected motion wins exact ties, a prior also what is nearly one.
     favour = torch.ones(1 + HYPOTHESES, device=expected.device)
     favour[0] = _PRIORS_FAVOUR if has_prior else 1 + 1e-6
     # Neighbouring hypotheses lead to different optima: the best ones are refined and scored again.
@@ -351,8 +355,8 @@ def _best_hypothesis(
 def _costs(samples: _Samples, motions: Tensor, *, final: bool = False) -> tuple[Tensor, Tensor]:
     """Returns truncated costs a pixel, -1 to 0, of motions `[B, M, 4, 4]`, `[B, M]`, and the scale.
 
-    A final choice is among motions at their optima. There, what lies between two bodies' motions
-    and explains both by half must not win over the one that explains a body.
+    A final choice is among motions at their optima. A compromise between two bodies' motions, which
+    explains both by half, must not win over the motion of one; squaring sees to that.
     """
     ru, rv, in_front, *_ = _residuals(samples, motions)
     known = in_front & samples.known.unsqueeze(1)
@@ -367,7 +371,7 @@ def _costs(samples: _Samples, motions: Tensor, *, final: bool = False) -> tuple[
 
 
 def _residuals(samples: _Samples, motion: Tensor) -> tuple[Tensor, ...]:
-    """Returns residuals in px, where points were in front of the camera, and how they moved.
+    """Returns residuals in px, whether points were in front of the camera, and how they moved.
 
     `motion` is `[B, 4, 4]`, or `[B, M, 4, 4]` for M motions of each frame; the results are
     `[B, (M,) N]`: u, v, in front, the shift of x / z and of y / z, and z now over z then.
@@ -389,7 +393,7 @@ def _residuals(samples: _Samples, motion: Tensor) -> tuple[Tensor, ...]:
 
 
 def _squared(samples: _Samples, ru: Tensor, rv: Tensor) -> Tensor:
-    """Returns the squared lengths of residuals, as the pixels' structure sees them."""
+    """Returns the squared lengths of residuals, weighted by the pixels' structure."""
     structure = samples.values[:, 6:].unbind(1)
     if not structure:
         return ru * ru + rv * rv
@@ -455,7 +459,7 @@ def _after(motion: Tensor, step: Tensor) -> Tensor:
 
 
 class _Weighted(NamedTuple):
-    """A motion's residuals, their Geman-McClure weights and what these pixels tell.
+    """A motion's residuals, their Geman-McClure weights, and what the pixels determine.
 
     A parameter's unit moves the pixels by one pixel in all (root of the sum of squares), so that
     radians and metres compare; 0 for a parameter that moves none. Eigenvalues and vectors are those
@@ -492,7 +496,7 @@ def _weighted(samples: _Samples, motion: Tensor) -> _Weighted:
 
 
 def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
-    """Returns the motion after Gauss-Newton steps, along the directions that the pixels tell."""
+    """Returns the motion after Gauss-Newton steps, in the directions that pixels determine."""
     for _ in range(steps):
         now = _weighted(samples, motion)
         # The step in the eigenbasis: a direction that no pixel tells keeps its value, where a
@@ -504,7 +508,7 @@ def _descended(samples: _Samples, motion: Tensor, steps: int) -> Tensor:
 
 
 def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns a motion's inlier share, its covariance and whether the pixels tell all of it."""
+    """Returns a motion's inlier share, its covariance and whether pixels determine all of it."""
     now = _weighted(samples, motion)
     # An M-estimator's covariance is the sandwich A^-1 B A^-1: A is the derivative of its equations,
     # B the covariance of their noise. A is the normal matrix times the mean slope of w(r^2) r,
@@ -524,19 +528,19 @@ def _described(samples: _Samples, motion: Tensor) -> tuple[Tensor, Tensor, Tenso
     variance = torch.where(is_open, torch.inf, variance)
     diagonal = torch.eye(6, dtype=torch.bool, device=motion.device)
     covariance = torch.where(diagonal, variance.unsqueeze(-1), covariance)
-    told = _is_told(samples, now)
-    within = torch.where(told, _INLIER_SCALES / _SCALES * now.scale, _STILL_PX)
+    is_motion = _is_motion(samples, now)
+    within = torch.where(is_motion, _INLIER_SCALES / _SCALES * now.scale, _STILL_PX)
     share = (now.squared < within.square().unsqueeze(-1)).sum(-1) / samples.number.clamp(min=1)
     enough = (samples.number >= MIN_PIXELS) & seen.all(-1) & motion.flatten(1).isfinite().all(-1)
-    return share, covariance, enough & told
+    return share, covariance, enough & is_motion
 
 
-def _is_told(samples: _Samples, now: _Weighted) -> Tensor:
-    """Returns whether flow is more than noise: it fits no motion at all, or one that it shows.
+def _is_motion(samples: _Samples, now: _Weighted) -> Tensor:
+    """Returns whether flow is more than noise: the camera rests, or its motion shows in the flow.
 
-    Noise has a motion that fits best, too. It shows it as much as chance does: the squared flow of
-    that motion is 6 / 2 N of the noise's, for N pixels and six parameters, and some more for the
-    choice of one among many. Noise of `_STILL_PX` can't be told from a camera that stands.
+    Noise has a best-fitting motion too, whose squared flow is by chance 6 / 2 N of the noise's, for
+    N pixels and six parameters, and some more as it is the best of many. Noise up to `_STILL_PX`
+    can't be distinguished from a camera at rest.
     """
     ego = _squared(samples, samples.values[:, 4] - now.at.ru, samples.values[:, 5] - now.at.rv)
     ego = (now.weight * ego).sum(-1) / now.weight.sum(-1).clamp(min=1e-12)

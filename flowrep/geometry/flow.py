@@ -23,9 +23,9 @@ SMALL = 1 << 14  # pixels up to which PyTorch is as fast, and numba need not be 
 
 
 class Flow(NamedTuple):
-    """Flow `[*B, 2, H, W]` on the current frame's grid, with a mask of known flow.
+    """Flow `[*B, 2, H, W]` on the current frame's grid, and where it is known.
 
-    `valid` is bool `[*B, 1, H, W]`; flow is 0 where it is False.
+    `valid` is bool `[*B, 1, H, W]`; where it is False, flow is 0.
     """
 
     flow: Tensor
@@ -55,11 +55,13 @@ def ego_flow(
     """Returns the flow of a static world under the camera's motion.
 
     Convention: (p_t - p_t') / dt on the current frame's grid, t' the previous frame; u right,
-    v down, pixels. If the camera drives forward, flow points outwards. Depth inf moves by rotation
-    only. Flow is invalid, and 0, where depth is nan or <= 0; where the point was not in front of
-    the previous camera at a hundredth of its current depth or more (closer to it, flow grows
-    without bound); and everywhere if a K, the motion or a tensor `dt` isn't finite, `dt` isn't
-    positive or an entry is beyond 1e8. Valid flow is finite.
+    v down, pixels. If the camera drives forward, flow points outwards. At depth inf, only rotation
+    causes flow.
+
+    Flow is invalid, and 0, where depth is nan or <= 0, and where the point's depth in the previous
+    camera was less than a hundredth of its current depth, or negative (there, flow grows without
+    bound). A whole frame is invalid if its K, its motion or its entry of a tensor `dt` isn't
+    finite, `dt` isn't positive, or an entry is beyond 1e8. Valid flow is finite.
 
     Equations 7 to 11 of the paper. Floats narrower than float32 are computed in float32.
 
@@ -70,6 +72,9 @@ def ego_flow(
             into the previous camera's.
         prev_K: K of the previous frame, `[*B, 3, 3]`, if it was another (zoom, autofocus).
         dt: time between the frames, a number or `[*B]`; 1 gives px/step, seconds give px/s.
+
+    Raises:
+        ValueError: a number `dt` isn't positive and finite.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> prev_from_curr = torch.eye(4)
@@ -94,17 +99,21 @@ def rigid_flow(
 ) -> Flow:
     """Returns the flow of a world of rigid bodies: the simulator's exact raw flow.
 
-    Convention: as in `ego_flow`, with one motion per instance. Row i of
-    `prev_from_curr_by_instance` maps a point fixed to instance i from the current camera's frame to
-    its place in the previous camera's frame; row 0 is the static world's. Where a pixel's row
-    equals `prev_from_curr`, the result is bitwise equal to that of `ego_flow`. A row that isn't
-    known makes only the pixels of its instance invalid.
+    Convention: as in `ego_flow`, with one motion for each instance. Row i of
+    `prev_from_curr_by_instance` takes a point fixed to instance i from the current camera's frame
+    into the previous camera's, at the previous frame; row 0 is the static world's. Where a pixel's
+    row equals `prev_from_curr`, the result is bitwise equal to that of `ego_flow`. A row that isn't
+    known (nan) makes only the pixels of its instance invalid.
+
+    Equation 1 of the paper.
 
     Args:
         depth: see `ego_flow`, as for `K`, `prev_K` and `dt`.
-        instance: `[*B, 1, H, W]`, integers in [0, N), 0 for the static world; others raise
-            RuntimeError.
-        prev_from_curr_by_instance: `[*B, N, 4, 4]`.
+        instance: `[*B, 1, H, W]`, integers in [0, N), 0 for the static world.
+        prev_from_curr_by_instance: `[*B, N, 4, 4]`, rigid, metres.
+
+    Raises:
+        RuntimeError: an id has no row.
 
     >>> K = torch.tensor([[4.0, 0.0, 1.0], [0.0, 8.0, 1.0], [0.0, 0.0, 1.0]])
     >>> motions = torch.eye(4).repeat(2, 1, 1)
@@ -132,16 +141,18 @@ def factorize(
 ) -> Factors:
     """Returns raw flow split into ego flow and object flow.
 
-    Convention: raw = ego + obj, all (p_t - p_t') / dt on the current frame's grid. Estimated flow
+    Convention: raw = ego + obj, all (p_t - p_t') / dt on the current frame's grid. Flow estimated
     from the current to the previous frame has to be negated first; flow from the previous to the
-    current frame lies on the wrong grid. The result is invalid, and obj 0, where ego flow is
-    invalid or raw is not finite. The factors have the widest of the arguments' float types.
+    current frame is on the wrong grid (see `adapt_flow`). The result is invalid, and obj 0, where
+    ego flow is invalid or raw is not finite. The factors have the widest of the arguments' float
+    types.
 
     Equation 6 of the paper.
 
     Args:
-        raw: `[*B, 2, H, W]`, pixels per dt, nan where it isn't known; or what `rigid_flow` returns,
-            which says so with a mask (its flow alone, 0 there, would count as measured).
+        raw: `[*B, 2, H, W]`, pixels per dt, nan where it isn't known; or the `Flow` of
+            `rigid_flow`, with its mask. (Its flow alone is 0 where it isn't known, which would
+            count as measured.)
         depth: see `ego_flow`, as for `K`, `prev_from_curr` and `prev_K`.
         dt: see `ego_flow`; the unit of `raw` must agree.
 
@@ -194,15 +205,18 @@ def adapt_flow(
 
     Convention: `direction` is that of the vectors: `"forward"` is p_t - p_t', from a point's
     previous to its current position; `"backward"` is p_t' - p_t. `grid` is the frame whose pixels
-    they belong to, `"current"` or `"previous"`. An estimator called with (current, previous) gives
-    backward flow on the current grid.
-
-    Flow on the previous frame's grid raises ValueError: its pixels have moved, several of them to
-    the same pixel and none to others, so flow on the current grid would be a guess.
+    the vectors belong to. An estimator called with (current, previous) gives backward flow on the
+    current grid.
 
     Args:
         flow: `[*B, 2, H, W]`, pixels.
+        direction: `"forward"` or `"backward"`.
+        grid: `"current"`; `"previous"` raises ValueError.
         channels: `"uv"` (column first) or `"row_column"`.
+
+    Raises:
+        ValueError: the grid is the previous frame's. Its pixels have moved, several of them to the
+            same pixel and none to others, so flow on the current grid would be a guess.
 
     >>> flow = torch.tensor([3.0, -2.0]).reshape(2, 1, 1)  # 3 rows up, 2 columns right it was
     >>> adapt_flow(flow, direction="backward", grid="current", channels="row_column").flatten()
@@ -222,11 +236,11 @@ def check_flow_options(direction: str, grid: str, channels: str) -> None:
     check_name("channels", channels, Channels)
     if grid == "previous":
         raise ValueError(
-            f"{direction} flow on the previous frame's grid cannot be turned into flow on the "
-            "current frame's grid exactly: pixels that were covered have no vector, and where "
-            "several land on one only depth says which is seen. Have the flow computed from the "
-            "current frame to the previous one (most estimators: swap the two pictures) and adapt "
-            "it with direction='backward', grid='current'"
+            f"{direction} flow on the previous frame's grid can't be converted exactly to the "
+            "current frame's grid: pixels that were covered have no vector, and where several move "
+            "to the same pixel only depth tells which one is seen. Compute flow from the current "
+            "frame to the previous one (with most estimators: swap the two pictures) and adapt it "
+            "with direction='backward', grid='current'"
         )
 
 
@@ -272,7 +286,10 @@ def _planes(
     motions: Tensor,
     dt: float | Tensor,
 ) -> Planes:
-    """Returns the flow of a motion per instance, `[*B, N, 4, 4]`; without ids, of the first."""
+    """Returns the flow planes of one motion for each instance, `[*B, N, 4, 4]`.
+
+    Without ids, all pixels have the first motion.
+    """
     height, width = depth.shape[-2:]
     dtype = torch.promote_types(torch.promote_types(depth.dtype, K.dtype), motions.dtype)
     if prev_K is not None:
@@ -300,7 +317,7 @@ def _planes(
     axx, axy, ax, ayx, ayy, ay, azx, azy, az, *e = each
     # q at infinity is A x~, which is affine in x and y: a term per column plus one per row.
     columns, rows = [axx * x, ayx * x, azx * x], [axy * y + ax, ayy * y + ay, azy * y + az]
-    if instance is None:  # tabulated, to save work per pixel
+    if instance is None:  # then each term has W or H values, not H · W
         x, *columns = _table(x, *columns)
         y, *rows = _table(y, *rows)
     q_far = [column + row for column, row in zip(columns, rows)]
@@ -332,8 +349,9 @@ def _table(*entries: Tensor) -> tuple[Tensor, ...]:
 
 
 def _suits_numba(depth: Tensor, *others: float | Tensor) -> bool:
-    """Returns whether `numba_flow` takes these: large float32 batches on a CPU, no gradients."""
-    if torch.compiler.is_compiling():  # first, as a question about sizes would limit the program
+    """Returns whether `numba_flow` can and should compute: large float32 batches, CPU, no grad."""
+    # First: a branch on sizes would make compiled code recompile for others.
+    if torch.compiler.is_compiling():
         return False
     tensors = [depth, *(other for other in others if isinstance(other, Tensor))]
     return (
@@ -345,7 +363,10 @@ def _suits_numba(depth: Tensor, *others: float | Tensor) -> bool:
 
 
 def _is_plain(tensor: Tensor) -> bool:
-    """Returns whether a tensor is numbers in memory: not a subclass, and not being transformed."""
+    """Returns whether a tensor is plain numbers in memory, which numpy can view.
+
+    Subclasses, tensors within `torch.func`'s transforms and dual tensors are not.
+    """
     if type(tensor) not in (Tensor, torch.nn.Parameter):
         return False
     if tensor.requires_grad and torch.is_grad_enabled():

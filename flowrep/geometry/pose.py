@@ -38,7 +38,9 @@ _OPPOSITE_WORLD_AXIS = {"unreal": 1, "unity": 2}
 
 
 def invert_rigid(a_from_b: Tensor) -> Tensor:
-    """Returns `b_from_a`, the inverse `[*B, 4, 4]` of a rotation and translation `[*B, 4, 4]`.
+    """Returns `b_from_a`, the inverse of a rotation and translation, `[*B, 4, 4]` each.
+
+    Convention: (Rᵀ, -Rᵀt) for (R, t); a matrix with scale or shear has another inverse.
 
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
@@ -56,13 +58,14 @@ def relative_motion(
 ) -> Tensor:
     """Returns `prev_from_curr` `[*B, 4, 4]`, composed in float64 and returned as `dtype`.
 
-    Convention: it maps a point from the current camera's frame to the previous camera's frame
-    (R and T of equation 11 of the paper). A world kilometres wide costs no precision, since large
+    Convention: it takes a point from the current camera's frame into the previous camera's (R and T
+    of equation 11 of the paper). A world kilometres wide costs no precision, since large
     coordinates cancel before the result is rounded. Equal poses give exactly the identity.
 
     Args:
-        world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world).
+        world_from_prev: `[*B, 4, 4]`, pose of the previous camera (camera-to-world), metres.
         world_from_curr: `[*B, 4, 4]`, pose of the current camera.
+        dtype: of the result.
 
     >>> prev, curr = torch.eye(4), torch.eye(4)
     >>> curr[2, 3] = 0.5  # half a metre forward along the camera's z
@@ -74,14 +77,14 @@ def relative_motion(
     common_batch(
         world_from_prev=world_from_prev.shape[:-2], world_from_curr=world_from_curr.shape[:-2]
     )
-    # prev_from_world * world_from_curr, with the translations subtracted first.
+    # prev_from_world · world_from_curr, with the translations subtracted first.
     rotation_prev_from_world = world_from_prev[..., :3, :3].double().mT
     rotation = rotation_prev_from_world @ world_from_curr[..., :3, :3].double()
     baseline_world = world_from_curr[..., :3, 3:].double() - world_from_prev[..., :3, 3:].double()
     translation = rotation_prev_from_world @ baseline_world
     bottom = world_from_curr[..., 3:, :].double().expand(*rotation.shape[:-2], 1, 4)
     motion = torch.cat([torch.cat([rotation, translation], -1), bottom], -2).to(dtype)
-    # The product of a rotation and its transpose is the identity up to rounding.
+    # The product of a rotation and its transpose is the identity only up to rounding.
     still = (world_from_prev == world_from_curr).flatten(-2).all(-1)
     identity = torch.eye(4, dtype=dtype, device=motion.device)
     return torch.where(still[..., None, None], identity, motion)
@@ -97,10 +100,10 @@ def instance_motion(
 ) -> Tensor:
     """Returns the motion of each body relative to the camera, `[*B, 1 + N, 4, 4]`.
 
-    Convention: row 0 is the static world's, `prev_from_curr`; row 1 + i maps a point fixed to body
-    i from the current camera's frame to its place in the previous camera's frame. If a body's pose
-    has not changed, its row is bitwise equal to row 0. Motions are composed in float64. The choice
-    of a body's axes and origin doesn't matter, as long as they are fixed to it.
+    Convention: row 0 is the static world's, `prev_from_curr`; row 1 + i takes a point fixed to body
+    i from the current camera's frame into the previous camera's, at the previous frame. If a body's
+    pose has not changed, its row is bitwise equal to row 0. Motions are composed in float64. A
+    body's axes and origin don't matter, as long as they are fixed to it.
 
     Args:
         world_from_prev: see `relative_motion`, as for `world_from_curr` and `dtype`.
@@ -120,7 +123,8 @@ def instance_motion(
             f"and {world_from_curr_body.shape[-3]}"
         )
     camera = relative_motion(world_from_prev, world_from_curr, dtype=dtype).unsqueeze(-3)
-    # A point's previous place: the inverse of the body's motion, in the cameras' frames.
+    # The point moves with the body: prev ← body at that time = body now ← curr. Both factors are
+    # relative motions, so that large world coordinates cancel in each.
     prev_body_from_prev = relative_motion(
         world_from_prev_body, world_from_prev.unsqueeze(-3), dtype=torch.float64
     )
@@ -136,8 +140,8 @@ def instance_motion(
 def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
     """Returns each pixel's row of `instance_motion`, in the shape of `ids`.
 
-    Convention: id `body_ids[i]` becomes 1 + i; any other id, also a negative one, becomes 0, the
-    static world.
+    Convention: id `body_ids[i]` becomes 1 + i; any other id, negative ones included, becomes 0, the
+    static world. The result is uint8, or int32 for 256 bodies and more.
 
     Args:
         ids: integers of any shape, as the simulator renders them.
@@ -155,7 +159,7 @@ def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
     dtype = torch.uint8 if count < 256 else torch.int32
     if count == 0:
         return torch.zeros_like(ids, dtype=dtype)
-    # Sorted and searched instead of tabulated, as ids may be as large as a packed colour.
+    # A binary search and not a table, as ids may be as large as a packed colour.
     ascending, order = body_ids.long().sort()
     ids = ids.long()
     nearest = torch.searchsorted(ascending, ids.contiguous()).clamp(max=count - 1)
@@ -165,9 +169,15 @@ def instance_rows(ids: Tensor, body_ids: Tensor) -> Tensor:
 def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None:
     """Checks that every transform `[*B, 4, 4]` is a rotation and a translation.
 
-    ValueError says which one, of the argument called `name`, is the first with nan or inf, a last
-    row other than (0, 0, 0, 1), scale or shear, or a left-handed frame. `tolerance` is on each
-    element of R R^T - I and on the last row. The check waits for a GPU.
+    The check waits for a GPU.
+
+    Args:
+        name: of the argument, for the message.
+        tolerance: on each element of R Rᵀ - I and of the last row.
+
+    Raises:
+        ValueError: the first transform that has nan or inf, a last row other than (0, 0, 0, 1),
+            scale or shear, or a left-handed frame.
 
     >>> check_rigid("pose", torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])))
     Traceback (most recent call last):
@@ -193,9 +203,11 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
 
 
 def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
-    """Returns points `[*B, ..., 3]` expressed in frame a, in the wider float type.
+    """Returns points `[*B, ..., 3]` in frame a, in the wider of the two float types.
 
-    The batch dims of `a_from_b` `[*B, 4, 4]` are the leading dims of `points_b`.
+    Args:
+        a_from_b: `[*B, 4, 4]`; its batch dims are the leading dims of `points_b`.
+        points_b: `[*B, ..., 3]`, metres, in frame b.
 
     >>> a_from_b = torch.eye(4)
     >>> a_from_b[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
@@ -212,6 +224,7 @@ def transform_points(a_from_b: Tensor, points_b: Tensor) -> Tensor:
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
     """Returns the rotation matrix `[*B, 3, 3]` of a rotation vector `[*B, 3]`, rad."""
+    # As exact as torch.linalg.matrix_exp of the cross product's matrix, in a fraction of the time.
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
@@ -232,25 +245,30 @@ def adapt_pose(
 ) -> Tensor:
     """Returns `world_from_cam` `[*B, 4, 4]`, float64, of a camera with OpenCV's axes.
 
-    Convention: `axes` are the directions of the camera's own axes: `"opencv"` x right, y down,
-    z forward; `"opengl"` (also Blender) x right, y up, z backward; `"ned"` x forward, y right,
-    z down; `"x_forward_z_up"` x forward, y left, z up. The world's axes are left unchanged, as they
-    cancel in every relative motion.
+    Convention: `axes` says where the camera's axes point: `"opencv"` x right, y down, z forward;
+    `"opengl"` (also Blender) x right, y up, z backward; `"ned"` x forward, y right, z down;
+    `"x_forward_z_up"` x forward, y left, z up. The world's axes stay as they are, since they cancel
+    in every relative motion.
 
-    Two are those of left-handed simulators, camera and world alike: `"unreal"` (also CARLA)
-    x forward, y right, z up; `"unity"` x right, y up, z forward. Their world becomes right-handed:
-    unreal's y points left, unity's z backward. Poses of bodies have to be given the same axes then.
+    Two are left-handed, camera and world alike: `"unreal"` (also CARLA) x forward, y right, z up;
+    `"unity"` x right, y up, z forward. Their worlds become right-handed: unreal's y points left,
+    unity's z backward. Convert poses of bodies with the same axes then.
 
     Args:
         pose: `[*B, 4, 4]`, or what `layout` says.
-        layout: `"matrix"`; `"matrix_3x4"`, the same without its last row; `"xyz_xyzw"` or
-            `"xyz_wxyz"`, `[*B, 7]`, translation and unit quaternion, its real part last or first;
-            `"xyz_yaw"` or `"xyz_yaw_pitch"`, `[*B, 4]` or `[*B, 5]`, translation and angles in
-            radians in a world whose z is up: yaw from the world's x to its y, pitch upwards, of a
-            camera that looks along its own x (`axes="x_forward_z_up"` or `"unreal"`).
-        direction: `"camera_to_world"` maps points in the camera's frame to the world's;
+        layout: `"matrix"`; `"matrix_3x4"`, without the last row; `"xyz_xyzw"` or `"xyz_wxyz"`,
+            `[*B, 7]`, translation and unit quaternion, its real part last or first; `"xyz_yaw"` or
+            `"xyz_yaw_pitch"`, `[*B, 4]` or `[*B, 5]`, translation and angles in radians in a world
+            whose z is up: yaw from the world's x to its y, pitch upwards. The camera then looks
+            along its x axis (`axes="x_forward_z_up"` or `"unreal"`).
+        direction: `"camera_to_world"` takes points from the camera's frame into the world's;
             `"world_to_camera"` (extrinsics) is the inverse.
-        check: whether a pose that is not rigid raises ValueError. The check waits for a GPU.
+        axes: see above.
+        check: whether to check that poses are rigid, which waits for a GPU.
+
+    Raises:
+        ValueError: an option is unknown, angles come with a camera that looks along its z, or, with
+            `check`, a pose is not rigid.
 
     >>> pose = torch.tensor([5.0, 6.0, 7.0, 0.0, 0.0, 0.0, 1.0])
     >>> world_from_cam = adapt_pose(pose, layout="xyz_xyzw", axes="x_forward_z_up")
@@ -269,8 +287,8 @@ def adapt_pose(
         check_rigid("pose", matrix)
     if direction == "world_to_camera":
         matrix = invert_rigid(matrix)
-    # Each column is a given one or its opposite. They are picked, as a product would round and
-    # constants created here would be copied to a GPU in every call.
+    # Each column is one of the given columns or its opposite. Picked, since a matrix product would
+    # round, and its constant would be copied to a GPU in every call.
     columns = [sign * matrix[..., axis : axis + 1] for axis, sign in _OPENCV_AXES[axes]]
     matrix = torch.cat([*columns, matrix[..., 3:]], -1)
     if (opposite := _OPPOSITE_WORLD_AXIS.get(axes)) is None:
@@ -286,7 +304,7 @@ def check_pose_options(layout: str, direction: str, axes: str) -> None:
     check_name("axes", axes, CameraAxes)
     if layout.startswith("xyz_yaw") and axes not in ("x_forward_z_up", "unreal"):
         raise ValueError(
-            f"layout {layout!r} is of a camera that looks along its own x, with z up: "
+            f"layout {layout!r} is for a camera that looks along its x axis, with z up: "
             f'axes="x_forward_z_up" or "unreal", not {axes!r}'
         )
 
@@ -315,10 +333,13 @@ def pose_from_quaternion(pose: Tensor, layout: PoseLayout, *, check: bool = True
     """Returns the 4x4 matrix `[*B, 4, 4]`, float64, of a translation and a unit quaternion.
 
     Args:
-        pose: `[*B, 7]`, x, y, z, then the quaternion.
+        pose: `[*B, 7]`, x, y, z in metres, then the quaternion.
         layout: `"xyz_xyzw"` or `"xyz_wxyz"`.
-        check: whether a quaternion whose length is not 1 raises ValueError. Rounding errors are
-            normalised away in either case.
+        check: whether a quaternion whose length is off 1 by 0.001 raises ValueError, which waits
+            for a GPU. Quaternions are normalised in either case.
+
+    Raises:
+        ValueError: with `check`, a quaternion's length is not 1.
 
     >>> half_turn_about_z = torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0])
     >>> pose_from_quaternion(half_turn_about_z, "xyz_xyzw")[0]

@@ -1,6 +1,6 @@
 """Checks of a scene as a whole: its parts agree, paths are open, people keep apart.
 
-Pydantic has checked each part for itself by then.
+Pydantic has checked each part by then.
 """
 
 from collections.abc import Iterable, Iterator
@@ -22,12 +22,12 @@ from flowrep.scenes.scene import (
     SceneError,
 )
 
-_LEAST_END_M = 1.0  # of an ending zone; the vehicle's place is checked at least every 0.42 m
+_LEAST_END_M = 1.0  # length of an ending zone; the vehicle is checked at least every 0.42 m
 
 
 def check_references(scene: Scene) -> None:
-    """Checks that what is named exists, and that places are on their roads."""
-    most = 255 // len(pedestrians.PARTS)  # as parts have 8-bit ids
+    """Checks that all names exist, and that distances along roads are on these roads."""
+    most = 255 // len(pedestrians.PARTS)  # instance ids have 8 bits, and 0 is the static world
     if scene.num_pedestrians > most:
         raise SceneError(f"pedestrian_groups: {scene.num_pedestrians} people; keep to {most}")
     _check_known("categories", scene.categories, CATEGORY_ID)
@@ -36,13 +36,13 @@ def check_references(scene: Scene) -> None:
     lengths_m = {road.name: centreline(road).length for road in scene.roads}
     for key, item in _on_roads(scene):
         _check_known(f"{key}.road", [item.road], lengths_m)
-        given = (getattr(item, name, None) for name in ("at_m", "from_m", "to_m"))
-        places = [at for at in given if at is not None]
+        keys = (getattr(item, name, None) for name in ("at_m", "from_m", "to_m"))
+        along_m = [at for at in keys if at is not None]
         length, may_extend = lengths_m[item.road], isinstance(item, BuildingRow | ObstacleRow)
-        if not may_extend and not all(0.0 <= at <= length + 1e-6 for at in places):
-            there = " to ".join(f"{at:g}" for at in places)
+        if not may_extend and not all(0.0 <= at <= length + 1e-6 for at in along_m):
+            span = " to ".join(f"{at:g}" for at in along_m)
             raise SceneError(
-                f"{key}: {there} m is not on road {item.road!r}; stay within 0 and {length:.1f}"
+                f"{key}: {span} m is not on road {item.road!r}; stay within 0 and {length:.1f}"
             )
     ends = {path.end for path in scene.paths}
     for zone in scene.zones:
@@ -110,7 +110,7 @@ def check_path(layout: Layout, path: Path) -> None:
 
 
 def check_walks(layout: Layout) -> None:
-    """Checks that no draw of an episode puts anyone into a box, a person or the vehicle."""
+    """Checks that no draw of an episode puts a person into a box, a person or the vehicle."""
     reach, least = pedestrians.RADIUS_M, pedestrians.APART_M
     grounds = {group.name: _ground(layout, group) for group in layout.scene.pedestrian_groups}
     boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]
@@ -148,8 +148,8 @@ def _ground(layout: Layout, group: PedestrianGroup) -> list[shapely.Geometry]:
         )
     line = layout.walk_line(group.walk)
     if len(line) < 2:
-        raise SceneError(f"{key}.walk: has no length; give two places apart from each other")
-    # Only one person may walk across their own walk: two could meet where lanes cross.
+        raise SceneError(f"{key}.walk: has no length; give two points apart from each other")
+    # Only a walk of a single person may cross itself: two people could meet where lanes cross.
     is_walkable = all(pedestrians.keeps_its_stretches(line, side * spread / 2) for side in (-1, 1))
     if not is_walkable or (group.count > 1 and not pedestrians.keeps_lanes_apart(line, spread)):
         raise SceneError(

@@ -1,7 +1,7 @@
 """A scene laid out on the ground: polygons, boxes and walking lines, computed once from its data.
 
-Convention: world metres, x forward at yaw 0, yaw counter-clockwise. Distances along a road are
-from its start; places before it, or beyond the road's end, are on its straight continuation.
+Convention: world metres, x forward at yaw 0, yaw counter-clockwise. Distances along a road start at
+its beginning; negative ones, and those beyond its end, are on its straight continuation.
 """
 
 import math
@@ -32,9 +32,9 @@ from flowrep.scenes.vehicle import VehicleState, footprint_corners
 
 Array = NDArray[np.float64]
 _ARC_STEP_DEG = 5.0
-_TOUCH_M = 0.05  # houses of a row stand wall to wall
-_PLOT_STEP_M = 0.5
-SHORTEST_M = 1e-3  # stretch of a walk; shorter ones are left out
+_TOUCH_M = 0.05  # by which houses may overlap, as those of a row stand wall to wall
+_PLOT_STEP_M = 0.5  # by which a house advances until there is room for it
+SHORTEST_M = 1e-3  # shorter stretches of a walk are left out: they have no heading
 
 
 def centreline(road: Road) -> shapely.LineString:
@@ -45,7 +45,7 @@ def centreline(road: Road) -> shapely.LineString:
         arc_deg = piece.arc_deg or 0.0
         count = max(1, math.ceil(abs(arc_deg) / _ARC_STEP_DEG))
         turn = math.radians(arc_deg) / count
-        # Chords: the points lie on the arc.
+        # Chords between points on the arc, each along the heading in the middle of its piece.
         chord = 2 * (piece.arc_radius_m or 0.0) * math.sin(abs(turn) / 2)
         length = piece.straight_m or chord
         for _ in range(count):
@@ -57,7 +57,7 @@ def centreline(road: Road) -> shapely.LineString:
 
 
 def stretch(line: shapely.LineString, from_m: float, to_m: float) -> shapely.LineString:
-    """Returns the part of a centreline between two distances along it, none beyond its ends."""
+    """Returns the part of a centreline between two distances along it, cut at its ends."""
     first, last = (min(max(at_m, 0.0), line.length) for at_m in (from_m, to_m))
     return shapely.ops.substring(line, first, last)
 
@@ -72,11 +72,12 @@ def without_repeats(points: Array) -> Array:
 
 
 def parallel(points: Array, aside_m: float) -> Array:
-    """Returns a line [M, 2] moved to its left, corner by corner, every stretch by `aside_m`."""
+    """Returns a line [M, 2] with every stretch moved to its left by `aside_m`, corner by corner."""
     steps = np.diff(points, axis=0)
     normals = np.stack([-steps[:, 1], steps[:, 0]], axis=-1) / np.hypot(*steps.T)[:, None]
     before, after = np.vstack([normals[:1], normals]), np.vstack([normals, normals[-1:]])
-    # The corner lies on the bisector, one metre from both adjacent stretches.
+    # A corner moves along the bisector of its stretches' normals a and b, to the distance 1 from
+    # both: (a + b) / (1 + a · b). The bound is for hairpins, where they are opposite.
     share = np.maximum(1.0 + (before * after).sum(axis=-1), 1e-9)
     return points + aside_m * (before + after) / share[:, None]
 
@@ -141,7 +142,7 @@ class Layout:
         paved = shapely.union_all([*wide, _with_round_corners(shapely.union_all(wide), radius)])
         self._paved = shapely.union(paved, self.drivable)
         self.sidewalks = self.terrain = shapely.Polygon()
-        # without any, rounding of corners leaves slivers
+        # Without sidewalks, the rounding of corners would leave slivers.
         if any(road.sidewalk_m > 0 for road in scene.roads):
             self.sidewalks = self._paved.difference(self.drivable)
         if scene.terrain_m > 0:
@@ -161,12 +162,12 @@ class Layout:
     def pose_at(self, road: str, at_m: float, offset_m: float = 0.0) -> tuple[float, float, float]:
         """Returns x, y and heading at a distance along a road, `offset_m` to its left."""
         line = self.lines[road]
-        # The heading is that of the chord around a place, also where two pieces meet.
+        # The heading is that of a short chord around the point, also where two pieces meet.
         step = min(0.05, line.length / 4)
         middle = min(max(at_m, step), line.length - step)
         behind, ahead = (line.interpolate(middle + sign * step) for sign in (-1, 1))
         heading = math.atan2(ahead.y - behind.y, ahead.x - behind.x)
-        # shapely would count negative distances from the far end, and stop at either
+        # shapely counts negative distances from the far end, and stops at either end.
         on_road = min(max(at_m, 0.0), line.length)
         point, beyond = line.interpolate(on_road), at_m - on_road
         x, y = point.x + beyond * math.cos(heading), point.y + beyond * math.sin(heading)
@@ -194,7 +195,7 @@ class Layout:
         return parallel(self._walks[walk], lateral_m)
 
     def _walk_points(self, walk: Walk) -> Array:
-        given: Any = walk  # its kind says which of its keys are not None
+        given: Any = walk  # which keys are not None depends on its kind
         if walk.kind == "points":
             return np.array(given.points_m)
         if walk.kind == "along":
@@ -203,7 +204,7 @@ class Layout:
         road = self.roads[given.road]
         # Keep a stride away from the house fronts.
         reach = road.width_m / 2 + road.sidewalk_m - 0.5
-        # From right to left across the road; the walk's own left points back along the road.
+        # From right to left across the road, so that the walk's left points back along the road.
         return np.array([self.pose_at(road.name, given.at_m, y)[:2] for y in (-reach, reach)])
 
     def _road_between(self, road: str, from_m: float, to_m: float) -> shapely.Polygon:
@@ -221,7 +222,8 @@ class Layout:
         return CrosswalkArea(self._road_between(crosswalk.road, first, last), heading)
 
     def _buildings(self) -> tuple[Box, ...]:
-        # Every house takes its draws in turn, so rows added at the end leave the others alone.
+        # Houses draw in the order of the rows: a row added at the end leaves the others as they
+        # are.
         rng = np.random.default_rng(self.scene.layout_seed)
         boxes: list[Box] = []
         for row in self.scene.building_rows:
@@ -252,7 +254,7 @@ class Layout:
             size = (front, depth, rng.uniform(*row.height_m))
             offset = side * (edge + rng.uniform(0.0, 0.8) + depth / 2)
             variant = int(rng.integers(1 << 16))
-            while at < row.to_m:  # advance to the next free place
+            while at < row.to_m:  # until there is room for this house
                 x, y, heading = self.pose_at(row.road, at + front / 2, offset)
                 facing = heading + (0.0 if row.side == "left" else math.pi)
                 house = Box("house", x, y, facing, size, variant)

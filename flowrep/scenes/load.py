@@ -1,4 +1,4 @@
-"""Loads a scene from its name, a YAML file or plain data, and checks it; its schema for editors."""
+"""Loads a scene from its name, a YAML file or a mapping, and checks it; its schema for editors."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ def load_scene(scene: str | Path | Mapping[str, Any] | Scene) -> Scene:
             or a `Scene`, which is checked again.
 
     Raises:
-        SceneError: the scene is invalid.
+        SceneError: the scene is unknown or invalid; the message names file and key.
 
     >>> load_scene("straight_road").time_limit_steps
     200
@@ -64,7 +64,8 @@ def _adapter() -> TypeAdapter[Scene]:
     return TypeAdapter(Scene)
 
 
-# Each of many environments is given the same one. A scene holds mappings and so has no hash.
+# Many environments are made from the same scene, which need not be checked again. Pickled, since a
+# scene holds mappings and has no hash.
 @lru_cache(maxsize=8)
 def _checked(pickled: bytes) -> Scene:
     scene = pickle.loads(pickled)
@@ -87,7 +88,7 @@ def _loaded(data: Any, source: str) -> Scene:
 
 
 def _complaint(error: ValidationError) -> str:
-    # A misspelt key is also missing under its right name; the misspelling explains it.
+    # A misspelt key is also reported as missing under its right name: name the misspelling.
     first = min(error.errors(), key=lambda each: each["type"] != "unexpected_keyword_argument")
     key = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in first["loc"])[1:]
     if first["type"] == "unexpected_keyword_argument":

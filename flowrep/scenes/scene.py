@@ -1,7 +1,7 @@
 """The data of a scene: frozen dataclasses whose field names are the keys of the YAML file.
 
-Pydantic checks types and ranges when a scene is loaded, and names the key of whatever else a
-`__post_init__` refuses; other code sees plain floats and ints.
+When a scene is loaded, pydantic checks types and ranges, and adds the key to what a `__post_init__`
+refuses. After that these are plain dataclasses of floats and ints.
 """
 
 import math
@@ -215,8 +215,7 @@ class Walk(Part):
 class PedestrianGroup(Part):
     """People on one walk; `standing` of them never move.
 
-    `draw` determines whether speed, phase and direction are drawn once for the group or for each
-    person.
+    `draw` says whether speed, phase and direction are drawn once for the group or for each person.
     """
 
     name: Name

@@ -1,1 +1,1 @@
-"""A street in PyBullet, which tests collisions and draws pictures, and in a rasteriser for maps."""
+"""A street as bodies: PyBullet tests collisions, a rasteriser draws what cameras see."""

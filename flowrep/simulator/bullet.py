@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flowrep.simulator.meshes import Mesh
 from flowrep.simulator.paint import AMBIENT, DIFFUSE, LIGHT
 
-# PyBullet prints its build time to stderr when it is imported.
+# PyBullet prints its build time when it is imported, from C, past sys.stderr.
 _stderr = os.dup(2)
 try:
     with open(os.devnull, "w") as nowhere:
@@ -34,7 +34,7 @@ _LIGHT = {
     "shadow": 0,
     "renderer": pybullet.ER_TINY_RENDERER,
 }
-_IDENTICAL: Any = functools.cache(lambda value: value)  # the first object equal to a value
+_INTERNED: Any = functools.cache(lambda value: value)  # the first object equal to a value
 
 
 class Picture(NamedTuple):
@@ -65,12 +65,12 @@ class Simulator:
 
     def add_body(self, mesh: Mesh, boxes_m: Sequence[tuple[float, ...]] = ()) -> int:
         """Returns PyBullet's number of a body; boxes are (x, y, yaw, length, width, height)."""
-        # PyBullet leaks the lists that it is given and their items. These lists end up empty, and
-        # the numbers are the same objects for every client of the process.
+        # PyBullet leaks the lists that it gets, with their items. So the lists are emptied
+        # afterwards, and the items are interned: all clients of the process share the same objects.
         arrays = {
-            name: [_IDENTICAL(tuple(row)) for row in getattr(mesh, name)]
+            name: [_INTERNED(tuple(row)) for row in getattr(mesh, name)]
             for name in ("vertices", "normals", "uvs")
-        } | {"indices": [_IDENTICAL(index) for index in mesh.indices]}
+        } | {"indices": [_INTERNED(index) for index in mesh.indices]}
         white = [1.0, 1.0, 1.0, 1.0]
         visual = pybullet.createVisualShape(
             pybullet.GEOM_MESH, rgbaColor=white, physicsClientId=self._client, **arrays
@@ -93,12 +93,12 @@ class Simulator:
         return body
 
     def add_box(self, length_m: float, width_m: float, height_m: float) -> int:
-        """Returns the number of a collision box on the ground that cameras don't see."""
+        """Returns the number of a collision box on the ground, invisible to cameras."""
         half = [length_m / 2, width_m / 2, height_m / 2]
         return self._add_unseen(pybullet.GEOM_BOX, height_m, halfExtents=half)
 
     def add_cylinder(self, radius_m: float, height_m: float) -> int:
-        """Returns the number of an upright collision cylinder that cameras don't see."""
+        """Returns the number of an upright collision cylinder, invisible to cameras."""
         return self._add_unseen(pybullet.GEOM_CYLINDER, height_m, radius=radius_m, height=height_m)
 
     def _add_unseen(self, kind: int, height_m: float, **shape: Any) -> int:

@@ -84,7 +84,8 @@ def depth_from_zbuffer(
     zbuffer: NDArray[np.float32], near_m: float, far_m: float
 ) -> NDArray[np.float32]:
     """Returns depth along z in metres from OpenGL depth-buffer values in [0, 1]."""
-    # far - (far - near)·z would cancel near z = 1, where 1 - z is exact in float32.
+    # In the usual formula, far - (far - near) · z cancels near z = 1. There 1 - z is exact in
+    # float32.
     gap = (np.float32(1.0) - zbuffer) * np.float32(far_m - near_m) + np.float32(near_m)
     return np.float32(far_m * near_m) / gap
 

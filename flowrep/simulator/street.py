@@ -23,15 +23,15 @@ from flowrep.simulator.paint import texture
 Array = NDArray[Any]
 _CATEGORIES = tuple(CLASS_COLOURS)  # by class id
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
-_HIDDEN_M = -1000.0  # out of reach of the camera and the vehicle
-_SAFE_CELL_M = 0.25
+_HIDDEN_M = -1000.0  # height of bodies that are not there, out of reach of camera and vehicle
+_SAFE_CELL_M = 0.25  # side of a cell of the table below
 _BOXES_A_BODY = 16  # PyBullet's limit for one compound shape
 
 
 class SafeGround:
-    """A fast test that a vehicle is clear of edges, boxes and ending zones; not of people.
+    """A table of where a vehicle is certainly clear of edges, boxes and ending zones.
 
-    It errs on the safe side: where it returns False, exact tests decide.
+    Elsewhere the exact and slower tests of PyBullet and shapely decide, as they do near people.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -46,7 +46,7 @@ class SafeGround:
         y = np.arange(self._y0, y1, _SAFE_CELL_M) + _SAFE_CELL_M / 2
         shapely.prepare(safe)
         table = shapely.contains_xy(safe, *np.meshgrid(x, y, indexing="ij"))
-        # As bytes, of which Python looks up an element in half the time.
+        # As bytes, whose elements Python looks up in half the time of an array's.
         self._columns = [column.astype(np.uint8).tobytes() for column in table]
 
     def __call__(self, x_m: float, y_m: float) -> bool:
@@ -67,7 +67,7 @@ class Street:
         self._numbers: list[int] = []  # PyBullet's, of the bodies
         vehicle, count = layout.scene.vehicle, layout.scene.num_pedestrians
         self._vehicle = self.simulator.add_box(vehicle.length_m, vehicle.width_m, vehicle.height_m)
-        # One cylinder for everyone: it is placed where the vehicle may touch someone.
+        # One cylinder for all people: it is placed wherever the vehicle may touch a person.
         self._person = self.simulator.add_cylinder(pedestrians.RADIUS_M, pedestrians.HEIGHT_M)
         self._boxes: list[tuple[Box, int]] = []  # all that can be hit, each with its body
         self._add_ground(layout)
@@ -90,7 +90,7 @@ class Street:
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
         """Returns the street of all environments of the process with this scene."""
-        # A PyBullet client takes 28 MB. A scene holds mappings, so it has no hash.
+        # A PyBullet client takes 28 MB. Pickled, since a scene holds mappings and has no hash.
         key = pickle.dumps(scene)
         street = _STREETS.get(key)
         if street is None:
@@ -98,7 +98,7 @@ class Street:
         return street
 
     def ids_by_number(self) -> NDArray[np.uint8]:
-        """Returns class and instance by PyBullet's number [N, 2]; number -1 reads the sky's."""
+        """Returns class and instance [N, 2] by PyBullet's number; the last, -1, is the sky."""
         ids = np.zeros((max(self._numbers) + 2, 2), dtype=np.uint8)
         ids[self._numbers] = [(body.semantic, body.instance) for body in self.bodies]
         return ids
@@ -125,7 +125,7 @@ class Street:
             self.simulator.place_at(part, position, rotation)
 
     def is_anyone_near(self, track: Sequence[VehicleState], poses: Array) -> Array:
-        """Returns at which of T times someone's pose [T, P, 4] is near enough to be touched."""
+        """Returns at which of T times anyone, at poses [T, P, 4], is near enough to be touched."""
         centres = np.array([state[:2] for state in track])
         gaps = poses[..., :2] - centres[:, None]
         return ((gaps * gaps).sum(axis=-1) <= self._person_reach_m**2).any(axis=-1)
@@ -172,16 +172,16 @@ class Street:
 
     def _add_solids(self, boxes: list[Box]) -> None:
         for category in dict.fromkeys(box.category for box in boxes):
-            own = [box for box in boxes if box.category == category]
-            for first in range(0, len(own), _BOXES_A_BODY):
-                mesh, chunk = Mesh(), own[first : first + _BOXES_A_BODY]
+            solids = [box for box in boxes if box.category == category]
+            for first in range(0, len(solids), _BOXES_A_BODY):
+                mesh, chunk = Mesh(), solids[first : first + _BOXES_A_BODY]
                 for box in chunk:
                     mesh.add(meshes.mesh_of(box))
                 self._add_solid(chunk, mesh)
 
     def _add_solid(self, boxes: list[Box], mesh: Mesh) -> int:
-        places = [(box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes]
-        body = self._add_body(mesh, boxes[0].category, boxes_m=places)
+        boxes_m = [(box.x_m, box.y_m, box.yaw_rad, *box.size_m) for box in boxes]
+        body = self._add_body(mesh, boxes[0].category, boxes_m=boxes_m)
         self._boxes += [(box, body) for box in boxes]
         return body
 

@@ -1,6 +1,6 @@
 """Conversion of other simulators' and robots' sensor data to the inputs of flowrep's transforms.
 
-Adapters write under keys of their own, so that nothing is adapted twice.
+Adapters never write to the key that they read, so that nothing is converted twice.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flowrep.transforms.flow import CameraTransform, Intrinsics
 
 
 class AdaptDepth(CameraTransform):
-    """Converts depth of any kind to depth along the optical axis.
+    """Converts any kind of depth to depth along the optical axis.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
@@ -36,6 +36,9 @@ class AdaptDepth(CameraTransform):
     Args:
         intrinsics: K `[3, 3]` in pixels or its key; only for `"ray_length"`.
         channels_last: whether the env's depth is `[*B, H, W, 1]`.
+
+    Raises:
+        ValueError: an option that `kind` needs is missing, or one that it doesn't read is given.
 
     Example:
         >>> from tensordict import TensorDict
@@ -90,13 +93,16 @@ class AdaptPose(MapTransform):
     | a pose | `("sensor", "world_from_cam")` | float64 `[*B, 4, 4]` | rigid | m |
 
     Convention and further arguments: see `flowrep.geometry.adapt_pose`. It also converts poses of
-    bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, as a body's own axes do not matter; in a
-    left-handed world (`"unreal"`, `"unity"`) with the camera's, which turn the world, too.
+    bodies, e.g. `[*B, N, 7]`, with `axes="opencv"`, since the axes of a body do not matter. In a
+    left-handed world (`"unreal"`, `"unity"`) give the camera's axes, which convert the world too.
 
     Args:
-        check: whether ill-formed poses raise ValueError at resets, in the envs that are reset, and
-            at the root of batches; steps aren't checked. A check waits for a GPU: switch it off if
-            resets or replay samples have to be fast there.
+        check: whether to check that poses are rigid, at resets (of the envs that are reset) and at
+            the root of batches; steps aren't checked. The check waits for a GPU: switch it off
+            where resets or replay samples have to be fast.
+
+    Raises:
+        ValueError: an option is unknown; in calls with `check`, a pose isn't rigid.
 
     Example:
         >>> from tensordict import TensorDict
@@ -206,14 +212,14 @@ class AdaptFlow(MapTransform):
 
 
 class BodyRows:
-    """Gives each body a row of its own while it is there, in worlds where bodies come and go.
+    """Assigns each body a row for as long as it exists, in worlds where bodies come and go.
 
-    `InstanceMotion` compares row i of this step's poses with row i of the previous step's, so a row
-    must stay with its body, and must be empty for a step before another body takes it. Rows of
-    absent bodies hold nan: their flow is unknown, not a jump.
+    `InstanceMotion` compares row i of this step's poses with row i of the previous step's. A row
+    must therefore stay with its body, and must be empty for a step before another body takes it.
+    Empty rows hold nan, which makes flow unknown; with another body's pose it would be a jump.
 
     Args:
-        count: the number of rows: bodies there at once, and those that have just left.
+        count: the number of rows: for all bodies that exist at once, and those that have just left.
 
     Example:
         >>> rows = BodyRows(3)
@@ -236,7 +242,7 @@ class BodyRows:
         self._row_of: dict[Hashable, int] = {}
 
     def __call__(self, poses: Mapping[Hashable, Tensor]) -> Tensor:
-        """Returns the poses `[count, 4, 4]`, float64; ValueError if rows are too few."""
+        """Returns the poses `[count, 4, 4]`, float64; ValueError if there are too few rows."""
         free = sorted(set(range(self.count)) - set(self._row_of.values()))
         arrived = [body for body in poses if body not in self._row_of]
         if len(arrived) > len(free):
@@ -252,9 +258,9 @@ class BodyRows:
         return out
 
     def instance(self, labels: Tensor, body_of: Mapping[int, Hashable]) -> Tensor:
-        """Returns `("sensor", "instance")`: 1 + the row of each pixel's body, 0 without one.
+        """Returns `("sensor", "instance")`: 1 + the row of each pixel's body, or 0.
 
-        `body_of` has the bodies' ids by label, which may change every step.
+        `body_of` gives the body of each label, which may change every step.
         """
         out = torch.zeros_like(labels)
         for label, body in body_of.items():

@@ -20,10 +20,10 @@ Keys: TypeAlias = NestedKey | list[NestedKey]
 
 
 class MissingKey(KeyError):
-    """A representation needs a key that the env does not offer."""
+    """A transform needs a key that the TensorDict or the env's specs lack."""
 
     def __str__(self) -> str:
-        """Returns the message itself, of which KeyError would return the repr."""
+        """Returns the message; KeyError's own method would return its repr, in quotes."""
         return str(self.args[0])
 
 
@@ -58,12 +58,20 @@ class MapTransform(Transform):
     calls, so the results are the same in an env, at a reset and on shuffled samples of a replay
     buffer.
 
+    TorchRL calls `_call` at each step, `_reset` at resets, `forward` on replay batches and
+    `transform_observation_spec` for the specs. All four end up in `compute` or `output_specs`.
+
     Args:
         reads: the expected layout of each input, in the order of `in_keys`.
         writes: the number of outputs, each of which needs a key.
 
     Attributes:
         label: the representations that it serves, for error messages; by default its out_keys.
+        compiled: whether `compute` runs through `torch.compile`; False by default.
+
+    Raises:
+        ValueError: `in_keys` or `out_keys` has another number of keys than the transform reads or
+            writes.
     """
 
     # Pure: takes one tensor per input key, returns one per output key.
@@ -101,7 +109,8 @@ class MapTransform(Transform):
                     f"representation {self.label} needs key {key!r}; the env offers {offered}. "
                     f"{remedy}"
                 )
-        # The TensorDict's or the spec's batch; that of the inputs may have further dims.
+        # `*B` is what precedes the first input's own dims, as long as it begins with the
+        # TensorDict's batch: a spec or a TensorDict without a batch may hold inputs that have one.
         batch, leading = source.shape, maps[0].shape[: -len(self.reads[0].shape)]
         if leading[: len(batch)] == batch:
             batch = leading
@@ -132,7 +141,8 @@ class MapTransform(Transform):
         if self.missing_tolerance and any(lacks):
             return next_tensordict
         maps = self._read(next_tensordict)
-        # The class's function: compiled once for all instances, which stay picklable.
+        # The class's function, not the bound method: compiled once for all instances, which stay
+        # picklable.
         compute = type(self).compute
         if self.compiled:
             compute = _compiled(compute)
@@ -143,17 +153,19 @@ class MapTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # TorchRL's own doesn't call the transform
+        # TorchRL's own `_reset` doesn't call the transform.
         begins = tensordict.get("_reset", None)
-        if begins is None or begins.is_cuda or self.compiled:  # a mask would wait or recompile
+        # Selecting rows by a mask waits for a GPU, and each new number of rows would recompile.
+        if begins is None or begins.is_cuda or self.compiled:
             return self._call(tensordict_reset)
         rows = flags_of_batch(begins, tensordict_reset)
         if rows.all() == rows.any():
             return self._call(tensordict_reset)
-        # TorchRL keeps only the rows that begin anew, and estimates are slow.
-        begun = self._call(tensordict_reset[rows])
+        # TorchRL keeps only the rows that are reset: the others need not be computed, which matters
+        # for estimated flow.
+        reset = self._call(tensordict_reset[rows])
         for key in self.out_keys:
-            if (value := begun.get(key, None)) is not None:
+            if (value := reset.get(key, None)) is not None:
                 whole = value.new_zeros((*rows.shape, *value.shape[1:]))
                 whole[rows] = value
                 tensordict_reset.set(key, whole)
@@ -185,19 +197,20 @@ class MapTransform(Transform):
 
 
 class RecurrentTransform(MapTransform):
-    """Reads the step before from the TensorDict passed to `step`, and keeps no state itself.
+    """A transform of the current and the previous step; it keeps no state itself.
 
-    The env declares the `carried_keys` as part of its state, so that episodes and envs can't mix.
-    `compute` returns the outputs at an episode's first frame, `advance` those of any other.
+    The previous step is read from the TensorDict passed to `step`. The env declares the
+    `carried_keys` as part of its state, so that episodes and envs can't mix. `compute` returns the
+    outputs at an episode's first frame, `advance` those at any other.
 
     In a replay buffer, stored outputs are left as they are. Outputs that are missing under `"next"`
-    follow from the root. Those that are missing at the root need a trajectory: a dimension named
-    "time", and `("next", "done")`; its first frame counts as an episode's first.
+    are computed from the root. Outputs that are missing at the root need a trajectory: a dimension
+    named "time", and `("next", "done")`. Its first frame counts as an episode's first.
     """
 
     @property
     def carried_keys(self) -> list[NestedKey]:
-        """The entries of the step before that `advance` needs: by default the inputs."""
+        """The keys of the previous step that `advance` needs: by default the inputs."""
         return self.in_keys
 
     def compute(self, *now: Tensor) -> tuple[Tensor, ...]:
@@ -206,18 +219,18 @@ class RecurrentTransform(MapTransform):
 
     @abstractmethod
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Returns the outputs of a step from the carried entries and the current inputs."""
+        """Returns the outputs from the previous step's `carried_keys` and the current inputs."""
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         now = self._read(next_tensordict)
-        made = self.advance(self._carried(tensordict), now)
+        outputs = self.advance(self._carried(tensordict), now)
         env = self.parent
         if env is not None and env.__dict__.get("_torchrl_native_autoreset", False):
-            # The next frame of an env that is done is a first one already, and the transforms that
-            # follow have to see what is computed from it.
+            # Such an env returns the first frame of the next episode with the last step of this
+            # one, and the transforms that follow have to see what is computed from it.
             done = flags_of_batch(next_tensordict.get("done"), next_tensordict)
-            made = self._begun_anew(done, now, made)
-        for key, value in zip(self.out_keys, made):
+            outputs = self._first_where(done, now, outputs)
+        for key, value in zip(self.out_keys, outputs):
             next_tensordict.set(key, value)
         return next_tensordict
 
@@ -231,26 +244,26 @@ class RecurrentTransform(MapTransform):
                 )
         return before
 
-    def _begun_anew(
-        self, begins: Tensor, now: Sequence[Tensor], made: Sequence[Tensor]
+    def _first_where(
+        self, begins: Tensor, now: Sequence[Tensor], outputs: Sequence[Tensor]
     ) -> tuple[Tensor, ...]:
-        """Returns outputs with those of a first frame where an episode `begins`, bool `[*B]`."""
+        """Returns the outputs, with those of a first frame where `begins`, bool `[*B]`, is True."""
         return tuple(
             torch.where(expand_as_right(begins, first), first, later)
-            for first, later in zip(self.compute(*now), made)
+            for first, later in zip(self.compute(*now), outputs)
         )
 
     @dispatch(source="in_keys", dest="out_keys", auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the outputs that a replay batch lacks, at its root and under `"next"`."""
         if missing := [key for key in self.out_keys if tensordict.get(key, None) is None]:
-            made = self._along_trajectory(tensordict, missing[0])
+            outputs = self._along_trajectory(tensordict, missing[0])
             for key in missing:
-                tensordict.set(key, made[key])
+                tensordict.set(key, outputs[key])
         following = tensordict.get("next", None)
         if following is None or not any(key in following.keys(True) for key in self.in_keys):
             return tensordict
-        # What is stored there is right even if the next frame is several steps ahead.
+        # A stored output is right even if the next frame is several steps ahead.
         if missing := [key for key in self.out_keys if following.get(key, None) is None]:
             # TorchRL's MultiStep and MultiStepTransform write the number of steps to this key.
             steps = tensordict.get("steps_to_next_obs", None)
@@ -275,7 +288,7 @@ class RecurrentTransform(MapTransform):
         now, done = self._read(tensordict), tensordict.get(("next", "done"), None)
         if done is None or "time" not in tensordict.names:
             raise MissingKey(
-                f"{missing!r} is not in the batch, and the step before can't be told: store "
+                f"{missing!r} is not in the batch, nor is the previous step it depends on: store "
                 f"{missing!r}, or give a trajectory with ('next', 'done') and a dimension named "
                 f"'time' (td.refine_names(..., 'time')); names are {tensordict.names}"
             )
@@ -285,16 +298,16 @@ class RecurrentTransform(MapTransform):
         steps: list[tuple[Tensor, ...]] = []
         before: list[Tensor] = []
         for t, frame in enumerate(zip(*(value.unbind(time) for value in now))):
-            made = self.compute(*frame)
+            outputs = self.compute(*frame)
             if t > 0:
-                made = self._begun_anew(ended[t - 1], frame, self.advance(before, frame))
-            moment = dict(zip([*self.in_keys, *self.out_keys], [*frame, *made]))
-            before = [moment[key] for key in self.carried_keys]
-            steps.append(made)
-        return {key: torch.stack(made, time) for key, made in zip(self.out_keys, zip(*steps))}
+                outputs = self._first_where(ended[t - 1], frame, self.advance(before, frame))
+            step = dict(zip([*self.in_keys, *self.out_keys], [*frame, *outputs]))
+            before = [step[key] for key in self.carried_keys]
+            steps.append(outputs)
+        return {key: torch.stack(each, time) for key, each in zip(self.out_keys, zip(*steps))}
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Returns the input specs of `step`, including the carried entries."""
+        """Returns the input specs of `step`, including the `carried_keys`."""
         input_spec = super().transform_input_spec(input_spec)
         if self.parent is None:
             return input_spec
@@ -317,8 +330,8 @@ def check_own_keys(transform: MapTransform) -> None:
     if shared:
         raise ValueError(
             f"{type(transform).__name__} reads and writes {', '.join(shared)}: a second pass, in a "
-            "replay buffer for instance, would start from what the first one made; give out_keys= "
-            "names of their own"
+            "replay buffer for instance, would convert what is converted already; give out_keys= "
+            "other names"
         )
 
 

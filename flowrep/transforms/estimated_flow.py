@@ -1,4 +1,4 @@
-"""Optical flow estimated from two pictures, for envs without exact flow."""
+"""Optical flow estimated from two pictures, for envs that have no exact flow."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from flowrep.transforms.flow import EGO_KEYS, FlowTransform, Intrinsics
 
 PICTURE_PAIR = Reads((6, "kH", "kW"), "integer")
 
-# An object's flow is believed where it leaves less than 0.9 of the pictures' squared difference and
-# gains more than rounding can. At 0.7, false object flow above 0.3 px was 8 % rarer, and people
-# 8 to 20 m ahead lost 4 points more of theirs.
+# An estimate of an object's flow counts where it leaves less than 0.9 of the pictures' squared
+# difference and gains more than rounding to grey levels can. At 0.7, false object flow above 0.3 px
+# was 8 % rarer, and people 8 to 20 m ahead lost 4 points more of theirs.
 _CLEARLY, _GREY_LEVELS = 0.9, 2.0
 
 # Takes two uint8 [N, 3, H, W], returns the flow from the first to the second, float [N, 2, H, W].
@@ -40,17 +40,17 @@ _MULTIPLE_PX = 8  # the network works at an eighth of the size
 
 @dataclass(frozen=True)
 class DIS:
-    """Dense inverse search: flow in a few milliseconds per picture on a CPU, without weights.
+    """Dense inverse search (Kroeger et al., 2016) by OpenCV: a few milliseconds a picture on a CPU.
 
-    Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels,
-    because the preset "medium" matches patches of 8 px at half size, too coarse for a picture of
-    48 px. The faster presets choose their scale by the picture's width and gain less, or nothing.
-    "fine" is "medium" at the picture's full size and smooths a tenth as much: people keep more of
-    their flow, at twice the cost.
+    Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels: the
+    preset "medium" matches patches of 8 px at half size, which is too coarse for a picture of 48
+    px. The faster presets choose their scale by the picture's width, and gain less or nothing by
+    it. "fine" is "medium" at the picture's full size with a tenth of the smoothing. People keep
+    more of their flow, at twice the cost.
 
-    The pictures of a batch are split among as many threads as torch uses
-    (`torch.set_num_threads`), since OpenCV releases Python's lock. Pictures on another device are
-    copied to the CPU and their flow back, which waits for the device.
+    A batch is split among as many threads as torch uses (`torch.set_num_threads`), as OpenCV
+    releases Python's lock. Pictures on another device are copied to the CPU and their flow back,
+    which waits for the device.
 
     Args:
         preset: `"ultrafast"`, `"fast"` or `"medium"`, OpenCV's own, or `"fine"`.
@@ -94,7 +94,7 @@ class DIS:
         if factor > 1:
             size = (width * factor, height * factor)
             grey = [cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC) for picture in grey]
-        # One estimator per call: its buffers aren't thread-safe, and creating it is cheap.
+        # A new estimator in each call: its buffers aren't thread-safe, and creating it is cheap.
         is_fine = self.preset == "fine"
         number = get_args(Preset).index("medium" if is_fine else self.preset)
         estimator = cv2.DISOpticalFlow_create(number)
@@ -115,7 +115,7 @@ def whole_factor(height: int, width: int, min_side_px: int) -> int:
     return max(1, math.ceil(min_side_px / min(height, width)))
 
 
-def _opencv() -> Any:  # its own types lack DISOpticalFlow_create
+def _opencv() -> Any:  # Any, as OpenCV's type stubs lack DISOpticalFlow_create
     require("flow estimated by DIS", "flow", "cv2")
     import cv2
 
@@ -123,17 +123,21 @@ def _opencv() -> Any:  # its own types lack DISOpticalFlow_create
 
 
 class RAFT(nn.Module):
-    """Recurrent all-pairs field transforms: flow by a network, on any device.
+    """Recurrent all-pairs field transforms (Teed and Deng, 2020): flow by torchvision's network.
 
-    Small pictures are enlarged by a whole factor and the flow is scaled back to their pixels.
-    Sides that are not a multiple of 8 are padded by repeating the border, and the padding is
-    cropped again. On pairs with hardly any motion it is noisier than DIS.
+    It runs on the device of its weights. Small pictures are enlarged by a whole factor and the flow
+    is scaled back to their pixels. Sides that are no multiple of 8 are padded by repeating the
+    border, and the padding is cut off again. Where hardly anything moves it is noisier than DIS.
 
     Args:
         weights: a file with the network's state dict, `.safetensors` or `.pth`, read without
             unpickling objects. The weights published by torchvision fit.
-        network: `"raft_small"` or `"raft_large"`, matching the weights.
-        min_side_px: as `DIS`'s, at least 128.
+        network: `"raft_small"` or `"raft_large"`, as the weights need.
+        min_side_px: see `DIS`; at least 128.
+
+    Raises:
+        ValueError: the file holds no weights, or not those of the network.
+        ImportError: torchvision is missing, or was built for another torch.
     """
 
     def __init__(
@@ -193,8 +197,8 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
         return torch.load(path, map_location="cpu", weights_only=True)
     except (ImportError, OSError):
         raise
-    except Exception:  # readers fail on garbage in as many ways as there is garbage
-        # Not "from error": torch's own text advises trusting the file.
+    except Exception:  # readers raise anything on a damaged file
+        # "from None", as torch's text advises to load the file with pickle.
         raise ValueError(
             f"'{path}' is not a readable weights file: it is damaged, or holds more than a state "
             "dict. Save the network's state_dict() again, preferably as .safetensors"
@@ -223,35 +227,39 @@ class EstimatedFlow(FlowTransform):
     | `("sensor", "prev_from_curr")` | | | | |
 
     Convention: as in `RawFlow`, on the current frame's grid. The estimator therefore runs from the
-    current picture to the previous one and its flow is negated; from the previous to the current
-    one it would lie on the wrong grid.
+    current picture to the previous one, and its flow is negated. Flow from the previous picture to
+    the current one would be on the previous frame's grid.
 
-    The input is the previous picture and, after it on the channels, the current one.
+    The input is the previous picture and, behind it on the channels, the current one.
     `FrameStack(k=2, in_keys=[("sensor", "rgb")], out_keys=["rgb2"])` writes them, correctly across
     resets and in a replay buffer. Pictures may be k = `picture_scale` times as large as the maps;
-    flow is then averaged. After a reset the current picture comes twice and flow is exactly 0.
+    their flow is then averaged. After a reset both pictures are the same and flow is exactly 0.
     Where the estimator's flow isn't finite, it is 0 and the mask beside it False.
 
     With `intrinsics` the camera's motion is compensated: the estimator sees the previous picture
-    warped by ego flow, to which its own answer, the objects' flow, is added. Large motion of the
-    world is then no difficulty. The answer counts only where it explains the picture clearly better
-    than ego flow does, so that plain surfaces, the sky and what the previous picture didn't show
-    have ego flow alone.
+    warped by ego flow, and its estimate, the objects' flow, is added to ego flow. Estimates are
+    then small even if the camera moves fast. An estimate counts only where it explains the picture
+    clearly better than ego flow does, so that plain surfaces, the sky and what the previous picture
+    didn't show have ego flow alone.
 
     Args:
         estimator: `"dis"`, `"raft_small"` or `"raft_large"` (which need `weights`), or a function
             from two batches of pictures, uint8 `[N, 3, H, W]`, to the flow from the first to the
-            second, float `[N, 2, H, W]`, e.g. a configured `flowrep.transforms.DIS`. A function has
-            none of the following three options.
+            second, float `[N, 2, H, W]`, e.g. a configured `flowrep.transforms.DIS`. The next
+            three options are not for functions.
         weights: file with RAFT's weights, see `flowrep.transforms.RAFT`.
         preset: of DIS, see `flowrep.transforms.DIS`; RAFT doesn't read it.
-        min_side_px: smaller pictures are enlarged to this; for RAFT to at least 128.
+        min_side_px: pictures with a shorter side are enlarged; for RAFT to at least 128.
         intrinsics: K `[3, 3]` of the maps, or its key; see `RawFlow`, as for `prev_intrinsics`.
             None leaves the pictures as they are.
         picture_scale: k, size of the pictures in sizes of the maps.
         outputs: which of `"raw"` and `"unscaled"` to write.
         scale: factor on raw; for raw's `unit` and for `dt_s` and `out_keys` see `RawFlow`.
         in_keys: the pair of pictures; with `intrinsics` also depth and the camera's motion.
+
+    Raises:
+        ValueError: an option can't be used; in calls, pictures that are not `picture_scale` times
+            as large as the maps, or an estimator's flow of another shape.
 
     Example:
         A texture that moved 2 px to the right since the previous picture.
@@ -303,7 +311,7 @@ class EstimatedFlow(FlowTransform):
         batch, size = pair.shape[:-3], pair.shape[-2:]
         self._map_size(pair, *camera)
         previous, current = pair.to(torch.uint8).reshape(-1, 6, *size).chunk(2, -3)
-        # After a reset both pictures are the same, and nothing has moved.
+        # After a reset both pictures are the same. Nothing has moved, whatever an estimator says.
         differs = (current != previous).flatten(1).any(1).reshape(-1, 1, 1, 1)
         if camera:
             _, depth, motion, K, prev_K = self._at_one_precision([pair, *camera])
@@ -317,28 +325,30 @@ class EstimatedFlow(FlowTransform):
         flow, known = (
             x.reshape(*batch, *x.shape[-3:]) for x in (torch.where(known, flow, 0.0), known)
         )
-        return self._written({"raw": flow, "unscaled": flow}, known)
+        return self._chosen({"raw": flow, "unscaled": flow}, known)
 
     def _compensated(self, current: Tensor, previous: Tensor, ego: Tensor, seen: Tensor) -> Tensor:
-        """Returns flow `[N, 2, H, W]`: ego flow, and what explains the pictures better than it."""
-        smooth = self._enlarged(ego, seen)
-        places = _places(smooth)
-        was = _looked_up(previous.float(), places)
-        own = self._estimate(current, was.round().to(torch.uint8))
-        # The warped picture shows at p - own what the previous one shows at p - own - ego(p - own).
-        moved = _places(own)
-        beyond = own + _looked_up(smooth, moved) - smooth
+        """Returns ego flow, plus estimates that explain the pictures better, `[N, 2, H, W]`."""
+        smooth = self._enlarged(ego, seen)  # [N, 2, kH, kW], as all that follows
+        sources = _sources(smooth)
+        warped = _sampled(previous.float(), sources)
+        estimate = self._estimate(current, warped.round().to(torch.uint8))
+        # With an estimate e, the warped picture shows at p - e what the previous one shows at p - e
+        # - ego(p - e). Beyond ego(p), the pixel has therefore moved by e + ego(p - e) - ego(p).
+        moved = _sources(estimate)
+        beyond = estimate + _sampled(smooth, moved) - smooth
         # Without texture, and where something comes into view, an estimate is a guess.
-        explained = _misfit(current, _looked_up(was, moved))
-        is_moving = explained < _CLEARLY * _misfit(current, was) - _GREY_LEVELS**2
-        is_moving &= (places.abs() <= 1).all(-1).unsqueeze(1)
-        beyond = torch.where(is_moving | ~own.isfinite(), beyond, 0.0)
+        misfit = _misfit(current, _sampled(warped, moved))
+        is_moving = misfit < _CLEARLY * _misfit(current, warped) - _GREY_LEVELS**2
+        is_moving &= (sources.abs() <= 1).all(-1).unsqueeze(1)  # the previous picture showed it
+        # An estimate that isn't finite is kept, so that the mask can say so.
+        beyond = torch.where(is_moving | ~estimate.isfinite(), beyond, 0.0)
         return torch.where(seen, ego, self._averaged(smooth)) + self._averaged(beyond)
 
     def _enlarged(self, ego: Tensor, seen: Tensor) -> Tensor:
-        """Returns ego flow in the pictures' size and pixels; holes of it are their neighbours'.
+        """Returns ego flow in the pictures' size and pixels; holes take their neighbours' flow.
 
-        Surfaces are smooth: steps of a whole pixel of the maps would be flow to an estimator.
+        It is interpolated, as an estimator would take steps of a whole pixel of the maps for flow.
         """
         k = self.picture_scale
         flow, weight = (
@@ -348,7 +358,7 @@ class EstimatedFlow(FlowTransform):
         return k * flow / weight.clamp(min=1e-6)
 
     def _averaged(self, flow: Tensor) -> Tensor:
-        """Returns flow of the pictures in the maps' size and pixels."""
+        """Returns the pictures' flow in the maps' size and pixels."""
         return functional.avg_pool2d(flow, self.picture_scale) / self.picture_scale
 
     def _estimate(self, current: Tensor, previous: Tensor) -> Tensor:
@@ -364,7 +374,7 @@ class EstimatedFlow(FlowTransform):
         return -flow.to(torch.float32)
 
     def output_specs(self, pair: TensorSpec, *camera: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns an unbounded spec per flow and a boolean one per mask, of the maps' size."""
+        """Returns an unbounded spec for each flow and a boolean one for each mask."""
         size = (*pair.shape[:-2], *self._map_size(pair, *camera))
         return super().output_specs(Unbounded(size, device=pair.device, dtype=pair.dtype))
 
@@ -388,22 +398,23 @@ def _misfit(current: Tensor, shown: Tensor) -> Tensor:
 
 
 def _around(maps: Tensor) -> Tensor:
-    """Returns the sum over the 5 × 5 pixels around each; beyond the border is 0."""
-    padded = functional.pad(maps, (2, 2, 2, 2))  # avg_pool2d is ten times as slow on a CPU
+    """Returns the sum over the 5 × 5 pixels around each, with 0 beyond the border."""
+    # Row by row: avg_pool2d takes ten times as long on a CPU.
+    padded = functional.pad(maps, (2, 2, 2, 2))
     return padded.unfold(-2, 5, 1).sum(-1).unfold(-1, 5, 1).sum(-1)
 
 
-def _places(flow: Tensor) -> Tensor:
-    """Returns where p - flow is for each pixel p, `[N, H, W, 2]`; a picture is from -1 to 1."""
+def _sources(flow: Tensor) -> Tensor:
+    """Returns p - flow for each pixel p, `[N, H, W, 2]`, -1 to 1 from border to border."""
     height, width = flow.shape[-2:]
     still = torch.eye(2, 3, device=flow.device, dtype=flow.dtype).unsqueeze(0)
     pixels = functional.affine_grid(still, [1, 1, height, width], align_corners=False)
     return pixels - flow.movedim(1, -1) * (2 / flow.new_tensor([width, height]))
 
 
-def _looked_up(maps: Tensor, places: Tensor) -> Tensor:
-    """Returns float maps `[N, C, H, W]` at places, of the nearest pixel beyond the border."""
-    return functional.grid_sample(maps, places, padding_mode="border", align_corners=False)
+def _sampled(maps: Tensor, points: Tensor) -> Tensor:
+    """Returns float maps `[N, C, H, W]` at points; beyond the border, the nearest pixel's value."""
+    return functional.grid_sample(maps, points, padding_mode="border", align_corners=False)
 
 
 def _estimator(

@@ -35,23 +35,26 @@ _DEPTH: NestedKey = ("sensor", "depth")
 _RAW_KEYS: Keys = [_DEPTH, ("sensor", "instance"), ("sensor", "instance_motion")]
 EGO_KEYS: list[NestedKey] = [_DEPTH, ("sensor", "prev_from_curr")]
 
-_CALLS_PER_LOOK = 100  # at the values of K on a GPU
-_SAME_CAMERA = 1e-5  # of fx: up to 0.01 px for a picture 1,000 wide
+_CALLS_PER_LOOK = 100  # on a GPU, the values of K are looked at in one call of this many
+_SAME_CAMERA = 1e-5  # share of fx by which K may differ: 0.01 px for a picture 1,000 px wide
 
 # K itself, or the key under which the env gives it.
 Intrinsics: TypeAlias = Tensor | Sequence[Sequence[float]] | NestedKey
 
 
 class CameraTransform(MapTransform):
-    """Holds K in its original float type, even if the transform is cast to another.
+    """A transform that needs the camera's K: given once, or read under a key of the TensorDict.
 
-    Raw flow, where it is the first input, becomes nan where the mask under `mask_key` is False. A
-    key of K, `[*B, 3, 3]`, is read after all other keys, and that of the previous frame's K last.
+    A given K keeps its float type, even if the transform is cast to another. A key of K, `[*B, 3,
+    3]`, is read after all other keys, and that of the previous frame's K last. Raw flow, where it
+    is the first input, becomes nan where the mask under `mask_key` is False.
 
-    A K that no camera of these maps has raises ValueError, see `check_intrinsics`; one that isn't
-    known (nan, inf, no focal length) makes its frame invalid. A K under a key that changes within
-    an episode raises ValueError too, unless the previous frame's has a key. Values are looked at
-    when they change, on a GPU in one call of a hundred, so that nothing waits for it.
+    Values of K are checked when they change; on a GPU, where reading them waits, in one call of a
+    hundred. A K that isn't known (nan, inf, no focal length) makes its frame invalid.
+
+    Raises:
+        ValueError: no camera of these maps has this K, see `check_intrinsics`; or K changes within
+            an episode and the previous frame's K has no key.
     """
 
     K: Tensor | None
@@ -108,7 +111,7 @@ class CameraTransform(MapTransform):
                 self._checked[key] = size, K.detach().clone()
 
     def _looks_at(self, K: Tensor) -> bool:
-        """Returns whether K's values are to be read now: on a GPU that waits for it."""
+        """Returns whether to read K's values now, which waits for a GPU."""
         if torch.compiler.is_compiling() or K.is_meta:
             return False
         return K.is_cpu or self._calls % _CALLS_PER_LOOK < 2  # at the first reset and call, too
@@ -119,7 +122,7 @@ class CameraTransform(MapTransform):
         """Raises ValueError if K changes from frame to frame where no episode is `done`."""
         if before is None or now is None or not self._looks_at(now) or torch.equal(before, now):
             return
-        # more than rounding; what isn't known compares False
+        # By more than rounding. What isn't known (nan) compares False.
         changes = (now - before).abs().amax((-2, -1)) > _SAME_CAMERA * now[..., 0, 0].abs()
         if (ended := done()) is not None:
             changes &= ~expand_as_right(ended, changes)
@@ -141,7 +144,7 @@ class CameraTransform(MapTransform):
             before, now = (
                 td.get(self.camera_keys[0], None) for td in (tensordict, next_tensordict)
             )
-            # the last frame of an episode may be the next one's first
+            # An env with autoreset returns the next episode's first frame where this one is done.
             self._check_one_camera(before, now, lambda: _ended(next_tensordict, "done"))
         return super()._step(tensordict, next_tensordict)
 
@@ -174,7 +177,7 @@ class CameraTransform(MapTransform):
         return [torch.where(known, maps[0], math.nan), *maps[1:]]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CameraTransform:
-        """Moves K between devices but keeps its type, as bfloat16 would round 319.5 px to 320."""
+        """Moves K between devices but keeps its type: bfloat16 would round 319.5 px to 320."""
         exact = self.K
         super()._apply(fn, recurse)
         if exact is not None and self.K is not None:
@@ -183,10 +186,10 @@ class CameraTransform(MapTransform):
 
 
 class FlowTransform(CameraTransform):
-    """Base of flow transforms, with the intrinsics K, the chosen outputs and their unit.
+    """Base of the flow transforms: K, the chosen outputs, their scale and unit.
 
-    A subclass names the outputs that it knows, and those that are `masked`: beside them it writes
-    where they are known, under `mask_key`. For the arguments see `RawFlow`.
+    A subclass names the outputs that it can write (`known`), and those of them that get a mask
+    beside them, under `mask_key` (`masked`). For the arguments see `RawFlow`.
     """
 
     known: tuple[str, ...]
@@ -229,16 +232,16 @@ class FlowTransform(CameraTransform):
         maps = [x.to(dtype) if x.is_floating_point() else x for x in maps]
         return maps if len(self.camera_keys) == 2 else [*maps, None]
 
-    def _written(self, made: Mapping[str, Tensor], valid: Tensor) -> tuple[Tensor, ...]:
+    def _chosen(self, flows: Mapping[str, Tensor], valid: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs, flows in their units, and the masks."""
-        made = {
-            name: made[name] if factor == 1.0 else made[name] * factor
+        scaled = {
+            name: flows[name] if factor == 1.0 else flows[name] * factor
             for name, factor in self.factors.items()
         }
-        return (*(made.get(name, valid) for name in self.outputs), *[valid] * len(self.masks))
+        return (*(scaled.get(name, valid) for name in self.outputs), *[valid] * len(self.masks))
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
-        """Returns an unbounded spec per flow and a boolean one per mask."""
+        """Returns an unbounded spec for each flow and a boolean one for each mask."""
         like = next((x for x, reads in zip(specs, self.reads) if reads == base.DEPTH), specs[0])
         batch, size, device = like.shape[:-3], like.shape[-2:], like.device
         flow = Unbounded(
@@ -259,30 +262,36 @@ class RawFlow(FlowTransform):
     | `("sensor", "instance_motion")` | `"raw_valid"` | as `"valid"` | | |
 
     Convention: p_t − p_t' on the current frame's grid, channels (u right, v down), t' the previous
-    step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, N, 4, 4]` maps a point fixed to
-    instance i from the current camera's frame to its place in the previous camera's frame; row 0 is
-    the static world's. The observation thus holds everything that flow needs of the previous step.
+    step (Eq. 1 of the paper). Row i of `instance_motion` `[*B, N, 4, 4]` takes a point fixed to
+    instance i from the current camera's frame into the previous camera's, at the previous step; row
+    0 is the static world's. The observation thus holds everything that flow needs of the previous
+    step: no state is kept, and shuffled samples of a replay buffer give the same flow as the env.
+
     Where flow isn't known, because depth is `nan` or a point was not in front of the previous
-    camera, raw is 0 and the mask beside it, `"raw_valid"`, is False: `FlowFactorize` reads both.
-    No state is kept, and shuffled samples of a replay buffer give the same flow as the env.
+    camera, raw is 0 and the mask beside it, `"raw_valid"`, is False. `FlowFactorize` reads both.
 
     Args:
         intrinsics: K `[3, 3]` of the maps, a tensor or nested lists, pixels; or the env's key for
             it, `[*B, 3, 3]`.
-        prev_intrinsics: key of the previous frame's K, beside that of K, for cameras that zoom or
-            focus, see `PreviousIntrinsics`. Without it, a K that is seen to change within an
-            episode is refused; a replay sample of single frames doesn't show that it does.
+        prev_intrinsics: key of the previous frame's K, for cameras that zoom or focus, see
+            `PreviousIntrinsics`; K needs a key then. Without it, a K that changes within an episode
+            raises ValueError. (A replay sample of single frames doesn't show that it changes.)
         outputs: which of `"raw"` and `"valid"` to write.
-        scale: factor on the flow.
+        scale: factor on the flow, finite and not 0.
         unit: `"px_per_step"` or `"px_per_s"`.
         dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
-        compiled: whether `compute` runs through `torch.compile`, which is some five times as fast
+        compiled: whether `compute` runs through `torch.compile`, which is about five times as fast
             on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
-            the result in torch's cache. Otherwise numba, where it is installed, computes large
-            float32 batches on a CPU two to five times as fast as PyTorch, with the same bits.
-        in_keys: depth, instance ids and one motion per instance.
-        out_keys: one key per output; their names by default. The mask's key follows raw's:
+            the result in torch's cache. Otherwise numba, if it is installed, computes large float32
+            batches on a CPU two to five times as fast as PyTorch, with the same bits.
+        in_keys: depth, instance ids, and one motion for each instance.
+        out_keys: one key for each output; their names by default. The mask's key follows raw's:
             `("sensor", "flow_valid")` for `("sensor", "flow")`.
+
+    Raises:
+        ValueError: an option can't be used, K is no camera's, or `compiled=True` without a C++
+            compiler. In calls, see `check_intrinsics` and `prev_intrinsics`.
+        RuntimeError: in calls, for an id without a row of `instance_motion`.
 
     Example:
         A body a metre away was 0.1 m further left: fx · 0.1 m / 1 m = 3 px to the right.
@@ -325,7 +334,7 @@ class RawFlow(FlowTransform):
         """Returns the chosen outputs, from depth, instance ids and motions (and K)."""
         depth, instance, motions, K, prev_K = self._at_one_precision(maps)
         flow, valid = geometry.rigid_flow(depth, instance, K, motions, prev_K=prev_K)
-        return self._written({"raw": flow}, valid)
+        return self._chosen({"raw": flow}, valid)
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns the outputs' specs; ids that say how many they are must be one per motion."""
@@ -340,7 +349,7 @@ class RawFlow(FlowTransform):
 
 
 class FlowFactorize(FlowTransform):
-    """Optical flow split into ego flow and object flow, in one pass over the pixels.
+    """Raw flow split into ego flow and object flow, in one pass over the pixels.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
@@ -350,22 +359,27 @@ class FlowFactorize(FlowTransform):
     | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
 
     Convention: ego is the flow that the camera's motion alone would cause (Eqs. 7–11 of the paper),
-    obj = raw − ego is the objects' own flow (Eq. 6), with `RawFlow`'s sign, grid and channels. See
-    `flowrep.geometry.factorize`, also for `prev_from_curr` and where flow isn't known and 0. Raw
-    flow isn't known either where the mask beside it, bool `"raw_valid"` (`RawFlow` and
-    `EstimatedFlow` write it; its key follows raw's), is False: a store of raw flow keeps both. With
-    the simulator's raw flow, obj is exactly 0 on everything static.
+    obj = raw − ego is the flow of what moves by itself (Eq. 6), with `RawFlow`'s sign, grid and
+    channels; see `flowrep.geometry.factorize`. With the simulator's raw flow, obj is exactly 0 on
+    everything static.
+
+    Raw flow isn't known where the mask beside it is False, bool `"raw_valid"`, whose key follows
+    raw's. `RawFlow` and `EstimatedFlow` write it, and whoever stores raw flow has to store both.
+    Where ego or raw flow isn't known, obj is 0 and `"valid"` False.
 
     Args:
         intrinsics: K `[3, 3]` of the maps, or its key; see `RawFlow`, as for `prev_intrinsics`.
-        outputs: which of `"ego"`, `"obj"`, `"raw"` (the raw flow itself, in the chosen unit, 0
-            where it isn't finite) and `"valid"` to write. With ego alone, raw flow isn't read.
+        outputs: which of `"ego"`, `"obj"`, `"raw"` (raw flow in the chosen unit, 0 where it isn't
+            finite) and `"valid"` to write. For ego alone, raw flow isn't read.
         scale: factor on the flows, or a mapping from output to factor.
         unit: `"px_per_step"` or `"px_per_s"`, or a mapping from output to unit; for `dt_s` and
             `compiled` see `RawFlow`.
         in_keys: raw flow (in px/step, unscaled), depth and camera motion; without raw flow for ego
             alone.
-        out_keys: one key per output; their names by default.
+        out_keys: one key for each output; their names by default.
+
+    Raises:
+        ValueError: as `RawFlow` does.
 
     Example:
         The camera moved 0.1 m to the right, so a wall a metre away moves by fx · 0.1 = 3 px to the
@@ -410,12 +424,12 @@ class FlowFactorize(FlowTransform):
         *raw, depth, motion, K, prev_K = self._at_one_precision(maps)
         if not raw:
             ego, valid = geometry.ego_flow(depth, K, motion, prev_K=prev_K)
-            return self._written({"ego": ego}, valid)
+            return self._chosen({"ego": ego}, valid)
         ego, obj, valid = geometry.factorize(raw[0], depth, K, motion, prev_K=prev_K)
-        made = {"ego": ego, "obj": obj}
+        flows = {"ego": ego, "obj": obj}
         if "raw" in self.outputs:
-            made["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
-        return self._written(made, valid)
+            flows["raw"] = torch.where(raw[0].isfinite(), raw[0], 0.0)
+        return self._chosen(flows, valid)
 
 
 def _is_equal(a: Tensor, b: Tensor) -> bool:
@@ -423,7 +437,7 @@ def _is_equal(a: Tensor, b: Tensor) -> bool:
 
 
 def _ended(tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
-    """Returns where an episode is over, bool of the TensorDict's batch; None if nothing says it."""
+    """Returns where an episode is over, bool `[*B]`, or None if the TensorDict doesn't say."""
     done = tensordict.get(key, None)
     return None if done is None else flags_of_batch(done, tensordict)
 

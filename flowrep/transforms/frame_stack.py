@@ -22,19 +22,22 @@ class FrameStack(RecurrentTransform):
     After a reset all k frames are the episode's first. The previous step's stack is read from the
     TensorDict passed to `step`, where the env declares it as part of its state, as TorchRL's
     `StepCounter` does. No state is kept between calls, so stacks can't mix episodes or envs.
-    TorchRL's `CatFrames` keeps state: in a replay buffer it stacks neighbours in a sample, which is
-    wrong if samples are shuffled.
+    (TorchRL's `CatFrames` keeps state. In a replay buffer it stacks neighbours in a sample, which
+    is wrong if samples are shuffled.)
 
-    In a replay buffer the stored root stack and the next frame give the next stack exactly,
-    shuffled or not: without `("next", out_key)` a transition takes k + 1 frames instead of 2 k.
-    n-step returns need it stored, since their next frame is several steps ahead.
+    In a replay buffer, the stack stored at the root and the next frame give the next stack exactly,
+    in shuffled samples too. Without `("next", out_key)`, a transition takes k + 1 frames instead of
+    2 k. Store it for n-step returns, whose next frame is several steps ahead.
 
     A batch without a stored stack has to be a trajectory, with a dimension named "time" and
-    `("next", "done")`; its first frame counts as an episode's first. A buffer may thus store single
+    `("next", "done")`. Its first frame counts as an episode's first. A buffer may thus store single
     frames (two per transition, or one if `next` is looked up) and sample slices of an episode.
     Stacks are exact from the k-th step of a slice on, `batch[:, k - 1:]`.
 
-    The stacks' keys (`out_keys`) must differ from the maps' keys.
+    Args:
+        k: the number of frames.
+        in_keys: the maps.
+        out_keys: one key for each stack, other than the maps' keys.
 
     Example:
         >>> from tensordict import TensorDict
@@ -59,7 +62,7 @@ class FrameStack(RecurrentTransform):
 
     @property
     def carried_keys(self) -> list[NestedKey]:
-        """The stacks of the step before."""
+        """The previous step's stacks."""
         return self.out_keys
 
     def compute(self, *frames: Tensor) -> tuple[Tensor, ...]:
@@ -67,7 +70,7 @@ class FrameStack(RecurrentTransform):
         return tuple(torch.cat([frame] * self.k, -3) for frame in frames)
 
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Returns the stacks of the step before without their oldest frames, and with the new."""
+        """Returns the previous stacks without their oldest frames, followed by the new frames."""
         return tuple(
             torch.cat([stack[..., frame.shape[-3] :, :, :], frame], -3)
             for stack, frame in zip(before, now)

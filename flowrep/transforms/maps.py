@@ -1,6 +1,6 @@
-"""One map a sensor: picture, segmentation, depth, and the rows of bodies.
+"""Transforms of a single map: picture, segmentation, depth, and instance ids.
 
-`in_keys` and `out_keys` of each are by default those that its table reads and writes.
+By default, `in_keys` and `out_keys` are those in each transform's table.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from flowrep.transforms.base import DEPTH, IDS, RGB, Keys, MapTransform, check_o
 Encoding = Literal["ids", "onehot"]
 
 _LINK_BIT = 24  # PyBullet's ids: body + (link + 1 << 24)
-_CALLS_PER_LOOK = 100  # at ids without a row, on a GPU or once some were named
+# How often ids without a row are looked for, on a GPU or once a warning named some: the search
+# takes a pass over the ids, and waits for a GPU.
+_CALLS_PER_LOOK = 100
 
 
 class Rgb(MapTransform):
@@ -32,8 +34,8 @@ class Rgb(MapTransform):
     | --- | --- | --- | --- | --- |
     | `("sensor", "rgb")` | `"rgb"` | uint8 `[*B, 3, H, W]` | 0 … 255 | |
 
-    It stays uint8, which takes a quarter of the memory of float32 in a replay buffer. A network can
-    read the divisor from the spec's bounds.
+    It stays uint8, which takes a quarter of the memory of float32 in a replay buffer. The spec's
+    bounds tell a network what to divide by.
 
     Example:
         >>> from tensordict import TensorDict
@@ -55,7 +57,7 @@ class Rgb(MapTransform):
 
 
 class Segmentation(MapTransform):
-    """Class of every pixel: the paper's semantic segmentation.
+    """The class of every pixel: the paper's semantic segmentation.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
@@ -63,15 +65,18 @@ class Segmentation(MapTransform):
     | | `"seg"`, onehot | float32 `[*B, n, H, W]` | 0 or 1 | |
 
     In a replay buffer, ids take an eighth of the memory of a one-hot float map of two classes.
-    Their spec is a `Categorical` with n, so a network can expand them. An id outside 0 … n − 1 is a
-    pixel without a class, all zeros in the one-hot encoding.
+    Their spec is a `Categorical` with n, so that a network can expand them. An id outside 0 … n − 1
+    is a pixel without a class, all zeros in the one-hot encoding.
 
-    In each call, ids of a wider or signed type are checked before conversion to uint8, which waits
-    for a GPU, and those that it can't hold raise ValueError. Pass uint8 to avoid that.
+    Ids of a wider or signed type are checked in each call before they are converted to uint8. The
+    check waits for a GPU; pass uint8 to avoid it.
 
     Args:
         num_classes: n, 1 to 256.
         encoding: `"ids"` or `"onehot"`.
+
+    Raises:
+        ValueError: in calls, with `encoding="ids"`, for ids outside 0 … 255.
 
     Example:
         >>> from tensordict import TensorDict
@@ -99,7 +104,7 @@ class Segmentation(MapTransform):
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         (ids,) = super()._read(tensordict)
-        # ids would wrap in uint8: 300 would become 44
+        # They would wrap in uint8: 300 would become 44.
         if self.encoding == "ids" and ids.dtype is not torch.uint8 and ids.numel():
             least, most = (int(bound) for bound in ids.aminmax())
             if least < 0 or most > 255:
@@ -127,14 +132,17 @@ class Segmentation(MapTransform):
 
 
 class Depth(MapTransform):
-    """Depth along the optical axis divided by `range_m`, clipped to [0, 1].
+    """Depth along the optical axis, divided by `range_m` and clipped to [0, 1].
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "depth")`, m | `"depth"` | float32 `[*B, 1, H, W]` | 0 … 1 | `range_m` |
 
-    Sky (`inf`) and everything beyond `range_m` becomes 1, a hole (`nan`) becomes `missing`, a
-    number in [0, 1].
+    Sky (`inf`) and everything beyond `range_m` become 1, holes (`nan`) become `missing`.
+
+    Args:
+        range_m: the depth that becomes 1, metres.
+        missing: the value of a hole, 0 to 1.
 
     Example:
         >>> from tensordict import TensorDict
@@ -169,27 +177,30 @@ class Depth(MapTransform):
 
 
 class InstanceIds(MapTransform):
-    """Converts a simulator's segmentation ids to rows of `instance_motion`.
+    """Converts a simulator's instance ids to rows of `instance_motion`.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | ids | `("sensor", "instance")` | uint8 `[*B, 1, H, W]` (int32 from 256 bodies) | 0 … N | row |
 
-    Ids that have no row become 0, the static world, and each is named once in a warning, with its
-    share of the pixels, unless it is negative (a background) or one of `static_ids`. They are
-    looked for in every call until some were named, then, as always on a GPU, in one of a hundred.
+    Ids that have no row become 0, the static world. A warning names each of them once, with its
+    share of the pixels, unless it is negative (a background) or one of `static_ids`. Every call
+    looks for such ids until the first warning; then, and on a GPU always, one call in a hundred.
 
     PyBullet's ids with links (`ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX`) hold a body's id and,
-    from bit 24 on, 1 + its link's. Bodies may then be named as (body, link), each with the pose of
-    its link, -1 for the base. Those that `body_ids` has without their links raise ValueError in a
-    picture of such ids, unless `links_as_body` says that links move as their bodies.
+    from bit 24 on, 1 + its link's. Name bodies as (body, link) then, each with the pose of its
+    link, -1 for the base.
 
     Args:
         body_ids: the ids of the bodies, or (body, link), in the order of their poses: the first
             becomes 1.
         static_ids: ids of what stands still, such as the floor's.
-        links_as_body: whether PyBullet's links that are not named take their body's row.
-        out_keys: must differ from `in_keys`, so that nothing is adapted twice.
+        links_as_body: whether links of PyBullet that `body_ids` lacks take their body's row.
+        out_keys: must differ from `in_keys`, so that nothing is converted twice.
+
+    Raises:
+        ValueError: `body_ids` names a body twice; or, in calls, the picture has PyBullet's ids with
+            links, `body_ids` has their bodies without links, and `links_as_body` is False.
 
     Example:
         >>> from tensordict import TensorDict
@@ -280,7 +291,8 @@ def _packed(body: int, link: int) -> int:
 
 
 def _body_of(ids: Tensor) -> Tensor:
-    """Returns the ids of the bodies of PyBullet's ids with links; a negative one stays."""
+    """Returns the bodies' ids of PyBullet's ids with links; negative ids stay."""
+    # Types of one or two bytes hold no links.
     return torch.where(ids < 0, ids, ids % (1 << _LINK_BIT)) if ids.element_size() > 2 else ids
 
 

@@ -1,4 +1,4 @@
-"""Left-right images of transitions, for replay in worlds that look alike in a mirror."""
+"""Left-right images of transitions, for replay in worlds that are their own mirror image."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Images = Literal["half", "both", "all"]
 class Mirror(Transform):
     """Left-right images of the transitions that a replay buffer samples.
 
-    In a street that may as well be its own mirror image, whatever is learnt from turning left holds
-    for turning right. A transition's image has the columns of its maps reversed, now and under
-    `"next"`, the horizontal component of its flows negated, and its action exchanged; reward and
-    ends are the same.
+    In a street that might as well be its mirror image, whatever holds for a left turn holds for a
+    right turn. A transition's image has the columns of its maps reversed, at the root and under
+    `"next"`, the horizontal component of its flows negated, and its action exchanged. Reward and
+    done flags stay the same.
 
     | reads and writes | shape | its image |
     | --- | --- | --- |
@@ -32,24 +32,29 @@ class Mirror(Transform):
     | `"action"` | `[*B]` or one-hot `[*B, n]` | `swapped_actions[action]` |
 
     Convention: pixel (0, 0)'s centre is (0.5, 0.5), so that column i sees x / z = (i + 0.5 - cx) /
-    fx, and the column that sees the opposite is 2·cx - 1 - i. With cx = W / 2 that is the last for
-    the first. flowrep's simulated camera samples a pixel at its left edge, cx = W / 2 + 0.5: column
-    i becomes W - i, and column 0 would be one beyond the picture. Such columns, |2·cx - W| at one
-    border, take the nearest that was seen; the others are exact.
+    fx, and the column that sees the opposite is 2·cx - 1 - i. With cx = W / 2 the first column
+    becomes the last. flowrep's simulated camera samples a pixel at its left edge, cx = W / 2 + 0.5:
+    column i becomes W - i, and column 0 would be one beyond the picture. Such columns, |2·cx - W|
+    of them at one border, take the nearest column that was seen; the others are exact.
 
-    This is for replay buffers. It keeps no state and writes over what it reads. An env refuses it,
-    since actions would have to be exchanged before they are taken.
+    It keeps no state and overwrites what it reads. It is for replay buffers: in an env, actions
+    would have to be exchanged before they are taken.
 
     Args:
         in_keys: all maps to mirror.
         flow_keys: those of them that are flows; None for none.
-        swapped_actions: for each action the one that does the same in a mirror, such as
+        swapped_actions: for each action the one that does the same in the mirror, such as
             `[0, 2, 1]` for (straight on, left, right).
-        intrinsics: the maps' camera [3, 3], without skew; None if it is centred, cx = W / 2. 2·cx
-            has to be whole, as nothing is interpolated: maps of classes couldn't be.
+        intrinsics: K `[3, 3]` of the maps, without skew; None if it is centred, cx = W / 2. 2·cx
+            has to be whole, since class ids can't be interpolated.
         images: "half" replaces each transition with probability 1/2, a trajectory (with a dimension
             named "time") as a whole; "both" appends the images along the first dimension, which
             doubles it; "all" replaces all.
+
+    Raises:
+        ValueError: `flow_keys` holds a key that `in_keys` lacks, `swapped_actions` is no exchange,
+            or K has skew or a cx between columns.
+        RuntimeError: it is used in an env.
 
     Example:
         >>> from tensordict import TensorDict
@@ -91,7 +96,7 @@ class Mirror(Transform):
         self.images = images
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns a batch of transitions with the images in their place, or behind them."""
+        """Returns the batch with images instead of transitions, or appended to them."""
         shape, device = tensordict.batch_size, tensordict[self.in_keys[0]].device
         if self.images == "half":
             drawn = [1 if name == "time" else n for name, n in zip(tensordict.names, shape)]
@@ -103,7 +108,7 @@ class Mirror(Transform):
         return torch.cat([tensordict, self._mirror(tensordict.copy(), chosen)])
 
     def _mirror(self, tensordict: TensorDictBase, chosen: Tensor) -> TensorDictBase:
-        """Writes the images of the `chosen` [*B] transitions over them."""
+        """Replaces the `chosen` `[*B]` transitions by their images."""
         action, swapped = tensordict["action"], self.swapped_actions.to(chosen.device)
         is_one_hot = action.ndim > chosen.ndim and action.shape[-1] == len(swapped)
         image = action[..., swapped] if is_one_hot else swapped[action.long()].to(action.dtype)
@@ -114,10 +119,10 @@ class Mirror(Transform):
             if tensordict.get(key, None) is None:
                 known = sorted(tensordict.keys(True, True), key=str)
                 raise MissingKey(f"Mirror needs key {key!r}; the batch has {known}")
-            for place in (tensordict, following):
-                x = None if place is None else place.get(key, None)
+            for step in (tensordict, following):
+                x = None if step is None else step.get(key, None)
                 if x is not None:
-                    place[key] = mirror_map(x, chosen, self.twice_cx, is_flow=is_flow)
+                    step[key] = mirror_map(x, chosen, self.twice_cx, is_flow=is_flow)
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -133,7 +138,7 @@ def mirror_map(x: Tensor, chosen: Tensor, twice_cx: int | None, *, is_flow: bool
     column = torch.arange(width, device=x.device)
     opposite = ((width if twice_cx is None else twice_cx) - 1 - column).clamp(0, width - 1)
     chosen = chosen[..., None, None, None]
-    # one pass over the maps: a gather takes half the time of a flip and a choice between the two
+    # One pass over the maps: a gather takes half the time of a flip and a `where` of the two.
     x = x.gather(-1, torch.where(chosen, opposite, column).expand(x.shape))
     if is_flow:
         x[..., ::2, :, :].mul_(torch.where(chosen, -1, 1).to(x.dtype))  # the gathered copy's u

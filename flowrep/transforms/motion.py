@@ -34,13 +34,13 @@ class CameraMotion(RecurrentTransform):
     | --- | --- | --- | --- | --- |
     | `("sensor", "world_from_cam")` | `("sensor", "prev_from_curr")` | float32 `[*B, 4, 4]` | | m |
 
-    Convention: `prev_from_curr` maps a point from the current camera's frame to the previous
+    Convention: `prev_from_curr` takes a point from the current camera's frame into the previous
     camera's (Eq. 11 of the paper). Poses are camera-to-world of a camera with OpenCV's axes (see
-    `AdaptPose`), of any float type; use float64 for large worlds. The motion is composed in float64
+    `AdaptPose`), of any float type; use float64 in large worlds. The motion is composed in float64
     and returned in float32. After a reset it is exactly the identity.
 
-    The previous step's pose is read where `FrameStack` reads its stack, and a replay buffer without
-    stored motions has to meet the same conditions.
+    The previous step's pose is read from the TensorDict passed to `step`, as `FrameStack` reads its
+    stack. A replay batch without stored motions has to be a trajectory, as described there.
 
     Example:
         >>> from tensordict import TensorDict
@@ -71,7 +71,7 @@ class CameraMotion(RecurrentTransform):
 
 
 class InstanceMotion(RecurrentTransform):
-    """The bodies' motions relative to the camera, for simulators that give their bodies' poses.
+    """The bodies' motions relative to the camera, for simulators that give the bodies' poses.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
@@ -79,8 +79,8 @@ class InstanceMotion(RecurrentTransform):
     | `("sensor", "world_from_body")` | | `[*B, 1 + N, 4, 4]` | | |
 
     Convention: see `flowrep.geometry.instance_motion`. `InstanceIds` converts a simulator's
-    segmentation ids to its rows, and `RawFlow` reads both. The previous step's poses are read as
-    `CameraMotion`'s.
+    instance ids to its rows, and `RawFlow` reads both. For the previous step's poses see
+    `CameraMotion`.
 
     Args:
         in_keys: keys of the camera's pose `[*B, 4, 4]` and the bodies' poses `[*B, N, 4, 4]`,
@@ -117,14 +117,14 @@ class InstanceMotion(RecurrentTransform):
 
 
 class PreviousIntrinsics(RecurrentTransform):
-    """K of the step before, for envs whose camera zooms or focuses.
+    """The previous step's K, for envs whose camera zooms or focuses.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
     | `("sensor", "K")` | `("sensor", "prev_K")` | as K, float `[*B, 3, 3]` | | px |
 
     The flow transforms read it under the key that their `prev_intrinsics` names. After a reset it
-    is the current K. The previous step's K is read as `CameraMotion`'s pose.
+    is the current K. For how it reads the previous step see `CameraMotion`.
 
     Example:
         >>> from tensordict import TensorDict
@@ -142,7 +142,7 @@ class PreviousIntrinsics(RecurrentTransform):
         super().__init__([CAMERA], in_keys, out_keys)
 
     def advance(self, before: Sequence[Tensor], now: Sequence[Tensor]) -> tuple[Tensor]:
-        """Returns the K of the step before."""
+        """Returns the previous step's K."""
         return (before[0],)
 
     def output_specs(self, K: TensorSpec) -> tuple[TensorSpec]:
@@ -161,9 +161,9 @@ class EstimateCameraMotion(CameraTransform):
     | `prior`, if given | `("sensor", "motion_valid")` | bool `[*B, 1]` | |
     | `"raw_valid"`, if there | | | |
 
-    Convention and where it fails: see `flowrep.geometry.camera_motion`. The result depends on the
-    frame alone, so it is the same in an env, in any batch and on replay samples. Without a prior, a
-    frame that tells no motion (`motion_valid` False) has the identity.
+    Convention, and where it fails: see `flowrep.geometry.camera_motion`. The result depends on the
+    frame alone, so it is the same in an env, in any batch and on replay samples. A frame from which
+    no motion can be estimated (`motion_valid` False) has the prior, or the identity without one.
 
     Put it after the transform that writes raw flow and before `FlowFactorize`, whose ego and object
     flow then need no pose.
@@ -172,11 +172,14 @@ class EstimateCameraMotion(CameraTransform):
         intrinsics: K `[3, 3]` of the maps, pixels, or the env's key for it, `[*B, 3, 3]`; see
             `RawFlow`, as for `prev_intrinsics`.
         picture: key of the current picture, uint8 `[*B, 3, kH, kW]`, k ≥ 1. Give it if raw flow is
-            estimated: flow of plain surfaces is then left out, and along edges.
-        prior: key of the motion expected, `[*B, 4, 4]`, such as odometry's.
+            estimated: flow on plain surfaces, and along edges, then doesn't count.
+        prior: key of the expected motion, `[*B, 4, 4]`, such as odometry's.
         outputs: which of `"motion"`, `"inlier_share"`, `"covariance"` and `"valid"` to write.
         in_keys: raw flow (px/step, unscaled) and depth.
-        out_keys: one key per output; the table's by default.
+        out_keys: one key for each output; the table's by default.
+
+    Raises:
+        ValueError: see `RawFlow`.
 
     Example:
         >>> from tensordict import TensorDict
@@ -221,7 +224,8 @@ class EstimateCameraMotion(CameraTransform):
         picture = rest.pop(0) if self.has_picture else None
         if picture is not None:
             k, size = picture.shape[-1] // depth.shape[-1], depth.shape[-2:]
-            if k > 1 and picture.shape[-2:] == (k * size[0], k * size[1]):  # others are refused
+            # Other sizes are left as they are, for `camera_motion` to refuse.
+            if k > 1 and picture.shape[-2:] == (k * size[0], k * size[1]):
                 flat = picture.reshape(-1, *picture.shape[-3:]).float()
                 picture = functional.avg_pool2d(flat, k).reshape(*picture.shape[:-2], *size)
         prior = rest.pop(0) if self.has_prior else None
@@ -230,13 +234,13 @@ class EstimateCameraMotion(CameraTransform):
         motion, share, covariance, valid = geometry.camera_motion(
             raw, depth, K, prev_K=prev_K, picture=picture, prior=prior
         )
-        made = {
+        estimates = {
             "motion": motion.float(),
             "inlier_share": share.float().unsqueeze(-1),
             "covariance": covariance.float(),
             "valid": valid.unsqueeze(-1),
         }
-        return tuple(made[name] for name in self.outputs)
+        return tuple(estimates[name] for name in self.outputs)
 
     def output_specs(self, raw: TensorSpec, *others: TensorSpec) -> tuple[TensorSpec, ...]:
         """Returns unbounded specs, one bounded to [0, 1] for the share, a boolean one for valid."""

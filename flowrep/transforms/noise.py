@@ -1,4 +1,4 @@
-"""Noise of real sensors on depth, camera motion and flow, drawn anew or fixed by a frame's name."""
+"""Noise of real sensors on depth, camera motion and flow: drawn anew, or fixed for each frame."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ SENSORS = {
 _GAMMA, _FIRST, _SECOND = (
     number - (1 << 64) for number in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 )
-_DIGITS = 24  # of a float32; `normal` and `uniform` use 24 bits of a number each
+_DIGITS = 24  # bits of a float32's fraction; `normal` and `uniform` use 24 of the 64 bits each
 
 
 class SensorNoise(MapTransform):
-    """Adds a real sensor's noise to depth, camera motion and flow; none by default.
+    """Adds real sensors' noise to depth, camera motion and flow; by default none.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
@@ -49,38 +49,41 @@ class SensorNoise(MapTransform):
     | `"raw"` if chosen | the same, noisy | float `[*B, 2, H, W]` | any | px/step |
     | `frame_key` if given | | integer `[*B, F]` | | |
 
-    Convention: depth z gets a normal error of standard deviation `depth_sigma_per_m` · z², as in
-    stereo and structured light. Depth that would not be in front of the camera becomes a hole
+    Convention: depth z gets a normal error of standard deviation `depth_sigma_per_m` · z², as that
+    of stereo and structured light. Depth that would not be in front of the camera becomes a hole
     (`nan`), and so does each pixel with probability `depth_dropout`. Camera motion is followed by a
-    small rigid motion of the current camera, so that integrated poses drift like odometry. A sensor
-    with all of its options at 0 is passed through bitwise unchanged.
+    small rigid motion of the current camera, so that integrated poses drift as odometry does. A
+    sensor with all of its options at 0 passes through bitwise unchanged.
 
     Put it into the env, after `RawFlow` and before `FlowFactorize`, so that stored samples hold
-    what the agent saw. Resets get noise like any frame.
+    what the agent saw. Frames at resets get noise like all others.
 
-    With `frame_key`, noise is a function of the integers that name a frame, e.g. episode and step:
-    a frame gets the same noise in any batch, order, process or session, at the root and under
-    `"next"`, and there is no state to save. Frames with the same name get the same noise.
+    With `frame_key`, noise is a function of the integers that identify a frame, e.g. episode and
+    step. A frame gets the same noise in any batch, order, process or session, at the root and under
+    `"next"`, and there is no state to save.
 
-    Without it, every call draws new noise, which on a replay buffer is augmentation: the root and
-    `"next"` get independent errors. The transform has its own generator, on the device of the
-    maps. Its state is part of `state_dict`, so that a resumed run continues the sequence. The envs
-    of a `SerialEnv` or `ParallelEnv` draw independent noise unless all are given one seed.
+    Without it, each call draws new noise. On a replay buffer that is augmentation: the root and
+    `"next"` get independent errors. The generator is on the maps' device and its state is part of
+    `state_dict`, so that a resumed run continues the sequence. The envs of a `SerialEnv` or
+    `ParallelEnv` draw independent noise unless all get the same seed.
 
     Args:
         sensors: which of `"depth"`, `"motion"` and `"flow"` to read and write.
-        depth_sigma_per_m: standard deviation of depth over z², 1/m; some 0.002 for a depth camera.
+        depth_sigma_per_m: standard deviation of depth over z², 1/m; about 0.002 for a depth camera.
         depth_dropout: probability that a pixel's depth is missing.
         drift_m: standard deviation per step of the motion's translation along each axis, metres.
         drift_rad: standard deviation per step of its rotation about each axis, radians.
         flow_sigma_px: standard deviation of each flow channel, pixels per step.
-        seed: the generator's; envs with the same seed have the same noise. None derives one from
+        seed: of the generator; envs with the same seed have the same noise. None derives it from
             torch's global generator (`torch.manual_seed` makes it reproducible) and the name of
             the worker process; with `frame_key` it is 0.
-        frame_key: key of the integers that name the frame, such as StreetEnv's
+        frame_key: key of the integers that identify the frame, such as StreetEnv's
             `("sensor", "frame")`.
-        in_keys: one key per sensor; the table's by default.
-        out_keys: one key per sensor; `in_keys` by default.
+        in_keys: one key for each sensor; the table's by default.
+        out_keys: one key for each sensor; `in_keys` by default.
+
+    Raises:
+        ValueError: an option is negative or not finite, or its sensor isn't among `sensors`.
 
     Example:
         >>> from tensordict import TensorDict
@@ -154,8 +157,8 @@ class SensorNoise(MapTransform):
             stream = list(SENSORS).index(sensor)
             bits = frame_bits(frame, shape, seed=self.seed or 0, stream=stream)
             return normal(bits), uniform(bits) if sensor == "depth" else uniforms
-        # A generator of each call's own, whose state is replaced and never changed in place: copies
-        # of the transform, TorchRL's shallow clones among them, go on independently.
+        # A new generator in each call, and its state is replaced, never changed in place: copies of
+        # the transform, TorchRL's shallow clones among them, then draw independently.
         generator = torch.Generator(device)
         if self._state is None:
             generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
@@ -172,7 +175,7 @@ class SensorNoise(MapTransform):
         return torch.empty(0, dtype=torch.uint8) if self._state is None else self._state
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Continues from a `state_dict` at the next use, on a device of the same kind."""
+        """Makes the next call continue from a `state_dict`, on a device of the same type."""
         self._state = state.clone().cpu() if len(state) else None
 
     def output_specs(self, *specs: TensorSpec) -> tuple[TensorSpec, ...]:
@@ -203,7 +206,7 @@ def noisy_depth(
 def drifted_motion(
     prev_from_curr: Tensor, normal: Tensor, *, drift_m: float, drift_rad: float
 ) -> Tensor:
-    """Returns the motion `[*B, 4, 4]` from a slightly displaced current camera, still rigid.
+    """Returns the rigid motion `[*B, 4, 4]` of a slightly displaced current camera.
 
     `normal` holds standard normal numbers `[*B, 6]`: translation, then rotation vector.
     """
@@ -228,26 +231,29 @@ def _check_options(sensors: Sequence[str], options: dict[str, float]) -> None:
 
 
 def split_mix(state: Tensor) -> Tensor:
-    """Returns the number that SplitMix64 generates from a state, int64, element by element."""
-    z = state + _GAMMA  # the constants are those of Steele, Lea and Flood, 2014
-    for places, factor in ((30, _FIRST), (27, _SECOND)):
-        z ^= _shifted(z, places)
+    """Returns the number that SplitMix64 generates from each state, int64.
+
+    With the constants of Steele, Lea and Flood (2014).
+    """
+    z = state + _GAMMA
+    for bits, factor in ((30, _FIRST), (27, _SECOND)):
+        z ^= _shifted(z, bits)
         z *= factor
     z ^= _shifted(z, 31)
     return z
 
 
 def frame_bits(frame: Tensor, shape: Sequence[int], *, seed: int, stream: int) -> Tensor:
-    """Returns 64 random bits for each element of frames named by integers `[*B, N]`, int64.
+    """Returns 64 random bits for each element, `[*B, *shape]`, of frames `[*B, N]`, int64.
 
-    The result is `[*B, *shape]`; `stream`, a small number, tells apart the uses of one frame's.
+    A frame is identified by N integers; `stream`, a small number, separates its sensors.
     """
     start = torch.full_like(frame[..., 0], seed, dtype=torch.int64)
     for number in (torch.full_like(start, stream), *frame.long().unbind(-1)):
         start = split_mix(start) ^ number
     start = split_mix(start)
-    places = torch.arange(math.prod(shape), device=frame.device)
-    numbers = split_mix(start.unsqueeze(-1) + places * _GAMMA)
+    element = torch.arange(math.prod(shape), device=frame.device)
+    numbers = split_mix(start.unsqueeze(-1) + element * _GAMMA)
     return numbers.unflatten(-1, tuple(shape))
 
 
@@ -263,8 +269,8 @@ def uniform(bits: Tensor) -> Tensor:
     return _shifted(bits, 64 - _DIGITS).float() * 2.0**-_DIGITS
 
 
-def _shifted(z: Tensor, places: int) -> Tensor:
-    """Returns the bits shifted right and filled with zeros, where torch repeats the sign."""
-    moved = z >> places
-    moved &= (1 << (64 - places)) - 1
+def _shifted(z: Tensor, bits: int) -> Tensor:
+    """Returns z shifted right and filled with zeros; torch's own shift repeats the sign."""
+    moved = z >> bits
+    moved &= (1 << (64 - bits)) - 1
     return moved

@@ -1,7 +1,7 @@
-"""Pictures of representations: fixed scales, one class palette, strips, PNG and mp4.
+"""Pictures of representations: maps in colour, strips of them, and PNG files.
 
-Nothing here is normalised per image: a colour means the same in every frame and in every figure.
-Images are numpy uint8 `[H, W, 3]`. Maps go in as numpy or torch, `[C, H, W]`.
+Nothing is normalised per image: a colour means the same in every frame and every figure. Maps are
+numpy arrays or torch tensors `[C, H, W]`, images are numpy uint8 `[H, W, 3]`.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 5.0}
 DEPTH_RANGE_M = 100.0
 
 _UNKNOWN = (128, 128, 128)
-# Near to far: dark ends in the black of "no surface".
+# Near to far, like matplotlib's magma_r, which isn't used so that pictures need no matplotlib; the
+# dark end is next to the black of "no surface".
 _DEPTH_COLOURS = np.array(
     [(252, 253, 191), (254, 176, 120), (241, 96, 93), (183, 55, 121), (104, 28, 129), (40, 16, 80)],
     dtype=np.float32,
 )
-# Subtracted from white for each direction at full saturation. In HSV to RGB at full value, each
-# channel is a trapezoid over hue, a third of a turn apart.
+# What a hue at full saturation subtracts from white, tabulated by direction [_HUES, 3]. In HSV at
+# full value, each channel is a trapezoid over hue, and the three are a third of a turn apart.
 _HUES = 6 * 4096
 _OFF_WHITE = 255 * (
     1 - np.clip(np.abs((6 * np.arange(_HUES)[:, None] / _HUES + (0, 4, 2)) % 6 - 3) - 1, 0, 1)
@@ -72,7 +73,7 @@ def flow_to_rgb(flow: Any, scale_px: float) -> Image:
     saturation = np.sqrt(np.minimum(np.hypot(u, v) / np.float32(scale_px), 1.0))
     hue = np.rint(np.arctan2(v, u) * np.float32(_HUES / (2 * np.pi))).astype(np.int32)
     off_white = _OFF_WHITE.take(hue % _HUES, axis=0) * saturation[..., None]
-    rgb = (255.5 - off_white).astype(np.uint8)  # rounded
+    rgb = (255.5 - off_white).astype(np.uint8)  # + 0.5, so that truncation rounds
     rgb[~known] = _UNKNOWN
     return rgb
 
@@ -108,9 +109,9 @@ def depth_to_rgb(depth: Any, range_m: float = DEPTH_RANGE_M) -> Image:
     """
     metres = _channels("depth", depth, 1)[0].astype(np.float32)
     surface = np.isfinite(metres)
-    place = np.log1p(np.clip(np.where(surface, metres, 0.0), 0, range_m)) / np.log1p(range_m)
+    share = np.log1p(np.clip(np.where(surface, metres, 0.0), 0, range_m)) / np.log1p(range_m)
     stops = np.linspace(0, 1, len(_DEPTH_COLOURS))
-    rgb = np.stack([np.interp(place, stops, channel) for channel in _DEPTH_COLOURS.T], -1)
+    rgb = np.stack([np.interp(share, stops, channel) for channel in _DEPTH_COLOURS.T], -1)
     rgb[~surface] = 0
     rgb[np.isnan(metres)] = _UNKNOWN
     return np.rint(rgb).astype(np.uint8)
@@ -198,7 +199,7 @@ def representation_strip(
 
 @lru_cache(maxsize=64)
 def class_legend(names: tuple[str, ...], width: int) -> Image:
-    """Returns classes' colours beside their names, in as many rows as the width asks for."""
+    """Returns the classes' colours beside their names, in as many rows as the width needs."""
     columns = max(1, width // _CLASS_PX)
     legend = np.full((-(-len(names) // columns) * _NOTE_PX, width, 3), 255, np.uint8)
     texts = {}
@@ -232,14 +233,17 @@ def strip(
 ) -> Image:
     """Returns images side by side, each under its label.
 
-    The smallest are enlarged by `tile_zoom`, and larger ones, as an estimator's pictures may be, to
-    the same size, all without interpolation.
+    The smallest are enlarged by `tile_zoom`, and all others, such as an estimator's larger
+    pictures, to the same size, without interpolation.
 
     Args:
         images: by label, `[H, W, 3]`.
         wheel_for: labels with the flow wheel beside them.
-        notes: by label, the note below it: a text, or a function that draws a legend of a width.
+        notes: by label, the note below it: a text, or a function from a width to a legend.
         framed: labels with a frame around label and image.
+
+    Raises:
+        ValueError: the images differ in their ratio of height to width.
     """
     sizes = sorted({image.shape[:2] for image in images.values()})
     height, width = sizes[0]
@@ -280,7 +284,7 @@ def resized(image: Image, height: int, width: int) -> Image:
 
 
 def tile_zoom(height: int, width: int) -> int:
-    """Returns by which factor a strip enlarges images of a size."""
+    """Returns the factor by which a strip enlarges images of this size."""
     return max(1, round(_TILE_PX / max(height, width)))
 
 
@@ -323,8 +327,8 @@ def written(image: Image, texts: Mapping[tuple[int, int], tuple[Any, ...]], *, s
 
     picture = pillow.fromarray(image)
     font, draw = ImageFont.load_default(size=size), ImageDraw.Draw(picture)
-    for place, (text, anchor, colour) in texts.items():
-        draw.text(place, text, fill=colour, font=font, anchor=anchor)
+    for position, (text, anchor, colour) in texts.items():
+        draw.text(position, text, fill=colour, font=font, anchor=anchor)
     return np.array(picture)
 
 

@@ -21,17 +21,17 @@ def steering(turned: float, sign: float = 0.0, background: Image | None = None) 
     """Returns a steering wheel between two arrows, `[60, 120, 3]`.
 
     Args:
-        turned: the yaw rate in shares of the largest, positive to the left: at 1 the wheel is
-            turned by 90° to the left, as seen by the driver.
-        sign: of the action that is chosen, positive to the left; 0 has no arrow.
-        background: what is behind it, of the same size; grey if None.
+        turned: the yaw rate as a share of the largest, positive to the left; at 1 the wheel is
+            turned by 90° to the left.
+        sign: of the chosen action, positive to the left; 0 draws no arrow.
+        background: an image of the same size to draw on; grey if None.
     """
     from PIL import Image as pillow
     from PIL import ImageDraw
 
     if background is None:
         background = np.full((_WHEEL_PX, 2 * _WHEEL_PX, 3), 90, np.uint8)
-    fine = 4  # Pillow draws without antialiasing, so larger and scaled down
+    fine = 4  # drawn larger and scaled down, as Pillow draws without antialiasing
     width, height = fine * 2 * _WHEEL_PX, fine * _WHEEL_PX
     picture = pillow.fromarray(background).resize((width, height))
     draw, x, y = ImageDraw.Draw(picture), width / 2, height / 2
@@ -58,9 +58,9 @@ def with_steering(image: Image, turned: float, sign: float = 0.0) -> Image:
     top, left = height - _WHEEL_PX - 6, (width - 2 * _WHEEL_PX) // 2
     if top < 0 or left < 0:
         return image
-    place = slice(top, top + _WHEEL_PX), slice(left, left + 2 * _WHEEL_PX)
+    area = slice(top, top + _WHEEL_PX), slice(left, left + 2 * _WHEEL_PX)
     image = image.copy()
-    image[place] = steering(turned, sign, image[place])
+    image[area] = steering(turned, sign, image[area])
     return image
 
 
@@ -93,7 +93,7 @@ def legend_strip(
 
 
 def _page(size: tuple[int, int], text: str, key: Image | None) -> Image:
-    """Returns wrapped text on white, above a picture in the middle of what is left."""
+    """Returns wrapped text on white, and a picture in the middle of the space below."""
     height, width = size
     page = np.full((height, width, 3), 255, np.uint8)
     lines = textwrap.wrap(text, max(10, width // 8))

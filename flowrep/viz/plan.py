@@ -107,7 +107,7 @@ def _draw_solids(axes: Axes, layout: Layout, path: str | None) -> dict[str, Any]
 
 
 def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
-    # Each zone is named at its road, and an arrow shows where vehicles start.
+    # Each zone has its name beside the road, and starts have an arrow in the direction of travel.
     scene, named = layout.scene, set[str]()
     starts = {path.start for path in scene.paths}
     for kind, colour in _ZONE_COLOURS.items():
@@ -123,7 +123,7 @@ def _draw_zones(axes: Axes, layout: Layout) -> list[Any]:
             named.add(name)
             zone = next(zone for zone in scene.zones if zone.name == name)
             x, y, heading = layout.pose_at(zone.road, (zone.from_m + zone.to_m) / 2)
-            # Starts to the left of the road and ends to its right: one place may be both.
+            # Starts are named to the left of the road, ends to its right: a zone may be both.
             reach = _LABEL_PT if name in starts else -_LABEL_PT
             aside = -reach * math.sin(heading), reach * math.cos(heading)
             box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.85, "lw": 0}

@@ -1,4 +1,4 @@
-"""Videos: an mp4 is either whole or not there."""
+"""Videos: an mp4 exists once it is complete, never in part."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ import numpy as np
 
 from flowrep.viz.maps import Image
 
-# Constant quality, near lossless. `veryfast` takes half the time of x264's default at the same
-# error, and the file is no larger.
+# Constant quality, nearly lossless. `veryfast` takes half the time of x264's default, at the same
+# error and size.
 _CODEC = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "10", "-preset", "veryfast")
 
 
 class Video:
-    """An mp4 (H.264) that browsers play, written frame by frame, in a folder made if needed.
+    """An mp4 (H.264) that browsers play, written frame by frame; its folder is created if needed.
 
     The file gets its name when it is complete. Odd sizes, which the codec does not support, are
     padded with a white row or column. Frames of other sizes than the first are cut or padded.
 
-    FFmpeg is started here, since imageio's writer ignores its exit status, and so a full disk.
+    It starts FFmpeg itself, since imageio's writer ignores its exit status, and thus a full disk.
 
     Raises:
         OSError: FFmpeg can't write the file; the message names it.
@@ -52,7 +52,7 @@ class Video:
         try:
             self._ffmpeg.stdin.write(frame.tobytes())
         except BrokenPipeError:
-            self.close()  # which says why it has ended
+            self.close()  # raises FFmpeg's last message
 
     def close(self) -> None:
         """Completes the file; without frames there is none."""
@@ -92,7 +92,7 @@ class Video:
             [get_ffmpeg_exe(), "-y", "-v", "error", *raw, "-i", "-", *_CODEC, str(self._partial)],
             stdin=subprocess.PIPE,
             stderr=self._messages,
-            start_new_session=True,  # Ctrl-C is for this process, which may still want the file
+            start_new_session=True,  # so that Ctrl-C doesn't end it before this process can
         )
 
     def _end(self) -> tuple[int, str]:
@@ -118,7 +118,7 @@ def write_video(path: str | Path, frames: Iterable[Image], *, fps: float) -> Non
 
 
 def is_playable(path: str | Path) -> bool:
-    """Returns whether a video is there and can be read."""
+    """Returns whether a file exists and FFmpeg can read its frames."""
     from imageio_ffmpeg import count_frames_and_secs
 
     try:

@@ -67,7 +67,7 @@ OPTIONS = {
     "layout must be one of": lambda: g.adapt_pose(M, layout="xyzw"),
     "['camera_to_world', 'world_to_camera']": lambda: g.adapt_pose(M, direction="cam2world"),
     "axes must be one of ['opencv',": lambda: g.adapt_pose(M, axes="blender"),
-    "'xyz_yaw' is of a camera that looks": lambda: g.adapt_pose(M[0], layout="xyz_yaw"),
+    "layout 'xyz_yaw'": lambda: g.adapt_pose(M[0], layout="xyz_yaw"),
 }
 MISTAKES = [
     *((ValueError, *each) for each in SHAPES.items()),
