@@ -57,6 +57,7 @@ _TIED = "\u00a0"  # a space at which no line breaks
 _WIDEST = 80  # points of the figure's axis
 _POWER = 0.8
 _FOUND = 0.5  # a run finds a way if it succeeds in this share of its episodes
+_HARDLY_EVER = 0.05  # success at the training speed
 
 Studies = Mapping[str, Mapping[str, Sequence[Run]]]
 
@@ -320,6 +321,21 @@ def _draw_effect(
             axes.plot(end, at, sign, color=colour, markersize=3.0, clip_on=False)
 
 
+def without(left_out: Sequence[Run], declared: Mapping[str, Any], studies: Studies) -> list[str]:
+    """Returns the rows whose effect is another one without some runs of the main study."""
+    rest = {s: [r for r in of if r not in left_out] for s, of in studies["main"].items()}
+    before, after = (
+        [claim for claims in claims_of(declared, {**studies, "main": of}) for claim in claims]
+        for of in (studies["main"], rest)
+    )
+    return [
+        f"{_effect_text(new)} in row {claim.number}"
+        for claim, other in zip(before, after)
+        for old, new in zip(claim.contrasts, other.contrasts)
+        if old.effect != new.effect and new.effect is not None
+    ]
+
+
 def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     """Returns success by stack and speed in one scene, and how many runs find all ways."""
     at = [f"{speed}, {_speed_range(runs[0], speed)}" for speed in SPEEDS]
@@ -361,6 +377,11 @@ def _ends_by_way(run: Run) -> list[Array]:
     driven = run.under(Condition("greedy", run.speed, run.fps))
     ends = np.where(driven["hit"] == "", driven["outcome"], driven["hit"])
     return [ends[driven["path"] == path["name"]] for path in run.config["scene"]["paths"]]
+
+
+def _at_training(run: Run) -> float:
+    """Returns a run's success at its training speed."""
+    return _share(run.under(Condition("greedy", run.speed, run.fps))["outcome"])
 
 
 def _share(ends: Array) -> float:
@@ -519,6 +540,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         return _effect_text(_contrast(asked, studies[study], [*studies[study]]))
 
     every = [run for of in main.values() for run in of]
+    failed = [run for run in every if _at_training(run) < _HARDLY_EVER]
     smallest = smallest_differences(primary) or [float("nan")]
     text = (
         TEMPLATES.overlay(loader=FileSystemLoader(HERE))
@@ -546,7 +568,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             pixels=sorted(
                 {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
             ),
-            frames=sorted({run.total_frames for run in every}),
+            frames=" or ".join(f"{n:,}" for n in sorted({run.total_frames for run in every})),
+            failed=[f"{_stack(r.stack)} in {_SHORT[r.scene]} (seed {r.seed})" for r in failed],
+            without=without(failed, declared, studies),
             episodes=sum(len(run.episodes["outcome"]) for run in runs),
             fewest=min(c.fewest for claim in primary for c in claim.contrasts),
             smallest=f"{min(smallest):.0f} to {max(smallest):.0f}",

@@ -45,11 +45,16 @@ def run_of(name, ends, *, scene="straight_road", stack="ego+obj", seed=0, paths=
     return Run(name, config, episode_columns(columns), {})
 
 
-def claims(runs, *contrasts, **changes):
-    """The primary and secondary claims, one of these contrasts unless the changes say otherwise."""
+def declared_with(*contrasts, **changes):
+    """What claims.yaml declares: a primary claim of these contrasts unless the changes differ."""
     claim = {"claim": "c", "contrasts": list(contrasts), "limits": ""}
     base = {"studies": {"main": SCENES}, "scenes": [*SCENES], "primary": [claim], "secondary": []}
-    declared = base | changes
+    return base | changes
+
+
+def claims(runs, *contrasts, **changes):
+    """The primary and secondary claims."""
+    declared = declared_with(*contrasts, **changes)
     return results.claims_of(declared, results.studies_of(declared, runs))
 
 
@@ -173,6 +178,19 @@ def test_a_claim_of_several_contrasts_may_hold_in_part():
         ((held, held), "holds"),
     ):
         assert Claim(1, "", "", contrasts).verdict == verdict
+
+
+def test_effects_without_some_runs_stand_beside_those_with_them():
+    # [ego,obj] has 6, 7 and 0 of 8, and without the last 50 points more than [raw]
+    runs = runs_with(both=(6, 7, 0), raw=(2, 3))
+    left_out = [run for run in runs if run.stack == "ego+obj" and run.seed == 2]
+    others = {"claim": "c", "contrasts": [HIGH | {"first": "raw"}], "limits": ""}
+    declared = declared_with(HIGH, secondary=[others | {"contrasts": [HIGH]}, others])
+    told = results.without(left_out, declared, results.studies_of(declared, runs))
+    assert [(text.split()[0], text.split()[-2:]) for text in told] == [
+        ("+50", ["row", "1"]),
+        ("+50", ["row", "2"]),  # the third compares [raw] with itself
+    ]
 
 
 def test_scores_are_of_the_episodes_that_all_drove():

@@ -2,8 +2,8 @@
 
 The unit is the run. Episodes of one run share its weights, so hundreds of them say little about
 what another seed would have learned; a run therefore counts with one number, its success rate.
-Rates are arrays `[R]`, one for each side of a comparison and each scene. Every scene has the same
-weight in a mean over scenes; otherwise a side with more seeds in the easier scene would look better.
+Rates are arrays `[R]`, one for each side of a comparison and each scene. All scenes have the same
+weight in a mean over scenes; else a side with more seeds in the easier scene would look better.
 
 With few runs a t interval is wide. A bootstrap over the same runs is too narrow: with five runs it
 covers the mean in 84 % of cases instead of 95.
