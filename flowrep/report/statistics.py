@@ -90,7 +90,7 @@ def mean_share(scenes: Sequence[Array], episodes: int = 0) -> Estimate:
     return Estimate(value, max(low, 0.0), min(high, 1.0))
 
 
-def improvement(scenes: Sequence[tuple[Array, Array]]) -> float:
+def improvement(scenes: Sequence[Sequence[Array]]) -> float:
     """Returns how often a run of the first side beats one of the second; a tie counts half."""
     pairs = [(ours[:, None], theirs[None]) for ours, theirs in scenes]
     return float(np.mean([((a > b) + 0.5 * (a == b)).mean() for a, b in pairs]))
