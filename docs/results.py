@@ -145,8 +145,8 @@ def claims_of(
     primary, secondary = (list(map(claim, declared[of])) for of in ("primary", "secondary"))
     together = [contrast for claim in primary for contrast in claim.contrasts]
     corrected = (holm([getattr(c, name) for c in together]) for name in ("p_value", "p_against"))
-    for contrast, *p_values in zip(together, *corrected):
-        contrast.p_value, contrast.p_against = p_values
+    for contrast, p_value, p_against in zip(together, *corrected):
+        contrast.p_value, contrast.p_against = p_value, p_against
     return primary, secondary
 
 
@@ -167,14 +167,15 @@ def _contrast(
     chosen = asked.get("scenes", scenes)
     has_all = {*chosen} <= {*strata}
     together = effect([sides for s in chosen for sides in strata[s]]) if has_all else None
-    p_values = (float("nan"), float("nan")) if together is None else _p_values(together, asked)
+    tested = (float("nan"), float("nan")) if together is None else p_values(together, asked)
     by_scene = {scene: effect(found) for scene, found in strata.items()}
     sides_of = [side for s in chosen for sides in strata.get(s, []) for side in sides]
     fewest = min(map(len, sides_of), default=0)
-    return Contrast(asked, together, by_scene, fewest, *p_values)
+    return Contrast(asked, together, by_scene, fewest, *tested)
 
 
-def _p_values(found: Effect, asked: Mapping[str, Any]) -> tuple[float, float]:
+def p_values(found: Effect, asked: Mapping[str, Any]) -> tuple[float, float]:
+    """Returns p of the protocol's test, and of the test that contradicts the claim."""
     if asked["expect"] != "equal":
         return found.p_value, found.p_value
     # of two one-sided tests, that against the nearer end of the margin has the larger p
@@ -225,7 +226,7 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     """Returns the table of claims in Markdown, a line for each contrast within a cell."""
     rows = []
     for claim in claims:
-        effects = "<br>".join(map(_effect_text, claim.contrasts))
+        effects = "<br>".join(map(effect_text, claim.contrasts))
         by_scene = "<br>".join(
             ", ".join(f"{_SHORT[scene]}{_TIED}{signed(e.value)}" for scene, e in c.by_scene.items())
             for c in claim.contrasts
@@ -242,7 +243,7 @@ def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) 
         (
             _label(first, first.contrasts[0]),
             points(first.contrasts[0].by_scene[scene].interval()),
-            _effect_text(second.contrasts[0]),
+            effect_text(second.contrasts[0]),
             f"**{second.verdict}**",
         )
         for first, second in zip(narrow, wide)
@@ -251,7 +252,8 @@ def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) 
     return _table(header, rows)
 
 
-def _effect_text(contrast: Contrast) -> str:
+def effect_text(contrast: Contrast) -> str:
+    """Returns an effect with its interval and p; of `equal`, p of the nearer one-sided question."""
     if contrast.effect is None:
         return "runs are missing"
     if np.isnan(contrast.p_value):
@@ -329,7 +331,7 @@ def without(left_out: Sequence[Run], declared: Mapping[str, Any], studies: Studi
         for of in (studies["main"], rest)
     )
     return [
-        f"{_effect_text(new)} in row {claim.number}"
+        f"{effect_text(new)} in row {claim.number}"
         for claim, other in zip(before, after)
         for old, new in zip(claim.contrasts, other.contrasts)
         if old.effect != new.effect and new.effect is not None
@@ -537,7 +539,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
 
     def beside(study: str, second: str, weights: Mapping[Any, int]) -> str:
         asked = {"first": "ego+obj", "second": second, "expect": "more", "success": weights}
-        return _effect_text(_contrast(asked, studies[study], [*studies[study]]))
+        return effect_text(_contrast(asked, studies[study], [*studies[study]]))
 
     every = [run for of in main.values() for run in of]
     failed = [run for run in every if _at_training(run) < _HARDLY_EVER]

@@ -77,9 +77,8 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
                 ends = Counter(track.outcome.replace("_", " ") for track in tracks)
                 ended = ", ".join(f"{number} {outcome}" for outcome, number in ends.items())
                 uri = data_uri("image/png", encoded(draw_plan(layout, tracks), "png", 100))
-                drives.plans.setdefault(scene, []).append(
-                    EmbeddedPicture(title, f"drives: {ended}", uri)
-                )
+                plan = EmbeddedPicture(title, f"drives: {ended}", uri)
+                drives.plans.setdefault(scene, []).append(plan)
         elif trajectories:
             drives.warnings.append(f"{run.name} has no {DRIVES} with greedy drives: no plan")
         films = films_of(run)[:videos]
@@ -93,7 +92,7 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
 
 
 def tracks_of(run: Run, count: int) -> list[Track]:
-    """Returns a run's first greedy drives at its training speed and frame rate, if there are any."""
+    """Returns a run's first greedy drives, if any, at its training speed and frame rate."""
     if run.folder is None or not count:
         return []
     try:
