@@ -57,6 +57,7 @@ _TIED = "\u00a0"  # a space at which no line breaks
 _WIDEST = 80  # points of the figure's axis
 _POWER = 0.8
 _FOUND = 0.5  # a run finds a way if it succeeds in this share of its episodes
+_HARDLY_EVER = 0.05  # success at the training speed
 
 Studies = Mapping[str, Mapping[str, Sequence[Run]]]
 
@@ -144,8 +145,8 @@ def claims_of(
     primary, secondary = (list(map(claim, declared[of])) for of in ("primary", "secondary"))
     together = [contrast for claim in primary for contrast in claim.contrasts]
     corrected = (holm([getattr(c, name) for c in together]) for name in ("p_value", "p_against"))
-    for contrast, *p_values in zip(together, *corrected):
-        contrast.p_value, contrast.p_against = p_values
+    for contrast, p_value, p_against in zip(together, *corrected):
+        contrast.p_value, contrast.p_against = p_value, p_against
     return primary, secondary
 
 
@@ -166,14 +167,15 @@ def _contrast(
     chosen = asked.get("scenes", scenes)
     has_all = {*chosen} <= {*strata}
     together = effect([sides for s in chosen for sides in strata[s]]) if has_all else None
-    p_values = (float("nan"), float("nan")) if together is None else _p_values(together, asked)
+    tested = (float("nan"), float("nan")) if together is None else p_values(together, asked)
     by_scene = {scene: effect(found) for scene, found in strata.items()}
     sides_of = [side for s in chosen for sides in strata.get(s, []) for side in sides]
     fewest = min(map(len, sides_of), default=0)
-    return Contrast(asked, together, by_scene, fewest, *p_values)
+    return Contrast(asked, together, by_scene, fewest, *tested)
 
 
-def _p_values(found: Effect, asked: Mapping[str, Any]) -> tuple[float, float]:
+def p_values(found: Effect, asked: Mapping[str, Any]) -> tuple[float, float]:
+    """Returns p of the protocol's test, and of the test that contradicts the claim."""
     if asked["expect"] != "equal":
         return found.p_value, found.p_value
     # of two one-sided tests, that against the nearer end of the margin has the larger p
@@ -224,7 +226,7 @@ def claims_table(claims: Sequence[Claim], p_name: str) -> str:
     """Returns the table of claims in Markdown, a line for each contrast within a cell."""
     rows = []
     for claim in claims:
-        effects = "<br>".join(map(_effect_text, claim.contrasts))
+        effects = "<br>".join(map(effect_text, claim.contrasts))
         by_scene = "<br>".join(
             ", ".join(f"{_SHORT[scene]}{_TIED}{signed(e.value)}" for scene, e in c.by_scene.items())
             for c in claim.contrasts
@@ -241,7 +243,7 @@ def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) 
         (
             _label(first, first.contrasts[0]),
             points(first.contrasts[0].by_scene[scene].interval()),
-            _effect_text(second.contrasts[0]),
+            effect_text(second.contrasts[0]),
             f"**{second.verdict}**",
         )
         for first, second in zip(narrow, wide)
@@ -250,7 +252,8 @@ def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) 
     return _table(header, rows)
 
 
-def _effect_text(contrast: Contrast) -> str:
+def effect_text(contrast: Contrast) -> str:
+    """Returns an effect with its interval and p; of `equal`, p of the nearer one-sided question."""
     if contrast.effect is None:
         return "runs are missing"
     if np.isnan(contrast.p_value):
@@ -320,6 +323,21 @@ def _draw_effect(
             axes.plot(end, at, sign, color=colour, markersize=3.0, clip_on=False)
 
 
+def without(left_out: Sequence[Run], declared: Mapping[str, Any], studies: Studies) -> list[str]:
+    """Returns the rows whose effect is another one without some runs of the main study."""
+    rest = {s: [r for r in of if r not in left_out] for s, of in studies["main"].items()}
+    before, after = (
+        [claim for claims in claims_of(declared, {**studies, "main": of}) for claim in claims]
+        for of in (studies["main"], rest)
+    )
+    return [
+        f"{effect_text(new)} in row {claim.number}"
+        for claim, other in zip(before, after)
+        for old, new in zip(claim.contrasts, other.contrasts)
+        if old.effect != new.effect and new.effect is not None
+    ]
+
+
 def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
     """Returns success by stack and speed in one scene, and how many runs find all ways."""
     at = [f"{speed}, {_speed_range(runs[0], speed)}" for speed in SPEEDS]
@@ -361,6 +379,11 @@ def _ends_by_way(run: Run) -> list[Array]:
     driven = run.under(Condition("greedy", run.speed, run.fps))
     ends = np.where(driven["hit"] == "", driven["outcome"], driven["hit"])
     return [ends[driven["path"] == path["name"]] for path in run.config["scene"]["paths"]]
+
+
+def _at_training(run: Run) -> float:
+    """Returns a run's success at its training speed."""
+    return _share(run.under(Condition("greedy", run.speed, run.fps))["outcome"])
 
 
 def _share(ends: Array) -> float:
@@ -516,9 +539,10 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
 
     def beside(study: str, second: str, weights: Mapping[Any, int]) -> str:
         asked = {"first": "ego+obj", "second": second, "expect": "more", "success": weights}
-        return _effect_text(_contrast(asked, studies[study], [*studies[study]]))
+        return effect_text(_contrast(asked, studies[study], [*studies[study]]))
 
     every = [run for of in main.values() for run in of]
+    failed = [run for run in every if _at_training(run) < _HARDLY_EVER]
     smallest = smallest_differences(primary) or [float("nan")]
     text = (
         TEMPLATES.overlay(loader=FileSystemLoader(HERE))
@@ -546,7 +570,9 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
             pixels=sorted(
                 {"{height_px} × {width_px}".format(**r.config["scene"]["camera"]) for r in every}
             ),
-            frames=sorted({run.total_frames for run in every}),
+            frames=" or ".join(f"{n:,}" for n in sorted({run.total_frames for run in every})),
+            failed=[f"{_stack(r.stack)} in {_SHORT[r.scene]} (seed {r.seed})" for r in failed],
+            without=without(failed, declared, studies),
             episodes=sum(len(run.episodes["outcome"]) for run in runs),
             fewest=min(c.fewest for claim in primary for c in claim.contrasts),
             smallest=f"{min(smallest):.0f} to {max(smallest):.0f}",

@@ -45,11 +45,16 @@ def run_of(name, ends, *, scene="straight_road", stack="ego+obj", seed=0, paths=
     return Run(name, config, episode_columns(columns), {})
 
 
-def claims(runs, *contrasts, **changes):
-    """The primary and secondary claims, one of these contrasts unless the changes say otherwise."""
+def declared_with(*contrasts, **changes):
+    """What claims.yaml declares: a primary claim of these contrasts unless the changes differ."""
     claim = {"claim": "c", "contrasts": list(contrasts), "limits": ""}
     base = {"studies": {"main": SCENES}, "scenes": [*SCENES], "primary": [claim], "secondary": []}
-    declared = base | changes
+    return base | changes
+
+
+def claims(runs, *contrasts, **changes):
+    """The primary and secondary claims."""
+    declared = declared_with(*contrasts, **changes)
     return results.claims_of(declared, results.studies_of(declared, runs))
 
 
@@ -130,7 +135,7 @@ def test_primary_contrasts_are_corrected_together_and_others_are_not():
 def test_alike_means_within_the_margin(value, error, verdict):
     asked = HIGH | {"expect": "equal", "margin": 0.05}
     found = Effect(value, error, 10.0)
-    contrast = Contrast(asked, found, {}, 3, *results._p_values(found, asked))
+    contrast = Contrast(asked, found, {}, 3, *results.p_values(found, asked))
     assert contrast.verdict == verdict
 
 
@@ -138,7 +143,7 @@ def test_two_one_sided_tests_have_the_larger_of_their_p_values():
     # 0.01 within ±0.05: the nearer side is (0.01 − 0.05) / 0.02 = −2, of 10 degrees p = 0.0367
     asked = HIGH | {"expect": "equal", "margin": 0.05}
     for value in (0.01, -0.01):
-        alike, apart = results._p_values(Effect(value, 0.02, 10.0), asked)
+        alike, apart = results.p_values(Effect(value, 0.02, 10.0), asked)
         assert (alike, apart) == (pytest.approx(0.0367, abs=1e-4), 1)
 
 
@@ -146,10 +151,10 @@ def test_what_contradicts_alike_is_a_difference_beyond_the_margin_with_its_own_p
     # 0.09 is 0.04 beyond ±0.05, two errors: two-sided p of 10 degrees 0.0734
     asked = HIGH | {"expect": "equal", "margin": 0.05}
     found = Effect(0.09, 0.02, 10.0)
-    contrast = Contrast(asked, found, {}, 3, *results._p_values(found, asked))
+    contrast = Contrast(asked, found, {}, 3, *results.p_values(found, asked))
     assert contrast.p_value == pytest.approx(1 - 0.0367, abs=1e-4)
     assert contrast.p_against == pytest.approx(0.0734, abs=1e-4)
-    assert results._effect_text(contrast).split()[-4:] == ["=", "0.073", "(beyond", "±5)"]
+    assert results.effect_text(contrast).split()[-4:] == ["=", "0.073", "(beyond", "±5)"]
 
 
 def test_what_contradicts_is_corrected_with_the_others():
@@ -173,6 +178,19 @@ def test_a_claim_of_several_contrasts_may_hold_in_part():
         ((held, held), "holds"),
     ):
         assert Claim(1, "", "", contrasts).verdict == verdict
+
+
+def test_effects_without_some_runs_stand_beside_those_with_them():
+    # [ego,obj] has 6, 7 and 0 of 8, and without the last 50 points more than [raw]
+    runs = runs_with(both=(6, 7, 0), raw=(2, 3))
+    left_out = [run for run in runs if run.stack == "ego+obj" and run.seed == 2]
+    others = {"claim": "c", "contrasts": [HIGH | {"first": "raw"}], "limits": ""}
+    declared = declared_with(HIGH, secondary=[others | {"contrasts": [HIGH]}, others])
+    told = results.without(left_out, declared, results.studies_of(declared, runs))
+    assert [(text.split()[0], text.split()[-2:]) for text in told] == [
+        ("+50", ["row", "1"]),
+        ("+50", ["row", "2"]),  # the third compares [raw] with itself
+    ]
 
 
 def test_scores_are_of_the_episodes_that_all_drove():

@@ -1,6 +1,6 @@
 """The figures: bars by speed, lines over frame rates and over training, with intervals.
 
-One colour per stack in every figure, safe for colour-blind readers; the same data give the same
+A stack has one colour in every figure, safe for colour-blind readers. The same data give the same
 files, byte for byte.
 """
 
@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flowrep.report.runs import SCENES, Curve, Grid, mean_curve
+from flowrep.report.runs import SCENES, Curve, SuccessGrid, mean_curve
 from flowrep.report.statistics import Estimate
 
-# Okabe and Ito's colours for single maps and for the two flows. A map added to the flows has its
-# own hue, darker, and a hatch or a dashed line.
+# Okabe and Ito's colours for single maps and for the two flows. Flows with another map are darker,
+# in that map's hue, and have a hatch or a dashed line.
 _COLOURS = {
     "ego": "#e69f00",
     "raw": "#56b4e9",
@@ -34,15 +34,15 @@ _COLOURS = {
 }
 _ADDED = {"ego+obj+seg2": "////", "ego+obj+depth2": "\\\\\\\\", "ego+obj+seg2+depth2": "xxxx"}
 _OTHERS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-_OF_VARIANTS = ("", "......", "++++", "||||")  # no stack uses them
+_CONFIG_HATCHES = ("", "......", "++++", "||||")  # of the configs of one stack
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "p")
 _TEXT, _FAINT = "#1b1f24", "#6b7480"
 
 _TITLES = dict(zip(SCENES, ("Straight Road", "S-Turn", "H-Shaped Pathways", "Three-Way Junction")))
 _BASELINE_LINES: dict[str, Any] = {"never_turn": ":", "random": "-.", "planner": "--"}
-_COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page
+_COLUMN_IN, _PAGE_IN = 3.5, 7.16  # widths of a paper's column and page (IEEE's two columns)
 _MOST_IN_A_ROW = 4  # panels
-_WIDEST_BAR = 0.3  # of a group
+_WIDEST_BAR = 0.3  # as a share of a group
 _CAPS: dict[str, Any] = {"capsize": 1.8, "capthick": 0.9, "clip_on": False}  # of whiskers
 
 
@@ -61,24 +61,24 @@ class Look(NamedTuple):
 
 
 def looks(names: Sequence[str]) -> dict[str, Look]:
-    """Returns how series of a figure are drawn: stacks, or their configs ("ego, noisy")."""
+    """Returns how the series of a figure are drawn; a series is "ego" or, of a config, "ego, x"."""
     parts = [name.partition(", ")[::2] for name in names]
-    stacks, variants = ([*dict.fromkeys(part)] for part in zip(*parts))
-    # The paper's stacks look the same in all figures. With another among them, all have colours in
-    # turn, so that no two look alike.
+    stacks, configs = ([*dict.fromkeys(part)] for part in zip(*parts))
+    # The paper's stacks look the same in all figures. If there is another, colours are dealt out
+    # in turn, so that no two stacks look alike.
     are_known = {*stacks} <= {*_COLOURS}
     colours = _COLOURS if are_known else dict(zip(stacks, cycle(_OTHERS)))
-    found = {}
-    for name, (stack, variant) in zip(names, parts):
+    by_name = {}
+    for name, (stack, config) in zip(names, parts):
         turn = [*colours].index(stack)
-        hatch = variants.index(variant) + (0 if are_known else turn // len(_OTHERS))
-        hatches = _OF_VARIANTS[hatch % len(_OF_VARIANTS)] or _ADDED.get(stack, "")
-        found[name] = Look(colours[stack], hatches, _MARKERS[turn % len(_MARKERS)])
-    return found
+        number = configs.index(config) + (0 if are_known else turn // len(_OTHERS))
+        hatch = _CONFIG_HATCHES[number % len(_CONFIG_HATCHES)] or _ADDED.get(stack, "")
+        by_name[name] = Look(colours[stack], hatch, _MARKERS[turn % len(_MARKERS)])
+    return by_name
 
 
 def words(name: str) -> str:
-    """Returns a config name as a heading; the paper's scenes are spelt as in the paper.
+    """Returns a name from a config as a heading, the paper's scenes as the paper spells them.
 
     >>> words("s_turn"), words("my_crossing")
     ('S-Turn', 'My crossing')
@@ -109,13 +109,14 @@ def encoded(figure: Figure, kind: str, dpi: int = 300) -> bytes:
     """Returns a figure as "png", "pdf" or "svg", the same bytes whenever it is drawn."""
     data = io.BytesIO()
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
+    # Type 42 keeps text as text; the salt makes an SVG's ids the same every time.
     settings: Any = {"pdf.fonttype": 42, "svg.hashsalt": "flowrep", "hatch.linewidth": 0.7}
-    with mpl.rc_context(settings):  # fonts of type 42: text stays text
+    with mpl.rc_context(settings):
         figure.savefig(data, format=kind, dpi=dpi, metadata=undated)
     return data.getvalue()
 
 
-def draw_bars(grids: Sequence[Grid]) -> Figure:
+def draw_bars(grids: Sequence[SuccessGrid]) -> Figure:
     """Returns grouped bars: a panel per scene, a group per speed mode, a bar per stack."""
     handles: list[Any] = [
         Patch(facecolor=look.colour, hatch=look.hatch, edgecolor="white", lw=0, label=name)
@@ -130,14 +131,17 @@ def draw_bars(grids: Sequence[Grid]) -> Figure:
     return _panels([(grid.scene, grid) for grid in grids], _bars, handles)
 
 
-def draw_rates(grids: Sequence[Grid]) -> Figure:
+def draw_rates(grids: Sequence[SuccessGrid]) -> Figure:
     """Returns success over frame rates: a panel per scene, a line per stack."""
     panels = [(grid.scene, grid) for grid in grids]
     return _panels(panels, _rate_lines, _line_handles(looks(grids[0].series)))
 
 
 def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> Figure:
-    """Returns a panel per scene: bold, the seeds' mean of evaluations; thin, their training."""
+    """Returns learning curves, a panel per scene.
+
+    Bold is the seeds' mean in evaluations, thin each seed's training episodes.
+    """
     style = looks(list(dict.fromkeys(name for _, curves in panels for name in curves)))
 
     def draw(axes: Axes, curves: Mapping[str, Sequence[Curve]]) -> None:
@@ -155,7 +159,6 @@ def draw_curves(panels: Sequence[tuple[str, Mapping[str, Sequence[Curve]]]]) -> 
 def _panels(
     panels: Sequence[tuple[str, Any]], draw: Callable[[Axes, Any], None], handles: Sequence[Any]
 ) -> Figure:
-    # As wide as a paper's column or page.
     columns = min(len(panels), _MOST_IN_A_ROW)
     rows = -(-len(panels) // columns)
     width = _COLUMN_IN if len(panels) == 1 else _PAGE_IN
@@ -173,18 +176,18 @@ def _panels(
         longest = max(len(handle.get_label()) for handle in handles)
         entry_in = (0.5 * longest + 3.5) * em_in  # half an em a letter, 3.5 for the sign and gaps
         beside = min(len(handles), max(1, int(width / entry_in)))
-        # matplotlib fills column by column, and people read row by row.
+        # matplotlib fills a legend column by column; people read row by row
         by_column = [handle for start in range(beside) for handle in handles[start::beside]]
         gaps = {"handlelength": 1.8, "columnspacing": 1.2, "handletextpad": 0.5}
         figure.legend(handles=by_column, loc="outside upper center", ncols=beside, **gaps)
     return figure
 
 
-def _bars(axes: Axes, grid: Grid) -> None:
+def _bars(axes: Axes, grid: SuccessGrid) -> None:
     width = min(0.84 / len(grid.series), _WIDEST_BAR)
     for group, condition in enumerate(grid.conditions):
-        for place, (name, look) in enumerate(looks(grid.series).items()):
-            at = group + (place - (len(grid.series) - 1) / 2) * width
+        for index, (name, look) in enumerate(looks(grid.series).items()):
+            at = group + (index - (len(grid.series) - 1) / 2) * width
             cell = grid.cells.get((name, condition))
             if cell is None:
                 style: Any = {"rotation": 90, "ha": "center", "va": "bottom", "color": _FAINT}
@@ -215,12 +218,12 @@ def _whiskers(scores: Sequence[Estimate]) -> list[list[float]]:
     return [below, [max(100 * (score.high - score.value), 0) for score in scores]]
 
 
-def _rate_lines(axes: Axes, grid: Grid) -> None:
+def _rate_lines(axes: Axes, grid: SuccessGrid) -> None:
     at = [condition.fps for condition in grid.conditions]
     step = min((b - a for a, b in pairwise(at)), default=1.0)
-    for place, (name, look) in enumerate(looks(grid.series).items()):
+    for index, (name, look) in enumerate(looks(grid.series).items()):
         # side by side, so that whiskers of equal scores are all visible
-        aside = (place - (len(grid.series) - 1) / 2) * 0.08 * step
+        aside = (index - (len(grid.series) - 1) / 2) * 0.08 * step
         driven = [c for c in grid.conditions if (name, c) in grid.cells]
         if driven:
             scores = [grid.cells[name, c].score for c in driven]

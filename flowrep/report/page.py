@@ -1,9 +1,9 @@
-"""One self-contained HTML page of a report, with drives and films that evaluations left.
+"""One self-contained HTML page of a report, with the drives and films that evaluations saved.
 
-`drives.npz` beside evaluation.csv holds where the vehicle was in each evaluated episode, before its
-first and after each of its T steps: `positions` [sum of T + 1, 2] in world metres, `starts` [N + 1]
-(episode n is `positions[starts[n]:starts[n + 1]]`), and for each episode `evaluation`, `policy`,
-`speed`, `fps`, `frames`, `episode_seed` and `outcome` as in evaluation.csv.
+Drives come from `drives.npz` in a run's folder. Its `positions` are the x and y of the vehicle in
+metres, `[sum of (T + 1), 2]`: before the first and after each of an episode's T steps. Episode n is
+`positions[starts[n]:starts[n + 1]]`. For each episode, `evaluation`, `policy`, `speed`, `fps`,
+`frames`, `episode_seed` and `outcome` are as in evaluation.csv.
 """
 
 import base64
@@ -35,26 +35,32 @@ TEMPLATES = Environment(
 )
 
 
-class Picture(NamedTuple):
+class EmbeddedPicture(NamedTuple):
     """A plan or a film of one agent."""
 
     title: str
     caption: str
-    data: str  # a URI
+    data: str  # a data URI
 
 
 class Drives(NamedTuple):
-    """Plans by the scene's title, films by the episode's, and a line for each run without."""
+    """Plans by scene, films by episode, and a warning for each run that lacks one."""
 
-    plans: dict[str, list[Picture]]
-    films: dict[str, list[Picture]]
+    plans: dict[str, list[EmbeddedPicture]]
+    films: dict[str, list[EmbeddedPicture]]
     warnings: list[str]
 
 
 def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
-    """Returns plans of so many drives, and so many films, of an agent of each scene and stack."""
+    """Returns a plan of drives, and films, of one agent of each group, scene and stack.
+
+    Args:
+        runs: of which those with the lowest seed are shown.
+        trajectories: the number of drives in a plan.
+        videos: the number of films of an agent.
+    """
     drives = Drives({}, {}, [])
-    finished: dict[Any, Run] = {}  # the one of the lowest seed
+    finished: dict[Any, Run] = {}
     for number, group in enumerate(groups_of(runs)):
         for run in sorted(group.runs, key=lambda run: run.seed):
             if run.is_finished:
@@ -71,12 +77,13 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
                 ends = Counter(track.outcome.replace("_", " ") for track in tracks)
                 ended = ", ".join(f"{number} {outcome}" for outcome, number in ends.items())
                 uri = data_uri("image/png", encoded(draw_plan(layout, tracks), "png", 100))
-                drives.plans.setdefault(scene, []).append(Picture(title, f"drives: {ended}", uri))
+                plan = EmbeddedPicture(title, f"drives: {ended}", uri)
+                drives.plans.setdefault(scene, []).append(plan)
         elif trajectories:
             drives.warnings.append(f"{run.name} has no {DRIVES} with greedy drives: no plan")
         films = films_of(run)[:videos]
         for film in films:
-            picture = Picture(title, film.name, data_uri("video/mp4", film.read_bytes()))
+            picture = EmbeddedPicture(title, film.name, data_uri("video/mp4", film.read_bytes()))
             drives.films.setdefault(f"{scene}, {words(film.stem)}", []).append(picture)
         if videos and not films:
             remedy = f"python -m flowrep.evaluate run={run.name} video=1"
@@ -85,16 +92,16 @@ def drives_of(runs: Sequence[Run], *, trajectories: int, videos: int) -> Drives:
 
 
 def tracks_of(run: Run, count: int) -> list[Track]:
-    """Returns a run's first greedy drives at its training speed and frame rate, none without."""
+    """Returns a run's first greedy drives, if any, at its training speed and frame rate."""
     if run.folder is None or not count:
         return []
     try:
         with np.load(run.folder / DRIVES) as saved:
-            ours = (saved["policy"] == "greedy") & (saved["speed"] == run.speed)
-            ours &= (saved["fps"] == run.fps) & (saved["frames"] >= run.total_frames)
-            ours &= saved["evaluation"] != "training"
-            ours &= np.isin(saved["outcome"], [*OUTCOME_COLOURS])
-            chosen = np.flatnonzero(ours)
+            shown = (saved["policy"] == "greedy") & (saved["speed"] == run.speed)
+            shown &= (saved["fps"] == run.fps) & (saved["frames"] >= run.total_frames)
+            shown &= saved["evaluation"] != "training"
+            shown &= np.isin(saved["outcome"], [*OUTCOME_COLOURS])
+            chosen = np.flatnonzero(shown)
             chosen = chosen[np.argsort(saved["episode_seed"][chosen], kind="stable")][:count]
             positions = saved["positions"].reshape(-1, 2).astype(float)
             starts, outcomes = saved["starts"], saved["outcome"][chosen].tolist()
@@ -105,11 +112,11 @@ def tracks_of(run: Run, count: int) -> list[Track]:
 
 
 def films_of(run: Run) -> list[Path]:
-    """Returns the films in a run's folder; not what a link there leads to outside of it."""
+    """Returns the films in a run's folder, without links that lead out of it."""
     if run.folder is None:
         return []
-    home, found = run.folder.resolve(), sorted(run.folder.glob("videos/*.mp4"))
-    return [film for film in found if film.is_file() and film.resolve().is_relative_to(home)]
+    home, films = run.folder.resolve(), sorted(run.folder.glob("videos/*.mp4"))
+    return [film for film in films if film.is_file() and film.resolve().is_relative_to(home)]
 
 
 def data_uri(kind: str, data: bytes) -> str:
@@ -118,7 +125,7 @@ def data_uri(kind: str, data: bytes) -> str:
 
 
 def render_page(report: Report, drives: Drives) -> str:
-    """Returns the page of a report, with plans and films of some of its episodes, if any."""
+    """Returns the page of a report as HTML."""
     runs, stacks = report.runs, sorted({run.stack for run in report.runs})
     what = listed(stacks) if len(stacks) < 4 else f"{len(stacks)} stacks"
     rows = []

@@ -1,4 +1,4 @@
-"""Runs as a report sees them: their columns, which may be compared, and what episodes came to."""
+"""Runs as a report sees them: which may be compared, and the success of their episodes."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,9 +14,11 @@ from flowrep.experiment.run import origin_of
 from flowrep.report.statistics import Array, Estimate, mean_share
 
 Columns = dict[str, NDArray[Any]]
-# of a run, from its episodes' outcomes under each condition
+"""A table by column."""
 Score = Callable[[Sequence[NDArray[Any]]], float]
-SPEEDS = ("low", "normal", "high")  # of pedestrians
+"""Returns a run's score from the outcomes of its episodes under each condition."""
+
+SPEEDS = ("low", "normal", "high")  # speed modes of the pedestrians
 # The paper's scenes and stacks, in the order of its figures.
 SCENES = ("straight_road", "s_turn", "h_shaped_pathways", "three_way_junction")
 FLOW_STACKS = ("ego", "raw", "obj", "ego+obj")
@@ -26,7 +28,7 @@ COMPLEMENTARY_STACKS = (
 STACKS = tuple(dict.fromkeys(FLOW_STACKS + COMPLEMENTARY_STACKS))
 BASELINES = ("never_turn", "random", "planner")
 _REPRESENTATIONS = ("raw", "ego", "obj", "seg", "seg2", "depth", "depth2", "rgb")
-_OF_EVERY_SCENE = ("camera", "frame_rate_hz")
+_OF_EVERY_SCENE = ("camera", "frame_rate_hz")  # keys of a scene that scenes share
 
 
 class Condition(NamedTuple):
@@ -39,13 +41,13 @@ class Condition(NamedTuple):
 
 @dataclass(eq=False)
 class Run:
-    """A run's config and tables, and what a report asks for of them."""
+    """A run's config and tables."""
 
     name: str  # its folder, or its name in packed tables
     config: Mapping[str, Any]
     episodes: Columns  # of evaluation.csv
     metrics: Columns  # of metrics.csv, nan where a cell is empty
-    folder: Path | None = None  # where films and drives may lie
+    folder: Path | None = None  # where films and drives may be
     machine: Mapping[str, str] = field(default_factory=dict)  # that trained it
 
     def __post_init__(self) -> None:
@@ -63,13 +65,13 @@ class Run:
 
     @cached_property
     def tested(self) -> NDArray[np.bool_]:
-        """Whether each episode is of the finished agent in its own scene, after training."""
+        """Whether each episode was driven by the finished agent, in the scene of its training."""
         e = self.episodes
-        is_own = e["scene"] == self.scene
-        while_training = e["scene_id"][is_own & (e["evaluation"] != "evaluate")]
-        if len(while_training):  # the scene may have been changed under the same name since
-            is_own &= e["scene_id"] == while_training[0]
-        return is_own & (e["evaluation"] != "training") & (e["frames"] >= self.total_frames)
+        here = e["scene"] == self.scene
+        while_training = e["scene_id"][here & (e["evaluation"] != "evaluate")]
+        if len(while_training):  # the scene may have changed since, under the same name
+            here &= e["scene_id"] == while_training[0]
+        return here & (e["evaluation"] != "training") & (e["frames"] >= self.total_frames)
 
     @cached_property
     def conditions(self) -> set[Condition]:
@@ -86,8 +88,11 @@ class Run:
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, str]:
-    # What determines a run's weights, by dotted key, without the seed. Keys of one scene alone are
-    # under its name, as options of a representation are: only runs that have it differ in them.
+    """Returns all that the weights depend on but the seed, by dotted key.
+
+    Keys of a single scene are under the scene's name, as options of a representation are under its
+    name, so that only runs which have them can differ in them.
+    """
     parts = origin_of(config) | {"total_frames": config["total_frames"]}
     del parts["flowrep"], parts["seed"]
     scene = parts.pop("scene")
@@ -96,12 +101,12 @@ def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     return {key: str(value) for key, value in _flat(parts) if value != {}}
 
 
-def _flat(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+def _flat(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     if isinstance(value, Mapping) and value:
         for key, inner in value.items():
-            yield from _flat(inner, f"{place}.{key}" if place else str(key))
+            yield from _flat(inner, f"{prefix}.{key}" if prefix else str(key))
     else:
-        yield place, _plain(value)
+        yield prefix, _plain(value)
 
 
 def _plain(value: Any) -> Any:
@@ -111,14 +116,14 @@ def _plain(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def in_order(found: Iterable[str], known: Sequence[str]) -> list[str]:
-    """Returns the found names without repeats, the known ones first and in their order."""
-    names = set(found)
-    return [name for name in known if name in names] + sorted(names - set(known))
+def in_order(names: Iterable[str], known: Sequence[str]) -> list[str]:
+    """Returns names without repeats: known ones first, in their order, then the others sorted."""
+    unique = set(names)
+    return [name for name in known if name in unique] + sorted(unique - set(known))
 
 
 def stack_of(representations: Iterable[str]) -> str:
-    """Returns the name of a set of representations, in any order."""
+    """Returns the name of a set of representations, whatever their order."""
     return "+".join(in_order(representations, _REPRESENTATIONS))
 
 
@@ -128,43 +133,43 @@ def scenes_of(runs: Sequence[Run]) -> list[str]:
 
 
 def in_stacks(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Returns the runs of each of their stacks, the paper's first."""
+    """Returns the runs by stack, the paper's stacks first."""
     stacks = in_order([run.stack for run in runs], STACKS)
     return {stack: [run for run in runs if run.stack == stack] for stack in stacks}
 
 
 class Group(NamedTuple):
-    """Runs that may be compared, and the keys in which groups differ with this one's values."""
+    """Runs that may be compared, and their values of the keys in which groups differ."""
 
     runs: tuple[Run, ...]
     differences: dict[str, str]
 
     @property
     def label(self) -> str:
-        """What distinguishes it from other groups; empty if it is the only one."""
+        """What distinguishes it from the other groups; empty if there are none."""
         shown = [f"{key}={value}"[:60] for key, value in self.differences.items()]
         return ", ".join(shown if len(shown) < 5 else [*shown[:3], f"{len(shown) - 3} more keys"])
 
 
 def groups_of(runs: Sequence[Run]) -> list[Group]:
-    """Returns runs that differ in scene, representations and seed alone, largest groups first."""
+    """Returns groups of runs that differ only in scene, representations and seed, largest first."""
     keys = dict.fromkeys(key for run in runs for key in run.settings)
-    # a key that a run could have and doesn't is a difference, as when a later version added it
-    own = [{k: run.settings.get(k, "absent") for k in keys if _can_have(run, k)} for run in runs]
-    differing = [key for key in keys if len({of[key] for of in own if key in of}) > 1]
+    # "absent" is a value, too: a later version may have added the key
+    values = [{k: run.settings.get(k, "absent") for k in keys if _can_have(run, k)} for run in runs]
+    differing = [key for key in keys if len({of[key] for of in values if key in of}) > 1]
     groups: dict[tuple[tuple[str, str], ...], list[Run]] = {}
-    for run, of in zip(runs, own):
+    for run, of in zip(runs, values):
         groups.setdefault(tuple((k, of[k]) for k in differing if k in of), []).append(run)
-    found = [Group(tuple(members), dict(values)) for values, members in groups.items()]
-    return sorted(found, key=lambda group: -len(group.runs))
+    every = [Group(tuple(members), dict(identity)) for identity, members in groups.items()]
+    return sorted(every, key=lambda group: -len(group.runs))
 
 
 def _can_have(run: Run, key: str) -> bool:
-    place, _, rest = key.partition(".")
-    part = rest.split(".")[0]
-    if place == "representations":
-        return part in run.config[place]
-    return place != "scene" or part in (*_OF_EVERY_SCENE, run.scene)
+    section, _, rest = key.partition(".")
+    name = rest.split(".")[0]
+    if section == "representations":
+        return name in run.config[section]
+    return section != "scene" or name in (*_OF_EVERY_SCENE, run.scene)
 
 
 def success_rate(outcomes: Sequence[NDArray[Any]]) -> float:
@@ -173,9 +178,9 @@ def success_rate(outcomes: Sequence[NDArray[Any]]) -> float:
 
 
 def departures(outcomes: Sequence[NDArray[Any]]) -> float:
-    """Returns the share of departures from the road in them and collisions: the paper's Table III.
+    """Returns departures from the road as a share of departures and collisions; nan without any.
 
-    It is nan without either.
+    It is the paper's Table III.
     """
     ends = np.concatenate(outcomes)
     out, hit = (ends == "out_of_bounds").sum(), (ends == "collision").sum()
@@ -185,36 +190,36 @@ def departures(outcomes: Sequence[NDArray[Any]]) -> float:
 def own_scores(
     runs: Iterable[Run], conditions: Sequence[Condition], score: Score = success_rate
 ) -> Array:
-    """Returns the score of each run `[R]`, of all its episodes, by seed.
+    """Returns the score of each run `[R]` over all of its episodes, sorted by seed.
 
-    Runs that lack a condition are left out, and those whose score is nan.
+    Runs that lack a condition are left out, as are runs whose score is nan.
     """
     ours = [r for r in sorted(runs, key=lambda r: r.seed) if r.conditions.issuperset(conditions)]
-    found = np.array([score([run.under(c)["outcome"] for c in conditions]) for run in ours])
-    return found[~np.isnan(found)]
+    scores = np.array([score([run.under(c)["outcome"] for c in conditions]) for run in ours])
+    return scores[~np.isnan(scores)]
 
 
 def paired_scores(
     sides: Sequence[Sequence[Run]], conditions: Sequence[Condition], score: Score = success_rate
 ) -> tuple[list[Array], int] | None:
-    """Returns the score of each run of each side, of the episodes that all of them drove.
+    """Returns the score of each run of each side, over the episodes that all of them drove.
 
-    An episode's difficulty is so no part of a difference. The number is that of those episodes;
-    None if there are none. Runs that lack a condition are left out.
+    An episode's difficulty is thus no part of a difference. The second value is the number of
+    those episodes; without any, the result is None. Runs that lack a condition are left out.
     """
     ours = [[run for run in side if run.conditions.issuperset(conditions)] for side in sides]
     if not all(ours):
         return None
     driven = [[[run.under(c) for c in conditions] for run in side] for side in ours]
-    seeds = (columns["episode_seed"] for side in driven for found in side for columns in found)
+    seeds = (columns["episode_seed"] for side in driven for tables in side for columns in tables)
     shared = reduce(np.intersect1d, seeds)
     if not len(shared):
         return None
 
-    def scored(found: Sequence[Columns]) -> float:
-        return score([c["outcome"][np.isin(c["episode_seed"], shared)] for c in found])
+    def scored(tables: Sequence[Columns]) -> float:
+        return score([c["outcome"][np.isin(c["episode_seed"], shared)] for c in tables])
 
-    return [np.array([scored(found) for found in side]) for side in driven], len(shared)
+    return [np.array([scored(tables) for tables in side]) for side in driven], len(shared)
 
 
 def changes(runs: Iterable[Run], before: Condition, after: Condition) -> Array:
@@ -223,8 +228,8 @@ def changes(runs: Iterable[Run], before: Condition, after: Condition) -> Array:
     def change(outcomes: Sequence[NDArray[Any]]) -> float:
         return success_rate(outcomes[1:]) - success_rate(outcomes[:1])
 
-    found = [paired_scores([[run]], (before, after), change) for run in runs]
-    return np.array([pair[0][0][0] for pair in found if pair])
+    pairs = [paired_scores([[run]], (before, after), change) for run in runs]
+    return np.array([pair[0][0][0] for pair in pairs if pair])
 
 
 def baseline_share(runs: Iterable[Run], condition: Condition) -> float | None:
@@ -233,7 +238,7 @@ def baseline_share(runs: Iterable[Run], condition: Condition) -> float | None:
     seeds, outcomes = (
         np.concatenate([c[name] for c in driven]) for name in ("episode_seed", "outcome")
     )
-    # its drive of an episode doesn't depend on the agent beside it: each episode counts once
+    # A baseline drives an episode alike beside any agent, so each episode counts once.
     _, first = np.unique(seeds, return_index=True)
     return success_rate([outcomes[first]]) if len(first) else None
 
@@ -242,14 +247,14 @@ class Cell(NamedTuple):
     """The success of one series in one scene and condition."""
 
     rates: Array  # of its runs [R]
-    counts: str  # the numbers of seeds and episodes, as text: `3 × 192`
+    counts: str  # seeds × episodes, as text: `3 × 192`
     score: Estimate
 
 
-class Grid(NamedTuple):
-    """Success in one scene by series, which is a stack (of one config), and condition.
+class SuccessGrid(NamedTuple):
+    """Success in one scene, by series and condition; a series is a stack, or a stack's config.
 
-    A place without runs has no cell.
+    Series without runs under a condition have no cell.
     """
 
     scene: str
@@ -275,8 +280,8 @@ def grid_of(
     series: Mapping[str, Sequence[Run]],
     conditions: Sequence[Condition],
     baselines: Sequence[str] = BASELINES,
-) -> Grid:
-    """Returns the success of several series of runs in a scene; those of others are left out."""
+) -> SuccessGrid:
+    """Returns the success of several series of runs in a scene, without runs of other scenes."""
     here = {name: [run for run in runs if run.scene == scene] for name, runs in series.items()}
     cells = {
         (name, condition): cell
@@ -289,7 +294,7 @@ def grid_of(
         for name, condition in product(baselines, conditions)
         if (share := baseline_share(everybody, condition._replace(policy=name))) is not None
     }
-    return Grid(scene, tuple(series), tuple(conditions), cells, shares)
+    return SuccessGrid(scene, tuple(series), tuple(conditions), cells, shares)
 
 
 class Curve(NamedTuple):
@@ -300,13 +305,14 @@ class Curve(NamedTuple):
 
 
 def curve_of(run: Run) -> Curve:
-    """Returns greedy evaluations at the run's own speed and frame rate, and training episodes."""
+    """Returns greedy evaluations at the run's speed and frame rate, and its training episodes."""
     e = run.episodes
-    own = (e["scene"] == run.scene) & (e["speed"] == run.speed) & (e["fps"] == run.fps)
-    own &= e["policy"] == "greedy"
+    here = (e["scene"] == run.scene) & (e["speed"] == run.speed) & (e["fps"] == run.fps)
+    here &= e["policy"] == "greedy"
     evaluated: dict[int, float] = {}
-    for kind in ("training", "final"):  # at the final frames that one alone: other episodes
-        chosen = own & (e["evaluation"] == kind)
+    # At the last frame count, the final evaluation replaces that of training: other episodes.
+    for kind in ("training", "final"):
+        chosen = here & (e["evaluation"] == kind)
         frames, outcomes = e["frames"][chosen], e["outcome"][chosen]
         at = np.unique(frames).tolist()
         evaluated |= {f: success_rate([outcomes[frames == f]]) for f in at}
@@ -316,7 +322,7 @@ def curve_of(run: Run) -> Curve:
 
 
 def mean_curve(curves: Sequence[Sequence[tuple[int, float]]]) -> list[tuple[int, float]]:
-    """Returns the mean over curves, at the frames that most of them have.
+    """Returns the mean over curves, at the frame counts that most of them have.
 
     >>> mean_curve([[(10, 0.0), (20, 0.5)], [(10, 1.0), (20, 1.0)], [(10, 0.5)]])
     [(10, 0.5), (20, 0.75)]
@@ -324,5 +330,5 @@ def mean_curve(curves: Sequence[Sequence[tuple[int, float]]]) -> list[tuple[int,
     at: dict[int, list[float]] = {}
     for frames, share in (point for curve in curves for point in curve):
         at.setdefault(frames, []).append(share)
-    most = [(frames, found) for frames, found in sorted(at.items()) if 2 * len(found) > len(curves)]
-    return [(frames, float(np.mean(found))) for frames, found in most]
+    common = ((n, shares) for n, shares in sorted(at.items()) if 2 * len(shares) > len(curves))
+    return [(frames, float(np.mean(shares))) for frames, shares in common]

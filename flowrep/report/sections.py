@@ -16,9 +16,9 @@ from flowrep.report.runs import (
     SPEEDS,
     STACKS,
     Condition,
-    Grid,
     Group,
     Run,
+    SuccessGrid,
     changes,
     curve_of,
     departures,
@@ -34,8 +34,8 @@ from flowrep.report.statistics import Estimate, effect, holm, improvement, mean_
 from flowrep.report.tables import MISSING, Table, listed, p_text, percent, points, ratio
 
 INTERVALS = (
-    "the mean over seeds with its 95 % t interval; of a single seed, or of seeds that all end "
-    "alike, Wilson's over the episodes"
+    "the mean over seeds with its 95 % t interval; for a single seed, or seeds with equal rates, "
+    "Wilson's interval over the episodes"
 )
 _MOST_PAIRS = 15  # in a table
 _LONGEST_LABEL = 30  # of a config, in a legend
@@ -54,34 +54,34 @@ _EXPERIMENTS = (
 _TABLE_III = ("ego+obj", "depth2", "seg2", "ego+obj+depth2", "ego+obj+seg2", _ALL)
 
 
-class Section(NamedTuple):
-    """One part of a report: its heading, tables, and figure with a caption."""
+class ReportSection(NamedTuple):
+    """One part of a report: its heading, its tables, and a figure with a caption."""
 
     name: str
     title: str
     tables: tuple[Table, ...] = ()
     figure: Figure | None = None
     caption: str = ""
-    label: str = ""  # what distinguishes the config of its runs from other sections'
-    folder: str = ""  # of its files
+    label: str = ""  # how the config of its runs differs from other sections'
+    folder: str = ""  # of its files, and its id in the page
 
 
 class Report(NamedTuple):
-    """What a page shows of runs, except their drives."""
+    """What a page shows of runs, apart from their drives."""
 
     runs: tuple[Run, ...]
     warnings: tuple[str, ...]
-    sections: tuple[Section, ...]
+    sections: tuple[ReportSection, ...]
 
 
 def assemble(runs: Sequence[Run], warnings: Sequence[str], policy: str = "greedy") -> Report:
-    """Returns the sections for runs, group by group, and the problems found in runs.
+    """Returns the sections for runs, group by group, and warnings about runs.
 
     Args:
         policy: whose evaluations are counted, "greedy" or "sampled".
     """
     groups = groups_of(runs)
-    wrong = [*warnings, *(w for w in (_unusable(run, policy) for run in runs) if w)]
+    unused = filter(None, (_unusable(run, policy) for run in runs))
     sections = []
     for number, group in enumerate(groups, start=1):
         prefix = f"{number}_" if len(groups) > 1 else ""
@@ -89,56 +89,56 @@ def assemble(runs: Sequence[Run], warnings: Sequence[str], policy: str = "greedy
             sections.append(section._replace(folder=prefix + section.name, label=group.label))
     if len(groups) > 1:
         sections.append(_configs_section(groups, policy)._replace(folder="configs"))
-    return Report(tuple(runs), tuple(wrong), tuple(sections))
+    return Report(tuple(runs), (*warnings, *unused), tuple(sections))
 
 
 def write_files(report: Report, folder: Path) -> list[Path]:
     """Writes figures as PNG and PDF, tables as LaTeX and CSV; returns the sections' folders."""
-    for section in report.sections:
-        place = folder / section.folder
-        place.mkdir(exist_ok=True)
+    folders = [folder / section.folder for section in report.sections]
+    for section, path in zip(report.sections, folders):
+        path.mkdir(exist_ok=True)
         if section.figure:
             for kind in ("png", "pdf"):
-                (place / f"{section.name}.{kind}").write_bytes(encoded(section.figure, kind))
+                (path / f"{section.name}.{kind}").write_bytes(encoded(section.figure, kind))
         for table in section.tables:
-            (place / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
-            (place / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
-    return [folder / section.folder for section in report.sections]
+            (path / f"{table.name}.tex").write_text(table.to_latex(), encoding="utf-8")
+            (path / f"{table.name}.csv").write_text(table.to_csv(), encoding="utf-8")
+    return folders
 
 
 def _unusable(run: Run, policy: str) -> str | None:
-    """Returns why a run fills no cell, None if it does."""
+    """Returns why a run is in no table, None if it is."""
     unused = "only its learning curve is used"
     if not run.is_finished:
         reached = f"{run.frames:,} of {run.total_frames:,} frames"
         return f"{run.name} is not finished, at {reached}: {unused}"
     if policy not in {condition.policy for condition in run.conditions}:
         remedy = f"python -m flowrep.evaluate run={run.name} policy={policy} adds one"
-        return f"{run.name} has no {policy} evaluation at its end: {unused}; {remedy}"
+        return f"{run.name} has no final {policy} evaluation: {unused}; {remedy}"
     return None
 
 
-def _group_sections(group: Group, policy: str) -> list[Section]:
+def _group_sections(group: Group, policy: str) -> list[ReportSection]:
     runs = [run for run in group.runs if _unusable(run, policy) is None]
     if not runs:
         return _curves(group.runs)
-    found = in_stacks(runs)
+    by_stack = in_stacks(runs)
     sections, shown = [], set[str]()
     for name, title, stacks, pairs in _EXPERIMENTS:
-        if len({*found} & {*stacks}) > 1:
-            series = {stack: found[stack] for stack in stacks if stack in found}
+        if len({*by_stack} & {*stacks}) > 1:
+            series = {stack: by_stack[stack] for stack in stacks if stack in by_stack}
             sections.append(_success_section(name, title, series, pairs, policy))
             shown |= {*stacks}
-    if {*found} - shown:
-        every = list(combinations(reversed(found), 2))
-        sections.append(_success_section("success", "Success", found, every, policy))
+    if {*by_stack} - shown:
+        every = list(combinations(reversed(by_stack), 2))
+        sections.append(_success_section("success", "Success", by_stack, every, policy))
     sections.append(_failure_section(runs, policy))
     if len(_rates(runs, policy)) > 1:
         sections.append(_rate_section(runs, policy))
     return [*sections, *_curves(group.runs)]
 
 
-# Runs of a group differ in scene, stack and seed alone: the first one's speed and frame rate are
+# Runs of a group differ only in scene, stack and seed, so the first one's speed and frame rate are
 # those of all.
 def _rates(runs: Sequence[Run], policy: str) -> list[float]:
     asked = (policy, runs[0].speed)
@@ -158,7 +158,7 @@ def _success_section(
     pairs: Sequence[tuple[str, str]],
     policy: str,
     baselines: Sequence[str] = BASELINES,
-) -> Section:
+) -> ReportSection:
     runs = [run for members in series.values() for run in members]
     conditions, scenes = _at_speeds(runs, policy), scenes_of(runs)
     grids = [grid_of(scene, series, conditions, baselines) for scene in scenes]
@@ -170,15 +170,15 @@ def _success_section(
     table = _success_table(name, grids, caption)
     differences = _differences_table(name, series, scenes, conditions, pairs)
     tables = (table, differences) if differences.blocks else (table,)
-    return Section(name, title, tables, draw_bars(grids), caption)
+    return ReportSection(name, title, tables, draw_bars(grids), caption)
 
 
-def _shares(grid: Grid, series: str) -> list[str]:
+def _shares(grid: SuccessGrid, series: str) -> list[str]:
     cells = [grid.cells.get((series, c)) for c in grid.conditions]
     return [percent(cell.score) if cell else MISSING for cell in cells]
 
 
-def _success_table(name: str, grids: Sequence[Grid], caption: str) -> Table:
+def _success_table(name: str, grids: Sequence[SuccessGrid], caption: str) -> Table:
     _, series, conditions, *_ = grids[0]
     blocks = []
     for grid in grids:
@@ -194,9 +194,9 @@ def _success_table(name: str, grids: Sequence[Grid], caption: str) -> Table:
         blocks.append((words(grid.scene), tuple(rows)))
     if len(grids) > 1:
 
-        def over_all(place: tuple[str, Condition]) -> str:
-            found = [grid.cells[place].rates for grid in grids if place in grid.cells]
-            return percent(mean_share(found)) if len(found) == len(grids) else MISSING
+        def over_all(key: tuple[str, Condition]) -> str:
+            rates = [grid.cells[key].rates for grid in grids if key in grid.cells]
+            return percent(mean_share(rates)) if len(rates) == len(grids) else MISSING
 
         rows = [(one, *(over_all((one, c)) for c in conditions), "") for one in series]
         blocks.append((f"All {len(grids)} scenes", tuple(rows)))
@@ -213,34 +213,32 @@ def _differences_table(
 ) -> Table:
     asked = [pair for pair in pairs if {*pair} <= {*series}]
     chosen = asked[:_MOST_PAIRS]
-    places = [(words(scene), [scene]) for scene in scenes]
+    headings = {words(scene): [scene] for scene in scenes}
     if len(scenes) > 1:
-        places.append((f"All {len(scenes)} scenes", list(scenes)))
+        headings[f"All {len(scenes)} scenes"] = list(scenes)
     blocks = []
-    for heading, here in places:
-        found = []
+    for heading, here in headings.items():
+        scored = {}  # of each pair and speed, by scene: rates of both sides, number of episodes
         for pair, condition in product(chosen, conditions):
             sides = [[[r for r in series[s] if r.scene == scene] for s in pair] for scene in here]
-            scored = [paired_scores(of_scene, [condition]) for of_scene in sides]
-            known = [(ours, theirs, number) for (ours, theirs), number in filter(None, scored)]
-            if len(known) == len(here):
-                found.append((pair, condition.speed, known))
-        effects = [effect([sides[:2] for sides in known]) for *_, known in found]
-        corrected = holm([effect.p_value for effect in effects])
+            of_scenes = [paired_scores(of, [condition]) for of in sides]
+            if None not in of_scenes:
+                scored[pair, condition.speed] = list(filter(None, of_scenes))
+        rates = [[both for both, _ in of_scenes] for of_scenes in scored.values()]
+        effects = list(map(effect, rates))
+        corrected = holm([each.p_value for each in effects])
         rows = []
-        for (pair, speed, known), difference, p in zip(found, effects, corrected):
-            better = f"{100 * improvement([sides[:2] for sides in known]):.0f}"
-            verdict, shared = difference.verdict(p), sum(number for *_, number in known)
-            p_values = p_text(difference.p_value), p_text(p)
-            cells = (speed, points(difference.interval()), verdict, *p_values, better, str(shared))
-            rows.append((" − ".join(pair), *cells))
-        if rows:
-            blocks.append((heading, tuple(rows)))
+        for (pair, speed), each, both, p in zip(scored, effects, rates, corrected):
+            shared = sum(number for _, number in scored[pair, speed])
+            cells = (points(each.interval()), each.verdict(p), p_text(each.p_value), p_text(p))
+            better = f"{100 * improvement(both):.0f}"
+            rows.append((" − ".join(pair), speed, *cells, better, str(shared)))
+        blocks += [(heading, tuple(rows))] if rows else []
     caption = (
         "First minus second in percentage points, on the episodes that all runs of both drove, "
         "with 95 % intervals and p of Welch's t-test over seeds; p (Holm) is corrected for the "
         "comparisons of its block, and a difference counts if it is below 0.05. P(first better) "
-        "is how often a run of the first beats one of the second, a tie counting half."
+        "is how often a run of the first beats one of the second; a tie counts half."
     )
     if len(chosen) < len(asked):
         caption += f" The first {len(chosen)} of {len(asked)} pairs."
@@ -249,8 +247,8 @@ def _differences_table(
     return Table(f"{name}_differences", caption, header, tuple(blocks), (1, 3))
 
 
-def _failure_section(runs: Sequence[Run], policy: str) -> Section:
-    # The paper's Table III, which is of low and high speed together.
+def _failure_section(runs: Sequence[Run], policy: str) -> ReportSection:
+    # The paper's Table III, at low and high speed together.
     fps, driven = runs[0].fps, {c.speed for c in _at_speeds(runs, policy)}
     speeds = ["low", "high"] if {"low", "high"} <= driven else [runs[0].speed]
     conditions = [Condition(policy, speed, fps) for speed in speeds]
@@ -262,14 +260,13 @@ def _failure_section(runs: Sequence[Run], policy: str) -> Section:
         blocks.append((words(scene), tuple(rows)))
     caption = (
         "Causes of failure in % of a run's collisions and departures from the road together, "
-        "time-outs left out: the mean over seeds with its 95 % t interval; of a single seed, or of "
-        f"seeds that all end alike, Wilson's. {words(' and '.join(speeds))} speed, {fps:g} frames "
-        f"per second, {policy} actions."
+        f"without time-outs: {INTERVALS}. {words(' and '.join(speeds))} speed, {fps:g} frames per "
+        f"second, {policy} actions."
     )
     header = ("representations", "out of bounds (%)", "collision (%)", "out of bounds to collision")
     counts = ("failures", "time-outs", "episodes")
     table = Table("failure_causes", caption, (*header, *counts), tuple(blocks))
-    return Section("failure_causes", "Causes of failure", (table,))
+    return ReportSection("failure_causes", "Causes of failure", (table,))
 
 
 def _failure_cells(runs: Sequence[Run], conditions: Sequence[Condition]) -> tuple[str, ...]:
@@ -287,7 +284,7 @@ def _failure_cells(runs: Sequence[Run], conditions: Sequence[Condition]) -> tupl
     return (percent(share, 1), percent(collisions, 1), ratio(share), *counted)
 
 
-def _rate_section(runs: Sequence[Run], policy: str) -> Section:
+def _rate_section(runs: Sequence[Run], policy: str) -> ReportSection:
     speed, trained = runs[0].speed, runs[0].fps
     ours = [run for run in runs if len(_rates([run], policy)) > 1]
     conditions = [Condition(policy, speed, rate) for rate in _rates(ours, policy)]
@@ -299,21 +296,21 @@ def _rate_section(runs: Sequence[Run], policy: str) -> Section:
         rows = []
         for name, members in series.items():
             lost = changes([run for run in members if run.scene == grid.scene], high, low)
-            told = points(effect([(lost,)]).interval()) if len(lost) else MISSING
-            rows.append((name, *_shares(grid, name), told))
+            loss = points(effect([(lost,)]).interval()) if len(lost) else MISSING
+            rows.append((name, *_shares(grid, name), loss))
         blocks.append((words(grid.scene), tuple(rows)))
     caption = (
         f"Success over the frame rate of the evaluation, trained at {trained:g} frames per second, "
-        f"{speed} speed, {policy} actions: {INTERVALS}. Points of one rate stand side by side."
+        f"{speed} speed, {policy} actions: {INTERVALS}. Points at one rate are side by side."
     )
     heads = (*(f"{c.fps:g} Hz (%)" for c in conditions), f"{high.fps:g} → {low.fps:g} Hz (points)")
-    said = f"In %. {caption} The last column is the change of the same agents on the same episodes."
-    table = Table("frame_rate_success", said, ("representations", *heads), tuple(blocks))
+    of_table = f"In %. {caption} The last column is the change of one agent on the same episodes."
+    table = Table("frame_rate_success", of_table, ("representations", *heads), tuple(blocks))
     title = "Sensitivity to the frame rate"
-    return Section("frame_rate", title, (table,), draw_rates(grids), caption)
+    return ReportSection("frame_rate", title, (table,), draw_rates(grids), caption)
 
 
-def _curves(runs: Sequence[Run]) -> list[Section]:
+def _curves(runs: Sequence[Run]) -> list[ReportSection]:
     panels = []
     for scene in scenes_of(runs):
         here = [run for run in runs if run.scene == scene]
@@ -326,17 +323,17 @@ def _curves(runs: Sequence[Run]) -> list[Section]:
         "Learning curves. Bold, with markers: greedy evaluations at the training speed, the mean "
         "over seeds. Thin: each seed's training episodes, sampled actions."
     )
-    return [Section("learning_curves", "Learning curves", (), draw_curves(panels), caption)]
+    return [ReportSection("learning_curves", "Learning curves", (), draw_curves(panels), caption)]
 
 
-def _configs_section(groups: Sequence[Group], policy: str) -> Section:
-    # Stacks that have runs of several configs, side by side and never pooled.
+def _configs_section(groups: Sequence[Group], policy: str) -> ReportSection:
+    # Stacks with runs of several configs, side by side and never pooled.
     keys = dict.fromkeys(key for group in groups for key in group.differences)
     labels = [group.label for group in groups]
     are_short = all(0 < len(label) <= _LONGEST_LABEL for label in labels)
     configs = labels if are_short else [f"config {n}" for n in range(1, len(groups) + 1)]
     rows = [(key, *(group.differences.get(key, "")[:60] for group in groups)) for key in keys]
-    caption = "Keys of the configs in which the runs differ. No number is of runs of two columns."
+    caption = "Config keys in which the runs differ. No number combines runs of two columns."
     columns = tuple(range(1, len(groups) + 1))
     table = Table("configs", caption, ("key", *configs), (("", tuple(rows)),), columns)
 
@@ -349,7 +346,7 @@ def _configs_section(groups: Sequence[Group], policy: str) -> Section:
             here = [r for r in runs if r.stack == stack and (r.scene, stack) in shared]
             series |= {(stack, config): here} if here else {}
     if not series:
-        return Section("configs", "Configs that differ", (table,))
+        return ReportSection("configs", "Configs that differ", (table,))
     named = {", ".join(place): runs for place, runs in series.items()}
     pairs = [(", ".join(b), ", ".join(a)) for a, b in combinations(series, 2) if a[0] == b[0]]
     section = _success_section("configs", "Configs that differ", named, pairs, policy, ())

@@ -1,4 +1,4 @@
-"""Tables of a report, as LaTeX (booktabs) and CSV, and numbers as text."""
+"""Tables as LaTeX (booktabs), Markdown and CSV, and numbers as text."""
 
 import csv
 import io
@@ -20,14 +20,13 @@ _LATEX: dict[str, str] = {character: rf"\{character}" for character in "&%$#_{}"
 
 
 class Table(NamedTuple):
-    """Text in rows; `name` is that of its files."""
+    """Text in rows, which stand in blocks."""
 
-    name: str
+    name: str  # of its files
     caption: str
     header: tuple[str, ...]
-    # headings, which may be "", and rows
-    blocks: tuple[tuple[str, tuple[tuple[str, ...], ...]], ...]
-    words: tuple[int, ...] = ()  # columns that are aligned left, beside the first
+    blocks: tuple[tuple[str, tuple[tuple[str, ...], ...]], ...]  # headings, "" for none, and rows
+    words: tuple[int, ...] = ()  # columns that are aligned left, apart from the first
 
     @property
     def alignment(self) -> str:
@@ -73,7 +72,7 @@ class Table(NamedTuple):
 
 
 def _inert(cell: str) -> str:
-    # Spreadsheets compute what begins like a formula, such as a folder's name "=1+1".
+    # Spreadsheets evaluate a cell that begins like a formula, such as a folder named "=1+1".
     begins = cell.startswith(("=", "+", "-", "@", "\t", "\r"))
     return f"'{cell}" if begins and not _NUMBERS.fullmatch(cell) else cell
 
@@ -88,38 +87,38 @@ def _latex_row(row: Sequence[str]) -> str:
 
 
 def percent(estimate: Estimate, digits: int = 0) -> str:
-    """Returns a share with its interval, if it is known, in %, as "85 [79–90]"."""
+    """Returns a share and its interval, if known, in %: "85 [79–90]"."""
     value, low, high = (100 * number for number in estimate)
     interval = "" if np.isnan(low) else f" [{low:.0f}–{high:.0f}]"
     return f"{value:.{digits}f}{interval}"
 
 
 def points(estimate: Estimate) -> str:
-    """Returns a difference with its interval, if it is known, in points, as "+12 [−3, +20]"."""
+    """Returns a difference and its interval, if known, in points: "+12 [−3, +20]"."""
     value, low, high = estimate
     interval = "" if np.isnan(low) else f" [{signed(low)}, {signed(high)}]"
     return signed(value) + interval
 
 
 def ratio(share: Estimate) -> str:
-    """Returns share : rest with its interval, as "0.250 [0.111–1.000]"."""
+    """Returns share / (1 - share) and its interval: "0.250 [0.111–1.000]"."""
     value, low, high = (f"{number / (1 - number):.3f}" if number < 1 else "∞" for number in share)
     return f"{value} [{low}–{high}]"
 
 
 def signed(share: float) -> str:
-    """Returns a difference in points with its sign, as "+12"."""
+    """Returns a difference in points with its sign: "+12"."""
     whole = round(100 * share)
     return f"{'+' if whole > 0 else '−' if whole < 0 else ''}{abs(whole)}"
 
 
 def p_text(p_value: float) -> str:
-    """Returns a p value as text, nothing for one that isn't known."""
+    """Returns a p value as text, "" if it is unknown."""
     if np.isnan(p_value):
         return ""
     return "<0.001" if p_value < 0.0005 else f"{p_value:.3f}"
 
 
 def listed(names: Sequence[str]) -> str:
-    """Returns names as a list in a sentence: a, b and c."""
+    """Returns names as a list in a sentence: "a, b and c"."""
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

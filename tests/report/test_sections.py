@@ -175,7 +175,7 @@ def test_pairs_that_are_too_many_for_a_table_are_counted(tmp_path):
         run_in(tmp_path, f"{place}", "sc", stack=f"map{place}")
     differences = sections_of(tmp_path)[0]["success"].tables[1]
     assert len(rows_in(differences)) == 15
-    assert differences.caption.endswith("The first 15 of 21 pairs.")
+    assert {"15", "21"} <= set(differences.caption.split())
 
 
 def test_runs_of_none_of_the_papers_experiments_are_shown_all_the_same(tmp_path):
@@ -192,7 +192,8 @@ def test_an_unfinished_run_is_in_the_learning_curve_alone(tmp_path):
     write_run(tmp_path / "half", config, rows, [{"frames": 400, "success": 0.25}])
     found, report = sections_of(tmp_path)
     assert list(found) == ["learning_curves"]
-    assert "half is not finished, at 400 of 1,000 frames" in report.warnings[0]
+    (warning,) = report.warnings
+    assert all(part in warning for part in ("half", "400", "1,000"))
 
 
 def test_a_learning_curve_is_of_the_speed_and_frame_rate_of_training(tmp_path):
