@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import closing
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,8 +30,8 @@ from flowrep.viz import contact_sheet, write_png, write_video
 
 if TYPE_CHECKING:
     from flowrep.experiment.agents import Agent
-    from flowrep.experiment.evaluation import Episode
     from flowrep.experiment.film import Film
+    from flowrep.experiment.outcomes import EpisodeRecord
     from flowrep.scenes import Scene
 
 ENVS = 16  # side by side, for the episodes that are not filmed
@@ -89,7 +90,7 @@ def view(
     config: ViewConfig, agent: Agent, film: Film, options: list[dict[str, Any]], folder: Path
 ) -> None:
     """Drives episodes and writes their pictures, plan, film and tables into a folder."""
-    from flowrep.experiment.evaluation import print_table
+    from flowrep.experiment.outcomes import print_table
     from flowrep.scenes.layout import Layout
     from flowrep.viz.plan import Track, draw_plan
 
@@ -100,8 +101,9 @@ def view(
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = episode.path if all(each.path == episode.path for each in episodes) else None
+    origin = agent.origin("view") | {"policy": config.policy}
     tables = {
-        "episodes": [each.row() for each in episodes],
+        "episodes": [replace(each, **origin).row() for each in episodes],
         "categories": category_rows(scene.categories, (frame.maps["seg"] for frame in frames)),
     }
     folder.mkdir(parents=True, exist_ok=True)
@@ -117,8 +119,9 @@ def view(
         for title, rows in tables.items():
             write_rows(new / f"{title}.csv", rows)
         replace_files(new, folder)
-    for title, rows in tables.items():
-        print_table(title, rows)
+    shown = ("path", "episode_seed", "outcome", "hit", "return", "length")
+    print_table("episodes", [{name: row[name] for name in shown} for row in tables["episodes"]])
+    print_table("categories", tables["categories"])
     arrived = sum(each.outcome == "success" for each in episodes)
     print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
     print(f"{folder}: {', '.join(each for each in FILES if (folder / each).exists())}")
@@ -133,7 +136,9 @@ def replace_files(new: Path, folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
 
 
-def drive_on(config: ViewConfig, agent: Agent, options: list[dict[str, Any]]) -> list[Episode]:
+def drive_on(
+    config: ViewConfig, agent: Agent, options: list[dict[str, Any]]
+) -> list[EpisodeRecord]:
     """Returns the episodes after the first, in their order, with what the policy sees alone."""
     from flowrep.experiment.evaluation import evaluate
 
@@ -143,7 +148,7 @@ def drive_on(config: ViewConfig, agent: Agent, options: list[dict[str, Any]]) ->
         ended = evaluate(env, agent.policy, options)
         counted = {"desc": "driving on", "unit": "episode", "total": len(options)}
         episodes = list(progress_bar(ended, what="driving on", **counted))
-    return sorted(episodes, key=lambda episode: episode.seed)
+    return sorted(episodes, key=lambda episode: episode.episode_seed)
 
 
 def category_rows(categories: Iterable[str], seg: Iterable[Any]) -> list[dict[str, Any]]:

@@ -36,7 +36,6 @@ FLOWREP_IMPORTS_ALLOWED = {
     "policies": {"pretrained", "experiment", "baselines", "config"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
-    "sweep": {"config", "progress", "tables", "files"},
     "config": {"config"},
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
     | {"extras", "tables", "files"},
@@ -49,7 +48,7 @@ THIRD_PARTY_ONLY_IN = {
         "view.py",
         "factorize.py",
         "config/cli.py",
-        "sweep.py",
+        "experiment/sweep.py",
         "torchrl_configs.py",
         "transforms/hydra_configs.py",
     },

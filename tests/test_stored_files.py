@@ -14,17 +14,19 @@ from safetensors.torch import save_file
 
 pytest.importorskip("pybullet", reason="the commands build the simulated street")
 
-from flowrep import pretrained, sweep
+from flowrep import pretrained
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
 from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
 from flowrep.evaluate import targets_of
-from flowrep.experiment import film
-from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolder, RunFolderError
+from flowrep.experiment import film, sweep
+from flowrep.experiment.lock import RunFolderError
+from flowrep.experiment.run import RunFolder
 from flowrep.export import export
 from flowrep.train import resumed
 from flowrep.view import agent_of
 from tests.config.composing import composed, plain
+from tests.experiment.test_run import episode
 
 EVIL = "import pathlib; pathlib.Path(__file__).with_name('PWNED').touch()\nclass A: pass\n"
 
@@ -184,10 +186,9 @@ def victim(tmp_path):
     return path
 
 
-ROW = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"outcome": "success"}
 WRITES = {
     "metrics.csv": lambda run: run.log_metrics(10, {"alpha": 0.5}),
-    "evaluation.csv": lambda run: run.save_episodes([ROW]),
+    "evaluation.csv": lambda run: run.save_episodes([episode(1)]),
     "failures.csv": lambda run: run.write_failures(),
     "machine.json": lambda run: run.note_machine({"cpu": "x"}),
     "config.yaml": lambda run: run.write_config({"seed": 1}),
@@ -246,11 +247,11 @@ def test_a_lock_that_is_a_link_is_refused_and_its_target_kept(tmp_path, victim, 
 
 @pytest.mark.parametrize("text", ["../../x", "a/b", "", "x" * 65, "a\nb"])
 def test_a_wandb_id_that_is_a_path_is_refused(tmp_path, monkeypatch, text):
-    monkeypatch.setattr("flowrep.experiment.run.require", lambda *_: None)
+    monkeypatch.setattr("flowrep.experiment.loggers.require", lambda *_: None)
     monkeypatch.setitem(sys.modules, "wandb", object())
     (tmp_path / "wandb_id").write_text(text)
     with pytest.raises(RunFolderError, match="wandb_id"):
-        RunFolder(tmp_path).log_to_wandb("offline", {})
+        RunFolder(tmp_path).loggers.add_wandb("offline", {})
 
 
 # Checkpoints that were made to be read.

@@ -92,7 +92,7 @@ def test_a_run_and_a_policy_of_ones_own_drive_as_baselines_do(tmp_path):
         assert film.street.scene.name == scene  # a run's agent is at home in its own
         film.close()
         ended[policy] = drive_on(config, agent, options_of(config))
-        assert [episode.seed for episode in ended[policy]] == [0, 1, 2]
+        assert [episode.episode_seed for episode in ended[policy]] == [0, 1, 2]
     never = driven(asked("policy=never_turn", "scene=s_turn", "episodes=3"))
     assert [e.outcome for e in ended[f"{path}:make"]] == [e.outcome for e in never]
 

@@ -24,7 +24,8 @@ from flowrep.config.schema import TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
 from flowrep.experiment import build
 from flowrep.experiment.agents import Agent
-from flowrep.experiment.evaluation import OUTCOMES, Comparison, print_results
+from flowrep.experiment.evaluation import PairedEvaluation
+from flowrep.experiment.outcomes import OUTCOMES, print_results
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
 
@@ -142,20 +143,19 @@ class Runner:
         config, asked, fps = self.config, self.config.evaluation, self.env.base_env.frame_rate_hz
         if kind == "final":
             episodes = asked.speeds, asked.fps, asked.final_episodes, FINAL_SEED
-            comparison = Comparison(*episodes, asked.policies, asked.baselines)
+            evaluation = PairedEvaluation(*episodes, asked.policies, asked.baselines)
         else:
-            comparison = Comparison([config.speed], [fps], asked.episodes, EVALUATION_SEED)
+            evaluation = PairedEvaluation([config.speed], [fps], asked.episodes, EVALUATION_SEED)
         agent = Agent(self.agent.policy, config, self.frames)
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
-            comparison.run(agent.make_env, agent.policy, num_envs, stop=stop)
-        if comparison.done < comparison.total:
+            evaluation.run(agent.make_env, agent.policy, num_envs, stop=stop)
+        if evaluation.done < evaluation.total:
             return False
-        rows = comparison.rows(**agent.origin(kind))
-        positions = [e.positions for _, e in comparison.results()] if kind == "final" else []
-        self.folder.log_episodes(rows, positions)
+        records = evaluation.records(**agent.origin(kind))
+        self.folder.log_episodes(records, drives=kind == "final")
         if kind == "final":
-            print_results(rows)
+            print_results([record.row() for record in records])
         return True
 
     def film(self) -> None:
@@ -283,10 +283,10 @@ class RecentEpisodes:
     def summary(self) -> dict[str, float]:
         """Returns the share of each outcome, mean return and mean length; nan without episodes."""
         if not self._ended:
-            return dict.fromkeys([*OUTCOMES[1:], "return", "length"], math.nan)
+            return dict.fromkeys([*OUTCOMES, "return", "length"], math.nan)
         outcomes, returns, lengths = zip(*self._ended)
-        shares = {name: outcomes.count(code) / len(outcomes) for code, name in enumerate(OUTCOMES)}
-        shares.pop(OUTCOMES[0])
+        ends = enumerate(OUTCOMES, start=1)  # 0 is the code of an episode that goes on
+        shares = {name: outcomes.count(code) / len(outcomes) for code, name in ends}
         return shares | {"return": fmean(returns), "length": fmean(lengths)}
 
     def state(self) -> dict[str, Any]:
