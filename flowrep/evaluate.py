@@ -67,9 +67,8 @@ def run(config: EvaluateConfig) -> None:
 
 def targets_of(config: EvaluateConfig) -> list[Target]:
     """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own."""
-    from flowrep.experiment.agents import load_trained
+    from flowrep.experiment.agents import Agent
     from flowrep.experiment.run import RunFolder
-    from flowrep.policies import load_agent
 
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.own_policies:
@@ -78,8 +77,8 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
             for run in RunFolder.all_in(path):
                 runs.setdefault(run.path.resolve(), run)
         trusted = config.algorithm.target
-        load = partial(load_trained, scene=config.scene, algorithm=trusted, **machine)
-        return [Target(run, partial(load, run), config.policy) for run in runs.values()]
+        load = partial(Agent.load, scene=config.scene, algorithm=trusted, **machine)
+        return [Target(run, partial(load, run.path), config.policy) for run in runs.values()]
     keys = ("scene", "representations", "flow", "motion", "noise")
     seen = {key: getattr(config, key) for key in keys}
     targets = []
@@ -87,7 +86,7 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
-        load = partial(load_agent, name, **seen, **machine)
+        load = partial(Agent.load, name, **seen, **machine)
         targets.append(Target(RunFolder(folder), load, [name]))
     return targets
 

@@ -56,7 +56,6 @@ def run(config: TrainConfig) -> float:
 
     Returns its final success, which a sweeper such as Optuna maximises.
     """
-    from flowrep.experiment import build
     from flowrep.experiment.run import RunFolder
 
     job = HydraConfig.get()
@@ -67,9 +66,7 @@ def run(config: TrainConfig) -> float:
             return finish(resumed(config, folder, typed), folder)
     folder = RunFolder(job.runtime.output_dir)
     with folder.held("training"):
-        folder.check_is_new()
-        config = build.with_precision(config)
-        folder.write_config(config.plain(), typed)
+        config = folder.begin(config, typed)
         announce(config, str(job.runtime.choices.get("preset")))
         return finish(config, folder)
 
@@ -126,9 +123,7 @@ def announce(config: TrainConfig, preset: str) -> None:
 def finish(config: TrainConfig, folder: RunFolder) -> float:
     """Does what remains of a run (training, evaluation, video) and returns its success."""
     from flowrep.agent import CheckpointError, DivergenceError
-    from flowrep.agent.observation import compute_dtype
     from flowrep.envs import WorkerError
-    from flowrep.experiment.run import machine_of
     from flowrep.experiment.runner import Runner
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
@@ -137,10 +132,6 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
         runner = Runner(config, folder)
         if config.resume is not None:
             runner.load()
-        folder.loggers.add_wandb(config.wandb, config.plain())
-        precision = getattr(config.algorithm, "precision", "fp32")
-        machine = machine_of(compute_dtype(precision, runner.agent.device))
-        folder.note_machine(machine | {"threads": config.threads})
         print(f"run folder: {folder.path}")
         try:
             is_evaluated = complete(runner, stop)

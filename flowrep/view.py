@@ -56,13 +56,13 @@ def run(config: ViewConfig) -> None:
 
 def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
     """Returns what drives; a run's agent drives in its own scene unless one was given."""
-    from flowrep.policies import load_agent
+    from flowrep.experiment.agents import Agent
 
     is_at_home = Path(config.policy).is_dir() and not is_scene_given
     scene, maps = None if is_at_home else config.scene, config.representations
     here: dict[str, Any] = {"device": "cpu", "num_envs": 1, "num_workers": 0}
     here["algorithm"] = config.algorithm.target
-    return load_agent(config.policy, scene=scene, representations=maps, **here)
+    return Agent.load(config.policy, scene=scene, representations=maps, **here)
 
 
 def street_of(config: ViewConfig) -> dict[str, Any]:

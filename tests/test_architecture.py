@@ -31,9 +31,6 @@ FLOWREP_IMPORTS_ALLOWED = {
     "progress": set(),
     "tables": {"files"},
     "viz": {"viz", "scenes", "geometry", "palette"},
-    "load_agent": set(),
-    "pretrained": {"experiment", "agent", "config"},
-    "policies": {"pretrained", "experiment", "baselines", "config"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
     "config": {"config"},

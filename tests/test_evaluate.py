@@ -18,11 +18,12 @@ from flowrep.config.schema import EvaluateConfig, validated
 from flowrep.envs import WorkerError, workers
 from flowrep.evaluate import run as evaluate
 from flowrep.evaluate import targets_of
-from flowrep.experiment.agents import Agent, PolicyError
+from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import BaselinePolicy, PairedEvaluation
+from flowrep.experiment.exported import export
+from flowrep.experiment.external import PolicyError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
-from flowrep.export import export
 from flowrep.tables import TableError, read_rows
 from tests.config.composing import composed, plain
 
@@ -148,13 +149,13 @@ def some(tmp_path, monkeypatch, driver):
     tiny = ["representations=[obj]", "scene.camera.height_px=12", "scene.camera.width_px=20", SHORT]
     config = composed(*tiny, "device=cpu")
 
-    def load(folder, *, scene=None, **machine):
-        if not folder.path.name.startswith("good"):
-            raise CheckpointError(f"no checkpoint in {folder.path}")
+    def load(path, *, scene=None, algorithm=None, **machine):
+        if not path.name.startswith("good"):
+            raise CheckpointError(f"no checkpoint in {path}")
         return Agent(driver, config.model_copy(update=machine), 64, "straight_road")
 
     def make(*names, overrides=()):
-        monkeypatch.setattr("flowrep.experiment.agents.load_trained", load)
+        monkeypatch.setattr(Agent, "load", load)
         folders = [RunFolder(tmp_path / name) for name in names]
         for folder in folders:
             folder.write_config({})
@@ -347,8 +348,8 @@ def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
     run = saved(tmp_path / "run", *given)
     evaluate(asked(f"run={run.path}", "episodes=3"))
     mine = episodes(run.read_episodes(), "greedy")
-    folder = export(run)
-    assert folder == run.path / "export"
+    folder = run.path / "export"
+    export(Agent.load(run.path, precision="fp32", device="cpu"), folder)
     card = json.loads((folder / "agent.json").read_text())
     assert [each["name"] for each in card["maps"]] == ["ego", "obj"]
     camera = run.read_config()["scene"]["camera"]

@@ -14,15 +14,15 @@ from safetensors.torch import save_file
 
 pytest.importorskip("pybullet", reason="the commands build the simulated street")
 
-from flowrep import pretrained
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
 from flowrep.config import UsageError
-from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
+from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
 from flowrep.evaluate import targets_of
-from flowrep.experiment import film, sweep
+from flowrep.experiment import agents, film, sweep
+from flowrep.experiment.agents import Agent
 from flowrep.experiment.lock import RunFolderError
 from flowrep.experiment.run import RunFolder
-from flowrep.export import export
+from flowrep.export import run as export
 from flowrep.train import resumed
 from flowrep.view import agent_of
 from tests.config.composing import composed, plain
@@ -63,7 +63,7 @@ def view(run, *typed):
 
 
 def exported(run, *typed):
-    return export(run, algorithm=typed[0].partition("=")[2] if typed else None)
+    return export(validated(ExportConfig, plain("export", f"run={run.path}", *typed)))
 
 
 def repeated_sweep(run, *typed):
@@ -74,7 +74,7 @@ def repeated_sweep(run, *typed):
 def packed(run, *_):
     config = run.read_config()
     save_checkpoint(run.path / "x.safetensors", {"config": config, "frames": 1, "policy": {}})
-    return pretrained.load("x")
+    return Agent.load(run.path / "x.safetensors")
 
 
 USES = [resume, evaluate, view, exported, repeated_sweep, packed]
@@ -82,9 +82,8 @@ USES = [resume, evaluate, view, exported, repeated_sweep, packed]
 
 @pytest.mark.parametrize("use", USES)
 @pytest.mark.parametrize("target", ["evil.A", "os.system", "flowrep.agent.load_checkpoint"])
-def test_a_stored_run_names_no_code(stranger, monkeypatch, use, target):
+def test_a_stored_run_names_no_code(stranger, use, target):
     run = stranger(target)
-    monkeypatch.setattr(pretrained, "FOLDER", run.path)
     with pytest.raises(UsageError) as refused:
         use(run)
     assert f"algorithm._target_={target}" in str(refused.value).split()  # what to type
@@ -282,11 +281,11 @@ def test_a_checkpoint_with_other_contents_is_one_error(tmp_path, metadata):
 
 @pytest.mark.parametrize("name", ["../x", "/tmp/x", "."])
 def test_a_pretrained_agent_is_one_of_the_files_that_come_with_flowrep(tmp_path, monkeypatch, name):
-    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "folder")
+    monkeypatch.setattr(agents, "PRETRAINED", tmp_path / "folder")
     (tmp_path / "folder").mkdir()
     (tmp_path / "x.safetensors").write_text("")
     with pytest.raises(UsageError, match="comes with flowrep"):
-        pretrained.load(name)
+        Agent.load("pretrained", scene={"name": name})
 
 
 def test_the_process_in_a_lock_is_plain_text(tmp_path):

@@ -16,9 +16,9 @@ pytest.importorskip("pybullet", reason="the command needs the simulator")
 
 from flowrep.config import UsageError
 from flowrep.config.schema import ViewConfig, validated
+from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import LEGEND_S, Film
 from flowrep.experiment.window import Keyboard, drive_by_hand
-from flowrep.policies import load_agent
 from flowrep.scenes import load_scene
 from flowrep.tables import read_rows
 from flowrep.view import (
@@ -213,7 +213,7 @@ def test_a_key_acts_while_it_is_held():
 @pytest.fixture
 def film():
     scene = composed("debug=smoke").scene
-    film = Film(load_agent("planner", scene=scene, device="cpu", num_envs=1, num_workers=0))
+    film = Film(Agent.load("planner", scene=scene, device="cpu"))
     yield film
     film.close()
 

@@ -20,17 +20,48 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from flowrep.baselines import BaselinePolicy
+from flowrep.config.schema import EnvConfig
 from flowrep.envs import Outcome
 from flowrep.envs.episode import hit_name
+from flowrep.experiment import build
 from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.progress import StopRequest, progress_bar
-from flowrep.scenes import Scene
+from flowrep.scenes import Scene, load_scene
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 _BLIND: dict[str, Any] = {"representations": {}, "noise": None, "num_workers": 0, "device": "cpu"}
 """The env of baselines, which read the simulator and need no observation."""
 _DRAWS = 1  # separates a policy's draws from other draws of an episode's seed
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A policy and the env in which it acts."""
+
+    policy: Policy | str  # writes `action`; or a baseline's name
+    config: EnvConfig
+    frames: int = 0  # that it was trained for; 0 if unknown
+    trained_in: str | None = None  # the name of a scene, None if unknown
+
+    def make_env(self, **changes: Any) -> EnvBase:
+        """Returns an env of its config, with changes of `make_env`'s arguments."""
+        num_envs = changes.get("num_envs", self.config.num_envs)
+        workers = {"num_workers": build.evaluation_workers(self.config, num_envs)}
+        return build.env(self.config, **workers | changes)
+
+    def origin(self, evaluation: str) -> dict[str, Any]:
+        """Returns the fields of an `EpisodeRecord` that say which agent drove where."""
+        scene = load_scene(self.config.scene)
+        return {
+            "scene": scene.name,
+            "scene_id": scene_id(scene),
+            "representations": "+".join(self.config.representations),
+            "flow": self.config.flow.source,
+            "seed": self.config.seed if self.frames else "",
+            "frames": self.frames,
+            "evaluation": evaluation,
+        }
 
 
 class _Running:
@@ -257,7 +288,7 @@ class PairedEvaluation:
     def records(self, **origin: Any) -> list[EpisodeRecord]:
         """Returns the episodes of whole groups, by speed, frame rate, policy and seed.
 
-        `origin` are the fields that say which agent drove, see `Agent.origin`.
+        `origin` are the fields that say which agent drove, see `Driver.origin`.
         """
         whole = [group for group in self._groups.values() if len(group) == len(self._seeds)]
         return [replace(group[seed], **origin) for group in whole for seed in self._seeds]

@@ -16,8 +16,7 @@ from torchrl.data import Categorical
 
 from flowrep.baselines import BaselinePolicy
 from flowrep.envs import street_envs
-from flowrep.experiment.agents import Agent
-from flowrep.experiment.evaluation import evaluate
+from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord, outcome_shares
 from flowrep.files import replace_file
 from flowrep.palette import OUTCOME_COLOURS
@@ -71,7 +70,7 @@ class Film:
         framed: the names of what the agent reads.
     """
 
-    def __init__(self, agent: Agent, **changes: Any) -> None:
+    def __init__(self, agent: Driver, **changes: Any) -> None:
         self.agent = agent
         read = agent.config.representations
         self.env = agent.make_env(
@@ -216,7 +215,9 @@ class Film:
             self.framed.append(label)
 
 
-def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: Any) -> EpisodeRecord:
+def record_episode(
+    agent: Driver, path: Path, *, episode_seed: int, **changes: Any
+) -> EpisodeRecord:
     """Writes the film of one greedy episode; `changes` are of the arguments of `make_env`."""
     with closing(Film(agent, **changes)) as film:
         frames, episode = film.drive({"episode_seed": episode_seed})
@@ -234,7 +235,7 @@ def how_it_ended(episode: EpisodeRecord) -> str:
     return f"{words}{hit} after {seconds:.1f} s, return {episode.return_:.2f}"
 
 
-def _picture_scale(agent: Agent) -> int:
+def _picture_scale(agent: Driver) -> int:
     """Returns the size of the picture in sizes of the maps: a tile's, if it is for films alone.
 
     An estimator's pictures have the size that the config says, whatever is asked for here.

@@ -20,6 +20,7 @@ from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
 from flowrep.config.schema import ALGORITHMS, EstimatedFlow, TrainConfig, validated_run
 from flowrep.config.yaml_file import read_yaml
+from flowrep.experiment import build
 from flowrep.experiment.lock import FolderLock, RunFolderError, locked
 from flowrep.experiment.loggers import Loggers
 from flowrep.experiment.outcomes import (
@@ -185,6 +186,13 @@ class RunFolder:
         """The file for a video of that name."""
         return self.path / "videos" / f"{name}.mp4"
 
+    def begin(self, config: TrainConfig, overrides: Iterable[str]) -> TrainConfig:
+        """Writes the config of a new run, in which `precision=auto` is resolved, and returns it."""
+        self.check_is_new()
+        config = build.with_precision(config)
+        self.write_config(config.plain(), overrides)
+        return config
+
     def write_config(self, config: Mapping[str, Any], overrides: Iterable[str] = ()) -> None:
         """Writes the resolved config, and the typed overrides where Hydra keeps them."""
         self._prepare()
@@ -208,7 +216,8 @@ class RunFolder:
         return validated_run(self.read_config(), str(self.config_path), algorithm)
 
     def note_machine(self, machine: Mapping[str, Any]) -> None:
-        """Adds what the run is computed with to machine.json, unless it was there last."""
+        """Appends this machine to machine.json, unless it is already the last entry."""
+        self._prepare()
         path = self.path / "machine.json"
         noted: list[Any] = []
         if path.is_file():
