@@ -23,6 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from flowrep.config import UsageError
 from flowrep.config.cli import folder_name, run_command
 from flowrep.config.schema import ViewConfig
+from flowrep.files import replace_files
 from flowrep.palette import CATEGORY_ID
 from flowrep.progress import progress_bar
 from flowrep.tables import write_rows
@@ -107,7 +108,7 @@ def view(
         "categories": category_rows(scene.categories, (frame.maps["seg"] for frame in frames)),
     }
     folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=folder, prefix=".new") as name:
+    with TemporaryDirectory() as name:
         new = Path(name)
         if config.video:
             pictures = film.pictures(frames, episode)
@@ -118,22 +119,16 @@ def view(
         draw_plan(Layout(scene), tracks, path=path).savefig(new / "plan.png", dpi=110)
         for title, rows in tables.items():
             write_rows(new / f"{title}.csv", rows)
-        replace_files(new, folder)
+        there = {path.name: path.read_bytes() for path in new.iterdir()}
+    replace_files(folder, there)
+    for name in {*FILES} - {*there}:  # of an earlier view with a film
+        (folder / name).unlink(missing_ok=True)
     shown = ("path", "episode_seed", "outcome", "hit", "return", "length")
     print_table("episodes", [{name: row[name] for name in shown} for row in tables["episodes"]])
     print_table("categories", tables["categories"])
     arrived = sum(each.outcome == "success" for each in episodes)
     print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
     print(f"{folder}: {', '.join(each for each in FILES if (folder / each).exists())}")
-
-
-def replace_files(new: Path, folder: Path) -> None:
-    """Moves the files of a view into a folder, and removes those that an earlier one left there."""
-    for name in FILES:
-        if (new / name).exists():
-            (new / name).replace(folder / name)
-        else:
-            (folder / name).unlink(missing_ok=True)
 
 
 def drive_on(

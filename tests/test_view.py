@@ -30,7 +30,6 @@ from flowrep.view import (
     folder_of,
     moments,
     moving_pixels,
-    replace_files,
 )
 from flowrep.view import view as show
 from tests.config.composing import composed, plain
@@ -107,14 +106,17 @@ def test_a_folder_belongs_to_a_scene_and_a_policy():
 
 
 def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
-    old, new = tmp_path / "old", tmp_path / "new"
-    for folder, names in ((old, [*FILES, "notes.txt"]), (new, ["sheet.png", "plan.png"])):
-        folder.mkdir()
-        for name in names:
-            (folder / name).write_text(folder.name)
-    replace_files(new, old)  # of a view with video=false
-    left = {path.name: path.read_text() for path in old.iterdir()}
-    assert left == {"sheet.png": "new", "plan.png": "new", "notes.txt": "old"}
+    for name in (*FILES, "notes.txt"):
+        (tmp_path / name).write_text("old")
+    config = asked("scene.time_limit_steps=3", *SMALL, "episodes=1", "video=false")
+    agent = agent_of(config, is_scene_given=True)
+    with closing(Film(agent)) as film:
+        show(config, agent, film, episodes_of(config, film.street.scene), tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {*FILES, "notes.txt"} - {"episode.mp4"}
+    assert [path.name for path in tmp_path.iterdir() if path.read_bytes() == b"old"] == [
+        "notes.txt"
+    ]
 
 
 @pytest.mark.slow

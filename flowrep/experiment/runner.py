@@ -22,6 +22,7 @@ from flowrep.agent import (
 from flowrep.agent.observation import compute_dtype, has_bf16
 from flowrep.config.schema import TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
+from flowrep.envs.workers import sheltered
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import Driver, PairedEvaluation
 from flowrep.experiment.outcomes import OUTCOMES, print_results
@@ -52,7 +53,9 @@ class Runner:
         torch.manual_seed(config.seed)
         self.env = build.env(config, compiled=config.compiled)
         self.env.set_seed(config.seed * config.num_envs)
-        self.agent = build.agent(config, self.env)
+        # TorchRL's storage starts multiprocessing's resource tracker, which a hang-up would end
+        with sheltered():
+            self.agent = build.agent(config, self.env)
         self.frames = 0  # of the environment, so far
         self.observation: TensorDictBase | None = None  # what is acted on next
         self.evaluation_pending = False  # the last one was interrupted and has to be run again
