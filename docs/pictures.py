@@ -16,10 +16,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from flowrep import pretrained
+from flowrep import Agent
 from flowrep.experiment.film import OUTCOME_S, Film
 from flowrep.geometry import ego_flow, unproject
-from flowrep.policies import load_agent
 from flowrep.scenes import load_scene
 from flowrep.transforms import EstimatedFlow
 from flowrep.viz import (
@@ -60,8 +59,7 @@ def main(folder: Path) -> None:
 
 def drive(scene, seed):
     """Returns the maps and the sensors of each step of a planner's drive, and K."""
-    agent = load_agent("planner", scene=asdict(scene), device="cpu", num_envs=1, num_workers=0)
-    film, steps = Film(agent), []
+    film, steps = Film(Agent.load("planner", scene=asdict(scene), device="cpu")), []
     K = torch.as_tensor(film.street.K)
     frames, _ = film.drive({"episode_seed": seed}, lambda step: steps.append(step["sensor"][0]))
     film.close()
@@ -86,7 +84,7 @@ def three_ways(maps):
 
 def write_gif(path: Path, seed: int = 1, last: int = 72, every: int = 2) -> None:
     """Films the end of a trained agent's drive: the picture, the classes, and what it reads."""
-    film = Film(pretrained.load("straight_road", device="cpu"))
+    film = Film(Agent.load("pretrained", scene="straight_road", device="cpu"))
     film.tiles = {name: film.tiles[name] for name in ("rgb", "seg", "obj")}
     frames, episode = film.drive({"episode_seed": seed})
     film.close()

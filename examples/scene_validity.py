@@ -9,10 +9,10 @@ from collections import Counter
 
 from flowrep.baselines import BASELINES
 from flowrep.envs import make_env
-from flowrep.experiment.evaluation import evaluate, wilson_interval
+from flowrep.experiment.evaluation import evaluate
+from flowrep.experiment.outcomes import OUTCOMES, wilson_interval
 from flowrep.scenes import load_scene, scene_names
 
-OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
 BOUNDS = {"planner": (0.95, 1.0), "never_turn": (0.0, 0.15), "random": (0.0, 0.05)}
 
 

@@ -20,9 +20,13 @@ else:
 
 
 def __getattr__(name: str) -> Any:
-    """Imports `flowrep.diagnose`, and with it PyTorch, when it is asked for."""
+    """Imports `diagnose` and `Agent`, and with them PyTorch, when they are first used."""
     if name == "diagnose":
         from flowrep.diagnosis import diagnose
 
         return diagnose
+    if name == "Agent":
+        from flowrep.experiment.agents import Agent
+
+        return Agent
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

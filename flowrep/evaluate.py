@@ -24,7 +24,7 @@ from flowrep.progress import StopRequest
 
 if TYPE_CHECKING:
     from flowrep.experiment.agents import Agent
-    from flowrep.experiment.evaluation import Comparison
+    from flowrep.experiment.evaluation import PairedEvaluation
     from flowrep.experiment.run import RunFolder
 
 
@@ -46,13 +46,13 @@ def run(config: EvaluateConfig) -> None:
 
     keep_freed_memory()
     targets = targets_of(config)
-    comparisons: dict[str, Comparison] = {}
+    evaluations: dict[str, PairedEvaluation] = {}
     failed: list[str] = []
     with StopRequest() as stop:
         for target in targets:
             try:
                 with target.folder.held("evaluating"):
-                    evaluate_one(config, target, comparisons, stop)
+                    evaluate_one(config, target, evaluations, stop)
             except Exception as error:
                 if len(targets) == 1 or not is_a_mistake(error):
                     raise
@@ -67,9 +67,8 @@ def run(config: EvaluateConfig) -> None:
 
 def targets_of(config: EvaluateConfig) -> list[Target]:
     """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own."""
-    from flowrep.experiment.agents import load_trained
+    from flowrep.experiment.agents import Agent
     from flowrep.experiment.run import RunFolder
-    from flowrep.policies import load_agent
 
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.own_policies:
@@ -78,8 +77,8 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
             for run in RunFolder.all_in(path):
                 runs.setdefault(run.path.resolve(), run)
         trusted = config.algorithm.target
-        load = partial(load_trained, scene=config.scene, algorithm=trusted, **machine)
-        return [Target(run, partial(load, run), config.policy) for run in runs.values()]
+        load = partial(Agent.load, scene=config.scene, algorithm=trusted, **machine)
+        return [Target(run, partial(load, run.path), config.policy) for run in runs.values()]
     keys = ("scene", "representations", "flow", "motion", "noise")
     seen = {key: getattr(config, key) for key in keys}
     targets = []
@@ -87,42 +86,45 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
-        load = partial(load_agent, name, **seen, **machine)
+        load = partial(Agent.load, name, **seen, **machine)
         targets.append(Target(RunFolder(folder), load, [name]))
     return targets
 
 
 def evaluate_one(
-    config: EvaluateConfig, target: Target, comparisons: dict[str, Comparison], stop: StopRequest
+    config: EvaluateConfig,
+    target: Target,
+    evaluations: dict[str, PairedEvaluation],
+    stop: StopRequest,
 ) -> None:
-    """Runs an agent's episodes, keeps finished ones even if interrupted, and films some."""
+    """Runs an agent's episodes, keeps whole groups even if interrupted, and films some."""
     from flowrep.experiment import build
-    from flowrep.experiment.evaluation import Comparison, print_results
+    from flowrep.experiment.evaluation import PairedEvaluation
+    from flowrep.experiment.outcomes import print_results
 
     agent, folder = target.load(), target.folder
+    folder.read_episodes()  # a damaged table is refused before hours of episodes, not after
     if not config.own_policies:  # whose networks may be large
         build.share_cores(agent.config)
     origin = agent.origin("evaluate")
     # agents of one scene share the baselines' episodes
     episodes = config.speed, config.fps, config.episodes, config.seed
-    comparison = comparisons.setdefault(
+    evaluation = evaluations.setdefault(
         f"{origin['scene_id']} {target.policies}",
-        Comparison(*episodes, target.policies, config.baselines),
+        PairedEvaluation(*episodes, target.policies, config.baselines),
     )
-    table = folder.read_episodes()
-    num_envs = agent.config.num_envs
 
     def try_to_save() -> None:
-        with suppress(OSError):  # the last time, it is reported
-            folder.save_episodes(comparison.rows(**origin), table)
+        with suppress(OSError):  # at the end it is reported
+            folder.save_episodes(evaluation.records(**origin))
 
+    num_envs = agent.config.num_envs
     try:
-        comparison.run(agent.make_env, agent.policy, num_envs, stop=stop, save=try_to_save)
+        evaluation.run(agent.make_env, agent.policy, num_envs, stop=stop, save=try_to_save)
     finally:
-        if rows := comparison.rows(**origin):
+        if records := evaluation.records(**origin):
             try:
-                positions = [episode.positions for _, episode in comparison.results()]
-                folder.log_episodes(rows, positions, table)
+                folder.log_episodes(records, drives=True)
                 folder.write_failures()
             except OSError as error:
                 raise OSError(
@@ -130,15 +132,13 @@ def evaluate_one(
                     "evaluate again"
                 ) from error
             print(folder.path)
-            if whole := comparison.rows(only_whole=True, **origin):
-                print_results(whole)
-            if len(whole) < len(rows):
-                print(
-                    f"{len(rows) - len(whole)} episodes are of a policy, speed and frame rate that "
-                    "lack others. Short episodes end first: compare them after the same command "
-                    "has run to its end"
-                )
-            print(f"{len(rows)} of {comparison.total} episodes are in {folder.evaluation_path}")
+            print_results([record.row() for record in records])
+            print(f"{len(records)} of {evaluation.total} episodes are in {folder.evaluation_path}")
+        if stop and len(records) < evaluation.total:
+            print(
+                "stopped: a policy, speed and frame rate of which some episodes were missing is "
+                "left out, as short episodes end first; the same command runs all of them again"
+            )
     film(config, agent, folder, stop)
 
 

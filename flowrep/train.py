@@ -17,10 +17,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from flowrep import sweep
 from flowrep.config import UsageError
 from flowrep.config.cli import OF_THE_MACHINE, checked, end_with, exit_with, line_for, run_command
 from flowrep.config.schema import TrainConfig
+from flowrep.experiment import sweep
+from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.progress import StopRequest
 
 if TYPE_CHECKING:
@@ -55,7 +56,6 @@ def run(config: TrainConfig) -> float:
 
     Returns its final success, which a sweeper such as Optuna maximises.
     """
-    from flowrep.experiment import build
     from flowrep.experiment.run import RunFolder
 
     job = HydraConfig.get()
@@ -66,9 +66,7 @@ def run(config: TrainConfig) -> float:
             return finish(resumed(config, folder, typed), folder)
     folder = RunFolder(job.runtime.output_dir)
     with folder.held("training"):
-        folder.check_is_new()
-        config = build.with_precision(config)
-        folder.write_config(config.plain(), typed)
+        config = folder.begin(config, typed)
         announce(config, str(job.runtime.choices.get("preset")))
         return finish(config, folder)
 
@@ -125,9 +123,7 @@ def announce(config: TrainConfig, preset: str) -> None:
 def finish(config: TrainConfig, folder: RunFolder) -> float:
     """Does what remains of a run (training, evaluation, video) and returns its success."""
     from flowrep.agent import CheckpointError, DivergenceError
-    from flowrep.agent.observation import compute_dtype
     from flowrep.envs import WorkerError
-    from flowrep.experiment.run import machine_of
     from flowrep.experiment.runner import Runner
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
@@ -136,10 +132,6 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
         runner = Runner(config, folder)
         if config.resume is not None:
             runner.load()
-        folder.log_to_wandb(config.wandb, config.plain())
-        precision = getattr(config.algorithm, "precision", "fp32")
-        machine = machine_of(compute_dtype(precision, runner.agent.device))
-        folder.note_machine(machine | {"threads": config.threads})
         print(f"run folder: {folder.path}")
         try:
             is_evaluated = complete(runner, stop)
@@ -156,13 +148,13 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
         print(f"\nstopped after {runner.frames} frames; the run is saved. Continue with")
         print(f"  {how_to_go_on}")
         sys.exit(stop.exit_code)
-    return sweep.success_of(folder.path)
+    return success_of(folder.path)
 
 
 def complete(runner: Runner, stop: StopRequest) -> bool:
     """Trains and evaluates as far as that is not done yet; returns whether all is done."""
     config, folder = runner.config, runner.folder
-    if sweep.is_finished(folder.path, config):
+    if is_finished(folder.path, config):
         how = line_for("evaluate", run=str(folder.path))
         print(f"this run is complete; evaluate it with: {how}")
     else:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from contextlib import closing
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from flowrep.config import UsageError
 from flowrep.config.cli import folder_name, run_command
 from flowrep.config.schema import ViewConfig
+from flowrep.files import replace_files
 from flowrep.palette import CATEGORY_ID
 from flowrep.progress import progress_bar
 from flowrep.tables import write_rows
@@ -29,8 +31,8 @@ from flowrep.viz import contact_sheet, write_png, write_video
 
 if TYPE_CHECKING:
     from flowrep.experiment.agents import Agent
-    from flowrep.experiment.evaluation import Episode
     from flowrep.experiment.film import Film
+    from flowrep.experiment.outcomes import EpisodeRecord
     from flowrep.scenes import Scene
 
 ENVS = 16  # side by side, for the episodes that are not filmed
@@ -55,13 +57,13 @@ def run(config: ViewConfig) -> None:
 
 def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
     """Returns what drives; a run's agent drives in its own scene unless one was given."""
-    from flowrep.policies import load_agent
+    from flowrep.experiment.agents import Agent
 
     is_at_home = Path(config.policy).is_dir() and not is_scene_given
     scene, maps = None if is_at_home else config.scene, config.representations
     here: dict[str, Any] = {"device": "cpu", "num_envs": 1, "num_workers": 0}
     here["algorithm"] = config.algorithm.target
-    return load_agent(config.policy, scene=scene, representations=maps, **here)
+    return Agent.load(config.policy, scene=scene, representations=maps, **here)
 
 
 def street_of(config: ViewConfig) -> dict[str, Any]:
@@ -89,7 +91,7 @@ def view(
     config: ViewConfig, agent: Agent, film: Film, options: list[dict[str, Any]], folder: Path
 ) -> None:
     """Drives episodes and writes their pictures, plan, film and tables into a folder."""
-    from flowrep.experiment.evaluation import print_table
+    from flowrep.experiment.outcomes import print_table
     from flowrep.scenes.layout import Layout
     from flowrep.viz.plan import Track, draw_plan
 
@@ -100,12 +102,13 @@ def view(
     tracks = [Track(each.positions.astype(float), each.outcome) for each in episodes]
     # Closed exits belong to a path; they are drawn if all episodes took the same one.
     path = episode.path if all(each.path == episode.path for each in episodes) else None
+    origin = agent.origin("view") | {"policy": config.policy}
     tables = {
-        "episodes": [each.row() for each in episodes],
+        "episodes": [replace(each, **origin).row() for each in episodes],
         "categories": category_rows(scene.categories, (frame.maps["seg"] for frame in frames)),
     }
     folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=folder, prefix=".new") as name:
+    with TemporaryDirectory() as name:
         new = Path(name)
         if config.video:
             pictures = film.pictures(frames, episode)
@@ -116,24 +119,21 @@ def view(
         draw_plan(Layout(scene), tracks, path=path).savefig(new / "plan.png", dpi=110)
         for title, rows in tables.items():
             write_rows(new / f"{title}.csv", rows)
-        replace_files(new, folder)
-    for title, rows in tables.items():
-        print_table(title, rows)
+        there = {path.name: path.read_bytes() for path in new.iterdir()}
+    replace_files(folder, there)
+    for name in {*FILES} - {*there}:  # of an earlier view with a film
+        (folder / name).unlink(missing_ok=True)
+    shown = ("path", "episode_seed", "outcome", "hit", "return", "length")
+    print_table("episodes", [{name: row[name] for name in shown} for row in tables["episodes"]])
+    print_table("categories", tables["categories"])
     arrived = sum(each.outcome == "success" for each in episodes)
     print(f"{config.policy}: {arrived} of {len(episodes)} episodes end in success")
     print(f"{folder}: {', '.join(each for each in FILES if (folder / each).exists())}")
 
 
-def replace_files(new: Path, folder: Path) -> None:
-    """Moves the files of a view into a folder, and removes those that an earlier one left there."""
-    for name in FILES:
-        if (new / name).exists():
-            (new / name).replace(folder / name)
-        else:
-            (folder / name).unlink(missing_ok=True)
-
-
-def drive_on(config: ViewConfig, agent: Agent, options: list[dict[str, Any]]) -> list[Episode]:
+def drive_on(
+    config: ViewConfig, agent: Agent, options: list[dict[str, Any]]
+) -> list[EpisodeRecord]:
     """Returns the episodes after the first, in their order, with what the policy sees alone."""
     from flowrep.experiment.evaluation import evaluate
 
@@ -143,7 +143,7 @@ def drive_on(config: ViewConfig, agent: Agent, options: list[dict[str, Any]]) ->
         ended = evaluate(env, agent.policy, options)
         counted = {"desc": "driving on", "unit": "episode", "total": len(options)}
         episodes = list(progress_bar(ended, what="driving on", **counted))
-    return sorted(episodes, key=lambda episode: episode.seed)
+    return sorted(episodes, key=lambda episode: episode.episode_seed)
 
 
 def category_rows(categories: Iterable[str], seg: Iterable[Any]) -> list[dict[str, Any]]:

@@ -31,12 +31,8 @@ FLOWREP_IMPORTS_ALLOWED = {
     "progress": set(),
     "tables": {"files"},
     "viz": {"viz", "scenes", "geometry", "palette"},
-    "load_agent": set(),
-    "pretrained": {"experiment", "agent", "config"},
-    "policies": {"pretrained", "experiment", "baselines", "config"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
-    "sweep": {"config", "progress", "tables", "files"},
     "config": {"config"},
     "report": {"report", "viz", "config", "experiment", "agent", "envs", "scenes"}
     | {"extras", "tables", "files"},
@@ -49,7 +45,7 @@ THIRD_PARTY_ONLY_IN = {
         "view.py",
         "factorize.py",
         "config/cli.py",
-        "sweep.py",
+        "experiment/sweep.py",
         "torchrl_configs.py",
         "transforms/hydra_configs.py",
     },

@@ -191,6 +191,22 @@ def test_the_data_guide_runs_and_gives_what_it_says():
     assert namespace["prev_from_curr"][:3, 3].tolist() == [0.0, 0.0, 2.0]
 
 
+@pytest.mark.slow
+def test_an_agent_is_trained_evaluated_saved_and_loaded_as_the_page_of_runs_says(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    code, scope = python_of(DOCS / "runs.md"), {}
+    for usual, quick in (('preset="laptop"', 'debug="smoke"'), ("episodes=100", "episodes=1")):
+        assert usual in code
+        code = code.replace(usual, quick)
+    exec(code, scope)
+    assert [each.speed for each in scope["episodes"]] == ["low", "normal", "high"]
+    assert scope["agent"].frames == 256
+    (folder,) = (tmp_path / "outputs").glob("*/*_straight_road_ego+obj_s0")
+    assert (folder / "checkpoint" / "latest.safetensors").exists()
+
+
 def test_the_guides_own_representation_works_in_an_env():
     scope: dict = {}
     exec(python_of(DOCS / "adding_a_representation.md"), scope)

@@ -18,12 +18,13 @@ from flowrep.config.schema import EvaluateConfig, validated
 from flowrep.envs import WorkerError, workers
 from flowrep.evaluate import run as evaluate
 from flowrep.evaluate import targets_of
-from flowrep.experiment.agents import Agent, PolicyError
-from flowrep.experiment.evaluation import BaselinePolicy
+from flowrep.experiment.agents import Agent
+from flowrep.experiment.evaluation import BaselinePolicy, PairedEvaluation
+from flowrep.experiment.exported import export
+from flowrep.experiment.external import PolicyError
 from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Runner
-from flowrep.export import export
-from flowrep.tables import TableError
+from flowrep.tables import TableError, read_rows
 from tests.config.composing import composed, plain
 
 pytestmark = pytest.mark.slow
@@ -116,9 +117,7 @@ def test_an_edited_config_is_refused(untouched):
 
 def test_a_damaged_table_is_refused_before_an_episode_is_run(untouched, monkeypatch):
     untouched.evaluation_path.write_text("scene;fps\nstraight_road;12\n")
-    monkeypatch.setattr(
-        "flowrep.experiment.evaluation.Comparison.run", lambda *_, **__: pytest.fail("too late")
-    )
+    monkeypatch.setattr(PairedEvaluation, "run", lambda *_, **__: pytest.fail("too late"))
     with pytest.raises(TableError, match=r"evaluation\.csv"):
         evaluate(asked(f"run={untouched.path}"))
 
@@ -150,13 +149,13 @@ def some(tmp_path, monkeypatch, driver):
     tiny = ["representations=[obj]", "scene.camera.height_px=12", "scene.camera.width_px=20", SHORT]
     config = composed(*tiny, "device=cpu")
 
-    def load(folder, *, scene=None, **machine):
-        if not folder.path.name.startswith("good"):
-            raise CheckpointError(f"no checkpoint in {folder.path}")
+    def load(path, *, scene=None, algorithm=None, **machine):
+        if not path.name.startswith("good"):
+            raise CheckpointError(f"no checkpoint in {path}")
         return Agent(driver, config.model_copy(update=machine), 64, "straight_road")
 
     def make(*names, overrides=()):
-        monkeypatch.setattr("flowrep.experiment.agents.load_trained", load)
+        monkeypatch.setattr(Agent, "load", load)
         folders = [RunFolder(tmp_path / name) for name in names]
         for folder in folders:
             folder.write_config({})
@@ -225,12 +224,18 @@ def worker_processes(monkeypatch):
 
 
 MANY = ["speed=[low,high]", "episodes=8", "num_envs=4", "baselines=[never_turn]"]
+STEPS_OF_A_GROUP = 100  # 8 episodes of at most 40 steps, 4 at a time
+
+
+def of_low_speed(rows):
+    """The greedy episodes at low speed, the first group that is run."""
+    return [row for row in rows if (row["speed"], row["policy"]) == ("low", "greedy")]
 
 
 @pytest.mark.parametrize(
     ("number", "num_workers"), [(signal.SIGINT, 0), (signal.SIGTERM, 2), (signal.SIGHUP, 2)]
 )
-def test_an_evaluation_that_was_stopped_keeps_what_ended_and_leaves_no_trace_once_it_is_run_again(
+def test_an_evaluation_that_was_stopped_keeps_whole_groups_and_leaves_no_trace_once_run_again(
     some, driver, worker_processes, number, num_workers
 ):
     (whole, folder), config = some("good_1", "good_2", overrides=MANY)
@@ -243,16 +248,18 @@ def test_an_evaluation_that_was_stopped_keeps_what_ended_and_leaves_no_trace_onc
         for process in (*worker_processes, os.getpid()):
             os.kill(process, number)
 
-    driver.at, driver.act = driver.steps + 60, signal_all
+    driver.at, driver.act = driver.steps + STEPS_OF_A_GROUP, signal_all
     again = config.model_copy(update={"run": [str(folder.path)]})
     worker_processes.clear()
     with pytest.raises(SystemExit) as ended:
         evaluate(again)
     assert len(worker_processes) == num_workers
     assert ended.value.code == 128 + number
-    kept = folder.read_episodes()
-    assert 0 < len(kept) < 16
-    assert kept == [row for row in rows if row in kept]
+    assert folder.read_episodes() == of_low_speed(rows)
+    failures = read_rows(folder.failures_path)
+    assert [(row["speed"], row["policy"], row["episodes"]) for row in failures] == [
+        ("low", "greedy", "8")
+    ]
     evaluate(again)
     assert folder.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
 
@@ -261,10 +268,12 @@ def test_a_worker_that_is_killed_is_named_and_what_ended_before_is_kept(
     some, driver, worker_processes
 ):
     (folder,), config = some("good", overrides=MANY)
-    driver.at, driver.act = 60, lambda: os.kill(worker_processes[0], signal.SIGKILL)
+    driver.at, driver.act = STEPS_OF_A_GROUP, lambda: os.kill(worker_processes[0], signal.SIGKILL)
     with pytest.raises(WorkerError, match=r"environments 0 to 1 is gone \(exit code -9\)"):
         evaluate(config.model_copy(update={"num_workers": 2}))
-    assert 0 < len(folder.read_episodes()) < 16
+    rows = folder.read_episodes()
+    assert len(rows) == 8
+    assert rows == of_low_speed(rows)
 
 
 def test_ctrl_c_keeps_what_was_run_and_says_so_to_the_shell(some, monkeypatch):
@@ -339,8 +348,8 @@ def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
     run = saved(tmp_path / "run", *given)
     evaluate(asked(f"run={run.path}", "episodes=3"))
     mine = episodes(run.read_episodes(), "greedy")
-    folder = export(run)
-    assert folder == run.path / "export"
+    folder = run.path / "export"
+    export(Agent.load(run.path, precision="fp32", device="cpu"), folder)
     card = json.loads((folder / "agent.json").read_text())
     assert [each["name"] for each in card["maps"]] == ["ego", "obj"]
     camera = run.read_config()["scene"]["camera"]

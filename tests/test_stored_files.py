@@ -14,17 +14,19 @@ from safetensors.torch import save_file
 
 pytest.importorskip("pybullet", reason="the commands build the simulated street")
 
-from flowrep import pretrained, sweep
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
 from flowrep.config import UsageError
-from flowrep.config.schema import EvaluateConfig, ViewConfig, validated
+from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
 from flowrep.evaluate import targets_of
-from flowrep.experiment import film
-from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolder, RunFolderError
-from flowrep.export import export
+from flowrep.experiment import agents, film, sweep
+from flowrep.experiment.agents import Agent
+from flowrep.experiment.lock import RunFolderError
+from flowrep.experiment.run import RunFolder
+from flowrep.export import run as export
 from flowrep.train import resumed
 from flowrep.view import agent_of
 from tests.config.composing import composed, plain
+from tests.experiment.test_run import episode
 
 EVIL = "import pathlib; pathlib.Path(__file__).with_name('PWNED').touch()\nclass A: pass\n"
 
@@ -61,7 +63,7 @@ def view(run, *typed):
 
 
 def exported(run, *typed):
-    return export(run, algorithm=typed[0].partition("=")[2] if typed else None)
+    return export(validated(ExportConfig, plain("export", f"run={run.path}", *typed)))
 
 
 def repeated_sweep(run, *typed):
@@ -72,7 +74,7 @@ def repeated_sweep(run, *typed):
 def packed(run, *_):
     config = run.read_config()
     save_checkpoint(run.path / "x.safetensors", {"config": config, "frames": 1, "policy": {}})
-    return pretrained.load("x")
+    return Agent.load(run.path / "x.safetensors")
 
 
 USES = [resume, evaluate, view, exported, repeated_sweep, packed]
@@ -80,9 +82,8 @@ USES = [resume, evaluate, view, exported, repeated_sweep, packed]
 
 @pytest.mark.parametrize("use", USES)
 @pytest.mark.parametrize("target", ["evil.A", "os.system", "flowrep.agent.load_checkpoint"])
-def test_a_stored_run_names_no_code(stranger, monkeypatch, use, target):
+def test_a_stored_run_names_no_code(stranger, use, target):
     run = stranger(target)
-    monkeypatch.setattr(pretrained, "FOLDER", run.path)
     with pytest.raises(UsageError) as refused:
         use(run)
     assert f"algorithm._target_={target}" in str(refused.value).split()  # what to type
@@ -184,10 +185,9 @@ def victim(tmp_path):
     return path
 
 
-ROW = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"outcome": "success"}
 WRITES = {
     "metrics.csv": lambda run: run.log_metrics(10, {"alpha": 0.5}),
-    "evaluation.csv": lambda run: run.save_episodes([ROW]),
+    "evaluation.csv": lambda run: run.save_episodes([episode(1)]),
     "failures.csv": lambda run: run.write_failures(),
     "machine.json": lambda run: run.note_machine({"cpu": "x"}),
     "config.yaml": lambda run: run.write_config({"seed": 1}),
@@ -246,11 +246,11 @@ def test_a_lock_that_is_a_link_is_refused_and_its_target_kept(tmp_path, victim, 
 
 @pytest.mark.parametrize("text", ["../../x", "a/b", "", "x" * 65, "a\nb"])
 def test_a_wandb_id_that_is_a_path_is_refused(tmp_path, monkeypatch, text):
-    monkeypatch.setattr("flowrep.experiment.run.require", lambda *_: None)
+    monkeypatch.setattr("flowrep.experiment.loggers.require", lambda *_: None)
     monkeypatch.setitem(sys.modules, "wandb", object())
     (tmp_path / "wandb_id").write_text(text)
     with pytest.raises(RunFolderError, match="wandb_id"):
-        RunFolder(tmp_path).log_to_wandb("offline", {})
+        RunFolder(tmp_path).loggers.add_wandb("offline", {})
 
 
 # Checkpoints that were made to be read.
@@ -281,11 +281,11 @@ def test_a_checkpoint_with_other_contents_is_one_error(tmp_path, metadata):
 
 @pytest.mark.parametrize("name", ["../x", "/tmp/x", "."])
 def test_a_pretrained_agent_is_one_of_the_files_that_come_with_flowrep(tmp_path, monkeypatch, name):
-    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "folder")
+    monkeypatch.setattr(agents, "PRETRAINED", tmp_path / "folder")
     (tmp_path / "folder").mkdir()
     (tmp_path / "x.safetensors").write_text("")
     with pytest.raises(UsageError, match="comes with flowrep"):
-        pretrained.load(name)
+        Agent.load("pretrained", scene={"name": name})
 
 
 def test_the_process_in_a_lock_is_plain_text(tmp_path):

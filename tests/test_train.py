@@ -147,11 +147,15 @@ def test_a_run_on_estimated_flow_is_trained_evaluated_and_filmed(tmp_path):
     assert (run / "videos" / "episode_normal.mp4").stat().st_size > 1e4
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_an_interrupted_run_saves_and_says_how_to_go_on(tmp_path, short_folder, number):
+@pytest.mark.parametrize(
+    ("number", "num_workers"), [(signal.SIGINT, 2), (signal.SIGHUP, 2), (signal.SIGHUP, 0)]
+)
+def test_an_interrupted_run_saves_and_says_how_to_go_on(
+    tmp_path, short_folder, number, num_workers
+):
     line = [
         sys.executable, "-m", "flowrep.train", "debug=smoke", "total_frames=1000000",
-        "log_every_frames=16", "checkpoint_every_frames=1000000", "num_workers=2",
+        "log_every_frames=16", "checkpoint_every_frames=1000000", f"num_workers={num_workers}",
         f"hydra.run.dir={tmp_path}/run",
     ]  # fmt: skip
     process = subprocess.Popen(

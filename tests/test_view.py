@@ -16,9 +16,9 @@ pytest.importorskip("pybullet", reason="the command needs the simulator")
 
 from flowrep.config import UsageError
 from flowrep.config.schema import ViewConfig, validated
+from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import LEGEND_S, Film
 from flowrep.experiment.window import Keyboard, drive_by_hand
-from flowrep.policies import load_agent
 from flowrep.scenes import load_scene
 from flowrep.tables import read_rows
 from flowrep.view import (
@@ -30,7 +30,6 @@ from flowrep.view import (
     folder_of,
     moments,
     moving_pixels,
-    replace_files,
 )
 from flowrep.view import view as show
 from tests.config.composing import composed, plain
@@ -92,7 +91,7 @@ def test_a_run_and_a_policy_of_ones_own_drive_as_baselines_do(tmp_path):
         assert film.street.scene.name == scene  # a run's agent is at home in its own
         film.close()
         ended[policy] = drive_on(config, agent, options_of(config))
-        assert [episode.seed for episode in ended[policy]] == [0, 1, 2]
+        assert [episode.episode_seed for episode in ended[policy]] == [0, 1, 2]
     never = driven(asked("policy=never_turn", "scene=s_turn", "episodes=3"))
     assert [e.outcome for e in ended[f"{path}:make"]] == [e.outcome for e in never]
 
@@ -107,14 +106,17 @@ def test_a_folder_belongs_to_a_scene_and_a_policy():
 
 
 def test_a_view_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path):
-    old, new = tmp_path / "old", tmp_path / "new"
-    for folder, names in ((old, [*FILES, "notes.txt"]), (new, ["sheet.png", "plan.png"])):
-        folder.mkdir()
-        for name in names:
-            (folder / name).write_text(folder.name)
-    replace_files(new, old)  # of a view with video=false
-    left = {path.name: path.read_text() for path in old.iterdir()}
-    assert left == {"sheet.png": "new", "plan.png": "new", "notes.txt": "old"}
+    for name in (*FILES, "notes.txt"):
+        (tmp_path / name).write_text("old")
+    config = asked("scene.time_limit_steps=3", *SMALL, "episodes=1", "video=false")
+    agent = agent_of(config, is_scene_given=True)
+    with closing(Film(agent)) as film:
+        show(config, agent, film, episodes_of(config, film.street.scene), tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {*FILES, "notes.txt"} - {"episode.mp4"}
+    assert [path.name for path in tmp_path.iterdir() if path.read_bytes() == b"old"] == [
+        "notes.txt"
+    ]
 
 
 @pytest.mark.slow
@@ -213,7 +215,7 @@ def test_a_key_acts_while_it_is_held():
 @pytest.fixture
 def film():
     scene = composed("debug=smoke").scene
-    film = Film(load_agent("planner", scene=scene, device="cpu", num_envs=1, num_workers=0))
+    film = Film(Agent.load("planner", scene=scene, device="cpu"))
     yield film
     film.close()
 

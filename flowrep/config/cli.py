@@ -6,6 +6,7 @@ at the edge. `HYDRA_FULL_ERROR=1` shows the traceback as well.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -73,6 +74,33 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[S
             problem = f"the output folder can't be made ({error}): give another with hydra.run.dir="
             error = UsageError(problem)
         end_with(error, schema)
+
+
+def composed(
+    config_name: str, values: Mapping[str, Any], schema: type[Section]
+) -> tuple[Any, str, list[str]]:
+    """Returns the model of a command's config in which keys have these values, for use in Python.
+
+    With it come the folder that the command would choose, and the values as overrides.
+    """
+    typed = list(_overrides(values))
+    register_resolvers()
+    try:
+        with hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+            config = hydra.compose(config_name, typed, return_hydra_config=True)
+        return checked(config, schema), str(config.hydra.run.dir), typed
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UsageError(explained(error, schema)) from None
+
+
+def _overrides(values: Mapping[str, Any], section: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _overrides(value, f"{section}{key}.")
+        elif isinstance(value, str):
+            yield override(f"{section}{key}", value)
+        else:
+            yield f"{section}{key}={json.dumps(value)}"
 
 
 @contextmanager

@@ -1,318 +1,271 @@
-"""Agents to evaluate, film or view: those of runs, and policies of the user's own."""
+"""Agents: trained, loaded, evaluated and saved from Python, and what `policy=` names."""
 
-import json
-import math
-import re
-import shlex
-import sys
-import sysconfig
-import traceback
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import module_from_spec, spec_from_file_location
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
-from torch.export.passes import move_to_device_pass
-from torchrl.data import Categorical, Composite, TensorSpec
-from torchrl.envs import EnvBase
+from torchrl.data import Composite
 
-from flowrep.agent import CheckpointError, load_checkpoint
-from flowrep.config.schema import EnvConfig, TrainConfig
+from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
+from flowrep.baselines import BASELINES
+from flowrep.config import UsageError
+from flowrep.config.cli import composed
+from flowrep.config.schema import EnvConfig, ExactFlow, Noise, TrainConfig, validated_run
 from flowrep.envs import street_envs
 from flowrep.experiment import build
-from flowrep.experiment.evaluation import Policy, scene_id
+from flowrep.experiment.evaluation import Driver, PairedEvaluation
+from flowrep.experiment.external import Task, check_card, load_policy
+from flowrep.experiment.outcomes import EpisodeRecord
 from flowrep.experiment.run import RunFolder, check_origin, origin_of
+from flowrep.experiment.runner import EVALUATION_ENVS, Runner
+from flowrep.progress import StopRequest
 from flowrep.scenes import load_scene
 
-PROGRAM, CARD, LOADER = "agent.pt2", "agent.json", "load_agent.py"
-"""The files of an exported agent: the program that runs it, what describes it, what loads it."""
-
-_NOT_THE_USERS = (
-    sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1]),
-    "<frozen ",
-)  # fmt: skip
-"""Beginnings of the names of files with other people's code."""
+PRETRAINED = Path(__file__).parents[1] / "pretrained"
+"""Agents that come with flowrep, one for each scene; README.md there is their card."""
+EVALUATION_SEED = 2_000_000  # of the first episode, as in conf/evaluate.yaml
+_SCALE = ".scale"
 
 
-@dataclass(frozen=True)
-class Agent:
-    """A policy and the env in which it acts."""
+class Agent(Driver):
+    """A policy and the env in which it acts, usually one that was trained.
 
-    policy: Policy | str  # writes `action`; or a baseline's name
-    config: EnvConfig
-    frames: int = 0  # that it was trained for; 0 if unknown
-    trained_in: str | None = None  # the name of a scene, None if unknown
-
-    def make_env(self, **changes: Any) -> EnvBase:
-        """Returns an env of its config, with changes of `make_env`'s arguments."""
-        num_envs = changes.get("num_envs", self.config.num_envs)
-        workers = {"num_workers": build.evaluation_workers(self.config, num_envs)}
-        return build.env(self.config, **workers | changes)
-
-    def origin(self, evaluation: str) -> dict[str, Any]:
-        """Returns the columns of evaluation.csv that tell which agent drove where."""
-        scene = load_scene(self.config.scene)
-        return {
-            "scene": scene.name,
-            "scene_id": scene_id(scene),
-            "representations": "+".join(self.config.representations),
-            "flow": self.config.flow.source,
-            "seed": self.config.seed if self.frames else "",
-            "frames": self.frames,
-            "evaluation": evaluation,
-        }
-
-
-def load_trained(
-    run: RunFolder,
-    *,
-    scene: Mapping[str, Any] | None = None,
-    algorithm: str | None = None,
-    **machine: Any,
-) -> Agent:
-    """Returns a run's agent, to act in the given scene, or in its own if None.
-
-    `machine` is `device`, `num_envs` and `num_workers`, in place of the run's; `algorithm` is one
-    that it may name besides flowrep's own.
-    """
-    own = run.config(algorithm)
-    path = run.checkpoint_path
-    state = load_checkpoint(path, ["origin", "frames", "policy"])
-    check_origin(state["origin"], origin_of(own.plain()), path)
-    return with_weights(
-        own, state["policy"], state["frames"], f"the agent of {run.path}", scene=scene, **machine
-    )
-
-
-def with_weights(
-    own: TrainConfig,
-    weights: Mapping[str, Tensor],
-    frames: int,
-    name: str,
-    *,
-    scene: Mapping[str, Any] | None = None,
-    **machine: Any,
-) -> Agent:
-    """Returns the agent of a run's config with these weights; `name` is for messages."""
-    if scene is not None:
-        machine["scene"] = {**scene, "camera": own.scene["camera"]}
-    config = own.model_copy(update=machine)
-    env = build.env(config, num_envs=1, num_workers=0)
-    policy = build.policy(config, env)
-    env.close()
-    try:
-        policy.load_state_dict(weights)
-    except RuntimeError as error:
-        reason = str(error).splitlines()[-1].strip()
-        raise CheckpointError(
-            f"{name} can't be used in scene '{config.scene['name']}', which has other classes "
-            f"than its own ({reason})"
-        ) from error
-    return Agent(policy, config, frames, own.scene["name"])
-
-
-def load_external(reference: str, config: EnvConfig) -> Agent:
-    """Returns a policy of the user's own, in the env of the config."""
-    env = build.env(config, num_envs=1, num_workers=0)
-    task = Task(
-        scene=config.scene["name"],
-        representations=config.representations,
-        observation_spec=Composite(
-            {name: env.observation_spec[name][0] for name in config.representations}
-        ),
-        action_spec=env.action_spec[0],
-        intrinsics=torch.from_numpy(street_envs(env)[0].K),
-        device=build.device(config.device),
-    )
-    env.close()
-    check_card(reference, task)
-    return Agent(load_policy(reference, task), config)
-
-
-class PolicyError(Exception):
-    """An external policy is missing, fails or returns no actions; the message names it."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """The task, as described to the function that makes an external policy."""
-
-    scene: str
-    representations: Mapping[str, Any]  # options by name, in the requested order
-    observation_spec: Composite  # of the maps of one environment, `[C, H, W]` each
-    action_spec: TensorSpec  # of one environment: 0 goes straight on, 1 turns left, 2 turns right
-    intrinsics: Tensor  # K `[3, 3]` of the maps, pixels
-    device: torch.device  # of the maps
-
-
-class ExternalPolicy:
-    """Writes `action` `[N]`, computed by an external function.
-
-    The function takes a TensorDict of batch `[N]` that holds only the task's maps `[N, C, H, W]`,
-    `env_id` int64 `[N]` and `is_init` bool `[N, 1]`, for policies that remember: each row's
-    environment, and whether its episode just began. It returns N integers (a tensor, an array or a
-    list), or the TensorDict with `action`.
+    >>> agent = Agent.load("pretrained", scene="straight_road")
+    >>> [episode] = agent.evaluate(episodes=1)
+    >>> episode.outcome
+    'success'
     """
 
-    def __init__(self, name: str, act: Callable[[TensorDictBase], Any], task: Task) -> None:
-        self.name, self._act, self._task = name, act, task
+    @classmethod
+    def train(
+        cls,
+        *,
+        folder: str | Path | None = None,
+        callback: Callable[[dict[str, float]], Any] | None = None,
+        **overrides: Any,
+    ) -> Agent:
+        """Trains an agent as `python -m flowrep.train` does, and returns it.
 
-    def __call__(self, maps: TensorDictBase) -> TensorDictBase:
-        """Returns the maps with `action`."""
-        seen = maps.select(*self._task.representations, "env_id", "is_init")
-        with _named(self.name):
-            given = self._act(seen)
-        if isinstance(given, TensorDictBase):
-            given = given.get("action")
-        n = int(self._task.action_spec.space.n)
-        try:
-            actions = torch.as_tensor(given).cpu()
-            whole = actions.long()
-            if actions.shape != maps.batch_size:
-                what = f"{actions.dtype} of shape {tuple(actions.shape)}"
-            elif ((whole == actions) & (whole >= 0) & (whole < n)).all():
-                return maps.set("action", whole)
-            else:
-                what = str(actions.tolist())
-        except (TypeError, ValueError, RuntimeError):
-            what = f"a {type(given).__name__}"
-        raise PolicyError(
-            f"policy '{self.name}' returned {what}; expected {len(maps)} whole numbers from 0 to "
-            f"{n - 1}, one action per environment"
-        )
+        The run is saved in its folder, where `resume=` of the command continues it, with the final
+        evaluation that the command adds. Ctrl-C saves it too, and raises KeyboardInterrupt.
 
+        Args:
+            folder: the run's folder; by default outputs/<day>/<time>_<name>.
+            callback: is called with each row of metrics.csv, `frames` included.
+            overrides: keys of conf/train.yaml and their values, such as `scene="s_turn"`,
+                `representations=["ego", "obj"]`, `preset="laptop"`, `total_frames=50_000` or
+                `evaluation={"every_frames": 0}`; beside the choice of a whole section, a key in it
+                is `**{"scene.time_limit_steps": 100}`.
 
-def load_policy(reference: str, task: Task) -> ExternalPolicy:
-    """Returns the policy that a reference names.
+        Raises:
+            UsageError: a key or a value is wrong; the message names it.
+        """
+        if "resume" in overrides:
+            raise UsageError("continue a run with python -m flowrep.train resume=<its folder>")
+        config, default, typed = composed("train", overrides, TrainConfig)
+        run = RunFolder(default if folder is None else folder)
+        with run.held("training"), StopRequest() as stop:
+            config = run.begin(config, typed)
+            with closing(Runner(config, run, on_log=callback)) as runner:
+                runner.train(stop)
+        if stop:
+            raise KeyboardInterrupt(f"stopped after {runner.frames} frames; saved in {run.path}")
+        return cls(runner.agent.policy, config, runner.frames, config.scene["name"])
 
-    It is `path.py:make` or `package.module:make`, a function that is called with the task and
-    returns the policy's function; or `path.pt2`, a program saved by `torch.export.save` that takes
-    the maps as arguments, in the task's order (that of flowrep's export in the order of its
-    agent.json), and returns a score per action.
-    """
-    with _named(reference):
-        if reference.endswith(".pt2"):
-            return ExternalPolicy(reference, _program(reference, task), task)
-        place, _, name = reference.rpartition(":")
-        act = getattr(_module(place), name)(task)
-        if not callable(act):
-            raise PolicyError(
-                f"{name}(task) returned a {type(act).__name__}; expected a function of a "
-                "TensorDict of maps"
+    @classmethod
+    def load(
+        cls,
+        name: str | Path,
+        *,
+        scene: str | Mapping[str, Any] | None = None,
+        representations: Mapping[str, Any] | None = None,
+        flow: Any = None,
+        motion: str | None = None,
+        noise: Noise | None = None,
+        algorithm: str | None = None,
+        precision: str | None = None,
+        **machine: Any,
+    ) -> Agent:
+        """Returns an agent, to act in a scene, or in the one of its training if None.
+
+        Args:
+            name: the folder of a run, a file that `save` wrote, "pretrained" (the agent of the
+                scene that comes with flowrep), a baseline, or a policy from another project:
+                path.py:make, package.module:make or path.pt2.
+            scene: its name, or its definition; the camera remains that of the training.
+            representations: the maps of a policy from another project, options by name.
+            flow: where they come from, as in conf/flow; exact flow if None.
+            motion: of the camera, "exact" or "estimated".
+            noise: of its sensors; none if None.
+            algorithm: a class outside of flowrep that a run may name; its code then runs.
+            precision: the number format of its networks, instead of the run's.
+            machine: `device`, `num_envs` and `num_workers` of its envs.
+
+        Raises:
+            UsageError: there is no such agent.
+            CheckpointError: a file is damaged, or the agent can't act in this scene.
+        """
+        name = str(name)
+        machine = {"device": "auto", "num_workers": 0, **machine}
+        if isinstance(scene, str):
+            scene = asdict(load_scene(scene))
+        is_external = ":" in name or name.endswith(".pt2")
+        if name in BASELINES or is_external:
+            if is_external and not representations:
+                raise UsageError(f"representations needs a value for policy={name}")
+            # not checked again: the values are of a command's config
+            config = EnvConfig.model_construct(
+                scene=scene or asdict(load_scene("straight_road")),
+                representations=representations if is_external else {},
+                flow=flow or ExactFlow(source="exact"),
+                motion=motion or "exact",
+                noise=noise or Noise(**dict.fromkeys(Noise.model_fields, 0.0)),
+                speed="normal",
+                renderer="auto",
+                seed=0,
+                **{"num_envs": 1, **machine},
             )
-    return ExternalPolicy(reference, act, task)
+            return cls(_external(name, config) if is_external else name, config)
+        if Path(name).is_dir():
+            trained, frames, weights = _of_run(RunFolder.existing(name), algorithm)
+            about = f"the agent of {name}"
+        elif name == "pretrained" or name.endswith(".safetensors"):
+            path = _pretrained(scene) if name == "pretrained" else Path(name)
+            trained, frames, weights = _of_file(path, algorithm)
+            about = f"the agent in {path.name}"
+        else:
+            raise UsageError(
+                f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
+                "a .safetensors file, path.py:make, package.module:make or path.pt2"
+            )
+        section = trained.algorithm
+        if precision is not None and "precision" in section.options():
+            machine["algorithm"] = section.model_copy(update={"precision": precision})
+        if scene is not None:
+            machine["scene"] = {**scene, "camera": trained.scene["camera"]}
+        config = trained.model_copy(update=machine)
+        with closing(build.env(config, num_envs=1, num_workers=0)) as env:
+            policy = build.policy(config, env)
+        try:
+            policy.load_state_dict(weights)
+        except RuntimeError as error:
+            reason = str(error).splitlines()[-1].strip()
+            raise CheckpointError(
+                f"{about} can't be used in scene '{config.scene['name']}', whose classes are not "
+                f"those of its training ({reason})"
+            ) from error
+        return cls(policy, config, frames, trained.scene["name"])
+
+    def evaluate(
+        self,
+        episodes: int = 100,
+        *,
+        speeds: Sequence[str] = (),
+        fps: Sequence[float] = (),
+        seed: int = EVALUATION_SEED,
+        policies: Sequence[str] = ("greedy",),
+        baselines: Sequence[str] = (),
+    ) -> list[EpisodeRecord]:
+        """Returns the records of episodes, those that `flowrep.evaluate` runs for the same seed.
+
+        Args:
+            episodes: for each policy, speed and frame rate.
+            speeds: the pedestrians' speed modes; by default that of the training.
+            fps: frame rates; by default the scene's.
+            seed: of the first episode.
+            policies: "greedy" takes the likeliest action, "sampled" draws one.
+            baselines: such as "planner", "never_turn" and "random", on the same episodes.
+        """
+        rates = fps or [load_scene(self.config.scene).frame_rate_hz]
+        names = [self.policy] if isinstance(self.policy, str) else policies
+        asked = speeds or [self.config.speed], rates, episodes, seed, names, baselines
+        evaluation = PairedEvaluation(*asked)
+        evaluation.run(self.make_env, self.policy, EVALUATION_ENVS)
+        return evaluation.records(**self.origin("evaluate"))
+
+    def save(self, path: str | Path, *, small: bool = False) -> None:
+        """Writes the policy and its config into one file, which `load` reads.
+
+        `small` rounds to a byte a weight, 1/127 of the largest of its row.
+        """
+        if not isinstance(self.config, TrainConfig) or isinstance(self.policy, str):
+            raise UsageError("only an agent that flowrep trained has weights to save")
+        weights = dict(self.policy.state_dict())  # type: ignore[attr-defined]
+        state = {"frames": self.frames, "config": self.config.plain()}
+        save_checkpoint(path, state | {"policy": packed(weights) if small else weights})
 
 
-def _module(place: str) -> Any:
-    if not place.endswith(".py"):
-        return import_module(place)
-    path = Path(place).resolve(strict=True)
-    sys.path.insert(0, str(path.parent))  # as Python does for a script
-    spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules[module.__name__] = module
-    spec.loader.exec_module(module)
-    return module
+def _of_run(run: RunFolder, algorithm: str | None) -> tuple[TrainConfig, int, dict[str, Tensor]]:
+    config, path = run.config(algorithm), run.checkpoint_path
+    state = load_checkpoint(path, ["origin", "frames", "policy"])
+    check_origin(state["origin"], origin_of(config.plain()), path)
+    return config, state["frames"], state["policy"]
 
 
-def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
-    # moving the module alone would leave the devices that its graph names
-    program = move_to_device_pass(torch.export.load(path), task.device).module()
-    card = _card(path)
-    names = task.representations if card is None else [each["name"] for each in card["maps"]]
-    return lambda maps: program(*(maps[name] for name in names)).argmax(-1)
+def _of_file(path: Path, algorithm: str | None) -> tuple[TrainConfig, int, dict[str, Tensor]]:
+    stored = load_checkpoint(path)
+    config = validated_run(stored["config"], path.name, algorithm)
+    return config, stored["frames"], unpacked(stored["policy"])
 
 
-@contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Turns any exception in external code into a PolicyError of one line, with its location."""
-    try:
-        yield
-    except PolicyError as error:
-        raise PolicyError(f"policy '{name}': {error}") from error.__cause__
-    except Exception as error:
-        text = str(error).strip().splitlines()
-        # the last line of the author's own code, rather than one deep in a library
-        frames = traceback.extract_tb(error.__traceback__)
-        own = [frame for frame in frames if not frame.filename.startswith(_NOT_THE_USERS)]
-        place = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
-        raise PolicyError(
-            f"policy '{name}' failed: {type(error).__name__}: {text[0] if text else ''}{place}"
-        ) from error
+def _pretrained(scene: Mapping[str, Any] | None) -> Path:
+    files = {file.stem: file for file in PRETRAINED.glob("*.safetensors")}
+    name = (scene or {}).get("name")
+    if name not in files:
+        there = ", ".join(sorted(files))
+        raise UsageError(f"no agent for scene '{name}' comes with flowrep; there are: {there}")
+    return files[name]
 
 
-def check_card(reference: str, task: Task) -> None:
-    """Checks that an exported agent gets maps like those that it was trained on.
-
-    What has no agent.json beside it passes. The error has the overrides that give the right maps.
-    """
-    with _named(reference):
-        card = _card(reference)
-        if card is None:
-            return
-        trained, here = _settings(card, task)
-    if wrong := [key for key in trained if trained[key] != here[key]]:
-        raise PolicyError(
-            f"policy '{reference}' was trained on other maps than those of "
-            f"{_overrides(here, wrong)}; give {_overrides(trained, wrong)}"
+def _external(reference: str, config: EnvConfig) -> Any:
+    """Returns a policy from another project, which is given the task in the env of the config."""
+    with closing(build.env(config, num_envs=1, num_workers=0)) as env:
+        maps = {name: env.observation_spec[name][0] for name in config.representations}
+        task = Task(
+            scene=config.scene["name"],
+            representations=config.representations,
+            observation_spec=Composite(maps),
+            action_spec=env.action_spec[0],
+            intrinsics=torch.from_numpy(street_envs(env)[0].K),
+            device=build.device(config.device),
         )
+    check_card(reference, task)
+    return load_policy(reference, task)
 
 
-def _card(reference: str) -> Any:
-    """Returns the content of an exported agent's agent.json, None for other policies."""
-    agent = Path(reference.removesuffix(":make"))
-    path = agent.with_name(CARD) if agent.name in (PROGRAM, LOADER) else None
-    if path is None or not path.is_file():
-        return None
-    try:
-        card = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise PolicyError(f"{path} is damaged: {error}; export the agent again") from error
-    digests = card.pop("crc32", {})  # exports of earlier versions have none
-    for name in digests.keys() & {CARD, PROGRAM}:
-        data = json.dumps(card).encode() if name == CARD else path.with_name(name).read_bytes()
-        if zlib.crc32(data) != digests[name]:
-            raise PolicyError(f"{path.with_name(name)} is not as exported; export the agent again")
-    return card
+def packed(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Returns matrices and filters as int8, with a scale for each output; the rest as it is.
+
+    A weight is rounded to 1/127 of the largest of its row, coarser than bfloat16, in which agents
+    compute; the pretrained agents' README.md has the success with and without.
+    """
+    stored = {}
+    for name, weight in weights.items():
+        stored[name] = weight
+        if weight.is_floating_point() and weight.ndim > 1:
+            scale = weight.flatten(1).abs().amax(1) / 127
+            columns = scale.clamp(min=1e-12).view(-1, *[1] * (weight.ndim - 1))
+            stored[name] = (weight / columns).round().to(torch.int8)
+            stored[name + _SCALE] = scale
+    return stored
 
 
-def _settings(card: Mapping[str, Any], task: Task) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns what the maps depend on, by its key on the command line: in training, and here."""
-    maps = {each["name"]: each for each in card["maps"]}
-    shape = task.observation_spec[next(iter(task.representations))].shape
-    trained = _camera(card["maps"][0]["shape"], card["intrinsics"])
-    here = _camera(shape, task.intrinsics.tolist())
-    if maps.keys() - task.representations.keys():
-        trained["representations"], here["representations"] = list(maps), list(task.representations)
-    for name in maps.keys() & task.representations.keys():
-        for option, value in maps[name]["options"].items():
-            key = f"representations.{name}.{option}"
-            trained[key], here[key] = value, task.representations[name].get(option)
-        spec = task.observation_spec[name]
-        if isinstance(spec, Categorical) and spec.n != card["num_classes"]:
-            trained["scene"], here["scene"] = card["scene"], task.scene
-    return trained, here
+def unpacked(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Returns the weights that `packed` stored; others pass as they are.
 
-
-def _camera(shape: Sequence[int], K: Sequence[Sequence[float]]) -> dict[str, Any]:
-    height, width = shape[-2:]
-    fov_deg = 2 * math.degrees(math.atan(height / 2 / K[1][1]))
-    size = {"scene.camera.height_px": height, "scene.camera.width_px": width}
-    return size | {"scene.camera.fov_deg": round(fov_deg, 3)}
-
-
-def _overrides(settings: Mapping[str, Any], keys: Sequence[str]) -> str:
-    """Returns settings as on the command line, `representations=[ego,obj] scene=s_turn`."""
-    texts = [f"{key}={json.dumps(settings[key], separators=(',', ':'))}" for key in keys]
-    plain = [text.replace('"', "") for text in texts]
-    # what a card from somebody else says may be pasted into a shell
-    return " ".join(x if re.fullmatch(r"[\w.=,\[\]-]+", x) else shlex.quote(x) for x in plain)
+    >>> weights = {"weight": torch.tensor([[1.0, -0.5], [0.0, 0.0]])}
+    >>> unpacked(packed(weights))["weight"]
+    tensor([[ 1.0000, -0.5039],
+            [ 0.0000,  0.0000]])
+    """
+    weights = dict(stored)
+    for name in [key for key in stored if key.endswith(_SCALE)]:
+        scale, whole = weights.pop(name), name.removesuffix(_SCALE)
+        weights[whole] = stored[whole] * scale.view(-1, *[1] * (stored[whole].ndim - 1))
+    return weights

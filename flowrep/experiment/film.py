@@ -16,8 +16,8 @@ from torchrl.data import Categorical
 
 from flowrep.baselines import BaselinePolicy
 from flowrep.envs import street_envs
-from flowrep.experiment.agents import Agent
-from flowrep.experiment.evaluation import Episode, evaluate, outcome_shares
+from flowrep.experiment.evaluation import Driver, evaluate
+from flowrep.experiment.outcomes import EpisodeRecord, outcome_shares
 from flowrep.files import replace_file
 from flowrep.palette import OUTCOME_COLOURS
 from flowrep.scenes.vehicle import YAW_SIGN
@@ -70,7 +70,7 @@ class Film:
         framed: the names of what the agent reads.
     """
 
-    def __init__(self, agent: Agent, **changes: Any) -> None:
+    def __init__(self, agent: Driver, **changes: Any) -> None:
         self.agent = agent
         read = agent.config.representations
         self.env = agent.make_env(
@@ -108,7 +108,7 @@ class Film:
         self,
         options: Mapping[str, Any],
         on_frame: Callable[[TensorDictBase], Any] = lambda tensordict: None,
-    ) -> tuple[list[Frame], Episode]:
+    ) -> tuple[list[Frame], EpisodeRecord]:
         """Returns every frame of one greedy episode, and the episode.
 
         `options` are of `StreetEnv.reset`; `on_frame` gets the env's TensorDict.
@@ -134,7 +134,7 @@ class Film:
         turned = episode.now.vehicle.yaw_rate_rps / math.radians(vehicle.max_yaw_rate_dps)
         return Frame(maps, episode.steps, turned)
 
-    def draw(self, frame: Frame, ended: Episode | None = None) -> Image:
+    def draw(self, frame: Frame, ended: EpisodeRecord | None = None) -> Image:
         """Returns a frame's picture; that of an episode that has `ended` says how."""
         tiles = dict(self.tiles)
         if "rgb" in tiles:
@@ -161,7 +161,7 @@ class Film:
             return _above(drawn, f"framed: what {name} reads; the other maps are exact")
         return _above(drawn, f"{name} reads none of these maps")
 
-    def pictures(self, frames: Sequence[Frame], episode: Episode) -> Iterator[Image]:
+    def pictures(self, frames: Sequence[Frame], episode: EpisodeRecord) -> Iterator[Image]:
         """Yields the pictures of a film: the legend, the episode, and how it ended."""
         yield from repeat(self.legend(), max(1, round(LEGEND_S * episode.fps)))
         yield from map(self.draw, frames[:-1])
@@ -215,24 +215,27 @@ class Film:
             self.framed.append(label)
 
 
-def record_episode(agent: Agent, path: Path, *, episode_seed: int, **changes: Any) -> Episode:
+def record_episode(
+    agent: Driver, path: Path, *, episode_seed: int, **changes: Any
+) -> EpisodeRecord:
     """Writes the film of one greedy episode; `changes` are of the arguments of `make_env`."""
     with closing(Film(agent, **changes)) as film:
         frames, episode = film.drive({"episode_seed": episode_seed})
         pictures = film.pictures(frames, episode)
+        path.parent.mkdir(exist_ok=True)
         replace_file(path, partial(write_video, frames=pictures, fps=episode.fps))
     return episode
 
 
-def how_it_ended(episode: Episode) -> str:
+def how_it_ended(episode: EpisodeRecord) -> str:
     """Returns an episode's outcome in words."""
     hit = f" ({episode.hit.replace('_', ' ')})" if episode.hit else ""
     words = episode.outcome.replace("_", " ")
     seconds = episode.length / episode.fps
-    return f"{words}{hit} after {seconds:.1f} s, return {episode.total_reward:.2f}"
+    return f"{words}{hit} after {seconds:.1f} s, return {episode.return_:.2f}"
 
 
-def _picture_scale(agent: Agent) -> int:
+def _picture_scale(agent: Driver) -> int:
     """Returns the size of the picture in sizes of the maps: a tile's, if it is for films alone.
 
     An estimator's pictures have the size that the config says, whatever is asked for here.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from statistics import fmean
 from typing import Any
 
@@ -19,13 +19,14 @@ from flowrep.agent import (
     save_checkpoint,
     torch_threads,
 )
-from flowrep.agent.observation import has_bf16
+from flowrep.agent.observation import compute_dtype, has_bf16
 from flowrep.config.schema import TrainConfig
 from flowrep.envs import begin_step, get_states, has_spare_cores, set_states
+from flowrep.envs.workers import sheltered
 from flowrep.experiment import build
-from flowrep.experiment.agents import Agent
-from flowrep.experiment.evaluation import OUTCOMES, Comparison, print_results
-from flowrep.experiment.run import RunFolder, check_origin, origin_of
+from flowrep.experiment.evaluation import Driver, PairedEvaluation
+from flowrep.experiment.outcomes import OUTCOMES, print_results
+from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
 from flowrep.progress import Every, StopRequest, Stopwatch, progress_bar
 
 EVALUATION_ENVS = 192  # side by side at least: more make a step of each cheaper
@@ -39,14 +40,22 @@ class Runner:
     `state` and `load` are its checkpoint: all that the rest of the run depends on.
     """
 
-    def __init__(self, config: TrainConfig, folder: RunFolder) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        folder: RunFolder,
+        on_log: Callable[[dict[str, float]], Any] | None = None,  # gets each row of metrics.csv
+    ) -> None:
         self.config, self.folder, self.clock = config, folder, Stopwatch()
+        self.on_log = on_log
         keep_freed_memory()
         build.share_cores(config)
         torch.manual_seed(config.seed)
         self.env = build.env(config, compiled=config.compiled)
         self.env.set_seed(config.seed * config.num_envs)
-        self.agent = build.agent(config, self.env)
+        # TorchRL's storage starts multiprocessing's resource tracker, which a hang-up would end
+        with sheltered():
+            self.agent = build.agent(config, self.env)
         self.frames = 0  # of the environment, so far
         self.observation: TensorDictBase | None = None  # what is acted on next
         self.evaluation_pending = False  # the last one was interrupted and has to be run again
@@ -55,6 +64,10 @@ class Runner:
     def train(self, stop: StopRequest) -> None:
         """Trains until `total_frames` or until a stop is requested, and saves the last state."""
         total = self.config.total_frames
+        self.folder.loggers.add_wandb(self.config.wandb, self.config.plain())
+        precision = getattr(self.config.algorithm, "precision", "fp32")
+        machine = machine_of(compute_dtype(precision, self.agent.device))
+        self.folder.note_machine(machine | {"threads": self.config.threads})
         log = Every(self.config.log_every_frames, self.frames)
         evaluate = Every(self.config.evaluation.every_frames, self.frames)
         save = Every(self.config.checkpoint_every_frames, self.frames)
@@ -131,6 +144,8 @@ class Runner:
         row["share_outside_updates"] = 1 - self.clock.share("update")
         row |= {name: means.get(name, math.nan) for name in self.agent.metric_names()}
         self.folder.log_metrics(self.frames, row)
+        if self.on_log is not None:
+            self.on_log({"frames": self.frames} | row)
         return row
 
     def evaluate(self, kind: str, stop: StopRequest) -> bool:
@@ -142,20 +157,19 @@ class Runner:
         config, asked, fps = self.config, self.config.evaluation, self.env.base_env.frame_rate_hz
         if kind == "final":
             episodes = asked.speeds, asked.fps, asked.final_episodes, FINAL_SEED
-            comparison = Comparison(*episodes, asked.policies, asked.baselines)
+            evaluation = PairedEvaluation(*episodes, asked.policies, asked.baselines)
         else:
-            comparison = Comparison([config.speed], [fps], asked.episodes, EVALUATION_SEED)
-        agent = Agent(self.agent.policy, config, self.frames)
+            evaluation = PairedEvaluation([config.speed], [fps], asked.episodes, EVALUATION_SEED)
+        driver = Driver(self.agent.policy, config, self.frames)
         with self.clock("evaluation"), torch.random.fork_rng(devices=[]):
             num_envs = max(EVALUATION_ENVS, config.num_envs)
-            comparison.run(agent.make_env, agent.policy, num_envs, stop=stop)
-        if comparison.done < comparison.total:
+            evaluation.run(driver.make_env, driver.policy, num_envs, stop=stop)
+        if evaluation.done < evaluation.total:
             return False
-        rows = comparison.rows(**agent.origin(kind))
-        positions = [e.positions for _, e in comparison.results()] if kind == "final" else []
-        self.folder.log_episodes(rows, positions)
+        records = evaluation.records(**driver.origin(kind))
+        self.folder.log_episodes(records, drives=kind == "final")
         if kind == "final":
-            print_results(rows)
+            print_results([record.row() for record in records])
         return True
 
     def film(self) -> None:
@@ -172,8 +186,8 @@ class Runner:
         draw_learning_curve(path, metrics, episodes, speed=self.config.speed, fps=fps)
         path = self.folder.video_path(f"episode_{self.config.speed}")
         if self.config.evaluation.video and not is_playable(path):
-            agent = Agent(self.agent.policy, self.config, self.frames)
-            record_episode(agent, path, episode_seed=FINAL_SEED)
+            driver = Driver(self.agent.policy, self.config, self.frames)
+            record_episode(driver, path, episode_seed=FINAL_SEED)
             print(f"video: {path}")
 
     def close(self) -> None:
@@ -283,10 +297,10 @@ class RecentEpisodes:
     def summary(self) -> dict[str, float]:
         """Returns the share of each outcome, mean return and mean length; nan without episodes."""
         if not self._ended:
-            return dict.fromkeys([*OUTCOMES[1:], "return", "length"], math.nan)
+            return dict.fromkeys([*OUTCOMES, "return", "length"], math.nan)
         outcomes, returns, lengths = zip(*self._ended)
-        shares = {name: outcomes.count(code) / len(outcomes) for code, name in enumerate(OUTCOMES)}
-        shares.pop(OUTCOMES[0])
+        ends = enumerate(OUTCOMES, start=1)  # 0 is the code of an episode that goes on
+        shares = {name: outcomes.count(code) / len(outcomes) for code, name in ends}
         return shares | {"return": fmean(returns), "length": fmean(lengths)}
 
     def state(self) -> dict[str, Any]:

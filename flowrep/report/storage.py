@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from flowrep.experiment.evaluation import OUTCOMES
-from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.experiment.lock import RunFolderError
+from flowrep.experiment.outcomes import OUTCOMES
+from flowrep.experiment.run import RunFolder
 from flowrep.files import replace_files
 from flowrep.report.runs import Columns, Run
 from flowrep.tables import TableError
@@ -30,7 +31,6 @@ from flowrep.tables import TableError
 RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
 Cells = Mapping[str, Sequence[str]]
 _MACHINE = ("commit", "precision", "cpu")
-_OUTCOMES = OUTCOMES[1:]  # the first is that of an episode that goes on
 _EPISODES: dict[str, type] = {
     "scene": str, "scene_id": str, "frames": int, "evaluation": str, "policy": str, "speed": str,
     "fps": float, "episode_seed": int, "path": str, "outcome": str, "hit": str, "length": int,
@@ -103,10 +103,10 @@ def episode_columns(cells: Cells) -> Columns:
         name: np.array(cells.get(name, empty), kind) for name, kind in _EPISODES.items()
     }
     # A misspelt success would count as a failure.
-    unknown = {*columns["outcome"].tolist()} - {*_OUTCOMES}
+    unknown = {*columns["outcome"].tolist()} - {*OUTCOMES}
     if unknown:
         names = ", ".join(map(repr, sorted(unknown)))
-        raise ValueError(f"unknown outcome {names} of an episode; known: {', '.join(_OUTCOMES)}")
+        raise ValueError(f"unknown outcome {names} of an episode; known: {', '.join(OUTCOMES)}")
     return columns
 
 

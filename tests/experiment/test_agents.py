@@ -1,231 +1,144 @@
-"""Policies of somebody else's: what they see, and what is said of those that can't be used."""
-
-import json
-import shlex
-from dataclasses import replace
+"""Agents from Python: trained, evaluated, saved and loaded, and those that come with flowrep."""
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.data import Categorical, Composite, Unbounded
 
-from flowrep.experiment.agents import ExternalPolicy, PolicyError, Task, check_card, load_policy
+pytest.importorskip("pybullet", reason="agents drive in the simulated street")
 
-TASK = Task(
-    scene="straight_road",
-    representations={"ego": {}, "depth": {}},
-    observation_spec=Composite(ego=Unbounded((2, 4, 6)), depth=Unbounded((1, 4, 6))),
-    action_spec=Categorical(3),
-    intrinsics=torch.eye(3),
-    device=torch.device("cpu"),
-)
+import flowrep
+from flowrep.config import UsageError, group_choices
+from flowrep.experiment.agents import PRETRAINED, Agent, packed, unpacked
+from flowrep.experiment.run import RunFolder
+from tests.config.composing import composed
+from tests.experiment.test_runner import differing
 
-
-def maps(count=2):
-    return TensorDict(
-        {
-            "ego": torch.zeros(count, 2, 4, 6),
-            "depth": torch.arange(1.0, count + 1).reshape(-1, 1, 1, 1).expand(-1, 1, 4, 6),
-            "env_id": torch.arange(count),
-            "is_init": torch.ones(count, 1, dtype=torch.bool),
-            "outcome": torch.zeros(count, 1),
-        },
-        [count],
-    )
+SCENES = sorted(group_choices("scene"))
+# of 20 episodes; one that never turns drives Straight Road in one of ten, the other scenes never
+LEAST = {"straight_road": 12, "s_turn": 12, "h_shaped_pathways": 3, "three_way_junction": 18}
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        [2, 0],
-        torch.tensor([2, 0]),
-        torch.tensor([2, 0], dtype=torch.uint8).numpy(),
-        TensorDict({"action": torch.tensor([2, 0])}, [2]),  # as TorchRL's modules write it
-    ],
-    ids=["list", "tensor", "array", "tensordict"],
-)
-def test_actions_may_come_in_any_form(given):
-    policy = ExternalPolicy("mine", lambda maps: given, TASK)
-    action = policy(maps())["action"]
-    assert action.dtype == torch.int64
-    assert action.tolist() == [2, 0]
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """An agent of a few frames, the folder of its run, and the rows that were logged."""
+    folder, rows = tmp_path_factory.mktemp("runs") / "first", []
+    agent = Agent.train(
+        folder=folder, callback=rows.append, scene="s_turn", representations=["obj"],
+        debug="smoke", total_frames=128, evaluation={"every_frames": 0}, device="cpu", wandb="off",
+        **{"scene.time_limit_steps": 30, "algorithm.hidden_size": 16},
+    )  # fmt: skip
+    return agent, folder, rows
 
 
-def test_a_policy_sees_its_maps_and_nothing_of_the_env():
-    seen = []
-    ExternalPolicy("mine", lambda maps: seen.append(maps) or [0, 0], TASK)(maps())
-    assert sorted(seen[0].keys()) == ["depth", "ego", "env_id", "is_init"]
-    assert seen[0].batch_size == (2,)
+def test_an_agent_is_trained_by_the_runner_of_the_command(trained):
+    agent, folder, rows = trained
+    assert [row["frames"] for row in rows] == [64, 128]
+    assert {*rows[0]} >= {"success", "q_loss", "updates"}
+    run = RunFolder.existing(folder)
+    assert [int(row["frames"]) for row in run.read_metrics()] == [64, 128]
+    assert run.config() == agent.config
+    given = ["scene=s_turn", "representations=[obj]", "debug=smoke", "total_frames=128"]
+    given += ["evaluation.every_frames=0", "device=cpu", "scene.time_limit_steps=30"]
+    asked = composed(*given, "algorithm.hidden_size=16", "algorithm.precision=fp32")
+    precision = agent.config.algorithm.precision
+    section = asked.algorithm.model_copy(update={"precision": precision})
+    assert agent.config == asked.model_copy(update={"algorithm": section})
+    assert precision != "auto"
 
 
-def test_make_is_told_the_task_and_may_import_what_lies_beside_it(tmp_path):
-    (tmp_path / "my_net.py").write_text("SIDE = 1\n")
-    path = tmp_path / "mine.py"
-    path.write_text(
-        "import my_net\n"
-        "def make(task):\n"
-        "    return lambda maps: [my_net.SIDE * len(task.representations)] * len(maps)\n"
-    )
-    assert load_policy(f"{path}:make", TASK)(maps(3))["action"].tolist() == [2, 2, 2]
-
-
-def test_a_program_that_torch_saved_is_a_policy(tmp_path):
-    class Scores(torch.nn.Module):
-        def forward(self, ego, depth):
-            return -(depth.mean((1, 2, 3)).unsqueeze(-1) - torch.arange(3)).abs()
-
-    given = (torch.zeros(2, 2, 4, 6), torch.zeros(2, 1, 4, 6))
-    batch = {0: torch.export.Dim("batch")}
-    program = torch.export.export(Scores(), given, dynamic_shapes=(batch, batch))
-    torch.export.save(program, tmp_path / "agent.pt2")
-    # Depths 1 and 2 are nearest to the scores of actions 1 and 2.
-    assert load_policy(str(tmp_path / "agent.pt2"), TASK)(maps())["action"].tolist() == [1, 2]
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ([0.5, 0.0], r"\[0.5, 0.0\]"),
-        ([[0], [1]], r"\(2, 1\)"),
-        ([0, 3], r"\[0, 3\]"),
-        ([0, -1], r"\[0, -1\]"),
-        (None, "NoneType"),
-        (TensorDict(), "NoneType"),
-    ],
-)
-def test_what_is_no_action_is_named(given, said):
-    with pytest.raises(PolicyError, match=f"^policy 'mine' returned .*{said}"):
-        ExternalPolicy("mine", lambda maps: given, TASK)(maps())
-
-
-@pytest.mark.parametrize(
-    ("body", "name", "said"),
-    [
-        ("def make(task): pass\n", "mak", "mak"),
-        ("def make(task): return 3\n", "make", "int"),
-        ("def make(task):\n    1 / 0\n", "make", r"ZeroDivisionError: .*mine\.py, line 2\)"),
-        ("import json\ndef make(task):\n    json.loads('x')\n", "make", r"mine\.py, line 3\)"),
-        ("import nowhere_at_all\n", "make", "nowhere_at_all"),
-        ("def make(:\n", "make", "SyntaxError"),
-        ("def make(task): return lambda maps: maps['rgb']\n", "make", r"rgb.*mine\.py, line 1\)"),
-    ],
-)
-def test_what_fails_in_a_policy_is_one_line_with_its_place(tmp_path, body, name, said):
-    path = tmp_path / "mine.py"
-    path.write_text(body)
-    with pytest.raises(PolicyError, match=said) as caught:
-        load_policy(f"{path}:{name}", TASK)(maps())
-    assert str(caught.value).startswith(f"policy '{path}:{name}'")
-    assert len(str(caught.value).splitlines()) == 1
-
-
-@pytest.mark.parametrize("name", ["nowhere.py:make", "nowhere.pt2", "no_such_package.part:make"])
-def test_what_is_not_there_or_damaged_is_named(name, tmp_path):
-    (tmp_path / "agent.pt2").write_text("something else")
-    for each in (name, f"{tmp_path}/agent.pt2"):
-        with pytest.raises(PolicyError, match=each.partition(".")[0]):
-            load_policy(each, TASK)
-
-
-# An exported agent on maps other than its own is refused, with what it takes to put it right.
-
-# 60 degrees up and down 30 rows are 15 / tan(30) = 25.98 pixels of focal length.
-K = [[25.98076, 0.0, 26.5], [0.0, 25.98076, 14.5], [0.0, 0.0, 1.0]]
-OPTIONS = {"ego": {"scale": 1.0, "unit": "px_per_step"}, "seg": {"encoding": "ids"}}
-CARD = {
-    "maps": [
-        {"name": "ego", "shape": [2, 30, 52], "options": OPTIONS["ego"]},
-        {"name": "seg", "shape": [1, 30, 52], "options": OPTIONS["seg"]},
-    ],
-    "intrinsics": K,
-    "num_classes": 5,
-    "scene": "straight_road",
-}
-
-
-def task(names=("ego", "seg"), size=(30, 52), classes=5, **changes):
-    specs = {
-        "ego": Unbounded((2, *size)),
-        "seg": Categorical(classes, (1, *size), dtype=torch.uint8),
-        "depth": Unbounded((1, *size)),
+def test_an_agent_is_the_same_from_its_run_and_from_a_file(trained, tmp_path):
+    agent, folder, _ = trained
+    agent.save(tmp_path / "agent.safetensors")
+    episodes = agent.evaluate(episodes=2)
+    assert [each.episode_seed for each in episodes] == [2_000_000, 2_000_001]
+    assert {(each.scene, each.frames, each.policy) for each in episodes} == {
+        ("s_turn", 128, "greedy")
     }
-    made = Task(
-        scene="straight_road",
-        representations={name: OPTIONS.get(name, {}) for name in names},
-        observation_spec=Composite({name: specs[name] for name in names}),
-        action_spec=Categorical(3),
-        intrinsics=torch.tensor(K),
-        device=torch.device("cpu"),
+    for name in (folder, tmp_path / "agent.safetensors"):
+        again = Agent.load(name, device="cpu")
+        assert differing(again.policy.state_dict(), agent.policy.state_dict()) == []
+        assert (again.frames, again.trained_in) == (128, "s_turn")
+    assert again.evaluate(episodes=2) == episodes
+
+
+def test_baselines_drive_the_same_episodes(trained):
+    agent, _, _ = trained
+    records = agent.evaluate(1, speeds=["low", "high"], fps=[6], seed=3, baselines=["never_turn"])
+    assert [(each.speed, each.fps, each.policy, each.episode_seed) for each in records] == [
+        (speed, 6.0, policy, 3) for speed in ("low", "high") for policy in ("greedy", "never_turn")
+    ]
+    (alone,) = Agent.load("never_turn", scene=agent.config.scene).evaluate(
+        1, speeds=["low"], fps=[6], seed=3
     )
-    return replace(made, **changes)
-
-
-@pytest.fixture(params=["agent.pt2", "load_agent.py:make"])
-def agent(request, tmp_path):
-    (tmp_path / "agent.json").write_text(json.dumps(CARD))
-    return f"{tmp_path}/{request.param}"
-
-
-def test_an_agent_passes_on_its_own_maps_in_any_order(agent):
-    check_card(agent, task())
-    check_card(agent, task(["seg", "depth", "ego"]))
-
-
-SCALED = {**OPTIONS, "ego": {"scale": 0.5, "unit": "px_per_step"}}
+    assert (alone.outcome, alone.length) == (records[1].outcome, records[1].length)
 
 
 @pytest.mark.parametrize(
-    ("shown", "here", "give"),
+    ("given", "named"),
     [
-        (
-            task(size=(60, 104), intrinsics=2 * torch.tensor(K)),
-            "scene.camera.height_px=60 scene.camera.width_px=104",
-            "scene.camera.height_px=30 scene.camera.width_px=52",
-        ),
-        (  # 15 pixels of focal length see 45 degrees up and 45 down
-            task(intrinsics=torch.tensor([[15.0, 0, 26.5], [0, 15.0, 14.5], [0, 0, 1]])),
-            "scene.camera.fov_deg=90.0",
-            "scene.camera.fov_deg=60.0",
-        ),
-        (task(["ego"]), "representations=[ego]", "representations=[ego,seg]"),
-        (task(["depth"]), "representations=[depth]", "representations=[ego,seg]"),
-        (
-            task(representations=SCALED),
-            "representations.ego.scale=0.5",
-            "representations.ego.scale=1.0",
-        ),
-        (task(classes=6, scene="s_turn"), "scene=s_turn", "scene=straight_road"),
+        ({"speed": "fast"}, "speed"),
+        ({"sceen": "s_turn"}, "sceen"),
+        ({"scene": "t_turn"}, "t_turn"),
+        ({"algorithm.tua": 0.1}, "algorithm.tua"),
+        ({"resume": "outputs/first"}, "resume="),
     ],
-    ids=["size", "view", "one too few", "others", "options", "classes"],
 )
-def test_other_maps_are_refused_with_the_overrides_for_its_own(agent, shown, here, give):
-    with pytest.raises(PolicyError) as caught:
-        check_card(agent, shown)
-    message = str(caught.value)
-    assert message.startswith(f"policy '{agent}'")
-    assert message.endswith(f" {here}; give {give}")
-    assert "\n" not in message
+def test_a_wrong_key_or_value_is_named_before_a_folder_is_made(tmp_path, given, named):
+    with pytest.raises(UsageError, match=named):
+        Agent.train(folder=tmp_path / "run", preset="laptop", **given)
+    assert not (tmp_path / "run").exists()
 
 
-def test_a_card_does_not_say_what_a_shell_would_run(agent, tmp_path):
-    maps = [{**CARD["maps"][0], "name": "ego]; touch PWNED; $(id) '"}]
-    (tmp_path / "agent.json").write_text(json.dumps(CARD | {"maps": maps}))
-    with pytest.raises(PolicyError) as caught:
-        check_card(agent, task())
-    words = shlex.split(str(caught.value).partition("; give ")[2], posix=True)
-    assert words == ["representations=[ego]; touch PWNED; $(id) ']"]
+def test_the_folder_of_another_run_is_refused(trained):
+    _, folder, _ = trained
+    with pytest.raises(ValueError, match="holds a run already"):
+        Agent.train(folder=folder, debug="smoke")
 
 
-def test_policies_that_flowrep_did_not_export_are_left_alone(tmp_path):
-    other = task(size=(9, 9))
-    check_card("package.module:make", other)
-    check_card(f"{tmp_path}/agent.pt2", other)  # without a card
-    (tmp_path / "agent.json").write_text(json.dumps(CARD))
-    check_card(f"{tmp_path}/mine.py:make", other)
+def test_what_has_no_weights_is_not_saved(tmp_path):
+    with pytest.raises(UsageError, match="weights"):
+        Agent.load("never_turn", scene="s_turn").save(tmp_path / "x.safetensors")
 
 
-@pytest.mark.parametrize("text", ["", "{}", '{"maps": [{"name": "ego"}]}'])
-def test_a_damaged_card_is_named(text, tmp_path):
-    (tmp_path / "agent.json").write_text(text)
-    with pytest.raises(PolicyError, match=r"agent\.pt2"):
-        check_card(f"{tmp_path}/agent.pt2", task())
+def test_the_package_has_it_by_name():
+    assert flowrep.Agent is Agent
+
+
+# The agents that come with flowrep: that they load, see what they were trained on, and drive.
+
+
+def test_every_scene_has_one_of_at_most_a_megabyte():
+    sizes = {path.stem: path.stat().st_size for path in PRETRAINED.glob("*.safetensors")}
+    assert sorted(sizes) == SCENES
+    assert max(sizes.values()) <= 1_000_000
+
+
+def test_rows_keep_their_largest_weight_exactly_and_others_to_half_a_step():
+    weights = {
+        "filters": torch.tensor([[[2.54, -0.013]], [[0.0, 0.0]]]),
+        "bias": torch.tensor([0.3]),
+    }
+    found = unpacked(packed(weights))
+    # a step of the first row is 2.54 / 127 = 0.02: -0.013 becomes -0.02, by truncation it were 0
+    torch.testing.assert_close(
+        found["filters"], torch.tensor([[[2.54, -0.02]], [[0.0, 0.0]]]), rtol=0, atol=1e-6
+    )
+    assert torch.equal(found["bias"], weights["bias"])
+
+
+@pytest.mark.parametrize("scene", [pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
+def test_it_drives_where_one_that_never_turns_does_not(scene):
+    episodes = Agent.load("pretrained", scene=scene, device="cpu").evaluate(20, seed=0)
+    assert sum(each.outcome == "success" for each in episodes) >= LEAST[scene]
+
+
+def test_a_scene_with_changes_is_driven_with_the_camera_of_training():
+    whole = Agent.load("pretrained", scene="straight_road", device="cpu").config.scene
+    scene = {**whole, "time_limit_steps": 7, "camera": {**whole["camera"], "height_px": 84}}
+    agent = Agent.load("pretrained", scene=scene, device="cpu")
+    assert agent.config.scene["time_limit_steps"] == 7
+    assert agent.config.scene["camera"]["height_px"] == 48
+
+
+def test_a_scene_without_one_is_told_which_there_are():
+    with pytest.raises(UsageError, match="straight_road"):
+        Agent.load("pretrained", scene={"name": "my_street"})

@@ -12,17 +12,7 @@ pytest.importorskip("pybullet", reason="policies drive the simulated street")
 
 from flowrep.agent.networks import DiscreteActions, stochastic_policy
 from flowrep.envs import make_env
-from flowrep.experiment.evaluation import (
-    Comparison,
-    evaluate,
-    failure_causes,
-    outcome_shares,
-    print_results,
-    scene_id,
-    wilson_interval,
-)
-from flowrep.experiment.run import EVALUATION_COLUMNS, RunFolder
-from flowrep.tables import read_rows
+from flowrep.experiment.evaluation import PairedEvaluation, evaluate, scene_id
 
 NO_OP = 0
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
@@ -62,13 +52,15 @@ def episodes(count, first=5, **options):
 
 def outcomes(found):
     """What an episode is known by, in the order of the seeds, whatever ended first."""
-    ended = [(e.seed, e.path, e.outcome, e.hit, round(e.total_reward, 4), e.length) for e in found]
-    return sorted(ended)
+    names = "episode_seed", "path", "outcome", "hit", "return", "length"
+    rows = [each.row() for each in found]
+    return sorted(tuple(row[name] for name in names) for row in rows)
 
 
 def test_an_episode_is_that_of_the_gymnasium_env(make_street):
     env = make_env("three_way_junction", num_envs=2)
-    found = {e.seed: e for e in evaluate(env, straight_on, episodes(3, first=4, path="right"))}
+    driven = evaluate(env, straight_on, episodes(3, first=4, path="right"))
+    found = {each.episode_seed: each for each in driven}
     env.close()
     street = make_street("three_way_junction", speed="low", sensors=())
     for seed, episode in found.items():
@@ -82,7 +74,7 @@ def test_an_episode_is_that_of_the_gymnasium_env(make_street):
         row = episode.row()
         assert (row["path"], row["speed"], row["fps"]) == ("right", "low", 12.0)
         assert episode.length == street.episode.steps
-        assert episode.total_reward == pytest.approx(total, abs=1e-5)
+        assert episode.return_ == pytest.approx(total, abs=1e-5)
         np.testing.assert_allclose(episode.positions, positions, atol=1e-4)
     # From the middle of the start zone, at 10 m/s and 12 steps per second, straight along x.
     np.testing.assert_allclose(
@@ -90,7 +82,7 @@ def test_an_episode_is_that_of_the_gymnasium_env(make_street):
     )
 
 
-def test_the_policy_sees_the_busy_places_and_which_of_them_have_just_begun(scene):
+def test_the_policy_sees_the_busy_envs_and_which_of_them_have_just_begun(scene):
     env, seen = make_env(scene, ["depth"], num_envs=3), []
 
     def act(tensordict):
@@ -139,7 +131,7 @@ ASKED = {"speeds": ["low", "high"], "fps": [12, 6], "episodes": 3, "seed": 5}
 
 @pytest.fixture(scope="module")
 def comparison(scene):
-    compared = Comparison(**ASKED, policies=["greedy", "sampled"], baselines=["random"])
+    compared = PairedEvaluation(**ASKED, policies=["greedy", "sampled"], baselines=["random"])
     compared.run(partial(make_env, scene, representations=["obj"]), weigher("obj"), num_envs=4)
     return compared
 
@@ -147,9 +139,9 @@ def comparison(scene):
 @pytest.mark.slow
 def test_rows_come_in_the_order_of_what_was_asked(comparison):
     assert comparison.done == comparison.total == 36
-    origin = ("scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation")
-    rows = comparison.rows(**dict.fromkeys(origin, ""))
-    assert tuple(rows[0]) == EVALUATION_COLUMNS
+    records = comparison.records(scene="s_turn", frames=7)
+    assert {(each.scene, each.frames) for each in records} == {("s_turn", 7)}
+    rows = [each.row() for each in records]
     order = [(row["speed"], row["fps"], row["policy"], row["episode_seed"]) for row in rows]
     names = "greedy", "sampled", "random"
     assert order == [
@@ -168,7 +160,7 @@ def test_rows_come_in_the_order_of_what_was_asked(comparison):
 
 @pytest.mark.slow
 def test_another_agents_run_keeps_the_baselines_episodes(comparison, scene):
-    before = comparison.rows()
+    before = comparison.records()
     made = []
 
     def make(**changes):
@@ -178,17 +170,18 @@ def test_another_agents_run_keeps_the_baselines_episodes(comparison, scene):
     other = weigher("obj")
     other.load_state_dict({name: value + 2.0 for name, value in other.state_dict().items()})
     comparison.run(make, other, num_envs=4)
-    after = comparison.rows()
-    of_random = [row for row in before if row["policy"] == "random"]
-    assert [row for row in after if row["policy"] == "random"] == of_random
+    after = comparison.records()
+    of_random = [each for each in before if each.policy == "random"]
+    assert [each for each in after if each.policy == "random"] == of_random
     assert after != before
     assert len(made) == 2  # an env for each frame rate, none for baselines
 
 
 @pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
-def test_every_episode_that_ended_before_a_stop_is_kept_in_its_order(scene, num_workers):
+def test_of_an_evaluation_that_was_stopped_only_whole_groups_count(scene, num_workers):
+    """Short episodes end first: those of the second speed that ended are a biased sample."""
     few = ASKED | {"episodes": 6, "fps": [12]}
-    whole, stopped = Comparison(**few), Comparison(**few)
+    whole, stopped = PairedEvaluation(**few), PairedEvaluation(**few)
 
     class OnceThreeOfTheSecondSpeedEnded:
         def __bool__(self):
@@ -197,19 +190,17 @@ def test_every_episode_that_ended_before_a_stop_is_kept_in_its_order(scene, num_
     make = partial(make_env, scene, representations=["obj"], num_workers=num_workers)
     whole.run(make, weigher("obj"), num_envs=6)
     stopped.run(make, weigher("obj"), num_envs=6, stop=OnceThreeOfTheSecondSpeedEnded())
-    rows = stopped.rows()
-    assert 9 <= stopped.done == len(rows) < 12
-    assert rows == [row for row in whole.rows() if row in rows]
-    seeds = [row["episode_seed"] for row in rows if row["speed"] == "high"]
-    assert seeds != list(range(5, 5 + len(seeds)))  # short ones end first: there is a gap
-    assert stopped.rows(only_whole=True) == [row for row in rows if row["speed"] == "low"]
+    assert 9 <= stopped.done < 12
+    records = stopped.records()
+    assert records == [each for each in whole.records() if each.speed == "low"]
+    assert len(records) == 6
 
 
 def test_what_is_complete_is_saved_before_the_rest_is_run(scene):
-    asked = Comparison(**ASKED | {"episodes": 1, "fps": [12]}, baselines=["never_turn"])
+    asked = PairedEvaluation(**ASKED | {"episodes": 1, "fps": [12]}, baselines=["never_turn"])
     saved = []
     make = partial(make_env, scene, representations=["obj"])
-    asked.run(make, weigher("obj"), num_envs=1, save=lambda: saved.append(len(asked.rows())))
+    asked.run(make, weigher("obj"), num_envs=1, save=lambda: saved.append(len(asked.records())))
     assert saved == [1, 2, 3, 4]
 
 
@@ -217,88 +208,3 @@ def test_a_scene_is_known_by_all_that_it_is(scene):
     assert scene_id(scene) == scene_id(replace(scene))
     assert scene_id(scene) != scene_id(replace(scene, time_limit_steps=3))
     assert len(scene_id(scene)) == 8
-
-
-def test_drives_are_kept_by_episode_and_replaced_when_driven_again(tmp_path):
-    folder = RunFolder(tmp_path)
-    same = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"frames": 9, "fps": 12.0, "length": 3}
-    same |= {"policy": "greedy", "outcome": "success"}
-    rows = [same | {"episode_seed": seed} for seed in (1, 2)]
-    first, second, other = (np.full((n, 2), n, np.float32) for n in (3, 4, 5))
-    folder.log_episodes(rows, [first, second])
-    folder.log_episodes(rows[:1], [other])
-    with np.load(folder.drives_path, allow_pickle=False) as saved:
-        assert saved["episode_seed"].tolist() == [1, 2]
-        assert saved["policy"].tolist() == ["greedy", "greedy"]
-        starts = saved["starts"]
-        np.testing.assert_array_equal(saved["positions"][starts[0] : starts[1]], other)
-        np.testing.assert_array_equal(saved["positions"][starts[1] : starts[2]], second)
-    assert not list(tmp_path.glob("*.tmp*"))
-
-
-def test_an_interval_contains_its_share_and_stays_a_probability():
-    assert wilson_interval(0, 0) == (0.0, 1.0)
-    for successes in range(11):
-        low, high = wilson_interval(successes, 10)
-        assert 0.0 <= low <= successes / 10 <= high <= 1.0
-    for trials in range(1, 400):  # at 192 of 192, for example, the end is rounded to less than 1
-        assert wilson_interval(trials, trials)[1] == 1.0
-        assert wilson_interval(0, trials)[0] == 0.0
-
-
-def test_shares_are_of_all_episodes():
-    shares = outcome_shares(["success", "success", "timeout", "collision"])
-    assert [round(share, 2) for share, _, _ in shares.values()] == [0.5, 0.25, 0.0, 0.25]
-
-
-ENDS = [("success", "")] * 2 + [("collision", "pedestrian")] * 3 + [("collision", "car")]
-ENDS += [("out_of_bounds", "")] * 2 + [("timeout", "")] * 2
-
-
-def failed_rows(policy="greedy", ends=ENDS):
-    same = {"scene": "s_turn", "representations": "ego+obj", "speed": "low", "fps": 12.0}
-    return [same | {"policy": policy, "outcome": outcome, "hit": hit} for outcome, hit in ends]
-
-
-def test_shares_are_of_the_failures():
-    (line,) = failure_causes(failed_rows())
-    assert (line["episodes"], line["failures"]) == (10, 8)
-    # Of 8: 2 off the road, 3 into people, 1 into a car, 2 too slow.
-    assert line["out of bounds"] == 25.0
-    assert line["collision: pedestrian"] == 37.5
-    assert line["collision: other"] == 12.5
-    assert line["timeout"] == 25.0
-    assert line["out of bounds to collisions"] == 0.5
-
-
-def test_policies_and_moments_of_training_are_told_apart_and_no_failure_has_no_shares():
-    rows = [row | {"frames": frames} for frames in (1000, 9000) for row in failed_rows()]
-    early, late, planner = failure_causes(rows + failed_rows("planner", [("success", "")] * 3))
-    assert (early["frames"], late["frames"], late["failures"]) == ("1000", "9000", 8)
-    assert (planner["policy"], planner["failures"], planner["timeout"]) == ("planner", 0, "")
-
-
-def test_tables_show_shares_with_intervals_and_causes_and_nothing_is_cut_off(capsys):
-    print_results(failed_rows("never_turn") + failed_rows("sampled", ENDS[:2] * 4))
-    text = capsys.readouterr().out
-    assert "…" not in text
-    assert "20 [6–51]" in text  # Wilson's interval of 2 in 10, by hand: 0.057 to 0.510
-    for word in ("never_turn", "bounds", "pedestrian", "timeout", "8 of 10", "38", "0 of 8"):
-        assert word in text
-
-
-@pytest.mark.parametrize("name", ["a[/b]c", "x[red]y", "[link=x]z", "a:car:b"])
-def test_the_name_of_a_policy_is_printed_as_it_is(capsys, name):
-    print_results(failed_rows(name))
-    assert capsys.readouterr().out.count(name) == 2  # in both tables
-
-
-def test_the_table_of_causes_is_replaced(tmp_path):
-    folder = RunFolder(tmp_path)
-    rows = [dict.fromkeys(EVALUATION_COLUMNS, 1) | row for row in failed_rows()]
-    for _ in range(2):
-        folder.save_episodes([row | {"episode_seed": k} for k, row in enumerate(rows)])
-        folder.write_failures()
-    (line,) = read_rows(folder.failures_path)
-    assert line["collision: pedestrian"] == "37.5"
-    assert float(line["timeout"]) == pytest.approx(25.0)

@@ -10,7 +10,6 @@ pytest.importorskip("pybullet", reason="the simulated street is driven")
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import LEGEND_S, Film, draw_learning_curve, record_episode
 from flowrep.palette import OUTCOME_COLOURS
-from flowrep.policies import load_agent
 from flowrep.transforms import Depth, stack
 from tests.config.composing import composed
 
@@ -41,7 +40,7 @@ def test_a_film_is_of_the_episode_that_names_it(film_of):
     frames, episode = film.drive(
         {"episode_seed": 2_000_017}, lambda tensordict: sensors.append(tensordict["sensor"][0])
     )
-    assert film.street.episode.seed == episode.seed == 2_000_017
+    assert film.street.episode.seed == episode.episode_seed == 2_000_017
     assert episode.outcome == "out_of_bounds"
     assert len(frames) == len(sensors) == episode.length + 1
     assert [frame.steps for frame in frames] == [*range(episode.length + 1)]
@@ -129,7 +128,7 @@ def test_what_the_agent_reads_is_framed_and_a_baseline_reads_nothing(film_of):
     assert left == 4 * (240 + 10 + 4)
     assert right - left + 1 == 250
     scene = composed("debug=smoke").scene
-    with_planner = Film(load_agent("planner", scene=scene, device="cpu", num_envs=1, num_workers=0))
+    with_planner = Film(Agent.load("planner", scene=scene, device="cpu"))
     frames, _ = with_planner.drive({"episode_seed": 3})
     assert not columns_of(with_planner.draw(frames[0]), FRAME_COLOUR).size
     with_planner.close()
@@ -205,7 +204,7 @@ def test_a_representation_of_ones_own_is_shown_in_grey(monkeypatch):
 def test_a_recorded_episode_is_a_whole_film(tmp_path):
     imageio = pytest.importorskip("imageio.v3")
     path, scene = tmp_path / "episode.mp4", composed("debug=smoke").scene
-    agent = load_agent("random", scene=scene, device="cpu", num_envs=1, num_workers=0)
+    agent = Agent.load("random", scene=scene, device="cpu")
     episode = record_episode(agent, path, episode_seed=3, frame_rate_hz=6.0)
     assert episode.fps == 6.0
     played = imageio.imread(path, plugin="FFMPEG")

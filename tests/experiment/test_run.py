@@ -18,15 +18,9 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from flowrep.agent import CheckpointError
-from flowrep.experiment.run import (
-    EVALUATION_COLUMNS,
-    FolderInUseError,
-    RunFolder,
-    RunFolderError,
-    check_origin,
-    machine_of,
-    origin_of,
-)
+from flowrep.experiment.lock import FolderInUseError, RunFolderError
+from flowrep.experiment.outcomes import EVALUATION_COLUMNS, EpisodeRecord
+from flowrep.experiment.run import RunFolder, check_origin, machine_of, origin_of
 from flowrep.tables import TableError, write_rows
 from tests.config.composing import plain
 
@@ -158,7 +152,7 @@ def test_a_lock_that_is_replaced_while_it_is_taken_is_not_held(tmp_path, monkeyp
         replaced(run)
         return flock(*arguments)
 
-    monkeypatch.setattr("flowrep.experiment.run.fcntl.flock", replace_then_lock)
+    monkeypatch.setattr("flowrep.experiment.lock.fcntl.flock", replace_then_lock)
     with pytest.raises(FolderInUseError), run.held("training"):
         pass
 
@@ -170,7 +164,7 @@ def no_locks(monkeypatch):
     def no_locks(*_):
         raise OSError(37, "No locks available")
 
-    monkeypatch.setattr("flowrep.experiment.run.fcntl.flock", no_locks)
+    monkeypatch.setattr("flowrep.experiment.lock.fcntl.flock", no_locks)
 
 
 @pytest.mark.usefixtures("no_locks")
@@ -192,7 +186,7 @@ def test_on_a_disk_without_locks_one_process_of_a_machine_has_the_folder(tmp_pat
 def test_on_a_disk_without_locks_the_last_machine_has_the_folder(tmp_path, monkeypatch):
     here, there = RunFolder(tmp_path), RunFolder(tmp_path)
     with here.held("training"):
-        monkeypatch.setattr("flowrep.experiment.run.platform.node", lambda: "another")
+        monkeypatch.setattr("flowrep.experiment.lock.platform.node", lambda: "another")
         with there.held("training"):
             there.check_held()
             with pytest.raises(RunFolderError, match=r"\.lock"):
@@ -206,7 +200,7 @@ def test_the_first_machine_does_not_release_what_the_last_one_holds(tmp_path, mo
     here, there = RunFolder(tmp_path), RunFolder(tmp_path)
     first, second = here.held("training"), there.held("training")
     first.__enter__()
-    monkeypatch.setattr("flowrep.experiment.run.platform.node", lambda: "another")
+    monkeypatch.setattr("flowrep.experiment.lock.platform.node", lambda: "another")
     with second:
         first.__exit__(None, None, None)
         there.check_held()
@@ -283,9 +277,9 @@ def test_another_version_is_refused(config):
 
 def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
-    RunFolder(tmp_path).log_to_wandb("off", {})
+    RunFolder(tmp_path).loggers.add_wandb("off", {})
     with pytest.raises(ImportError, match=r"wandb=offline needs .*\[train,wandb\]"):
-        RunFolder(tmp_path).log_to_wandb("offline", {})
+        RunFolder(tmp_path).loggers.add_wandb("offline", {})
 
 
 @pytest.mark.slow
@@ -294,7 +288,7 @@ def test_offline_runs_are_kept_in_the_folder_and_go_on_under_the_same_name(tmp_p
     names = []
     for frames in (10, 20):
         run = RunFolder(tmp_path)
-        run.log_to_wandb("offline", {"seed": 3})
+        run.loggers.add_wandb("offline", {"seed": 3})
         run.log_metrics(frames, {"alpha": 1 / frames})
         names.append(wandb.run.id)
         assert wandb.run.config["seed"] == 3
@@ -313,16 +307,14 @@ def test_metrics_and_means_of_evaluations_go_to_tensorboard(tmp_path):
     run = RunFolder(tmp_path)
     run.log_metrics(10, {"alpha": 0.5})
     same = {"scene": "s_turn", "evaluation": "training", "policy": "greedy", "frames": 500}
-    same = dict.fromkeys(EVALUATION_COLUMNS, "") | same | {"speed": "normal", "fps": 12.0}
     ends = [("success", 1, 10), ("timeout", 2, 20), ("collision", 3, 30), ("success", 10, 60)]
     run.log_episodes(
         [
-            same | {"episode_seed": k, "outcome": outcome, "return": total, "length": length}
+            episode(k, outcome, return_=total, length=length, speed="normal", **same)
             for k, (outcome, total, length) in enumerate(ends)
         ]
     )
-    for logger in run._loggers:
-        logger.experiment.flush()
+    run.loggers.flush()
     events = EventAccumulator(str(next(tmp_path.rglob("events.out.tfevents.*"))))
     events.Reload()
     title = "evaluation/s_turn/normal/12fps/greedy"
@@ -342,7 +334,7 @@ def test_a_resumed_run_drops_the_rows_it_will_write_again(tmp_path):
     run = RunFolder(tmp_path)
     for frames in (10, 20, 30):
         run.log_metrics(frames, {"alpha": 1 / frames})
-        run.log_episodes([episode(frames, frames=str(frames))])
+        run.log_episodes([episode(frames, frames=frames)])
     run.forget_after(20)
     run.log_metrics(25, {"alpha": 0.5})
     assert [row["frames"] for row in run.read_metrics()] == ["10", "20", "25"]
@@ -356,12 +348,12 @@ def test_only_what_was_written_before_the_first_checkpoint_is_dropped_without_on
     run = RunFolder(tmp_path)
     for logged in (8, 16):
         run.log_metrics(logged, {"alpha": 1 / logged})
-        run.log_episodes([episode(1, frames=str(logged), evaluation="training")])
+        run.log_episodes([episode(1, frames=logged, evaluation="training")])
     run.start_again(first_save=16)
     assert not run.metrics_path.exists()
     assert not run.evaluation_path.exists()
     run.log_metrics(8, {"alpha": 0.5})
-    run.log_episodes([episode(1, frames=str(frames), evaluation=kind)])
+    run.log_episodes([episode(1, frames=frames, evaluation=kind)])
     with pytest.raises(RunFolderError, match=r"latest\.safetensors"):
         run.start_again(first_save=16)
     assert len(run.read_metrics()) == len(run.read_episodes()) == 1
@@ -405,9 +397,22 @@ def test_a_folder_without_a_run_is_named(tmp_path):
     assert not (tmp_path / "nothing").exists()
 
 
+ROAD = np.array([[0.0, 0.0], [1.0, 2.0]], dtype=np.float32)
+
+
 def episode(seed, outcome="collision", **changes):
-    row = dict.fromkeys(EVALUATION_COLUMNS, "1") | {"outcome": outcome, "episode_seed": str(seed)}
-    return row | changes
+    """The record of an episode that drove from (0, 0) to (1, 2)."""
+    return EpisodeRecord(
+        **{
+            "speed": "low", "fps": 12.0, "episode_seed": seed, "path": "only", "outcome": outcome,
+            "hit": "", "return_": 1.0, "length": 1, "frames": 1, "positions": ROAD,
+        } | changes
+    )  # fmt: skip
+
+
+def cells(record, **changes):
+    """A record as a row of evaluation.csv."""
+    return {name: str(cell) for name, cell in record.row().items()} | changes
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "evaluation.csv"])
@@ -420,7 +425,7 @@ def test_a_folder_that_holds_a_run_is_no_place_for_a_new_one(tmp_path, name):
         run.check_is_new()
 
 
-def test_an_episode_that_is_evaluated_again_takes_its_place(tmp_path):
+def test_an_episode_that_is_evaluated_again_replaces_its_row(tmp_path):
     run = RunFolder(tmp_path)
     run.log_episodes([episode(7), episode(8), episode(9)])
     before = run.evaluation_path.read_bytes()
@@ -428,36 +433,30 @@ def test_an_episode_that_is_evaluated_again_takes_its_place(tmp_path):
     assert run.evaluation_path.read_bytes() == before
     run.log_episodes([episode(8, "timeout")])
     run.log_episodes([episode(8, evaluation="final")])
-    assert [(row["episode_seed"], row["outcome"]) for row in run.read_episodes()] == [
-        ("7", "collision"), ("8", "timeout"), ("9", "collision"), ("8", "collision"),
+    rows = [(row["episode_seed"], row["evaluation"], row["outcome"]) for row in run.read_episodes()]
+    assert sorted(rows) == [
+        ("7", "", "collision"), ("8", "", "timeout"), ("8", "final", "collision"),
+        ("9", "", "collision"),
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("there", "new", "then"),
-    [
-        ([1, 3, 9], [1, 2, 3, 4], [1, 2, 3, 4, 9]),  # two were missing after an interruption
-        ([3, 9], [1, 2, 3], [1, 2, 3, 9]),
-        ([1, 2, 9], [2], [1, 2, 9]),
-        ([8, 9], [1, 2], [8, 9, 1, 2]),
-        ([], [2, 1], [2, 1]),
-    ],
-)
-def test_new_episodes_stand_where_an_uninterrupted_evaluation_has_them(tmp_path, there, new, then):
-    run = RunFolder(tmp_path)
-    run.save_episodes([episode(seed) for seed in there])
-    run.save_episodes([episode(seed, "timeout") for seed in new])
-    rows = run.read_episodes()
-    assert [int(row["episode_seed"]) for row in rows] == then
-    again = {int(row["episode_seed"]) for row in rows if row["outcome"] == "timeout"}
-    assert again == set(new)
+@pytest.mark.parametrize("there", [[], [2], [3, 4], [1, 2, 3, 4]])
+def test_an_evaluation_run_again_leaves_the_table_of_one_that_was_never_stopped(tmp_path, there):
+    whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
+    for run in (whole, stopped):
+        run.save_episodes([episode(seed, evaluation="training") for seed in (8, 9)])
+    stopped.save_episodes([episode(seed, evaluation="final") for seed in there])
+    for run in (whole, stopped):
+        run.save_episodes([episode(seed, evaluation="final") for seed in (1, 2, 3, 4)])
+    assert stopped.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
+    assert [row["episode_seed"] for row in whole.read_episodes()] == [*"891234"]
 
 
 HEADER = ",".join(EVALUATION_COLUMNS)
-ROW = ",".join(episode(1).values())
+ROW = ",".join(cells(episode(1)).values())
 DAMAGED = {
     "an outcome that is none": f"{HEADER}\n{ROW.replace('collision', 'collisiom')}\n",
-    "frames that are no number": f"{HEADER}\n{','.join(episode(1, frames='1O').values())}\n",
+    "frames that are no number": f"{HEADER}\n{','.join(cells(episode(1), frames='1O').values())}\n",
     "semicolons": f"{HEADER}\n{ROW}\n".replace(",", ";"),
     "a column less": f"{HEADER.replace(',hit', '')}\n{ROW.rpartition(',')[0]}\n",
     "a short row": f"{HEADER}\n{ROW}\n{ROW.rpartition(',')[0]}\n",
@@ -475,10 +474,10 @@ def test_a_damaged_table_is_refused_and_stays_as_it_is(tmp_path, text):
 
 
 def test_a_table_from_before_a_column_is_read_with_empty_cells_and_goes_on(tmp_path):
-    run, older = RunFolder(tmp_path), episode(1)
+    run, older = RunFolder(tmp_path), cells(episode(1))
     del older["scene_id"], older["path"]
     write_rows(run.evaluation_path, [older])
-    assert run.read_episodes() == [episode(1, scene_id="", path="")]
+    assert run.read_episodes() == [cells(episode(1), scene_id="", path="")]
     run.log_episodes([episode(2, path="left")])
     assert [row["path"] for row in run.read_episodes()] == ["", "left"]
 
@@ -491,8 +490,6 @@ def test_a_cell_that_can_not_be_is_named_with_its_row(tmp_path):
 
 
 # Drives are pictures' data; what they cost must not be the episodes.
-
-ROAD = np.array([[0.0, 0.0], [1.0, 2.0]], dtype=np.float32)
 
 
 def drives(run):
@@ -531,13 +528,13 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_damaged_drives_cost_no_episode_and_are_set_aside(tmp_path, capsys, damage):
     run = RunFolder(tmp_path)
-    run.log_episodes([episode(1)], [ROAD])
+    run.log_episodes([episode(1)], drives=True)
     damage(run)
     before = run.drives_path.read_bytes()
     capsys.readouterr()
-    run.log_episodes([episode(2)], [2 * ROAD])
+    run.log_episodes([episode(2, positions=2 * ROAD)], drives=True)
     assert [row["episode_seed"] for row in run.read_episodes()] == ["1", "2"]
-    assert drives(run) == {"2": (2 * ROAD).tolist()}
+    assert drives(run) == {2: (2 * ROAD).tolist()}
     (aside,) = (path for path in tmp_path.glob("drives*") if path != run.drives_path)
     assert aside.read_bytes() == before
     (said,) = capsys.readouterr().err.splitlines()
@@ -547,9 +544,10 @@ def test_damaged_drives_cost_no_episode_and_are_set_aside(tmp_path, capsys, dama
 
 def test_whole_drives_are_added_to(tmp_path):
     run = RunFolder(tmp_path)
-    run.log_episodes([episode(1)], [ROAD])
-    run.log_episodes([episode(2), episode(1)], [2 * ROAD, 3 * ROAD])
-    assert drives(run) == {"1": (3 * ROAD).tolist(), "2": (2 * ROAD).tolist()}
+    run.log_episodes([episode(1)], drives=True)
+    again = [episode(2, positions=2 * ROAD), episode(1, positions=3 * ROAD)]
+    run.log_episodes(again, drives=True)
+    assert drives(run) == {1: (3 * ROAD).tolist(), 2: (2 * ROAD).tolist()}
 
 
 def test_episodes_are_saved_before_their_drives(tmp_path, monkeypatch):
@@ -559,7 +557,7 @@ def test_episodes_are_saved_before_their_drives(tmp_path, monkeypatch):
     run = RunFolder(tmp_path)
     monkeypatch.setattr(np, "savez_compressed", full)
     with pytest.raises(OSError, match=r"drives\.npz"):
-        run.log_episodes([episode(1)], [ROAD])
+        run.log_episodes([episode(1)], drives=True)
     assert len(run.read_episodes()) == 1
 
 
@@ -578,8 +576,7 @@ def test_a_run_goes_on_where_its_tensorboard_is_removed(tmp_path):
         if frames == 10:
             shutil.rmtree(tmp_path / "tensorboard")
         run.log_metrics(frames, {f"metric{k}": float(frames) for k in range(20)})
-        (logger,) = run._loggers
-        logger.experiment.flush()
+        run.loggers.flush()
     events = EventAccumulator(str(next(tmp_path.rglob("events.out.tfevents.*"))))
     events.Reload()
     assert [event.step for event in events.Scalars("metric3")] == list(range(10, 30))

@@ -13,7 +13,8 @@ from flowrep.agent import DivergenceError
 from flowrep.config import UsageError, group_choices
 from flowrep.config.schema import validated_run
 from flowrep.experiment import build
-from flowrep.experiment.run import RunFolder, RunFolderError
+from flowrep.experiment.lock import RunFolderError
+from flowrep.experiment.run import RunFolder
 from flowrep.experiment.runner import Means, RecentEpisodes, Runner, progress_text
 from flowrep.progress import StopRequest
 from flowrep.train import resumed

@@ -2,7 +2,7 @@
 
 import yaml
 
-from flowrep.experiment.run import EVALUATION_COLUMNS
+from flowrep.experiment.outcomes import EVALUATION_COLUMNS
 from flowrep.tables import write_rows
 
 EPISODES = 8

@@ -10,7 +10,7 @@ import yaml
 pytest.importorskip("scipy", reason="reports are an extra")
 
 from flowrep import files
-from flowrep.experiment.run import RunFolderError
+from flowrep.experiment.lock import RunFolderError
 from flowrep.report.storage import (
     EPISODES,
     RUNS,

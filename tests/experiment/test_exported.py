@@ -14,8 +14,8 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from flowrep import files
 from flowrep.agent import PPO, DiscreteSAC, DoubleDQN
 from flowrep.agent.networks import PolicyNetwork
-from flowrep.experiment.agents import PolicyError, Task, check_card, load_policy
-from flowrep.export import ExportError, acting_program, write_agent
+from flowrep.experiment.exported import ExportError, acting_program, write_agent
+from flowrep.experiment.external import PolicyError, Task, check_card, load_policy
 from tests.agent.plain import encode, head
 
 HEIGHT, WIDTH, CLASSES = 40, 52, 5

@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -29,9 +29,9 @@ from omegaconf import DictConfig
 from flowrep.config import UsageError, cli
 from flowrep.config.schema import ALGORITHMS, TrainConfig, validated, validated_run
 from flowrep.config.yaml_file import read_yaml
+from flowrep.experiment.outcomes import is_finished, success_of
 from flowrep.files import open_to_append
 from flowrep.progress import STOP_SIGNALS, StopRequest
-from flowrep.tables import read_rows
 
 cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worker resolves too
 
@@ -47,8 +47,6 @@ POLL_S = 0.5
 PARENT = os.getppid()
 TRAIN = (sys.executable, "-m", "flowrep.train")
 FINISHED, FAILED, STOPPED = "finished", "failed", "stopped"
-OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
-"""Those of episodes, written out, as the simulator that has them takes seconds to import."""
 _ONLY_SHOWS = {"--cfg", "-c", "--info", "-i", "--help", "-h", "--hydra-help", "--version"}
 _NEEDED_BY = {
     # finished jobs take no time, so batches would grow and delay the unfinished ones
@@ -279,25 +277,3 @@ def _check_is_same(folder: Path, config: TrainConfig) -> None:
                 f"'{folder}' holds a run with {key}={stored.get(key)}, the sweep asks for {value}: "
                 "give the sweep another folder with hydra.sweep.dir=, or move it away"
             )
-
-
-def is_finished(folder: Path, config: TrainConfig) -> bool:
-    """Returns whether a run's final evaluation is in its folder."""
-    frames = [int(row["frames"]) for row in _final(folder)]
-    enough = sum(each >= config.total_frames for each in frames)
-    return enough >= config.evaluation.final_total
-
-
-def success_of(folder: Path) -> float:
-    """Returns the share of a run's last final greedy episodes that succeed; nan without any."""
-    greedy = [row for row in _final(folder) if row["policy"] == "greedy"]
-    last = max((int(row["frames"]) for row in greedy), default=0)
-    ends = [row["outcome"] for row in greedy if int(row["frames"]) == last]
-    return ends.count("success") / len(ends) if ends else float("nan")
-
-
-def _final(folder: Path) -> list[dict[str, str]]:
-    columns = ("evaluation", "policy", "frames", "outcome")
-    checks: dict[str, Callable[[str], Any]] = {"frames": int, "outcome": OUTCOMES.index}
-    rows = read_rows(folder / "evaluation.csv", columns, checks)
-    return [row for row in rows if row["evaluation"] == "final"]

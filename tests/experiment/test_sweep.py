@@ -13,9 +13,10 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from flowrep import sweep
 from flowrep.config import UsageError, cli, group_choices
 from flowrep.config.schema import TrainConfig
+from flowrep.experiment import sweep
+from flowrep.experiment.outcomes import EVALUATION_COLUMNS, is_finished
 from flowrep.tables import TableError, read_rows
 from tests.config.composing import composed, plain
 
@@ -53,12 +54,14 @@ def attempt(tmp_path, monkeypatch):
 
 
 # the final evaluation of `CONFIG`: one episode of each of four policies
-FINISHES = """
+FINISHES = f"""
 open(folder + "/times", "a").write("x")
+columns = {EVALUATION_COLUMNS}
 with open(folder + "/evaluation.csv", "w") as table:
-    print("evaluation,frames,policy,outcome", file=table)
+    print(*columns, sep=",", file=table)
     for policy, end in zip(("greedy", "sampled", "a", "b"), ("success", *["timeout"] * 3)):
-        print(f"final,256,{policy},{end}", file=table)
+        row = dict(evaluation="final", frames=256, policy=policy, fps=12.0, outcome=end)
+        print(*(row.get(name, "") for name in columns), sep=",", file=table)
 """
 
 
@@ -66,9 +69,9 @@ def test_a_run_that_finishes_gives_its_success_and_is_not_run_again(attempt, tmp
     for _ in range(2):
         assert attempt(FINISHES).startswith("finished, success 100%")
     assert (tmp_path / "times").read_text() == "x"
-    assert sweep.is_finished(tmp_path, CONFIG)
+    assert is_finished(tmp_path, CONFIG)
     # made longer, it needs another final evaluation
-    assert not sweep.is_finished(tmp_path, CONFIG.model_copy(update={"total_frames": 512}))
+    assert not is_finished(tmp_path, CONFIG.model_copy(update={"total_frames": 512}))
 
 
 @pytest.mark.parametrize(
@@ -111,13 +114,6 @@ def test_a_run_that_saved_after_a_signal_is_stopped(attempt, code):
 def test_an_outcome_that_is_none_is_no_failure_and_no_success(attempt):
     with pytest.raises(TableError, match=r"evaluation\.csv.*'succes'"):
         attempt(FINISHES.replace('"success"', '"succes"'))
-
-
-def test_outcomes_are_those_of_the_simulator():
-    pytest.importorskip("pybullet", reason="the simulator has them")
-    from flowrep.experiment.evaluation import OUTCOMES
-
-    assert OUTCOMES[1:] == sweep.OUTCOMES
 
 
 def test_a_run_is_told_to_save_when_the_sweep_is_stopped(attempt, tmp_path):

@@ -1,0 +1,214 @@
+"""Policies from other projects: scripts, modules and programs, and agents that were exported."""
+
+import json
+import math
+import re
+import shlex
+import sys
+import sysconfig
+import traceback
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.export.passes import move_to_device_pass
+from torchrl.data import Categorical, Composite, TensorSpec
+
+PROGRAM, CARD, LOADER = "agent.pt2", "agent.json", "load_agent.py"
+"""The files of an exported agent: its program, the description of its maps, and their loader."""
+
+_LIBRARIES = (
+    sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), str(Path(__file__).parents[1]),
+    "<frozen ",
+)  # fmt: skip
+"""How the names of files begin that the author of a policy didn't write."""
+
+
+class PolicyError(Exception):
+    """An external policy is missing, fails or returns no actions; the message names it."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """The task, as described to the function that makes an external policy."""
+
+    scene: str
+    representations: Mapping[str, Any]  # options by name, in the requested order
+    observation_spec: Composite  # of the maps of one environment, `[C, H, W]` each
+    action_spec: TensorSpec  # of one environment: 0 goes straight on, 1 turns left, 2 turns right
+    intrinsics: Tensor  # K `[3, 3]` of the maps, pixels
+    device: torch.device  # of the maps
+
+
+class ExternalPolicy:
+    """Writes `action` `[N]`, computed by an external function.
+
+    The function takes a TensorDict of batch `[N]` that holds only the task's maps `[N, C, H, W]`,
+    `env_id` int64 `[N]` and `is_init` bool `[N, 1]`, for policies that remember: each row's
+    environment, and whether its episode just began. It returns N integers (a tensor, an array or a
+    list), or the TensorDict with `action`.
+    """
+
+    def __init__(self, name: str, act: Callable[[TensorDictBase], Any], task: Task) -> None:
+        self.name, self._act, self._task = name, act, task
+
+    def __call__(self, maps: TensorDictBase) -> TensorDictBase:
+        """Returns the maps with `action`."""
+        seen = maps.select(*self._task.representations, "env_id", "is_init")
+        with _named(self.name):
+            given = self._act(seen)
+        if isinstance(given, TensorDictBase):
+            given = given.get("action")
+        n = int(self._task.action_spec.space.n)
+        try:
+            actions = torch.as_tensor(given).cpu()
+            whole = actions.long()
+            if actions.shape != maps.batch_size:
+                what = f"{actions.dtype} of shape {tuple(actions.shape)}"
+            elif ((whole == actions) & (whole >= 0) & (whole < n)).all():
+                return maps.set("action", whole)
+            else:
+                what = str(actions.tolist())
+        except (TypeError, ValueError, RuntimeError):
+            what = f"a {type(given).__name__}"
+        raise PolicyError(
+            f"policy '{self.name}' returned {what}; expected {len(maps)} whole numbers from 0 to "
+            f"{n - 1}, one action per environment"
+        )
+
+
+def load_policy(reference: str, task: Task) -> ExternalPolicy:
+    """Returns the policy that a reference names.
+
+    It is `path.py:make` or `package.module:make`, a function that is called with the task and
+    returns the policy's function; or `path.pt2`, a program saved by `torch.export.save` that takes
+    the maps as arguments, in the task's order (that of flowrep's export in the order of its
+    agent.json), and returns a score per action.
+    """
+    with _named(reference):
+        if reference.endswith(".pt2"):
+            return ExternalPolicy(reference, _program(reference, task), task)
+        module, _, name = reference.rpartition(":")
+        act = getattr(_module(module), name)(task)
+        if not callable(act):
+            raise PolicyError(
+                f"{name}(task) returned a {type(act).__name__}; expected a function of a "
+                "TensorDict of maps"
+            )
+    return ExternalPolicy(reference, act, task)
+
+
+def _module(name: str) -> Any:
+    if not name.endswith(".py"):
+        return import_module(name)
+    path = Path(name).resolve(strict=True)
+    sys.path.insert(0, str(path.parent))  # as Python does for a script
+    spec = spec_from_file_location(f"flowrep_policy_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[module.__name__] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
+    # moving the module alone would leave the devices that its graph names
+    program = move_to_device_pass(torch.export.load(path), task.device).module()
+    card = _card(path)
+    names = task.representations if card is None else [each["name"] for each in card["maps"]]
+    return lambda maps: program(*(maps[name] for name in names)).argmax(-1)
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Turns any exception in external code into a PolicyError of one line, with its location."""
+    try:
+        yield
+    except PolicyError as error:
+        raise PolicyError(f"policy '{name}': {error}") from error.__cause__
+    except Exception as error:
+        text = str(error).strip().splitlines()
+        # the last line that the author wrote, rather than one deep in a library
+        frames = traceback.extract_tb(error.__traceback__)
+        theirs = [frame for frame in frames if not frame.filename.startswith(_LIBRARIES)]
+        where = f" ({theirs[-1].filename}, line {theirs[-1].lineno})" if theirs else ""
+        raise PolicyError(
+            f"policy '{name}' failed: {type(error).__name__}: {text[0] if text else ''}{where}"
+        ) from error
+
+
+def check_card(reference: str, task: Task) -> None:
+    """Checks that an exported agent gets maps like those that it was trained on.
+
+    What has no agent.json beside it passes. The error has the overrides that give the right maps.
+    """
+    with _named(reference):
+        card = _card(reference)
+        if card is None:
+            return
+        trained, here = _settings(card, task)
+    if wrong := [key for key in trained if trained[key] != here[key]]:
+        raise PolicyError(
+            f"policy '{reference}' was trained on other maps than those of "
+            f"{_overrides(here, wrong)}; give {_overrides(trained, wrong)}"
+        )
+
+
+def _card(reference: str) -> Any:
+    """Returns the content of an exported agent's agent.json, None for other policies."""
+    agent = Path(reference.removesuffix(":make"))
+    path = agent.with_name(CARD) if agent.name in (PROGRAM, LOADER) else None
+    if path is None or not path.is_file():
+        return None
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise PolicyError(f"{path} is damaged: {error}; export the agent again") from error
+    digests = card.pop("crc32", {})  # exports of earlier versions have none
+    for name in digests.keys() & {CARD, PROGRAM}:
+        data = json.dumps(card).encode() if name == CARD else path.with_name(name).read_bytes()
+        if zlib.crc32(data) != digests[name]:
+            raise PolicyError(f"{path.with_name(name)} is not as exported; export the agent again")
+    return card
+
+
+def _settings(card: Mapping[str, Any], task: Task) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns what the maps depend on, by its key on the command line: in training, and here."""
+    maps = {each["name"]: each for each in card["maps"]}
+    shape = task.observation_spec[next(iter(task.representations))].shape
+    trained = _camera(card["maps"][0]["shape"], card["intrinsics"])
+    here = _camera(shape, task.intrinsics.tolist())
+    if maps.keys() - task.representations.keys():
+        trained["representations"], here["representations"] = list(maps), list(task.representations)
+    for name in maps.keys() & task.representations.keys():
+        for option, value in maps[name]["options"].items():
+            key = f"representations.{name}.{option}"
+            trained[key], here[key] = value, task.representations[name].get(option)
+        spec = task.observation_spec[name]
+        if isinstance(spec, Categorical) and spec.n != card["num_classes"]:
+            trained["scene"], here["scene"] = card["scene"], task.scene
+    return trained, here
+
+
+def _camera(shape: Sequence[int], K: Sequence[Sequence[float]]) -> dict[str, Any]:
+    height, width = shape[-2:]
+    fov_deg = 2 * math.degrees(math.atan(height / 2 / K[1][1]))
+    size = {"scene.camera.height_px": height, "scene.camera.width_px": width}
+    return size | {"scene.camera.fov_deg": round(fov_deg, 3)}
+
+
+def _overrides(settings: Mapping[str, Any], keys: Sequence[str]) -> str:
+    """Returns settings as on the command line, `representations=[ego,obj] scene=s_turn`."""
+    texts = [f"{key}={json.dumps(settings[key], separators=(',', ':'))}" for key in keys]
+    plain = [text.replace('"', "") for text in texts]
+    # what a card from somebody else says may be pasted into a shell
+    return " ".join(x if re.fullmatch(r"[\w.=,\[\]-]+", x) else shlex.quote(x) for x in plain)

@@ -1,0 +1,194 @@
+"""How episodes ended: the rows of evaluation.csv, whether a run is finished, and its success.
+
+The workers of a sweep import this module, so it imports no PyTorch.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from flowrep.tables import read_rows
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from flowrep.config.schema import TrainConfig
+
+OUTCOMES = ("success", "collision", "out_of_bounds", "timeout")
+"""How an episode can end. Written out, as the simulator that defines them imports PyTorch."""
+
+CAUSES = ("out of bounds", "collision: pedestrian", "collision: other", "timeout")
+_FAILURE_GROUP = (
+    "scene", "scene_id", "representations", "flow", "frames", "evaluation", "policy", "speed", "fps"
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeRecord:
+    """One evaluated episode. Its fields but the last are the columns of evaluation.csv."""
+
+    # which agent drove; known to the agent, not to the loop that drives
+    scene: str = ""
+    scene_id: str = ""  # a hash of all that defines the scene
+    representations: str = ""  # "ego+obj"
+    flow: str = ""  # "exact" or "estimated"
+    seed: int | str = ""  # of the agent's run; "" for a policy without one
+    frames: int = 0  # that the agent was trained for
+    evaluation: str = ""  # "training", "final" or "evaluate"
+    policy: str = ""  # "greedy", "sampled", or the name of another policy
+    # under which conditions
+    speed: str  # the pedestrians' speed mode; "" for the env's default
+    fps: float
+    episode_seed: int  # determines path and people, see `StreetEnv.reset`
+    path: str  # the name of the scene's path that the episode drew, or was given
+    # and how it ended
+    outcome: str  # one of `OUTCOMES`
+    hit: str  # the category that was hit, or ""
+    return_: float  # undiscounted sum of rewards
+    length: int  # the number of steps T
+    # of the vehicle, x and y in metres, `[T + 1, 2]`; kept in drives.npz
+    positions: NDArray[np.float32] = field(repr=False, compare=False)
+
+    def row(self) -> dict[str, Any]:
+        """Returns its cells in evaluation.csv by column."""
+        row = {column: getattr(self, name) for column, name in _FIELDS.items()}
+        return row | {"return": round(self.return_, 4)}
+
+
+# `return` can't be the name of a field
+_FIELDS = {each.name.rstrip("_"): each.name for each in fields(EpisodeRecord)[:-1]}
+EVALUATION_COLUMNS = tuple(_FIELDS)
+
+_LATER = {"scene_id": "", "path": ""}  # columns that older tables lack, with their empty cells
+_CHECKS: dict[str, Callable[[str], Any]] = {
+    "frames": int, "fps": float, "outcome": OUTCOMES.index,
+}  # fmt: skip
+"""Of cells in evaluation.csv: a misspelt outcome would count as a failure."""
+
+
+def read_episodes(path: Path) -> list[dict[str, str]]:
+    """Returns the rows of an evaluation.csv, none if there is no such file."""
+    needed = [name for name in EVALUATION_COLUMNS if name not in _LATER]
+    return [_LATER | row for row in read_rows(path, needed, _CHECKS)]
+
+
+def is_finished(folder: Path, config: TrainConfig) -> bool:
+    """Returns whether a run's final evaluation is in its folder."""
+    frames = [int(row["frames"]) for row in _final(folder)]
+    enough = sum(each >= config.total_frames for each in frames)
+    return enough >= config.evaluation.final_total
+
+
+def success_of(folder: Path) -> float:
+    """Returns the success of a run's greedy policy in its last final evaluation, nan without."""
+    greedy = [row for row in _final(folder) if row["policy"] == "greedy"]
+    last = max((int(row["frames"]) for row in greedy), default=0)
+    ends = [row["outcome"] for row in greedy if int(row["frames"]) == last]
+    return ends.count("success") / len(ends) if ends else float("nan")
+
+
+def _final(folder: Path) -> list[dict[str, str]]:
+    rows = read_episodes(folder / "evaluation.csv")
+    return [row for row in rows if row["evaluation"] == "final"]
+
+
+def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Returns Wilson's score interval of a proportion; (0, 1) without trials."""
+    if not trials:
+        return 0.0, 1.0
+    # the proportions p from which the observed share is at most z standard errors away: the
+    # solutions of (share - p)² = z² p (1 - p) / trials
+    z2 = NormalDist().inv_cdf(0.5 + confidence / 2) ** 2
+    share = successes / trials
+    centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
+    half = (z2 * share * (1 - share) / trials + z2**2 / (4 * trials**2)) ** 0.5 / (1 + z2 / trials)
+    # rounding may leave an end an ulp on the wrong side of the share, or outside of [0, 1]
+    return max(0.0, min(share, centre - half)), min(1.0, max(share, centre + half))
+
+
+def outcome_shares(outcomes: Iterable[str]) -> dict[str, tuple[float, float, float]]:
+    """Returns the share of each outcome, with its 95 % Wilson interval."""
+    counts = Counter(outcomes)
+    trials = counts.total()
+    return {
+        name: (counts[name] / max(trials, 1), *wilson_interval(counts[name], trials))
+        for name in OUTCOMES
+    }
+
+
+def failure_causes(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Returns the number of failures and their causes in % for each scene, policy and speed.
+
+    Shares are of the failures, as in the paper's Table III, and empty where nothing failed.
+    Evaluations after different numbers of training frames are kept apart.
+    """
+    groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for row in rows:
+        key = tuple(str(row.get(name, "")) for name in _FAILURE_GROUP)
+        cause = row["outcome"].replace("_", " ")
+        if cause == "collision":
+            cause += ": pedestrian" if row.get("hit") == "pedestrian" else ": other"
+        groups[key].append(cause)
+    table = []
+    for key, causes in groups.items():
+        counts = Counter(causes)
+        failures = len(causes) - counts["success"]
+        shares = {c: round(100 * counts[c] / failures, 1) if failures else "" for c in CAUSES}
+        collisions = counts["collision: pedestrian"] + counts["collision: other"]
+        ratio = round(counts["out of bounds"] / collisions, 3) if collisions else ""
+        line = dict(zip(_FAILURE_GROUP, key)) | {"episodes": len(causes), "failures": failures}
+        table.append(line | shares | {"out of bounds to collisions": ratio})
+    return table
+
+
+def print_results(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Prints the share of each outcome, and the causes of failure, by policy and speed."""
+    by_policy: dict[tuple[Any, ...], list[str]] = defaultdict(list)
+    for row in rows:
+        by_policy[row["speed"], f"{float(row['fps']):g}", row["policy"]].append(row["outcome"])
+    table = [
+        {"speed": speed, "fps": fps, "policy": policy, "episodes": len(outcomes)}
+        | {
+            name: f"{100 * share:.0f} [{100 * low:.0f}–{100 * high:.0f}]"
+            for name, (share, low, high) in outcome_shares(outcomes).items()
+        }
+        for (speed, fps, policy), outcomes in by_policy.items()
+    ]
+    print_table("Share of episodes in % [95 % interval]", table)
+    table = [
+        {"speed": line["speed"], "fps": f"{float(line['fps']):g}", "policy": line["policy"]}
+        | {"failures": f"{line['failures']} of {line['episodes']}"}
+        | {cause: "" if line[cause] == "" else f"{line[cause]:.0f}" for cause in CAUSES}
+        for line in failure_causes(rows)
+    ]
+    print_table("Causes of failure in % of the failures", table)
+
+
+def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Prints rows that have the same keys, which are the headings."""
+    table = Table(title=title, box=box.SIMPLE, pad_edge=False)
+    for name in rows[0]:
+        heading = name.replace("_", " ").replace(": ", ":\n")
+        is_number = all(str(row[name])[:1] in "-0123456789" for row in rows)
+        # a policy's name may be a long path: it is folded, numbers are not
+        table.add_column(
+            heading,
+            no_wrap=name != "policy",
+            overflow="fold",
+            justify="right" if is_number else "left",
+        )
+    for row in rows:
+        table.add_row(*map(str, row.values()))
+    # names are text: a[b] is no markup, :car: no emoji
+    console = Console(width=max(100, Console().width), markup=False, emoji=False)
+    console.print(table)

@@ -1,0 +1,101 @@
+"""How episodes ended, in numbers: shares with intervals, causes of failure, tables."""
+
+import pytest
+
+from flowrep.experiment.outcomes import (
+    EVALUATION_COLUMNS,
+    OUTCOMES,
+    failure_causes,
+    outcome_shares,
+    print_results,
+    wilson_interval,
+)
+from flowrep.experiment.run import RunFolder
+from flowrep.tables import read_rows
+from tests.experiment.test_run import episode
+
+
+def test_outcomes_are_those_of_the_simulator_in_the_order_of_their_codes():
+    pytest.importorskip("pybullet", reason="the simulator has them")
+    from flowrep.envs import Outcome
+
+    assert [Outcome(code).label for code in (1, 2, 3, 4)] == [*OUTCOMES]
+
+
+def test_a_record_has_a_cell_for_each_column_of_the_table():
+    """The columns of docs/runs.md, in their order."""
+    row = episode(7, "timeout", return_=-4.30001, path="left").row()
+    assert list(row) == [
+        "scene", "scene_id", "representations", "flow", "seed", "frames", "evaluation", "policy",
+        "speed", "fps", "episode_seed", "path", "outcome", "hit", "return", "length",
+    ]  # fmt: skip
+    assert tuple(row) == EVALUATION_COLUMNS
+    assert (row["episode_seed"], row["path"], row["outcome"]) == (7, "left", "timeout")
+    assert row["return"] == -4.3
+
+
+def test_an_interval_contains_its_share_and_stays_a_probability():
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+    for successes in range(11):
+        low, high = wilson_interval(successes, 10)
+        assert 0.0 <= low <= successes / 10 <= high <= 1.0
+    for trials in range(1, 400):  # at 192 of 192, for example, the end is rounded to less than 1
+        assert wilson_interval(trials, trials)[1] == 1.0
+        assert wilson_interval(0, trials)[0] == 0.0
+
+
+def test_shares_are_of_all_episodes():
+    shares = outcome_shares(["success", "success", "timeout", "collision"])
+    assert [round(share, 2) for share, _, _ in shares.values()] == [0.5, 0.25, 0.0, 0.25]
+
+
+ENDS = [("success", "")] * 2 + [("collision", "pedestrian")] * 3 + [("collision", "car")]
+ENDS += [("out_of_bounds", "")] * 2 + [("timeout", "")] * 2
+
+
+def failed_rows(policy="greedy", ends=ENDS):
+    same = {"scene": "s_turn", "representations": "ego+obj", "speed": "low", "fps": 12.0}
+    return [same | {"policy": policy, "outcome": outcome, "hit": hit} for outcome, hit in ends]
+
+
+def test_shares_are_of_the_failures():
+    (line,) = failure_causes(failed_rows())
+    assert (line["episodes"], line["failures"]) == (10, 8)
+    # Of 8: 2 off the road, 3 into people, 1 into a car, 2 too slow.
+    assert line["out of bounds"] == 25.0
+    assert line["collision: pedestrian"] == 37.5
+    assert line["collision: other"] == 12.5
+    assert line["timeout"] == 25.0
+    assert line["out of bounds to collisions"] == 0.5
+
+
+def test_policies_and_moments_of_training_are_told_apart_and_no_failure_has_no_shares():
+    rows = [row | {"frames": frames} for frames in (1000, 9000) for row in failed_rows()]
+    early, late, planner = failure_causes(rows + failed_rows("planner", [("success", "")] * 3))
+    assert (early["frames"], late["frames"], late["failures"]) == ("1000", "9000", 8)
+    assert (planner["policy"], planner["failures"], planner["timeout"]) == ("planner", 0, "")
+
+
+def test_tables_show_shares_with_intervals_and_causes_and_nothing_is_cut_off(capsys):
+    print_results(failed_rows("never_turn") + failed_rows("sampled", ENDS[:2] * 4))
+    text = capsys.readouterr().out
+    assert "…" not in text
+    assert "20 [6–51]" in text  # Wilson's interval of 2 in 10, by hand: 0.057 to 0.510
+    for word in ("never_turn", "bounds", "pedestrian", "timeout", "8 of 10", "38", "0 of 8"):
+        assert word in text
+
+
+@pytest.mark.parametrize("name", ["a[/b]c", "x[red]y", "[link=x]z", "a:car:b"])
+def test_the_name_of_a_policy_is_printed_as_it_is(capsys, name):
+    print_results(failed_rows(name))
+    assert capsys.readouterr().out.count(name) == 2  # in both tables
+
+
+def test_the_table_of_causes_is_replaced(tmp_path):
+    folder = RunFolder(tmp_path)
+    for _ in range(2):
+        folder.save_episodes([episode(k, end, hit=hit) for k, (end, hit) in enumerate(ENDS)])
+        folder.write_failures()
+    (line,) = read_rows(folder.failures_path)
+    assert line["collision: pedestrian"] == "37.5"
+    assert float(line["timeout"]) == pytest.approx(25.0)
