@@ -1,7 +1,7 @@
 # `make help` lists the targets. Everything happens in .venv at the root of the checkout.
 
 # Override with `make train PYTHON=...`.
-PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3.14 || command -v python3)
 # Installed before all that depends on torch, so that pip doesn't pick a build of its own choice.
 # On Linux the default is CUDA's build, 6.6 GB with all that .venv holds. For the CPU's, 2.2 GB,
 # give the index that pytorch.org/get-started/locally prints for it: make install INDEX=...
@@ -16,13 +16,13 @@ INSTALLED := $(ENV)/.installed
 DEVELOPED := $(ENV)/.developed
 
 .DEFAULT_GOAL := help
-.PHONY: help install develop demo train evaluate view results gallery test test-fast test-python schema lint types format bench bench-gpu smoke docs wheel clean check-python
+.PHONY: help install develop demo train evaluate view results gallery test test-fast test-python test-lowest schema lint types format bench bench-gpu smoke docs wheel clean check-python
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
 
 check-python:
-	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v <= (3, 13) else "flowrep needs Python 3.11, 3.12 or 3.13 (found %d.%d): try `make PYTHON=python3.13`" % v)'
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else "flowrep needs Python 3.11 or newer (found %d.%d): try `make PYTHON=python3.13`" % v)'
 
 $(INSTALLED): pyproject.toml | check-python
 	@echo "Installing PyTorch into $(ENV) (a minute or two) ..."
@@ -79,8 +79,15 @@ test: $(DEVELOPED)  ## Run the tests
 test-fast: $(DEVELOPED)  ## Run those that take no more than a second or two
 	$(PYTEST) -m "not slow" $(ARGS)
 
-test-python:  ## Run the fast tests on another Python, in an environment of its own: make test-python PYTHON=python3.13
-	$(MAKE) test-fast ENV=.venv-$(notdir $(PYTHON))
+test-python:  ## Run the fast tests with the newest packages, on another Python: make test-python PYTHON=python3.14
+	$(MAKE) test-fast ENV=.venv-$(notdir $(PYTHON)) TORCH=torch
+
+# uv can choose the oldest versions, pip can't. Without a GPU: make test-lowest UV_TORCH_BACKEND=cpu
+test-lowest: $(DEVELOPED)  ## Run the fast tests with the oldest packages that pyproject.toml admits
+	$(BIN)/uv venv --quiet --allow-existing --python 3.11 .venv-lowest
+	$(BIN)/uv pip install --quiet --python .venv-lowest --resolution lowest-direct --editable ".[dev]"
+	@touch .venv-lowest/.installed .venv-lowest/.developed
+	$(MAKE) test-fast ENV=.venv-lowest
 
 schema: $(INSTALLED)  ## Write the JSON schema of scene files that editors use
 	$(BIN)/python -c 'from flowrep.scenes.load import json_schema; print(json_schema(), end="")' > docs/scene.schema.json

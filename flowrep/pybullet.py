@@ -83,8 +83,8 @@ class BulletCamera:
         >>> ball = pybullet.createMultiBody(0, -1, ball, [0, 0, 2], physicsClientId=client)
         >>> view = pybullet.computeViewMatrix([0, -3, 2], [0, 0, 2], [0, 0, 1])
         >>> camera = BulletCamera(client, 60, 40, fov_deg=60, view=view)
-        >>> camera.reset()["depth"][0, 20, 30].round(1)
-        np.float32(2.5)
+        >>> print(camera.reset()["depth"][0, 20, 30].round(1))
+        2.5
         >>> pybullet.resetBasePositionAndOrientation(ball, [0.25, 0, 2], [0, 0, 0, 1], client)
         >>> camera()["instance_motion"][camera.rows[ball, -1], :3, 3]  # it was 25 cm to the left
         array([-0.25,  0.  ,  0.  ], dtype=float32)

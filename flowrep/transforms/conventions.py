@@ -25,22 +25,22 @@ from flowrep.transforms.motion import CameraMotion, InstanceMotion
 Options: TypeAlias = Mapping[str, Any]
 Layout: TypeAlias = Literal["hw", "hwc"]
 
-_PARTS = "adapted"  # what adapters pass on to the next, and nobody else reads
+_PARTS = "adapted"  # keys under it are read by the next adapter only
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Convention:
     """What a simulator gives: names of its buffers, and the options of their adapters.
 
-    An option that is the name of an argument of `sensors_from` stands for its value.
+    An option whose value is the name of an argument of `sensors_from` takes that argument's value.
 
     Args:
         simulator: its name, and the version that the facts are of.
         sources: where the simulator's makers say so.
-        tried: how it was tried on the simulator itself; empty if only on buffers written as the
-            sources say.
-        layout: of depth and flow, `"hw"` or `"hwc"`.
-        ids_layout: of ids; of several channels, the first counts.
+        tried: where it is tested on the simulator itself; empty if it is only tested on buffers
+            written as the sources say.
+        layout: of maps, `"hw"` or `"hwc"`.
+        ids_layout: of ids, if it differs; of several channels, the first is read.
         depth: options of `AdaptDepth` by buffer, the usual one first.
         pose: buffers of the camera's pose, one or position and quaternion.
         pose_options: of `AdaptPose`.
@@ -48,7 +48,7 @@ class Convention:
         bodies_options: of their `AdaptPose`.
         ids: buffer of instance ids.
         background: ids of what is no body.
-        flow: buffer of measured flow, if it has any whose convention is known.
+        flow: buffer of measured flow; empty if there is none, or its convention isn't known.
         flow_options: of `AdaptFlow`.
         K: where K comes from.
         notes: what else has to be known.
@@ -56,19 +56,19 @@ class Convention:
 
     simulator: str
     sources: tuple[str, ...]
-    tried: str
-    layout: Layout
-    ids_layout: Layout
+    tried: str = ""
+    layout: Layout = "hw"
+    ids_layout: Layout | None = None
     depth: Mapping[str, Options]
     pose: tuple[str, ...]
     pose_options: Options
     bodies: tuple[str, ...]
-    bodies_options: Options
+    bodies_options: Options = field(default_factory=dict)
     ids: str
-    background: tuple[int, ...]
-    K: str
+    background: tuple[int, ...] = (0,)
     flow: str = ""
     flow_options: Options = field(default_factory=dict)
+    K: str
     notes: str = ""
 
 
@@ -84,9 +84,7 @@ _ISAAC_3 = Convention(
         "isaaclab.sensors.camera.camera_data",
         "Omniverse Replicator, Annotators Information: Motion Vectors",
     ),
-    tried="",
     layout="hwc",
-    ids_layout="hwc",
     depth=_ISAAC_DEPTH,
     pose=("pos_w", "quat_w_ros"),
     pose_options={"layout": "xyz_xyzw", "axes": "opencv"},
@@ -123,14 +121,11 @@ CONVENTIONS: dict[str, Convention] = {
         sources=("mani_skill.render.shaders; mani_skill.sensors.camera",),
         tried="examples/maniskill_flow.py",
         layout="hwc",
-        ids_layout="hwc",
         depth={"depth": {"kind": "z", "scale_m": 1e-3, "sky": 0.0}},
         pose=("cam2world_gl",),
         pose_options={"axes": "opengl"},
         bodies=("body_poses",),
-        bodies_options={},
         ids="segmentation",
-        background=(0,),
         K="intrinsic_cv, pixel centres at halves",
         notes="Depth is int16 millimetres: what is farther than 32.7 m wraps round and counts as "
         "sky. ManiSkillEnv of the example collects the buffers and the poses of "
@@ -140,7 +135,6 @@ CONVENTIONS: dict[str, Convention] = {
         simulator="MuJoCo 3.17",
         sources=("mujoco.readthedocs.io: Python, Renderer; XML reference, body/camera",),
         tried="examples/mujoco_flow.py",
-        layout="hw",
         ids_layout="hwc",
         depth={"depth": {"kind": "z", "sky": "far_m"}},
         pose=("camera_pose",),
@@ -160,7 +154,6 @@ CONVENTIONS: dict[str, Convention] = {
         sources=("mjlab.sensor.camera_sensor; mujoco_warp._src.render",),
         tried="MuJoCo Warp on a CPU, tests/transforms/test_conventions.py; not mjlab",
         layout="hwc",
-        ids_layout="hwc",
         depth={"depth": {"kind": "z", "sky": 0.0}},
         pose=("camera_pose",),
         pose_options={"axes": "opengl"},
@@ -176,8 +169,6 @@ CONVENTIONS: dict[str, Convention] = {
         simulator="Newton 1.8",
         sources=("newton.sensors.SensorCamera; newton.State.body_q",),
         tried="tests/transforms/test_conventions.py, on a CPU",
-        layout="hw",
-        ids_layout="hw",
         depth={
             "forward_depth": {"kind": "z", "sky": 0.0},
             "depth": {"kind": "ray_length", "sky": 0.0, "intrinsics": "intrinsics"},
@@ -197,15 +188,12 @@ CONVENTIONS: dict[str, Convention] = {
         simulator="Genesis 1.4.5",
         sources=("genesis.vis.camera.Camera: render, transform, intrinsics",),
         tried="tests/transforms/test_conventions.py, on a CPU",
-        layout="hw",
-        ids_layout="hw",
         depth={"depth": {"kind": "z", "sky": "far_m"}},
         pose=("transform",),
         pose_options={"axes": "opengl"},
         bodies=("links_pos", "links_quat"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentation",
-        background=(0,),
         K="camera.intrinsics",
         notes="far_m is the camera's far. Ids are indices of scene.segmentation_idx_dict, at "
         "VisOptions(segmentation_level='link') one a link. Where a driver multisamples "
@@ -214,16 +202,12 @@ CONVENTIONS: dict[str, Convention] = {
     "habitat": Convention(
         simulator="Habitat-Sim 0.3.3",
         sources=("habitat_sim: gfx_batch/DepthUnprojection, agent.SixDOFPose, CameraSensorSpec",),
-        tried="",
-        layout="hw",
-        ids_layout="hw",
         depth={"depth_sensor": {"kind": "z", "sky": 0.0}},
         pose=("position", "rotation"),
         pose_options={"layout": "xyz_wxyz", "axes": "opengl"},
         bodies=("object_position", "object_rotation"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="semantic_sensor",
-        background=(0,),
         K="intrinsics_from_fov(hfov, axis='horizontal')",
         notes="Take the sensor's pose, agent.get_state().sensor_states[name], not the agent's. "
         "quaternion.as_float_array gives (w, x, y, z); an object's rotation is a Magnum "
@@ -232,9 +216,7 @@ CONVENTIONS: dict[str, Convention] = {
     "kubric": Convention(
         simulator="Kubric (0ee21e2, MOVi)",
         sources=("kubric: challenges/movi/README.md; renderer/blender_utils.py; core/cameras.py",),
-        tried="",
         layout="hwc",
-        ids_layout="hwc",
         depth={
             "depth": {"kind": "ray_length", "sky": 1e10, "intrinsics": "intrinsics"},
             "z": {"kind": "z", "sky": 1e10},
@@ -244,7 +226,6 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("instance_positions", "instance_quaternions"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentations",
-        background=(0,),
         flow="backward_flow",
         flow_options={"direction": "backward", "grid": "current", "channels": "row_column"},
         K="focal_length / sensor_width * width",
@@ -255,16 +236,12 @@ CONVENTIONS: dict[str, Convention] = {
     "ai2thor": Convention(
         simulator="AI2-THOR 5",
         sources=("ai2thor.allenai.org: Environment State; ai2thor.server.Event",),
-        tried="",
-        layout="hw",
-        ids_layout="hw",
         depth={"depth_frame": {"kind": "z", "sky": "far_m"}},
         pose=("camera_pose",),
         pose_options={"axes": "unity"},
         bodies=("object_poses",),
         bodies_options={"axes": "unity"},
         ids="instance_ids",
-        background=(0,),
         K="intrinsics_from_fov(fieldOfView)",
         notes="Unity's world is left-handed, with y up: poses are 4 x 4 matrices in it. far_m is "
         "the camera's far plane, 20 m by default. Ids are colours: number them, by "
@@ -273,16 +250,12 @@ CONVENTIONS: dict[str, Convention] = {
     "carla": Convention(
         simulator="CARLA 0.9.16",
         sources=("carla.readthedocs.io/en/0.9.16: Sensors reference; carla.Transform.get_matrix",),
-        tried="",
-        layout="hw",
-        ids_layout="hw",
         depth={"depth": {"kind": "z", "scale_m": 1000.0 / (256**3 - 1), "sky": 256**3 - 1}},
         pose=("transform",),
         pose_options={"axes": "unreal"},
         bodies=("actor_transforms",),
         bodies_options={"axes": "unreal"},
         ids="instance",
-        background=(0,),
         K="intrinsics_from_fov(fov, axis='horizontal')",
         notes="Depth is R + 256 G + 65536 B, as int32, and an id G + 256 B of the instance camera; "
         "raw_data is BGRA. Poses are transform.get_matrix(). Set lens_circle_multiplier and lens_k "
@@ -292,9 +265,6 @@ CONVENTIONS: dict[str, Convention] = {
     "airsim": Convention(
         simulator="Cosys-AirSim 3.3",
         sources=("Cosys-AirSim: docs/image_apis.md; docs/apis.md, Coordinate system",),
-        tried="",
-        layout="hw",
-        ids_layout="hw",
         depth={
             "DepthPlanar": {"kind": "z", "sky": "far_m"},
             "DepthPerspective": {"kind": "ray_length", "sky": "far_m", "intrinsics": "intrinsics"},
@@ -304,7 +274,6 @@ CONVENTIONS: dict[str, Convention] = {
         bodies=("object_positions", "object_orientations"),
         bodies_options={"layout": "xyz_wxyz"},
         ids="segmentation",
-        background=(0,),
         K="intrinsics_from_fov(fov, axis='horizontal')",
         notes="far_m is what the sky has in your world, such as 65504: look at a pixel. Ids are "
         "colours: pack them, R + 256 G + 65536 B, by simGetSegmentationColorMap. OpticalFlow is of "
@@ -314,8 +283,6 @@ CONVENTIONS: dict[str, Convention] = {
         simulator="PyBullet 3.2.7",
         sources=("PyBullet Quickstart Guide: getCameraImage, computeViewMatrix",),
         tried="tests/transforms/test_conventions.py",
-        layout="hw",
-        ids_layout="hw",
         depth={"depth": {"kind": "z_buffer", "near_m": "near_m", "far_m": "far_m"}},
         pose=("view",),
         pose_options={"direction": "world_to_camera", "axes": "opengl"},
@@ -393,11 +360,11 @@ def sensors_from(
             verb = "needs" if value is None else "doesn't read"
             raise ValueError(f"{row.simulator}'s {chosen} {verb} {name}=; {row.notes}")
 
-    named = dict(keys or {})
-    start = (prefix,) if isinstance(prefix, str) else tuple(prefix)
+    elsewhere = dict(keys or {})
+    root = (prefix,) if isinstance(prefix, str) else tuple(prefix)
 
     def key(name: str) -> NestedKey:
-        return named.pop(name, (*start, name) if start else name)
+        return elsewhere.pop(name, (*root, name) if root else name)
 
     def plane(name: str, layout: Layout) -> Transform:
         return Plane(layout, in_keys=key(name), out_keys=(_PARTS, name))
@@ -411,24 +378,27 @@ def sensors_from(
         )
         return [parts, AdaptPose(**options, in_keys=joined, out_keys=written)]
 
-    made = [plane(chosen, row.layout), AdaptDepth(**options, in_keys=(_PARTS, chosen))]
-    made += [*poses(row.pose, row.pose_options, ("sensor", "world_from_cam")), CameraMotion()]
+    adapters = [plane(chosen, row.layout), AdaptDepth(**options, in_keys=(_PARTS, chosen))]
+    adapters += [*poses(row.pose, row.pose_options, ("sensor", "world_from_cam")), CameraMotion()]
     if body_ids is not None:
-        made += poses(row.bodies, row.bodies_options, ("sensor", "world_from_body"))
-        still = [*row.background, *static_ids]
-        rows = InstanceIds(body_ids, static_ids=still, in_keys=(_PARTS, row.ids))
-        made += [plane(row.ids, row.ids_layout), rows]
-        made.append(InstanceMotion())
+        adapters += poses(row.bodies, row.bodies_options, ("sensor", "world_from_body"))
+        static = [*row.background, *static_ids]
+        adapters += [
+            plane(row.ids, row.ids_layout or row.layout),
+            InstanceIds(body_ids, static_ids=static, in_keys=(_PARTS, row.ids)),
+            InstanceMotion(),
+        ]
     if flow:
         is_last = row.layout == "hwc"
-        made.append(AdaptFlow(**row.flow_options, channels_last=is_last, in_keys=key(row.flow)))
-    if named:
-        raise ValueError(f"keys= names {sorted(named)}, which {row.simulator} doesn't read here")
-    return made
+        adapters.append(AdaptFlow(**row.flow_options, channels_last=is_last, in_keys=key(row.flow)))
+    if elsewhere:
+        names = sorted(elsewhere)
+        raise ValueError(f"keys= names {names}, which {row.simulator} doesn't read here")
+    return adapters
 
 
 class Plane(MapTransform):
-    """A picture's first channel, as a map with its channel first.
+    """A picture's first channel, as a map `[*B, 1, H, W]`.
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
