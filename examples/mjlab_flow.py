@@ -11,7 +11,7 @@ A group of mjlab's observations holds what flow needs; TorchRL's `MJLabWrapper` 
 
 - spaces are of float32, so ids are sent as such, and cast here;
 - a geom moves as its body: geoms that share a body have the same pose;
-- a camera of MuJoCo with `sensorsize` and `focal` has K from those, this one from `fovy`.
+- a camera that MuJoCo's model gives a sensor size, as this one, has K from that, not from `fovy`.
 """
 
 import sys
@@ -19,6 +19,7 @@ from functools import partial
 from typing import Any
 
 import mjlab.tasks  # noqa: F401 - registers the tasks
+import numpy as np
 import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
@@ -28,12 +29,18 @@ from torch import Tensor
 from torchrl.envs import Compose, DTypeCastTransform, MJLabWrapper, TransformedEnv
 
 import flowrep
-from flowrep.geometry import intrinsics_from_fov
 from flowrep.transforms import FlowFactorize, RawFlow, sensors_from
 
-HEIGHT, WIDTH, FOV_DEG = 64, 96, 70.0
-K = intrinsics_from_fov(FOV_DEG, axis="vertical", height=HEIGHT, width=WIDTH)
-TASK, WRIST = "Mjlab-Lift-Cube-Yam", "robot/link_6"
+HEIGHT, WIDTH = 64, 112
+TASK, WRIST = "Mjlab-Lift-Cube-Yam", "robot/camera_d405"
+
+
+def intrinsics(env: Any) -> Tensor:
+    """Returns K of the wrist's camera: MuJoCo has its focal lengths and sensor in metres."""
+    model, camera = env.sim.mj_model, env.scene["eye"].camera_idx
+    px_per_m = np.array([WIDTH, HEIGHT]) / model.cam_sensorsize[camera]
+    fx, fy, cx, cy = model.cam_intrinsic[camera] * np.tile(px_per_m, 2)
+    return torch.tensor([[fx, 0, cx + WIDTH / 2], [0, fy, cy + HEIGHT / 2], [0, 0, 1]]).float()
 
 
 def moving_geoms(env: Any) -> list[int]:
@@ -65,13 +72,11 @@ def make_env(num_envs: int = 2, device: str = "cpu") -> TransformedEnv:
     config.scene.num_envs = num_envs
     eye = CameraSensorCfg(
         name="eye",
-        parent_body=WRIST,
-        pos=(0.0, 0.0, 0.1),
-        quat=(0.0, 1.0, 0.0, 0.0),
-        fovy=FOV_DEG,
+        camera_name=WRIST,
         height=HEIGHT,
         width=WIDTH,
-        data_types=("rgb", "depth", "segmentation"),
+        data_types=("depth", "segmentation"),
+        enabled_geom_groups=(0, 3),  # the robot by its collision shapes, as mjlab's own task does
     )
     config.scene.sensors = (*config.scene.sensors, eye)
     terms = {
@@ -86,8 +91,7 @@ def make_env(num_envs: int = 2, device: str = "cpu") -> TransformedEnv:
         concatenate_terms=False,
     )
     env = ManagerBasedRlEnv(config, device=device)
-    geoms = moving_geoms(env)
-    ids = ("eye", "segmentation")
+    K, geoms, ids = intrinsics(env), moving_geoms(env), ("eye", "segmentation")
     flow = Compose(
         DTypeCastTransform(torch.float32, torch.int32, in_keys=[ids], out_keys=[ids]),
         *sensors_from(
@@ -106,7 +110,7 @@ def main(path: str | None = None) -> None:
     env = make_env()
     torch.manual_seed(0)
     frames = env.rollout(20)["next"]
-    print(flowrep.diagnose(frames, K))
+    print(flowrep.diagnose(frames, intrinsics(env)))
     if path is not None:
         from flowrep.viz import representation_strip, write_png
 

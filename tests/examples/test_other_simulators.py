@@ -37,6 +37,59 @@ def test_a_robots_hand_in_maniskill():
     assert diagnose(frames).is_right
 
 
+def share_that_warps(frames, K):
+    """The share of visible pixels `[*, T]` that flow leads to their surface in the frame before.
+
+    By points and the nearest pixel, body by body: what is nearer there hides it.
+    """
+    frames, agreed, visible = frames.reshape(-1, frames.shape[-1]), 0, 0
+    for before, now in ((run[t - 1], run[t]) for run in frames for t in range(1, len(run))):
+        height, width = now["sensor", "depth"].shape[-2:]
+        for v, u in [divmod(pixel, width) for pixel in range(0, height * width, 3)]:
+            z, body = now["sensor", "depth"][0, v, u], int(now["sensor", "instance"][0, v, u])
+            x, y = (torch.tensor([u + 0.5, v + 0.5]) - now["raw"][:, v, u]).floor().int().tolist()
+            if z.isinf() or not (0 <= x < width and 0 <= y < height):
+                continue
+            point = z * torch.linalg.inv(K) @ torch.tensor([u + 0.5, v + 0.5, 1.0])
+            motion = now["sensor", "instance_motion"][body]
+            z_before = (motion[:3, :3] @ point + motion[:3, 3])[2]
+            there = before["sensor", "depth"][0, y, x]
+            if there < 0.97 * z_before:
+                continue  # hidden
+            visible += 1
+            is_body = before["sensor", "instance"][0, y, x] == body
+            agreed += bool(is_body and (there - z_before).abs() < 0.03 * z_before)
+    assert visible > 1000
+    return agreed / visible
+
+
+def test_worlds_of_newton():
+    pytest.importorskip("newton", reason="pip install newton; it runs on a CPU")
+    from examples.newton_flow import K, make_env
+
+    env = make_env()
+    check_env_specs(env)
+    frames = env.rollout(6, policy=lambda td: td.set("action", torch.ones(2, 1)))["next"]
+    assert share_that_warps(frames, K) > 0.99
+    speed, row = frames["obj"].norm(dim=-3, keepdim=True), frames["sensor", "instance"]
+    assert (speed[row == 0] == 0).all()
+    for body in (1, 2):
+        assert speed[0][row[0] == body].median() < 0.9 * speed[1][row[1] == body].median()
+
+
+def test_a_robots_wrist_in_mjlab():
+    pytest.importorskip("mjlab", reason="pip install mjlab; it runs on a CPU")
+    from examples.mjlab_flow import intrinsics, make_env
+
+    env = make_env()
+    check_env_specs(env)
+    frames = env.rollout(6)["next"]
+    assert share_that_warps(frames, intrinsics(env)) > 0.99
+    speed, row = frames["obj"].norm(dim=-3, keepdim=True), frames["sensor", "instance"]
+    assert (speed[row == 0] == 0).all()
+    assert speed[row > 0].max() > 0.5
+
+
 class Bench:
     """Two benches in ManiSkill's conventions: a camera goes 0.1 m to the right above a wall 1 m
     ahead, and body 3 in front of it, in the second bench alone, as far again. K: f = 20 px."""
