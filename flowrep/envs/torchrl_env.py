@@ -146,6 +146,7 @@ def make_env(
         raise ValueError(f"num_envs is {num_envs}; give at least one environment")
     device = usable_device(device)
     loaded = load_scene(scene)
+    # The estimator needs pictures of its scale, whatever the env was asked for.
     if isinstance(flow, Mapping):
         picture_scale = flow.get("picture_scale", picture_scale)
     drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}

@@ -251,6 +251,7 @@ def strip(
         raise ValueError(f"a strip needs images of one ratio of height to width, got {sizes}")
     zoom = tile_zoom(height, width)
     with_wheel = frozenset(wheel_for)
+    # A column for each image: label, note (if any image has one, so that all stand level), image.
     columns: list[Image] = []
     for label, image in images.items():
         bar = text_bar(label, width * zoom, _BAR_PX, size=18).copy()
