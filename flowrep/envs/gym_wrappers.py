@@ -115,6 +115,10 @@ class NumericInfo(gym.Wrapper):
 
     `outcome` is a code of `Outcome`, `hit` a class id or 255, `path` an index into the scene's
     paths; `is_success` is what Stable-Baselines3 reads.
+
+    Args:
+        env: a `StreetEnv`, wrapped or not.
+        truncate_timeouts: whether a time-out is `truncated`, not `terminated`.
     """
 
     def __init__(self, env: gym.Env, *, truncate_timeouts: bool = False) -> None:

@@ -236,7 +236,11 @@ def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
 
 
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
-    """Restores states from `get_states`; continue with the TensorDict of the same step."""
+    """Restores states from `get_states`; continue with the TensorDict of the same step.
+
+    Raises:
+        ValueError: there isn't one state for each environment.
+    """
     vector = _vector(env)
     if len(states) != (count := vector.num_envs):
         raise ValueError(f"{len(states)} states for {count} environments; give one for each")

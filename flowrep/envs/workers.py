@@ -86,8 +86,7 @@ class WorkerVectorEnv(VectorEnv):
         self.observation_space = batch_space(space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
-        # Rows of the batch by worker, as evenly as possible: 5 environments in 3 workers are 2, 1,
-        # 2.
+        # Rows of the batch by worker, as evenly as possible: 2, 1 and 2 of 5 in 3 workers.
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
         self._rows = [slice(*ends) for ends in pairwise(bounds)]
         self._workers: list[_Worker] = []
