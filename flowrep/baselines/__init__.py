@@ -23,7 +23,7 @@ def never_turn(env: StreetEnv) -> int:
 
 
 class RandomActions:
-    """Draws actions uniformly; those of an episode don't depend on earlier episodes."""
+    """Draws actions uniformly from `seed` and the episode's; earlier episodes play no part."""
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed

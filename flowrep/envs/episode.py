@@ -97,6 +97,7 @@ class Episode:
         paths = {each.name: each for each in scene.paths}
         if path is not None and path not in paths:
             raise ValueError(f"unknown path {path!r}; the scene has {[*paths]}")
+        # The order of the draws is part of what a seed means: first the path, then the people.
         rng = np.random.default_rng(episode_seed)
         # Drawn even if a path is given, so that a seed has the same people on every path.
         drawn = scene.paths[int(rng.integers(len(scene.paths)))]
@@ -133,6 +134,8 @@ class Episode:
 
     def step(self, action: int, street: Street) -> None:
         """Drives one step, or part of it if the episode ends."""
+        # The yaw rate changes once, at the beginning; then the vehicle rolls along one arc, on
+        # which the footprint is checked at every tick.
         turned = turn(self.now.vehicle, YAW_SIGN[action], self.dt_s, self.layout.scene.vehicle)
         times_s = [(1 + i) * self.tick_s for i in range(self.ticks_per_step)]
         track = [roll(turned, time_s, self.vehicle_speed_mps) for time_s in times_s]

@@ -83,6 +83,7 @@ class RepresentationObservation(gym.Wrapper):
         """Begins an episode, with a frame rate of its own unless flow is in px/s."""
         check_rate(self._stack, options, self._frame_rate_hz)
         observation, info = self.env.reset(seed=seed, options=options)
+        # TorchRL's entry points of a transform, called as its TransformedEnv calls them.
         sensed = _sensed(observation)
         self._now = self._stack._reset(sensed, sensed)
         return self._maps(), info
@@ -114,6 +115,10 @@ class NumericInfo(gym.Wrapper):
 
     `outcome` is a code of `Outcome`, `hit` a class id or 255, `path` an index into the scene's
     paths; `is_success` is what Stable-Baselines3 reads.
+
+    Args:
+        env: a `StreetEnv`, wrapped or not.
+        truncate_timeouts: whether a time-out is `truncated`, not `terminated`.
     """
 
     def __init__(self, env: gym.Env, *, truncate_timeouts: bool = False) -> None:

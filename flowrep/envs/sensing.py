@@ -74,6 +74,7 @@ class Sensing:
             if "instance_motion" in self.names:
                 parts_before = world_from_parts(np.stack([e.poses_before for e in episodes]))
                 parts = world_from_parts(np.stack([e.poses for e in episodes]))
+                # Composed in float64, rounded once. Row 0 is copied, as a view would have gaps.
                 rows = instance_motion(before, now, parts_before, parts).astype(np.float32)
                 observation |= {"instance_motion": rows, "prev_from_curr": rows[:, 0].copy()}
             else:
@@ -141,6 +142,7 @@ class Sensing:
         return self._rasterisers[scale]
 
     def _pictured(self, episode: Episode) -> Arrays:
+        # All environments share one PyBullet world: people and exits are placed for each picture.
         self._street.close_exits(episode.path.closures)
         self._street.place_pedestrians(episode.poses)
         picture = self.look(episode)

@@ -110,6 +110,8 @@ class StreetEnv(gym.Env):
         self.begin(seed=seed, options=options)
         return self.sensing.observe(self.episode), self._info()
 
+    # `begin` and `drive` leave out the observation, so that `StreetVectorEnv` draws all at once.
+
     def begin(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begins an episode as `reset` does, without an observation."""
         super().reset(seed=seed)

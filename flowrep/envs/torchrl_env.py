@@ -146,6 +146,7 @@ def make_env(
         raise ValueError(f"num_envs is {num_envs}; give at least one environment")
     device = usable_device(device)
     loaded = load_scene(scene)
+    # The estimator needs pictures of its scale, whatever the env was asked for.
     if isinstance(flow, Mapping):
         picture_scale = flow.get("picture_scale", picture_scale)
     drawn: Any = {"renderer": choose_renderer(renderer), "picture_scale": picture_scale}
@@ -235,7 +236,11 @@ def get_states(env: TransformedEnv) -> list[dict[str, Any]]:
 
 
 def set_states(env: TransformedEnv, states: Sequence[Mapping[str, Any]]) -> None:
-    """Restores states from `get_states`; continue with the TensorDict of the same step."""
+    """Restores states from `get_states`; continue with the TensorDict of the same step.
+
+    Raises:
+        ValueError: there isn't one state for each environment.
+    """
     vector = _vector(env)
     if len(states) != (count := vector.num_envs):
         raise ValueError(f"{len(states)} states for {count} environments; give one for each")

@@ -86,6 +86,7 @@ class WorkerVectorEnv(VectorEnv):
         self.observation_space = batch_space(space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._begun: NDArray[Any] | None = None  # the actions of a step that is under way
+        # Rows of the batch by worker, as evenly as possible: 2, 1 and 2 of 5 in 3 workers.
         bounds = np.linspace(0, self.num_envs, num_workers + 1).round().astype(int).tolist()
         self._rows = [slice(*ends) for ends in pairwise(bounds)]
         self._workers: list[_Worker] = []
@@ -154,6 +155,7 @@ class WorkerVectorEnv(VectorEnv):
         elif not np.array_equal(self._begun, actions):
             raise ValueError(f"step_async began a step with {self._begun}, step got {actions}")
         self._begun = None
+        # Workers write observations into shared memory, where the next step overwrites them.
         outcomes = [worker.receive()[:3] for worker in self._workers]
         rewards, terminated, truncated = map(np.concatenate, zip(*outcomes))
         return deepcopy(self._shared), rewards, terminated, truncated, {}

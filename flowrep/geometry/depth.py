@@ -87,7 +87,11 @@ def _is_sky(depth: Tensor, sky: float) -> Tensor:
 def z_from_ray_length(ray_length: Tensor, K: Tensor) -> Tensor:
     """Returns depth along the optical axis from ray lengths, `[*B, 1, H, W]`, metres.
 
-    Convention: see `adapt_depth`, as for K `[*B, 3, 3]`.
+    Convention: see `adapt_depth`.
+
+    Args:
+        ray_length: `[*B, 1, H, W]`, metres from the camera's centre.
+        K: `[*B, 3, 3]`, pixels.
 
     >>> K = torch.tensor([[4.0, 0.0, -2.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]])
     >>> z_from_ray_length(torch.full((1, 1, 1), 5.0), K)  # it looks along (0.75, 0, 1)
@@ -107,10 +111,16 @@ def z_from_z_buffer(
 ) -> Tensor:
     """Returns depth along the optical axis from a perspective camera's depth buffer, metres.
 
-    Convention: see `adapt_depth`; both are `[*B, 1, H, W]`. The result is inf where nothing was
-    drawn and nan where the buffer is outside [0, 1], both up to rounding: PyBullet's software
-    renderer has 0.9999999 or 1.0000001 where nothing was drawn, so a surface that close to the far
-    plane counts as none. A reversed buffer is exactly 0 there, since numbers near 0 are exact.
+    Convention: see `adapt_depth`. The result is inf where nothing was drawn and nan where the
+    buffer is outside [0, 1], both up to rounding: PyBullet's software renderer has 0.9999999 or
+    1.0000001 where nothing was drawn, so a surface that close to the far plane counts as none. A
+    reversed buffer is exactly 0 there, since numbers near 0 are exact.
+
+    Args:
+        z_buffer: `[*B, 1, H, W]`, 0 to 1.
+        near_m: the near plane, more than 0.
+        far_m: the far plane, farther than `near_m`; may be inf.
+        is_reversed: whether 1 is at the near plane.
 
     >>> z_from_z_buffer(torch.tensor([[[0.5]]]), near_m=0.5, far_m=torch.inf)
     tensor([[[1.]]])

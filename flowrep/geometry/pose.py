@@ -173,6 +173,7 @@ def check_rigid(name: str, a_from_b: Tensor, *, tolerance: float = 1e-3) -> None
 
     Args:
         name: of the argument, for the message.
+        a_from_b: the transforms.
         tolerance: on each element of R Rᵀ - I and of the last row.
 
     Raises:

@@ -1,7 +1,10 @@
 """TorchRL transforms that turn sensor maps into mid-level representations.
 
-A constructor raises ValueError, which names the argument, for a value that can't be used. In calls,
-ValueError names an input of another layout, and `MissingKey`, a KeyError, one that isn't there.
+`*B` is any leading batch. Every transform takes `in_keys` and `out_keys`, as in TorchRL one key (a
+string, or a tuple of strings if nested) or a list of keys; by default those in its table.
+
+A constructor raises ValueError for a value that can't be used, and names the argument. A call
+raises ValueError for an input of another layout, and `MissingKey`, a KeyError, for a missing one.
 """
 
 from flowrep.transforms.adapt import AdaptDepth, AdaptFlow, AdaptPose, BodyRows

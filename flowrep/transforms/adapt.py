@@ -168,11 +168,13 @@ class AdaptFlow(MapTransform):
     | --- | --- | --- | --- | --- |
     | flow | `"raw"` | float `[*B, 2, H, W]` | any | px/step |
 
-    Convention and further arguments: see `flowrep.geometry.adapt_flow`. Flow on the previous
-    frame's grid raises ValueError, which names the remedy.
+    Convention and further arguments: see `flowrep.geometry.adapt_flow`.
 
     Args:
         channels_last: whether the env's flow is `[*B, H, W, 2]`.
+
+    Raises:
+        ValueError: an option is unknown, or the grid is the previous frame's.
 
     Example:
         >>> from tensordict import TensorDict

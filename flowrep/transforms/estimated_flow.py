@@ -178,7 +178,7 @@ class RAFT(nn.Module):
         return super().train(False)
 
     def _prepared(self, pictures: Tensor, factor: int) -> Tensor:
-        scaled = pictures.float() / 127.5 - 1.0
+        scaled = pictures.float() / 127.5 - 1.0  # torchvision's weights expect -1 to 1
         if factor > 1:
             scaled = functional.interpolate(
                 scaled, scale_factor=factor, mode="bilinear", align_corners=False

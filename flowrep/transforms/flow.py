@@ -69,6 +69,7 @@ class CameraTransform(MapTransform):
         writes: int = 1,
         prev_intrinsics: NestedKey | None = None,
     ) -> None:
+        # A key is a string or a tuple of strings; K is a tensor or rows of numbers.
         K, keys = None, []
         if intrinsics is not None:
             if isinstance(intrinsics, str) or all(isinstance(part, str) for part in intrinsics):
@@ -153,6 +154,7 @@ class CameraTransform(MapTransform):
         """Writes the outputs for a batch of any shape, at its root and under `"next"`."""
         self._calls += 1
         if self._needs_one_camera:
+            # Two frames in a row: the root and "next", or neighbours along the time dimension.
             key, frames = self.camera_keys[0], tensordict
             now = tensordict.get(("next", key), None)
             if now is None and "time" in tensordict.names:
@@ -230,6 +232,7 @@ class FlowTransform(CameraTransform):
         dtype = torch.promote_types(depth.dtype, torch.float32)
         maps = [*maps] if self.K is None else [*maps, self.K]
         maps = [x.to(dtype) if x.is_floating_point() else x for x in maps]
+        # With two keys, K and the previous K are the last of the maps already.
         return maps if len(self.camera_keys) == 2 else [*maps, None]
 
     def _chosen(self, flows: Mapping[str, Tensor], valid: Tensor) -> tuple[Tensor, ...]:

@@ -39,6 +39,10 @@ class FrameStack(RecurrentTransform):
         in_keys: the maps.
         out_keys: one key for each stack, other than the maps' keys.
 
+    Raises:
+        ValueError: `k` is less than 1, or a stack has the key of a map.
+        MissingKey: in calls, the previous step or the trajectory is missing.
+
     Example:
         >>> from tensordict import TensorDict
         >>> frames = torch.arange(3.0).reshape(3, 1, 1, 1)

@@ -144,6 +144,9 @@ class Depth(MapTransform):
         range_m: the depth that becomes 1, metres.
         missing: the value of a hole, 0 to 1.
 
+    Raises:
+        ValueError: `range_m` isn't positive and finite, or `missing` isn't in [0, 1].
+
     Example:
         >>> from tensordict import TensorDict
         >>> depth = torch.tensor([[[25.0, 400.0, torch.inf, torch.nan]]])

@@ -220,6 +220,7 @@ class EstimateCameraMotion(CameraTransform):
 
     def compute(self, raw: Tensor, depth: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
         """Returns the chosen outputs."""
+        # In the order of the keys: picture, prior, K, previous K, each if there is one.
         rest = list(more)
         picture = rest.pop(0) if self.has_picture else None
         if picture is not None:

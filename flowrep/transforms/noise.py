@@ -164,6 +164,7 @@ class SensorNoise(MapTransform):
             generator.manual_seed(_drawn_seed() if self.seed is None else self.seed)
         else:
             generator.set_state(self._state)
+        # Always in this order, or a resumed run would draw other numbers.
         normals = torch.randn((*batch, *shape), generator=generator, device=device)
         if sensor == "depth":
             uniforms = torch.rand((*batch, *shape), generator=generator, device=device)
@@ -185,7 +186,8 @@ class SensorNoise(MapTransform):
 
 def _drawn_seed() -> int:
     """Returns a seed that differs between envs in one process and between worker processes."""
-    # Forked workers share the state of torch's generator and spawned ones its default seed.
+    # Forked workers share the state of torch's generator, spawned ones its default seed: only their
+    # names differ.
     drawn = int(torch.randint(2**62, ()))
     return drawn ^ zlib.crc32(multiprocessing.current_process().name.encode())
 

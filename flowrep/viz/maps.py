@@ -88,7 +88,7 @@ def flow_wheel(size_px: int, background: tuple[int, int, int] = (255, 255, 255))
 
 
 def classes_to_rgb(semantic: Any) -> Image:
-    """Returns class ids `[1, H, W]` in the colours of `CLASS_COLOURS`; unknown ids are grey."""
+    """Returns class ids, `semantic` `[1, H, W]`, as `CLASS_COLOURS`; unknown ids are grey."""
     ids = _channels("semantic", semantic, 1)[0]
     palette = np.full((256, 3), _UNKNOWN, dtype=np.uint8)
     palette[: len(CLASS_COLOURS)] = list(CLASS_COLOURS.values())
@@ -251,6 +251,7 @@ def strip(
         raise ValueError(f"a strip needs images of one ratio of height to width, got {sizes}")
     zoom = tile_zoom(height, width)
     with_wheel = frozenset(wheel_for)
+    # A column for each image: label, note (if any image has one, so that all stand level), image.
     columns: list[Image] = []
     for label, image in images.items():
         bar = text_bar(label, width * zoom, _BAR_PX, size=18).copy()

@@ -43,6 +43,7 @@ def draw_plan(layout: Layout, tracks: Iterable[Track] = (), *, path: str | None 
 
     The closures of `path` are drawn in full; if it is None, all are drawn faintly.
     """
+    # As wide as what stands there, and as high as the same metres need, within a page.
     standing = [box.footprint for box in (*layout.buildings, *layout.obstacles)]
     shown = shapely.union_all([layout.drivable, layout.sidewalks, *standing])
     x0, y0, x1, y1 = shown.buffer(_MARGIN_M).bounds
@@ -69,6 +70,7 @@ def _colour(category: str, tint: float = _TINT) -> tuple[float, ...]:
 def _fill(axes: Axes, ground: BaseGeometry, colour: Any, **style: Any) -> None:
     for part in shapely.get_parts(ground):
         if part.geom_type == "Polygon":
+            # One compound path, so that holes stay open.
             rings = [part.exterior, *part.interiors]
             outline = Outline.make_compound_path(*(Outline(ring.coords) for ring in rings))
             axes.add_patch(PathPatch(outline, facecolor=colour, **{"linewidth": 0} | style))

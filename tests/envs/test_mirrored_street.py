@@ -11,6 +11,7 @@ from flowrep.envs import StreetEnv, make_mirror
 from flowrep.geometry import factorize, rigid_flow
 from flowrep.scenes import load_scene, scene_names
 from flowrep.simulator.rasteriser import Rasteriser
+from flowrep.simulator.street import Street
 
 LEFT, RIGHT = 1, 2
 SIDEWAYS = np.diag([1.0, -1.0, 1.0, 1.0])  # of the world and of bodies: y to the left
@@ -35,7 +36,7 @@ def test_maps_of_the_mirrored_street(name):
     env.reset(options={"episode_seed": 7})
     for action in [LEFT] * 3 + [RIGHT] * 4 + [LEFT] * 2:
         observation, *_ = env.step(action)
-    street = env.sensing._street
+    street = Street.shared(env.scene)
     range_m = camera.near_m, camera.far_m
     size = camera.height_px, camera.width_px
     rasterise = Rasteriser(other_way_round(street.triangles), env.K, size, range_m)

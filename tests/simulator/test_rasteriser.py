@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowrep.simulator.meshes import Body, gather
-from flowrep.simulator.rasteriser import Rasteriser, _compiled
+from flowrep.simulator.rasteriser import Rasteriser
 
 # Nothing is square and nothing centred, so that no two numbers can be swapped.
 HEIGHT, WIDTH = 6, 9
@@ -151,14 +151,3 @@ def test_chunks_hold_every_triangle_once():
         distances = np.linalg.norm(points - triangles.centres[c], axis=1)
         assert distances.max() <= triangles.radii[c] * (1 + 1e-12)
     assert sorted(regained) == sorted(vertices[corners].tolist())
-
-
-def test_without_a_folder_for_machine_code_each_process_compiles_anew(monkeypatch):
-    """As where flowrep and the home are read-only."""
-    monkeypatch.setattr("numba.core.caching.CacheImpl._locator_classes", [])
-
-    @_compiled
-    def doubled(x):
-        return 2 * x
-
-    assert doubled(21) == 42

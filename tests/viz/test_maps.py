@@ -147,10 +147,6 @@ def test_a_map_in_grey_is_black_at_its_least_and_white_at_its_most():
     assert grey[:5].tolist() == [[v, v, v] for v in (0, 0, 64, 255, 255)]
 
 
-def test_half_the_saturation_is_where_the_note_says():
-    assert viz.flow_note(4.0) == "full at 4 px, half at 1 px"  # as the colours by hand above
-
-
 def test_the_given_scale_is_that_of_the_colours():
     given = {"obj": torch.full((2, 3, 40), 2.0)}
     image = viz.representation_strip(given, flow_scale_px={"obj": 8.0})
