@@ -2,8 +2,8 @@
 
     python benchmarks/evaluation.py [--scene straight_road] [--maps ego obj] [--num-envs 32 96]
 
-The agent has a network's cost but always drives straight on, so that the episodes are the same
-whatever is measured. The batch sizes take turns. Times are CPU times.
+The agent costs as much as a trained network but always drives straight on, so that the episodes are
+the same whatever is measured. The batch sizes take turns. Times are CPU times.
 """
 
 import argparse
@@ -48,7 +48,7 @@ class StraightOn:
 def measured(
     scene: Scene, maps: list[str], policy: Policy, num_envs: int, episodes: int
 ) -> dict[str, float]:
-    """Returns CPU seconds by part of an evaluation, its steps and the seconds to make its env."""
+    """Returns CPU seconds of an evaluation, by part and for making its env, and its steps."""
     spent: Counter[str] = Counter()
 
     def timed(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
@@ -65,6 +65,8 @@ def measured(
     env = make_env(scene, maps, num_envs=num_envs)
     made = time.process_time()
     options = [{"episode_seed": FIRST_SEED + k, "speed": "normal"} for k in range(episodes)]
+    # A step of the TransformedEnv contains the GymWrapper's, which drives and draws the streets;
+    # the rest of it is the representations'.
     parts = {"streets": (GymWrapper, "_step"), "env": (TransformedEnv, "_step")}
     with ExitStack() as stack:
         for name, (owner, method) in (parts | {"act": (StraightOn, "__call__")}).items():

@@ -81,7 +81,8 @@ def sweep(
     for height, width in SWEEP_SIZES:
         for batch in SWEEP_BATCHES:
             pixels = batch * height * width
-            # Inputs, outputs and the previous call's results, whose memory may not be free yet.
+            # Inputs and outputs, and 20 bytes a pixel for the previous call's results, whose memory
+            # may not be free yet.
             needed = pixels * (BYTES_PER_PIXEL + 20)
             if needed > limit:
                 print(
@@ -183,6 +184,7 @@ def verdict(held: bool) -> str:
 
 
 def median_ratio(slow: list[float], fast: list[float]) -> float:
+    # of each turn, in which the machine's load is the same for both
     return statistics.median(s / f for s, f in zip(slow, fast))
 
 

@@ -78,6 +78,7 @@ def flowrep_update(
 
 
 def nature(side: int) -> nn.Sequential:
+    """Returns the convolutions of the DQN paper: 8/4, 4/2, 3/1, without padding."""
     final = ((((side - 8) // 4 + 1) - 4) // 2 + 1) - 2
     return nn.Sequential(
         nn.Conv2d(CHANNELS, 32, 8, 4), nn.LeakyReLU(), nn.Conv2d(32, 64, 4, 2), nn.LeakyReLU(),
@@ -125,24 +126,26 @@ def plain_update(steps: TensorDict, dtype: torch.dtype) -> Callable[[], object]:
     reward, ended = (steps["next", name].squeeze(-1) for name in ("reward", "terminated"))
     target_entropy = TARGET_ENTROPY_WEIGHT * torch.tensor(ACTIONS, device=device).log()
 
-    def two(q: torch.Tensor) -> torch.Tensor:
+    def two(q: torch.Tensor) -> torch.Tensor:  # [B, 2 A] to [B, 2, A]
         return q.float().unflatten(-1, (2, ACTIONS))
 
     def update() -> None:
         alpha = log_alpha.detach().exp()
         with torch.autocast(device.type, dtype, enabled=dtype is not torch.float32):
             with torch.no_grad():
+                # y = r + γ Σ π(a|s') (min Q(s', a) - α log π(a|s')), without the sum at an end
                 embedded = target.embed(following)
                 log_policy = actor(embedded).float().log_softmax(-1)
                 q = two(target.head(embedded)).amin(1)
                 value = (log_policy.exp() * (q - alpha * log_policy)).sum(-1)
                 y = reward + GAMMA * value.masked_fill(ended, 0.0)
+            # The policy reads the critic's encoder but does not train it.
             embedded = critic.embed(maps)
             q = two(critic.head(embedded))
             log_policy = actor(embedded.detach()).float().log_softmax(-1)
         chosen = q.gather(-1, action.unsqueeze(-1).expand(-1, 2, -1)).squeeze(-1)
         policy = log_policy.exp()
-        loss = 2 * F.mse_loss(chosen, y.unsqueeze(-1).expand(-1, 2))
+        loss = 2 * F.mse_loss(chosen, y.unsqueeze(-1).expand(-1, 2))  # the sum over both Qs
         loss = loss + (policy * (alpha * log_policy - q.detach().amin(1))).sum(-1).mean()
         surplus = (policy * log_policy).sum(-1).mean().detach() + target_entropy
         (loss - log_alpha * surplus).backward()

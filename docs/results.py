@@ -1,8 +1,8 @@
 """The page of results: `make results` writes docs/results.md and its figure.
 
-What is tested is declared in claims.yaml, the words around the numbers in results.md.jinja, and
-all numbers come from the packed runs. A run counts with its success rate: its episodes are those
-that all compared runs drove.
+claims.yaml declares what is tested, results.md.jinja has the words around the numbers, and all
+numbers come from the packed runs. `flowrep.report.statistics` decides what is significant. A run
+counts with its success rate over the episodes that all compared runs drove.
 """
 
 import sys
@@ -47,14 +47,11 @@ FIGURE = "images/results_claims.svg"
 CLAIMS = HERE / "claims.yaml"
 _SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
-_STUDY = {  # in the figure
-    "resolution": ", 84 px",
-    "wide_confirmation": ", 0.6–2.4 m/s",
-}
+_STUDY = {"resolution": ", 84 px", "wide_confirmation": ", 0.6–2.4 m/s"}  # in the figure
 UNSEEN = "not seen with this recipe"
 _CLAIMED = {"more": "higher", "less": "lower"}
 _TIED = "\u00a0"  # a space at which no line breaks
-_WIDEST = 80  # points of the figure's axis
+_WIDEST = 80  # points, where the figure's axis ends
 _POWER = 0.8
 _FOUND = 0.5  # a run finds a way if it succeeds in this share of its episodes
 _HARDLY_EVER = 0.05  # success at the training speed
@@ -63,37 +60,31 @@ Studies = Mapping[str, Mapping[str, Sequence[Run]]]
 
 
 def studies_of(declared: Mapping[str, Any], runs: Sequence[Run]) -> Studies:
-    """Returns the finished runs of each study and scene, where there are any."""
-    found = {
-        study: {
-            scene: [
-                run
-                for run in runs
-                if run.is_finished and any(fnmatch(run.name, p) for p in patterns.split())
-            ]
-            for scene, patterns in of_scenes.items()
-        }
+    """Returns the finished runs of each study and scene, if there are any."""
+
+    def finished(patterns: str) -> list[Run]:
+        asked = [r for r in runs if any(fnmatch(r.name, p) for p in patterns.split())]
+        return [run for run in asked if run.is_finished]
+
+    return {
+        study: {s: of for s, patterns in of_scenes.items() if (of := finished(patterns))}
         for study, of_scenes in declared["studies"].items()
     }
-    return {name: {s: of for s, of in study.items() if of} for name, study in found.items()}
 
 
 @dataclass
 class Contrast:
-    """One comparison, as claims.yaml asks for it, and its outcome.
+    """One comparison that claims.yaml asks for, and its outcome.
 
-    `effect` is the difference in the mean over its scenes, None without runs on both sides;
-    `fewest` the fewest runs of a side in a scene. `p_value` is that of the protocol's test, and
-    `p_against` that of the test which contradicts: for `equal`, of a difference beyond the margin,
-    else the same one. Both are corrected if the claim is primary.
+    p values are corrected if the claim is primary.
     """
 
     asked: Mapping[str, Any]
-    effect: Effect | None
+    effect: Effect | None  # in the mean over scenes; None if a side has no run
     by_scene: Mapping[str, Effect]
-    fewest: int
-    p_value: float
-    p_against: float
+    fewest: int  # runs on a side in a scene
+    p_value: float  # of the protocol's test
+    p_against: float  # of what contradicts: for `equal`, a difference beyond the margin
 
     @property
     def verdict(self) -> str:
@@ -104,10 +95,10 @@ class Contrast:
             if self.p_value < LEVEL:
                 return "holds"
             return "contradicted" if self.p_against < LEVEL else UNSEEN
-        found = self.effect.verdict(self.p_value)
-        if found == "not seen":
+        direction = self.effect.verdict(self.p_value)
+        if direction == "not seen":
             return UNSEEN
-        return "holds" if found == _CLAIMED[self.asked["expect"]] else "contradicted"
+        return "holds" if direction == _CLAIMED[self.asked["expect"]] else "contradicted"
 
 
 class Claim(NamedTuple):
@@ -121,12 +112,12 @@ class Claim(NamedTuple):
     @property
     def verdict(self) -> str:
         """Returns the verdict on all of its contrasts."""
-        found = {contrast.verdict for contrast in self.contrasts}
-        if len(found) == 1:
-            return found.pop()
-        if "holds" in found:
+        verdicts = {contrast.verdict for contrast in self.contrasts}
+        if len(verdicts) == 1:
+            return verdicts.pop()
+        if "holds" in verdicts:
             return "holds in part"
-        return "contradicted" if "contradicted" in found else UNSEEN
+        return "contradicted" if "contradicted" in verdicts else UNSEEN
 
 
 def claims_of(
@@ -154,41 +145,31 @@ def _contrast(
     asked: Mapping[str, Any], study: Mapping[str, Sequence[Run]], scenes: Sequence[str]
 ) -> Contrast:
     firsts = [asked["first"]] if isinstance(asked["first"], str) else asked["first"]
-    strata: dict[str, list[list[Array]]] = {}
+    strata: dict[str, list[list[Array]]] = {}  # rates of both sides, by scene and first stack
     for scene, here in study.items():
-        found = []
         for first in firsts:
             stacks = [first, *([asked["second"]] if "second" in asked else [])]
             sides = scores([[run for run in here if run.stack == stack] for stack in stacks], asked)
             if sides is not None and not np.isnan(np.concatenate(sides)).any():
-                found.append(sides)
-        if len(found) == len(firsts):
-            strata[scene] = found
+                strata.setdefault(scene, []).append(sides)
+    strata = {scene: sides for scene, sides in strata.items() if len(sides) == len(firsts)}
     chosen = asked.get("scenes", scenes)
-    has_all = {*chosen} <= {*strata}
-    together = effect([sides for s in chosen for sides in strata[s]]) if has_all else None
-    tested = (float("nan"), float("nan")) if together is None else p_values(together, asked)
-    by_scene = {scene: effect(found) for scene, found in strata.items()}
-    sides_of = [side for s in chosen for sides in strata.get(s, []) for side in sides]
-    fewest = min(map(len, sides_of), default=0)
-    return Contrast(asked, together, by_scene, fewest, *tested)
-
-
-def p_values(found: Effect, asked: Mapping[str, Any]) -> tuple[float, float]:
-    """Returns p of the protocol's test, and of the test that contradicts the claim."""
-    if asked["expect"] != "equal":
-        return found.p_value, found.p_value
-    # of two one-sided tests, that against the nearer end of the margin has the larger p
-    nearer = found._replace(value=abs(found.value) - asked["margin"])
-    if nearer.value < 0:
-        return nearer.p_value / 2, 1.0
-    return 1 - nearer.p_value / 2, nearer.p_value
+    by_scene = {scene: effect(sides) for scene, sides in strata.items()}
+    if not {*chosen} <= {*strata}:
+        return Contrast(asked, None, by_scene, 0, float("nan"), float("nan"))
+    pairs = [sides for scene in chosen for sides in strata[scene]]
+    together, fewest = effect(pairs), min(len(side) for sides in pairs for side in sides)
+    if asked["expect"] == "equal":
+        p_values = together.p_within(asked["margin"]), together.p_beyond(asked["margin"])
+    else:
+        p_values = together.p_value, together.p_value
+    return Contrast(asked, together, by_scene, fewest, *p_values)
 
 
 def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Array] | None:
-    """Returns the score of each run of each side, of one scene; None if a side has no run.
+    """Returns the score of each run of each side, in one scene; None if a side has no run.
 
-    `asked` names the measure and its conditions as in claims.yaml. A run's episodes are those that
+    `asked` names the measure and its conditions as in claims.yaml. Scores are of the episodes that
     all runs of all sides drove.
     """
     if not all(sides):
@@ -199,13 +180,13 @@ def scores(sides: Sequence[Sequence[Run]], asked: Mapping[str, Any]) -> list[Arr
     def score(outcomes: Sequence[Any]) -> float:
         if kind == "out_of_bounds":
             return departures(outcomes)
-        means = [success_rate([ends]) for ends in outcomes]
-        return (
-            means[0] / means[1] if kind == "kept" else float(np.dot(means, [*asked[kind].values()]))
-        )
+        rates = [success_rate([ends]) for ends in outcomes]
+        if kind == "kept":
+            return rates[0] / rates[1]
+        return float(np.dot(rates, [*asked[kind].values()]))
 
-    found = paired_scores(sides, conditions, score)
-    return found and found[0]
+    paired = paired_scores(sides, conditions, score)
+    return paired and paired[0]
 
 
 def _measure(asked: Mapping[str, Any]) -> str:
@@ -213,9 +194,13 @@ def _measure(asked: Mapping[str, Any]) -> str:
 
 
 def _conditions(run: Run, names: Iterable[str | int]) -> list[Condition]:
-    """Returns greedy drives at each speed mode, or frame rate at the speed of training."""
-    of = [(n, run.fps) if isinstance(n, str) else (run.speed, float(n)) for n in names]
-    return [Condition("greedy", *condition) for condition in of]
+    """Returns greedy driving at each speed mode, or at each frame rate and the training speed."""
+    asked = [(n, run.fps) if isinstance(n, str) else (run.speed, float(n)) for n in names]
+    return [Condition("greedy", *condition) for condition in asked]
+
+
+def _as_trained(run: Run) -> Condition:
+    return Condition("greedy", run.speed, run.fps)
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -253,7 +238,11 @@ def protocols_table(narrow: Sequence[Claim], wide: Sequence[Claim], scene: str) 
 
 
 def effect_text(contrast: Contrast) -> str:
-    """Returns an effect with its interval and p; of `equal`, p of the nearer one-sided question."""
+    """Returns an effect with its interval and p.
+
+    If the claim is that two stacks are equal, p is that of a difference within the margin, or
+    beyond it if the effect is.
+    """
     if contrast.effect is None:
         return "runs are missing"
     if np.isnan(contrast.p_value):
@@ -324,7 +313,7 @@ def _draw_effect(
 
 
 def without(left_out: Sequence[Run], declared: Mapping[str, Any], studies: Studies) -> list[str]:
-    """Returns the rows whose effect is another one without some runs of the main study."""
+    """Returns the rows whose effect changes without some runs of the main study."""
     rest = {s: [r for r in of if r not in left_out] for s, of in studies["main"].items()}
     before, after = (
         [claim for claims in claims_of(declared, {**studies, "main": of}) for claim in claims]
@@ -358,12 +347,12 @@ def scene_table(runs: Sequence[Run], is_fork: bool) -> str:
 
 def all_ways_found(runs: Sequence[Run]) -> str:
     """Returns how many of the runs find all ways."""
-    found = sum(min(map(_share, _ends_by_way(run))) >= _FOUND for run in runs)
-    return f"{found} of {len(runs)}"
+    number = sum(min(map(_share, _ends_by_way(run))) >= _FOUND for run in runs)
+    return f"{number} of {len(runs)}"
 
 
 def missed_ways(runs: Iterable[Run]) -> list[str]:
-    """Returns each stack's seeds that miss a way, and how each ends on its worst."""
+    """Returns each stack's seeds that miss a way, and how each ends on its worst path."""
     missed: dict[str, list[str]] = {}
     for run in runs:
         worst = min(_ends_by_way(run), key=_share)
@@ -375,15 +364,10 @@ def missed_ways(runs: Iterable[Run]) -> list[str]:
 
 
 def _ends_by_way(run: Run) -> list[Array]:
-    """Returns how episodes end on each path, greedy and at the run's training speed."""
-    driven = run.under(Condition("greedy", run.speed, run.fps))
+    """Returns how episodes end on each path, with greedy actions at the training speed."""
+    driven = run.under(_as_trained(run))
     ends = np.where(driven["hit"] == "", driven["outcome"], driven["hit"])
     return [ends[driven["path"] == path["name"]] for path in run.config["scene"]["paths"]]
-
-
-def _at_training(run: Run) -> float:
-    """Returns a run's success at its training speed."""
-    return _share(run.under(Condition("greedy", run.speed, run.fps))["outcome"])
 
 
 def _share(ends: Array) -> float:
@@ -391,13 +375,13 @@ def _share(ends: Array) -> float:
 
 
 def _successes(runs: Sequence[Run]) -> list[str]:
-    found = [cell_of(runs, condition) for condition in _conditions(runs[0], SPEEDS)]
-    return [percent(cell.score) if cell else "" for cell in found]
+    cells = [cell_of(runs, condition) for condition in _conditions(runs[0], SPEEDS)]
+    return [percent(cell.score) if cell else "" for cell in cells]
 
 
 def _each_run(runs: Sequence[Run]) -> str:
     """Returns the runs' success at their training speed."""
-    cell = cell_of(runs, Condition("greedy", runs[0].speed, runs[0].fps))
+    cell = cell_of(runs, _as_trained(runs[0]))
     return ", ".join(f"{100 * rate:.0f}" for rate in (cell.rates if cell else ()))
 
 
@@ -406,13 +390,13 @@ def _stack(stack: str) -> str:
 
 
 def failure_table(papers: Mapping[str, float], runs: Sequence[Run]) -> str:
-    """Returns Table III beside the paper's, at low and high speed together and in training."""
+    """Returns the paper's Table III beside ours, of low and high speed and of the training's."""
     rows, here = [], in_stacks(runs)
     for stack in (stack for stack in papers if stack in here):
         members, shares = here[stack], []
         for speeds in (("low", "high"), ("normal",)):
-            found = own_scores(members, _conditions(members[0], speeds), departures)
-            shares.append(percent(mean_share([found])) if len(found) else "")
+            of_runs = own_scores(members, _conditions(members[0], speeds), departures)
+            shares.append(percent(mean_share([of_runs])) if len(of_runs) else "")
         rows.append((_stack(stack), f"{papers[stack]:.1f}", *shares, str(len(members))))
     return _table(("", "the paper", "low and high", "training", "runs"), rows)
 
@@ -424,9 +408,9 @@ def rate_table(runs: Sequence[Run]) -> str:
     for stack, members in in_stacks(runs).items():
         means = []
         for rate in frame_rates:
-            weights = {int(r): float(r == rate) for r in frame_rates}
-            found = scores([members], {"success": weights})
-            means.append(float(found[0].mean()) if found else float("nan"))
+            # all rates are named, so that the episodes are those that were driven at each
+            of_runs = scores([members], {"success": {int(r): r == rate for r in frame_rates}})
+            means.append(float(of_runs[0].mean()) if of_runs else float("nan"))
         cells = [f"{100 * mean:.0f}" for mean in means]
         lost = signed(means[0] - means[-1])
         rows.append((_stack(stack), *cells, lost, f"{means[0] / means[-1]:.2f}", str(len(members))))
@@ -436,15 +420,14 @@ def rate_table(runs: Sequence[Run]) -> str:
 
 
 def variation_table(titles: Mapping[str, str], studies: Studies) -> str:
-    """Returns success of the stacks of each further study, with the speeds of its tests."""
+    """Returns the success of each stack in further studies, with the speeds of training."""
+
+    def row(title: str, stack: str, runs: Sequence[Run]) -> Sequence[str]:
+        trained_at = _speed_range(runs[0], runs[0].speed)
+        return (title, _stack(stack), trained_at, *_successes(runs), str(len(runs)))
+
     rows = [
-        (
-            title,
-            _stack(stack),
-            _speed_range(runs[0], runs[0].speed),
-            *_successes(runs),
-            str(len(runs)),
-        )
+        row(title, stack, runs)
         for study, title in titles.items()
         for members in studies[study].values()
         for stack, runs in in_stacks(members).items()
@@ -458,7 +441,7 @@ def _speed_range(run: Run, speed: str) -> str:
 
 
 def estimates_table(titles: Mapping[str, str], studies: Studies) -> str:
-    """Returns success at the training speed, scene beside scene, with more and more estimated."""
+    """Returns success at the training speed, scene beside scene, for each kind of estimates."""
     scenes = list(dict.fromkeys(scene for study in titles for scene in studies[study]))
     rows = []
     for study, title in titles.items():
@@ -486,12 +469,12 @@ def runs_table(studies: Studies) -> str:
 
 
 def smallest_differences(claims: Sequence[Claim]) -> list[float]:
-    """Returns the difference that each contrast sees with 80 % power, in points.
+    """Returns the true difference that each contrast detects with a power of 80 %, in points.
 
-    That is at the level which Holm's method asks of the smallest of their p values.
+    The level is the one that Holm's method demands of the smallest p: 5 % over their number.
     """
-    found = [x.effect for claim in claims for x in claim.contrasts if x.effect]
-    errors = [(x.error, stats.t(x.freedom)) for x in found if not np.isnan(x.error)]
+    effects = [x.effect for claim in claims for x in claim.contrasts if x.effect]
+    errors = [(x.error, stats.t(x.freedom)) for x in effects if not np.isnan(x.error)]
     level = LEVEL / max(len(errors), 1)
     return [100 * error * float(t.ppf(1 - level / 2) + t.ppf(_POWER)) for error, t in errors]
 
@@ -499,40 +482,41 @@ def smallest_differences(claims: Sequence[Claim]) -> list[float]:
 def of_bfloat16(runs: Sequence[Run]) -> tuple[int, Array]:
     """Returns how many runs computed in bfloat16, and how much better they are than the others.
 
-    The latter in points, of each scene and stack that has both, in the mean over speeds.
+    The latter is in points, in the mean over speeds, for each scene and stack with both kinds.
     """
-    asked, found = {"success": dict.fromkeys(SPEEDS, 1 / 3)}, []
-    is_short = {run: run.machine.get("precision") == "bfloat16" for run in runs}
-    for scene in {run.scene: None for run in runs}:
-        for members in in_stacks([run for run in runs if run.scene == scene]).values():
-            sides = [[run for run in members if is_short[run] == short] for short in (True, False)]
-            rates = scores(sides, asked)
-            found += [] if rates is None else [100 * (rates[0].mean() - rates[1].mean())]
-    return sum(is_short.values()), np.array(found)
+    asked, differences = {"success": dict.fromkeys(SPEEDS, 1 / 3)}, []
+    cells: dict[Any, tuple[list[Run], list[Run]]] = {}
+    for run in runs:
+        is_other = run.machine.get("precision") != "bfloat16"
+        cells.setdefault((run.scene, run.stack), ([], []))[is_other].append(run)
+    for sides in cells.values():
+        if rates := scores(sides, asked):
+            differences.append(100 * (rates[0].mean() - rates[1].mean()))
+    return sum(len(short) for short, _ in cells.values()), np.array(differences)
 
 
 def sampled_minus_greedy(runs: Sequence[Run]) -> list[list[float]]:
-    """Returns how much better a run is with sampled actions, in points, at each speed.
+    """Returns how much better sampled actions are, in points, by run and speed.
 
-    Only of runs that were evaluated with both.
+    Runs that were evaluated with only one kind of actions are left out.
     """
-    found = []
+    by_run = []
     for run in runs:
-        of_run = []
+        differences = []
         for speed in SPEEDS:
             conditions = (Condition(policy, speed, run.fps) for policy in ("sampled", "greedy"))
             sampled, greedy = (run.under(c)["outcome"] for c in conditions)
             if len(sampled) and len(greedy):
-                of_run.append(100 * (success_rate([sampled]) - success_rate([greedy])))
-        found += [of_run] if of_run else []
-    return found
+                differences.append(100 * (success_rate([sampled]) - success_rate([greedy])))
+        by_run += [differences] if differences else []
+    return by_run
 
 
 def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figure]:
     """Returns the page and its figure."""
     studies = studies_of(declared, runs)
     primary, secondary = claims_of(declared, studies)
-    # the second protocol's scenes are those that it has
+    # the second protocol has runs in some scenes only
     of_wide = {**declared, "scenes": [*studies["wide_speeds"]]}
     wide, _ = claims_of(of_wide, studies, "wide_speeds")
     main, forks = studies["main"], declared["forks"]
@@ -542,7 +526,7 @@ def render(declared: Mapping[str, Any], runs: Sequence[Run]) -> tuple[str, Figur
         return effect_text(_contrast(asked, studies[study], [*studies[study]]))
 
     every = [run for of in main.values() for run in of]
-    failed = [run for run in every if _at_training(run) < _HARDLY_EVER]
+    failed = [r for r in every if _share(r.under(_as_trained(r))["outcome"]) < _HARDLY_EVER]
     smallest = smallest_differences(primary) or [float("nan")]
     text = (
         TEMPLATES.overlay(loader=FileSystemLoader(HERE))

@@ -133,28 +133,19 @@ def test_primary_contrasts_are_corrected_together_and_others_are_not():
     ],
 )
 def test_alike_means_within_the_margin(value, error, verdict):
-    asked = HIGH | {"expect": "equal", "margin": 0.05}
-    found = Effect(value, error, 10.0)
-    contrast = Contrast(asked, found, {}, 3, *results.p_values(found, asked))
-    assert contrast.verdict == verdict
+    assert equal_by(Effect(value, error, 10.0)).verdict == verdict
 
 
-def test_two_one_sided_tests_have_the_larger_of_their_p_values():
-    # 0.01 within ±0.05: the nearer side is (0.01 − 0.05) / 0.02 = −2, of 10 degrees p = 0.0367
-    asked = HIGH | {"expect": "equal", "margin": 0.05}
-    for value in (0.01, -0.01):
-        alike, apart = results.p_values(Effect(value, 0.02, 10.0), asked)
-        assert (alike, apart) == (pytest.approx(0.0367, abs=1e-4), 1)
+def equal_by(found, margin=0.05):
+    asked = HIGH | {"expect": "equal", "margin": margin}
+    return Contrast(asked, found, {}, 3, found.p_within(margin), found.p_beyond(margin))
 
 
-def test_what_contradicts_alike_is_a_difference_beyond_the_margin_with_its_own_p():
-    # 0.09 is 0.04 beyond ±0.05, two errors: two-sided p of 10 degrees 0.0734
-    asked = HIGH | {"expect": "equal", "margin": 0.05}
-    found = Effect(0.09, 0.02, 10.0)
-    contrast = Contrast(asked, found, {}, 3, *results.p_values(found, asked))
-    assert contrast.p_value == pytest.approx(1 - 0.0367, abs=1e-4)
-    assert contrast.p_against == pytest.approx(0.0734, abs=1e-4)
-    assert results.effect_text(contrast).split()[-4:] == ["=", "0.073", "(beyond", "±5)"]
+def test_a_claim_of_equality_shows_the_p_of_what_its_effect_suggests():
+    # 0.09 is 0.04 beyond ±0.05, two errors: two-sided p of 10 degrees 0.0734; 0.01 is as far within
+    beyond, within = (results.effect_text(equal_by(Effect(x, 0.02, 10.0))) for x in (0.09, 0.01))
+    assert beyond.split()[-4:] == ["=", "0.073", "(beyond", "±5)"]
+    assert within.split()[-4:] == ["=", "0.037", "(within", "±5)"]
 
 
 def test_what_contradicts_is_corrected_with_the_others():

@@ -1,1 +1,1 @@
-"""What runs say: figures, tables and a page of folders of runs, and the page of results."""
+"""Reports on runs: statistics, figures, tables and an HTML page."""

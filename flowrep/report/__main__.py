@@ -1,6 +1,6 @@
 """Reports on runs: `python -m flowrep.report outputs/<sweep>`.
 
-What takes seconds to import is imported when the config has passed.
+Slow imports wait until the config has been checked.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ def report(config: ReportConfig) -> Path:
     from flowrep.report.storage import is_archive, read_runs, without_repeats
 
     folders = list(map(Path, config.run))
-    is_of_runs = folders[0].is_dir() and not is_archive(folders[0])
-    output = Path(config.output or (folders[0] if is_of_runs else Path("outputs")) / "report")
-    found, unreadable = read_runs(folders)
-    runs, repeats = without_repeats(found)
+    holds_runs = folders[0].is_dir() and not is_archive(folders[0])
+    output = Path(config.output or (folders[0] if holds_runs else Path("outputs")) / "report")
+    readable, unreadable = read_runs(folders)
+    runs, repeats = without_repeats(readable)
     warnings = [*unreadable, *repeats]
     for warning in warnings:
         print(f"left out: {warning}")
@@ -39,10 +39,10 @@ def report(config: ReportConfig) -> Path:
     print(summary(runs))
     assembled = assemble(runs, warnings, config.policy)
     for warning in assembled.warnings[len(warnings) :]:
-        print(f"in part: {warning}")
+        print(f"used in part: {warning}")
     for section in assembled.sections:
         for table in section.tables:
-            if not table.name.endswith("_differences"):  # too long for a screen
+            if not table.name.endswith("_differences"):  # these are too long for a screen
                 show(table, f"{section.title} {section.label}".strip())
     output.mkdir(parents=True, exist_ok=True)
     for folder in write_files(assembled, output):
@@ -63,7 +63,7 @@ def show(table: Table, title: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    heading = Text(title, style="table.title")  # in a str, brackets would be markup
+    heading = Text(title, style="table.title")  # rich takes brackets in a str for markup
     shown = rich.table.Table(title=heading, box=rich.box.SIMPLE, pad_edge=False)
     for name, side in zip(table.header, table.alignment):
         shown.add_column(Text(name), justify="left" if side == "l" else "right", no_wrap=True)

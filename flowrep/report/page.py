@@ -1,9 +1,6 @@
 """One self-contained HTML page of a report, with the drives and films that evaluations saved.
 
-Drives come from `drives.npz` in a run's folder. Its `positions` are the x and y of the vehicle in
-metres, `[sum of (T + 1), 2]`: before the first and after each of an episode's T steps. Episode n is
-`positions[starts[n]:starts[n + 1]]`. For each episode, `evaluation`, `policy`, `speed`, `fps`,
-`frames`, `episode_seed` and `outcome` are as in evaluation.csv.
+`RunFolder`, which writes drives.npz, says what is in it.
 """
 
 import base64

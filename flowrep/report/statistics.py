@@ -43,6 +43,17 @@ class Effect(NamedTuple):
             return 1.0 if self.value == 0 else float("nan")
         return float(2 * stats.t.sf(abs(self.value) / self.error, self.freedom))
 
+    def p_within(self, margin: float) -> float:
+        """Returns p of two one-sided tests that the difference is smaller than a margin."""
+        # The larger p of the two is that of the test against the nearer end of the margin.
+        nearer = self._replace(value=abs(self.value) - margin)
+        return nearer.p_value / 2 if nearer.value < 0 else 1 - nearer.p_value / 2
+
+    def p_beyond(self, margin: float) -> float:
+        """Returns the two-sided p of a difference that is larger than a margin."""
+        nearer = self._replace(value=abs(self.value) - margin)
+        return 1.0 if nearer.value < 0 else nearer.p_value
+
     def interval(self) -> Estimate:
         """Returns the difference with its 95 % interval, which excludes 0 exactly if p < 0.05."""
         if self.error == 0:

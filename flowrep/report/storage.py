@@ -2,8 +2,9 @@
 
     python -m flowrep.report.storage outputs/<sweep> ... --into outputs/reference
 
-Packed, `runs.jsonl` has a line per run: its name, commit, precision, CPU and config;
-`episodes.csv.gz` has a row per evaluated episode, `training.csv.gz` one per logged step.
+Packed, `runs.jsonl` has a line per run: its name, commit, precision, CPU and config.
+`episodes.csv.gz` has a row per evaluated episode, with the columns of `EpisodeRecord` that neither
+config nor outcome imply; `training.csv.gz` has a row per logged step.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import io
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from fnmatch import fnmatch
 from itertools import groupby
 from operator import itemgetter
@@ -22,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from flowrep.experiment.lock import RunFolderError
-from flowrep.experiment.outcomes import OUTCOMES
+from flowrep.experiment.outcomes import EVALUATION_COLUMNS, OUTCOMES, EpisodeRecord
 from flowrep.experiment.run import RunFolder
 from flowrep.files import replace_files
 from flowrep.report.runs import Columns, Run
@@ -31,27 +33,30 @@ from flowrep.tables import TableError
 RUNS, EPISODES, TRAINING = "runs.jsonl", "episodes.csv.gz", "training.csv.gz"
 Cells = Mapping[str, Sequence[str]]
 _MACHINE = ("commit", "precision", "cpu")
-_EPISODES: dict[str, type] = {
-    "scene": str, "scene_id": str, "frames": int, "evaluation": str, "policy": str, "speed": str,
-    "fps": float, "episode_seed": int, "path": str, "outcome": str, "hit": str, "length": int,
-}  # fmt: skip
+_TYPES: dict[Any, type] = {"int": int, "float": float, "str": str}
+_IMPLIED = ("representations", "flow", "seed", "return")
+_EPISODES = {
+    each.name: _TYPES[each.type]
+    for each in fields(EpisodeRecord)
+    if each.name in EVALUATION_COLUMNS and each.name not in _IMPLIED
+}
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[Run], list[str]]:
-    """Returns the runs in folders at any depth, and a line for each that was left out.
+    """Returns the runs in folders at any depth, and a warning for each that was left out.
 
-    A folder of packed tables stands for its runs; with a pattern after its name, such as
-    `outputs/reference/s_turn_*`, for those with such names.
+    A folder of packed tables stands for all of its runs, or with a pattern after its name, such as
+    `outputs/reference/s_turn_*`, for the runs whose names match.
     """
     runs: dict[str, Run] = {}  # by path, so that a folder given twice counts once
     warnings: list[str] = []
     for folder in folders:
-        place, pattern = (folder, "*") if folder.exists() else (folder.parent, folder.name)
-        if is_archive(place):
-            found = {run.name: run for run in read_archive(place, pattern)}
-            if not found:
-                raise RunFolderError(f"'{folder}': no packed run in it has such a name")
-            runs |= found
+        archive, pattern = (folder, "*") if folder.exists() else (folder.parent, folder.name)
+        if is_archive(archive):
+            packed = {run.name: run for run in read_archive(archive, pattern)}
+            if not packed:
+                raise RunFolderError(f"'{folder}': no packed run has a name like '{pattern}'")
+            runs |= packed
             continue
         paths = [config.parent for config in sorted(folder.rglob("config.yaml"))]
         paths = [p for p in paths if {".hydra", "wandb"}.isdisjoint(p.relative_to(folder).parts)]
@@ -85,19 +90,22 @@ def read_run(path: Path) -> Run:
 
 
 def without_repeats(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Returns one run per config and seed, and a line for each other: it would be another seed."""
+    """Returns one run per config and seed, and a warning for each other one.
+
+    Of several, the run with the most tested episodes is kept.
+    """
     kept: dict[Any, Run] = {}
     warnings = []
     for run in sorted(runs, key=lambda run: (-int(run.tested.sum()), -run.frames)):
         best = kept.setdefault((run.stack, run.seed, *sorted(run.settings.items())), run)
         if run is not best:
             same = f"{run.name} is the same run as {best.name}, config and seed"
-            warnings.append(f"{same}: left out, it would count as another seed")
+            warnings.append(f"{same}: left out, as it would count as another seed")
     return [run for run in runs if run in kept.values()], warnings
 
 
 def episode_columns(cells: Cells) -> Columns:
-    """Returns the columns of evaluation.csv that a report reads, "" in those that it lacks."""
+    """Returns the columns of evaluation.csv that a report reads, "" for missing ones."""
     empty = [""] * len(cells.get("frames", ()))
     columns: Columns = {
         name: np.array(cells.get(name, empty), kind) for name, kind in _EPISODES.items()
@@ -115,13 +123,13 @@ def _metric_columns(cells: Cells) -> Columns:
 
 
 def _machine(path: Path) -> dict[str, str]:
-    # Several machines where it was resumed on another.
+    # A run that was resumed on another machine has several.
     try:
-        noted = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-        of_each = {key: dict.fromkeys(str(each.get(key)) for each in noted) for key in _MACHINE}
+        machines = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+        values = {key: dict.fromkeys(str(each.get(key)) for each in machines) for key in _MACHINE}
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path.name}: {error}") from error
-    return {key: " | ".join(found) or "unknown" for key, found in of_each.items()}
+    return {key: " | ".join(names) or "unknown" for key, names in values.items()}
 
 
 def is_archive(folder: Path) -> bool:
@@ -130,7 +138,7 @@ def is_archive(folder: Path) -> bool:
 
 
 def read_archive(folder: Path, pattern: str = "*") -> list[Run]:
-    """Returns the packed runs of a folder with such names, in their order."""
+    """Returns the packed runs of a folder whose names match a pattern."""
     try:
         return _read_archive(folder, pattern)
     except RunFolderError:
@@ -157,7 +165,7 @@ def _read_archive(folder: Path, pattern: str) -> list[Run]:
 
 
 def _of_runs(path: Path) -> dict[str, Cells]:
-    # by columns, since a dict for each of some 400,000 rows takes seconds
+    # By columns: a dict for each of some 400,000 rows would take seconds.
     with gzip.open(path, "rt", encoding="utf-8", newline="") as file:
         lines = csv.reader(file)
         names = next(lines)[1:]
@@ -166,7 +174,10 @@ def _of_runs(path: Path) -> dict[str, Cells]:
 
 
 def write_archive(runs: Sequence[Run], folder: Path) -> None:
-    """Packs runs into a folder, in place of those of the same names, the same byte for byte."""
+    """Adds runs to a folder of packed runs, in place of those of the same names.
+
+    The same runs give the same bytes.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     before = read_archive(folder) if is_archive(folder) else []
     kept = dict(sorted({Path(run.name).name: run for run in (*before, *runs)}.items()))
@@ -194,7 +205,7 @@ def _packed(names: Sequence[str], tables: Mapping[str, Columns]) -> bytes:
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, float):  # five digits of a loss are enough
+    if isinstance(value, float):  # five digits are enough for a loss
         return "" if value != value else f"{value:.5g}" if abs(value) < 1e5 else f"{value:.0f}"
     return str(value)
 

@@ -79,6 +79,16 @@ def test_the_verdict_is_the_sign_of_a_difference_whose_corrected_p_is_small(
     assert Effect(value, 0.01, 4.0).verdict(p_value) == verdict
 
 
+def test_equality_is_tested_against_the_nearer_end_of_the_margin():
+    # 0.01 within ±0.05: (0.01 - 0.05) / 0.02 = -2, of 10 degrees p = 0.0367, and as far on the
+    # other side; 0.09 is as far beyond
+    for value in (0.01, -0.01):
+        assert Effect(value, 0.02, 10.0).p_within(0.05) == pytest.approx(0.0367, abs=1e-4)
+        assert Effect(value, 0.02, 10.0).p_beyond(0.05) == 1
+    assert Effect(0.09, 0.02, 10.0).p_within(0.05) == pytest.approx(1 - 0.0367, abs=1e-4)
+    assert Effect(-0.09, 0.02, 10.0).p_beyond(0.05) == pytest.approx(2 * 0.0367, abs=2e-4)
+
+
 def test_without_a_spread_between_runs_there_is_no_test():
     alone = effect([(rates(0.9), rates(0.1, 0.2))])
     alike = effect([(rates(0.9, 0.9), rates(0.1, 0.1))])

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import os
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ import yaml
 
 pytest.importorskip("scipy", reason="reports are an extra")
 
-from flowrep import files
 from flowrep.experiment.lock import RunFolderError
 from flowrep.report.storage import (
     EPISODES,
@@ -132,7 +132,7 @@ def test_damaged_packed_runs_are_named(tmp_path, name, damage):
         read_archive(packed)
 
 
-@pytest.mark.parametrize("step", ["_flush", "_rename"])
+@pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_packing_that_fails_leaves_what_was_there(tmp_path, monkeypatch, step):
     def fail(*_):
         raise OSError(28, "No space left on device")
@@ -141,7 +141,7 @@ def test_packing_that_fails_leaves_what_was_there(tmp_path, monkeypatch, step):
     write_archive([read_run(run_in(tmp_path, "a"))], packed)
     before = {path.name: path.read_bytes() for path in packed.iterdir()}
     other = read_run(run_in(tmp_path, "b"))
-    monkeypatch.setattr(files, step, fail)
+    monkeypatch.setattr(os, step, fail)
     with pytest.raises(OSError, match=f"'{packed}'"):
         write_archive([other], packed)
     assert {path.name: path.read_bytes() for path in packed.iterdir()} == before
