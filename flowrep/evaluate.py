@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Target(NamedTuple):
-    """An agent to evaluate: the folder of its table, how it is loaded, and its ways to act."""
+    """An agent to evaluate: the folder of its table, how it is loaded, and how it acts."""
 
     folder: RunFolder
     load: Callable[[], Agent]
@@ -39,8 +39,8 @@ class Target(NamedTuple):
 def run(config: EvaluateConfig) -> None:
     """Runs episodes of agents and baselines, one agent after the other, and saves the rows.
 
-    A folder in use, or an agent that can't be evaluated or saved, is reported and does not stop the
-    others; the exit code is then 1. Baselines drive once in each scene.
+    If a folder is in use, or an agent can't be evaluated or saved, the others still are, and the
+    exit code is 1. Baselines drive once in each scene.
     """
     from flowrep.agent import keep_freed_memory
 
@@ -66,13 +66,13 @@ def run(config: EvaluateConfig) -> None:
 
 
 def targets_of(config: EvaluateConfig) -> list[Target]:
-    """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own."""
+    """Returns the agents to evaluate: of runs and sweeps, or policies from other projects."""
     from flowrep.experiment.agents import Agent
     from flowrep.experiment.run import RunFolder
 
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.own_policies:
-        runs: dict[Path, RunFolder] = {}  # each once, under whatever names
+        runs: dict[Path, RunFolder] = {}  # each run once, even if it is named in several ways
         for path in config.run or []:
             for run in RunFolder.all_in(path):
                 runs.setdefault(run.path.resolve(), run)
@@ -80,13 +80,13 @@ def targets_of(config: EvaluateConfig) -> list[Target]:
         load = partial(Agent.load, scene=config.scene, algorithm=trusted, **machine)
         return [Target(run, partial(load, run.path), config.policy) for run in runs.values()]
     keys = ("scene", "representations", "flow", "motion", "noise")
-    seen = {key: getattr(config, key) for key in keys}
+    maps = {key: getattr(config, key) for key in keys}
     targets = []
     for name in config.own_policies:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
-        load = partial(Agent.load, name, **seen, **machine)
+        load = partial(Agent.load, name, **maps, **machine)
         targets.append(Target(RunFolder(folder), load, [name]))
     return targets
 

@@ -1,9 +1,9 @@
-"""Sweeps: `python -m flowrep.train -m seed=0,1,2` is a run for each job, in a folder of its own.
+"""Sweeps: `python -m flowrep.train -m seed=0,1,2` trains a run for each job, each in a folder.
 
-A job is the command `python -m flowrep.train <its overrides> hydra.run.dir=<folder>`, or
-`resume=<folder>` where it has begun, and nothing where its final evaluation is there. So a sweep
-continues where it was stopped, whatever stopped it. Hydra's launchers (one after the other, joblib,
-SLURM, Ray) call `job` in their workers, which therefore import no torch here.
+A job starts `python -m flowrep.train <its overrides> hydra.run.dir=<folder>`. If that run has begun
+already, the job resumes it, and if its final evaluation is done, there is nothing to do. So the
+same command continues a sweep, whatever stopped it. Hydra's launchers (one run after the other,
+joblib, SLURM, Ray) call `job` in their workers, so this module imports no PyTorch.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worke
 
 LOG = "job.log"
 STOP = ".stop_"
-"""The file that tells the jobs of a sweep, on whatever machine, to save and stop, without its id.
+"""How the name of the file begins that tells a sweep's jobs, on any machine, to save and stop.
 
-Two sweeps may share a folder, so each has an id, which jobs get as `_ID` of `hydra.job.env_set`.
+It ends with the sweep's id, as two sweeps may share a folder. Jobs get the id as `_ID` in
+`hydra.job.env_set`.
 """
 _ID = "FLOWREP_SWEEP"
 _BEGUN = "--- sweep "
@@ -57,7 +58,7 @@ _NEEDED_BY = {
         "hydra.sweeper.max_failure_rate=1.0",
     ),
 }
-"""Options of plugins that a sweep needs, added unless they are typed."""
+"""Options that a sweep with these plugins needs; they are added unless they are typed."""
 
 
 class RunFailedError(RuntimeError):
@@ -79,9 +80,9 @@ def run_sweep() -> NoReturn:
             "hydra.sweep.dir=<its folder>"
         )
     typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
-    places = [cli.value_of(text) for text in sys.argv[1:] if text not in typed]
+    folders = [cli.value_of(text) for text in sys.argv[1:] if text not in typed]
     new = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
-    folder = Path(places[-1] if places else new).absolute()
+    folder = Path(folders[-1] if folders else new).absolute()
     sweep_id = f"s{secrets.token_hex(4)}"  # not digits alone, which Hydra reads as a number
     given = cli.override("hydra.sweep.dir", str(folder))
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
@@ -112,7 +113,7 @@ def run_sweep() -> NoReturn:
 
 
 def _states(sweep: Path, sweep_id: str) -> dict[str, str]:
-    """Returns what the last line of the log of each of a sweep's runs says of it, by name."""
+    """Returns the state of each run of a sweep, by name: the last line of the run's log."""
     states = {}
     for log in sorted(sweep.glob(f"*/{LOG}")):
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -124,7 +125,7 @@ def _states(sweep: Path, sweep_id: str) -> dict[str, str]:
 
 
 def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
-    """Prints how each run stands, where the logs of failed ones are, and how to compare them."""
+    """Prints the state of each run, where the logs of failed ones are, and how to compare runs."""
     finished, failed = (
         sum(state.startswith(word) for state in states.values()) for word in (FINISHED, FAILED)
     )
@@ -139,7 +140,7 @@ def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
 
 
 def job(config: DictConfig) -> float:
-    """Does what remains of one run in a process of its own; called by Hydra's launchers.
+    """Runs what remains of one run in a separate process; called by Hydra's launchers.
 
     Returns its final greedy success; nan if a run of a grid has none, so that the others go on.
     """
@@ -147,7 +148,7 @@ def job(config: DictConfig) -> float:
     folder, sweep = Path(hydra.runtime.output_dir), Path(hydra.sweep.dir)
     is_worker = multiprocessing.current_process().name != "MainProcess"  # of a pool, as joblib's
     if is_worker:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launching process leaves a `.stop`
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launching process writes a stop file
 
     sweep_id = hydra.job.env_set[_ID]
     stopped = sweep / f"{STOP}{sweep_id}"
@@ -163,7 +164,7 @@ def job(config: DictConfig) -> float:
         state = _say(folder, f"{FAILED}: error: {' '.join(str(error).split())}")
     print(f"{folder.name}: {state}", flush=True)
     if is_worker and os.getppid() != PARENT:
-        os._exit(1)  # nobody waits for its result
+        os._exit(1)  # the launching process is gone
     if state.startswith(FINISHED):
         return success_of(folder)
     if hydra.sweeper["_target_"].endswith("BasicSweeper"):
@@ -176,7 +177,7 @@ def _line(folder: Path, config: TrainConfig, is_worker: bool) -> list[str]:
     hydra = HydraConfig.get()
     typed = list(hydra.overrides.task)
     machine = [text for text in typed if text.partition("=")[0] in cli.OF_THE_MACHINE]
-    if is_worker and config.num_workers == "auto":  # it has only its own core
+    if is_worker and config.num_workers == "auto":  # other workers use the other cores
         machine = [*(text for text in machine if "device" in text), "num_workers=0"]
     if (folder / "config.yaml").is_file():
         target = config.algorithm.target
@@ -193,7 +194,7 @@ def _line(folder: Path, config: TrainConfig, is_worker: bool) -> list[str]:
 def attempted(
     folder: Path, config: TrainConfig, line: list[str], should_stop: Callable[[], bool]
 ) -> str:
-    """Returns how a run stands after what remains of it was done: "failed: error: no space".
+    """Runs what remains of a run and returns its state, such as "failed: error: no space".
 
     `line` are the arguments of `flowrep.train`. Once `should_stop` is true, the run saves and ends.
     """
@@ -223,7 +224,7 @@ def _exit_code(line: list[str], log: Path, should_stop: Callable[[], bool]) -> i
         try:
             while run.poll() is None and not should_stop():
                 time.sleep(POLL_S)
-        finally:  # a launcher may end its worker by an exception
+        finally:  # a launcher may end its worker with an exception
             if run.poll() is None:
                 run.terminate()
             run.wait()
@@ -231,21 +232,21 @@ def _exit_code(line: list[str], log: Path, should_stop: Callable[[], bool]) -> i
 
 
 def _end_with_parent() -> None:
-    """Has a process save and end when its parent ends, however it does, and at no other signal."""
-    for number in (signal.SIGUSR1, signal.SIGUSR2):  # SLURM's, meant for its launcher
+    """Makes a process save and end when its parent ends, even if that is killed."""
+    for number in (signal.SIGUSR1, signal.SIGUSR2):  # SLURM sends them for its launcher
         signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def _begin(folder: Path, sweep_id: str) -> None:
-    """Adds a line to a run's log that tells which sweep attempts it."""
+    """Adds a line to a run's log that says which sweep attempts it."""
     with open_to_append(folder / LOG) as log:
         log.write(f"{_BEGUN}{sweep_id} {datetime.now():%Y-%m-%d %H:%M:%S}\n".encode())
 
 
 def _say(folder: Path, state: str) -> str:
-    """Adds a line to a run's log, whose last such line is how the run stands, and returns it."""
+    """Adds a state to a run's log, where the last one counts, and returns it."""
     with open_to_append(folder / LOG) as log:
         log.write(f"--- {state}\n".encode())
     return state
@@ -263,13 +264,13 @@ def _reason(log: Path, begin: int, code: int) -> str:
 
 
 def _check_is_same(folder: Path, config: TrainConfig) -> None:
-    """Checks that a folder holds no other run than the one that a sweep asks for."""
+    """Checks that a folder holds the run that the sweep asks for, or none."""
     path = folder / "config.yaml"
     if not path.is_file():
         return
     stored = validated_run(read_yaml(path), str(path), config.algorithm.target).plain()
     asked = config.plain()
-    if asked["algorithm"].get("precision", "auto") == "auto":  # which the run has resolved
+    if asked["algorithm"].get("precision", "auto") == "auto":  # the run has resolved it
         asked["algorithm"] |= {k: v for k, v in stored["algorithm"].items() if k == "precision"}
     for key, value in asked.items():
         if key not in (*cli.OF_THE_MACHINE, "resume") and stored.get(key) != value:

@@ -1,4 +1,4 @@
-"""A window in which a policy drives, or whoever holds the arrow keys."""
+"""A window in which a policy drives, or a person with the arrow keys."""
 
 import time
 from collections import deque
@@ -17,13 +17,17 @@ from flowrep.scenes.vehicle import NO_OP, TURN_LEFT, TURN_RIGHT
 
 
 class NewEpisode(Exception):
-    """The episode was left for the next one."""
+    """The driver skips the rest of the episode."""
 
 
 class Keyboard:
-    """A policy that takes the action of the held keys, or lets another, of this name, drive.
+    """A policy that acts by the keys that are held, or hands over to another policy.
 
-    Both keys together cancel out.
+    Both arrow keys together cancel out.
+
+    Args:
+        other: the policy that drives after a press of S.
+        name: of that policy, for the window's title.
     """
 
     ACTIONS = {"left": TURN_LEFT, "right": TURN_RIGHT}  # noqa: RUF012 - never changed
@@ -36,7 +40,7 @@ class Keyboard:
         self.driver = "you"
 
     def press(self, key: str | None) -> None:
-        """Handles a key press; other keys than letters may have no name."""
+        """Handles a key press; matplotlib gives None for keys that it has no name for."""
         key = (key or "").lower()
         if key in self.ACTIONS:
             self._held.add(key)
@@ -66,8 +70,8 @@ def drive_by_hand(
 ) -> None:
     """Opens a window and drives one episode after the other until it is closed.
 
-    A finished one stays in view until R begins the next, of the next seed. `pause` draws, and
-    handles keys for some seconds; by default in a window on the screen.
+    The last frame of an episode stays in view until R begins the next one, with the next seed.
+    `pause` draws and handles keys for some seconds; by default that of a window on the screen.
     """
     import matplotlib.pyplot as plt
 
