@@ -192,7 +192,7 @@ WRITES = {
     "machine.json": lambda run: run.note_machine({"cpu": "x"}),
     "config.yaml": lambda run: run.write_config({"seed": 1}),
     "checkpoint/latest.safetensors": lambda run: save_checkpoint(run.checkpoint_path, {"a": 1}),
-    "job.log": lambda run: sweep._say(run.path, "failed"),
+    "job.log": lambda run: sweep.JobLog(run.path).end("failed"),
 }
 
 

@@ -39,10 +39,10 @@ LOG = "job.log"
 STOP = ".stop_"
 """How the name of the file begins that tells a sweep's jobs, on any machine, to save and stop.
 
-It ends with the sweep's id, as two sweeps may share a folder. Jobs get the id as `_ID` in
+It ends with the sweep's id, as two sweeps may share a folder. Jobs get the id as `SWEEP_ID` in
 `hydra.job.env_set`.
 """
-_ID = "FLOWREP_SWEEP"
+SWEEP_ID = "FLOWREP_SWEEP"
 _BEGUN = "--- sweep "
 POLL_S = 0.5
 PARENT = os.getppid()
@@ -87,7 +87,11 @@ def run_sweep() -> NoReturn:
     given = cli.override("hydra.sweep.dir", str(folder))
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
     needed = [option for option in needed if option.partition("=")[0] not in keys]
-    sys.argv[1:] = [*typed, given, *needed, f"+hydra.job.env_set.{_ID}={sweep_id}"]
+    # argparse wants all overrides side by side, and flags with values may stand around them
+    are_keys = ["=" in text and not text.startswith("-") for text in typed]
+    at = are_keys.index(True) if True in are_keys else len(typed)
+    added = [given, *needed, f"+hydra.job.env_set.{SWEEP_ID}={sweep_id}"]
+    sys.argv[1:] = [*typed[:at], *added, *typed[at:]]
     stopped, is_whole = folder / f"{STOP}{sweep_id}", True
 
     def mark() -> None:
@@ -98,30 +102,53 @@ def run_sweep() -> NoReturn:
         try:
             cli.run_hydra("train", job, TrainConfig)
         except SystemExit:
-            if not _states(folder, sweep_id):
+            if not states_of(folder, sweep_id):
                 raise  # a mistake on the command line, which has been printed
             is_whole = False
     if is_whole:  # no job is left to read it
         stopped.unlink(missing_ok=True)
-    states = _states(folder, sweep_id)
+    states = states_of(folder, sweep_id)
     _sum_up(folder, states)
     if stop or not is_whole or not all(state.startswith(FINISHED) for state in states.values()):
-        again = shlex.join(["python", "-m", "flowrep.train", *typed, given])
+        again = shlex.join(["python", "-m", "flowrep.train", *typed[:at], given, *typed[at:]])
         print(f"Continue the remaining runs with\n  {again}")
         sys.exit(stop.exit_code or 1)
     sys.exit(0)
 
 
-def _states(sweep: Path, sweep_id: str) -> dict[str, str]:
-    """Returns the state of each run of a sweep, by name: the last line of the run's log."""
-    states = {}
-    for log in sorted(sweep.glob(f"*/{LOG}")):
-        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-        if any(line.startswith(f"{_BEGUN}{sweep_id} ") for line in lines):
-            last = lines[-1]
-            is_state = last.startswith("--- ") and not last.startswith(_BEGUN)
-            states[log.parent.name] = last.removeprefix("--- ") if is_state else STOPPED
-    return states
+class JobLog:
+    """What a run of a sweep printed, with a line for each attempt and for how each one ended."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / LOG
+
+    def begin(self, sweep_id: str) -> None:
+        """Adds a line that says which sweep attempts the run."""
+        self._add(f"{_BEGUN}{sweep_id} {datetime.now():%Y-%m-%d %H:%M:%S}")
+
+    def end(self, state: str) -> str:
+        """Adds how the attempt ended, and returns it."""
+        self._add(f"--- {state}")
+        return state
+
+    def state(self, sweep_id: str) -> str | None:
+        """Returns how the last attempt ended; None if this sweep has not attempted the run."""
+        lines = self.path.read_text(encoding="utf-8", errors="replace").splitlines()
+        if not any(line.startswith(f"{_BEGUN}{sweep_id} ") for line in lines):
+            return None
+        has_ended = lines[-1].startswith("--- ") and not lines[-1].startswith(_BEGUN)
+        return lines[-1].removeprefix("--- ") if has_ended else STOPPED
+
+    def _add(self, line: str) -> None:
+        with open_to_append(self.path) as log:
+            log.write(f"{line}\n".encode())
+
+
+def states_of(sweep: Path, sweep_id: str) -> dict[str, str]:
+    """Returns the states of the runs that a sweep has attempted, by name."""
+    logs = sorted(sweep.glob(f"*/{LOG}"))
+    states = {log.parent.name: JobLog(log.parent).state(sweep_id) for log in logs}
+    return {name: state for name, state in states.items() if state is not None}
 
 
 def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
@@ -150,18 +177,18 @@ def job(config: DictConfig) -> float:
     if is_worker:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launching process writes a stop file
 
-    sweep_id = hydra.job.env_set[_ID]
+    sweep_id = hydra.job.env_set[SWEEP_ID]
     stopped = sweep / f"{STOP}{sweep_id}"
 
     def should_stop() -> bool:
         return stopped.exists() or (is_worker and os.getppid() != PARENT)
 
     try:
-        _begin(folder, sweep_id)
+        JobLog(folder).begin(sweep_id)
         asked = validated(TrainConfig, cli.plain_config(config))
-        state = attempted(folder, asked, _line(folder, asked, is_worker), should_stop)
+        state = attempted(folder, asked, arguments_of(folder, asked, is_worker), should_stop)
     except Exception as error:  # the other runs go on
-        state = _say(folder, f"{FAILED}: error: {' '.join(str(error).split())}")
+        state = JobLog(folder).end(f"{FAILED}: error: {' '.join(str(error).split())}")
     print(f"{folder.name}: {state}", flush=True)
     if is_worker and os.getppid() != PARENT:
         os._exit(1)  # the launching process is gone
@@ -172,7 +199,7 @@ def job(config: DictConfig) -> float:
     raise RunFailedError(f"{folder} {state}")
 
 
-def _line(folder: Path, config: TrainConfig, is_worker: bool) -> list[str]:
+def arguments_of(folder: Path, config: TrainConfig, is_worker: bool) -> list[str]:
     """Returns the arguments of `flowrep.train` for a job's run."""
     hydra = HydraConfig.get()
     typed = list(hydra.overrides.task)
@@ -199,18 +226,18 @@ def attempted(
     `line` are the arguments of `flowrep.train`. Once `should_stop` is true, the run saves and ends.
     """
     _check_is_same(folder, config)
-    code = begin = 0
+    log, code, begin = JobLog(folder), 0, 0
     if not is_finished(folder, config):
         if should_stop():
             return STOPPED
         print(f"{folder.name}: running", flush=True)
-        begin = (folder / LOG).stat().st_size if (folder / LOG).exists() else 0
-        code = _exit_code(line, folder / LOG, should_stop)
+        begin = log.path.stat().st_size if log.path.exists() else 0
+        code = _exit_code(line, log.path, should_stop)
     if is_finished(folder, config):
-        return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
+        return log.end(f"{FINISHED}, success {success_of(folder):.0%}")
     if code in {ended for number in STOP_SIGNALS for ended in (128 + number, -number)}:
-        return _say(folder, STOPPED)
-    return _say(folder, f"{FAILED}: {_reason(folder / LOG, begin, code)}")
+        return log.end(STOPPED)
+    return log.end(f"{FAILED}: {_reason(log.path, begin, code)}")
 
 
 def _exit_code(line: list[str], log: Path, should_stop: Callable[[], bool]) -> int:
@@ -237,19 +264,6 @@ def _end_with_parent() -> None:
         signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
-
-
-def _begin(folder: Path, sweep_id: str) -> None:
-    """Adds a line to a run's log that says which sweep attempts it."""
-    with open_to_append(folder / LOG) as log:
-        log.write(f"{_BEGUN}{sweep_id} {datetime.now():%Y-%m-%d %H:%M:%S}\n".encode())
-
-
-def _say(folder: Path, state: str) -> str:
-    """Adds a state to a run's log, where the last one counts, and returns it."""
-    with open_to_append(folder / LOG) as log:
-        log.write(f"--- {state}\n".encode())
-    return state
 
 
 def _reason(log: Path, begin: int, code: int) -> str:
