@@ -17,7 +17,7 @@ pytest.importorskip("pybullet", reason="the commands build the simulated street"
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
 from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
-from flowrep.evaluate import targets_of
+from flowrep.evaluate import candidates_of
 from flowrep.experiment import agents, film, sweep
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.lock import RunFolderError
@@ -55,7 +55,7 @@ def resume(run, *typed):
 
 def evaluate(run, *typed):
     config = validated(EvaluateConfig, plain("evaluate", f"run={run.path}", *typed))
-    return targets_of(config)[0].load()
+    return candidates_of(config)[0].load()
 
 
 def view(run, *typed):

@@ -44,7 +44,7 @@ _STATUS_PX = 28
 _ACTIONS = ("keeps its yaw rate", "turns left", "turns right")  # in the order of YAW_SIGN
 
 
-class Frame(NamedTuple):
+class FilmFrame(NamedTuple):
     """What a film shows of one step."""
 
     maps: dict[str, Tensor]  # [C, H, W] by tile; ids, metres or px per step
@@ -107,12 +107,12 @@ class Film:
         self,
         options: Mapping[str, Any],
         on_frame: Callable[[TensorDictBase], Any] = lambda tensordict: None,
-    ) -> tuple[list[Frame], EpisodeRecord]:
+    ) -> tuple[list[FilmFrame], EpisodeRecord]:
         """Returns every frame of one greedy episode, and the episode.
 
         `options` are of `StreetEnv.reset`; `on_frame` gets the env's TensorDict.
         """
-        frames: list[Frame] = []
+        frames: list[FilmFrame] = []
 
         def note(tensordict: TensorDictBase) -> TensorDictBase:
             acted = self.policy(tensordict)
@@ -126,14 +126,14 @@ class Film:
         (episode,) = evaluate(self.env, note, [options], on_frame=keep)
         return frames, episode
 
-    def frame(self, tensordict: TensorDictBase) -> Frame:
+    def frame(self, tensordict: TensorDictBase) -> FilmFrame:
         """Returns the frame of the env's TensorDict and the street's current state."""
         maps = {tile: make(tensordict[key][0].cpu()) for tile, (key, make) in self._maps.items()}
         episode, vehicle = self.street.episode, self.street.scene.vehicle
         turned = episode.now.vehicle.yaw_rate_rps / math.radians(vehicle.max_yaw_rate_dps)
-        return Frame(maps, episode.steps, turned)
+        return FilmFrame(maps, episode.steps, turned)
 
-    def draw(self, frame: Frame, ended: EpisodeRecord | None = None) -> Image:
+    def draw(self, frame: FilmFrame, ended: EpisodeRecord | None = None) -> Image:
         """Returns a frame's picture; an episode in `ended` says how it ended."""
         tiles = dict(self.tiles)
         if "rgb" in tiles:
@@ -160,7 +160,7 @@ class Film:
             return _above(drawn, f"framed: what {name} reads; the other maps are exact")
         return _above(drawn, f"{name} reads none of these maps")
 
-    def pictures(self, frames: Sequence[Frame], episode: EpisodeRecord) -> Iterator[Image]:
+    def pictures(self, frames: Sequence[FilmFrame], episode: EpisodeRecord) -> Iterator[Image]:
         """Yields the pictures of a film: the legend, the episode, and how it ended."""
         yield from repeat(self.legend(), max(1, round(LEGEND_S * episode.fps)))
         yield from map(self.draw, frames[:-1])

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 
 from flowrep.config import UsageError
 from flowrep.experiment.evaluation import Policy, evaluate
-from flowrep.experiment.film import Film, Frame, how_it_ended
+from flowrep.experiment.film import Film, FilmFrame, how_it_ended
 from flowrep.scenes.vehicle import NO_OP, TURN_LEFT, TURN_RIGHT
 
 
@@ -126,7 +126,7 @@ def drive_in_window(
         pause(max(1e-3, 1 / film.street.frame_rate_hz - (time.monotonic() - drawn_at)))
         drawn_at = time.monotonic()
 
-    latest: deque[Frame] = deque(maxlen=1)
+    latest: deque[FilmFrame] = deque(maxlen=1)
     (episode,) = evaluate(film.env, keyboard, [options], on_frame=draw)
     show(film.draw(latest[-1], episode))
     title.set_text(f"{how_it_ended(episode)}    {keyboard.HELP}")
