@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -48,6 +49,7 @@ class Runner:
     ) -> None:
         self.config, self.folder, self.clock = config, folder, Stopwatch()
         self.on_log = on_log
+        logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
         keep_freed_memory()
         build.share_cores(config)
         torch.manual_seed(config.seed)
