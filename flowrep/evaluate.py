@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from flowrep.experiment.run import RunFolder
 
 
-class Target(NamedTuple):
-    """An agent to evaluate: the folder of its table, how it is loaded, and its ways to act."""
+class Candidate(NamedTuple):
+    """An agent to evaluate: the folder of its table, how it is loaded, and how it acts."""
 
     folder: RunFolder
     load: Callable[[], Agent]
@@ -39,61 +39,61 @@ class Target(NamedTuple):
 def run(config: EvaluateConfig) -> None:
     """Runs episodes of agents and baselines, one agent after the other, and saves the rows.
 
-    A folder in use, or an agent that can't be evaluated or saved, is reported and does not stop the
-    others; the exit code is then 1. Baselines drive once in each scene.
+    If a folder is in use, or an agent can't be evaluated or saved, the others still are, and the
+    exit code is 1. Baselines drive once in each scene.
     """
     from flowrep.agent import keep_freed_memory
 
     keep_freed_memory()
-    targets = targets_of(config)
+    candidates = candidates_of(config)
     evaluations: dict[str, PairedEvaluation] = {}
     failed: list[str] = []
     with StopRequest() as stop:
-        for target in targets:
+        for candidate in candidates:
             try:
-                with target.folder.held("evaluating"):
-                    evaluate_one(config, target, evaluations, stop)
+                with candidate.folder.held("evaluating"):
+                    evaluate_one(config, candidate, evaluations, stop)
             except Exception as error:
-                if len(targets) == 1 or not is_a_mistake(error):
+                if len(candidates) == 1 or not is_a_mistake(error):
                     raise
                 print_error(error)
-                failed.append(str(target.folder.path))
+                failed.append(str(candidate.folder.path))
             if stop:
                 sys.exit(stop.exit_code)
     if failed:
         print_error(f"not evaluated or not saved, see above: {', '.join(failed)}")
-        sys.exit(1 if len(failed) < len(targets) else EXIT_USAGE)
+        sys.exit(1 if len(failed) < len(candidates) else EXIT_USAGE)
 
 
-def targets_of(config: EvaluateConfig) -> list[Target]:
-    """Returns the agents to evaluate: of runs and of sweeps, or policies of the user's own."""
+def candidates_of(config: EvaluateConfig) -> list[Candidate]:
+    """Returns the agents to evaluate: of runs and sweeps, or policies from other projects."""
     from flowrep.experiment.agents import Agent
     from flowrep.experiment.run import RunFolder
 
     machine = config.model_dump(include={"device", "num_envs", "num_workers"})
     if not config.own_policies:
-        runs: dict[Path, RunFolder] = {}  # each once, under whatever names
+        runs: dict[Path, RunFolder] = {}  # each run once, even if it is named in several ways
         for path in config.run or []:
             for run in RunFolder.all_in(path):
                 runs.setdefault(run.path.resolve(), run)
         trusted = config.algorithm.target
         load = partial(Agent.load, scene=config.scene, algorithm=trusted, **machine)
-        return [Target(run, partial(load, run.path), config.policy) for run in runs.values()]
+        return [Candidate(run, partial(load, run.path), config.policy) for run in runs.values()]
     keys = ("scene", "representations", "flow", "motion", "noise")
-    seen = {key: getattr(config, key) for key in keys}
-    targets = []
+    maps = {key: getattr(config, key) for key in keys}
+    candidates = []
     for name in config.own_policies:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
-        load = partial(Agent.load, name, **seen, **machine)
-        targets.append(Target(RunFolder(folder), load, [name]))
-    return targets
+        load = partial(Agent.load, name, **maps, **machine)
+        candidates.append(Candidate(RunFolder(folder), load, [name]))
+    return candidates
 
 
 def evaluate_one(
     config: EvaluateConfig,
-    target: Target,
+    candidate: Candidate,
     evaluations: dict[str, PairedEvaluation],
     stop: StopRequest,
 ) -> None:
@@ -102,7 +102,7 @@ def evaluate_one(
     from flowrep.experiment.evaluation import PairedEvaluation
     from flowrep.experiment.outcomes import print_results
 
-    agent, folder = target.load(), target.folder
+    agent, folder = candidate.load(), candidate.folder
     folder.read_episodes()  # a damaged table is refused before hours of episodes, not after
     if not config.own_policies:  # whose networks may be large
         build.share_cores(agent.config)
@@ -110,8 +110,8 @@ def evaluate_one(
     # agents of one scene share the baselines' episodes
     episodes = config.speed, config.fps, config.episodes, config.seed
     evaluation = evaluations.setdefault(
-        f"{origin['scene_id']} {target.policies}",
-        PairedEvaluation(*episodes, target.policies, config.baselines),
+        f"{origin['scene_id']} {candidate.policies}",
+        PairedEvaluation(*episodes, candidate.policies, config.baselines),
     )
 
     def try_to_save() -> None:

@@ -1,4 +1,4 @@
-"""Optional packages: which are installed, the error for missing ones, and what numba compiles."""
+"""Optional packages: which are installed, the error for a missing one, and numba's compiler."""
 
 import sys
 from collections.abc import Callable

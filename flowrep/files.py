@@ -1,4 +1,4 @@
-"""Files that survive an interruption: written whole or not at all, and never through a link."""
+"""Files that are written whole or not at all, and never through a link."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from typing import IO, Any
 
 
 def replace_file(path: Path, write: Callable[[Path], Any]) -> None:
-    """Has `write` write a file under another path, and renames it to `path` once it is on disk.
+    """Calls `write` with another path, and renames the file to `path` once it is on disk.
 
-    Until then `path` is the previous file, whatever interrupts it. An OSError names `path`.
+    If that is interrupted, the previous file stays. An OSError names `path`.
     """
     _replace(path.parent, [path.name], lambda partial: write(partial / path.name))
 
@@ -31,8 +31,8 @@ def replace_text(path: Path, text: str) -> None:
 def replace_files(folder: Path, files: Mapping[str, bytes], *, as_one: bool = False) -> None:
     """Replaces files of a folder by these, given by name, once all are on disk.
 
-    They are renamed in their order. With `as_one`, old and new ones are never side by side: the old
-    ones go before, the last of `files` first, so that where that is, all are.
+    They are renamed in their order. With `as_one`, old and new files are never mixed: the old ones
+    are removed first, beginning with the last of `files`, so if that one is there, all are.
     """
 
     def write(partial: Path) -> None:
@@ -45,15 +45,15 @@ def replace_files(folder: Path, files: Mapping[str, bytes], *, as_one: bool = Fa
 def _replace(
     folder: Path, names: Sequence[str], write: Callable[[Path], Any], as_one: bool = False
 ) -> None:
-    # A new folder holds no link under any name, and what writers leave beside their file goes too.
+    # In a new folder no name is a link, and whatever writers leave beside their file goes with it.
     partial = folder / f".{names[-1]}.{secrets.token_hex(4)}.partial"
     with naming(folder if names[1:] else folder / names[0]):
-        for left in folder.glob(f".{escape(names[-1])}.*partial"):  # by writers that were killed
+        for left in folder.glob(f".{escape(names[-1])}.*partial"):  # of writers that were killed
             shutil.rmtree(left, ignore_errors=True)
         try:
             partial.mkdir()
             write(partial)
-            mode = partial.stat().st_mode & 0o666  # that of new files; some writers give another
+            mode = partial.stat().st_mode & 0o666  # as of any new file; some writers set another
             for name in names:
                 (partial / name).chmod(mode)
                 _flush(partial / name)
@@ -80,7 +80,7 @@ def _flush(path: Path) -> None:
 
 
 def open_to_append(path: Path) -> IO[bytes]:
-    """Opens a file, or a new one, to append bytes without a buffer; a link is refused."""
+    """Opens or creates a file to append bytes without a buffer; a link is refused."""
     return open(str(path), "ab", buffering=0, opener=_open_no_link)
 
 
@@ -97,7 +97,7 @@ def _open_no_link(path: str, flags: int) -> int:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Has the OSErrors inside name a file; that of a full disk names none, others a partial one."""
+    """Makes OSErrors name this file: that of a full disk names none, others a partial one."""
     try:
         yield
     except OSError as error:
@@ -107,7 +107,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def set_aside(path: Path, problem: object) -> None:
-    """Renames a damaged file, so that a new one can be written, and says so."""
+    """Renames a damaged file, so that a new one can be written, and prints a warning."""
     names = (path.with_name(f"{path.stem}.damaged{n}{path.suffix}") for n in count(1))
     other = next(name for name in names if not os.path.lexists(name))
     path.rename(other)

@@ -1,4 +1,4 @@
-"""How a long loop shows its progress, is stopped, acts at intervals, and spends its time."""
+"""What long loops need: a progress bar, a stop by signal, intervals, and a stopwatch."""
 
 import io
 import os
@@ -19,7 +19,7 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
-    """Returns a tqdm bar; where stderr is no terminal, it is a plain line every half minute.
+    """Returns a tqdm bar; where stderr is no terminal, it prints a plain line each half minute.
 
     Args:
         iterable: what the bar counts, as for tqdm; None to count with `update`.
@@ -29,8 +29,8 @@ def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
     from tqdm.asyncio import tqdm_asyncio  # here, as envs import this module and need no tqdm
     from tqdm.auto import tqdm
 
-    # tqdm's own is one between processes, for which multiprocessing starts another process, whose
-    # traceback a hang-up would print
+    # tqdm's default lock is one between processes, for which multiprocessing starts its resource
+    # tracker, and a hang-up would make that print a traceback
     tqdm.set_lock(_LOCK)
     is_notebook = tqdm is not tqdm_asyncio
     if sys.stderr.isatty() or is_notebook:
@@ -42,7 +42,7 @@ def progress_bar(iterable: Any = None, *, what: str, **options: Any) -> Any:
 
 
 class _Lines(io.TextIOBase):
-    """A bar's file: passes on its text as a line every half minute, without the cursor's moves."""
+    """A file for tqdm that prints its text as a line each half minute, without cursor moves."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -61,14 +61,14 @@ class _Lines(io.TextIOBase):
 class StopRequest:
     """Turns SIGINT, SIGTERM and SIGHUP into a flag that the loop checks between two steps.
 
-    The first signal sets `received` and calls `then`. Another Ctrl-C ends the process at once;
-    another SIGTERM doesn't, since schedulers send it to each process of a job and more than once.
-    SIGHUP stays ignored where it is, as under `nohup`. The previous handlers are restored when its
+    The first signal sets `received` and calls `then`. A second Ctrl-C ends the process at once; a
+    second SIGTERM doesn't, since schedulers send it to each process of a job and more than once.
+    If SIGHUP is ignored, as under `nohup`, it stays so. The previous handlers are restored when the
     context ends.
     """
 
     was_received: ClassVar[bool] = False
-    """Whether a request whose context has not ended yet was made: waits should be short then."""
+    """Whether a stop was requested in a context that has not ended yet: keep waits short then."""
 
     def __init__(self, then: Callable[[], Any] = lambda: None) -> None:
         self.received: signal.Signals | None = None
@@ -105,7 +105,7 @@ class StopRequest:
 
 
 def _leave_closed_terminal() -> None:
-    """Sends output to nowhere if its terminal was closed, where printing would raise an error."""
+    """Discards further output if its terminal was closed, as printing would raise an error."""
     for descriptor in (1, 2):
         poll = select.poll()
         poll.register(descriptor, 0)  # hang-ups and errors are always reported
@@ -117,7 +117,7 @@ def _leave_closed_terminal() -> None:
 
 @dataclass
 class Every:
-    """True once each time a step counter passes a multiple of `interval`, 0 for never."""
+    """True once each time a step counter passes a multiple of `interval`; never if that is 0."""
 
     interval: int
     last: int = 0
@@ -156,6 +156,6 @@ class Stopwatch:
         return self.seconds.get(section, 0.0) / (sum(self.seconds.values()) or 1.0)
 
     def summary(self) -> str:
-        """Returns the shares of all sections in one line, the largest first."""
+        """Returns the share of each section in one line, the largest first."""
         ordered = sorted(self.seconds, key=self.seconds.__getitem__, reverse=True)
         return ", ".join(f"{name} {self.share(name):.0%}" for name in ordered)

@@ -1,4 +1,4 @@
-"""CSV tables that rows are appended to, readable even after a writer was killed."""
+"""CSV tables that stay readable if a process is killed while it appends rows."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ from flowrep.files import naming, open_to_append, replace_file
 
 
 class TableError(ValueError):
-    """A table is not what was written."""
+    """A table is damaged, or another program's."""
 
 
 def read_rows(
@@ -21,8 +21,9 @@ def read_rows(
 ) -> list[dict[str, str]]:
     """Returns a table's rows, none if there is no file; an incomplete last line is left out.
 
-    A table without one of `columns` is refused, as after a spreadsheet saved it with semicolons,
-    and one with a cell for which its column's check raises a ValueError.
+    Raises:
+        TableError: one of `columns` is missing, as after a spreadsheet saved the table with
+            semicolons; or a column's check raises a ValueError for a cell.
     """
     if not path.is_file():
         return []
@@ -84,9 +85,9 @@ def append_rows(
     if is_new:
         writer.writeheader()
     writer.writerows(rows)
-    # in one call, so that a killed process leaves all of them or none
+    # in one call, so that a process that is killed leaves all rows or none
     with naming(path), open_to_append(path) as raw:
         data = text.getvalue().encode("utf-8")
         written = raw.write(data)
-        while written < len(data):  # a nearly full disk takes a part, then raises
+        while written < len(data):  # an almost full disk takes a part, and raises at the next call
             written += raw.write(data[written:])

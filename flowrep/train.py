@@ -5,7 +5,6 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 
 from __future__ import annotations
 
-import logging
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -28,11 +27,11 @@ if TYPE_CHECKING:
     from flowrep.experiment.run import RunFolder
     from flowrep.experiment.runner import Runner
 
-PATIENCE_S = 60.0  # for the process of a run that was stopped and still saves
+PATIENCE_S = 60.0  # a process that was told to stop may still be saving the run
 
 
 class EarlyCheck(Callback):
-    """Refuses a config before Hydra makes the run's folder; conf/run_folder.yaml names it."""
+    """Checks a config before Hydra makes the run's folder; conf/run_folder.yaml adds it."""
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Ends the process if the config is wrong."""
@@ -47,7 +46,7 @@ class EarlyCheck(Callback):
                 from flowrep.experiment import build
 
                 build.device(model.device)
-        except Exception as error:  # Hydra would only warn
+        except Exception as error:  # Hydra would print a warning and go on
             end_with(error, TrainConfig)
 
 
@@ -72,35 +71,38 @@ def run(config: TrainConfig) -> float:
 
 
 def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainConfig:
-    """Returns the config of the run to resume, which keeps a larger `total_frames`."""
+    """Returns the config of the run to resume, with the changes that are allowed.
+
+    A larger `total_frames` is written to the run's config.
+    """
     given = [text.partition("=")[0] for text in typed if not text.startswith("resume=")]
     trusted = "algorithm._target_"
-    own = folder.config(config.algorithm.target if trusted in given else None)
+    stored = folder.config(config.algorithm.target if trusted in given else None)
     allowed = (*OF_THE_MACHINE, "total_frames", trusted)
     if others := [key for key in given if key not in allowed]:
         raise UsageError(
-            f"resume= continues a run with its own config, so '{others[0]}=' would be ignored: "
+            f"resume= continues a run with its stored config, so '{others[0]}=' would be ignored: "
             f"leave it out ({', '.join(allowed)} may be given)"
         )
-    if trusted in given and own.algorithm.target != config.algorithm.target:
+    if trusted in given and stored.algorithm.target != config.algorithm.target:
         raise UsageError(
-            f"the run in '{folder.path}' is of {trusted}={own.algorithm.target}: leave out "
+            f"the run in '{folder.path}' is of {trusted}={stored.algorithm.target}: leave out "
             f"{trusted}={config.algorithm.target}, or start a new run with it"
         )
-    frames = config.total_frames if "total_frames" in given else own.total_frames
-    if frames < own.total_frames:
+    frames = config.total_frames if "total_frames" in given else stored.total_frames
+    if frames < stored.total_frames:
         raise UsageError(
-            f"total_frames={frames} is less than the run's {own.total_frames}: a run can be made "
-            "longer, not shorter"
+            f"total_frames={frames} is less than the run's {stored.total_frames}: a run can be "
+            "made longer, not shorter"
         )
-    if frames > own.total_frames:
-        folder.write_config(own.plain() | {"total_frames": frames})
+    if frames > stored.total_frames:
+        folder.write_config(stored.plain() | {"total_frames": frames})
     changes = {key: getattr(config, key) for key in given if key != trusted}
-    return own.model_copy(update=changes | {"resume": str(folder.path)})
+    return stored.model_copy(update=changes | {"resume": str(folder.path)})
 
 
 def announce(config: TrainConfig, preset: str) -> None:
-    """Prints what is about to be run where, and on a CPU how long the paper's settings take."""
+    """Prints what is trained on which device, and on a CPU how long the paper's settings take."""
     import torch
 
     from flowrep.envs.workers import available_cores
@@ -121,12 +123,11 @@ def announce(config: TrainConfig, preset: str) -> None:
 
 
 def finish(config: TrainConfig, folder: RunFolder) -> float:
-    """Does what remains of a run (training, evaluation, video) and returns its success."""
+    """Runs what remains of a run (training, evaluation, video) and returns its success."""
     from flowrep.agent import CheckpointError, DivergenceError
     from flowrep.envs import WorkerError
     from flowrep.experiment.runner import Runner
 
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
     how_to_go_on = line_for("train", resume=str(folder.path))
     with StopRequest() as stop:
         runner = Runner(config, folder)
@@ -152,7 +153,7 @@ def finish(config: TrainConfig, folder: RunFolder) -> float:
 
 
 def complete(runner: Runner, stop: StopRequest) -> bool:
-    """Trains and evaluates as far as that is not done yet; returns whether all is done."""
+    """Trains and evaluates, unless that is done already; returns whether all is done."""
     config, folder = runner.config, runner.folder
     if is_finished(folder.path, config):
         how = line_for("evaluate", run=str(folder.path))

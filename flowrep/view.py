@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 ENVS = 16  # side by side, for the episodes that are not filmed
 FILES = ("sheet.png", "episode.mp4", "plan.png", "episodes.csv", "categories.csv")
-"""What a view writes, and replaces as a whole."""
+"""The files of a view; a new view replaces all of them."""
 
 
 def run(config: ViewConfig) -> None:
@@ -56,14 +56,18 @@ def run(config: ViewConfig) -> None:
 
 
 def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
-    """Returns what drives; a run's agent drives in its own scene unless one was given."""
+    """Returns what drives: a run's agent in the scene of its training, unless one was given."""
     from flowrep.experiment.agents import Agent
 
-    is_at_home = Path(config.policy).is_dir() and not is_scene_given
-    scene, maps = None if is_at_home else config.scene, config.representations
-    here: dict[str, Any] = {"device": "cpu", "num_envs": 1, "num_workers": 0}
-    here["algorithm"] = config.algorithm.target
-    return Agent.load(config.policy, scene=scene, representations=maps, **here)
+    keeps_scene = Path(config.policy).is_dir() and not is_scene_given
+    return Agent.load(
+        config.policy,
+        scene=None if keeps_scene else config.scene,
+        representations=config.representations,
+        algorithm=config.algorithm.target,
+        device="cpu",
+        num_envs=1,
+    )
 
 
 def street_of(config: ViewConfig) -> dict[str, Any]:
@@ -73,8 +77,8 @@ def street_of(config: ViewConfig) -> dict[str, Any]:
 
 def folder_of(config: ViewConfig, scene: Scene) -> Path:
     """Returns the folder of a view: one for each scene and policy, unless another is given."""
-    own = Path("outputs", "view", folder_name(scene.name), folder_name(config.policy))
-    return own if config.output is None else Path(config.output)
+    default = Path("outputs", "view", folder_name(scene.name), folder_name(config.policy))
+    return default if config.output is None else Path(config.output)
 
 
 def episodes_of(config: ViewConfig, scene: Scene) -> list[dict[str, Any]]:
@@ -134,7 +138,7 @@ def view(
 def drive_on(
     config: ViewConfig, agent: Agent, options: list[dict[str, Any]]
 ) -> list[EpisodeRecord]:
-    """Returns the episodes after the first, in their order, with what the policy sees alone."""
+    """Returns the episodes after the first, in their order; only the policy's maps are drawn."""
     from flowrep.experiment.evaluation import evaluate
 
     if not options:
@@ -162,7 +166,7 @@ def category_rows(categories: Iterable[str], seg: Iterable[Any]) -> list[dict[st
 
 
 def moving_pixels(maps: Mapping[str, Any]) -> int:
-    """Returns the number of pixels that move by themselves and are not close to the camera."""
+    """Returns how many pixels show a moving object more than 4 m from the camera."""
     return int(((maps["obj"] != 0).any(0) & (maps["depth"][0] > 4.0)).sum())
 
 

@@ -16,8 +16,8 @@ from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, validated
 from flowrep.envs import WorkerError, workers
+from flowrep.evaluate import candidates_of
 from flowrep.evaluate import run as evaluate
-from flowrep.evaluate import targets_of
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.evaluation import BaselinePolicy, PairedEvaluation
 from flowrep.experiment.exported import export
@@ -84,7 +84,7 @@ def test_a_run_that_is_named_twice_is_evaluated_once(run, tmp_path):
     (tmp_path / "link").symlink_to(run.path)
     named = [run.path, run.path.parent, tmp_path / "link", f"{run.path}/../{run.path.name}"]
     config = asked("run=x").model_copy(update={"run": [str(path) for path in named]})
-    assert [target.folder.path for target in targets_of(config)] == [run.path]
+    assert [candidate.folder.path for candidate in candidates_of(config)] == [run.path]
 
 
 def test_an_agent_drives_in_another_scene_and_changed_scenes_are_told_apart(untouched):

@@ -17,7 +17,7 @@ pytest.importorskip("pybullet", reason="the commands build the simulated street"
 from flowrep.agent import CheckpointError, checkpoint, load_checkpoint, save_checkpoint
 from flowrep.config import UsageError
 from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
-from flowrep.evaluate import targets_of
+from flowrep.evaluate import candidates_of
 from flowrep.experiment import agents, film, sweep
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.lock import RunFolderError
@@ -55,7 +55,7 @@ def resume(run, *typed):
 
 def evaluate(run, *typed):
     config = validated(EvaluateConfig, plain("evaluate", f"run={run.path}", *typed))
-    return targets_of(config)[0].load()
+    return candidates_of(config)[0].load()
 
 
 def view(run, *typed):
@@ -192,7 +192,7 @@ WRITES = {
     "machine.json": lambda run: run.note_machine({"cpu": "x"}),
     "config.yaml": lambda run: run.write_config({"seed": 1}),
     "checkpoint/latest.safetensors": lambda run: save_checkpoint(run.checkpoint_path, {"a": 1}),
-    "job.log": lambda run: sweep._say(run.path, "failed"),
+    "job.log": lambda run: sweep.JobLog(run.path).end("failed"),
 }
 
 

@@ -33,12 +33,12 @@ _LIBRARIES = (
 
 
 class PolicyError(Exception):
-    """An external policy is missing, fails or returns no actions; the message names it."""
+    """A policy from another project is missing, fails or returns no actions."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """The task, as described to the function that makes an external policy."""
+    """The task, as a policy from another project is told about it."""
 
     scene: str
     representations: Mapping[str, Any]  # options by name, in the requested order
@@ -49,12 +49,12 @@ class Task:
 
 
 class ExternalPolicy:
-    """Writes `action` `[N]`, computed by an external function.
+    """Writes `action` `[N]`, computed by a function from another project.
 
-    The function takes a TensorDict of batch `[N]` that holds only the task's maps `[N, C, H, W]`,
-    `env_id` int64 `[N]` and `is_init` bool `[N, 1]`, for policies that remember: each row's
-    environment, and whether its episode just began. It returns N integers (a tensor, an array or a
-    list), or the TensorDict with `action`.
+    The function takes a TensorDict of batch `[N]` with the task's maps `[N, C, H, W]` and, for
+    policies that remember, `env_id` int64 `[N]`, the env of each row, and `is_init` bool `[N, 1]`,
+    whether its episode just began. It returns N integers (a tensor, an array or a list), or the
+    TensorDict with `action`.
     """
 
     def __init__(self, name: str, act: Callable[[TensorDictBase], Any], task: Task) -> None:
@@ -121,7 +121,7 @@ def _module(name: str) -> Any:
 
 
 def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
-    # moving the module alone would leave the devices that its graph names
+    # moving the module alone would leave the devices that are written in its graph
     program = move_to_device_pass(torch.export.load(path), task.device).module()
     card = _card(path)
     names = task.representations if card is None else [each["name"] for each in card["maps"]]
@@ -130,7 +130,7 @@ def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
 
 @contextmanager
 def _named(name: str) -> Iterator[None]:
-    """Turns any exception in external code into a PolicyError of one line, with its location."""
+    """Turns an exception in a policy's code into a PolicyError: one line, with file and line."""
     try:
         yield
     except PolicyError as error:
@@ -147,9 +147,10 @@ def _named(name: str) -> Iterator[None]:
 
 
 def check_card(reference: str, task: Task) -> None:
-    """Checks that an exported agent gets maps like those that it was trained on.
+    """Checks that an exported agent gets maps like those of its training.
 
-    What has no agent.json beside it passes. The error has the overrides that give the right maps.
+    A policy without an agent.json beside it passes. The error has the overrides that give the right
+    maps.
     """
     with _named(reference):
         card = _card(reference)
@@ -210,5 +211,5 @@ def _overrides(settings: Mapping[str, Any], keys: Sequence[str]) -> str:
     """Returns settings as on the command line, `representations=[ego,obj] scene=s_turn`."""
     texts = [f"{key}={json.dumps(settings[key], separators=(',', ':'))}" for key in keys]
     plain = [text.replace('"', "") for text in texts]
-    # what a card from somebody else says may be pasted into a shell
+    # quoted, as the card may be a stranger's, and the line may be pasted into a shell
     return " ".join(x if re.fullmatch(r"[\w.=,\[\]-]+", x) else shlex.quote(x) for x in plain)

@@ -39,12 +39,12 @@ from flowrep.viz.overlay import legend_strip, steering, with_steering
 LEGEND_S, OUTCOME_S = 3.0, 1.0
 """How long a film shows its legend before the episode, and the last frame with the outcome."""
 
-_MOST_TILES = 4  # of a representation that has no colours: one for each channel
+_MOST_TILES = 4  # of a representation that is drawn channel by channel
 _STATUS_PX = 28
 _ACTIONS = ("keeps its yaw rate", "turns left", "turns right")  # in the order of YAW_SIGN
 
 
-class Frame(NamedTuple):
+class FilmFrame(NamedTuple):
     """What a film shows of one step."""
 
     maps: dict[str, Tensor]  # [C, H, W] by tile; ids, metres or px per step
@@ -54,20 +54,19 @@ class Frame(NamedTuple):
 
 
 class Film:
-    """An agent's env of one street, its frames, and their pictures.
+    """An agent in an env of one street, and the pictures of its steps: a tile for each map.
 
-    What the agent reads is drawn as its env's transforms write it, noisy or estimated, and framed.
-    What it doesn't read of rgb, seg, depth, raw, ego and obj stands beside it, from the simulator's
-    exact sensors.
+    Maps that the agent reads are drawn as its env's transforms write them, noisy or estimated, with
+    a frame around. The others of rgb, seg, depth, raw, ego and obj are added from exact sensors.
 
     Args:
-        agent: whose policy drives.
+        agent: its policy drives.
         changes: of the arguments of `make_env`.
 
     Attributes:
-        env: of one street, with the sensors.
-        tiles: what is drawn, by name; fewer may be left in it.
-        framed: the names of what the agent reads.
+        env: one street, with its sensors.
+        tiles: what is drawn, by name; remove some to draw less.
+        framed: the names of the tiles that the agent reads.
     """
 
     def __init__(self, agent: Driver, **changes: Any) -> None:
@@ -95,7 +94,7 @@ class Film:
             }
             self.env.append_transform(representation_stack(exact, **context))
         self.framed = [name for name in read if name in self.tiles]
-        # the key of each tile's map, and what turns what is there into the tile's units
+        # by tile: the key of its map, and the function that converts the map to the tile's units
         self._maps = {name: (name, self._in_units(name)) for name in self.tiles}
         for name in read:
             if name not in self._maps:
@@ -108,12 +107,12 @@ class Film:
         self,
         options: Mapping[str, Any],
         on_frame: Callable[[TensorDictBase], Any] = lambda tensordict: None,
-    ) -> tuple[list[Frame], EpisodeRecord]:
+    ) -> tuple[list[FilmFrame], EpisodeRecord]:
         """Returns every frame of one greedy episode, and the episode.
 
         `options` are of `StreetEnv.reset`; `on_frame` gets the env's TensorDict.
         """
-        frames: list[Frame] = []
+        frames: list[FilmFrame] = []
 
         def note(tensordict: TensorDictBase) -> TensorDictBase:
             acted = self.policy(tensordict)
@@ -127,15 +126,15 @@ class Film:
         (episode,) = evaluate(self.env, note, [options], on_frame=keep)
         return frames, episode
 
-    def frame(self, tensordict: TensorDictBase) -> Frame:
-        """Returns the frame of the street's present state and the env's TensorDict."""
+    def frame(self, tensordict: TensorDictBase) -> FilmFrame:
+        """Returns the frame of the env's TensorDict and the street's current state."""
         maps = {tile: make(tensordict[key][0].cpu()) for tile, (key, make) in self._maps.items()}
         episode, vehicle = self.street.episode, self.street.scene.vehicle
         turned = episode.now.vehicle.yaw_rate_rps / math.radians(vehicle.max_yaw_rate_dps)
-        return Frame(maps, episode.steps, turned)
+        return FilmFrame(maps, episode.steps, turned)
 
-    def draw(self, frame: Frame, ended: EpisodeRecord | None = None) -> Image:
-        """Returns a frame's picture; that of an episode that has `ended` says how."""
+    def draw(self, frame: FilmFrame, ended: EpisodeRecord | None = None) -> Image:
+        """Returns a frame's picture; an episode in `ended` says how it ended."""
         tiles = dict(self.tiles)
         if "rgb" in tiles:
             sign = 0.0 if frame.action is None else YAW_SIGN[frame.action]
@@ -161,7 +160,7 @@ class Film:
             return _above(drawn, f"framed: what {name} reads; the other maps are exact")
         return _above(drawn, f"{name} reads none of these maps")
 
-    def pictures(self, frames: Sequence[Frame], episode: EpisodeRecord) -> Iterator[Image]:
+    def pictures(self, frames: Sequence[FilmFrame], episode: EpisodeRecord) -> Iterator[Image]:
         """Yields the pictures of a film: the legend, the episode, and how it ended."""
         yield from repeat(self.legend(), max(1, round(LEGEND_S * episode.fps)))
         yield from map(self.draw, frames[:-1])
@@ -185,11 +184,11 @@ class Film:
         return representation_options(name) | dict(given)
 
     def _in_units(self, name: str) -> Callable[[Tensor], Tensor]:
-        """Returns what turns a map as the agent reads it into ids, metres or px per step."""
+        """Returns the function that converts a map to ids, metres or pixels per step."""
         options = self._options(name)
         if "encoding" in options:
             return lambda ids: ids if len(ids) == 1 else ids.argmax(0, keepdim=True).byte()
-        if "range_m" in options:  # 1 is the sky's, too
+        if "range_m" in options:  # 1 is at or beyond the range, as the sky is
             return lambda depth: torch.where(depth < 1, depth * options["range_m"], torch.inf)
         if name in FLOWS:
             dt_s = 1.0 / self.street.frame_rate_hz if options["unit"] == "px_per_s" else 1.0
@@ -197,7 +196,7 @@ class Film:
         return lambda values: values
 
     def _add_tiles(self, name: str) -> None:
-        """Adds tiles for a representation that has none: one for each frame, or each channel."""
+        """Adds tiles for a representation without a stock tile: one per frame, or per channel."""
         spec, in_units = self.env.observation_spec[name], self._in_units(name)
         if frames_of := {"seg2": "seg", "depth2": "depth"}.get(name):
             tile, count = self.tiles[frames_of], int(self._options(name)["k"])
@@ -236,9 +235,10 @@ def how_it_ended(episode: EpisodeRecord) -> str:
 
 
 def _picture_scale(agent: Driver) -> int:
-    """Returns the size of the picture in sizes of the maps: a tile's, if it is for films alone.
+    """Returns the factor from the maps' size to that of rgb.
 
-    An estimator's pictures have the size that the config says, whatever is asked for here.
+    rgb is rendered at the size of a tile unless the agent reads it. Estimators of flow get
+    pictures of the config's size in any case.
     """
     config = agent.config
     if "rgb" in config.representations or choose_renderer(config.renderer) == "pybullet":
@@ -247,7 +247,7 @@ def _picture_scale(agent: Driver) -> int:
 
 
 def _plain(spec: Any) -> Callable[[Any], Image]:
-    """Returns what draws a channel of a map of this spec, which has no colours of its own."""
+    """Returns the function that draws a channel of a map of this spec, in grey or as classes."""
     if isinstance(spec, Categorical):
         return classes_to_rgb
     low, high = float(spec.space.low.min()), float(spec.space.high.max())

@@ -1,4 +1,4 @@
-"""Loads an agent trained by flowrep, with torch alone, from agent.pt2 and agent.json beside it."""
+"""Loads an agent that flowrep trained, from agent.pt2 and agent.json here; needs torch alone."""
 
 import io
 import json

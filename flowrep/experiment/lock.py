@@ -25,22 +25,22 @@ class FolderInUseError(OSError):
 
 
 class FolderLock:
-    """The file by which a process holds a folder, and in which it describes itself.
+    """A locked file in a folder, in which the process that holds the folder describes itself.
 
-    The kernel's lock is on the open file and ends with the process, in whatever way. The file
-    stays: if holders removed it, another could lock a new one of that name beside them.
+    The kernel's lock is on the open file and ends with the process, even if it is killed. The file
+    stays: if a holder removed it, two processes could hold the old file and a new one of its name.
     """
 
     _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # raised by some network disks
 
     def __init__(self, folder: Path) -> None:
         self._path, self._text = folder / ".lock", b""
-        # through no link, and not waiting for the other end of a named pipe
+        # a link is refused, and a named pipe does not block until its other end is opened
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
         try:
             self._file = os.open(self._path, flags, 0o666)
-            found = os.fstat(self._file)
-            is_plain = stat.S_ISREG(found.st_mode) and found.st_nlink < 2
+            status = os.fstat(self._file)
+            is_plain = stat.S_ISREG(status.st_mode) and status.st_nlink < 2
         except OSError as error:
             if error.errno != errno.ELOOP:
                 raise
@@ -57,7 +57,7 @@ class FolderLock:
         except OSError as error:
             if error.errno not in self._NO_LOCKS:
                 raise
-            if platform.node() in self.holder():  # which is alive
+            if platform.node() in self.holder():  # a live process of this machine
                 return False
             print(f"warning: no locks on the disk of '{self._path}' ({error})", file=sys.stderr)
         if not self._is_at_its_path():  # replaced since it was opened
@@ -80,19 +80,19 @@ class FolderLock:
             )
 
     def holder(self) -> str:
-        """Describes the process that wrote the file; empty if that has ended."""
+        """Describes the process that wrote the file; empty if that process has ended."""
         try:
-            found = json.loads(os.pread(self._file, 4096, 0))
-            pid, host = int(found["pid"]), found["host"]
-            text = f"process {pid} on {host} has been {found['doing']} in it since {found['since']}"
-        except (ValueError, KeyError, TypeError):  # nothing yet, or not its text
+            told = json.loads(os.pread(self._file, 4096, 0))
+            pid, host = int(told["pid"]), told["host"]
+            text = f"process {pid} on {host} has been {told['doing']} in it since {told['since']}"
+        except (ValueError, KeyError, TypeError):  # empty, or written by something else
             return ""
         if host == platform.node() and not _is_alive(pid):
             return ""
         return "".join(filter(str.isprintable, text))
 
     def close(self) -> None:
-        """Lets others take it."""
+        """Releases the folder."""
         if self._text and self._is_ours():
             os.ftruncate(self._file, 0)
         os.close(self._file)
@@ -104,7 +104,7 @@ class FolderLock:
             return False
 
     def _is_ours(self) -> bool:
-        # on a disk without locks, another process may have written to the same file
+        # on a disk without locks, another process may have written to the file since
         return os.pread(self._file, len(self._text) + 1, 0) == self._text
 
 
@@ -113,16 +113,16 @@ def _is_alive(pid: int) -> bool:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:  # of another user
+    except PermissionError:  # it is another user's
         pass
     return True
 
 
 @contextmanager
 def locked(folder: Path, doing: str, patience_s: float = 0.0) -> Iterator[FolderLock]:
-    """Locks a folder against other processes, until the process ends in whatever way.
+    """Locks a folder against other processes until the context, or the process, ends.
 
-    Waits `patience_s` for another process to end. `doing` tells others what this one does.
+    Waits `patience_s` for another process to release it. `doing` tells others what this one does.
     """
     until = time.monotonic() + patience_s
     while True:

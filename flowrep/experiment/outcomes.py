@@ -69,7 +69,7 @@ class EpisodeRecord:
 _FIELDS = {each.name.rstrip("_"): each.name for each in fields(EpisodeRecord)[:-1]}
 EVALUATION_COLUMNS = tuple(_FIELDS)
 
-_LATER = {"scene_id": "", "path": ""}  # columns that older tables lack, with their empty cells
+_LATER = ("scene_id", "path")  # columns that older tables lack; their cells are read as empty
 _CHECKS: dict[str, Callable[[str], Any]] = {
     "frames": int, "fps": float, "outcome": OUTCOMES.index,
 }  # fmt: skip
@@ -79,7 +79,8 @@ _CHECKS: dict[str, Callable[[str], Any]] = {
 def read_episodes(path: Path) -> list[dict[str, str]]:
     """Returns the rows of an evaluation.csv, none if there is no such file."""
     needed = [name for name in EVALUATION_COLUMNS if name not in _LATER]
-    return [_LATER | row for row in read_rows(path, needed, _CHECKS)]
+    rows = read_rows(path, needed, _CHECKS)
+    return [{name: row.get(name, "") for name in EVALUATION_COLUMNS} for row in rows]
 
 
 def is_finished(folder: Path, config: TrainConfig) -> bool:

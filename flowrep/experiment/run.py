@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flowrep import __version__
 from flowrep.agent import CheckpointError
 from flowrep.config import UsageError
-from flowrep.config.schema import ALGORITHMS, EstimatedFlow, TrainConfig, validated_run
+from flowrep.config.schema import TrainConfig, validated_run
 from flowrep.config.yaml_file import read_yaml
 from flowrep.experiment import build
 from flowrep.experiment.lock import FolderLock, RunFolderError, locked
@@ -33,7 +33,7 @@ from flowrep.files import replace_file, replace_text, set_aside
 from flowrep.tables import append_rows, is_whole, read_rows, write_rows
 
 _EPISODE = ("scene", "scene_id", "frames", "evaluation", "policy", "speed", "fps", "episode_seed")
-"""The columns that identify a row's policy and episode."""
+"""The columns that identify a row of evaluation.csv."""
 _DRIVE = ("scene_id", "evaluation", "frames", "policy", "speed", "fps", "episode_seed", "outcome")
 """The columns in drives.npz."""
 
@@ -45,23 +45,9 @@ _IDENTITY = (
 
 def origin_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the identity of a run: flowrep's version, and the config keys that define it."""
-    whole = {"motion": "exact", **config}  # earlier runs have no motion
-    parts = json.loads(json.dumps({key: whole[key] for key in _IDENTITY}))
-    return {"flowrep": __version__} | _without_defaults(parts)
-
-
-def _without_defaults(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns parts of a config without options at the schema's default."""
-    # only options that earlier runs did not have yet have a default there
-    of_algorithm = ALGORITHMS.get(parts["algorithm"]["_target_"])
-    kept = dict(parts)
-    for key, section in {"algorithm": of_algorithm, "flow": EstimatedFlow}.items():
-        fields = section.model_fields if section else {}
-        options = parts[key].items()
-        kept[key] = {k: v for k, v in options if k not in fields or fields[k].default != v}
-    # read by configs that choose images, and by no street
-    kept["scene"] = {key: value for key, value in parts["scene"].items() if key != "symmetric"}
-    return kept
+    parts = json.loads(json.dumps({key: config[key] for key in _IDENTITY}))
+    parts["scene"].pop("symmetric", None)  # read by configs that choose images, and by no street
+    return {"flowrep": __version__, **parts}
 
 
 def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
@@ -71,33 +57,32 @@ def check_origin(saved: Mapping[str, Any], expected: Mapping[str, Any], path: Pa
             f"{path} was written by flowrep {saved.get('flowrep')}, this is {expected['flowrep']}: "
             "install that version, or start a new run"
         )
-    there = _flat(_without_defaults({"motion": "exact", **saved}))
-    here = _flat(expected)
+    there, here = _flat(saved), _flat(expected)
     for key in {**there, **here}:
         was, now = there.get(key, "absent"), here.get(key, "absent")
-        if was != now and key.partition(".")[0] in expected:
+        if was != now:
             raise CheckpointError(
                 f"{path} belongs to a run with {key}={was}, the config.yaml of its folder says "
                 f"{key}={now}: restore the file that was there, or start a new run"
             )
 
 
-def _flat(config: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+def _flat(config: Mapping[str, Any], section: str = "") -> dict[str, Any]:
     """Returns nested values by their dotted keys; an empty mapping is a value."""
     flat: dict[str, Any] = {}
     for key, value in config.items():
-        nested = _flat(value, f"{place}{key}.") if isinstance(value, Mapping) else {}
-        flat |= nested or {f"{place}{key}": value}
+        nested = _flat(value, f"{section}{key}.") if isinstance(value, Mapping) else {}
+        flat |= nested or {f"{section}{key}": value}
     return flat
 
 
 def machine_of(precision: torch.dtype) -> dict[str, Any]:
-    """Returns what a run is computed with: versions, commit, processor and number format."""
+    """Returns what computes a run: versions, commit, processor and number format."""
     home, commit = Path(__file__).parents[2], None
     if (home / ".git").exists() and shutil.which("git"):
         ask = ["git", "-C", str(home), "describe", "--always", "--dirty", "--abbrev=40"]
-        found = subprocess.run([*ask, "--exclude=*"], capture_output=True, text=True)
-        commit = found.stdout.strip() or None
+        answer = subprocess.run([*ask, "--exclude=*"], capture_output=True, text=True)
+        commit = answer.stdout.strip() or None
     return {
         "flowrep": __version__,
         "commit": commit,
@@ -153,14 +138,14 @@ class RunFolder:
     def check_is_new(self) -> None:
         """Checks that a run can begin here."""
         files = (self.config_path, self.metrics_path, self.evaluation_path, self.checkpoint_path)
-        found = [file for file in files if file.exists()]
-        if found:
-            is_run = found[0] == self.config_path
-            how = f"continue it with resume={self.path}, or " if is_run else ""
-            raise RunFolderError(
-                f"'{self.path}' holds a run already ({found[0].name}): {how}give the new one a "
-                "folder of its own with hydra.run.dir="
-            )
+        for file in files:
+            if file.exists():
+                is_run = file == self.config_path
+                how = f"continue it with resume={self.path}, or " if is_run else ""
+                raise RunFolderError(
+                    f"'{self.path}' holds a run already ({file.name}): {how}give the new one "
+                    "another folder with hydra.run.dir="
+                )
 
     @contextmanager
     def held(self, doing: str, patience_s: float = 0.0) -> Iterator[None]:
@@ -173,12 +158,12 @@ class RunFolder:
                 self._lock = None
 
     def check_held(self) -> None:
-        """Checks that the folder, if this process has locked it, still is."""
+        """Checks that the folder is still locked, if this process locked it."""
         if self._lock is not None:
             self._lock.check()
 
     def _prepare(self) -> None:
-        """Checks that the folder may be written to, and makes a new one."""
+        """Checks that this process may write to the folder, and creates it if necessary."""
         self.check_held()
         self.path.mkdir(parents=True, exist_ok=True)
 
@@ -194,7 +179,7 @@ class RunFolder:
         return config
 
     def write_config(self, config: Mapping[str, Any], overrides: Iterable[str] = ()) -> None:
-        """Writes the resolved config, and the typed overrides where Hydra keeps them."""
+        """Writes the resolved config, and the overrides where Hydra keeps them."""
         self._prepare()
         (self.path / ".hydra").mkdir(exist_ok=True)
         typed = yaml.safe_dump(list(overrides), allow_unicode=True)
@@ -216,20 +201,20 @@ class RunFolder:
         return validated_run(self.read_config(), str(self.config_path), algorithm)
 
     def note_machine(self, machine: Mapping[str, Any]) -> None:
-        """Appends this machine to machine.json, unless it is already the last entry."""
+        """Appends a machine to machine.json, unless it is already the last entry."""
         self._prepare()
         path = self.path / "machine.json"
-        noted: list[Any] = []
+        machines: Any = []
         if path.is_file():
             try:
-                noted = json.loads(path.read_text(encoding="utf-8"))
-                if not isinstance(noted, list):
+                machines = json.loads(path.read_text(encoding="utf-8"))
+                if not isinstance(machines, list):
                     raise ValueError("no list of machines")
             except (ValueError, RecursionError) as error:
                 set_aside(path, error)
-                noted = []
-        if noted[-1:] != [machine]:
-            replace_text(path, json.dumps([*noted, machine], indent=1) + "\n")
+                machines = []
+        if machines[-1:] != [machine]:
+            replace_text(path, json.dumps([*machines, machine], indent=1) + "\n")
 
     def log_metrics(self, frames: int, metrics: Mapping[str, float]) -> None:
         """Appends one row to metrics.csv and logs the same values to TensorBoard and wandb."""
@@ -239,18 +224,17 @@ class RunFolder:
 
     def forget_after(self, frames: int) -> None:
         """Drops the rows logged after `frames`; a resumed run writes them again."""
-        for path, rows, columns in (
-            (self.metrics_path, self.read_metrics(), None),
-            (self.evaluation_path, self.read_episodes(), EVALUATION_COLUMNS),
-        ):
+        metrics, episodes = self.read_metrics(), self.read_episodes()
+        for path, rows in ((self.metrics_path, metrics), (self.evaluation_path, episodes)):
             kept = [row for row in rows if int(row["frames"]) <= frames]
             if len(kept) < len(rows) or not is_whole(path):
-                write_rows(path, kept, columns)
+                write_rows(path, kept)
 
     def start_again(self, first_save: int) -> None:
         """Drops all rows of a run that was killed before its first checkpoint, to start it again.
 
-        Rows of more frames than `first_save`, when the first one is due, show that there was one.
+        The first checkpoint is due after `first_save` frames: rows of more frames show that there
+        was one, and that its file is lost.
         """
         episodes = self.read_episodes()
         rows = [*self.read_metrics(), *episodes]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -48,6 +49,7 @@ class Runner:
     ) -> None:
         self.config, self.folder, self.clock = config, folder, Stopwatch()
         self.on_log = on_log
+        logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage it creates
         keep_freed_memory()
         build.share_cores(config)
         torch.manual_seed(config.seed)
@@ -58,7 +60,7 @@ class Runner:
             self.agent = build.agent(config, self.env)
         self.frames = 0  # of the environment, so far
         self.observation: TensorDictBase | None = None  # what is acted on next
-        self.evaluation_pending = False  # the last one was interrupted and has to be run again
+        self.evaluation_pending = False  # whether a stop cut the last one short
         self.metrics, self.recent = Means(), RecentEpisodes()
 
     def train(self, stop: StopRequest) -> None:
@@ -71,9 +73,9 @@ class Runner:
         log = Every(self.config.log_every_frames, self.frames)
         evaluate = Every(self.config.evaluation.every_frames, self.frames)
         save = Every(self.config.checkpoint_every_frames, self.frames)
-        # Updates are taken between choosing an action and waiting for its step. Environments with
-        # processes and cores of their own step meanwhile, which TorchRL's sequential `Trainer` does
-        # not support. The order of operations, and so the result, is the same where they don't.
+        # Updates run between choosing an action and waiting for its step, during which envs in
+        # worker processes step on spare cores; TorchRL's sequential `Trainer` can't do that. The
+        # order of operations, and so the result, is the same without workers.
         is_on_gpu = self.agent.device.type == "cuda"
         steps_meanwhile = is_on_gpu or has_spare_cores(self.env, self.config.threads)
         if self.observation is None:
@@ -97,7 +99,7 @@ class Runner:
                 self.frames += stepped.numel()
                 self.recent.add(stepped)
                 if self.frames >= total:
-                    self.learn(bar)  # there is no next step to overlap with
+                    self.learn(bar)  # no next step is left to overlap with
                 bar.update(self.frames - bar.n)
                 if log(self.frames):
                     row = self.log(bar.format_dict["rate"])
@@ -115,7 +117,7 @@ class Runner:
             with torch.no_grad():
                 return self.agent.act(self.observation)
         except RuntimeError as error:
-            self.check()  # an update may have seen it first, and its error says more
+            self.check()  # the loss may have diverged first, and that error says more
             if "probability tensor" not in str(error):
                 raise
             keys = self.agent.policy.in_keys
@@ -127,9 +129,9 @@ class Runner:
             ) from error
 
     def learn(self, bar: Any) -> None:
-        """Takes the updates that are due after the frames so far."""
+        """Runs the updates that are due after the frames so far."""
         for _ in range(self.agent.updates_due(self.frames)):
-            bar.update(0)  # its clock goes on: an update of the paper's size takes a second
+            bar.update(0)  # redraws its clock: an update of the paper's size takes a second
             with self.clock("memory"):
                 batch = self.agent.sample()
             with self.clock("update"), torch_threads(self.config.threads):
@@ -173,12 +175,12 @@ class Runner:
         return True
 
     def film(self) -> None:
-        """Writes causes of failure and learning curve, and films an episode unless it is there."""
+        """Writes causes of failure and the learning curve, and films an episode unless done."""
         # drawing takes seconds to import
         from flowrep.experiment.film import draw_learning_curve, record_episode
         from flowrep.viz import is_playable
 
-        self.close()  # its processes take memory, and so does filming
+        self.close()  # its worker processes take memory, and so does filming
         metrics, episodes = self.folder.read_metrics(), self.folder.read_episodes()
         self.folder.write_failures()
         fps = self.env.base_env.frame_rate_hz
@@ -215,9 +217,9 @@ class Runner:
             save_checkpoint(self.folder.checkpoint_path, self.state())
 
     def load(self) -> None:
-        """Continues from the checkpoint and drops what was logged after it."""
+        """Continues from the checkpoint and drops the rows logged after it."""
         path, config = self.folder.checkpoint_path, self.config
-        if not path.exists():  # killed before the first, or the file is gone
+        if not path.exists():  # killed before the first one, or the file was removed
             due = min(config.checkpoint_every_frames, config.total_frames)
             self.folder.start_again(first_save=due + config.num_envs - 1)
             return
@@ -261,7 +263,7 @@ class Runner:
 
 
 def progress_text(row: Mapping[str, float]) -> str:
-    """Returns the end of the progress line, for 120 columns; nan values are left out."""
+    """Returns the end of the progress line, short enough for 120 columns; nan is left out."""
     losses = [name for name in row if name.endswith("_loss")][:1]
     shown = {"success": f"{row['success']:.0%}"}
     shown |= {name: f"{row[name]:.3g}" for name in ("alpha", "entropy", *losses) if name in row}
@@ -277,7 +279,7 @@ class RecentEpisodes:
     """Outcomes, returns and lengths of the latest finished episodes of all environments."""
 
     def __init__(self) -> None:
-        self._running = torch.zeros(2, 1)  # then [2, num_envs]: return and length so far
+        self._running = torch.zeros(2, 1)  # [2, num_envs] from the first step: return, length
         self._ended: deque[tuple[int, float, int]] = deque(maxlen=RECENT_EPISODES)
 
     def add(self, stepped: TensorDictBase) -> None:
@@ -285,7 +287,7 @@ class RecentEpisodes:
         after = stepped["next"]
         rewards = after["reward"].flatten().double()
         step = torch.stack([rewards, torch.ones_like(rewards)])
-        # not in place, as restored sums are on the CPU
+        # not in place: restored sums are on the CPU, the env may be on a GPU
         self._running = self._running.to(step.device) + step
         done = after["done"].flatten()
         outcomes = after["outcome"].flatten()[done].tolist()
@@ -314,7 +316,7 @@ class RecentEpisodes:
 
 
 class Means:
-    """Means of the updates' metrics since the last row, without waiting for a device."""
+    """Means of the updates' metrics since the last row; adding one doesn't wait for a GPU."""
 
     def __init__(self) -> None:
         self._sums: dict[str, Tensor] = {}
@@ -323,7 +325,7 @@ class Means:
     def add(self, metrics: Mapping[str, Tensor]) -> None:
         """Adds the metrics of one update."""
         for name, value in metrics.items():
-            # not in place, as restored sums are on the CPU, and a CUDA graph reuses its tensors
+            # not in place: restored sums are on the CPU, and a CUDA graph reuses its tensors
             self._sums[name] = self._sums.get(name, 0) + value.detach()
         self._count += 1
 

@@ -1,9 +1,9 @@
-"""Sweeps: `python -m flowrep.train -m seed=0,1,2` is a run for each job, in a folder of its own.
+"""Sweeps: `python -m flowrep.train -m seed=0,1,2` trains a run for each job, each in a folder.
 
-A job is the command `python -m flowrep.train <its overrides> hydra.run.dir=<folder>`, or
-`resume=<folder>` where it has begun, and nothing where its final evaluation is there. So a sweep
-continues where it was stopped, whatever stopped it. Hydra's launchers (one after the other, joblib,
-SLURM, Ray) call `job` in their workers, which therefore import no torch here.
+A job starts `python -m flowrep.train <its overrides> hydra.run.dir=<folder>`. If that run has begun
+already, the job resumes it, and if its final evaluation is done, there is nothing to do. So the
+same command continues a sweep, whatever stopped it. Hydra's launchers (one run after the other,
+joblib, SLURM, Ray) call `job` in their workers, so this module imports no PyTorch.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ cli.register_resolvers()  # for the paths in conf/run_folder.yaml, which a worke
 
 LOG = "job.log"
 STOP = ".stop_"
-"""The file that tells the jobs of a sweep, on whatever machine, to save and stop, without its id.
+"""How the name of the file begins that tells a sweep's jobs, on any machine, to save and stop.
 
-Two sweeps may share a folder, so each has an id, which jobs get as `_ID` of `hydra.job.env_set`.
+It ends with the sweep's id, as two sweeps may share a folder. Jobs get the id as `SWEEP_ID` in
+`hydra.job.env_set`.
 """
-_ID = "FLOWREP_SWEEP"
+SWEEP_ID = "FLOWREP_SWEEP"
 _BEGUN = "--- sweep "
 POLL_S = 0.5
 PARENT = os.getppid()
@@ -57,7 +58,7 @@ _NEEDED_BY = {
         "hydra.sweeper.max_failure_rate=1.0",
     ),
 }
-"""Options of plugins that a sweep needs, added unless they are typed."""
+"""Options that a sweep with these plugins needs; they are added unless they are typed."""
 
 
 class RunFailedError(RuntimeError):
@@ -79,14 +80,18 @@ def run_sweep() -> NoReturn:
             "hydra.sweep.dir=<its folder>"
         )
     typed = [text for text in sys.argv[1:] if not text.startswith("hydra.sweep.dir=")]
-    places = [cli.value_of(text) for text in sys.argv[1:] if text not in typed]
+    folders = [cli.value_of(text) for text in sys.argv[1:] if text not in typed]
     new = f"outputs/{datetime.now():%Y-%m-%d/%H-%M-%S}_sweep"
-    folder = Path(places[-1] if places else new).absolute()
+    folder = Path(folders[-1] if folders else new).absolute()
     sweep_id = f"s{secrets.token_hex(4)}"  # not digits alone, which Hydra reads as a number
     given = cli.override("hydra.sweep.dir", str(folder))
     needed = [option for choice in typed for option in _NEEDED_BY.get(choice, ())]
     needed = [option for option in needed if option.partition("=")[0] not in keys]
-    sys.argv[1:] = [*typed, given, *needed, f"+hydra.job.env_set.{_ID}={sweep_id}"]
+    # argparse wants all overrides side by side, and flags with values may stand around them
+    are_keys = ["=" in text and not text.startswith("-") for text in typed]
+    at = are_keys.index(True) if True in are_keys else len(typed)
+    added = [given, *needed, f"+hydra.job.env_set.{SWEEP_ID}={sweep_id}"]
+    sys.argv[1:] = [*typed[:at], *added, *typed[at:]]
     stopped, is_whole = folder / f"{STOP}{sweep_id}", True
 
     def mark() -> None:
@@ -97,34 +102,57 @@ def run_sweep() -> NoReturn:
         try:
             cli.run_hydra("train", job, TrainConfig)
         except SystemExit:
-            if not _states(folder, sweep_id):
+            if not states_of(folder, sweep_id):
                 raise  # a mistake on the command line, which has been printed
             is_whole = False
     if is_whole:  # no job is left to read it
         stopped.unlink(missing_ok=True)
-    states = _states(folder, sweep_id)
+    states = states_of(folder, sweep_id)
     _sum_up(folder, states)
     if stop or not is_whole or not all(state.startswith(FINISHED) for state in states.values()):
-        again = shlex.join(["python", "-m", "flowrep.train", *typed, given])
+        again = shlex.join(["python", "-m", "flowrep.train", *typed[:at], given, *typed[at:]])
         print(f"Continue the remaining runs with\n  {again}")
         sys.exit(stop.exit_code or 1)
     sys.exit(0)
 
 
-def _states(sweep: Path, sweep_id: str) -> dict[str, str]:
-    """Returns what the last line of the log of each of a sweep's runs says of it, by name."""
-    states = {}
-    for log in sorted(sweep.glob(f"*/{LOG}")):
-        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-        if any(line.startswith(f"{_BEGUN}{sweep_id} ") for line in lines):
-            last = lines[-1]
-            is_state = last.startswith("--- ") and not last.startswith(_BEGUN)
-            states[log.parent.name] = last.removeprefix("--- ") if is_state else STOPPED
-    return states
+class JobLog:
+    """What a run of a sweep printed, with a line for each attempt and for how each one ended."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / LOG
+
+    def begin(self, sweep_id: str) -> None:
+        """Adds a line that says which sweep attempts the run."""
+        self._add(f"{_BEGUN}{sweep_id} {datetime.now():%Y-%m-%d %H:%M:%S}")
+
+    def end(self, state: str) -> str:
+        """Adds how the attempt ended, and returns it."""
+        self._add(f"--- {state}")
+        return state
+
+    def state(self, sweep_id: str) -> str | None:
+        """Returns how the last attempt ended; None if this sweep has not attempted the run."""
+        lines = self.path.read_text(encoding="utf-8", errors="replace").splitlines()
+        if not any(line.startswith(f"{_BEGUN}{sweep_id} ") for line in lines):
+            return None
+        has_ended = lines[-1].startswith("--- ") and not lines[-1].startswith(_BEGUN)
+        return lines[-1].removeprefix("--- ") if has_ended else STOPPED
+
+    def _add(self, line: str) -> None:
+        with open_to_append(self.path) as log:
+            log.write(f"{line}\n".encode())
+
+
+def states_of(sweep: Path, sweep_id: str) -> dict[str, str]:
+    """Returns the states of the runs that a sweep has attempted, by name."""
+    logs = sorted(sweep.glob(f"*/{LOG}"))
+    states = {log.parent.name: JobLog(log.parent).state(sweep_id) for log in logs}
+    return {name: state for name, state in states.items() if state is not None}
 
 
 def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
-    """Prints how each run stands, where the logs of failed ones are, and how to compare them."""
+    """Prints the state of each run, where the logs of failed ones are, and how to compare runs."""
     finished, failed = (
         sum(state.startswith(word) for state in states.values()) for word in (FINISHED, FAILED)
     )
@@ -139,7 +167,7 @@ def _sum_up(folder: Path, states: Mapping[str, str]) -> None:
 
 
 def job(config: DictConfig) -> float:
-    """Does what remains of one run in a process of its own; called by Hydra's launchers.
+    """Runs what remains of one run in a separate process; called by Hydra's launchers.
 
     Returns its final greedy success; nan if a run of a grid has none, so that the others go on.
     """
@@ -147,23 +175,23 @@ def job(config: DictConfig) -> float:
     folder, sweep = Path(hydra.runtime.output_dir), Path(hydra.sweep.dir)
     is_worker = multiprocessing.current_process().name != "MainProcess"  # of a pool, as joblib's
     if is_worker:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launching process leaves a `.stop`
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launching process writes a stop file
 
-    sweep_id = hydra.job.env_set[_ID]
+    sweep_id = hydra.job.env_set[SWEEP_ID]
     stopped = sweep / f"{STOP}{sweep_id}"
 
     def should_stop() -> bool:
         return stopped.exists() or (is_worker and os.getppid() != PARENT)
 
     try:
-        _begin(folder, sweep_id)
+        JobLog(folder).begin(sweep_id)
         asked = validated(TrainConfig, cli.plain_config(config))
-        state = attempted(folder, asked, _line(folder, asked, is_worker), should_stop)
+        state = attempted(folder, asked, arguments_of(folder, asked, is_worker), should_stop)
     except Exception as error:  # the other runs go on
-        state = _say(folder, f"{FAILED}: error: {' '.join(str(error).split())}")
+        state = JobLog(folder).end(f"{FAILED}: error: {' '.join(str(error).split())}")
     print(f"{folder.name}: {state}", flush=True)
     if is_worker and os.getppid() != PARENT:
-        os._exit(1)  # nobody waits for its result
+        os._exit(1)  # the launching process is gone
     if state.startswith(FINISHED):
         return success_of(folder)
     if hydra.sweeper["_target_"].endswith("BasicSweeper"):
@@ -171,12 +199,12 @@ def job(config: DictConfig) -> float:
     raise RunFailedError(f"{folder} {state}")
 
 
-def _line(folder: Path, config: TrainConfig, is_worker: bool) -> list[str]:
+def arguments_of(folder: Path, config: TrainConfig, is_worker: bool) -> list[str]:
     """Returns the arguments of `flowrep.train` for a job's run."""
     hydra = HydraConfig.get()
     typed = list(hydra.overrides.task)
     machine = [text for text in typed if text.partition("=")[0] in cli.OF_THE_MACHINE]
-    if is_worker and config.num_workers == "auto":  # it has only its own core
+    if is_worker and config.num_workers == "auto":  # other workers use the other cores
         machine = [*(text for text in machine if "device" in text), "num_workers=0"]
     if (folder / "config.yaml").is_file():
         target = config.algorithm.target
@@ -193,23 +221,23 @@ def _line(folder: Path, config: TrainConfig, is_worker: bool) -> list[str]:
 def attempted(
     folder: Path, config: TrainConfig, line: list[str], should_stop: Callable[[], bool]
 ) -> str:
-    """Returns how a run stands after what remains of it was done: "failed: error: no space".
+    """Runs what remains of a run and returns its state, such as "failed: error: no space".
 
     `line` are the arguments of `flowrep.train`. Once `should_stop` is true, the run saves and ends.
     """
     _check_is_same(folder, config)
-    code = begin = 0
+    log, code, begin = JobLog(folder), 0, 0
     if not is_finished(folder, config):
         if should_stop():
             return STOPPED
         print(f"{folder.name}: running", flush=True)
-        begin = (folder / LOG).stat().st_size if (folder / LOG).exists() else 0
-        code = _exit_code(line, folder / LOG, should_stop)
+        begin = log.path.stat().st_size if log.path.exists() else 0
+        code = _exit_code(line, log.path, should_stop)
     if is_finished(folder, config):
-        return _say(folder, f"{FINISHED}, success {success_of(folder):.0%}")
+        return log.end(f"{FINISHED}, success {success_of(folder):.0%}")
     if code in {ended for number in STOP_SIGNALS for ended in (128 + number, -number)}:
-        return _say(folder, STOPPED)
-    return _say(folder, f"{FAILED}: {_reason(folder / LOG, begin, code)}")
+        return log.end(STOPPED)
+    return log.end(f"{FAILED}: {_reason(log.path, begin, code)}")
 
 
 def _exit_code(line: list[str], log: Path, should_stop: Callable[[], bool]) -> int:
@@ -223,7 +251,7 @@ def _exit_code(line: list[str], log: Path, should_stop: Callable[[], bool]) -> i
         try:
             while run.poll() is None and not should_stop():
                 time.sleep(POLL_S)
-        finally:  # a launcher may end its worker by an exception
+        finally:  # a launcher may end its worker with an exception
             if run.poll() is None:
                 run.terminate()
             run.wait()
@@ -231,24 +259,11 @@ def _exit_code(line: list[str], log: Path, should_stop: Callable[[], bool]) -> i
 
 
 def _end_with_parent() -> None:
-    """Has a process save and end when its parent ends, however it does, and at no other signal."""
-    for number in (signal.SIGUSR1, signal.SIGUSR2):  # SLURM's, meant for its launcher
+    """Makes a process save and end when its parent ends, even if that is killed."""
+    for number in (signal.SIGUSR1, signal.SIGUSR2):  # SLURM sends them for its launcher
         signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
-
-
-def _begin(folder: Path, sweep_id: str) -> None:
-    """Adds a line to a run's log that tells which sweep attempts it."""
-    with open_to_append(folder / LOG) as log:
-        log.write(f"{_BEGUN}{sweep_id} {datetime.now():%Y-%m-%d %H:%M:%S}\n".encode())
-
-
-def _say(folder: Path, state: str) -> str:
-    """Adds a line to a run's log, whose last such line is how the run stands, and returns it."""
-    with open_to_append(folder / LOG) as log:
-        log.write(f"--- {state}\n".encode())
-    return state
 
 
 def _reason(log: Path, begin: int, code: int) -> str:
@@ -263,13 +278,13 @@ def _reason(log: Path, begin: int, code: int) -> str:
 
 
 def _check_is_same(folder: Path, config: TrainConfig) -> None:
-    """Checks that a folder holds no other run than the one that a sweep asks for."""
+    """Checks that a folder holds the run that the sweep asks for, or none."""
     path = folder / "config.yaml"
     if not path.is_file():
         return
     stored = validated_run(read_yaml(path), str(path), config.algorithm.target).plain()
     asked = config.plain()
-    if asked["algorithm"].get("precision", "auto") == "auto":  # which the run has resolved
+    if asked["algorithm"].get("precision", "auto") == "auto":  # the run has resolved it
         asked["algorithm"] |= {k: v for k, v in stored["algorithm"].items() if k == "precision"}
     for key, value in asked.items():
         if key not in (*cli.OF_THE_MACHINE, "resume") and stored.get(key) != value:

@@ -1,4 +1,4 @@
-"""A window in which a policy drives, or whoever holds the arrow keys."""
+"""A window in which a policy drives, or a person with the arrow keys."""
 
 import time
 from collections import deque
@@ -12,18 +12,22 @@ from tensordict import TensorDictBase
 
 from flowrep.config import UsageError
 from flowrep.experiment.evaluation import Policy, evaluate
-from flowrep.experiment.film import Film, Frame, how_it_ended
+from flowrep.experiment.film import Film, FilmFrame, how_it_ended
 from flowrep.scenes.vehicle import NO_OP, TURN_LEFT, TURN_RIGHT
 
 
 class NewEpisode(Exception):
-    """The episode was left for the next one."""
+    """The driver skips the rest of the episode."""
 
 
 class Keyboard:
-    """A policy that takes the action of the held keys, or lets another, of this name, drive.
+    """A policy that acts by the keys that are held, or hands over to another policy.
 
-    Both keys together cancel out.
+    Both arrow keys together cancel out.
+
+    Args:
+        other: the policy that drives after a press of S.
+        name: of that policy, for the window's title.
     """
 
     ACTIONS = {"left": TURN_LEFT, "right": TURN_RIGHT}  # noqa: RUF012 - never changed
@@ -36,7 +40,7 @@ class Keyboard:
         self.driver = "you"
 
     def press(self, key: str | None) -> None:
-        """Handles a key press; other keys than letters may have no name."""
+        """Handles a key press; matplotlib gives None for keys that it has no name for."""
         key = (key or "").lower()
         if key in self.ACTIONS:
             self._held.add(key)
@@ -66,8 +70,8 @@ def drive_by_hand(
 ) -> None:
     """Opens a window and drives one episode after the other until it is closed.
 
-    A finished one stays in view until R begins the next, of the next seed. `pause` draws, and
-    handles keys for some seconds; by default in a window on the screen.
+    The last frame of an episode stays in view until R begins the next one, with the next seed.
+    `pause` draws and handles keys for some seconds; by default that of a window on the screen.
     """
     import matplotlib.pyplot as plt
 
@@ -122,7 +126,7 @@ def drive_in_window(
         pause(max(1e-3, 1 / film.street.frame_rate_hz - (time.monotonic() - drawn_at)))
         drawn_at = time.monotonic()
 
-    latest: deque[Frame] = deque(maxlen=1)
+    latest: deque[FilmFrame] = deque(maxlen=1)
     (episode,) = evaluate(film.env, keyboard, [options], on_frame=draw)
     show(film.draw(latest[-1], episode))
     title.set_text(f"{how_it_ended(episode)}    {keyboard.HELP}")

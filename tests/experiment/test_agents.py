@@ -60,6 +60,19 @@ def test_an_agent_is_the_same_from_its_run_and_from_a_file(trained, tmp_path):
     assert again.evaluate(episodes=2) == episodes
 
 
+def test_a_small_file_rounds_weights_to_a_byte(trained, tmp_path):
+    agent, _, _ = trained
+    for name, small in (("whole", False), ("small", True)):
+        agent.save(tmp_path / f"{name}.safetensors", small=small)
+    whole, small = (tmp_path / f"{name}.safetensors" for name in ("whole", "small"))
+    assert small.stat().st_size < 0.5 * whole.stat().st_size
+    weights = agent.policy.state_dict()
+    for name, rounded in Agent.load(small, device="cpu").policy.state_dict().items():
+        torch.testing.assert_close(
+            rounded, weights[name], rtol=0, atol=weights[name].abs().max() / 254 + 1e-6
+        )
+
+
 def test_baselines_drive_the_same_episodes(trained):
     agent, _, _ = trained
     records = agent.evaluate(1, speeds=["low", "high"], fps=[6], seed=3, baselines=["never_turn"])

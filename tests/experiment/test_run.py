@@ -241,29 +241,6 @@ def test_an_edited_config_is_refused_by_the_name_of_the_key(config, place, value
         check_origin(origin_of(config), origin_of(edited), PATH)
 
 
-def test_a_run_from_before_an_option_existed_is_the_same_as_with_its_default(config):
-    older = copy.deepcopy(config)
-    del older["algorithm"]["persistent_exploration"], older["motion"]
-    saved = origin_of(config) | {"algorithm": config["algorithm"]}  # which has the default
-    del saved["motion"]
-    check_origin(saved, origin_of(older), PATH)
-    check_origin(origin_of(older), origin_of(config), PATH)
-    config = copy.deepcopy(config)
-    config["algorithm"]["persistent_exploration"] = 0.1
-    with pytest.raises(CheckpointError, match="persistent_exploration"):
-        check_origin(origin_of(older), origin_of(config), PATH)
-
-
-def test_a_run_from_before_larger_pictures_is_one_of_pictures_as_large_as_the_maps(config):
-    flow = plain("train", "debug=smoke", "flow=estimated", "flow.picture_scale=1")["flow"]
-    now = config | {"flow": flow}
-    before = config | {"flow": {k: v for k, v in flow.items() if k != "picture_scale"}}
-    check_origin({**origin_of(now), "flow": before["flow"]}, origin_of(now), PATH)
-    now = config | {"flow": flow | {"picture_scale": 2}}
-    with pytest.raises(CheckpointError, match=r"flow\.picture_scale=absent"):
-        check_origin(origin_of(before), origin_of(now), PATH)
-
-
 def test_a_run_from_before_scenes_said_whether_they_are_symmetric_is_the_same(config):
     assert config["scene"]["symmetric"]
     scene = {key: value for key, value in config["scene"].items() if key != "symmetric"}

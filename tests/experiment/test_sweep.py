@@ -1,5 +1,6 @@
 """A sweep is runs: each is begun or resumed by its own command, and what it left says the rest."""
 
+import json
 import math
 import os
 import re
@@ -89,10 +90,11 @@ def test_a_run_that_finishes_gives_its_success_and_is_not_run_again(attempt, tmp
 )
 def test_a_run_that_fails_says_why_and_is_tried_again(attempt, tmp_path, code, expected):
     attempt("print('error: old'); sys.exit(2)")
-    sweep._begin(tmp_path, "s1")
+    sweep.JobLog(tmp_path).begin("s1")
     state = attempt(code)
     assert re.match(f"failed: {expected}", state)
-    assert sweep._states(tmp_path.parent, "s1")[tmp_path.name] == state
+    assert sweep.JobLog(tmp_path).state("s1") == state
+    assert sweep.JobLog(tmp_path).state("s2") is None  # of another sweep in the same folder
     assert attempt(FINISHES).startswith("finished")
 
 
@@ -152,28 +154,37 @@ def test_a_run_has_resolved_what_its_sweep_leaves_to_the_machine(attempt, tmp_pa
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(stored))
     assert attempt(FINISHES).startswith("finished")
     other = CONFIG.algorithm.model_copy(update={"precision": "fp32"})
+    asked = CONFIG.model_copy(update={"algorithm": other})
     with pytest.raises(UsageError, match="precision"):
-        sweep._check_is_same(tmp_path, CONFIG.model_copy(update={"algorithm": other}))
+        sweep.attempted(tmp_path, asked, [], lambda: True)
 
 
-def test_the_line_of_a_run_begins_or_resumes_it(tmp_path, monkeypatch):
-    source = SimpleNamespace(provider="command-line", path="/mine")
-    hydra = SimpleNamespace(
-        overrides=SimpleNamespace(task=["seed=1", "device=cpu"], hydra=["hydra.searchpath=[x]"]),
-        runtime=SimpleNamespace(config_sources=[source]),
-        job=SimpleNamespace(config_name="train"),
-    )
-    monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra)
-    config, odd = composed("num_workers=auto"), tmp_path / "josé (2)"
-    line = sweep._line(odd, config, is_worker=True)
-    assert line[0].startswith("hydra.run.dir='")
-    assert {"seed=1", "device=cpu", "num_workers=0", "hydra.searchpath=[x]"} <= {*line}
-    assert line[line.index("--config-dir") + 1] == "/mine"
-    odd.mkdir()
-    (odd / "config.yaml").touch()
-    assert sweep._line(odd, config, is_worker=False) == [f"resume='{odd}'", "device=cpu"]
-    others = composed("algorithm._target_=mine.Own")
-    assert sweep._line(odd, others, is_worker=False)[-1] == "algorithm._target_=mine.Own"
+def test_a_job_begins_its_run_or_resumes_it(monkeypatch, tmp_path):
+    """In a folder with a name that Hydra and shells would misread, and a config of the user's."""
+    odd, mine = tmp_path / "josé (2)", tmp_path / "mine"
+    (mine / "scene").mkdir(parents=True)
+    begun = "import json, sys; print('error: ' + json.dumps(sys.argv[1:])); sys.exit(2)"
+    monkeypatch.setattr(sweep, "TRAIN", (sys.executable, "-S", "-c", begun))
+    monkeypatch.setattr(sweep, "POLL_S", 0.01)
+    typed = ["debug=smoke", "device=cpu", "seed=1", f"hydra.searchpath=[file://{mine}]"]
+    typed += ["--config-dir", str(mine), f"hydra.sweep.dir='{odd}'"]
+
+    def arguments():
+        """What the one job of the sweep calls `flowrep.train` with."""
+        monkeypatch.setattr(sys, "argv", ["train", "-m", *typed])
+        with pytest.raises(SystemExit) as ended:
+            sweep.run_sweep()
+        assert ended.value.code == 1
+        (log,) = odd.glob("*/job.log")
+        (*_, reason) = [line for line in log.read_text().splitlines() if "error: " in line]
+        return log.parent, json.loads(reason.rpartition("error: ")[2])
+
+    folder, line = arguments()
+    assert line[0] == f"hydra.run.dir='{folder}'"
+    assert {"debug=smoke", "device=cpu", "seed=1", f"hydra.searchpath=[file://{mine}]"} <= {*line}
+    assert line[line.index("--config-dir") + 1] == str(mine)
+    (folder / "config.yaml").write_text(yaml.safe_dump(plain("train", *typed[:3])))
+    assert arguments() == (folder, [f"resume='{folder}'", "device=cpu"])
 
 
 def test_of_two_sweeps_in_a_folder_ctrl_c_stops_one_and_each_sums_up_its_own_runs(
@@ -188,7 +199,7 @@ def test_of_two_sweeps_in_a_folder_ctrl_c_stops_one_and_each_sums_up_its_own_run
             ids[name] = next(x for x in sys.argv if "env_set" in x).rpartition("=")[2]
             folder = tmp_path / name
             folder.mkdir()
-            job = SimpleNamespace(env_set={sweep._ID: ids[name]})
+            job = SimpleNamespace(env_set={sweep.SWEEP_ID: ids[name]})
             dirs = {"output_dir": str(folder), "dir": str(tmp_path)}
             config = SimpleNamespace(
                 runtime=SimpleNamespace(**dirs), sweep=SimpleNamespace(**dirs), job=job,
@@ -198,7 +209,9 @@ def test_of_two_sweeps_in_a_folder_ctrl_c_stops_one_and_each_sums_up_its_own_run
             def attempted(folder, config, line, should_stop):
                 meanwhile()
                 both[name] = should_stop()
-                return sweep._say(folder, sweep.STOPPED if both[name] else "finished, success 0%")
+                return sweep.JobLog(folder).end(
+                    sweep.STOPPED if both[name] else "finished, success 0%"
+                )
 
             monkeypatch.setattr(sweep.HydraConfig, "get", lambda: config)
             monkeypatch.setattr(sweep, "attempted", attempted)
@@ -210,7 +223,7 @@ def test_of_two_sweeps_in_a_folder_ctrl_c_stops_one_and_each_sums_up_its_own_run
             sweep.run_sweep()
         return ended.value.code
 
-    monkeypatch.setattr(sweep, "_line", lambda *_: [])
+    monkeypatch.setattr(sweep, "arguments_of", lambda *_: [])
     monkeypatch.setattr(cli, "plain_config", lambda config: CONFIG.plain())
     codes = []
 
@@ -236,7 +249,7 @@ def test_a_failed_run_stops_a_sweeper_that_needs_its_result_and_no_grid(
         sweeper={"_target_": sweeper},
     )
     monkeypatch.setattr(sweep.HydraConfig, "get", lambda: hydra)
-    monkeypatch.setattr(sweep, "_line", lambda *_: [])
+    monkeypatch.setattr(sweep, "arguments_of", lambda *_: [])
     monkeypatch.setattr(cli, "plain_config", lambda config: {})  # which is not valid
     if "Basic" in sweeper:
         assert math.isnan(sweep.job({}))

@@ -18,6 +18,7 @@ def config_of(scene="straight_road", stack="ego+obj", seed=0, **changes):
         "num_envs": 2,
         "representations": {name: {} for name in stack.split("+")},
         "flow": {"source": "exact"},
+        "motion": "exact",
         "noise": {"depth_sigma_per_m": 0.0, "drift_m": 0.0},
         "scene": {
             "name": scene,
