@@ -243,14 +243,14 @@ def test_an_edited_config_is_refused_by_the_name_of_the_key(config, place, value
 
 def test_a_run_from_before_an_option_existed_is_the_same_as_with_its_default(config):
     older = copy.deepcopy(config)
-    del older["algorithm"]["persistent_exploration"], older["motion"]
+    del older["algorithm"]["mirror"], older["motion"]
     saved = origin_of(config) | {"algorithm": config["algorithm"]}  # which has the default
     del saved["motion"]
     check_origin(saved, origin_of(older), PATH)
     check_origin(origin_of(older), origin_of(config), PATH)
     config = copy.deepcopy(config)
-    config["algorithm"]["persistent_exploration"] = 0.1
-    with pytest.raises(CheckpointError, match="persistent_exploration"):
+    config["algorithm"]["mirror"] = True
+    with pytest.raises(CheckpointError, match="mirror"):
         check_origin(origin_of(older), origin_of(config), PATH)
 
 
