@@ -28,6 +28,7 @@ from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 from flowrep.agent import DiscreteSAC, keep_freed_memory
 from flowrep.agent.algorithm import WARM_UP
 from flowrep.agent.observation import has_bf16
+from flowrep.options import DiscreteSACOptions
 
 MAPS = ("ego", "obj")
 CHANNELS, ACTIONS = 2, 3
@@ -66,10 +67,12 @@ def flowrep_update(
     """Returns an update of an agent that has stored these steps and learns from all at once."""
     side, batch = steps["ego"].shape[-1], len(steps)
     spec = Composite({name: Unbounded((CHANNELS, side, side)) for name in MAPS})
+    options = DiscreteSACOptions(
+        encoder=encoder, precision=precision, batch_size=batch, replay_capacity=2 * batch
+    )
     agent = DiscreteSAC(
-        spec, Categorical(ACTIONS), list(MAPS), total_frames=10**9, device=steps.device,
-        encoder=encoder, precision=precision, batch_size=batch, replay_capacity=2 * batch,
-    )  # fmt: skip
+        spec, Categorical(ACTIONS), list(MAPS), options, total_frames=10**9, device=steps.device
+    )
     agent.memory.extend(steps)
     if eager:
         agent.step_eagerly()

@@ -23,6 +23,7 @@ from flowrep.agent import DiscreteSAC, ReplayMemory
 from flowrep.agent.dsac import DiscreteSACMapLoss
 from flowrep.agent.networks import DiscreteActions
 from flowrep.envs import get_states, make_env, set_states
+from flowrep.options import DiscreteSACOptions
 from flowrep.scenes import load_scene
 
 MAPS = ["ego", "obj"]
@@ -58,13 +59,10 @@ def make_trainer(frames: int, num_envs: int, side: int, batch_size: int, seed: i
     scene = replace(scene, camera=replace(scene.camera, height_px=side, width_px=side))
     env = make_env(scene, MAPS, num_envs=num_envs, seed=seed).append_transform(InitTracker())
     spec, action_spec = env.observation_spec, env.action_spec
-    policy = DiscreteSAC.make_policy(
-        spec, action_spec, MAPS, device="cpu", precision="auto", hidden_size=512
-    )
+    options = DiscreteSACOptions(initial_alpha=0.05, gamma=GAMMA)
+    policy = DiscreteSAC.make_policy(spec, action_spec, MAPS, options, total_frames=frames)
     network = policy[0].module.network
-    loss = DiscreteSACMapLoss(
-        network, DiscreteActions.from_spec(action_spec), initial_alpha=0.05, gamma=GAMMA
-    )
+    loss = DiscreteSACMapLoss(network, DiscreteActions.from_spec(action_spec), options)
     memory = ReplayMemory(
         network.codecs, capacity=50_000, batch_size=batch_size, device="cpu", n_steps=N_STEPS,
         gamma=GAMMA,

@@ -22,7 +22,6 @@ MODULES = {
     "envs/__init__.py": "needs pybullet; run: pip install 'flowrep-rl[sim]'",
     "pybullet.py": "needs pybullet; run: pip install 'flowrep-rl[sim]'",
     "scenes/__init__.py": "needs shapely; run: pip install 'flowrep-rl[sim]'",
-    "torchrl_configs.py": "needs hydra; run: pip install 'flowrep-rl[train]'",
 }
 
 

@@ -7,8 +7,6 @@ python examples/torchrl_recipe/train.py trainer.total_frames=100000
 import hydra
 from torchrl.trainers.algorithms.configs import *  # noqa: F403 - registers TorchRL's groups
 
-import flowrep.torchrl_configs  # noqa: F401 - registers flowrep's beside them
-
 
 @hydra.main(config_path=".", config_name="config", version_base="1.3")
 def main(config):

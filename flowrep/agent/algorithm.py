@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -16,13 +15,10 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.objectives import LossModule, SoftUpdate
 
 from flowrep.agent.networks import DiscreteActions, acting_network, stochastic_policy
+from flowrep.options import AlgorithmOptions
 
 Step = Callable[[TensorDictBase], TensorDictBase]
 WARM_UP = 3  # eager steps, which create Adam's moments and TorchRL's caches
-# Arguments that a run gives to an algorithm, and an algorithm to its base class and its loss.
-NOT_OPTIONS = {"self", "observation_spec", "action_spec", "keys", "total_frames", "device"}
-NOT_OPTIONS |= {"mirror_image", "rate_factors", "policy_options", "network", "actor", "actions"}
-VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 class Algorithm(ABC):
@@ -47,15 +43,17 @@ class Algorithm(ABC):
         total_updates: gradient steps over the whole training.
         tau: share of the online weights in each move of the targets; None without targets.
         max_grad_norm: the norm over all gradients is scaled down to this maximum.
-        rate_factors: factors on the learning rate, by name of the trained weight.
     """
+
+    OPTIONS: ClassVar[type[AlgorithmOptions]]
+    """What a config may set; the constructor takes an instance of it."""
 
     METRICS: ClassVar[Mapping[str, str]]
     """Logged metrics, each with its key in the loss's output. The sum of those that end in `_loss`
     is minimised."""
 
     LOSS: ClassVar[Callable[..., LossModule]]
-    """Builds the loss from the policy's `MapNetwork` and `DiscreteActions`."""
+    """Builds the loss from the policy's `MapNetwork`, `DiscreteActions` and the options."""
 
     CAPTURABLE: ClassVar[bool] = True
     """Whether `losses` and `after_update` can be part of a CUDA graph, see `as_cuda_graph`."""
@@ -75,7 +73,6 @@ class Algorithm(ABC):
         total_updates: int,
         tau: float | None = None,
         max_grad_norm: float | None = None,
-        rate_factors: Mapping[str, float] | None = None,
     ) -> None:
         self.loss = loss
         if tau is not None:
@@ -90,7 +87,7 @@ class Algorithm(ABC):
         self.max_grad_norm = max_grad_norm
         self.device = next(iter(self.trained.values())).device
         self.optimizer = torch.optim.Adam(
-            self._parameter_groups(rate_factors or {}),
+            self._parameter_groups(self.rate_factors()),
             fused=True,
             capturable=self.device.type == "cuda",
         )
@@ -119,48 +116,27 @@ class Algorithm(ABC):
         observation_spec: Composite,
         action_spec: TensorSpec,
         keys: Sequence[NestedKey],
+        options: Any,
         *,
-        device: torch.device | str,
-        **options: Any,
+        total_frames: int,
+        device: torch.device | str = "cpu",
     ) -> Any:
         """Returns an untrained policy alone, for an agent that only acts.
 
         Its `state_dict` is interchangeable with that of `policy`. The arguments are those of the
-        constructor of `OffPolicy`; options that don't affect acting are ignored.
+        constructor of `OffPolicy`.
         """
         network = acting_network(
             observation_spec,
             action_spec,
             keys,
             device=torch.device(device),
-            precision=options["precision"],
-            hidden_size=options["hidden_size"],
-            layer_norm=options.get("layer_norm", False),  # not an option of every algorithm
+            precision=options.precision,
+            hidden_size=options.hidden_size,
+            layer_norm=getattr(options, "layer_norm", False),  # not an option of every algorithm
         )
         actions = DiscreteActions.from_spec(action_spec)
         return stochastic_policy(network, list(keys), actions, writes_log_prob=cls.WRITES_LOG_PROB)
-
-    @classmethod
-    def options(cls) -> dict[str, inspect.Parameter]:
-        """Returns the parameters that a config may set, by name.
-
-        These are the parameters of the class and, if it takes arbitrary keywords, those of its
-        bases and its loss.
-
-        >>> from flowrep.agent import DoubleDQN
-        >>> DoubleDQN.options()["final_epsilon"].default, DoubleDQN.options()["tau"].default
-        (0.05, 0.005)
-        """
-        owners: list[Any] = [owner for owner in cls.__mro__ if "__init__" in vars(owner)]
-        owners[owners.index(Algorithm) :] = [cls.LOSS] if hasattr(cls, "LOSS") else []
-        found: dict[str, inspect.Parameter] = {}
-        for owner in owners:
-            parameters = inspect.signature(owner.__init__).parameters
-            named = {n: p for n, p in parameters.items() if p.kind not in VARIADIC}
-            found = {n: p for n, p in named.items() if n not in NOT_OPTIONS} | found
-            if len(named) == len(parameters):
-                break
-        return found
 
     def step_eagerly(self) -> None:
         """Runs all further updates eagerly, not as a CUDA graph, for debugging and timing."""
@@ -196,6 +172,10 @@ class Algorithm(ABC):
         """Returns the scalars named in `METRICS`; the losses among them carry gradients."""
         out = self.loss(batch)
         return {name: out[key] for name, key in self.METRICS.items()}
+
+    def rate_factors(self) -> Mapping[str, float]:
+        """Returns factors on the learning rate, by name of the trained weight."""
+        return {}
 
     def other_weights(self) -> Mapping[str, Tensor]:
         """Returns tensors that training changes besides the weights of the loss, by name."""

@@ -17,6 +17,7 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 
 from flowrep.agent.networks import DiscreteActions, MapNetwork, PolicyNetwork
 from flowrep.agent.off_policy import OffPolicy
+from flowrep.options import DoubleDQNOptions
 
 
 class EpsilonGreedyPolicy(TensorDictSequential):
@@ -49,7 +50,7 @@ class DoubleDQNMapLoss(DQNLoss):
     """TorchRL's double Q-learning loss on stored maps, with a target; see `DoubleDQN`."""
 
     def __init__(
-        self, network: MapNetwork, actions: DiscreteActions, *, gamma: float = 0.99
+        self, network: MapNetwork, actions: DiscreteActions, options: DoubleDQNOptions
     ) -> None:
         keys = [codec.key for codec in network.codecs]
         learning = TensorDictModule(PolicyNetwork(network), keys, ["action_value"])
@@ -60,7 +61,7 @@ class DoubleDQNMapLoss(DQNLoss):
             double_dqn=True,
             action_space=actions.space,
         )
-        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        self.make_value_estimator(ValueEstimators.TD0, gamma=options.gamma)
 
 
 class DoubleDQN(OffPolicy):
@@ -72,35 +73,11 @@ class DoubleDQN(OffPolicy):
 
     and moves the target by `tau`. Without exploration (TorchRL's `ExplorationType.DETERMINISTIC`)
     the policy takes the action of the largest value.
-
-    Args:
-        run: positional arguments of `OffPolicy`.
-        total_frames: environment frames over the whole training.
-        initial_epsilon: ε at the start, from which it falls linearly.
-        final_epsilon: ε after `exploration_share` of the frames.
-        exploration_share: share of `total_frames` over which ε falls.
-        options: further arguments of `OffPolicy`.
     """
 
+    OPTIONS = DoubleDQNOptions
     LOSS = DoubleDQNMapLoss
     METRICS: ClassVar = {"q_loss": "loss", "td_error": "td_error", "epsilon": "epsilon"}
-
-    def __init__(
-        self,
-        *run: Any,
-        total_frames: int,
-        initial_epsilon: float = 1.0,
-        final_epsilon: float = 0.05,
-        exploration_share: float = 0.2,
-        **options: Any,
-    ) -> None:
-        policy_options = {
-            "initial_epsilon": initial_epsilon,
-            "final_epsilon": final_epsilon,
-            "exploration_share": exploration_share,
-            "total_frames": total_frames,
-        }
-        super().__init__(*run, total_frames=total_frames, policy_options=policy_options, **options)
 
     @property
     def exploration(self) -> EGreedyModule:
@@ -108,8 +85,8 @@ class DoubleDQN(OffPolicy):
         return self.policy[2]
 
     def other_weights(self) -> Mapping[str, Tensor]:
-        """Returns ε, beside those of `OffPolicy`."""
-        return {**super().other_weights(), "epsilon": self.exploration.eps}
+        """Returns ε."""
+        return {"epsilon": self.exploration.eps}
 
     @classmethod
     def make_policy(
@@ -117,16 +94,20 @@ class DoubleDQN(OffPolicy):
         observation_spec: Composite,
         action_spec: TensorSpec,
         keys: Sequence[NestedKey],
-        **options: Any,
+        options: DoubleDQNOptions,
+        *,
+        total_frames: int,
+        device: torch.device | str = "cpu",
     ) -> EpsilonGreedyPolicy:
         """See `Algorithm.make_policy`; the policy's state includes ε."""
-        stochastic = super().make_policy(observation_spec, action_spec, keys, **options)
+        run: Any = {"total_frames": total_frames, "device": device}
+        stochastic = super().make_policy(observation_spec, action_spec, keys, options, **run)
         exploration = EGreedyModule(
             action_spec,
-            float(options["initial_epsilon"]),
-            float(options["final_epsilon"]),
-            max(1, int(options["exploration_share"] * options["total_frames"])),
-            device=options["device"],
+            options.initial_epsilon,
+            options.final_epsilon,
+            max(1, int(options.exploration_share * total_frames)),
+            device=device,
         )
         actions = DiscreteActions.from_spec(action_spec)
         return EpsilonGreedyPolicy(stochastic[0].module, list(keys), actions, exploration)

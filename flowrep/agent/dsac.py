@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -15,8 +15,8 @@ from flowrep.agent import networks
 from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork
 from flowrep.agent.observation import decode_maps
 from flowrep.agent.off_policy import OffPolicy, td_target, transition_keys
+from flowrep.options import AlgorithmOptions, DiscreteSACOptions, SoftActorCriticOptions
 
-ENCODERS = ("shared", "separate")
 METRICS = {
     "q_loss": "loss_qvalue", "actor_loss": "loss_actor", "alpha_loss": "loss_alpha",
     "alpha": "alpha", "entropy": "entropy", "q_mean": "q_mean", "td_error": "td_error",
@@ -30,14 +30,6 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
     with gradients, for L_π without. Here both share one hidden layer of twice the width and are
     evaluated once. TorchRL keeps the networks, the targets and α. Its target parameters are those
     of the Q-functions and their encoder.
-
-    Args:
-        encoder: with `"shared"`, policy and Q-functions read one set of encoders, trained by L_Q
-            alone, and in y both read its target, so that each observation is encoded once. With
-            `"separate"`, each has its own, and π(·|s') in y reads the policy's.
-        initial_alpha: α before the first update.
-        target_entropy_weight: target entropy as a share of the largest, log n.
-        entropy_in_target: with False, y lacks the bonus α H(π(·|s')): Q values reward alone.
     """
 
     critic_encoder: Encoder
@@ -52,16 +44,9 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         self,
         actor: MapNetwork,
         actions: DiscreteActions,
-        *,
-        encoder: str = "shared",
-        initial_alpha: float = 0.5,
-        target_entropy_weight: float = 0.2,
-        entropy_in_target: bool = True,
-        gamma: float = 0.99,
+        options: DiscreteSACOptions,
     ) -> None:
-        if encoder not in ENCODERS:
-            raise ValueError(f"encoder={encoder!r}: expected one of {', '.join(ENCODERS)}")
-        shared = encoder == "shared"
+        shared = options.encoder == "shared"
         with next(actor.parameters()).device:
             critic_encoder = actor.encoder
             if not shared:
@@ -73,13 +58,12 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
             action_space=actions.space,
             num_actions=actions.count,
             loss_function="l2",
-            alpha_init=initial_alpha,
+            alpha_init=options.initial_alpha,
             target_entropy="auto",
-            target_entropy_weight=target_entropy_weight,
+            target_entropy_weight=options.target_entropy_weight,
         )
-        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        self.make_value_estimator(ValueEstimators.TD0, gamma=options.gamma)
         self.codecs, self.actions, self.encoder_is_shared = actor.codecs, actions, shared
-        self.entropy_in_target = entropy_in_target
         self.convert_to_functional(critic_encoder, "critic_encoder", create_target_params=True)
         if not shared:
             self.convert_to_functional(actor.encoder, "actor_encoder")
@@ -134,9 +118,7 @@ class DiscreteSACMapLoss(DiscreteSACLoss):
         seen = embedding if self.encoder_is_shared else self.actor_encoder(images)
         log_policy = self._log_policy(seen)
         q = networks.heads_together(embedding, self.target_qvalue_network_params["module"]).amin(0)
-        if self.entropy_in_target:
-            q = q - alpha * log_policy
-        value = (log_policy.exp() * q).sum(-1, keepdim=True)
+        value = (log_policy.exp() * (q - alpha * log_policy)).sum(-1, keepdim=True)
         return td_target(batch, value, self.gamma)
 
     def _log_policy(self, embedding: Tensor) -> Tensor:
@@ -159,15 +141,13 @@ class DiscreteSAC(OffPolicy):
     `tau`. ML-Agents halves L_Q (which changes Adam's steps only through its epsilon) and uses Q1
     alone in L_π. For transitions of several steps, r is the discounted sum of their rewards,
     without the entropy bonus of the steps between.
-
-    Args:
-        alpha_rate_factor: learning rate of log α relative to that of the weights.
-        run: positional arguments of `OffPolicy`.
-        options: its other arguments, and those of `DiscreteSACMapLoss`.
     """
 
+    OPTIONS: ClassVar[type[AlgorithmOptions]] = DiscreteSACOptions
+    options: SoftActorCriticOptions
     LOSS: ClassVar[Callable[..., LossModule]] = DiscreteSACMapLoss
     METRICS = METRICS
 
-    def __init__(self, *run: Any, alpha_rate_factor: float = 1.0, **options: Any) -> None:
-        super().__init__(*run, rate_factors={"log_alpha": alpha_rate_factor}, **options)
+    def rate_factors(self) -> Mapping[str, float]:
+        """Returns the factor of log α."""
+        return {"log_alpha": self.options.alpha_rate_factor}

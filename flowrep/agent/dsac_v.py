@@ -15,6 +15,7 @@ from flowrep.agent.dsac import DiscreteSAC
 from flowrep.agent.networks import DiscreteActions, MapNetwork
 from flowrep.agent.observation import decode_maps
 from flowrep.agent.off_policy import td_target, transition_keys
+from flowrep.options import DiscreteSACWithValueOptions
 
 METRICS = {
     "q_loss": "loss_qvalue", "value_loss": "loss_value", "actor_loss": "loss_actor",
@@ -26,7 +27,7 @@ METRICS = {
 class DiscreteSACValueLoss(LossModule):
     """The losses of `DiscreteSACWithValue` on stored maps, as `ReplayMemory` samples them.
 
-    Its target parameters are those of V; its arguments are those of `DiscreteSACMapLoss`.
+    Its target parameters are those of V.
     """
 
     actor: MapNetwork
@@ -47,22 +48,19 @@ class DiscreteSACValueLoss(LossModule):
         self,
         actor: MapNetwork,
         actions: DiscreteActions,
-        *,
-        initial_alpha: float = 0.5,
-        target_entropy_weight: float = 0.2,
-        gamma: float = 0.99,
+        options: DiscreteSACWithValueOptions,
     ) -> None:
         super().__init__()
         with next(actor.parameters()).device:
             q1, q2 = (actor.another(actions.count) for _ in range(2))
             value = actor.another(1)
-            log_alpha = torch.nn.Parameter(torch.tensor(math.log(initial_alpha)))
+            log_alpha = torch.nn.Parameter(torch.tensor(math.log(options.initial_alpha)))
         for name, network in {"actor": actor, "q1": q1, "q2": q2}.items():
             self.convert_to_functional(network, name)
         self.convert_to_functional(value, "value", create_target_params=True)
         self.log_alpha = log_alpha
-        self.codecs, self.actions, self.gamma = actor.codecs, actions, gamma
-        self.target_entropy = target_entropy_weight * math.log(actions.count)
+        self.codecs, self.actions, self.gamma = actor.codecs, actions, options.gamma
+        self.target_entropy = options.target_entropy_weight * math.log(actions.count)
         self.in_keys = transition_keys(self.codecs)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -115,5 +113,6 @@ class DiscreteSACWithValue(DiscreteSAC):
     `DiscreteSAC` with a shared encoder.
     """
 
+    OPTIONS = DiscreteSACWithValueOptions
     LOSS = DiscreteSACValueLoss
     METRICS = METRICS

@@ -18,6 +18,7 @@ from flowrep.agent.algorithm import Algorithm
 from flowrep.agent.networks import DiscreteActions, Encoder, Head, MapNetwork, stochastic_policy
 from flowrep.agent.observation import MapCodec, decode_maps, store_maps
 from flowrep.agent.replay import OUTCOME, time_first
+from flowrep.options import PPOOptions
 
 
 class Rollout:
@@ -67,35 +68,21 @@ class Rollout:
 
 
 class ClipPPOMapLoss(ClipPPOLoss):
-    """TorchRL's clipped loss on stored maps, with one encoder for policy and V; see `PPO`.
-
-    Args:
-        clip: distance of ρ from 1 beyond which the objective no longer rewards moving it.
-        value_weight: weight of L_V.
-        entropy_weight: weight of L_H.
-    """
+    """TorchRL's clipped loss on stored maps, with one encoder for policy and V; see `PPO`."""
 
     encoder: Encoder
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
 
-    def __init__(
-        self,
-        network: MapNetwork,
-        actions: DiscreteActions,
-        *,
-        clip: float = 0.2,
-        value_weight: float = 0.5,
-        entropy_weight: float = 0.01,
-    ) -> None:
+    def __init__(self, network: MapNetwork, actions: DiscreteActions, options: PPOOptions) -> None:
         with next(network.parameters()).device:
             critic = Head(network.encoder.embedding_size, network.hidden_size, 1)
         super().__init__(
             stochastic_policy(network.head, ["embedding"], actions),
             TensorDictModule(critic, ["embedding"], ["state_value"]),
-            clip_epsilon=clip,
-            entropy_coeff=entropy_weight,
-            critic_coeff=value_weight,
+            clip_epsilon=options.clip,
+            entropy_coeff=options.entropy_weight,
+            critic_coeff=options.value_weight,
             loss_critic_type="l2",
             normalize_advantage=True,
         )
@@ -135,17 +122,10 @@ class PPO(Algorithm):
         L_V = value_weight · mean (V(s) - R)²
         L_H = entropy_weight · mean Σ_a π(a|s) log π(a|s)
 
-    Arguments that are not listed are those of `OffPolicy`.
-
-    Args:
-        rollout_length: steps of each environment between two rounds of learning.
-        epochs: passes over them.
-        batch_size: steps per update; an incomplete last batch is left out of its pass.
-        gae_lambda: GAE's λ, from 0 (relies on V) to 1 (relies on the rewards).
-        max_grad_norm: see `Algorithm`.
-        loss_options: further arguments of `ClipPPOMapLoss`.
+    The arguments are those of `OffPolicy`.
     """
 
+    OPTIONS = PPOOptions
     WRITES_LOG_PROB = True
     LOSS = ClipPPOMapLoss
     METRICS: ClassVar = {
@@ -160,73 +140,61 @@ class PPO(Algorithm):
         observation_spec: Composite,
         action_spec: TensorSpec,
         keys: Sequence[NestedKey],
+        options: PPOOptions,
         *,
         total_frames: int,
         device: torch.device | str = "cpu",
-        precision: str = "auto",
-        learning_rate: float = 3e-4,
-        rollout_length: int = 64,
-        epochs: int = 4,
-        batch_size: int = 256,
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        max_grad_norm: float = 0.5,
-        hidden_size: int = 512,
-        **loss_options: Any,
     ) -> None:
-        self.rollout_length, self.epochs, self.batch_size = rollout_length, epochs, batch_size
-        self.num_envs = observation_spec.shape.numel()
-        frames_per_round = rollout_length * self.num_envs
-        if batch_size > frames_per_round:
+        self.options, self.num_envs = options, observation_spec.shape.numel()
+        steps = options.rollout_length
+        frames_per_round = steps * self.num_envs
+        if options.batch_size > frames_per_round:
             raise ValueError(
-                f"batch_size={batch_size} is more than the {frames_per_round} frames of a rollout "
-                f"({rollout_length} steps of {self.num_envs} environments): raise rollout_length "
-                "or num_envs, or lower batch_size"
+                f"batch_size={options.batch_size} is more than the {frames_per_round} frames of a "
+                f"rollout ({steps} steps of {self.num_envs} environments): raise rollout_length or "
+                "num_envs, or lower batch_size"
             )
         self.policy = self.make_policy(
-            observation_spec,
-            action_spec,
-            keys,
-            device=device,
-            precision=precision,
-            hidden_size=hidden_size,
+            observation_spec, action_spec, keys, options, total_frames=total_frames, device=device
         )
         network, actions = self.policy[0].module.network, DiscreteActions.from_spec(action_spec)
-        self._advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, device=device)
+        discounts = {"gamma": options.gamma, "lmbda": options.gae_lambda}
+        self._advantage = GAE(**discounts, value_network=None, device=device)
         self.codecs = network.codecs
         self.memory = Rollout(self.codecs, torch.device(device))
         self._round: TensorDictBase = TensorDict()  # the steps in training, [n]
         self._batches: list[Tensor] = []  # rows of the batches to come
         super().__init__(
-            self.LOSS(network, actions, **loss_options),
-            learning_rate=learning_rate,
-            total_updates=total_frames // frames_per_round * self._updates_of(rollout_length),
-            max_grad_norm=max_grad_norm,
+            self.LOSS(network, actions, options),
+            learning_rate=options.learning_rate,
+            total_updates=total_frames // frames_per_round * self._updates_of(steps),
+            max_grad_norm=options.max_grad_norm,
         )
 
     def _updates_of(self, steps: int) -> int:
-        return self.epochs * (steps * self.num_envs // self.batch_size)
+        return self.options.epochs * (steps * self.num_envs // self.options.batch_size)
 
     def updates_due(self, frames: int) -> int:
         """Returns the number of updates of one round if a rollout is complete, else 0."""
         steps = len(self.memory)
-        return 0 if steps < self.rollout_length else self._updates_of(steps)
+        return 0 if steps < self.options.rollout_length else self._updates_of(steps)
 
     def sample(self) -> TensorDictBase:
         """Returns the round's next batch; the first call begins the round and clears the memory."""
         if not self._batches:
             self._round = self._with_advantages(self.memory.steps()).reshape(-1)
             self.memory.clear()  # no frame is learnt from in two rounds
-            for _ in range(self.epochs):
-                rows = torch.randperm(len(self._round)).split(self.batch_size)
-                self._batches += [r for r in rows if len(r) == self.batch_size]
+            size = self.options.batch_size
+            for _ in range(self.options.epochs):
+                rows = torch.randperm(len(self._round)).split(size)
+                self._batches += [r for r in rows if len(r) == size]
         return self._round[self._batches.pop(0).to(self._round["action"].device)]
 
     @torch.no_grad()
     def _with_advantages(self, steps: TensorDictBase) -> TensorDictBase:
         """Returns steps `[N, T]` with `advantage` and `value_target`, by the current weights."""
         for some in (steps, steps["next"]):
-            parts = some.reshape(-1).split(self.batch_size)  # as large as training has them
+            parts = some.reshape(-1).split(self.options.batch_size)  # as large as training has them
             values = torch.cat([self.loss.state_value(part) for part in parts])
             some["state_value"] = values.reshape(*steps.shape, 1)
         return self._advantage(steps)

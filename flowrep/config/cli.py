@@ -14,9 +14,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
-from contextlib import contextmanager
 from hashlib import sha1
-from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -28,11 +26,11 @@ from hydra.core.utils import env_override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from flowrep import __version__
 from flowrep.config import CONF_DIR, UsageError, config_groups, group_choices
-from flowrep.config.schema import Section, validated
-from flowrep.config.yaml_file import check_yaml, checked_yaml
+from flowrep.config.schema import Command, validated
 
 EXIT_USAGE = 2
 FOLDERS = ("resume", "run", "input", "output", "hydra.run.dir", "hydra.sweep.dir")
@@ -42,7 +40,7 @@ OF_THE_MACHINE = ("device", "num_workers", "threads")
 IS_DEBUGGING = bool(os.environ.get("HYDRA_FULL_ERROR"))
 
 
-def run_command(config_name: str, command: Callable[[Any], Any], schema: type[Section]) -> None:
+def run_command(config_name: str, command: Callable[[Any], Any], schema: type[Command]) -> None:
     """Composes the config of `sys.argv` from conf/, and runs the command on its model."""
 
     def job(config: DictConfig) -> Any:
@@ -54,7 +52,7 @@ def run_command(config_name: str, command: Callable[[Any], Any], schema: type[Se
     run_hydra(config_name, job, schema)
 
 
-def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[Section]) -> None:
+def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[Command]) -> None:
     """Runs a Hydra job; what Hydra refuses ends the process in an `error:` line."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -64,8 +62,7 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[S
     try:
         sys.argv[1:] = as_typed(sys.argv[1:], schema)
         _show_if_asked(sys.argv[1:], config_name)
-        # Hydra raises its errors, not prints them
-        with env_override({"HYDRA_FULL_ERROR": "1"}), _files_named():
+        with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra raises its errors, not prints them
             main(job)()
     except KeyboardInterrupt:
         sys.exit(130)
@@ -77,7 +74,7 @@ def run_hydra(config_name: str, job: Callable[[DictConfig], Any], schema: type[S
 
 
 def composed(
-    config_name: str, values: Mapping[str, Any], schema: type[Section]
+    config_name: str, values: Mapping[str, Any], schema: type[Command]
 ) -> tuple[Any, str, list[str]]:
     """Returns the model of a command's config in which keys have these values, for use in Python.
 
@@ -103,41 +100,7 @@ def _overrides(values: Mapping[str, Any], section: str = "") -> Iterator[str]:
             yield f"{section}{key}={json.dumps(value)}"
 
 
-@contextmanager
-def _files_named() -> Iterator[None]:
-    """Lets errors of YAML files that Hydra reads name the file and the line.
-
-    Hydra reads each with `OmegaConf.load`, and has no hook between reading a file and copying what
-    is in it, which takes forever where aliases repeat each other.
-    """
-    load: Any = OmegaConf.load
-
-    def checked_load(file: Any) -> Any:
-        if not hasattr(file, "read"):
-            return load(file)
-        text, name = file.read(), getattr(file, "name", "a YAML file")
-        if re.search(r"(^|[\s\[{,])\*\w", text):  # an alias
-            checked_yaml(name, text, check_yaml)
-        return checked_yaml(name, text, mapping)
-
-    def mapping(text: str) -> Any:
-        try:
-            config = load(StringIO(text))
-        except OmegaConfBaseException as error:  # a key or an interpolation that can't be
-            raise ValueError(error) from error
-        if not isinstance(config, DictConfig):
-            raise ValueError("it should hold `key: value` lines")
-        return config
-
-    omegaconf: Any = OmegaConf
-    omegaconf.load = checked_load
-    try:
-        yield
-    finally:
-        omegaconf.load = load
-
-
-def end_with(error: Exception, schema: type[Section]) -> NoReturn:
+def end_with(error: Exception, schema: type[Command]) -> NoReturn:
     """Ends the process with the line of a mistake, or the traceback of a bug."""
     if IS_DEBUGGING or not is_a_mistake(error):
         traceback.print_exception(error)
@@ -148,12 +111,13 @@ def end_with(error: Exception, schema: type[Section]) -> NoReturn:
 def is_a_mistake(error: Exception) -> bool:
     """Returns whether an error is about something that a user can change."""
     # BrokenExecutor: of a launcher whose worker was killed, as for want of memory
-    kinds = HydraException, OmegaConfBaseException, ValueError, ImportError, OSError, BrokenExecutor
+    libraries = HydraException, OmegaConfBaseException, YAMLError, BrokenExecutor
     is_plugin = str(error).startswith("Unknown plugin class")  # Hydra raises a RuntimeError
-    return isinstance(error, kinds) or is_plugin or type(error).__module__.startswith("flowrep.")
+    is_ours = type(error).__module__.startswith("flowrep.")
+    return isinstance(error, (*libraries, ValueError, ImportError, OSError)) or is_plugin or is_ours
 
 
-def checked(config: DictConfig, schema: type[Section]) -> Any:
+def checked(config: DictConfig, schema: type[Command]) -> Any:
     """Returns a composed config as its model; keys that the user added (`+note=pilot`) pass."""
     plain, job = plain_config(config), config.get("hydra") or HydraConfig.get()
     model = validated(schema, plain)
@@ -193,33 +157,26 @@ def print_error(problem: str | Exception) -> None:
         print(f"error: {line}", file=sys.stderr)
 
 
-def explained(error: Exception, schema: type[Section]) -> str:
-    """Returns an error in a line: after a typo or a wrong choice with what there is instead."""
+def explained(error: Exception, schema: type[Command]) -> str:
+    """Returns an error in a line; after a typo in a key or a choice, with what there is."""
     text = str(error)
     missing = re.match(r"In '[^']*': Could not (?:find|load) '([^']+)/([^/']+)'", text)
     if isinstance(error, MissingConfigException) and missing:
         group, name = missing.groups()
         there = ", ".join(sorted(error.options or group_choices(group)))
-        file = f"{group}/{name.removesuffix('.yaml')}.yaml"
         return (
-            f"unknown {group} '{name}'; there are: {there}. A choice of your own is a file {file} "
-            "in a folder that --config-dir names"
+            f"unknown {group} '{name}'; there are: {there}. A choice of your own is a file "
+            f"{group}/{name.removesuffix('.yaml')}.yaml in a folder that --config-dir names"
         )
     unknown = re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text)
     if unknown:
         return _unknown_key(unknown[1], schema)
-    if isinstance(error, UnicodeDecodeError):  # of a file, which it doesn't name
-        line = error.object[: error.end].splitlines()[-1].decode("utf-8", "replace")
-        return f"a YAML file is not in UTF-8: '{line}'"
-    if not isinstance(error, HydraException | OmegaConfBaseException):
-        return text
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    useless = ("object_type=", "See http", "provider=")
-    said = " ".join(line for line in lines if not line.startswith(useless))
-    return said.partition(" Config search path")[0]
+    if isinstance(error, HydraException | OmegaConfBaseException | YAMLError):
+        text = " ".join(text.split()).partition(" See https://hydra.cc")[0]
+    return text
 
 
-def _unknown_key(key: str, schema: type[Section]) -> str:
+def _unknown_key(key: str, schema: type[Command]) -> str:
     """Returns that there is no such key, and the sections that have one, or all keys."""
     if "." in key:
         return f"unknown key '{key}': --cfg job shows the keys that there are"
@@ -227,10 +184,9 @@ def _unknown_key(key: str, schema: type[Section]) -> str:
     files = [(group, path) for group in groups for path in CONF_DIR.glob(f"{group}/**/*.yaml")]
     line = re.compile(rf"^{re.escape(key)}:", re.MULTILINE)
     meant = sorted({f"{g}.{key}" for g, path in files if line.search(path.read_text("utf-8"))})
-    if meant:
-        return f"unknown key '{key}': do you mean {' or '.join(meant)}?"
     keys = [*schema.model_fields, *(("preset", "debug") if "resume" in schema.model_fields else ())]
-    return f"unknown key '{key}'; there are: {', '.join(keys)}"
+    hint = f"do you mean {' or '.join(meant)}?" if meant else f"there are: {', '.join(keys)}"
+    return f"unknown key '{key}'; {hint}"
 
 
 def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
@@ -254,23 +210,19 @@ def _show_if_asked(arguments: Sequence[str], config_name: str) -> None:
 # Texts with any characters, for Hydra and the shell.
 
 
-def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
+def as_typed(arguments: Sequence[str], schema: type[Command]) -> list[str]:
     """Returns a command line as Hydra reads it: folders quoted, those without a key named `run`."""
-    # quoted are folders that exist, and those that Hydra can't read, or would take for a number
-    keys, folders, others, previous = schema.model_fields, [], [], ""
+    folders, others, previous = [], [], ""
     for text in arguments:
         key, _, value = text.partition("=")
         is_split = value.startswith("[") and "]" not in value  # by the shell, at a space
         if is_split and not Path(value).exists():
             raise UsageError(f"'{text}' is no list: write {key}=[a,b], or '{key}=[a, b]' in quotes")
-        if text.startswith("--") and key[2:] in {*keys, *config_groups()}:
-            raise UsageError(f"'{text}': write {key[2:]}=<value>, without --")
-        may_be_bare = "run" in keys and text[:1] not in "-~+" and not previous.startswith("-")
-        if may_be_bare and (text == key or Path(text).exists()):
+        is_own = text[:1] not in "-~+" and not previous.startswith("-")
+        if is_own and "run" in schema.model_fields and (text == key or Path(text).exists()):
             folders.append(text)
         else:
-            is_name = key in FOLDERS and value and _is_misread(key, value)
-            others.append(override(key, value) if is_name else text)
+            others.append(override(key, value) if _is_folder(key, value) else text)
         previous = text
     # argparse takes all keys from one stretch: `seed=0,1 -m scene=s_turn` has two
     flags = {"-m", "--multirun"} & {*others}
@@ -283,13 +235,11 @@ def as_typed(arguments: Sequence[str], schema: type[Section]) -> list[str]:
     return [f"run=[{','.join(quoted)}]" if quoted[1:] else f"run={quoted[0]}", *others]
 
 
-def _is_misread(key: str, text: str) -> bool:
-    """Returns whether a folder's name means something else to Hydra, or might."""
-    parsed = _parsed(f"{key}={text}")
-    is_number = parsed is not None and isinstance(parsed.value(), int | float)  # true is one, too
-    is_named = is_number and key != "input"  # that may be a camera's number
-    is_unreadable = parsed is None and not text.startswith("[")
-    return is_unreadable or is_named or Path(text).exists()
+def _is_folder(key: str, value: str) -> bool:
+    """Returns whether a value is the name of a folder, not yet in quotes."""
+    is_camera = key == "input" and value.isdigit()
+    is_for_hydra = value[:1] in ("", "[", "'", '"') or value in ("null", "???") or "${" in value
+    return key in FOLDERS and (Path(value).exists() or not (is_camera or is_for_hydra))
 
 
 def value_of(text: str) -> str:
@@ -312,7 +262,7 @@ def override(key: str, text: str) -> str:
     if parsed is not None and parsed.value() == text:
         return f"{key}={text}"
     # OmegaConf would replace an interpolation, and takes backslashes before one for escapes
-    text = re.sub(r"(\\*)\$\{", lambda found: found[1] * 2 + r"\${", text)
+    text = re.sub(r"(\\*)\$\{", lambda match: match[1] * 2 + r"\${", text)
     return f"{key}={QuotedString(text, Quote.single).with_quotes()}"
 
 

@@ -1,15 +1,23 @@
 """The commands' configs as pydantic models: every key, its type and its range.
 
-`conf/` holds the defaults, so nothing has one here. Names of classes, scenes and options are
-written out, so that reading a config imports neither torch nor a simulator;
-tests/config/test_schema.py holds them equal to the code and to conf/.
+`conf/` holds the values. The sections of algorithms, representations, flow and noise are in
+`flowrep.options`.
 """
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_type_hints,
+)
 
 from pydantic import (
     BaseModel,
@@ -26,19 +34,24 @@ from pydantic import (
 )
 
 from flowrep.config import UsageError
+from flowrep.options import (
+    ALGORITHMS,
+    CLASS,
+    AlgorithmOptions,
+    Count,
+    EstimatedFlow,
+    ExactFlow,
+    Noise,
+    Options,
+    Positive,
+    Representations,
+    Text,
+)
 
 Model = TypeVar("Model", bound=BaseModel)
 
-# Larger whole numbers are not exact as floats, larger seeds are more than numpy takes.
-Count = Annotated[int, Field(ge=1, le=2**53)]
 CountOrZero = Annotated[int, Field(ge=0, le=2**53)]
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
-PositiveShare = Annotated[float, Field(gt=0, le=1)]
-Text = Annotated[str, Field(min_length=1)]
-
+Seed = Annotated[int, Field(ge=0, lt=2**31)]  # larger ones are more than numpy takes
 SpeedMode = Literal["low", "normal", "high"]
 FrameRate = Annotated[float, Field(ge=0.5, le=1000)]
 BaselineName = Literal["planner", "never_turn", "random"]
@@ -63,51 +76,10 @@ OneOrMore = BeforeValidator(_listed)
 """Lets a list of one be written without brackets."""
 
 
-class Section(BaseModel):
-    """Keys of a config: none is unknown, none is missing, and types are strict."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-    def plain(self) -> dict[str, Any]:
-        """Returns the keys and values as they are written in a config."""
-        return self.model_dump(by_alias=True)
-
-
-class Command(Section):
+class Command(Options):
     """The whole config of a command; it keeps keys that it doesn't know, such as `+note=pilot`."""
 
     model_config = ConfigDict(extra="allow")
-
-
-# What the agent sees.
-
-_SEGMENTATION = {"encoding": Literal["ids", "onehot"]}
-_DEPTH = {"range_m": Positive, "missing": Share}
-_FLOW = {"scale": float, "unit": Literal["px_per_step", "px_per_s"]}
-REPRESENTATIONS: dict[str, dict[str, Any]] = {
-    "rgb": {},
-    "seg": _SEGMENTATION,
-    "depth": _DEPTH,
-    "raw": _FLOW,
-    "ego": _FLOW,
-    "obj": _FLOW,
-    "seg2": _SEGMENTATION | {"k": Count},
-    "depth2": _DEPTH | {"k": Count},
-}
-"""The options of each representation and their types."""
-
-
-def _section(name: str, **fields: Any) -> Any:
-    return create_model(name, __base__=Section, **fields)
-
-
-def _options(name: str) -> Any:
-    return _section(name, **{key: (kind, ...) for key, kind in REPRESENTATIONS[name].items()})
-
-
-Representations: Any = _section(
-    "Representations", **{name: (_options(name), None) for name in REPRESENTATIONS}
-)
 
 
 def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
@@ -118,176 +90,44 @@ def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
     return {name: dict(options) for name, options in value.items()}
 
 
+Flow = Annotated[ExactFlow | EstimatedFlow, Field(discriminator="source")]
+
+
+class ForeignAlgorithm(AlgorithmOptions):
+    """Options of an algorithm of the user's own, which `experiment.build` checks."""
+
+    model_config = ConfigDict(extra="allow")
+    target: str = Field(alias="_target_", pattern=CLASS)
+
+
+def _kind(section: Any) -> str:
+    """Returns which options an algorithm's section holds."""
+    target = (
+        section.get("_target_") if isinstance(section, Mapping) else getattr(section, "target", "")
+    )
+    return target if isinstance(target, str) and target in ALGORITHMS else "foreign"
+
+
 if TYPE_CHECKING:
     Stack = dict[str, dict[str, Any]]
+    Algorithm = AlgorithmOptions
 else:
     Stack = Annotated[
         Representations, WrapValidator(_in_their_order), PlainSerializer(lambda value: value)
     ]
-
-
-class ExactFlow(Section):
-    """`flow=exact`."""
-
-    source: Literal["exact"]
-
-
-class EstimatedFlow(Section):
-    """`flow=estimated`."""
-
-    source: Literal["estimated"]
-    estimator: Literal["dis", "raft_small", "raft_large"]
-    weights: Text | None
-    preset: Literal["ultrafast", "fast", "medium", "fine"]
-    min_side_px: Count
-    picture_scale: Count = 1  # runs from before it lack it
-
-
-Flow = Annotated[ExactFlow | EstimatedFlow, Field(discriminator="source")]
-
-
-class Noise(Section):
-    """Errors of the depth camera and of odometry."""
-
-    depth_sigma_per_m: NotNegative
-    depth_dropout: Share
-    drift_m: NotNegative
-    drift_rad: NotNegative
-
-
-# The algorithms.
-
-
-class Target(Section):
-    """A class by its name, with options that its signature checks."""
-
-    model_config = ConfigDict(extra="allow")
-    target: Text = Field(alias="_target_")
-
-    def options(self) -> dict[str, Any]:
-        """Returns the options by name, without the class."""
-        return self.model_dump(by_alias=True, exclude={"target"})
-
-
-class AnyAlgorithm(Target):
-    """A user's own algorithm."""
-
-    target: Annotated[str, Field(pattern=r"^\w+(\.\w+)+$")] = Field(alias="_target_")
-
-    def first_update(self, num_envs: int) -> tuple[str, int]:
-        """Returns the option that delays learning, and the frames until something is learnt."""
-        return "", 0
-
-
-class _Learner(AnyAlgorithm):
-    """The options that the algorithms of `flowrep.agent` have in common."""
-
-    model_config = ConfigDict(extra="forbid")
-    precision: Literal["auto", "bf16", "fp32"]
-    learning_rate: Positive
-    gamma: Share
-    hidden_size: Count
-    batch_size: Count
-
-
-class _OffPolicy(_Learner):
-    """The options that algorithms with a replay memory have in common."""
-
-    tau: PositiveShare
-    replay_capacity: Count
-    frames_per_update: Count
-    learning_starts: Count | None
-    n_steps: Count
-    layer_norm: bool
-    mirror: bool = False  # not in runs before it
-    persistent_exploration: Share = 0.0  # nor this one
-
-    def first_update(self, num_envs: int) -> tuple[str, int]:
-        """Returns the frames until the memory holds enough for an update."""
-        key = "batch_size" if self.learning_starts is None else "learning_starts"
-        starts = getattr(self, key)
-        if starts < num_envs:
-            raise ValueError(
-                f"algorithm.{key}={starts} is less than num_envs={num_envs}: before their second "
-                "step there is nothing to learn from; raise learning_starts, or lower num_envs"
-            )
-        return key, starts + self.frames_per_update
-
-
-class DiscreteSAC(_OffPolicy):
-    """`algorithm=dsac`."""
-
-    encoder: Literal["shared", "separate"]
-    initial_alpha: Positive
-    target_entropy_weight: Share
-    entropy_in_target: bool = True  # not in runs before it
-    alpha_rate_factor: NotNegative
-
-
-class DiscreteSACWithValue(_OffPolicy):
-    """`algorithm=dsac_v`."""
-
-    initial_alpha: Positive
-    target_entropy_weight: Share
-    alpha_rate_factor: NotNegative
-
-
-class DoubleDQN(_OffPolicy):
-    """`algorithm=dqn`."""
-
-    initial_epsilon: Share
-    final_epsilon: Share
-    exploration_share: Share
-
-
-class PPO(_Learner):
-    """`algorithm=ppo`."""
-
-    rollout_length: Count
-    epochs: Count
-    gae_lambda: Share
-    clip: PositiveShare
-    value_weight: NotNegative
-    entropy_weight: NotNegative
-    max_grad_norm: Positive
-
-    def first_update(self, num_envs: int) -> tuple[str, int]:
-        """Returns the frames of a rollout."""
-        return "rollout_length", self.rollout_length * num_envs
-
-
-ALGORITHMS: dict[str, type[AnyAlgorithm]] = {
-    f"flowrep.agent.{section.__name__}": section
-    for section in (DiscreteSAC, DiscreteSACWithValue, DoubleDQN, PPO)
-}
-"""The sections of flowrep's own algorithms, by `_target_`."""
-
-
-def _algorithm_tag(value: Any) -> str:
-    target = value.get("_target_") if isinstance(value, Mapping) else getattr(value, "target", "")
-    section = ALGORITHMS.get(target) if isinstance(target, str) else None
-    return section.__name__ if section else "AnyAlgorithm"
-
-
-Algorithm = Annotated[
-    Annotated[DiscreteSAC, Tag("DiscreteSAC")]
-    | Annotated[DiscreteSACWithValue, Tag("DiscreteSACWithValue")]
-    | Annotated[DoubleDQN, Tag("DoubleDQN")]
-    | Annotated[PPO, Tag("PPO")]
-    | Annotated[AnyAlgorithm, Tag("AnyAlgorithm")],
-    Discriminator(_algorithm_tag),
-]
+    Algorithm = Annotated[
+        Union[
+            Annotated[ForeignAlgorithm, Tag("foreign")],
+            *(Annotated[options, Tag(target)] for target, options in ALGORITHMS.items()),
+        ],
+        Discriminator(_kind),
+    ]
 # pydantic puts the member of a union between the keys in an error's place
-_TAGS = {
-    "exact",
-    "estimated",
-    "AnyAlgorithm",
-    *(section.__name__ for section in ALGORITHMS.values()),
-}
+_MEMBERS = {"exact", "estimated", "foreign", *ALGORITHMS}
 
 
-class TrustedAlgorithm(Section):
-    """The algorithm that a run's config may name, if it is not one of flowrep's own."""
+class Trusted(Options):
+    """The class that a run's config may name, if it is not one of flowrep's own."""
 
     target: Text | None = Field(alias="_target_")
 
@@ -306,16 +146,16 @@ class EnvConfig(Command):
     renderer: Renderer
     representations: Stack
     flow: Flow
-    motion: MotionSource = "exact"  # not in runs before it
+    motion: MotionSource
     noise: Noise
-    scene: dict[str, Any]  # flowrep.scenes.load_scene checks it
+    scene: dict[str, Any]  # flowrep.scenes.load_scene makes a Scene of it
 
 
 Acting = Literal["greedy", "sampled"]
 """How an agent acts in its final evaluation."""
 
 
-class Evaluation(Section):
+class Evaluation(Options):
     """How the agent is evaluated while it learns and at the end."""
 
     every_frames: CountOrZero
@@ -323,8 +163,7 @@ class Evaluation(Section):
     final_episodes: Count
     speeds: Annotated[list[SpeedMode], Field(min_length=1), Distinct]
     fps: Annotated[list[FrameRate], Field(min_length=1), Distinct]
-    # not in runs before it
-    policies: Annotated[list[Acting], Field(min_length=1), Distinct] = [*get_args(Acting)]
+    policies: Annotated[list[Acting], Field(min_length=1), Distinct]
     baselines: Annotated[list[BaselineName], Distinct]
     video: bool
 
@@ -339,7 +178,7 @@ class TrainConfig(EnvConfig):
     """The whole config of `flowrep.train`."""
 
     total_frames: Count
-    threads: Count = 1  # not in runs before it
+    threads: Count
     compiled: bool
     log_every_frames: Count
     checkpoint_every_frames: Count
@@ -366,7 +205,7 @@ class EvaluateConfig(Command):
     """The whole config of `flowrep.evaluate`."""
 
     run: Annotated[list[Text] | None, OneOrMore]
-    algorithm: TrustedAlgorithm
+    algorithm: Trusted
     scene: dict[str, Any] | None = None
     representations: Stack | None = None
     flow: Flow | None = None
@@ -418,7 +257,7 @@ class ExportConfig(Command):
     """The whole config of `flowrep.export`."""
 
     run: Text
-    algorithm: TrustedAlgorithm
+    algorithm: Trusted
     output: Text | None
 
 
@@ -428,7 +267,7 @@ class ViewConfig(Command):
     scene: dict[str, Any]
     representations: Stack | None = None
     policy: Text
-    algorithm: TrustedAlgorithm
+    algorithm: Trusted
     speed: SpeedMode
     frame_rate_hz: FrameRate | None
     path: Text | None
@@ -450,10 +289,15 @@ class ReportConfig(Command):
     videos: CountOrZero
 
 
-class Reader(Target):
-    """A reader of recordings."""
+class Reader(Options):
+    """A reader of recordings, whose options its signature checks."""
 
-    target: Annotated[str, Field(pattern=r"^flowrep\.sequences\.\w+$")] = Field(alias="_target_")
+    model_config = ConfigDict(extra="allow")
+    target: str = Field(alias="_target_", pattern=r"^flowrep\.sequences\.\w+$")
+
+    def options(self) -> dict[str, Any]:
+        """Returns the options by name, without the class."""
+        return dict(self.model_extra or {})
 
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Reader:
@@ -463,7 +307,7 @@ class Reader(Target):
         return self
 
 
-class FlowScale(Section):
+class FlowScale(Options):
     """Flow of full colour, pixels."""
 
     raw: Positive
@@ -536,13 +380,14 @@ def check_options(maker: type, options: Mapping[str, Any], section: str) -> None
     fields: dict[str, Any] = {
         p.name: (hints[p.name], ... if p.default is p.empty else p.default) for p in parameters
     }
-    place = _section("Place", **{section: (_section("Options", **fields), ...)})
-    validated(place, {section: options})
+    checked = create_model(maker.__name__, __base__=Options, **fields)
+    whole: Any = {section: (checked, ...)}
+    validated(create_model("Config", **whole), {section: options})
 
 
 def _line(details: Any) -> str:
     """Returns pydantic's error in a line that begins with the key."""
-    key = ".".join(str(part) for part in details["loc"] if part not in _TAGS)
+    key = ".".join(str(part) for part in details["loc"] if part not in _MEMBERS)
     kind, value = details["type"], details["input"]
     message = details["msg"].removeprefix("Value error, ")
     if kind == "extra_forbidden":

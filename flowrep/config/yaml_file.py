@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,21 +62,7 @@ def read_yaml(path: str | Path) -> Any:
         UsageError: it can't be read, in one line with the file and the line.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: can't be read: {error}") from error
-    return checked_yaml(path, text, lambda text: yaml.load(text, _Loader))
-
-
-def check_yaml(text: str) -> None:
-    """Raises an error if the aliases of a YAML text repeat each other, or it can't be read."""
-    _Loader(text).get_single_node()
-
-
-def checked_yaml(path: str | Path, text: str, load: Callable[[str], Any]) -> Any:
-    """Returns what `load` makes of the text of a YAML file; its errors name the file."""
-    try:
-        return load(text)
+        return yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = "" if mark is None else f", line {mark.line + 1}"

@@ -145,7 +145,7 @@ class Agent(Driver):
                 "a .safetensors file, path.py:make, package.module:make or path.pt2"
             )
         section = trained.algorithm
-        if precision is not None and hasattr(section, "precision"):
+        if precision is not None and hasattr(build.algorithm(section)[1], "precision"):
             machine["algorithm"] = section.model_copy(update={"precision": precision})
         if scene is not None:
             machine["scene"] = {**scene, "camera": trained.scene["camera"]}

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import multiprocessing
-from inspect import signature
+from collections.abc import Mapping
 from pkgutil import resolve_name
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase, InitTracker
+from pydantic import create_model
+from torchrl.envs import EnvBase, InitTracker, Transform
 
 from flowrep.agent import Algorithm
 from flowrep.agent.observation import resolved_precision
 from flowrep.config import UsageError
-from flowrep.config.schema import ALGORITHMS, AnyAlgorithm, EnvConfig, TrainConfig
+from flowrep.config.schema import EnvConfig, TrainConfig, validated
 from flowrep.envs import make_env, make_mirror
 from flowrep.envs.torchrl_env import usable_device
 from flowrep.envs.workers import available_cores
+from flowrep.options import ALGORITHMS, AlgorithmOptions
 
 ENVS_PER_WORKER = 24  # of an evaluation: fewer aren't worth the start of a process
 
@@ -33,23 +35,92 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
 
     Observations include `is_init`, which marks the beginning of an episode for the replay memory.
     """
+    num_envs = changes.get("num_envs", config.num_envs)
+    num_workers = changes.get("num_workers", config.num_workers)
+    if num_workers == "auto":
+        num_workers = worker_count(num_envs, busy_cores=_threads(config))
     arguments: dict[str, Any] = {
         "scene": config.scene,
-        "representations": config.representations,
-        "flow": config.flow.plain(),
+        "representations": {n: _options(n, o) for n, o in config.representations.items()},
+        "flow": dict(config.flow),
         "motion": config.motion,
-        "noise": config.noise.plain(),
-        "num_envs": config.num_envs,
+        "noise": dict(config.noise),
+        "num_envs": num_envs,
         "device": device(config.device),
         "speed": config.speed,
         "renderer": config.renderer,
     }
-    arguments |= changes
-    num_workers = changes.get("num_workers", config.num_workers)
-    if num_workers == "auto":
-        num_workers = worker_count(arguments["num_envs"], busy_cores=_threads(config))
-    arguments["num_workers"] = num_workers
-    return make_env(**arguments).append_transform(InitTracker())
+    made = make_env(**arguments | changes | {"num_workers": num_workers})
+    return made.append_transform(InitTracker())
+
+
+def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
+    """Returns the config's algorithm, untrained, for the env's specs."""
+    maker, options = algorithm(config.algorithm)
+    images = {}
+    if getattr(options, "mirror", False):
+        images["mirror_image"] = make_mirror(config.scene, config.representations)
+    return maker(*_specs(config, env), options, **_run(config), **images)
+
+
+def policy(config: TrainConfig, env: EnvBase) -> Any:
+    """Returns the untrained policy of the config's algorithm alone."""
+    maker, options = algorithm(config.algorithm)
+    return maker.make_policy(*_specs(config, env), options, **_run(config))
+
+
+def _specs(config: EnvConfig, env: EnvBase) -> tuple[Any, Any, list[str]]:
+    return env.observation_spec, env.action_spec, list(config.representations)
+
+
+def _run(config: TrainConfig) -> dict[str, Any]:
+    return {"total_frames": config.total_frames, "device": device(config.device)}
+
+
+def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
+    """Returns the class that a section names, and its options, checked if it isn't flowrep's."""
+    maker = _class("algorithm", section.target, Algorithm)
+    if section.target in ALGORITHMS:
+        return maker, section
+    whole: Any = create_model("Config", algorithm=(maker.OPTIONS, ...))
+    return maker, validated(whole, {"algorithm": section.plain()}).algorithm
+
+
+def _options(name: str, options: Mapping[str, Any]) -> Mapping[str, Any] | Transform:
+    """Returns a representation's options, or the transform if it is one of the user's own."""
+    if "_target_" not in options:
+        return options
+    own = dict(options)
+    maker = _class(f"representations.{name}", own.pop("_target_"), Transform)
+    try:
+        return maker(**own, out_keys=name)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"representations.{name}: {error}") from error
+
+
+def _class(key: str, target: str, base: type) -> Any:
+    """Returns the class that a config names, after checking what it is one of."""
+    try:
+        named = resolve_name(target)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(
+            f"{key}._target_={target} can't be imported: {error}; is its folder in PYTHONPATH?"
+        ) from None
+    if not (isinstance(named, type) and issubclass(named, base)):
+        raise UsageError(
+            f"{key}._target_={target} is not a subclass of {base.__module__}.{base.__name__}"
+        )
+    return named
+
+
+def with_precision(config: TrainConfig) -> TrainConfig:
+    """Returns a new run's config with the number format that `precision=auto` is here."""
+    section = config.algorithm
+    _, options = algorithm(section)
+    if not hasattr(options, "precision"):  # an algorithm of the user's own
+        return config
+    chosen = {"precision": resolved_precision(options.precision, device(config.device))}
+    return config.model_copy(update={"algorithm": section.model_copy(update=chosen)})
 
 
 def share_cores(config: EnvConfig) -> None:
@@ -60,17 +131,6 @@ def share_cores(config: EnvConfig) -> None:
     """
     if device(config.device).type == "cpu" and config.flow.source == "exact":
         torch.set_num_threads(1)
-
-
-def with_precision(config: TrainConfig) -> TrainConfig:
-    """Returns a new run's config with the number format that `precision=auto` is here."""
-    section = config.algorithm
-    options = algorithm_class(section).options()
-    if "precision" not in options:  # an algorithm of the user's own
-        return config
-    asked = section.options().get("precision", options["precision"].default)
-    chosen = {"precision": resolved_precision(asked, device(config.device))}
-    return config.model_copy(update={"algorithm": section.model_copy(update=chosen)})
 
 
 def worker_count(num_envs: int, busy_cores: int = 0) -> int:
@@ -93,47 +153,3 @@ def evaluation_workers(config: EnvConfig, num_envs: int) -> int:
     if isinstance(config.num_workers, int):
         return min(config.num_workers, num_envs)
     return worker_count(num_envs // ENVS_PER_WORKER)
-
-
-def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
-    """Returns the config's algorithm, untrained, for the env's specs."""
-    arguments, options = _arguments(config, env)
-    if options.get("mirror"):
-        options["mirror_image"] = make_mirror(config.scene, config.representations)
-    return algorithm_class(config.algorithm)(*arguments, **options)
-
-
-def policy(config: TrainConfig, env: EnvBase) -> Any:
-    """Returns the untrained policy of the config's algorithm alone."""
-    arguments, options = _arguments(config, env)
-    return algorithm_class(config.algorithm).make_policy(*arguments, **options)
-
-
-def _arguments(config: TrainConfig, env: EnvBase) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Returns the arguments of the config's algorithm, by position and by name."""
-    specs = env.observation_spec, env.action_spec, list(config.representations)
-    of_the_run = {"total_frames": config.total_frames, "device": device(config.device)}
-    return specs, of_the_run | config.algorithm.options()
-
-
-def algorithm_class(section: AnyAlgorithm) -> Any:
-    """Returns the class that a config names, after checking that it is one of an algorithm."""
-    target = section.target
-    try:
-        found = resolve_name(target)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise UsageError(
-            f"algorithm._target_={target} can't be imported: {error}; is its folder in PYTHONPATH?"
-        ) from None
-    if not (isinstance(found, type) and issubclass(found, Algorithm)):
-        raise UsageError(
-            f"algorithm._target_={target} is not a subclass of flowrep.agent.Algorithm"
-        )
-    if target not in ALGORITHMS:
-        try:
-            required = {"total_frames": 0, "device": None}
-            signature(found).bind(None, None, None, **required | section.options())
-        except TypeError as error:
-            known = ", ".join(found.options())
-            raise UsageError(f"algorithm: {error}; the options of {target} are: {known}") from None
-    return found

@@ -20,76 +20,50 @@ key, `in_keys: [a, b]` are two. Names and defaults come from the signatures of t
 
 from __future__ import annotations
 
-import dataclasses
+import importlib
 import inspect
 import re
-from collections.abc import Callable, Mapping
 from typing import Any
+
+from flowrep.extras import require
+
+require("flowrep.transforms.hydra_configs", "train", "hydra")
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from torchrl.envs.transforms import Transform
-from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from flowrep import transforms
-from flowrep.extras import require
 from flowrep.transforms.base import as_keys
 
-require("flowrep.transforms.hydra_configs", "train", "hydra")
+
+def config_of(transform: type[Transform]) -> dict[str, Any]:
+    """Returns a transform's class and arguments; one without a default is `???`, to be given."""
+    # TorchRL's metaclass hides the constructor's signature
+    parameters = inspect.signature(transform.__init__).parameters
+    arguments = {name: _plain(name, p.default) for name, p in parameters.items() if name != "self"}
+    # lists and mappings reach the transform as Python's own types, not as OmegaConf's
+    target = {"_target_": f"{transform.__module__}.{transform.__qualname__}", "_convert_": "all"}
+    return target | arguments
 
 
-def config_class(
-    target: Callable[..., Any], base: type = TransformConfig, *, partial: bool = False
-) -> Any:
-    """Returns the config of a class or function: a dataclass with a field for each parameter.
-
-    `base` is TorchRL's config class of the group; with `partial`, Hydra returns a function of the
-    arguments that are still missing.
-    """
-    # TorchRL's metaclasses hide the constructor's signature.
-    made_by = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
-    fields: list[tuple[str, Any, Any]] = [
-        (name, Any, _field(name, parameter.default))
-        for name, parameter in inspect.signature(made_by).parameters.items()
-        if name != "self"
-    ]
-    place = f"{target.__module__}.{target.__qualname__}"
-    # Lists and mappings reach the target as Python's own types, not as OmegaConf's.
-    fields += [("_target_", str, place), ("_convert_", str, "all"), ("_partial_", bool, partial)]
-    return dataclasses.make_dataclass(
-        f"{target.__name__}Config",
-        fields,
-        bases=(base,),
-        namespace={"__doc__": f"Configuration of `{place}`.", "__module__": __name__},
-    )
-
-
-def _field(name: str, default: Any) -> Any:
+def _plain(name: str, default: Any) -> Any:
     if default is inspect.Parameter.empty:
         return MISSING
     if name in ("in_keys", "out_keys") and default is not None:
-        default = [key if isinstance(key, str) else [*key] for key in as_keys(default)]
-    if isinstance(default, (tuple, list)):
-        return dataclasses.field(default_factory=lambda: [*default])
-    return default
+        return [key if isinstance(key, str) else [*key] for key in as_keys(default)]
+    return [*default] if isinstance(default, tuple) else default
 
 
-# By name in the group `transform`: `raw_flow` for `RawFlow`.
-CONFIGS: dict[str, type[TransformConfig]] = {
-    re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower(): config_class(getattr(transforms, name))
-    for name in transforms.__all__
-    if isinstance(getattr(transforms, name), type)
-    and issubclass(getattr(transforms, name), Transform)
-}
-# `RawFlowConfig` and the others by name, too, as pickle looks classes up.
-globals().update({config.__name__: config for config in CONFIGS.values()})
+importlib.import_module("torchrl.trainers.algorithms.configs")  # which registers TorchRL's
+CONFIGS: dict[str, dict[str, Any]] = {}
+"""By name in the group `transform`: `raw_flow` for `RawFlow`."""
 
-
-def register(configs: Mapping[tuple[str, str], type]) -> None:
-    """Stores configs by group and name; importing a module with configs calls this."""
-    store = ConfigStore.instance()
-    for (group, name), config in configs.items():
-        store.store(group=group, name=name, node=config, provider="flowrep")
-
-
-register({("transform", name): config for name, config in CONFIGS.items()})
+for _name in transforms.__all__:
+    _class = getattr(transforms, _name)
+    if isinstance(_class, type) and issubclass(_class, Transform):
+        snake_case = re.sub(r"(?<!^)(?=[A-Z])", "_", _name).lower()
+        CONFIGS[snake_case] = config_of(_class)
+        ConfigStore.instance().store(
+            group="transform", name=snake_case, node=CONFIGS[snake_case], provider="flowrep"
+        )

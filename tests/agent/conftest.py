@@ -42,9 +42,11 @@ def make_agent(observation_spec):
     ):  # fmt: skip
         torch.manual_seed(seed)
         action_spec = Categorical(3) if action_spec is None else action_spec
-        small = {name: value for name, value in SMALL.items() if name in algorithm.options()}
-        settings = {"total_frames": 1000} | small | changes
-        return algorithm(spec, action_spec, list(keys), **settings)
+        known = algorithm.OPTIONS.model_fields
+        options = {name: value for name, value in (SMALL | changes).items() if name in known}
+        run = {name: value for name, value in changes.items() if name not in known}
+        run = {"total_frames": 1000} | run
+        return algorithm(spec, action_spec, list(keys), algorithm.OPTIONS(**options), **run)
 
     return make
 

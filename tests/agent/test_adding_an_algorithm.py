@@ -8,7 +8,6 @@ import torch
 import yaml
 from torchrl.data import Categorical
 
-from flowrep.agent import Algorithm
 from flowrep.config import CONF_DIR
 
 DOCS = Path(__file__).parents[2] / "docs" / "adding_an_algorithm.md"
@@ -19,7 +18,7 @@ def block(language):
     return found
 
 
-def test_the_example_learns_and_its_yaml_spells_out_its_signature(
+def test_the_example_learns_and_its_yaml_spells_out_its_options(
     tmp_path, observation_spec, random_steps
 ):
     (tmp_path / "sarsa.py").write_text(block("python"), encoding="utf-8")
@@ -30,12 +29,10 @@ def test_the_example_learns_and_its_yaml_spells_out_its_signature(
     assert options.pop("defaults") == ["base/off_policy@_here_", "_self_"]
     algorithm = getattr(module, options.pop("_target_").rpartition(".")[2])
     shared = yaml.safe_load((CONF_DIR / "algorithm" / "base" / "off_policy.yaml").read_text())
-    assert {n: p.default for n, p in algorithm.options().items()} == {**shared, **options}
+    assert algorithm.OPTIONS(**shared | options) == algorithm.OPTIONS()
 
-    agent = algorithm(
-        observation_spec, Categorical(3), ["flow", "seg"], total_frames=500, device="cpu",
-        **(options | {"batch_size": 8, "hidden_size": 32}),
-    )  # fmt: skip
+    small = algorithm.OPTIONS(**shared | options | {"batch_size": 8, "hidden_size": 32})
+    agent = algorithm(observation_spec, Categorical(3), ["flow", "seg"], small, total_frames=500)
     action = agent.policy(random_steps(5).exclude("action"))["action"]
     assert action.shape == (5,)
     for frames in range(5, 105, 5):
@@ -45,12 +42,3 @@ def test_the_example_learns_and_its_yaml_spells_out_its_signature(
     assert agent.updates == 9
     assert set(metrics) == set(agent.metric_names())
     assert all(torch.isfinite(value) for value in metrics.values())
-
-
-def test_a_learner_without_a_loss_class_has_the_options_of_its_signature():
-    class Patient(Algorithm):
-        def __init__(self, *, patience: int) -> None:
-            pass
-
-    assert not hasattr(Patient, "LOSS")
-    assert list(Patient.options()) == ["patience"]

@@ -55,7 +55,7 @@ def test_an_update_moves_all_weights_and_returns_what_it_says(make_any, random_s
 
 def test_a_transition_of_three_steps_is_discounted_three_times(make_any, random_steps, as_batch):
     agent, cubed = make_any(gamma=0.5), make_any(gamma=0.5**3)
-    if not hasattr(agent, "frames_per_update"):
+    if not hasattr(agent.options, "frames_per_update"):
         pytest.skip("learns from whole rollouts")
     steps = random_steps(16)
     batch, once = as_batch(agent, steps), as_batch(agent, steps)
@@ -163,14 +163,12 @@ def test_a_policy_is_built_and_loaded_without_its_learner(
 ):
     """Of one environment, too, where a rollout would be less than a batch of PPO's."""
     (algorithm,) = make_any.args
-    options = {name: parameter.default for name, parameter in algorithm.options().items()}
-    changes = {"layer_norm": True} if "layer_norm" in options else {}
+    changes = {"layer_norm": True} if "layer_norm" in algorithm.OPTIONS.model_fields else {}
     agent = make_any(**changes)
     learn(agent, random_steps, 12)
     save_checkpoint(tmp_path / "c", {"policy": dict(agent.policy.state_dict())})
-    options |= {"precision": "fp32", "hidden_size": 32, "total_frames": 1000} | changes
     policy = algorithm.make_policy(
-        observation_spec[:1], Categorical(3), ["flow", "seg"], device="cpu", **options
+        observation_spec[:1], Categorical(3), ["flow", "seg"], agent.options, total_frames=1000
     )
     maps = random_maps(20)
     with torch.no_grad():

@@ -25,7 +25,7 @@ def test_bfloat16_stays_near_float32(make_agent, random_steps, as_batch):
 
 
 def test_settings_that_do_not_exist_are_refused(make_agent):
-    with pytest.raises(ValueError, match="encoder='both'"):
+    with pytest.raises(ValueError, match="encoder"):
         make_agent(encoder="both")
     with pytest.raises(TypeError, match="Binary"):
         make_agent(action_spec=Binary(3))
@@ -56,19 +56,6 @@ def test_learns_to_walk_to_the_end_of_a_corridor(make_agent, as_batch):
         q = critic.module(agent.loss.critic_encoder([images]))
     # going right is worth gamma to the power of the cells left to go: 0.125, 0.25, 0.5, 1
     torch.testing.assert_close(q[:, 2], torch.tensor([0.125, 0.25, 0.5, 1.0]), atol=0.1, rtol=0)
-
-
-def test_without_entropy_in_the_target_it_is_that_of_a_vanishing_alpha(
-    make_agent, random_steps, as_batch
-):
-    steps = random_steps(16)
-    with_bonus, without, small = (
-        make_agent(**options)
-        for options in ({}, {"entropy_in_target": False}, {"initial_alpha": 1e-9})
-    )
-    losses = [a.losses(as_batch(a, steps))["q_loss"] for a in (with_bonus, without, small)]
-    torch.testing.assert_close(losses[1], losses[2])
-    assert abs(losses[0] - losses[1]) > 1e-3 * losses[0]
 
 
 LR, ALPHA, GAMMA, TAU, TARGET_ENTROPY = 3e-4, 0.5, 0.99, 0.005, 0.2 * math.log(3)

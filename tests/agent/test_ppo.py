@@ -4,6 +4,7 @@ from tensordict import TensorDict
 from torchrl.data import Categorical, Composite, Unbounded
 
 from flowrep.agent import PPO
+from flowrep.options import PPOOptions
 from tests.agent.test_replay import step as stored_step
 
 ENVS = 2
@@ -12,13 +13,14 @@ SPEC = Composite(view=Unbounded((ENVS, 1, 36, 36)), shape=(ENVS,))
 
 def make_ppo(**changes):
     settings = {
-        "total_frames": 600, "device": "cpu", "precision": "fp32", "learning_rate": 1e-3,
+        "precision": "fp32", "learning_rate": 1e-3,
         "rollout_length": 4, "epochs": 3, "batch_size": 3, "gamma": 0.5, "gae_lambda": 0.75,
         "clip": 0.2, "value_weight": 0.5, "entropy_weight": 0.01, "max_grad_norm": 0.5,
         "hidden_size": 16,
     }  # fmt: skip
     torch.manual_seed(0)
-    return PPO(SPEC, Categorical(3), ["view"], **(settings | changes))
+    options = PPOOptions(**(settings | changes))
+    return PPO(SPEC, Categorical(3), ["view"], options, total_frames=600)
 
 
 def step(now, later, reward, ended="--"):

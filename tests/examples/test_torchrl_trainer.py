@@ -42,8 +42,7 @@ def test_a_run_in_two_pieces_is_the_run_in_one_bit_for_bit(tmp_path):
 @pytest.mark.slow
 def test_torchrls_trainer_runs_from_config_groups_alone(tmp_path):
     import hydra
-
-    import flowrep.torchrl_configs  # noqa: F401 - registers its groups
+    import torchrl.trainers.algorithms.configs  # noqa: F401 - registers its groups
 
     recipe = Path(__file__).parents[2] / "examples" / "torchrl_recipe"
     small = ["trainer.total_frames=96", "trainer.optim_steps_per_batch=1", "trainer.log_interval=1",

@@ -8,9 +8,10 @@ pytest.importorskip("pybullet", reason="a run is built with the simulator")
 
 from flowrep.agent import DoubleDQN, observation
 from flowrep.config import UsageError
-from flowrep.config.schema import ALGORITHMS, AnyAlgorithm
+from flowrep.config.schema import ForeignAlgorithm
 from flowrep.experiment import build
-from flowrep.experiment.build import algorithm_class, device, evaluation_workers, with_precision
+from flowrep.experiment.build import algorithm, device, evaluation_workers, with_precision
+from flowrep.options import ALGORITHMS
 from tests.config.composing import composed
 
 
@@ -19,12 +20,14 @@ def own_module(tmp_path, monkeypatch):
     """A module `someones` with an algorithm."""
     (tmp_path / "someones.py").write_text(
         "from flowrep.agent import DoubleDQN\n"
+        "from flowrep.options import AlgorithmOptions, Count, DoubleDQNOptions, Positive\n"
         "class Learner(DoubleDQN):\n"
-        "    def __init__(self, observation_spec, action_spec, keys, *, total_frames, device,\n"
-        "                 patience, mood=1.0): ...\n"
+        "    class OPTIONS(AlgorithmOptions):\n"
+        "        patience: Count\n"
+        "        mood: Positive = 1.0\n"
         "class Other(DoubleDQN):\n"
-        "    def __init__(self, observation_spec, action_spec, keys, *, total_frames, device,\n"
-        "                 patience, precision='auto'): ...\n"
+        "    class OPTIONS(DoubleDQNOptions):\n"
+        "        patience: Count\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     yield
@@ -32,14 +35,17 @@ def own_module(tmp_path, monkeypatch):
 
 
 def named(target, **options):
-    return AnyAlgorithm.model_validate({"_target_": target, **options})
+    return ForeignAlgorithm.model_validate({"_target_": target, **options})
 
 
 @pytest.mark.usefixtures("own_module")
 def test_an_algorithm_is_found_by_its_name():
-    assert algorithm_class(named("flowrep.agent.DoubleDQN")) is DoubleDQN
-    assert all(algorithm_class(named(target)) for target in ALGORITHMS)
-    assert algorithm_class(named("someones.Learner", patience=3)).__name__ == "Learner"
+    assert algorithm(composed("algorithm=dqn").algorithm)[0] is DoubleDQN
+    for target, options in ALGORITHMS.items():
+        assert algorithm(named(target))[0].OPTIONS is options
+    maker, options = algorithm(named("someones.Learner", patience=3))
+    assert maker.__name__ == "Learner"
+    assert (options.patience, options.mood) == (3, 1.0)
 
 
 @pytest.mark.parametrize(("faster", "chosen"), [(True, "bf16"), (False, "fp32")])
@@ -48,8 +54,8 @@ def test_a_new_run_s_config_says_in_which_format_it_computes(monkeypatch, faster
     monkeypatch.setattr(observation, "has_bf16", lambda device: True)
     monkeypatch.setattr(observation, "_bf16_products_are_faster", lambda: faster)
 
-    def precision(algorithm):
-        config = composed("device=cpu").model_copy(update={"algorithm": algorithm})
+    def precision(section):
+        config = composed("device=cpu").model_copy(update={"algorithm": section})
         return with_precision(config).plain()["algorithm"].get("precision")
 
     section = composed("device=cpu").algorithm
@@ -70,13 +76,14 @@ def test_a_new_run_s_config_says_in_which_format_it_computes(monkeypatch, faster
         ("nowhere.Learner", {}, "nowhere"),
         ("someones.Nobody", {"patience": 3}, "Nobody"),
         ("someones.Learner", {}, "patience"),
-        ("someones.Learner", {"patience": 3, "moood": 2}, "moood.*mood"),
+        ("someones.Learner", {"patience": 3, "moood": 2}, "algorithm.moood"),
+        ("someones.Learner", {"patience": 0}, "algorithm.patience.*1"),
     ],
 )
 @pytest.mark.usefixtures("own_module")
 def test_what_is_no_algorithm_is_refused(target, options, says):
     with pytest.raises(UsageError, match=says):
-        algorithm_class(named(target, **options))
+        algorithm(named(target, **options))
 
 
 def test_a_device_that_is_not_there_is_named():

@@ -32,16 +32,16 @@ CARD = {
     "num_classes": CLASSES,
     "scene": "s_turn",
 }
-SMALL = {"device": "cpu", "precision": "fp32", "hidden_size": 24}
+SMALL = {"precision": "fp32", "hidden_size": 24}
 
 
 def build(algorithm):
     torch.manual_seed(3)
     options = dict(SMALL)
     if algorithm is DoubleDQN:
-        options |= {"total_frames": 9, "final_epsilon": 0.0, "initial_epsilon": 0.0}
-        options |= {"exploration_share": 0.5, "layer_norm": True}
-    return algorithm.make_policy(SPEC, Categorical(3, (1,)), KEYS, **options)
+        options |= {"final_epsilon": 0.0, "initial_epsilon": 0.0, "layer_norm": True}
+    options = algorithm.OPTIONS(**options)
+    return algorithm.make_policy(SPEC, Categorical(3, (1,)), KEYS, options, total_frames=9)
 
 
 def network_of(policy):
@@ -192,7 +192,8 @@ def test_a_damaged_export_is_named(copied, name, file):
 @pytest.mark.parametrize("name", ["agent.pt2", "load_agent.py:make"])
 def test_the_program_of_another_export_is_noticed(copied, name):
     torch.manual_seed(4)
-    other = DiscreteSAC.make_policy(SPEC, Categorical(3, (1,)), KEYS, **SMALL)
+    options = DiscreteSAC.OPTIONS(**SMALL)
+    other = DiscreteSAC.make_policy(SPEC, Categorical(3, (1,)), KEYS, options, total_frames=9)
     torch.export.save(acting_program(other, SPEC), copied / "agent.pt2")
     assert "agent.pt2" in refused(copied, name)
 
