@@ -56,25 +56,25 @@ def main() -> None:
     args = parser.parse_args()
     roots = {"": HERE} | ({"base, ": args.base.resolve()} if args.base else {})
     overrides = [*args.overrides, f"total_frames={args.frames}"]
-    found: dict[str, list[dict[str, float]]] = {}
+    measured: dict[str, list[dict[str, float]]] = {}
     for _, (name, root) in product(range(args.rounds), roots.items()):
-        found.setdefault(f"{name}all threads", []).append(train(*overrides, root=root))
+        measured.setdefault(f"{name}all threads", []).append(train(*overrides, root=root))
         if args.alone:
             continue
         one = train(*overrides, root=root, OMP_NUM_THREADS="1")
-        found.setdefault(f"{name}one thread", []).append(one)
+        measured.setdefault(f"{name}one thread", []).append(one)
         busy = subprocess.Popen([sys.executable, "-c", BUSY])
         try:
             beside = train(*overrides, root=root)
         finally:
             busy.kill()
             busy.wait()
-        found.setdefault(f"{name}all threads, beside a busy loop", []).append(beside)
+        measured.setdefault(f"{name}all threads, beside a busy loop", []).append(beside)
     print(f"{' '.join(overrides)}, {os.cpu_count()} cores, medians of {args.rounds}")
     print(f"| training | frames/s | min for {PAPER_FRAMES:,} | of all threads | outside updates |")
     print("| --- | --- | --- | --- | --- |")
-    rates = {n: statistics.median(r["frames_per_second"] for r in f) for n, f in found.items()}
-    for name, runs in found.items():
+    rates = {n: statistics.median(r["frames_per_second"] for r in f) for n, f in measured.items()}
+    for name, runs in measured.items():
         outside = statistics.median(run["share_outside_updates"] for run in runs)
         rate, share = rates[name], rates[name] / rates["all threads"]
         minutes = PAPER_FRAMES / rate / 60

@@ -268,9 +268,9 @@ def draw_claims(claims: Sequence[Claim]) -> Figure:
         axes = figure.add_subplot()
         axes.axvline(0, color="#6b7480", linewidth=0.8)
         for row, (_, contrast) in enumerate(rows):
-            for place, (scene, colour) in enumerate(_COLOURS.items()):
+            for index, (scene, colour) in enumerate(_COLOURS.items()):
                 if scene in contrast.by_scene:
-                    at = row + 0.1 + 0.15 * place
+                    at = row + 0.1 + 0.15 * index
                     _draw_effect(axes, contrast.by_scene[scene], at, colour, "o", 3.5)
             if contrast.effect is not None:
                 _draw_effect(axes, contrast.effect, row - 0.12, "#1b1f24", "D", 5.0)
@@ -299,9 +299,9 @@ def _label(claim: Claim, contrast: Contrast) -> str:
 
 
 def _draw_effect(
-    axes: Any, found: Effect, at: float, colour: str, marker: str, size: float
+    axes: Any, drawn: Effect, at: float, colour: str, marker: str, size: float
 ) -> None:
-    value, low, high = (100 * number for number in found.interval())
+    value, low, high = (100 * number for number in drawn.interval())
     axes.plot(value, at, marker, color=colour, markersize=size)
     if np.isnan(low):
         return
@@ -457,15 +457,15 @@ def estimates_table(titles: Mapping[str, str], studies: Studies) -> str:
 
 def runs_table(studies: Studies) -> str:
     """Returns the number of runs of each stack in each study and scene."""
-    places = {
+    columns = {
         f"{'' if study == 'main' else study.replace('_', ' ')} {_SHORT[scene]}".strip(): members
         for study, scenes in studies.items()
         for scene, members in scenes.items()
     }
-    stacks = in_order([run.stack for members in places.values() for run in members], STACKS)
-    counts = [[sum(r.stack == stack for r in of) for of in places.values()] for stack in stacks]
+    stacks = in_order([run.stack for members in columns.values() for run in members], STACKS)
+    counts = [[sum(r.stack == stack for r in of) for of in columns.values()] for stack in stacks]
     rows = [(_stack(s), *(str(n or "") for n in of)) for s, of in zip(stacks, counts)]
-    return _table(("", *places), rows)
+    return _table(("", *columns), rows)
 
 
 def smallest_differences(claims: Sequence[Claim]) -> list[float]:

@@ -238,7 +238,7 @@ def baseline_share(runs: Iterable[Run], condition: Condition) -> float | None:
     seeds, outcomes = (
         np.concatenate([c[name] for c in driven]) for name in ("episode_seed", "outcome")
     )
-    # A baseline drives an episode alike beside any agent, so each episode counts once.
+    # A baseline drives an episode the same way beside any agent, so each episode counts once.
     _, first = np.unique(seeds, return_index=True)
     return success_rate([outcomes[first]]) if len(first) else None
 

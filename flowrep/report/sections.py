@@ -339,15 +339,15 @@ def _configs_section(groups: Sequence[Group], policy: str) -> ReportSection:
 
     series: dict[tuple[str, str], list[Run]] = {}  # of a stack and a config
     usable = [[run for run in g.runs if _unusable(run, policy) is None] for g in groups]
-    places = Counter(place for runs in usable for place in {(r.scene, r.stack) for r in runs})
-    shared = [place for place, configs_there in places.items() if configs_there > 1]
+    in_configs = Counter(key for runs in usable for key in {(r.scene, r.stack) for r in runs})
+    shared = [key for key, number in in_configs.items() if number > 1]
     for stack in in_order([stack for _, stack in shared], STACKS):
         for config, runs in zip(configs, usable):
             here = [r for r in runs if r.stack == stack and (r.scene, stack) in shared]
             series |= {(stack, config): here} if here else {}
     if not series:
         return ReportSection("configs", "Configs that differ", (table,))
-    named = {", ".join(place): runs for place, runs in series.items()}
+    named = {", ".join(key): runs for key, runs in series.items()}
     pairs = [(", ".join(b), ", ".join(a)) for a, b in combinations(series, 2) if a[0] == b[0]]
     section = _success_section("configs", "Configs that differ", named, pairs, policy, ())
     return section._replace(tables=(table, *section.tables))
