@@ -139,28 +139,21 @@ def is_archive(folder: Path) -> bool:
 
 def read_archive(folder: Path, pattern: str = "*") -> list[Run]:
     """Returns the packed runs of a folder whose names match a pattern."""
+    runs, what = [], f"'{folder}'"
     try:
-        return _read_archive(folder, pattern)
-    except RunFolderError:
-        raise
+        episodes, training = _of_runs(folder / EPISODES), _of_runs(folder / TRAINING)
+        for line in (folder / RUNS).read_text(encoding="utf-8").splitlines():
+            entry = json.loads(line)
+            name = entry["run"]
+            if fnmatch(name, pattern):
+                what = f"'{folder}', run {name}"
+                columns = episode_columns(episodes.get(name, {}))
+                metrics = _metric_columns(training.get(name, {}))
+                machine = {key: entry[key] for key in _MACHINE}
+                runs.append(Run(name, entry["config"], columns, metrics, machine=machine))
     except Exception as error:  # gzip, csv and json fail on garbage in a dozen ways
-        what = f"{type(error).__name__}: {error}"
-        raise RunFolderError(f"'{folder}': damaged packed runs ({what}): restore them") from error
-
-
-def _read_archive(folder: Path, pattern: str) -> list[Run]:
-    episodes, training = _of_runs(folder / EPISODES), _of_runs(folder / TRAINING)
-    runs = []
-    for line in (folder / RUNS).read_text(encoding="utf-8").splitlines():
-        entry = json.loads(line)
-        name, machine = entry["run"], {key: entry[key] for key in _MACHINE}
-        if fnmatch(name, pattern):
-            driven, logged = episodes.get(name, {}), training.get(name, {})
-            try:
-                columns = episode_columns(driven), _metric_columns(logged)
-            except ValueError as error:
-                raise RunFolderError(f"{folder}, run {name}: {error}") from None
-            runs.append(Run(name, entry["config"], *columns, machine=machine))
+        problem = f"damaged packed runs ({type(error).__name__}: {error}): restore them"
+        raise RunFolderError(f"{what}: {problem}") from error
     return runs
 
 
