@@ -1,7 +1,7 @@
 """The page of results: `make results` writes docs/results.md and its figure.
 
 claims.yaml declares what is tested, results.md.jinja has the words around the numbers, and all
-numbers come from the packed runs. `flowrep.report.statistics` decides what is significant. A run
+numbers come from the packed runs. `flowrep.report.statistics` decides whether a claim holds. A run
 counts with its success rate over the episodes that all compared runs drove.
 """
 
@@ -37,7 +37,7 @@ from flowrep.report.runs import (
     paired_scores,
     success_rate,
 )
-from flowrep.report.statistics import LEVEL, Array, Effect, effect, holm, mean_share
+from flowrep.report.statistics import LEVEL, UNSEEN, Array, Effect, effect, holm, mean_share
 from flowrep.report.storage import read_archive
 from flowrep.report.tables import Table, p_text, percent, points, signed
 
@@ -48,8 +48,6 @@ CLAIMS = HERE / "claims.yaml"
 _SHORT = dict(zip(SCENES, ("SR", "ST", "H", "T")))
 _COLOURS = dict(zip(SCENES, ("#0072b2", "#e69f00", "#009e73", "#cc79a7")))
 _STUDY = {"resolution": ", 84 px", "wide_confirmation": ", 0.6–2.4 m/s"}  # in the figure
-UNSEEN = "not seen with this recipe"
-_CLAIMED = {"more": "higher", "less": "lower"}
 _TIED = "\u00a0"  # a space at which no line breaks
 _WIDEST = 80  # points, where the figure's axis ends
 _POWER = 0.8
@@ -89,16 +87,9 @@ class Contrast:
     @property
     def verdict(self) -> str:
         """Returns "holds", "contradicted", `UNSEEN` or "can't be tested"."""
-        if self.effect is None or np.isnan(self.p_value):
+        if self.effect is None:
             return "can't be tested"
-        if self.asked["expect"] == "equal":
-            if self.p_value < LEVEL:
-                return "holds"
-            return "contradicted" if self.p_against < LEVEL else UNSEEN
-        direction = self.effect.verdict(self.p_value)
-        if direction == "not seen":
-            return UNSEEN
-        return "holds" if direction == _CLAIMED[self.asked["expect"]] else "contradicted"
+        return self.effect.verdict_on(self.asked["expect"], self.p_value, self.p_against)
 
 
 class Claim(NamedTuple):

@@ -16,7 +16,7 @@ from docs import results
 from docs.results import Claim, Contrast, rate_table, scores
 from flowrep.report.runs import Run, groups_of
 from flowrep.report.sections import assemble
-from flowrep.report.statistics import Effect
+from flowrep.report.statistics import UNSEEN, Effect
 from flowrep.report.storage import (
     episode_columns,
     is_archive,
@@ -90,7 +90,7 @@ def test_a_studys_runs_have_names_like_any_of_its_patterns():
         ("more", (6, 7), (2, 3), "holds"),  # +50, error 6.3 points
         ("less", (6, 7), (2, 3), "contradicted"),
         ("less", (2, 3), (6, 7), "holds"),
-        ("more", (2, 8), (3, 4), results.UNSEEN),
+        ("more", (2, 8), (3, 4), UNSEEN),
         ("more", (6,), (2, 3), "can't be tested"),
         ("more", (), (2, 3), "can't be tested"),
     ],
@@ -127,9 +127,9 @@ def test_primary_contrasts_are_corrected_together_and_others_are_not():
     ("value", "error", "verdict"),
     [
         (0.01, 0.01, "holds"),  # 90 % interval inside ±0.05
-        (0.01, 0.05, results.UNSEEN),
+        (0.01, 0.05, UNSEEN),
         (0.2, 0.01, "contradicted"),  # all of it beyond the margin
-        (0.07, 0.02, results.UNSEEN),
+        (0.07, 0.02, UNSEEN),
     ],
 )
 def test_alike_means_within_the_margin(value, error, verdict):

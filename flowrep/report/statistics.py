@@ -19,6 +19,8 @@ from scipy import stats
 Array = NDArray[np.float64]
 
 LEVEL = 0.05  # of tests; intervals cover 1 - LEVEL
+UNSEEN = "not seen with this recipe"
+_CLAIMED = {"more": "higher", "less": "lower"}
 
 
 class Estimate(NamedTuple):
@@ -68,6 +70,21 @@ class Effect(NamedTuple):
         if p_value >= LEVEL:
             return "not seen"
         return "higher" if self.value > 0 else "lower"
+
+    def verdict_on(self, expect: str, p_value: float, p_against: float) -> str:
+        """Returns whether a claim "holds", is "contradicted", `UNSEEN` or "can't be tested".
+
+        Args:
+            expect: what is claimed of the difference: "more" or "less" than 0, or "equal".
+            p_value: corrected p of the claim's test; `p_within` the margin for "equal".
+            p_against: corrected p `p_beyond` the margin, which contradicts "equal".
+        """
+        if np.isnan(p_value):
+            return "can't be tested"
+        if p_value >= LEVEL:
+            return "contradicted" if expect == "equal" and p_against < LEVEL else UNSEEN
+        holds = expect == "equal" or self.verdict(p_value) == _CLAIMED[expect]
+        return "holds" if holds else "contradicted"
 
 
 def effect(scenes: Sequence[Sequence[Array]]) -> Effect:
