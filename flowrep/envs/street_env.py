@@ -180,7 +180,7 @@ class StreetEnv(gym.Env):
         if vehicle_speed_mps is None:
             vehicle_speed_mps = self.scene.vehicle.speed_mps
         if not 0 <= vehicle_speed_mps < math.inf:
-            raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 to stand")
+            raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 for rest")
         self._episode = Episode(
             self._street.layout,
             checked_frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),

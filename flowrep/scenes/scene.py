@@ -228,7 +228,7 @@ class PedestrianGroup(Part):
 
     def __post_init__(self) -> None:
         if self.standing > self.count:
-            raise ValueError("standing is more than count")
+            raise ValueError("give a standing of at most count")
 
 
 @dataclass(frozen=True)
