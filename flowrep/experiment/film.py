@@ -90,7 +90,6 @@ class Film:
             context: dict[str, Any] = {
                 "intrinsics": torch.from_numpy(self.street.K),
                 "num_classes": self.street.num_classes,
-                "dt_s": 1.0 / self.street.frame_rate_hz,
             }
             self.env.append_transform(representation_stack(exact, **context))
         self.framed = [name for name in read if name in self.tiles]
@@ -191,8 +190,7 @@ class Film:
         if "range_m" in options:  # 1 is at or beyond the range, as the sky is
             return lambda depth: torch.where(depth < 1, depth * options["range_m"], torch.inf)
         if name in FLOWS:
-            dt_s = 1.0 / self.street.frame_rate_hz if options["unit"] == "px_per_s" else 1.0
-            return lambda flow: flow * (dt_s / options["scale"])
+            return lambda flow: flow / options["scale"]
         return lambda values: values
 
     def _add_tiles(self, name: str) -> None:

@@ -195,13 +195,6 @@ def test_options_of_a_representation_reach_its_transform(make):
     assert (near < 1).any()
 
 
-def test_a_reset_cannot_change_the_seconds_of_flow_in_px_per_s(make):
-    options = {"frame_rate_hz": 6.0}
-    make(representations=["obj"]).reset(options=options)  # in px a step
-    with pytest.raises(ValueError, match="another env, with frame_rate_hz=6"):
-        make(representations={"obj": {"unit": "px_per_s"}}).reset(options=options)
-
-
 def test_an_episode_that_ends_begins_anew_alone(make):
     env = make(representations=["seg"], num_envs=3, seed=1)
     # The first turns off the road within 20 steps; the others go straight on.
