@@ -19,7 +19,6 @@ from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord, outcome_shares
 from flowrep.files import replace_file
-from flowrep.palette import OUTCOME_COLOURS
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import representation_stack
@@ -33,7 +32,7 @@ from flowrep.viz import (
     stock_tiles,
     write_video,
 )
-from flowrep.viz.maps import class_legend, resized, text_bar, tile_zoom
+from flowrep.viz.maps import OUTCOME_COLOURS, class_legend, resized, text_bar, tile_zoom
 from flowrep.viz.overlay import legend_strip, steering, with_steering
 
 LEGEND_S, OUTCOME_S = 3.0, 1.0

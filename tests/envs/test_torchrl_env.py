@@ -24,8 +24,8 @@ from flowrep.envs import (
     street_envs,
 )
 from flowrep.envs.sensing import SENSORS
-from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import SceneError, load_scene
+from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.transforms import Depth, FlowFactorize, RawFlow
 
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}

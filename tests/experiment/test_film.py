@@ -9,8 +9,8 @@ pytest.importorskip("pybullet", reason="the simulated street is driven")
 
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import LEGEND_S, Film, draw_learning_curve, record_episode
-from flowrep.palette import OUTCOME_COLOURS
 from flowrep.transforms import Depth, stack
+from flowrep.viz import OUTCOME_COLOURS
 from tests.config.composing import composed
 
 FRAME_COLOUR = (230, 97, 1)
