@@ -178,7 +178,6 @@ class FlowOptions(Options):
     """Options of raw, ego and object flow."""
 
     scale: float
-    unit: Literal["px_per_step", "px_per_s"]
 
 
 class StackedSegmentationOptions(SegmentationOptions):

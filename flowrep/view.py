@@ -24,8 +24,8 @@ from flowrep.config import UsageError
 from flowrep.config.cli import folder_name, run_command
 from flowrep.config.schema import ViewConfig
 from flowrep.files import replace_files
-from flowrep.palette import CATEGORY_ID
 from flowrep.progress import progress_bar
+from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.tables import write_rows
 from flowrep.viz import contact_sheet, write_png, write_video
 

@@ -18,19 +18,17 @@ FLOWREP_IMPORTS_ALLOWED = {
     "diagnosis": {"diagnosis", "geometry"},
     "agent": {"agent", "extras", "files", "options"},
     "files": set(),
-    "palette": set(),
-    "scenes": {"scenes", "config", "extras", "palette"},
-    "simulator": {"simulator", "scenes", "palette", "extras"},
-    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "palette", "extras"}
-    | {"progress"},
+    "scenes": {"scenes", "config", "extras"},
+    "simulator": {"simulator", "scenes", "extras"},
+    "envs": {"envs", "simulator", "scenes", "transforms", "geometry", "extras"} | {"progress"},
     "pybullet": {"simulator", "extras"},
     "baselines": {"baselines", "envs", "scenes"},
     "experiment": {"experiment", "baselines", "envs", "simulator", "scenes", "agent"}
-    | {"transforms", "geometry", "palette", "progress", "tables", "config", "extras", "viz"}
+    | {"transforms", "geometry", "progress", "tables", "config", "extras", "viz"}
     | {"files", "options"},
     "progress": set(),
     "tables": {"files"},
-    "viz": {"viz", "scenes", "geometry", "palette"},
+    "viz": {"viz", "scenes", "geometry"},
     "sequences": {"sequences", "config", "progress", "tables", "extras"}
     | {"transforms", "geometry", "viz", "diagnosis"},
     "config": {"config", "options"},

@@ -11,10 +11,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from flowrep.palette import CATEGORY_ID
 from flowrep.scenes.layout import Layout
 from flowrep.scenes.pedestrians import Crowd, draw_crowd
-from flowrep.scenes.scene import Range, Scene
+from flowrep.scenes.scene import CATEGORIES, CATEGORY_ID, Range, Scene
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState, footprint_corners, roll, turn
 from flowrep.simulator.street import Street
 
@@ -44,7 +43,7 @@ def reward(outcome: Outcome) -> float:
 
 def hit_name(code: int) -> str:
     """Returns the category of a code of `hit`, or "" for nothing."""
-    return "" if code == NOTHING_HIT else [*CATEGORY_ID][code]
+    return "" if code == NOTHING_HIT else CATEGORIES[code]
 
 
 Array = NDArray[Any]

@@ -1,6 +1,5 @@
 """Representations as plain numpy maps, for gymnasium learners without TorchRL."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -15,7 +14,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from flowrep.envs.episode import Outcome
 from flowrep.envs.street_env import StreetEnv
-from flowrep.envs.torchrl_env import check_rate, sensors_read
+from flowrep.envs.torchrl_env import sensors_read
 from flowrep.scenes.scene import Scene
 from flowrep.transforms import representation_stack
 from flowrep.transforms.flow import Intrinsics
@@ -36,7 +35,6 @@ class RepresentationObservation(gym.Wrapper):
         representations: names, or a mapping from name to options.
         intrinsics: K `[3, 3]` of the maps; the env's `K` by default.
         num_classes: the number of semantic classes; the env's `num_classes` by default.
-        dt_s: seconds a step; 1 over the env's `frame_rate_hz` by default.
 
     Raises:
         ValueError: the observation is no dict, or a representation needs what neither the env nor
@@ -57,7 +55,6 @@ class RepresentationObservation(gym.Wrapper):
         joined: bool = True,
         intrinsics: Intrinsics | None = None,
         num_classes: int | None = None,
-        dt_s: float | None = None,
     ) -> None:
         super().__init__(env)
         self.names = tuple(representations)
@@ -67,21 +64,15 @@ class RepresentationObservation(gym.Wrapper):
             intrinsics = torch.from_numpy(inner.K)
         if num_classes is None:
             num_classes = getattr(inner, "num_classes", None)
-        if dt_s is None and hasattr(inner, "frame_rate_hz"):
-            dt_s = 1.0 / inner.frame_rate_hz
-        self._frame_rate_hz = 1.0 / dt_s if dt_s else math.nan  # unknown; then no flow is in px/s
         asked = _onehot(representations) if joined else representations
-        self._stack = representation_stack(
-            asked, intrinsics=intrinsics, num_classes=num_classes, dt_s=dt_s
-        )
+        self._stack = representation_stack(asked, intrinsics=intrinsics, num_classes=num_classes)
         self._now = TensorDict()
         self.observation_space = self._space(env.observation_space)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Maps, dict[str, Any]]:
-        """Begins an episode, with a frame rate of its own unless flow is in px/s."""
-        check_rate(self._stack, options, self._frame_rate_hz)
+        """Begins an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         # TorchRL's entry points of a transform, called as its TransformedEnv calls them.
         sensed = _sensed(observation)
@@ -164,8 +155,8 @@ def make_street(
         options: further arguments of `StreetEnv`.
     """
     if representations and "sensors" not in options:
-        # Which sensors are read doesn't depend on K, the number of classes or the frame rate.
-        any_camera: dict[str, Any] = {"intrinsics": torch.eye(3), "num_classes": 1, "dt_s": 1.0}
+        # Which sensors are read doesn't depend on K and the number of classes.
+        any_camera: dict[str, Any] = {"intrinsics": torch.eye(3), "num_classes": 1}
         options["sensors"] = sensors_read(representation_stack(representations, **any_camera))
     env: gym.Env = StreetEnv(scene, **options)
     if representations or truncate_timeouts:

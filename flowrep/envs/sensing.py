@@ -9,11 +9,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from flowrep.envs.episode import Episode, Moment
-from flowrep.palette import CLASS_COLOURS, num_classes
 from flowrep.scenes.pedestrians import PARTS, world_from_parts
+from flowrep.scenes.scene import num_classes
 from flowrep.simulator import camera
 from flowrep.simulator.bullet import Picture
 from flowrep.simulator.motion import instance_motion, planar, relative_motion, rigid_inverse
+from flowrep.simulator.paint import SKY
 from flowrep.simulator.street import Street
 
 Array = NDArray[Any]
@@ -151,7 +152,7 @@ class Sensing:
         depth[is_sky] = np.inf
         semantic, instance = np.moveaxis(self._ids_by_number[picture.body], -1, 0)
         rgb = picture.rgba[..., :3].transpose(2, 0, 1).copy()
-        rgb[:, is_sky] = np.array(CLASS_COLOURS["sky"])[:, None]
+        rgb[:, is_sky] = np.array(SKY)[:, None]
         maps = {"depth": depth, "semantic": semantic, "instance": instance}
         return {name: array[None] for name, array in maps.items()} | {"rgb": rgb}
 

@@ -11,9 +11,8 @@ from gymnasium import spaces
 
 from flowrep.envs.episode import Episode, Moment, Outcome, reward
 from flowrep.envs.sensing import SENSORS, Sensing
-from flowrep.palette import num_classes
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import FRAME_RATES_HZ, Range, Scene, SpeedMode
+from flowrep.scenes.scene import FRAME_RATES_HZ, Range, Scene, SpeedMode, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN, VehicleState
 from flowrep.simulator.street import Street
 
@@ -30,7 +29,7 @@ class StreetEnv(gym.Env):
     | key | shape | dtype | meaning |
     | --- | --- | --- | --- |
     | `depth` | [1, H, W] | float32 | metres along z; sky is inf |
-    | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.palette` |
+    | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.scenes.scene.CATEGORY_ID` |
     | `instance` | [1, H, W] | uint8 | 0: static world; 1, 2, 3: first person's body and legs, ... |
     | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
     | `instance_motion` | [1 + 3·P, 4, 4] | float32 | the same by instance; row 0: static world |
@@ -180,7 +179,7 @@ class StreetEnv(gym.Env):
         if vehicle_speed_mps is None:
             vehicle_speed_mps = self.scene.vehicle.speed_mps
         if not 0 <= vehicle_speed_mps < math.inf:
-            raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 to stand")
+            raise ValueError(f"vehicle_speed_mps is {vehicle_speed_mps}; give m/s, 0 for rest")
         self._episode = Episode(
             self._street.layout,
             checked_frame_rate(self.scene, options.get("frame_rate_hz", self.frame_rate_hz)),

@@ -1,6 +1,5 @@
 """TorchRL environments of streets, with the transforms that write representations."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,9 +15,8 @@ from flowrep.envs.sensing import SENSORS
 from flowrep.envs.street_env import StreetEnv, checked_frame_rate
 from flowrep.envs.vector_env import StreetVectorEnv
 from flowrep.envs.workers import WorkerVectorEnv, available_cores
-from flowrep.palette import num_classes
 from flowrep.scenes.load import load_scene
-from flowrep.scenes.scene import Range, Scene, SpeedMode
+from flowrep.scenes.scene import Range, Scene, SpeedMode, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer, sensor_intrinsics
 from flowrep.transforms import Mirror, representation_stack
@@ -44,38 +42,18 @@ def sensors_read(transforms: Iterable[Any]) -> list[str]:
     return [name for name in SENSORS if ("sensor", name) in keys]
 
 
-def check_rate(
-    transforms: Iterable[Any], options: Mapping[str, Any] | None, frame_rate_hz: float
-) -> None:
-    """Raises ValueError for a reset to another frame rate than flow in px/s was set up for."""
-    asked = (options or {}).get("frame_rate_hz")
-    if asked is None or not any(getattr(t, "is_per_second", False) for t in transforms):
-        return
-    if not math.isclose(float(asked), frame_rate_hz):
-        raise ValueError(
-            f"flow in px_per_s was set up for {frame_rate_hz:g} frames a second, not {asked}: make "
-            f"another env, with frame_rate_hz={asked}"
-        )
-
-
 class VectorWrapper(GymWrapper):
-    """TorchRL's wrapper; reset masks are optional and moved to the CPU, reset options checked."""
+    """TorchRL's wrapper; reset masks are optional, and moved to the CPU."""
 
     def __init__(
         self,
         env: VectorEnv,
         scene: Scene,
         frame_rate_hz: float,
-        transforms: Iterable[Any],
         **kwargs: Any,
     ) -> None:
         super().__init__(env, **kwargs)
         self.scene, self.frame_rate_hz = scene, frame_rate_hz
-        self._transforms = [*transforms]
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        check_rate(self._transforms, kwargs.get("options"), self.frame_rate_hz)
-        return super()._reset(tensordict, **kwargs)
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
         # TorchRL 0.14 passes masks on from the TensorDict's device, which fails on CUDA, and
@@ -158,7 +136,6 @@ def make_env(
             representations,
             intrinsics=torch.from_numpy(sensor_intrinsics(loaded.camera)),
             num_classes=num_classes(loaded.categories),
-            dt_s=1.0 / frame_rate_hz,
             compiled=compiled,
             flow=flow,
             motion=motion,
@@ -176,7 +153,6 @@ def make_env(
         else StreetVectorEnv(factories),
         loaded,
         frame_rate_hz,
-        transforms,
         device=device,
         categorical_action_encoding=True,
     )

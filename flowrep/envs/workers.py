@@ -74,8 +74,8 @@ class WorkerVectorEnv(VectorEnv):
         self.num_envs, self.num_workers = len(env_factories), num_workers
         if not 1 <= num_workers <= self.num_envs:
             raise ValueError(
-                f"num_workers is {num_workers} for {self.num_envs} environments; give each worker "
-                "one at least"
+                f"num_workers is {num_workers} for {self.num_envs} environments; give at "
+                "most one worker for each"
             )
         self.autoreset_mode = AutoresetMode.DISABLED
         example = in_each(env_factories[:1])
@@ -213,7 +213,7 @@ class _Worker:
                 pid = self.process.pid
                 raise WorkerError(
                     f"the worker process of {self.name} has not answered for {waited:.0f} s: if "
-                    f"process {pid} is suspended, 'kill -CONT {pid}' lets it go on"
+                    f"process {pid} is suspended, resume it with 'kill -CONT {pid}'"
                 )
         return self.pipe.recv()
 
@@ -223,9 +223,9 @@ class _Worker:
         except (EOFError, OSError) as error:
             self.process.join(timeout=1.0)
             code = self.process.exitcode
-            why = "perhaps the system killed it for want of memory"
+            why = "perhaps the system killed it because memory ran out"
             if code != -signal.SIGKILL:
-                why = "what it printed says why"
+                why = "its last output says why"
             raise WorkerError(
                 f"the worker process of {self.name} is gone (exit code {code}): {why}"
             ) from error

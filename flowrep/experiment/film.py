@@ -19,7 +19,6 @@ from flowrep.envs import street_envs
 from flowrep.experiment.evaluation import Driver, evaluate
 from flowrep.experiment.outcomes import EpisodeRecord, outcome_shares
 from flowrep.files import replace_file
-from flowrep.palette import OUTCOME_COLOURS
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import representation_stack
@@ -33,7 +32,7 @@ from flowrep.viz import (
     stock_tiles,
     write_video,
 )
-from flowrep.viz.maps import class_legend, resized, text_bar, tile_zoom
+from flowrep.viz.maps import OUTCOME_COLOURS, class_legend, resized, text_bar, tile_zoom
 from flowrep.viz.overlay import legend_strip, steering, with_steering
 
 LEGEND_S, OUTCOME_S = 3.0, 1.0
@@ -90,7 +89,6 @@ class Film:
             context: dict[str, Any] = {
                 "intrinsics": torch.from_numpy(self.street.K),
                 "num_classes": self.street.num_classes,
-                "dt_s": 1.0 / self.street.frame_rate_hz,
             }
             self.env.append_transform(representation_stack(exact, **context))
         self.framed = [name for name in read if name in self.tiles]
@@ -191,8 +189,7 @@ class Film:
         if "range_m" in options:  # 1 is at or beyond the range, as the sky is
             return lambda depth: torch.where(depth < 1, depth * options["range_m"], torch.inf)
         if name in FLOWS:
-            dt_s = 1.0 / self.street.frame_rate_hz if options["unit"] == "px_per_s" else 1.0
-            return lambda flow: flow * (dt_s / options["scale"])
+            return lambda flow: flow / options["scale"]
         return lambda values: values
 
     def _add_tiles(self, name: str) -> None:

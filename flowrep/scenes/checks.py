@@ -9,10 +9,10 @@ from typing import Any
 
 import shapely
 
-from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import pedestrians
 from flowrep.scenes.layout import Layout, centreline, free_ground
 from flowrep.scenes.scene import (
+    CATEGORY_ID,
     CATEGORY_OF_KIND,
     BuildingRow,
     ObstacleRow,

@@ -17,6 +17,13 @@ SpeedMode = Literal["low", "normal", "high"]
 Kind = Literal["house", "tree", "fence", "car", "traffic_light", "lamp_post"]
 Range = tuple[float, float]
 
+CATEGORIES = (
+    "sky", "road", "sidewalk", "building", "pedestrian", "terrain", "crosswalk", "tree", "fence",
+    "car", "traffic_light",
+)  # fmt: skip
+CATEGORY_ID: dict[str, int] = {name: number for number, name in enumerate(CATEGORIES)}
+"""The semantic classes and their ids; `flowrep.viz.CLASS_COLOURS` has their colours."""
+
 # The semantic class of each kind: lamp posts share that of buildings.
 CATEGORY_OF_KIND: dict[Kind, str] = {kind: kind for kind in get_args(Kind)}
 CATEGORY_OF_KIND |= {"house": "building", "lamp_post": "building"}
@@ -26,6 +33,15 @@ LEAST_HEIGHT_M: dict[Kind, float] = {"car": 0.7, "traffic_light": 1.0, "lamp_pos
 
 class SceneError(ValueError):
     """An invalid scene; the message names the file, the key, the problem and the remedy."""
+
+
+def num_classes(categories: Sequence[str]) -> int:
+    """Returns how many ids a semantic map of these categories needs (largest id plus one).
+
+    >>> num_classes(("sky", "road", "sidewalk", "building", "pedestrian"))
+    5
+    """
+    return 1 + max(CATEGORY_ID[name] for name in categories)
 
 
 def _in_order(bounds: Range) -> Range:
@@ -228,7 +244,7 @@ class PedestrianGroup(Part):
 
     def __post_init__(self) -> None:
         if self.standing > self.count:
-            raise ValueError("standing is more than count")
+            raise ValueError("give a standing of at most count")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.palette import CATEGORY_ID, CLASS_COLOURS
+from flowrep.scenes.scene import CATEGORY_ID
 
 SIZE_PX = 256  # a side of the texture
 _SWATCH_PX = 8
@@ -32,8 +32,9 @@ _COARSEST_WAVES = 5  # over the grain's size: 4 m on roads
 # road's error, and contrasts of 1 raise that of people.
 _CONTRAST_OF = {"road": 0.3, "crosswalk": 0.3, "sidewalk": 0.2, "terrain": 0.3, "tree": 0.3}
 _CONTRAST_OF |= {"pedestrian": 0.3, "building": 0.12, "fence": 0.2}
-_CONTRAST = [_CONTRAST_OF.get(name, 0.1) for name in CLASS_COLOURS]  # by class
+_CONTRAST = [_CONTRAST_OF.get(name, 0.1) for name in CATEGORY_ID]  # by class
 
+SKY = (112, 178, 232)  # where nothing is; that of maps in `flowrep.viz` too
 PAINTS: dict[str, tuple[int, int, int]] = {
     "asphalt": (84, 84, 90),
     "lane_mark": (226, 222, 206),

@@ -14,13 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrep.extras import compiled
-from flowrep.palette import CLASS_COLOURS
 from flowrep.simulator import paint
 from flowrep.simulator.meshes import Triangles
-from flowrep.simulator.paint import AMBIENT, DIFFUSE, FRONT_SIZE, GRAIN_SIZE, LIGHT
+from flowrep.simulator.paint import AMBIENT, DIFFUSE, FRONT_SIZE, GRAIN_SIZE, LIGHT, SKY
 
 _LEAST_AREA_PX = 0.01  # twice the area below which PyBullet's renderer omits triangles
-_SKY = CLASS_COLOURS["sky"]
 _GRAIN_LEVELS = GRAIN_SIZE.bit_length() - 1
 _FRONT_LEVELS = FRONT_SIZE.bit_length()
 _NO_TABLES = np.empty((0, 0, 2), np.float32), np.empty((0, 0, 0, 3), np.float32)
@@ -277,7 +275,7 @@ def _shade(inverse, number, K, cam_from_world, world_from_body, look, rgb):
                 end += 1
             if t < 0:
                 for x in range(begin, end):
-                    rgb[0, y, x], rgb[1, y, x], rgb[2, y, x] = _SKY
+                    rgb[0, y, x], rgb[1, y, x], rgb[2, y, x] = SKY
                 continue
             if t != last:
                 # What a triangle's pixels share: its normal in camera axes, its shade, and the map

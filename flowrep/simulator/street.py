@@ -10,10 +10,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from flowrep.palette import CATEGORY_ID, CLASS_COLOURS
 from flowrep.scenes import pedestrians
 from flowrep.scenes.layout import Box, Layout
-from flowrep.scenes.scene import Scene
+from flowrep.scenes.scene import CATEGORIES, CATEGORY_ID, Scene
 from flowrep.scenes.vehicle import VehicleState
 from flowrep.simulator import meshes
 from flowrep.simulator.bullet import Simulator
@@ -21,7 +20,6 @@ from flowrep.simulator.meshes import Body, Mesh, gather, person_meshes
 from flowrep.simulator.paint import texture
 
 Array = NDArray[Any]
-_CATEGORIES = tuple(CLASS_COLOURS)  # by class id
 _TWO_LANES_M = 5.0  # narrower roads have no lane marks
 _HIDDEN_M = -1000.0  # height of bodies that are not there, out of reach of camera and vehicle
 _SAFE_CELL_M = 0.25  # side of a cell of the table below
@@ -144,7 +142,7 @@ class Street:
         is_near &= self.is_shown(closures)[self._owners]
         for body in dict.fromkeys(self._owners[is_near].tolist()):
             if simulator.touch(self._vehicle, self._numbers[body]):
-                return _CATEGORIES[self.bodies[body].semantic]
+                return CATEGORIES[self.bodies[body].semantic]
         return ""
 
     def _add_ground(self, layout: Layout) -> None:

@@ -221,7 +221,7 @@ class EstimatedFlow(FlowTransform):
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
-    | `"rgb2"`, uint8 `[*B,6,kH,kW]` | `"raw"` | float32 `[*B, 2, H, W]` | any | `unit` × `scale` |
+    | `"rgb2"`, uint8 `[*B,6,kH,kW]` | `"raw"` | float32 `[*B, 2, H, W]` | any | px/step × `scale` |
     | with `intrinsics`: | `"unscaled"` if chosen | as above | any | px/step |
     | `("sensor", "depth")`, m | `"raw_valid"`, `"unscaled_valid"` | bool `[*B, 1, H, W]` | | |
     | `("sensor", "prev_from_curr")` | | | | |
@@ -254,7 +254,7 @@ class EstimatedFlow(FlowTransform):
             None leaves the pictures as they are.
         picture_scale: k, size of the pictures in sizes of the maps.
         outputs: which of `"raw"` and `"unscaled"` to write.
-        scale: factor on raw; for raw's `unit` and for `dt_s` and `out_keys` see `RawFlow`.
+        scale: factor on raw; for `out_keys` see `RawFlow`.
         in_keys: the pair of pictures; with `intrinsics` also depth and the camera's motion.
 
     Raises:
@@ -288,8 +288,6 @@ class EstimatedFlow(FlowTransform):
         picture_scale: int = 1,
         outputs: Sequence[str] = ("raw",),
         scale: float = 1.0,
-        unit: str = "px_per_step",
-        dt_s: float | None = None,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
@@ -298,8 +296,7 @@ class EstimatedFlow(FlowTransform):
             reads, keys = [*reads, base.DEPTH, base.MOTION], [*keys, *EGO_KEYS]
         keys = keys if in_keys is None else in_keys
         scales = {name: scale if name == "raw" else 1.0 for name in outputs}
-        units = {name: unit if name == "raw" else "px_per_step" for name in outputs}
-        options = (outputs, scales, units, dt_s, False, prev_intrinsics)
+        options = (outputs, scales, False, prev_intrinsics)
         super().__init__(intrinsics, reads, keys, out_keys, *options)
         self.estimator = _estimator(estimator, weights, preset, min_side_px)
         if picture_scale < 1:

@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
 from flowrep import geometry
-from flowrep.geometry.checks import check_name, first_wrong
+from flowrep.geometry.checks import first_wrong
 from flowrep.transforms import base
 from flowrep.transforms.base import (
     Keys,
@@ -27,8 +27,6 @@ from flowrep.transforms.base import (
     check_choice,
     flags_of_batch,
 )
-
-Unit = Literal["px_per_step", "px_per_s"]
 
 CAMERA = Reads((3, 3), "float")
 _DEPTH: NestedKey = ("sensor", "depth")
@@ -188,7 +186,7 @@ class CameraTransform(MapTransform):
 
 
 class FlowTransform(CameraTransform):
-    """Base of the flow transforms: K, the chosen outputs, their scale and unit.
+    """Base of the flow transforms: K, the chosen outputs, and their scale.
 
     A subclass names the outputs that it can write (`known`), and those of them that get a mask
     beside them, under `mask_key` (`masked`). For the arguments see `RawFlow`.
@@ -205,8 +203,6 @@ class FlowTransform(CameraTransform):
         out_keys: Keys | None,
         outputs: Sequence[str],
         scale: float | Mapping[str, float],
-        unit: str | Mapping[str, str],
-        dt_s: float | None,
         compiled: bool = False,
         prev_intrinsics: NestedKey | None = None,
     ) -> None:
@@ -217,10 +213,7 @@ class FlowTransform(CameraTransform):
         self.masks = [mask_key(key) for name, key in zip(outputs, keys) if name in self.masked]
         self.out_keys: list[NestedKey] = [*keys, *self.masks]
         flows = [output for output in outputs if output != "valid"]
-        scales = _per_output("scale", scale, flows)
-        units = _per_output("unit", unit, flows)
-        self.is_per_second = "px_per_s" in units.values()
-        self.factors = {name: _factor(scales[name], units[name], dt_s) for name in flows}
+        self.scales = _scales(scale, flows)
         if compiled:
             _check_compiler()
         self.compiled = bool(compiled)
@@ -236,10 +229,10 @@ class FlowTransform(CameraTransform):
         return maps if len(self.camera_keys) == 2 else [*maps, None]
 
     def _chosen(self, flows: Mapping[str, Tensor], valid: Tensor) -> tuple[Tensor, ...]:
-        """Returns the chosen outputs, flows in their units, and the masks."""
+        """Returns the chosen outputs, flows times their scales, and the masks."""
         scaled = {
-            name: flows[name] if factor == 1.0 else flows[name] * factor
-            for name, factor in self.factors.items()
+            name: flows[name] if scale == 1.0 else flows[name] * scale
+            for name, scale in self.scales.items()
         }
         return (*(scaled.get(name, valid) for name in self.outputs), *[valid] * len(self.masks))
 
@@ -260,7 +253,7 @@ class RawFlow(FlowTransform):
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
-    | `("sensor", "depth")`, m | `"raw"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
+    | `("sensor", "depth")`, m | `"raw"` | float `[*B, 2, H, W]` | any | px/step × `scale` |
     | `("sensor", "instance")` | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
     | `("sensor", "instance_motion")` | `"raw_valid"` | as `"valid"` | | |
 
@@ -280,9 +273,7 @@ class RawFlow(FlowTransform):
             `PreviousIntrinsics`; K needs a key then. Without it, a K that changes within an episode
             raises ValueError. (A replay sample of single frames doesn't show that it changes.)
         outputs: which of `"raw"` and `"valid"` to write.
-        scale: factor on the flow, finite and not 0.
-        unit: `"px_per_step"` or `"px_per_s"`.
-        dt_s: duration of a step in seconds; needed only for `"px_per_s"`.
+        scale: factor on the flow, finite and not 0; the frame rate gives pixels per second.
         compiled: whether `compute` runs through `torch.compile`, which is about five times as fast
             on a CPU and equal up to rounding. Compiling takes up to a minute; later processes find
             the result in torch's cache. Otherwise numba, if it is installed, computes large float32
@@ -322,15 +313,13 @@ class RawFlow(FlowTransform):
         prev_intrinsics: NestedKey | None = None,
         outputs: Sequence[str] = ("raw",),
         scale: float = 1.0,
-        unit: str = "px_per_step",
-        dt_s: float | None = None,
         compiled: bool = False,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
         reads = [base.DEPTH, base.IDS, base.MOTIONS]
         keys = _RAW_KEYS if in_keys is None else in_keys
-        options = (outputs, scale, unit, dt_s, compiled, prev_intrinsics)
+        options = (outputs, scale, compiled, prev_intrinsics)
         super().__init__(intrinsics, reads, keys, out_keys, *options)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
@@ -356,8 +345,8 @@ class FlowFactorize(FlowTransform):
 
     | reads | writes | shape | range | unit |
     | --- | --- | --- | --- | --- |
-    | `"raw"`, px/step | `"ego"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
-    | `("sensor", "depth")`, m | `"obj"` | float `[*B, 2, H, W]` | any | `unit` × `scale` |
+    | `"raw"`, px/step | `"ego"` | float `[*B, 2, H, W]` | any | px/step × `scale` |
+    | `("sensor", "depth")`, m | `"obj"` | float `[*B, 2, H, W]` | any | px/step × `scale` |
     | `("sensor", "prev_from_curr")` | `"raw"` if chosen | as above | any | as above |
     | `"raw_valid"`, if there | `"valid"` if chosen | bool `[*B, 1, H, W]` | | |
 
@@ -372,11 +361,10 @@ class FlowFactorize(FlowTransform):
 
     Args:
         intrinsics: K `[3, 3]` of the maps, or its key; see `RawFlow`, as for `prev_intrinsics`.
-        outputs: which of `"ego"`, `"obj"`, `"raw"` (raw flow in the chosen unit, 0 where it isn't
+        outputs: which of `"ego"`, `"obj"`, `"raw"` (raw flow times its scale, 0 where it isn't
             finite) and `"valid"` to write. For ego alone, raw flow isn't read.
         scale: factor on the flows, or a mapping from output to factor.
-        unit: `"px_per_step"` or `"px_per_s"`, or a mapping from output to unit; for `dt_s` and
-            `compiled` see `RawFlow`.
+        compiled: see `RawFlow`.
         in_keys: raw flow (in px/step, unscaled), depth and camera motion; without raw flow for ego
             alone.
         out_keys: one key for each output; their names by default.
@@ -408,8 +396,6 @@ class FlowFactorize(FlowTransform):
         prev_intrinsics: NestedKey | None = None,
         outputs: Sequence[str] = ("ego", "obj"),
         scale: float | Mapping[str, float] = 1.0,
-        unit: str | Mapping[str, str] = "px_per_step",
-        dt_s: float | None = None,
         compiled: bool = False,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
@@ -419,7 +405,7 @@ class FlowFactorize(FlowTransform):
         if {"obj", "raw"} & set(outputs):
             reads, keys = [base.FLOW, *reads], ["raw", *EGO_KEYS]
         keys = keys if in_keys is None else in_keys
-        options = (outputs, scale, unit, dt_s, compiled, prev_intrinsics)
+        options = (outputs, scale, compiled, prev_intrinsics)
         super().__init__(intrinsics, reads, keys, out_keys, *options)
 
     def compute(self, *maps: Tensor) -> tuple[Tensor, ...]:
@@ -458,23 +444,15 @@ def mask_key(flow: NestedKey) -> NestedKey:
     return (*path, f"{name}_valid") if path else f"{name}_valid"
 
 
-def _per_output(option: str, value: object, flows: Sequence[str]) -> dict[str, Any]:
-    if not isinstance(value, Mapping):
-        return dict.fromkeys(flows, value)
-    if set(value) != set(flows):
-        raise ValueError(f"{option} needs one value for each of {list(flows)}, got {dict(value)}")
-    return dict(value)
-
-
-def _factor(scale: float, unit: str, dt_s: float | None) -> float:
-    check_name("unit", unit, Unit)
-    if not math.isfinite(scale) or scale == 0.0:
-        raise ValueError(f"scale must be a finite number other than 0, got {scale}")
-    if unit == "px_per_step":
-        return float(scale)
-    if dt_s is None or not dt_s > 0:
-        raise ValueError(f"unit 'px_per_s' needs dt_s, the seconds that a step lasts; got {dt_s}")
-    return scale / dt_s
+def _scales(scale: float | Mapping[str, float], flows: Sequence[str]) -> dict[str, float]:
+    """Returns the factor of each flow; raises ValueError if one is missing, 0 or not finite."""
+    scales = scale if isinstance(scale, Mapping) else dict.fromkeys(flows, scale)
+    if set(scales) != set(flows):
+        raise ValueError(f"scale needs one value for each of {list(flows)}, got {dict(scales)}")
+    for factor in scales.values():
+        if not math.isfinite(factor) or factor == 0.0:
+            raise ValueError(f"scale must be a finite number other than 0, got {factor}")
+    return {name: float(scales[name]) for name in flows}
 
 
 def as_intrinsics(intrinsics: Tensor | Sequence[Sequence[float]]) -> Tensor:

@@ -269,7 +269,7 @@ class InstanceIds(MapTransform):
                 raise ValueError(
                     f"{self.in_keys[0]!r} holds PyBullet's ids with links, {_named(links[0])} for "
                     "instance, and body_ids has bodies without links: name those that have a pose "
-                    "of their own as (body, link), -1 for the base, or say links_as_body=True"
+                    "of their own as (body, link), -1 for the base, or set links_as_body=True"
                 )
         shares = [f"{_named(n)} ({count / ids.numel():.1%})" for n, count in zip(numbers, counts)]
         warnings.warn(

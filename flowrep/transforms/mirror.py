@@ -87,8 +87,8 @@ class Mirror(Transform):
         actions = torch.arange(len(swapped))
         if sorted(swapped.tolist()) != actions.tolist() or not swapped[swapped].equal(actions):
             raise ValueError(
-                "swapped_actions gives each action's mirror image, and the image's is the action "
-                f"again; got {swapped.tolist()}"
+                "swapped_actions must exchange actions in pairs, or map one to itself; got "
+                f"{swapped.tolist()}"
             )
         check_name("images", images, Images)
         self.register_buffer("swapped_actions", swapped, persistent=False)

@@ -21,7 +21,7 @@ from flowrep.transforms.noise import SENSORS, SensorNoise
 FLOW_SOURCES = MOTION_SOURCES = ("exact", "estimated")
 NOISE_OPTIONS = SENSORS["depth"].options + SENSORS["motion"].options
 _ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px", "picture_scale")
-_FLOW_OPTIONS = ("scale", "unit")
+_FLOW_OPTIONS = ("scale",)
 
 
 class _Representation(NamedTuple):
@@ -83,7 +83,6 @@ def representation_stack(
     intrinsics: Intrinsics | None = None,
     prev_intrinsics: NestedKey | None = None,
     num_classes: int | None = None,
-    dt_s: float | None = None,
     compiled: bool = False,
     flow: str | Mapping[str, Any] = "exact",
     motion: str = "exact",
@@ -103,7 +102,6 @@ def representation_stack(
         intrinsics: K `[3, 3]` of the sensor maps in pixels, or its key; raw, ego and obj need it,
             except for estimated raw flow. For `prev_intrinsics` see `RawFlow`.
         num_classes: number of semantic classes; seg and seg2 need it.
-        dt_s: duration of a step in seconds; flow in `px_per_s` needs it.
         compiled: whether flow is computed through `torch.compile`, see `RawFlow`.
         flow: source of raw flow, and thus of obj: `"exact"` (`RawFlow`), `"estimated"`
             (`EstimatedFlow`, from `("sensor", "rgb")`, compensated for the camera's motion if obj
@@ -134,7 +132,7 @@ def representation_stack(
     _check_known("source of motion", [motion], MOTION_SOURCES)
     transforms, keys = _noise_transforms(noise, chosen, reads_motion=motion == "exact")
     transforms += _map_transforms(chosen, num_classes, keys["depth"])
-    context = {"dt_s": dt_s, "compiled": compiled}
+    context = {"compiled": compiled}
     if motion == "estimated" and not {"ego", "obj"}.isdisjoint(flows):
         keys["motion"] = _ESTIMATED_MOTION_KEY
     camera = {"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics}
@@ -268,7 +266,7 @@ def _flow_transforms(
     if estimator is not None and ("raw" in flows or needs_unscaled):
         unscaled = _ESTIMATED_FLOW_KEY
         written = {"unscaled": unscaled} | ({"raw": "raw"} if "raw" in flows else {})
-        options: dict[str, Any] = factors.pop("raw", {}) | {"dt_s": context["dt_s"]}
+        options: dict[str, Any] = dict(factors.pop("raw", {}))
         options |= {"outputs": list(written), "out_keys": list(written.values())}
         transforms = [FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])]
         if "obj" in flows:
@@ -306,7 +304,6 @@ def _flow_transforms(
             **camera,
             outputs=list(factors),
             scale={name: options["scale"] for name, options in factors.items()},
-            unit={name: options["unit"] for name, options in factors.items()},
             in_keys=[*raw, keys["depth"], keys["motion"]],
             **context,
         )

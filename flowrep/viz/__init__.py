@@ -1,8 +1,10 @@
 """Pictures of representations, fixed in colour and scale; `flowrep.viz.plan` draws scenes."""
 
 from flowrep.viz.maps import (
+    CLASS_COLOURS,
     DEPTH_RANGE_M,
     FLOW_SCALE_PX,
+    OUTCOME_COLOURS,
     Image,
     Tile,
     classes_to_rgb,
@@ -21,7 +23,8 @@ from flowrep.viz.maps import (
 from flowrep.viz.video import Video, is_playable, write_video
 
 __all__ = [
-    "DEPTH_RANGE_M", "FLOW_SCALE_PX", "Image", "Tile", "Video", "classes_to_rgb", "contact_sheet",
+    "CLASS_COLOURS", "DEPTH_RANGE_M", "FLOW_SCALE_PX", "OUTCOME_COLOURS", "Image", "Tile", "Video",
+    "classes_to_rgb", "contact_sheet",
     "depth_bar", "depth_to_rgb", "flow_note", "flow_to_rgb", "flow_wheel", "grey_to_rgb",
     "is_playable", "representation_strip", "stock_tiles", "strip", "write_png", "write_video",
 ]  # fmt: skip

@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrep.palette import CLASS_COLOURS
-
 Image = NDArray[np.uint8]
 Note = str | Callable[[int], Image]
 
@@ -24,6 +22,29 @@ FLOW_SCALE_PX: dict[str, float] = {"raw": 20.0, "ego": 20.0, "obj": 5.0}
 """Flow magnitude in pixels at which a representation's colour is fully saturated."""
 
 DEPTH_RANGE_M = 100.0
+
+CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
+    "sky": (112, 178, 232),
+    "road": (84, 84, 92),
+    "sidewalk": (196, 176, 160),
+    "building": (150, 84, 60),
+    "pedestrian": (222, 40, 60),
+    "terrain": (112, 158, 74),
+    "crosswalk": (238, 234, 220),
+    "tree": (36, 104, 48),
+    "fence": (214, 148, 70),
+    "car": (46, 64, 196),
+    "traffic_light": (250, 214, 40),
+}
+"""Class name to colour, in the order of the class ids (`flowrep.scenes.scene.CATEGORY_ID`)."""
+
+OUTCOME_COLOURS = {
+    "success": "#0072b2",
+    "collision": "#d55e00",
+    "out_of_bounds": "#cc79a7",
+    "timeout": "#f0c000",
+}
+"""Colour of each outcome in every figure, safe for colour-blind readers (Okabe and Ito)."""
 
 _UNKNOWN = (128, 128, 128)
 # Near to far, like matplotlib's magma_r, which isn't used so that pictures need no matplotlib; the

@@ -17,8 +17,8 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from flowrep.palette import CLASS_COLOURS, OUTCOME_COLOURS
 from flowrep.scenes.layout import Layout
+from flowrep.viz.maps import CLASS_COLOURS, OUTCOME_COLOURS
 
 _WALK_COLOUR = "black"
 _ZONE_COLOURS = {"end": "#56b4e9", "start": "#009e73"}  # starts are drawn last, on top

@@ -15,9 +15,9 @@ from gymnasium.utils.env_checker import check_env
 from flowrep.baselines import Planner
 from flowrep.envs import SCENE_BY_ID
 from flowrep.envs.episode import Moment
-from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
 from flowrep.scenes.layout import Layout, free_ground
+from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.scenes.vehicle import VehicleState
 from flowrep.simulator.meshes import kerb, lane_marks
 

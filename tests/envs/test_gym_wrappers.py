@@ -138,11 +138,3 @@ def test_an_env_of_ones_own_is_wrapped_by_its_camera():
         RepresentationObservation(Wall(), ["raw"], intrinsics=K)
     with pytest.raises(ValueError, match="need intrinsics="):
         RepresentationObservation(Wall(), ["ego"])
-
-
-def test_a_reset_cannot_change_the_seconds_of_flow_in_px_per_s():
-    per_second = {"ego": {"unit": "px_per_s"}}
-    env = gymnasium.make(ID, representations=per_second)
-    env.reset(options={"frame_rate_hz": 12.0})
-    with pytest.raises(ValueError, match="another env, with frame_rate_hz=6"):
-        env.reset(options={"frame_rate_hz": 6.0})

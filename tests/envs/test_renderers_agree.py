@@ -15,8 +15,8 @@ import shapely
 
 from flowrep.envs import StreetEnv
 from flowrep.envs.episode import Moment
-from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import load_scene, scene_names
+from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.scenes.vehicle import VehicleState
 
 MAPS = ("depth", "semantic", "instance")

@@ -24,8 +24,8 @@ from flowrep.envs import (
     street_envs,
 )
 from flowrep.envs.sensing import SENSORS
-from flowrep.palette import CATEGORY_ID
 from flowrep.scenes import SceneError, load_scene
+from flowrep.scenes.scene import CATEGORY_ID
 from flowrep.transforms import Depth, FlowFactorize, RawFlow
 
 NOISE = {"depth_sigma_per_m": 0.01, "depth_dropout": 0.1, "drift_m": 0.05, "drift_rad": 0.01}
@@ -193,13 +193,6 @@ def test_options_of_a_representation_reach_its_transform(make):
     # Half the default range of 100 m in metres: what is 10 m away or more fills the short range.
     assert (near[plain >= 0.1] == 1).all()
     assert (near < 1).any()
-
-
-def test_a_reset_cannot_change_the_seconds_of_flow_in_px_per_s(make):
-    options = {"frame_rate_hz": 6.0}
-    make(representations=["obj"]).reset(options=options)  # in px a step
-    with pytest.raises(ValueError, match="another env, with frame_rate_hz=6"):
-        make(representations={"obj": {"unit": "px_per_s"}}).reset(options=options)
 
 
 def test_an_episode_that_ends_begins_anew_alone(make):

@@ -131,7 +131,7 @@ def test_what_is_not_there_or_damaged_is_named(name, tmp_path):
 
 # 60 degrees up and down 30 rows are 15 / tan(30) = 25.98 pixels of focal length.
 K = [[25.98076, 0.0, 26.5], [0.0, 25.98076, 14.5], [0.0, 0.0, 1.0]]
-OPTIONS = {"ego": {"scale": 1.0, "unit": "px_per_step"}, "seg": {"encoding": "ids"}}
+OPTIONS = {"ego": {"scale": 1.0}, "seg": {"encoding": "ids"}}
 CARD = {
     "maps": [
         {"name": "ego", "shape": [2, 30, 52], "options": OPTIONS["ego"]},
@@ -171,7 +171,7 @@ def test_an_agent_passes_on_its_own_maps_in_any_order(agent):
     check_card(agent, task(["seg", "depth", "ego"]))
 
 
-SCALED = {**OPTIONS, "ego": {"scale": 0.5, "unit": "px_per_step"}}
+SCALED = {**OPTIONS, "ego": {"scale": 0.5}}
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ pytest.importorskip("pybullet", reason="the simulated street is driven")
 
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import LEGEND_S, Film, draw_learning_curve, record_episode
-from flowrep.palette import OUTCOME_COLOURS
 from flowrep.transforms import Depth, stack
+from flowrep.viz import OUTCOME_COLOURS
 from tests.config.composing import composed
 
 FRAME_COLOUR = (230, 97, 1)
@@ -69,13 +69,13 @@ def test_what_the_agent_does_not_read_is_exact(film_of):
 
 
 def test_what_the_agent_reads_is_drawn_in_its_units_and_as_noisy_as_it_is(film_of):
-    options = "representations.obj.scale=0.2", "representations.ego.unit=px_per_s"
+    options = "representations.obj.scale=0.2", "representations.ego.scale=12.0"
     noise = "noise=depth_camera", "noise.depth_dropout=0.2"
     film, seen = film_of("representations=[ego,obj,depth]", *options, *noise), []
     frames, _ = film.drive({"episode_seed": 3}, lambda tensordict: seen.append(tensordict.clone()))
     maps, read = frames[9].maps, seen[9]
     torch.testing.assert_close(maps["obj"], read["obj"][0] * 5.0)
-    torch.testing.assert_close(maps["ego"], read["ego"][0] / 12.0)  # at 12 frames a second
+    torch.testing.assert_close(maps["ego"], read["ego"][0] / 12.0)
     torch.testing.assert_close(maps["depth"], (read["depth"][0] * 100.0).where(
         read["depth"][0] < 1, torch.tensor(torch.inf)
     ))  # fmt: skip

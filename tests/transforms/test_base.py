@@ -33,7 +33,7 @@ TRANSFORMS = {
     "rgb": T.Rgb,
     "raw": lambda: T.RawFlow(INTRINSICS, scale=0.5, outputs=["raw", "valid"]),
     "ego": lambda: T.FlowFactorize(INTRINSICS, outputs=["ego"]),
-    "ego, obj": lambda: T.FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
+    "ego, obj": lambda: T.FlowFactorize(INTRINSICS, scale=10.0),
     "stack": lambda: T.FrameStack(k=3, in_keys=[("sensor", "rgb")], out_keys=["rgb3"]),
 }
 each_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=list(TRANSFORMS))

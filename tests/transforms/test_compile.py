@@ -31,7 +31,7 @@ TRANSFORMS = {
     "onehot": lambda: T.Segmentation(NUM_CLASSES, encoding="onehot"),
     "depth": T.Depth,
     "K under a key": lambda: T.RawFlow(("sensor", "K"), scale=0.5, outputs=["raw", "valid"]),
-    "ego, obj": lambda: T.FlowFactorize(INTRINSICS, unit="px_per_s", dt_s=0.1),
+    "ego, obj": lambda: T.FlowFactorize(INTRINSICS, scale=10.0),
     "ray length": lambda: T.AdaptDepth(
         "ray_length", intrinsics=INTRINSICS, in_keys=("sensor", "depth"), out_keys="z"
     ),

@@ -65,23 +65,21 @@ def test_a_camera_that_slides_right_sees_the_world_go_left_and_a_body_that_rose_
     assert torch.allclose(td["raw"][:, 1, 3], torch.tensor([-2.0, 0.0]))
 
 
-def test_units_and_scales_are_each_output_s_own():
+def test_each_output_has_its_scale():
     td = factors(
         scene(),
         outputs=["raw", "ego", "obj"],
         out_keys=["raw_out", "ego", "obj"],
-        scale={"raw": 1.0, "ego": 0.5, "obj": 3.0},
-        unit={"raw": "px_per_s", "ego": "px_per_step", "obj": "px_per_s"},
-        dt_s=0.25,
+        scale={"obj": 12.0, "raw": 4.0, "ego": 0.5},
     )
-    assert torch.allclose(td["raw_out"][:, 0, 1], torch.tensor([-8.0, -8.0]))  # -2 px / 0.25 s
+    assert torch.allclose(td["raw_out"][:, 0, 1], torch.tensor([-8.0, -8.0]))  # of -2 px
     assert torch.allclose(td["ego"][:, 0, 1], torch.tensor([-1.0, 0.0]))
     assert torch.allclose(td["obj"][:, 0, 1], torch.tensor([0.0, -24.0]))
-    raw = RawFlow(K, unit="px_per_s", dt_s=0.25, scale=0.5)(scene())["raw"]
-    assert torch.allclose(raw[:, 0, 1], torch.tensor([-4.0, -4.0]))
+    raw = RawFlow(K, scale=0.5)(scene())["raw"]
+    assert torch.allclose(raw[:, 0, 1], torch.tensor([-1.0, -1.0]))
 
 
-@pytest.mark.parametrize("options", [{}, {"scale": 3.7, "unit": "px_per_s", "dt_s": 1 / 12}])
+@pytest.mark.parametrize("options", [{}, {"scale": 3.7}])
 def test_object_flow_is_exactly_0_on_what_stands_still(options):
     td = TensorDict({"sensor": frame(env=1, episode=0, step=2)})
     split = FlowFactorize(INTRINSICS, **options)(RawFlow(INTRINSICS)(td))
@@ -206,8 +204,6 @@ def test_ego_alone_reads_no_raw_flow():
         ({"outputs": ["ego", "eggo"]}, r"\['ego', 'obj', 'raw', 'valid'\], each once"),
         ({"outputs": ["ego", "ego"]}, "each once"),
         ({"outputs": "ego"}, "must be a list"),
-        ({"unit": "m_per_s"}, r"\['px_per_step', 'px_per_s'\], got 'm_per_s'"),
-        ({"unit": "px_per_s"}, "needs dt_s"),
         ({"scale": 0.0}, "scale must be a finite number other than 0"),
         ({"scale": {"ego": 1.0}}, r"^scale needs one value for each of \['ego', 'obj'\]"),
         ({"intrinsics": torch.eye(4)}, r"K, \[3, 3\], or the key of .*; got \[4, 4\]"),

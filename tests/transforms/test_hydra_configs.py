@@ -58,7 +58,7 @@ def test_composed_by_a_project_s_own_config_beside_torchrl_s(tmp_path):
     with hydra.initialize_config_dir(str(tmp_path), version_base="1.3"):
         config = hydra.compose("main", overrides=["raw.scale=0.5", "raw.outputs=[raw,valid]"])
     raw, split = hydra.utils.instantiate(config.stack)
-    assert (raw.outputs, raw.factors) == (("raw", "valid"), {"raw": 0.5})
+    assert (raw.outputs, raw.scales) == (("raw", "valid"), {"raw": 0.5})
     assert (split.outputs, split.in_keys[-1]) == (("obj",), ("sensor", "K"))
 
 

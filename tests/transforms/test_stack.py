@@ -17,9 +17,7 @@ from tests.transforms.fake_env import INTRINSICS, NUM_CLASSES, FakeSensorEnv
 from tests.transforms.test_base import moments
 from tests.transforms.test_motion import wide_frames
 
-stack = functools.partial(
-    representation_stack, intrinsics=INTRINSICS, num_classes=NUM_CLASSES, dt_s=0.5
-)
+stack = functools.partial(representation_stack, intrinsics=INTRINSICS, num_classes=NUM_CLASSES)
 
 
 def rollout(representations) -> torch.Tensor:
@@ -89,12 +87,12 @@ def test_all_at_once_are_what_each_is_alone():
 
 
 def test_options_reach_the_transforms():
-    flows = {"raw": {"scale": 2.0}, "ego": {"unit": "px_per_s"}, "obj": None}
+    flows = {"raw": {"scale": 2.0}, "ego": {"scale": 4.0}, "obj": None}
     depths = {"depth": {"range_m": 20.0}, "depth2": {"k": 3}}
     td = rollout({**flows, **depths, "seg": {"encoding": "onehot"}, "seg2": {}})
     plain = rollout(["raw", "ego", "obj", "depth", "seg", "seg2"])
     assert torch.equal(td["raw"], 2 * plain["raw"])
-    assert torch.equal(td["ego"], 2 * plain["ego"])  # 0.5 s a step
+    assert torch.equal(td["ego"], 4 * plain["ego"])
     assert torch.equal(td["obj"], plain["obj"])
     assert torch.allclose(td["depth"], (5 * plain["depth"]).clamp(max=1))
     assert td["depth2"].shape[-3] == 3
@@ -138,8 +136,6 @@ def test_what_the_camera_has_to_say_is_asked_for():
         representation_stack(["seg2"])
     with pytest.raises(ValueError, match="need intrinsics="):
         representation_stack(["depth", "ego"], num_classes=3)
-    with pytest.raises(ValueError, match="needs dt_s"):
-        representation_stack({"ego": {"unit": "px_per_s"}}, intrinsics=INTRINSICS)
     assert representation_stack(["depth", "rgb"])
 
 

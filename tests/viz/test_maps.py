@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from flowrep import viz
-from flowrep.palette import CLASS_COLOURS
+from flowrep.viz import CLASS_COLOURS
 
 
 def flow_of(u: float, v: float) -> np.ndarray:
@@ -57,6 +57,12 @@ def test_flow_wheel_is_its_own_legend():
     assert wheel[50, 0].tolist() == [0, 255, 255]  # left rim: flow to the left
     assert np.abs(wheel[100, 50].astype(int) - (128, 255, 0)).max() <= 1  # lower rim: down
     assert wheel[0, 0].tolist() == [255, 255, 255]  # outside the disc
+
+
+def test_classes_have_a_colour_each_in_the_order_of_their_ids():
+    scene = pytest.importorskip("flowrep.scenes.scene", exc_type=ImportError)
+    assert list(CLASS_COLOURS) == list(scene.CATEGORY_ID)
+    assert len(set(CLASS_COLOURS.values())) == len(CLASS_COLOURS)
 
 
 def test_classes_take_their_colour_from_the_one_table():
