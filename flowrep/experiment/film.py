@@ -23,7 +23,7 @@ from flowrep.palette import OUTCOME_COLOURS
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import representation_stack
-from flowrep.transforms.stack import FLOWS, representation_options
+from flowrep.transforms.stack import FLOWS, REPRESENTATIONS, representation_options
 from flowrep.viz import (
     Image,
     Tile,
@@ -180,6 +180,8 @@ class Film:
         return tile._replace(draw=draw)
 
     def _options(self, name: str) -> dict[str, Any]:
+        if name not in REPRESENTATIONS:  # a user's own, whose options may mean anything
+            return {}
         given = self.agent.config.representations.get(name) or {}
         return representation_options(name) | dict(given)
 
