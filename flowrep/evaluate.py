@@ -76,8 +76,7 @@ def candidates_of(config: EvaluateConfig) -> list[Candidate]:
         for path in config.run or []:
             for run in RunFolder.all_in(path):
                 runs.setdefault(run.path.resolve(), run)
-        trusted = config.algorithm.target
-        load = partial(Agent.load, scene=config.scene, algorithm=trusted, **machine)
+        load = partial(Agent.load, scene=config.scene, trusted=config.trusted, **machine)
         return [Candidate(run, partial(load, run.path), config.policy) for run in runs.values()]
     keys = ("scene", "representations", "flow", "motion", "noise")
     maps = {key: getattr(config, key) for key in keys}

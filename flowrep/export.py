@@ -23,8 +23,8 @@ def run(config: ExportConfig) -> None:
 
     run = RunFolder.existing(config.run)
     folder = Path(config.output or run.path / "export")
-    trusted = config.algorithm.target
-    export(Agent.load(run.path, algorithm=trusted, precision="fp32", device="cpu"), folder)
+    agent = Agent.load(run.path, trusted=config.trusted, precision="fp32", device="cpu")
+    export(agent, folder)
     print(f"the agent is in {folder}; load_agent.py there shows how to run it")
 
 

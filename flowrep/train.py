@@ -5,6 +5,7 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 
 from __future__ import annotations
 
+import re
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -75,11 +76,13 @@ def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainCo
 
     A larger `total_frames` is written to the run's config.
     """
-    given = [text.partition("=")[0] for text in typed if not text.startswith("resume=")]
+    typed = [text.lstrip("+") for text in typed if not text.startswith("resume=")]
+    given = [text.partition("=")[0] for text in typed]
     trusted = "algorithm._target_"
-    stored = folder.config(config.algorithm.target if trusted in given else None)
+    classes = [k for k in given if re.fullmatch(r"(algorithm|representations\.\w+)\._target_", k)]
+    stored = folder.config(config.trusted if classes else ())
     allowed = (*OF_THE_MACHINE, "total_frames", trusted)
-    if others := [key for key in given if key not in allowed]:
+    if others := [key for key in given if key not in (*allowed, *classes)]:
         raise UsageError(
             f"resume= continues a run with its stored config, so '{others[0]}=' would be ignored: "
             f"leave it out ({', '.join(allowed)} may be given)"
@@ -97,7 +100,7 @@ def resumed(config: TrainConfig, folder: RunFolder, typed: list[str]) -> TrainCo
         )
     if frames > stored.total_frames:
         folder.write_config(stored.plain() | {"total_frames": frames})
-    changes = {key: getattr(config, key) for key in given if key != trusted}
+    changes = {key: getattr(config, key) for key in given if key not in classes}
     return stored.model_copy(update=changes | {"resume": str(folder.path)})
 
 

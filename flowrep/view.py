@@ -64,7 +64,7 @@ def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
         config.policy,
         scene=None if keeps_scene else config.scene,
         representations=config.representations,
-        algorithm=config.algorithm.target,
+        trusted=config.trusted,
         device="cpu",
         num_envs=1,
     )

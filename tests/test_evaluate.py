@@ -149,7 +149,7 @@ def some(tmp_path, monkeypatch, driver):
     tiny = ["representations=[obj]", "scene.camera.height_px=12", "scene.camera.width_px=20", SHORT]
     config = composed(*tiny, "device=cpu")
 
-    def load(path, *, scene=None, algorithm=None, **machine):
+    def load(path, *, scene=None, trusted=(), **machine):
         if not path.name.startswith("good"):
             raise CheckpointError(f"no checkpoint in {path}")
         return Agent(driver, config.model_copy(update=machine), 64, "straight_road")

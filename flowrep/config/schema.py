@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -81,9 +81,19 @@ class Command(Options):
 
     model_config = ConfigDict(extra="allow")
 
+    @property
+    def trusted(self) -> list[str]:
+        """The classes outside of flowrep that it names; a stored run may name these, too."""
+        named = getattr(self, "algorithm", None), getattr(self, "representations", None)
+        targets = [getattr(named[0], "target", None)]
+        targets += [options.get("_target_") for options in (named[1] or {}).values()]
+        return [target for target in targets if target]
+
 
 def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
     """Checks options and returns them as they are: a model would forget the order of its keys."""
+    if isinstance(value, Mapping) and not all(str(name).isidentifier() for name in value):
+        raise ValueError("a name is of letters, digits and _")
     check(value)
     if not value:
         raise ValueError("is empty; choose at least one: representations=[ego,obj]")
@@ -247,7 +257,10 @@ class EvaluateConfig(Command):
         for key in needed if own else ():
             if getattr(self, key) is None:
                 raise ValueError(f"{key} needs a value for policy={own[0]}")
+        maps = (self.representations or {}).values()
         for key in ("representations", "flow", "motion", "noise", "output"):
+            if key == "representations" and all(options.keys() == {"_target_"} for options in maps):
+                continue
             if not own and getattr(self, key) is not None:
                 raise ValueError(f"{key}= is for a policy of your own; a run's is in its config")
         return self
@@ -257,6 +270,7 @@ class ExportConfig(Command):
     """The whole config of `flowrep.export`."""
 
     run: Text
+    representations: Stack | None = None
     algorithm: Trusted
     output: Text | None
 
@@ -355,21 +369,27 @@ def validated(schema: type[Model], plain: Mapping[str, Any], source: str = "") -
         raise UsageError("\n".join(f"{source}: {x}" if source else x for x in lines)) from None
 
 
-def validated_run(plain: Any, source: str, algorithm: str | None = None) -> TrainConfig:
+def validated_run(plain: Any, source: str, trusted: Collection[str] = ()) -> TrainConfig:
     """Returns the config that a run stored.
 
-    Its algorithm is one of flowrep's own, or `algorithm`, which the user typed: a file that may
-    come from somebody else must not name what is imported.
+    Its classes are flowrep's own, or `trusted`, which the user typed: a file that may come from
+    somebody else must not name what is imported.
     """
     if not isinstance(plain, Mapping):
         raise UsageError(f"{source} holds no run's config: restore the file")
     config = validated(TrainConfig, plain, source)
-    target = config.algorithm.target
-    if target not in (*ALGORITHMS, algorithm):
-        raise UsageError(
-            f"{source} names code that isn't flowrep's own, {target}: if you trust it, add "
-            f"algorithm._target_={target}"
-        )
+    named = {"algorithm": config.algorithm.target}
+    named |= {
+        f"+representations.{name}": options["_target_"]
+        for name, options in config.representations.items()
+        if "_target_" in options
+    }
+    for key, target in named.items():
+        if target not in (*ALGORITHMS, *trusted):
+            raise UsageError(
+                f"{source} names code that isn't flowrep's own, {target}: if you trust it, add "
+                f"{key}._target_={target}"
+            )
     return config
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
@@ -88,7 +88,7 @@ class Agent(Driver):
         flow: Any = None,
         motion: str | None = None,
         noise: Noise | None = None,
-        algorithm: str | None = None,
+        trusted: Collection[str] = (),
         precision: str | None = None,
         **machine: Any,
     ) -> Agent:
@@ -103,7 +103,7 @@ class Agent(Driver):
             flow: where they come from, as in conf/flow; exact flow if None.
             motion: of the camera, "exact" or "estimated".
             noise: of its sensors; none if None.
-            algorithm: a class outside of flowrep that a run may name; its code then runs.
+            trusted: classes outside of flowrep that a run may name; their code then runs.
             precision: the number format of its networks, instead of the run's.
             machine: `device`, `num_envs` and `num_workers` of its envs.
 
@@ -133,11 +133,11 @@ class Agent(Driver):
             )
             return cls(_external(name, config) if is_external else name, config)
         if Path(name).is_dir():
-            trained, frames, weights = _of_run(RunFolder.existing(name), algorithm)
+            trained, frames, weights = _of_run(RunFolder.existing(name), trusted)
             about = f"the agent of {name}"
         elif name == "pretrained" or name.endswith(".safetensors"):
             path = _pretrained(scene) if name == "pretrained" else Path(name)
-            trained, frames, weights = _of_file(path, algorithm)
+            trained, frames, weights = _of_file(path, trusted)
             about = f"the agent in {path.name}"
         else:
             raise UsageError(
@@ -201,16 +201,16 @@ class Agent(Driver):
         save_checkpoint(path, state | {"policy": packed(weights) if small else weights})
 
 
-def _of_run(run: RunFolder, algorithm: str | None) -> tuple[TrainConfig, int, dict[str, Tensor]]:
-    config, path = run.config(algorithm), run.checkpoint_path
+def _of_run(run: RunFolder, trusted: Collection[str]) -> tuple[TrainConfig, int, dict[str, Tensor]]:
+    config, path = run.config(trusted), run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(config.plain()), path)
     return config, state["frames"], state["policy"]
 
 
-def _of_file(path: Path, algorithm: str | None) -> tuple[TrainConfig, int, dict[str, Tensor]]:
+def _of_file(path: Path, trusted: Collection[str]) -> tuple[TrainConfig, int, dict[str, Tensor]]:
     stored = load_checkpoint(path)
-    config = validated_run(stored["config"], path.name, algorithm)
+    config = validated_run(stored["config"], path.name, trusted)
     return config, stored["frames"], unpacked(stored["policy"])
 
 

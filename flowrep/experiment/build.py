@@ -41,7 +41,7 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
         num_workers = worker_count(num_envs, busy_cores=_threads(config))
     arguments: dict[str, Any] = {
         "scene": config.scene,
-        "representations": {n: _options(n, o) for n, o in config.representations.items()},
+        "representations": config.representations,
         "flow": dict(config.flow),
         "motion": config.motion,
         "noise": dict(config.noise),
@@ -50,8 +50,10 @@ def env(config: EnvConfig, **changes: Any) -> EnvBase:
         "speed": config.speed,
         "renderer": config.renderer,
     }
-    made = make_env(**arguments | changes | {"num_workers": num_workers})
-    return made.append_transform(InitTracker())
+    arguments |= changes | {"num_workers": num_workers}
+    maps: Mapping[str, Any] = arguments["representations"]
+    arguments["representations"] = {name: _options(name, maps[name]) for name in maps}
+    return make_env(**arguments).append_transform(InitTracker())
 
 
 def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
@@ -86,9 +88,9 @@ def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
     return maker, validated(whole, {"algorithm": section.plain()}).algorithm
 
 
-def _options(name: str, options: Mapping[str, Any]) -> Mapping[str, Any] | Transform:
+def _options(name: str, options: Mapping[str, Any] | None) -> Mapping[str, Any] | Transform | None:
     """Returns a representation's options, or the transform if it is one of the user's own."""
-    if "_target_" not in options:
+    if not options or "_target_" not in options:
         return options
     own = dict(options)
     maker = _class(f"representations.{name}", own.pop("_target_"), Transform)

@@ -22,7 +22,7 @@ from flowrep.files import replace_file
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer
 from flowrep.transforms import representation_stack
-from flowrep.transforms.stack import FLOWS, representation_options
+from flowrep.transforms.stack import FLOWS, REPRESENTATIONS, representation_options
 from flowrep.viz import (
     Image,
     Tile,
@@ -178,6 +178,8 @@ class Film:
         return tile._replace(draw=draw)
 
     def _options(self, name: str) -> dict[str, Any]:
+        if name not in REPRESENTATIONS:  # a user's own, whose options may mean anything
+            return {}
         given = self.agent.config.representations.get(name) or {}
         return representation_options(name) | dict(given)
 

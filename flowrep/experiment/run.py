@@ -5,7 +5,7 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -196,9 +196,9 @@ class RunFolder:
             raise RunFolderError(f"{self.config_path} holds no config; restore the file")
         return config
 
-    def config(self, algorithm: str | None = None) -> TrainConfig:
-        """Returns the resolved config as its model; see `validated_run` for `algorithm`."""
-        return validated_run(self.read_config(), str(self.config_path), algorithm)
+    def config(self, trusted: Collection[str] = ()) -> TrainConfig:
+        """Returns the resolved config as its model; see `validated_run` for `trusted`."""
+        return validated_run(self.read_config(), str(self.config_path), trusted)
 
     def note_machine(self, machine: Mapping[str, Any]) -> None:
         """Appends a machine to machine.json, unless it is already the last entry."""

@@ -207,8 +207,10 @@ def arguments_of(folder: Path, config: TrainConfig, is_worker: bool) -> list[str
     if is_worker and config.num_workers == "auto":  # other workers use the other cores
         machine = [*(text for text in machine if "device" in text), "num_workers=0"]
     if (folder / "config.yaml").is_file():
-        target = config.algorithm.target
-        trusted = [] if target in ALGORITHMS else [cli.override("algorithm._target_", target)]
+        maps = config.representations.items()
+        targets = {f"+representations.{name}._target_": o.get("_target_") for name, o in maps}
+        targets["algorithm._target_"] = config.algorithm.target
+        trusted = [cli.override(k, v) for k, v in targets.items() if v and v not in ALGORITHMS]
         return [cli.override("resume", str(folder)), *machine, *trusted]
     line = [cli.override("hydra.run.dir", str(folder)), *typed, *machine]
     line += [text for text in hydra.overrides.hydra if text.startswith("hydra.searchpath=")]
@@ -282,7 +284,7 @@ def _check_is_same(folder: Path, config: TrainConfig) -> None:
     path = folder / "config.yaml"
     if not path.is_file():
         return
-    stored = validated_run(read_yaml(path), str(path), config.algorithm.target).plain()
+    stored = validated_run(read_yaml(path), str(path), config.trusted).plain()
     asked = config.plain()
     if asked["algorithm"].get("precision", "auto") == "auto":  # the run has resolved it
         asked["algorithm"] |= {k: v for k, v in stored["algorithm"].items() if k == "precision"}

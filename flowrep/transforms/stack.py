@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -18,34 +19,25 @@ from flowrep.transforms.maps import Depth, Rgb, Segmentation
 from flowrep.transforms.motion import EstimateCameraMotion
 from flowrep.transforms.noise import SENSORS, SensorNoise
 
-FLOW_SOURCES = MOTION_SOURCES = ("exact", "estimated")
-NOISE_OPTIONS = SENSORS["depth"].options + SENSORS["motion"].options
-_ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px", "picture_scale")
+Representations = Sequence[str] | Mapping[str, Mapping[str, Any] | Transform | None]
+Options = dict[str, Any]
+
+_SOURCES = ("exact", "estimated")
 _FLOW_OPTIONS = ("scale",)
-
-
-class _Representation(NamedTuple):
-    """A representation's transform and the parameters of it that a user may set."""
-
-    transform: type[Transform]
-    options: tuple[str, ...] = ()
-    frames_of: str | None = None  # the representation whose last k frames it is
-
-
-# In the order of computation.
-_REPRESENTATIONS: dict[str, _Representation] = {
-    "rgb": _Representation(Rgb),
-    "seg": _Representation(Segmentation, ("encoding",)),
-    "depth": _Representation(Depth, ("range_m", "missing")),
-    "raw": _Representation(RawFlow, _FLOW_OPTIONS),
-    "ego": _Representation(FlowFactorize, _FLOW_OPTIONS),
-    "obj": _Representation(FlowFactorize, _FLOW_OPTIONS),
-    "seg2": _Representation(Segmentation, ("encoding",), frames_of="seg"),
-    "depth2": _Representation(Depth, ("range_m", "missing"), frames_of="depth"),
+_ESTIMATOR_OPTIONS = ("estimator", "weights", "preset", "min_side_px", "picture_scale")
+# The transform of each representation, and which of its parameters a user may set.
+_OPTIONS: dict[str, tuple[type[Transform], tuple[str, ...]]] = {
+    "rgb": (Rgb, ()),
+    "seg": (Segmentation, ("encoding",)),
+    "depth": (Depth, ("range_m", "missing")),
+    "raw": (RawFlow, _FLOW_OPTIONS),
+    "ego": (FlowFactorize, _FLOW_OPTIONS),
+    "obj": (FlowFactorize, _FLOW_OPTIONS),
 }
+_FRAMES_OF = {"seg2": "seg", "depth2": "depth"}  # the last k frames
 FLOWS = ("raw", "ego", "obj")  # of two channels, u and v
 
-REPRESENTATIONS: tuple[str, ...] = tuple(_REPRESENTATIONS)
+REPRESENTATIONS: tuple[str, ...] = (*_OPTIONS, *_FRAMES_OF)
 
 _UNSCALED_KEY = "_raw"  # exact raw flow in px/step, for FlowFactorize
 _PICTURE_KEY = ("sensor", "rgb")
@@ -53,32 +45,28 @@ _PICTURE_KEY = ("sensor", "rgb")
 _PICTURES_KEY = "_rgb2"
 _ESTIMATED_FLOW_KEY = ("sensor", "flow")  # in px/step
 _ESTIMATED_MOTION_KEY = ("sensor", "estimated_motion")
-_NOISY_KEYS: dict[str, NestedKey] = {
-    "depth": ("sensor", "noisy_depth"),
-    "motion": ("sensor", "noisy_motion"),
-}
+_NOISY_KEYS = {"depth": ("sensor", "noisy_depth"), "motion": ("sensor", "noisy_motion")}
 _KEPT = (_PICTURES_KEY, _ESTIMATED_FLOW_KEY, _ESTIMATED_MOTION_KEY, *_NOISY_KEYS.values())
 
 
-def representation_options(name: str) -> dict[str, Any]:
+def representation_options(name: str) -> Options:
     """Returns a representation's options with their defaults.
 
     >>> representation_options("depth2")
     {'k': 2, 'range_m': 100.0, 'missing': 0.0}
     """
     _check_known("representation", [name], REPRESENTATIONS)
-    entry = _REPRESENTATIONS[name]
-    options = _defaults(FrameStack, ("k",)) if entry.frames_of else {}
-    return options | _defaults(entry.transform, entry.options)
+    stacked = _defaults(FrameStack, ("k",)) if name in _FRAMES_OF else {}
+    return stacked | _defaults(*_OPTIONS[_FRAMES_OF.get(name, name)])
 
 
-def _defaults(transform: type[Transform], names: Sequence[str]) -> dict[str, Any]:
+def _defaults(transform: type[Transform], names: Sequence[str]) -> Options:
     parameters = inspect.signature(transform).parameters
     return {name: parameters[name].default for name in names}
 
 
 def representation_stack(
-    representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None],
+    representations: Representations,
     *,
     intrinsics: Intrinsics | None = None,
     prev_intrinsics: NestedKey | None = None,
@@ -98,7 +86,8 @@ def representation_stack(
 
     Args:
         representations: names, or a mapping from name to options (`representation_options`); a
-            name is one of `REPRESENTATIONS`, its key in the TensorDict is the same.
+            name is one of `REPRESENTATIONS`, its key in the TensorDict is the same. Under another
+            name, a transform that writes this key.
         intrinsics: K `[3, 3]` of the sensor maps in pixels, or its key; raw, ego and obj need it,
             except for estimated raw flow. For `prev_intrinsics` see `RawFlow`.
         num_classes: number of semantic classes; seg and seg2 need it.
@@ -122,23 +111,45 @@ def representation_stack(
         Compose(
             FlowFactorize([('sensor', 'depth'), ('sensor', 'prev_from_curr')] -> ['ego']))
     """
-    chosen = _with_options(representations)
+    chosen, foreign = _with_options(representations)
     if num_classes is None and not {"seg", "seg2"}.isdisjoint(chosen):
         raise ValueError("representations seg and seg2 need num_classes=")
     estimator = _estimator_options(flow)
     flows = {name: chosen[name] for name in FLOWS if name in chosen}
     if intrinsics is None and flows and (estimator is None or set(flows) != {"raw"}):
         raise ValueError(f"representations {', '.join(FLOWS)} need intrinsics=, the camera's K")
-    _check_known("source of motion", [motion], MOTION_SOURCES)
-    transforms, keys = _noise_transforms(noise, chosen, reads_motion=motion == "exact")
-    transforms += _map_transforms(chosen, num_classes, keys["depth"])
-    context = {"compiled": compiled}
-    if motion == "estimated" and not {"ego", "obj"}.isdisjoint(flows):
-        keys["motion"] = _ESTIMATED_MOTION_KEY
-    camera = {"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics}
-    transforms += _flow_transforms(flows, estimator, camera, keys, context)
+    _check_known("source of motion", [motion], _SOURCES)
+    estimates_motion = motion == "estimated" and not {"ego", "obj"}.isdisjoint(flows)
+
+    noisy = _noise(noise, chosen, reads_motion=motion == "exact")
+    keys = {name: SENSORS[name].key for name in _NOISY_KEYS}
+    keys |= {name: key for name, key in _NOISY_KEYS.items() if noisy and key in noisy[0].out_keys}
+    camera = _Camera(
+        k={"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics},
+        depth=keys["depth"],
+        motion=_ESTIMATED_MOTION_KEY if estimates_motion else keys["motion"],
+        compiled=compiled,
+    )
+    transforms = [*noisy, *_maps(chosen, num_classes, keys["depth"])]
+    if flows:
+        needs_unscaled = "obj" in flows or estimates_motion
+        if estimator is None:
+            sources = _exact_flow(flows, camera, needs_unscaled, estimates_motion)
+        elif needs_unscaled or "raw" in flows:
+            sources = _estimated_flow(flows, estimator, camera, estimates_motion)
+        else:
+            sources = []
+        for transform in sources:
+            if transform.out_keys[0] not in flows:  # errors name what is made of it
+                transform.label = " and ".join(map(repr, flows))
+        is_written = any("raw" in transform.out_keys for transform in sources)
+        factors = {name: flows[name] for name in flows if not (name == "raw" and is_written)}
+        unscaled = _UNSCALED_KEY if estimator is None else _ESTIMATED_FLOW_KEY
+        transforms += [*sources, *_split(factors, unscaled, camera)]
+    transforms += foreign.values()
     written = dict.fromkeys(key for transform in transforms for key in transform.out_keys)
-    hidden = [key for key in written if key not in (*chosen, *_KEPT)]
+    shown = {*chosen, *_KEPT, *(key for each in foreign.values() for key in each.out_keys)}
+    hidden = [key for key in written if key not in shown]
     return Compose(*transforms, *([DropKeys(*hidden)] if hidden else []))
 
 
@@ -163,149 +174,188 @@ def _check_known(what: str, names: Iterable[object], known: Collection[str]) -> 
             raise ValueError(f"unknown {what} {name!r}. There are {list(known)}")
 
 
-def _with_options(
-    representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None],
-) -> dict[str, dict[str, Any]]:
+def _with_options(representations: Representations) -> tuple[dict[str, Options], dict[str, Any]]:
+    """Returns all options of the representations, and the transforms under other names."""
     if isinstance(representations, str) or not representations:
         raise ValueError(
             f"representations must be a list of names, some of {list(REPRESENTATIONS)}; "
             f"got {representations!r}"
         )
-    chosen: dict[str, dict[str, Any]] = {}
+    chosen: dict[str, Options] = {}
+    foreign: dict[str, Transform] = {}
     for name in representations:
         if name in chosen:
             raise ValueError(f"representation {name!r} is named twice")
-        own = representations[name] if isinstance(representations, Mapping) else None
-        options = representation_options(name)
-        _check_known(f"option of representation {name!r}:", own or {}, options)
-        chosen[name] = options | dict(own or {})
-    return chosen
-
-
-def _noise_transforms(
-    noise: Mapping[str, float] | None, chosen: Collection[str], *, reads_motion: bool
-) -> tuple[list[Transform], dict[str, NestedKey]]:
-    """Returns one `SensorNoise`, if a representation reads a noisy sensor, and the keys to read.
-
-    The exact values keep their keys, so that raw flow and a second pass over the same frames start
-    from them.
-    """
-    given: dict[str, Any] = dict.fromkeys(NOISE_OPTIONS, 0.0)
-    _check_known("option of noise:", noise or {}, given)
-    given |= noise or {}
-    SensorNoise(**given)  # checks all values, used or not
-    readers = {  # raw flow is not measured by a depth camera
-        "depth": [name for name in chosen if name in ("depth", "depth2", "ego", "obj")],
-        "motion": [name for name in chosen if name in ("ego", "obj") and reads_motion],
-    }
-    options = {name: {o: given[o] for o in SENSORS[name].options} for name in readers}
-    noisy = [name for name in readers if readers[name] and any(options[name].values())]
-    keys = {name: SENSORS[name].key for name in readers}
-    if not noisy:
-        return [], keys
-    transform = SensorNoise(
-        sensors=noisy,
-        **{o: given[o] for name in noisy for o in options[name]},
-        frame_key=("sensor", "frame"),
-        out_keys=[_NOISY_KEYS[name] for name in noisy],
-    )
-    transform.label = " and ".join(readers["depth"])
-    return [transform], keys | {name: _NOISY_KEYS[name] for name in noisy}
-
-
-def _map_transforms(
-    chosen: dict[str, dict[str, Any]], num_classes: int | None, depth_key: NestedKey
-) -> list[Transform]:
-    """Returns the transforms of all representations except flow."""
-    transforms: list[Transform] = []
-    stacks: list[Transform] = []
-    for name, options in chosen.items():
-        if name in FLOWS:
+        given = representations[name] if isinstance(representations, Mapping) else None
+        if isinstance(given, Transform):
+            if name in REPRESENTATIONS or name not in given.out_keys:
+                raise ValueError(
+                    f"representation {name!r}: expected a transform that writes this key, and a "
+                    f"name that isn't one of {list(REPRESENTATIONS)}; it writes {given.out_keys}"
+                )
+            foreign[name] = given
             continue
-        entry = _REPRESENTATIONS[name]
-        key, frame = name, entry.frames_of or name
-        frame_options = {option: options[option] for option in entry.options}
-        if entry.frames_of:
-            shared = chosen.get(frame) == frame_options
-            key = frame if shared else f"_{frame}"
-            stacks.append(FrameStack(k=options["k"], in_keys=key, out_keys=name))
-            if shared:
-                continue
-        if frame == "seg":
-            frame_options["num_classes"] = num_classes
-        elif frame == "depth":
-            frame_options["in_keys"] = depth_key
-        transforms.append(entry.transform(**frame_options, out_keys=key))
-    return transforms + stacks
+        options = representation_options(name)
+        _check_known(f"option of representation {name!r}:", given or {}, options)
+        chosen[name] = options | dict(given or {})
+    return chosen, foreign
 
 
-def _estimator_options(flow: str | Mapping[str, Any]) -> dict[str, Any] | None:
+def _estimator_options(flow: str | Mapping[str, Any]) -> Options | None:
     """Returns `EstimatedFlow`'s options, or None if flow is exact."""
-    options: dict[str, Any] = {"source": flow} if isinstance(flow, str) else dict(flow)
-    source = options.pop("source", None)
-    _check_known("source of flow", [source], FLOW_SOURCES)
+    given: Options = {"source": flow} if isinstance(flow, str) else dict(flow)
+    source = given.get("source")
+    options = {name: value for name, value in given.items() if name != "source"}
+    _check_known("source of flow", [source], _SOURCES)
     known = _ESTIMATOR_OPTIONS if source == "estimated" else ()
     _check_known(f"option of {source} flow:", options, known)
     return options if source == "estimated" else None
 
 
-def _flow_transforms(
-    flows: dict[str, dict[str, Any]],
-    estimator: dict[str, Any] | None,
-    camera: dict[str, Any],
-    keys: dict[str, NestedKey],
-    context: dict[str, Any],
+def _noise(
+    noise: Mapping[str, float] | None, chosen: Collection[str], *, reads_motion: bool
 ) -> list[Transform]:
-    """Returns the sources of raw flow and of motion, if needed, and one FlowFactorize if it is."""
-    transforms: list[Transform] = []
-    factors = dict(flows)
-    unscaled: NestedKey = _UNSCALED_KEY
-    estimates_motion = keys["motion"] == _ESTIMATED_MOTION_KEY
-    needs_unscaled = "obj" in flows or estimates_motion
-    compensated: Transform | None = None
-    if estimator is not None and ("raw" in flows or needs_unscaled):
-        unscaled = _ESTIMATED_FLOW_KEY
-        written = {"unscaled": unscaled} | ({"raw": "raw"} if "raw" in flows else {})
-        options: dict[str, Any] = dict(factors.pop("raw", {}))
-        options |= {"outputs": list(written), "out_keys": list(written.values())}
-        transforms = [FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])]
-        if "obj" in flows:
-            inputs = [_PICTURES_KEY, keys["depth"], keys["motion"]]
-            options |= camera | {"in_keys": inputs}
-            compensated = EstimatedFlow(**estimator, **options)
-            # then for the camera's motion alone, which a coarser estimate tells
-            options = {"outputs": ["unscaled"], "out_keys": unscaled}
-            if estimator.get("preset") == "fine":
-                options["preset"] = "medium"
-        if compensated is None or estimates_motion:
-            plain = estimator | options | {"in_keys": _PICTURES_KEY}
-            transforms.append(EstimatedFlow(**plain))
-    elif needs_unscaled:  # raw, too, is then made from the unscaled flow
-        transforms = [RawFlow(**camera, out_keys=unscaled, **context)]
-    elif "raw" in flows:
-        transforms = [RawFlow(**camera, **factors.pop("raw"), **context)]
-    if estimates_motion:
-        estimate_motion = EstimateCameraMotion(
-            **camera,
-            picture=None if estimator is None else _PICTURE_KEY,
-            outputs=["motion"],
-            in_keys=[unscaled, keys["depth"]],
-            out_keys=[_ESTIMATED_MOTION_KEY],
-        )
-        transforms.append(estimate_motion)
-    if compensated is not None:
-        transforms.append(compensated)
-    for transform in transforms:
-        if transform.out_keys[0] not in flows:  # errors name what is made of it
-            transform.label = " and ".join(map(repr, flows))
-    if factors:
-        raw = [] if set(factors) == {"ego"} else [unscaled]
-        split = FlowFactorize(
-            **camera,
+    """Returns one `SensorNoise` if a representation reads a noisy sensor.
+
+    The exact values keep their keys, so that raw flow and a second pass over the same frames start
+    from them.
+    """
+    options = {sensor: SENSORS[sensor].options for sensor in _NOISY_KEYS}
+    known = dict.fromkeys((name for names in options.values() for name in names), 0.0)
+    _check_known("option of noise:", noise or {}, known)
+    given: Options = known | dict(noise or {})
+    SensorNoise(**given)  # checks all values, used or not
+    split = [name for name in chosen if name in ("ego", "obj")]
+    readers = {  # raw flow is not measured by a depth camera
+        "depth": [name for name in chosen if name in ("depth", "depth2", *split)],
+        "motion": split if reads_motion else [],
+    }
+    noisy = [s for s in readers if readers[s] and any(given[name] for name in options[s])]
+    if not noisy:
+        return []
+    transform = SensorNoise(
+        sensors=noisy,
+        **{name: given[name] for sensor in noisy for name in options[sensor]},
+        frame_key=("sensor", "frame"),
+        out_keys=[_NOISY_KEYS[sensor] for sensor in noisy],
+    )
+    transform.label = " and ".join(readers["depth"])
+    return [transform]
+
+
+def _maps(
+    chosen: Mapping[str, Options], num_classes: int | None, depth_key: NestedKey
+) -> list[Transform]:
+    """Returns the transforms of rgb, seg, depth and, last, of stacks of them."""
+
+    def one(name: str, key: str, options: Options) -> Transform:
+        if name == "rgb":
+            return Rgb(out_keys=key)
+        if name == "seg":
+            return Segmentation(num_classes, **options, out_keys=key)  # type: ignore[arg-type]
+        return Depth(**options, in_keys=depth_key, out_keys=key)
+
+    maps: list[Transform] = []
+    stacks: list[Transform] = []
+    for name, options in chosen.items():
+        if name in FLOWS:
+            continue
+        if name not in _FRAMES_OF:
+            maps.append(one(name, name, options))
+            continue
+        frame = _FRAMES_OF[name]
+        of_frame = {option: value for option, value in options.items() if option != "k"}
+        is_shared = chosen.get(frame) == of_frame
+        key = frame if is_shared else f"_{frame}"
+        if not is_shared:
+            maps.append(one(frame, key, of_frame))
+        stacks.append(FrameStack(k=options["k"], in_keys=key, out_keys=name))
+    return maps + stacks
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """What the flow transforms have in common: K, and the keys of depth and motion."""
+
+    k: Options
+    depth: NestedKey
+    motion: NestedKey
+    compiled: bool
+
+    @property
+    def options(self) -> Options:
+        return {**self.k, "compiled": self.compiled}
+
+
+def _exact_flow(
+    flows: Mapping[str, Options], camera: _Camera, needs_unscaled: bool, estimates_motion: bool
+) -> list[Transform]:
+    """Returns `RawFlow` and, if it is asked for, the camera's motion made of it.
+
+    With `needs_unscaled`, raw is made of the same flow later, by `FlowFactorize`.
+    """
+    if not needs_unscaled:
+        return [RawFlow(**camera.options, **flows["raw"])] if "raw" in flows else []
+    raw = RawFlow(**camera.options, out_keys=_UNSCALED_KEY)
+    return [raw, _motion(_UNSCALED_KEY, camera)] if estimates_motion else [raw]
+
+
+def _estimated_flow(
+    flows: Mapping[str, Options], estimator: Options, camera: _Camera, estimates_motion: bool
+) -> list[Transform]:
+    """Returns the pair of pictures, the flow between them and, if asked for, the camera's motion.
+
+    obj is made of flow that is compensated for the camera's motion. Where that motion is estimated,
+    too, it is made of a first, uncompensated flow.
+    """
+    pictures = FrameStack(k=2, in_keys=[_PICTURE_KEY], out_keys=[_PICTURES_KEY])
+    has_raw = "raw" in flows
+    written: Options = {
+        "outputs": ["unscaled", "raw"] if has_raw else ["unscaled"],
+        "out_keys": [_ESTIMATED_FLOW_KEY, "raw"] if has_raw else [_ESTIMATED_FLOW_KEY],
+        **flows.get("raw", {}),
+    }
+    picture = _PICTURE_KEY
+    if "obj" not in flows:
+        plain = EstimatedFlow(**estimator, **written, in_keys=_PICTURES_KEY)
+        motion = [_motion(_ESTIMATED_FLOW_KEY, camera, picture)] if estimates_motion else []
+        return [pictures, plain, *motion]
+    inputs = [_PICTURES_KEY, camera.depth, camera.motion]
+    compensated = EstimatedFlow(**estimator, **written, **camera.k, in_keys=inputs)
+    if not estimates_motion:
+        return [pictures, compensated]
+    # a coarser estimate is enough for the camera's motion
+    coarser = {"preset": "medium"} if estimator.get("preset") == "fine" else {}
+    first = EstimatedFlow(
+        **estimator | coarser,
+        outputs=["unscaled"],
+        in_keys=_PICTURES_KEY,
+        out_keys=_ESTIMATED_FLOW_KEY,
+    )
+    return [pictures, first, _motion(_ESTIMATED_FLOW_KEY, camera, picture), compensated]
+
+
+def _motion(flow: NestedKey, camera: _Camera, picture: NestedKey | None = None) -> Transform:
+    """Returns the transform that estimates the camera's motion from flow and depth."""
+    return EstimateCameraMotion(
+        **camera.k,
+        picture=picture,
+        outputs=["motion"],
+        in_keys=[flow, camera.depth],
+        out_keys=[camera.motion],
+    )
+
+
+def _split(factors: Mapping[str, Options], unscaled: NestedKey, camera: _Camera) -> list[Transform]:
+    """Returns one `FlowFactorize` for the flows that no source writes itself."""
+    if not factors:
+        return []
+    raw = [] if set(factors) == {"ego"} else [unscaled]
+    return [
+        FlowFactorize(
+            **camera.options,
             outputs=list(factors),
             scale={name: options["scale"] for name, options in factors.items()},
-            in_keys=[*raw, keys["depth"], keys["motion"]],
-            **context,
+            in_keys=[*raw, camera.depth, camera.motion],
         )
-        transforms.append(split)
-    return transforms
+    ]

@@ -9,7 +9,7 @@ pytest.importorskip("pybullet", reason="the simulated street is driven")
 
 from flowrep.experiment.agents import Agent
 from flowrep.experiment.film import LEGEND_S, Film, draw_learning_curve, record_episode
-from flowrep.transforms import Depth, stack
+from flowrep.transforms import Depth
 from flowrep.viz import OUTCOME_COLOURS
 from tests.config.composing import composed
 
@@ -184,12 +184,10 @@ class Nearness(Depth):
         return (Bounded(0.0, 1.0, shape=shape, device=depth.device, dtype=torch.float32),)
 
 
-def test_a_representation_of_ones_own_is_shown_in_grey(monkeypatch):
-    entry = stack._Representation(Nearness)
-    monkeypatch.setitem(stack._REPRESENTATIONS, "near", entry)
-    monkeypatch.setattr(stack, "REPRESENTATIONS", (*stack.REPRESENTATIONS, "near"))
+def test_a_representation_of_ones_own_is_shown_in_grey():
     config = composed("debug=smoke", "device=cpu")
-    agent = Agent(leave_the_road, config.model_copy(update={"representations": {"near": {}}}))
+    own = {"near": {"_target_": f"{__name__}.Nearness", "range_m": 50.0}}
+    agent = Agent(leave_the_road, config.model_copy(update={"representations": own}))
     film = Film(agent)
     frames, _ = film.drive({"episode_seed": 3})
     assert film.framed == ["near, 1 of 2", "near, 2 of 2"]

@@ -1,0 +1,148 @@
+"""docs/adding_a_representation.md: a transform and a YAML file outside of a clone are enough."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("pybullet", reason="the environments are built with it")
+
+from flowrep.config import UsageError
+from flowrep.config.schema import EvaluateConfig, ExportConfig, ViewConfig, validated
+from flowrep.experiment import build
+from flowrep.experiment.agents import Agent
+from flowrep.experiment.film import Film
+from flowrep.experiment.run import RunFolder
+from flowrep.train import resumed
+from tests.config.composing import composed, plain
+
+PAGE = Path(__file__).parents[1] / "docs" / "adding_a_representation.md"
+TYPED = "+representations.edges._target_=mine.Edges"
+
+
+def block(language):
+    (first, *_) = re.findall(rf"```{language}\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    return first
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The page's module, on the path, and its folder of configs."""
+    (tmp_path / "mine.py").write_text(block("python"), encoding="utf-8")
+    (tmp_path / "my_configs" / "representations").mkdir(parents=True)
+    (tmp_path / "my_configs" / "representations" / "edges.yaml").write_text(block("yaml"))
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    sys.modules.pop("mine", None)
+
+
+@pytest.fixture
+def config(folder):
+    search = f"hydra.searchpath=[file://{folder / 'my_configs'}]"
+    return composed(search, "representations=[ego,edges]", "debug=smoke", "device=cpu")
+
+
+def test_an_agent_acts_on_it_and_a_film_shows_it(config):
+    env = build.env(config)
+    agent = build.agent(config, env)
+    maps = env.reset()
+    assert agent.policy(maps)["action"].shape == (4,)
+    assert [codec.key for codec in agent.codecs] == ["ego", "edges"]
+    assert maps["edges"].amax() == 1.0  # to the sky
+    env.close()
+    film = Film(Agent("never_turn", config))
+    assert "edges" in film.framed
+    film.close()
+
+
+def test_its_options_reach_it_and_are_checked_by_it(config):
+    def edges(**options):
+        own = {"edges": {"_target_": "mine.Edges", **options}}
+        env = build.env(config.model_copy(update={"representations": own}), seed=0)
+        maps = env.reset()["edges"]
+        env.close()
+        return maps
+
+    assert torch.equal(edges(factor=0.0), torch.zeros(4, 1, 40, 48))
+    with pytest.raises(UsageError, match=r"representations\.edges.*factr"):
+        edges(factr=1.0)
+    with pytest.raises(UsageError, match=r"mine\.Egdes"):
+        build.env(config.model_copy(update={"representations": {"e": {"_target_": "mine.Egdes"}}}))
+    no_transform = {"e": {"_target_": "flowrep.agent.PPO"}}
+    with pytest.raises(UsageError, match="Transform"):
+        build.env(config.model_copy(update={"representations": no_transform}))
+
+
+def command(model, name, *typed):
+    return validated(model, plain(name, *typed))
+
+
+def stored_config(run, *typed):
+    """What a resumed run has for its config."""
+    asked = composed("debug=smoke", f"resume={run.path}", *typed)
+    return resumed(asked, run, [f"resume={run.path}", *typed])
+
+
+@pytest.mark.parametrize("typed", [[], ["+representations.edges._target_=mine.Other"]])
+def test_a_stored_run_names_no_code(config, folder, typed):
+    run = RunFolder(folder / "run")
+    run.write_config(config.plain())
+    for use in (
+        lambda: stored_config(run, *typed),
+        lambda: Agent.load(run.path, trusted=command(ViewConfig, "view", *typed).trusted),
+        lambda: run.config(command(ExportConfig, "export", "run=x", *typed).trusted),
+        lambda: run.config(command(EvaluateConfig, "evaluate", "run=x", *typed).trusted),
+    ):
+        with pytest.raises(UsageError, match=re.escape(TYPED)):
+            use()
+    assert "mine" not in sys.modules
+
+
+def test_what_the_user_typed_is_used(config, folder):
+    run = RunFolder(folder / "run")
+    run.write_config(config.plain())
+    assert stored_config(run, TYPED).representations == config.representations
+    for model, line in (
+        (ExportConfig, ["export", "run=x"]),
+        (EvaluateConfig, ["evaluate", "run=x"]),
+    ):
+        asked = command(model, *line, TYPED)
+        assert run.config(asked.trusted).representations == config.representations
+    with pytest.raises(UsageError, match="representations="):
+        command(EvaluateConfig, "evaluate", "run=x", TYPED, "+representations.edges.factor=1.0")
+
+
+@pytest.mark.parametrize("name", ["a b", "x;y", "\x1b[2J"])
+def test_a_name_that_is_none_is_never_printed_to_be_pasted(config, folder, name):
+    run = RunFolder(folder / "run")
+    own = {name: {"_target_": "mine.Edges"}}
+    run.write_config(config.plain() | {"representations": own})
+    with pytest.raises(UsageError) as refused:
+        run.config()
+    assert "_target_=" not in str(refused.value)
+    assert str(refused.value).isprintable()
+
+
+@pytest.mark.slow
+def test_from_the_command_line(folder):
+    def run(command, *arguments):
+        line = [sys.executable, "-m", f"flowrep.{command}", *arguments]
+        path = os.pathsep.join([str(folder), str(PAGE.parents[1])])
+        env = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+        return subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True)
+
+    done = run(
+        "train", "--config-dir", "my_configs", "representations=[ego,edges]", "debug=smoke",
+        "device=cpu", "representations.edges.factor=8", "hydra.run.dir=run",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    evaluate = "run=run", "episodes=1", "speed=low", "baselines=[]", "num_workers=0", "device=cpu"
+    refused = run("evaluate", *evaluate)
+    assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)
+    assert TYPED in refused.stderr
+    done = run("evaluate", *evaluate, "num_envs=1", "video=1", TYPED)
+    assert done.returncode == 0, done.stderr
