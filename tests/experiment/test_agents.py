@@ -53,7 +53,8 @@ def test_an_agent_is_the_same_from_its_run_and_from_a_file(trained, tmp_path):
     assert {(each.scene, each.frames, each.policy) for each in episodes} == {
         ("s_turn", 128, "greedy")
     }
-    for name in (folder, tmp_path / "agent.safetensors"):
+    (tmp_path / "12:00").symlink_to(folder)  # a colon, as in module:make
+    for name in (folder, tmp_path / "12:00", tmp_path / "agent.safetensors"):
         again = Agent.load(name, device="cpu")
         assert differing(again.policy.state_dict(), agent.policy.state_dict()) == []
         assert (again.frames, again.trained_in) == (128, "s_turn")
