@@ -115,7 +115,8 @@ class Agent(Driver):
         machine = {"device": "auto", "num_workers": 0, **machine}
         if isinstance(scene, str):
             scene = asdict(load_scene(scene))
-        is_external = ":" in name or name.endswith(".pt2")
+        is_folder = Path(name).is_dir()  # of a run, whose name may hold a colon
+        is_external = not is_folder and (":" in name or name.endswith(".pt2"))
         if name in BASELINES or is_external:
             if is_external and not representations:
                 raise UsageError(f"representations needs a value for policy={name}")
@@ -132,13 +133,13 @@ class Agent(Driver):
                 **{"num_envs": 1, **machine},
             )
             return cls(_external(name, config) if is_external else name, config)
-        if Path(name).is_dir():
-            trained, frames, weights = _of_run(RunFolder.existing(name), trusted)
-            about = f"the agent of {name}"
-        elif name == "pretrained" or name.endswith(".safetensors"):
+        if name == "pretrained" or name.endswith(".safetensors"):
             path = _pretrained(scene) if name == "pretrained" else Path(name)
             trained, frames, weights = _of_file(path, trusted)
             about = f"the agent in {path.name}"
+        elif is_folder:
+            trained, frames, weights = _of_run(RunFolder.existing(name), trusted)
+            about = f"the agent of {name}"
         else:
             raise UsageError(
                 f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "

@@ -1,5 +1,7 @@
 """Agents from Python: trained, evaluated, saved and loaded, and those that come with flowrep."""
 
+import signal
+
 import pytest
 import torch
 
@@ -17,16 +19,18 @@ SCENES = sorted(group_choices("scene"))
 LEAST = {"straight_road": 12, "s_turn": 12, "h_shaped_pathways": 3, "three_way_junction": 18}
 
 
+TINY = {
+    "scene": "s_turn", "representations": ["obj"], "debug": "smoke", "total_frames": 128,
+    "evaluation": {"every_frames": 0}, "device": "cpu", "scene.time_limit_steps": 30,
+    "algorithm.hidden_size": 16,
+}  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """An agent of a few frames, the folder of its run, and the rows that were logged."""
     folder, rows = tmp_path_factory.mktemp("runs") / "first", []
-    agent = Agent.train(
-        folder=folder, callback=rows.append, scene="s_turn", representations=["obj"],
-        debug="smoke", total_frames=128, evaluation={"every_frames": 0}, device="cpu", wandb="off",
-        **{"scene.time_limit_steps": 30, "algorithm.hidden_size": 16},
-    )  # fmt: skip
-    return agent, folder, rows
+    return Agent.train(folder=folder, callback=rows.append, **TINY), folder, rows
 
 
 def test_an_agent_is_trained_by_the_runner_of_the_command(trained):
@@ -53,7 +57,8 @@ def test_an_agent_is_the_same_from_its_run_and_from_a_file(trained, tmp_path):
     assert {(each.scene, each.frames, each.policy) for each in episodes} == {
         ("s_turn", 128, "greedy")
     }
-    for name in (folder, tmp_path / "agent.safetensors"):
+    (tmp_path / "12:00").symlink_to(folder)  # a colon, as in module:make
+    for name in (folder, tmp_path / "12:00", tmp_path / "agent.safetensors"):
         again = Agent.load(name, device="cpu")
         assert differing(again.policy.state_dict(), agent.policy.state_dict()) == []
         assert (again.frames, again.trained_in) == (128, "s_turn")
@@ -99,6 +104,15 @@ def test_a_wrong_key_or_value_is_named_before_a_folder_is_made(tmp_path, given, 
     with pytest.raises(UsageError, match=named):
         Agent.train(folder=tmp_path / "run", preset="laptop", **given)
     assert not (tmp_path / "run").exists()
+
+
+def test_ctrl_c_saves_the_run_and_is_raised(tmp_path):
+    def interrupt(row):
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt, match=str(tmp_path)):
+        Agent.train(folder=tmp_path / "run", callback=interrupt, **TINY)
+    assert Agent.load(tmp_path / "run", device="cpu").frames == 64  # the first row is at 64
 
 
 def test_the_folder_of_another_run_is_refused(trained):
