@@ -163,8 +163,8 @@ CONVENTIONS: dict[str, Convention] = {
         background=(),
         K="intrinsics_from_fov(fovy)",
         notes="As MuJoCo's, but depth is 0 where nothing is hit. A camera with sensorsize has K "
-        "from its focal lengths and sensor, cropped to the picture's aspect ratio. TorchRL's MJLabWrapper "
-        "passes on RGB alone; a group of observations brings the rest.",
+        "from its focal lengths and sensor, cropped to the picture's aspect ratio. "
+        "TorchRL's MJLabWrapper passes on RGB alone; a group of observations brings the rest.",
     ),
     "newton": Convention(
         simulator="Newton 1.8",
