@@ -34,7 +34,7 @@ def _remedy(package: str, extra: str) -> str:
     if package == "pybullet" and sys.version_info >= (3, 14):  # where the extra leaves it out
         return (
             "it has no wheels for Python 3.14 yet: use Python 3.13, or compile it with "
-            "`pip install pybullet-arm64`, which needs a C++ compiler and takes some minutes"
+            "`pip install pybullet-arm64`, which needs a C++ compiler and about ten minutes"
         )
     return f"run: pip install 'flowrep-rl[{extra}]'"
 
