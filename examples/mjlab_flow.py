@@ -11,7 +11,8 @@ A group of mjlab's observations holds what flow needs; TorchRL's `MJLabWrapper` 
 
 - spaces are of float32, so ids are sent as such, and cast here;
 - a geom moves as its body: geoms that share a body have the same pose;
-- a camera that MuJoCo's model gives a sensor size, as this one, has K from that, not from `fovy`.
+- a camera with a sensor size in MuJoCo's model, as this one, has K from that, not from `fovy`. The
+  renderer crops the sensor to the picture's aspect ratio.
 """
 
 import sys
@@ -19,7 +20,6 @@ from functools import partial
 from typing import Any
 
 import mjlab.tasks  # noqa: F401 - registers the tasks
-import numpy as np
 import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
@@ -36,11 +36,12 @@ TASK, WRIST = "Mjlab-Lift-Cube-Yam", "robot/camera_d405"
 
 
 def intrinsics(env: Any) -> Tensor:
-    """Returns K of the wrist's camera: MuJoCo has its focal lengths and sensor in metres."""
+    """Returns K of the wrist's camera, whose focal lengths and sensor MuJoCo has in metres."""
     model, camera = env.sim.mj_model, env.scene["eye"].camera_idx
-    px_per_m = np.array([WIDTH, HEIGHT]) / model.cam_sensorsize[camera]
-    fx, fy, cx, cy = model.cam_intrinsic[camera] * np.tile(px_per_m, 2)
-    return torch.tensor([[fx, 0, cx + WIDTH / 2], [0, fy, cy + HEIGHT / 2], [0, 0, 1]]).float()
+    width_m, height_m = model.cam_sensorsize[camera]
+    px_per_m = max(WIDTH / width_m, HEIGHT / height_m)  # cropped to the picture's aspect ratio
+    fx, fy, cx, cy = model.cam_intrinsic[camera] * px_per_m
+    return torch.tensor([[fx, 0, WIDTH / 2 - cx], [0, fy, HEIGHT / 2 - cy], [0, 0, 1]]).float()
 
 
 def moving_geoms(env: Any) -> list[int]:

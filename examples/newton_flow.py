@@ -24,6 +24,7 @@ import torch
 import warp as wp
 from newton.sensors import SensorCamera
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
@@ -69,23 +70,29 @@ class Yard(EnvBase):
         self.action_spec = Bounded(-1.0, 1.0, (num_worlds, 1))
         self.reward_spec = Unbounded((num_worlds, 1))
 
-    def observe(self) -> TensorDict:
-        """Returns Newton's maps and poses in its conventions, with ids as in the first world."""
-        # At rest the camera looks down, -z: it is pitched up about x, then turned about z.
+    def cameras(self) -> Tensor:
+        """Returns the cameras' poses [N, 7], positions and quaternions (x, y, z, w)."""
+        # At rest a camera looks down, -z: it is pitched up about x, then turned about z.
         sin_p, cos_p = math.sin(PITCH_RAD / 2), math.cos(PITCH_RAD / 2)
         sin_y, cos_y = (self.yaw / 2).sin(), (self.yaw / 2).cos()
         xyzw = torch.stack([cos_y * sin_p, sin_y * sin_p, sin_y * cos_p, cos_y * cos_p], -1)
-        camera = torch.cat([self.position, xyzw], -1)
+        return torch.cat([self.position, xyzw], -1)
+
+    def render(self) -> None:
+        """Draws the maps of all worlds."""
+        poses = wp.from_torch(self.cameras(), dtype=wp.transformf)
         self.model.bvh_refit_shapes(self.now)
-        self.sensor.update(
-            self.now, wp.from_torch(camera, dtype=wp.transformf), self.rays, **self.maps
-        )
+        self.sensor.update(self.now, poses, self.rays, **self.maps)
+
+    def observe(self) -> TensorDict:
+        """Returns Newton's maps and poses in its conventions, with ids as in the first world."""
+        self.render()
         ids = wp.to_torch(self.maps["shape_index_image"]).long()
         is_body = (ids != FLOOR) & (ids != 0xFFFFFFFF)
         return TensorDict(
             forward_depth=wp.to_torch(self.maps["forward_depth_image"]).clone(),
             shape_index=torch.where(is_body, 1 + (ids - 1) % len(BODIES), ids),
-            camera_transforms=camera,
+            camera_transforms=self.cameras(),
             body_q=wp.to_torch(self.now.body_q).reshape(-1, len(BODIES), 7).clone(),
             batch_size=self.batch_size,
         )

@@ -24,10 +24,19 @@ def require(what: str, extra: str, *packages: str, module: str = "") -> None:
     """
     for package in packages:
         if not is_installed(package):
-            message = f"{what} needs {package}; run: pip install 'flowrep-rl[{extra}]'"
+            message = f"{what} needs {package}; {_remedy(package, extra)}"
             if module == "__main__" or Path(sys.argv[0]).name.startswith("flowrep-"):
                 sys.exit(f"error: {message}")
-            raise ImportError(message)
+            raise ModuleNotFoundError(message, name=package)
+
+
+def _remedy(package: str, extra: str) -> str:
+    if package == "pybullet" and sys.version_info >= (3, 14):  # where the extra leaves it out
+        return (
+            "it has no wheels for Python 3.14 yet: use Python 3.13, or compile it with "
+            "`pip install pybullet-arm64`, which needs a C++ compiler and about ten minutes"
+        )
+    return f"run: pip install 'flowrep-rl[{extra}]'"
 
 
 @cache

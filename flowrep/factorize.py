@@ -5,6 +5,7 @@ What needs PyTorch, which takes seconds to import, is imported when the config h
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -30,14 +31,13 @@ if TYPE_CHECKING:
 
 def factorize_recording(config: FactorizeConfig) -> int:
     """Writes raw, ego and object flow of a recording; returns the exit code."""
-    import cv2
-
+    # OpenCV's messages about broken files would clutter the one-line error. It reads this as it is
+    # imported, below; only newer versions can be silenced later.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from flowrep import sequences
     from flowrep.sequences.job import Job
     from flowrep.sequences.output import Output
 
-    # OpenCV's messages about broken files would clutter the one-line error.
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     stream = open_stream(config)
     flow_source = open_flow_source(config, stream)
     motion_source = open_motion_source(config, stream)

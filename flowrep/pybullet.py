@@ -151,8 +151,8 @@ class BulletCamera:
         Args:
             view: the camera's view now, instead of the constructor's.
         """
-        bodies = self._there()
-        poses = {tag: body.poses(self._client) for tag, body in bodies.items()}
+        bodies = self._existing()
+        poses = {tag: body.poses(self._client) for tag, body in bodies.items()}  # [1 + links, 4, 4]
         world_from_cam = self._pose(view, bodies, poses)
         if not self._has_links:
             poses = {tag: pose[:1] for tag, pose in poses.items()}
@@ -208,12 +208,12 @@ class BulletCamera:
         K[:2, 2] += half[0] * -float(matrix[0, 2]), half[1] * float(matrix[1, 2])  # off-centre
         return K, (float(near_m), float(far_m))
 
-    def _there(self) -> dict[str, _Body]:
+    def _existing(self) -> dict[str, _Body]:
         """Returns the bodies that exist now, by the tag that each keeps while it exists."""
         client, bodies = self._client, {}
         for number in map(client.getBodyUniqueId, range(client.getNumBodies())):
             key = client.getUserDataId(number, _TAG)
-            if key < 0:  # no camera has seen it: a new body, perhaps of a number used before
+            if key < 0:  # a new body, which may have the number of one that was removed
                 key = client.addUserData(number, _TAG, uuid.uuid4().hex)
             tag = client.getUserData(key).decode()
             bodies[tag] = self._bodies.get(tag) or _Body(client, number)
@@ -227,15 +227,17 @@ class BulletCamera:
 
     def _rows(self, poses: Mapping[str, Array]) -> dict[tuple[str, int], int]:
         """Returns the row of each instance: as it was, or a free one for a new instance."""
-        there = [(tag, link - 1) for tag, pose in poses.items() for link in range(len(pose))]
-        # A row stays empty for a step: a pixel of the same row is of the same body in both frames.
+        present = [(tag, link - 1) for tag, pose in poses.items() for link in range(len(pose))]
+        # The row of one that left stays empty for a step, so that a row is never of one body in
+        # this frame and of another in the frame before.
         taken = set(self._row_of.values())
         free = (row for row in range(1, 1 + self.max_instances) if row not in taken)
-        row_of = {each: self._row_of.get(each) or next(free, 0) for each in there}
-        if lacking := sum(row == 0 for row in row_of.values()):
+        row_of = {each: self._row_of.get(each) or next(free, 0) for each in present}
+        if without := sum(row == 0 for row in row_of.values()):
             raise ValueError(
-                f"{len(there)} bodies and links are there, and {len(taken - set(row_of.values()))} "
-                f"have just left: give max_instances={self.max_instances + lacking} or more"
+                f"the world has {len(present)} bodies and links, and "
+                f"{len(taken - set(row_of.values()))} have just left: give max_instances="
+                f"{self.max_instances + without} or more"
             )
         return row_of
 
@@ -250,9 +252,9 @@ class BulletCamera:
                 raise ValueError("the camera has no view: give it to BulletCamera or to each call")
             return pose_of_view(view)
         body, link = self._link
-        for tag, there in bodies.items():
-            if there.number == body and -1 <= link < len(there.parents):
-                world_from_link = poses[tag][1 + link] @ there.mass_from_link[1 + link]
+        for tag, each in bodies.items():
+            if each.number == body and -1 <= link < len(each.parents):
+                world_from_link = poses[tag][1 + link] @ each.mass_from_link[1 + link]
                 return world_from_link if view is None else world_from_link @ pose_of_view(view)
         raise ValueError(
             f"no body {body} with a link {link}; there are "
@@ -267,11 +269,11 @@ class BulletCamera:
         shape = self.height, self.width  # PyBullet returns tuples if it was built without numpy
         ids = np.asarray(ids, dtype=np.int32).reshape(shape)
         zbuffer = np.asarray(zbuffer, dtype=np.float32).reshape(shape)
+        # The z-buffer of the sky is close to 1, above or below, but seldom 1.
         is_sky = ids == -1
-        # Not by the z-buffer, which is next to 1 there, above or below, but seldom 1.
         depth = depth_from_zbuffer(zbuffer, *self._range_m)
         depth[is_sky] = np.inf
-        # ids are body + ((link + 1) << 24), of which the sky's -1 is body 0xffffff, link 254
+        # ids are body + ((link + 1) << 24); the sky's -1 would be body 0xffffff, link 254
         packed = np.where(is_sky, 0, ids).view(np.uint32)
         body, link = packed & 0xFFFFFF, packed >> 24
         rows = self._table(int(body.max()), int(link.max()))
@@ -384,7 +386,8 @@ class _Client:
 class _Body:
     """A body: what doesn't change while it exists, and the poses of its base and links.
 
-    Poses are those of the centres of mass, as `getBasePositionAndOrientation` gives them.
+    Poses are those of the centres of mass, as `getBasePositionAndOrientation` gives them. Those of
+    links follow from the joints' positions, the forward kinematics that Bullet draws.
     """
 
     def __init__(self, client: Any, number: int) -> None:

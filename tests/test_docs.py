@@ -15,7 +15,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import CatTensors, Compose, TransformedEnv, check_env_specs
+from torchrl.envs import TransformedEnv, check_env_specs
 
 from docs import docstrings
 from flowrep import transforms
@@ -31,7 +31,6 @@ from flowrep.config.schema import (
 from flowrep.transforms import RawFlow
 from flowrep.transforms.hydra_configs import CONFIGS
 from tests.config.composing import plain
-from tests.transforms import oracles
 from tests.transforms.fake_env import HEIGHT, WIDTH, FakeSensorEnv
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -140,46 +139,6 @@ def test_the_env_guide_runs_with_the_readers_own_env():
     assert len(namespace["stack"]) > 1
     assert namespace["valid"].all()
     assert namespace["observation"].shape == (4, 84, 84)
-
-
-class IsaacLabCamera(FakeSensorEnv):
-    """The test's env with a camera's buffers in the conventions of Isaac Lab."""
-
-    def __init__(self):
-        super().__init__()
-        vectors, depth = Unbounded((HEIGHT, WIDTH, 2)), Unbounded((HEIGHT, WIDTH, 1))
-        camera = {"depth": depth, "motion_vectors": vectors}
-        camera |= {"pos_w": Unbounded(3), "quat_w_ros": Unbounded(4)}
-        camera["intrinsic_matrices"] = self.observation_spec["sensor", "K"]
-        self.observation_spec = Composite(camera=camera, want=self.observation_spec["sensor"])
-
-    def _observe(self):
-        sensor = super()._observe()["sensor"]
-        u, v = oracles.raw(sensor)
-        pose = sensor["world_from_cam"].clone()
-        pose[:3, 3] -= torch.tensor([5000.0, 0.0, 0.0])  # float32 is too coarse for a wide world
-        x, y, z, *vector, w = position_and_quaternion(pose).float()
-        camera = {
-            "depth": sensor["depth"].movedim(0, -1),
-            "motion_vectors": torch.stack([-u, -v], -1),
-            "pos_w": torch.stack([x, y, z]),
-            "quat_w_ros": torch.stack([w, *vector]),
-            "intrinsic_matrices": sensor["K"],
-        }
-        return TensorDict(camera=camera, want=sensor)
-
-
-def test_isaac_labs_buffers_become_ego_and_object_flow():
-    scope = vars(transforms) | {"CatTensors": CatTensors, "Compose": Compose}
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "simulators.md").read_text("utf-8"), re.S)
-    exec(next(block for block in blocks if block.startswith("isaac_lab")), scope)
-    env = TransformedEnv(IsaacLabCamera(), scope["isaac_lab"])
-    check_env_specs(env, seed=None)
-    for seen in env.rollout(3):
-        for name in ("ego", "obj"):
-            expected = getattr(oracles, name)(seen["want"])
-            torch.testing.assert_close(seen[name], expected, atol=1e-3, rtol=1e-4)
-    assert seen["obj"].abs().amax() > 0.3  # the walker
 
 
 def test_the_data_guide_runs_and_gives_what_it_says():

@@ -33,9 +33,21 @@ def load(name, path):
 @pytest.mark.parametrize(("path", "says"), MODULES.items(), ids=list(MODULES))
 def test_an_import_names_the_extra(path, says, monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras.sys, "version_info", (3, 13, 0))
     with pytest.raises(ImportError) as caught:
         load("a_copy", path)
     assert says in str(caught.value)
+
+
+def test_python_3_14_is_told_how_to_get_pybullet(monkeypatch):
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras.sys, "version_info", (3, 14, 0))
+    with pytest.raises(ModuleNotFoundError) as caught:
+        extras.require("flowrep.envs", "sim", "pybullet")
+    assert "pip install pybullet-arm64" in str(caught.value)
+    assert caught.value.name == "pybullet"  # so that pytest.importorskip skips
+    with pytest.raises(ModuleNotFoundError, match="flowrep-rl"):
+        extras.require("flowrep.envs", "sim", "shapely")
 
 
 def test_a_command_ends_in_one_line_with_what_it_would_miss_at_its_end(monkeypatch):

@@ -152,7 +152,7 @@ CONVENTIONS: dict[str, Convention] = {
     "mjlab": Convention(
         simulator="mjlab 1.6 (MuJoCo Warp 4.0)",
         sources=("mjlab.sensor.camera_sensor; mujoco_warp._src.render",),
-        tried="MuJoCo Warp on a CPU, tests/transforms/test_conventions.py; not mjlab",
+        tried="examples/mjlab_flow.py, on a CPU",
         layout="hwc",
         depth={"depth": {"kind": "z", "sky": 0.0}},
         pose=("camera_pose",),
@@ -162,13 +162,14 @@ CONVENTIONS: dict[str, Convention] = {
         ids="segmentation",
         background=(),
         K="intrinsics_from_fov(fovy)",
-        notes="As MuJoCo's, but depth is 0 where nothing is hit. TorchRL's MJLabWrapper passes on "
-        "RGB alone.",
+        notes="As MuJoCo's, but depth is 0 where nothing is hit. A camera with sensorsize has K "
+        "from its focal lengths and sensor, cropped to the picture's aspect ratio. "
+        "TorchRL's MJLabWrapper passes on RGB alone; a group of observations brings the rest.",
     ),
     "newton": Convention(
         simulator="Newton 1.8",
         sources=("newton.sensors.SensorCamera; newton.State.body_q",),
-        tried="tests/transforms/test_conventions.py, on a CPU",
+        tried="examples/newton_flow.py, on a CPU",
         depth={
             "forward_depth": {"kind": "z", "sky": 0.0},
             "depth": {"kind": "ray_length", "sky": 0.0, "intrinsics": "intrinsics"},
@@ -181,7 +182,8 @@ CONVENTIONS: dict[str, Convention] = {
         background=(0xFFFFFFFF,),
         K="intrinsics_from_fov(camera_fov), pixel centres at halves",
         notes="Ids are those of shapes, so body_ids names shapes and body_q has a row for each: "
-        "state.body_q[model.shape_body[shapes]]. A miss has depth 0, clear_data.clear_depth; "
+        "state.body_q[model.shape_body[shapes]]. Shapes are counted through all worlds. A miss has "
+        "depth 0, clear_data.clear_depth; "
         "SensorTiledCamera documents a negative one.",
     ),
     "genesis": Convention(

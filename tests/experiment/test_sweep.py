@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from flowrep.config import UsageError, cli, group_choices
+from flowrep.config import CONF_DIR, UsageError, cli, group_choices
 from flowrep.config.schema import TrainConfig
 from flowrep.experiment import sweep
 from flowrep.experiment.outcomes import EVALUATION_COLUMNS, is_finished
@@ -357,3 +357,10 @@ def test_an_interrupted_sweep_goes_on_and_a_failed_run_stops_no_other(tmp_path):
     rows = read_rows(whole / "metrics.csv")
     assert [int(row["frames"]) for row in rows] == list(range(20, 241, 20))
     assert (whole / "job.log").read_text().count("run folder: ") == 2  # begun, and resumed
+
+
+def test_ray_can_join_a_cluster():
+    # The plugin sets object_store_memory unless the key is there, and Ray refuses any value but
+    # None when it joins a cluster.
+    launcher = yaml.safe_load((CONF_DIR / "hydra/launcher/ray_jobs.yaml").read_text("utf-8"))
+    assert launcher["ray"]["init"]["object_store_memory"] is None
