@@ -11,19 +11,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flowrep import geometry
+from flowrep.diagnosis.fit import EYE, median, px_of, sampled
 from flowrep.diagnosis.recordings import nothing, why_not
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed
-from flowrep.diagnosis.witness import (
-    EYE,
-    LEAST_MOVEMENT_PX,
-    LEAST_PIXELS,
-    median,
-    px_of,
-    sampled,
-)  # fmt: skip
 
 _PAIRS = 8
+_MOVED_PX, _FEW_PIXELS = 0.25, 16  # bodies that show
 _SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
 _SAME_DEPTH = 0.03  # relative
 _ONE_SEES, _BETTER = 0.3, 0.03  # shares of bodies' pixels: the least, and a lead that tells
@@ -85,7 +79,8 @@ def diagnose(
     if not len(able):
         return nothing(reasons)
     able = able[_spread(len(able), _PAIRS)]
-    rivals = rivals_of({}, of_flow=raw is not None, absolute=absolute)
+    by_flow = raw is not None
+    rivals = rivals_of({}, by_flow=by_flow, of_flow=by_flow, absolute=absolute)
     names = [str(index) for index in kept[able].tolist()]
     found = diagnosed(pairs.of(able), [], rivals, names, _call)
     faults, odd = _recomputed(seen, ego_key, obj_key)
@@ -213,8 +208,8 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
         return [], [], [doubt]
     shift = (seen.flow.flow - seen.ego.flow).norm(dim=1)
     known = seen.flow.valid & seen.ego.valid & seen.depth.isfinite()
-    of = ((ids > 0) & known[:, 0] & (shift > LEAST_MOVEMENT_PX)).nonzero()
-    if len(of) < LEAST_PIXELS // 4:
+    of = ((ids > 0) & known[:, 0] & (shift > _MOVED_PX)).nonzero()
+    if len(of) < _FEW_PIXELS:
         return [], ["no moving body is seen: ids and motions of bodies are not tested"], []
     frame, own, z = of[:, 0], ids[*of.T], seen.depth[:, 0][*of.T]
     points = geometry.unproject(seen.depth, seen.K)[*of.T].unsqueeze(-1)
