@@ -74,7 +74,8 @@ def test_a_listed_mistake_is_named_with_the_numbers_that_mend_it(mistake, mends)
 
 @pytest.mark.slow_after_first
 @pytest.mark.parametrize(
-    "mistake", ["poses' yaw times 1.2", "poses' height halved", "depth 10 cm off", "flow shuffled"]
+    "mistake",
+    ["poses' yaw times 1.2", "depth 10 cm off", "flow shuffled", "poses late from the middle on"],
 )
 def test_a_mistake_that_nobody_listed_is_noticed(mistake):
     assert only("room", mistake).found.is_wrong
@@ -85,6 +86,21 @@ def test_a_mistake_that_nobody_listed_is_noticed(mistake):
 def test_an_env_whose_raw_flow_follows_its_mistake_is_told_by_depth(mistake):
     cell = only("room, env", mistake)
     assert cell.kind == "named", cell.found
+
+
+def test_depth_of_another_time_is_noticed_though_flow_is_noisy():
+    taken = realsense(0)
+    found = matrix.of_recording(taken.with_(depth=np.roll(taken.depth, -5, 0)))
+    assert found.verdict == "something is wrong"
+    assert "depth" in found.words
+
+
+def test_a_value_of_depth_that_fills_much_of_the_picture_is_named():
+    depth = shots().depth.copy()
+    depth[:, :40] = 65.535  # a third of 120 rows
+    (note,) = examined(shots().with_(depth=depth), {}).notes
+    assert "33%" in note
+    assert "65.53" in note
 
 
 def test_the_table_of_the_docs_has_every_mistake_and_none_that_passed():
