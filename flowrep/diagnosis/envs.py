@@ -80,16 +80,17 @@ def diagnose(
     able = able[_spread(len(able), _PAIRS)]
     rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
     names = [str(index) for index in kept[able].tolist()]
-    found = diagnosed(pairs.of(able), [], rivals, names, _call)
+    result = diagnosed(pairs.of(able), [], rivals, names, _call)
     faults, odd = _recomputed(seen, ego_key, obj_key)
-    fault, unseen, doubt = _bodies(seen, pairs.depth_step)
-    found = replace(found, notes=(*found.notes, *odd, *unseen))
+    fault, untested, doubt = _bodies(seen, pairs.depth_step)
+    result = replace(result, notes=(*result.notes, *odd, *untested))
     if faults := [*faults, *fault]:
-        words = "; ".join([found.words, *faults] if found.is_wrong else faults)
-        return replace(found, verdict=found.verdict if found.is_wrong else "wrong", words=words)
-    if doubt and found.is_right:
-        return replace(found, verdict="can't tell", words=f"{doubt[0]}; else {found.words}")
-    return found
+        words = "; ".join([result.words, *faults] if result.is_wrong else faults)
+        verdict = result.verdict if result.is_wrong else "wrong"
+        return replace(result, verdict=verdict, words=words)
+    if doubt and result.is_right:
+        return replace(result, verdict="can't tell", words=f"{doubt[0]}; else {result.words}")
+    return result
 
 
 def _spread(count: int, most: int) -> Tensor:
@@ -213,9 +214,9 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     tries["if they stand still"], shares = seen.motion[frame], {}
     for says, motions in tries.items():  # shares of pixels that show a body, and are right then
         then = (motions[:, :3, :3] @ points).squeeze(-1) + motions[:, :3, 3]
-        place = seen.prev_K[frame] @ (then / then[:, 2:].clamp(1e-6)).unsqueeze(-1)
-        place = place[:, :2, 0].nan_to_num(-1.0).long().minimum(size - 1).clamp(min=0)
-        at = (frame, place[:, 1], place[:, 0])
+        pixel = seen.prev_K[frame] @ (then / then[:, 2:].clamp(1e-6)).unsqueeze(-1)
+        pixel = pixel[:, :2, 0].nan_to_num(-1.0).long().minimum(size - 1).clamp(min=0)
+        at = (frame, pixel[:, 1], pixel[:, 0])
         fits = (then[:, 2] / seen.before[at] - 1).abs() < _SAME_DEPTH + 1.5 * depth_step / z
         shares[says] = float((fits & (seen.ids_before[:, 0][at] == body)).double().mean())
     share = shares["as recorded"]

@@ -24,7 +24,7 @@ _SETTLED = 0.01  # a step that is too small to matter, in scales of all pixels' 
 class Pairs(NamedTuple):
     """P pairs of frames as N pixels each, float64, nan where unknown."""
 
-    place: Tensor  # [P, 2, N], centres
+    pixel: Tensor  # [P, 2, N], centres
     raw: Tensor  # [P, 2, N]
     depth: Tensor  # [P, N], of the current frame
     texture: Tensor  # [P, 3, N], the root of the structure tensor: xx, xy, yy
@@ -77,7 +77,7 @@ def sampled(
     while math.gcd(step, size) > 1:
         step += 1
     index = torch.arange(min(size, 8 * PIXELS)) * step % size
-    place = torch.stack([index % width, index // width]).double() + 0.5
+    pixel = torch.stack([index % width, index // width]).double() + 0.5
 
     def at(maps: Tensor) -> Tensor:
         return maps.flatten(-2)[..., index].double()
@@ -103,7 +103,7 @@ def sampled(
     is_coarse = 1 < len(values) < 0.1 * depth.numel()
     depth_step = float(values.diff().median()) if is_coarse else 0.0
     z = first(depth.unsqueeze(1)).squeeze(1)
-    maps = [first(place.expand(count, -1, -1)), first(flow), z, first(texture), depth_step / z]
+    maps = [first(pixel.expand(count, -1, -1)), first(flow), z, first(texture), depth_step / z]
     whole = [K.double(), prev_K.double(), path.double()]
     whole += [depths.double().reciprocal() for depths in (now, before)]
     scale_px = 0.5 if raw is None else 1e-4
@@ -114,7 +114,7 @@ def sampled(
 
 def seen_before(pairs: Pairs, motion: Tensor) -> tuple[Tensor, Tensor]:
     """Returns where pixels were before, `[..., P, 2, N]`, and their depth then over that now."""
-    rays = torch.linalg.inv_ex(pairs.K)[0] @ homogeneous(pairs.place)
+    rays = torch.linalg.inv_ex(pairs.K)[0] @ homogeneous(pairs.pixel)
     bent, by = bool(pairs.distortion.any()), pairs.distortion[..., None]
     if bent:
         straight = rays[:, :2]
@@ -141,14 +141,14 @@ def residual(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
     Of flow, along the directions that have texture unless `plain`. Of depth, beyond its steps, how
     far a surface at 45 degrees would have to move to be as near as the frame before shows it.
     """
-    place, ratio = seen_before(pairs, motion)
+    pixel, ratio = seen_before(pairs, motion)
     known = ~pairs.depth.isnan() & motion.isfinite().flatten(-2).all(-1, keepdim=True)
     if not pairs.by_flow:
-        left = looked_up(pairs.before, place) * pairs.depth * ratio - 1
+        left = looked_up(pairs.before, pixel) * pairs.depth * ratio - 1
         left = left.sign() * (left.abs() - pairs.coarseness).clamp(min=0.0)
         left = (pairs.K[:, 0, :1] * left).masked_fill(ratio.isnan(), _BEHIND_PX)
         return torch.where(known & pairs.depth.isfinite(), left, math.nan).unsqueeze(-2)
-    left = (pairs.raw - pairs.gain @ (pairs.place - place)).nan_to_num(nan=_BEHIND_PX)
+    left = (pairs.raw - pairs.gain @ (pairs.pixel - pixel)).nan_to_num(nan=_BEHIND_PX)
     known = known & pairs.raw.isfinite().all(-2)
     if pairs.is_estimated and not plain:  # the texture is the picture's, whatever axes the flow has
         xx, xy, yy = pairs.texture.unbind(1)
@@ -158,11 +158,11 @@ def residual(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
     return torch.where(known.unsqueeze(-2), left, math.nan)
 
 
-def looked_up(maps: Tensor, place: Tensor, mode: str = "bilinear") -> Tensor:
+def looked_up(maps: Tensor, pixel: Tensor, mode: str = "bilinear") -> Tensor:
     """Returns maps `[P, H, W]` at places `[..., P, 2, N]`, nan outside."""
     size = torch.tensor([maps.shape[-1], maps.shape[-2]], dtype=torch.float64).unsqueeze(-1)
-    inside = ((place >= 0.5) & (place <= size - 0.5)).all(-2)
-    grid = torch.where(inside.unsqueeze(-2), 2 * place / size - 1, 0.0)
+    inside = ((pixel >= 0.5) & (pixel <= size - 0.5)).all(-2)
+    grid = torch.where(inside.unsqueeze(-2), 2 * pixel / size - 1, 0.0)
     grid = grid.reshape(-1, *grid.shape[-3:]).permute(1, 0, 3, 2)  # [P, ..., N, 2]
     values = functional.grid_sample(maps.unsqueeze(1), grid, mode, align_corners=False)
     return torch.where(inside, values[:, 0].transpose(0, 1).reshape(inside.shape), math.nan)
@@ -226,9 +226,9 @@ def descended(
     """
     count, (_, k) = len(group), n.shape
     free = 0 if motion is None else 6
-    # All unknowns: six of each motion, then the numbers. Those that a pair depends on:
-    mine = (torch.arange(free * count).view(count, free), k * group.unsqueeze(1) + torch.arange(k))
-    index = torch.cat([mine[0], free * count + mine[1]], 1)
+    # The unknowns are six of each motion, then the numbers; `index` has those of each pair.
+    of_motion, of_group = torch.arange(free * count).view(count, free), k * group.unsqueeze(1)
+    index = torch.cat([of_motion, free * count + of_group + torch.arange(k)], 1)
     size = free * count + n.numel()
     tries = small_motion(_STEP * torch.cat([torch.zeros(1, 6), torch.eye(6)]).double()).unsqueeze(1)
     for _ in range(steps):

@@ -25,12 +25,18 @@ from flowrep.diagnosis.fit import (
 
 
 class Rival(NamedTuple):
-    """A mistake.
+    """A mistake, and the change that undoes it.
 
-    `typed` is the option that mends it, or what to do; both texts may hold the numbers that are
-    learnt, by Gauss-Newton steps from each `start`. `each` pair may have its own. `usual` are the
-    numbers of a mistake that should show. Those `in_pixels` are shares of the width, and whole
-    pixels in the end: to interpolate depth would average its noise, and leave less.
+    Attributes:
+        of: what it is a mistake of.
+        typed: the option that mends it, or what to do; with the fitted numbers in braces.
+        says: the mistake in words, likewise.
+        change: corrects pairs, given numbers `[P, k]`.
+        start: where the fit of the numbers starts; the best end counts.
+        usual: numbers of a typical mistake, to see whether it would show.
+        each: the numbers differ from pair to pair.
+        in_pixels: the numbers are shares of the width, rounded to whole pixels after the fit.
+            Interpolated depth would have less noise, and the rival would win for that.
     """
 
     of: Literal["poses", "flow", "camera", "depth"]
@@ -188,7 +194,7 @@ def _transposed(path: Tensor) -> Tensor:
 
 
 def _rolled(places: int, path: Tensor) -> Tensor:
-    """Poses whose quaternion's numbers are moved by one place."""
+    """Poses whose quaternion's numbers are shifted by one."""
     known = path.isfinite().flatten(-2).all(-1)[..., None, None]
     R = torch.where(known, path, EYE)[..., :3, :3]
     # A rotation's quaternion, but for its sign, is the last eigenvector of this.
@@ -257,20 +263,20 @@ def _from_buffer(buffer: Tensor, line: Tensor) -> Tensor:
 def _along_ray(power: int, pairs: Pairs, n: Tensor) -> Pairs:
     """Depth times the length of the ray per metre of z, or divided by it."""
 
-    def per_z(K: Tensor, place: Tensor) -> Tensor:
-        return (torch.linalg.inv_ex(K)[0] @ homogeneous(place)).norm(dim=1) ** power
+    def per_z(K: Tensor, pixel: Tensor) -> Tensor:
+        return (torch.linalg.inv_ex(K)[0] @ homogeneous(pixel)).norm(dim=1) ** power
 
     before, (height, width) = pairs.before, pairs.now.shape[-2:]
     if not pairs.by_flow:
         v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
         everywhere = torch.stack([u, v]).double().flatten(1)
         before = before / per_z(pairs.prev_K, everywhere).unflatten(-1, (height, width))
-    return pairs._replace(depth=pairs.depth * per_z(pairs.K, pairs.place), before=before)
+    return pairs._replace(depth=pairs.depth * per_z(pairs.K, pairs.pixel), before=before)
 
 
 def _moved_depth(pairs: Pairs, shares: Tensor) -> Pairs:
-    place = pairs.place + (shares * pairs.now.shape[-1]).unsqueeze(-1)
-    return pairs._replace(depth=looked_up(pairs.now, place).reciprocal())
+    pixel = pairs.pixel + (shares * pairs.now.shape[-1]).unsqueeze(-1)
+    return pairs._replace(depth=looked_up(pairs.now, pixel).reciprocal())
 
 
 def _turned(axis: int, pairs: Pairs, n: Tensor) -> Pairs:
@@ -279,9 +285,9 @@ def _turned(axis: int, pairs: Pairs, n: Tensor) -> Pairs:
         turn = torch.eye(3, dtype=torch.float64)
         turn[axis, axis], turn[axis, 2] = -1.0, pairs.now.shape[2 - axis]
         return pairs._replace(K=turn @ pairs.K, prev_K=turn @ pairs.prev_K)
-    place = pairs.place.clone()
-    place[:, axis] = pairs.now.shape[2 - axis] - place[:, axis]
-    return pairs._replace(depth=looked_up(pairs.now, place).reciprocal())
+    pixel = pairs.pixel.clone()
+    pixel[:, axis] = pairs.now.shape[2 - axis] - pixel[:, axis]
+    return pairs._replace(depth=looked_up(pairs.now, pixel).reciprocal())
 
 
 def _gain(uu: float, uv: float, vu: float, vv: float) -> Change:
@@ -298,17 +304,17 @@ def _to_next(pairs: Pairs, n: Tensor) -> Pairs:
     return pairs._replace(path=pairs.path[:, [3, 3, 2, 1]], gain=-pairs.gain)
 
 
-def _reversed(pairs: Pairs, place: Tensor, maps: Tensor) -> Pairs:
+def _reversed(pairs: Pairs, pixel: Tensor, maps: Tensor) -> Pairs:
     """Flow from the frame before to this one, at places there, as if time ran back."""
     other: Any = {"path": pairs.path.flip(1), "K": pairs.prev_K, "prev_K": pairs.K}
     other["gain"] = -pairs.gain
-    depth = looked_up(maps, place, "nearest").reciprocal()
-    return pairs._replace(place=place, depth=depth, **other)
+    depth = looked_up(maps, pixel, "nearest").reciprocal()
+    return pairs._replace(pixel=pixel, depth=depth, **other)
 
 
 def _of_previous(pairs: Pairs, n: Tensor) -> Pairs:
-    return _reversed(pairs, pairs.place, pairs.before)
+    return _reversed(pairs, pairs.pixel, pairs.before)
 
 
 def _late_depth(pairs: Pairs, n: Tensor) -> Pairs:
-    return _reversed(pairs, pairs.place - torch.linalg.solve(pairs.gain, pairs.raw), pairs.now)
+    return _reversed(pairs, pairs.pixel - torch.linalg.solve(pairs.gain, pairs.raw), pairs.now)

@@ -99,7 +99,7 @@ def diagnosed(
     """
     recorded, others = _explanations(pairs, starts, rivals)
     width, motion = pairs.now.shape[-1], pairs.motion if pairs.has_poses else recorded.motion
-    ego = pairs.place - fit.seen_before(pairs, motion)[0]
+    ego = pairs.pixel - fit.seen_before(pairs, motion)[0]
     raw_px = median(px_of(pairs.raw if pairs.by_flow else ego))
     noise = torch.stack([e.spread for e in (recorded, *others)]).nan_to_num(math.inf).amin(0)
     errors, least = recorded.beyond(noise), recorded.least
@@ -149,9 +149,10 @@ def diagnosed(
             why = f"{size} are left, by rough poses or a mistake that {len(errors)} pairs hide"
         return Diagnosis("can't tell", why, **numbers)
     notes = [f"{steps} smaller errors"] if pairs.is_coarse else []
-    farthest = pairs.now[pairs.now > 0].amin()
-    if (share := float((pairs.now == farthest).double().mean())) > _FARTHEST:
-        notes.append(f"{share:.0%} of depth is {1 / farthest:.4g} m: if that is no surface, say so")
+    known = pairs.now[pairs.now > 0].reciprocal()
+    share = float((known == known.amax()).double().mean()) if len(known) else 0.0
+    if share > _FARTHEST:
+        notes.append(f"{share:.0%} of depth is {known.amax():.4g} m: if that is no surface, say so")
     if stray:
         notes.append(f"poses that don't fit the others: {', '.join(stray)}")
     if not pairs.has_poses:
@@ -165,7 +166,7 @@ def diagnosed(
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Fit:
     """What the data leave, as they are or as a rival corrects them, px `[P]`.
 
     `error` is what the recorded motion leaves beyond the best one, `spread` what that leaves.
@@ -234,7 +235,7 @@ def _is_better(after: Tensor, before: Tensor) -> bool:
 
 def _explanations(
     pairs: Pairs, starts: Sequence[Tensor], rivals: Sequence[Rival]
-) -> tuple[_Found, list[_Found]]:
+) -> tuple[_Fit, list[_Fit]]:
     """Returns what the data leave, as they are and as each rival that may help corrects them."""
     few, none, has_poses = pairs.of(pixels=slice(fit.FITTED)), pairs.depth[:, :0], pairs.has_poses
     still = EYE.expand(len(none), 4, 4)
@@ -244,13 +245,13 @@ def _explanations(
         known = [pairs.motion, *known]
         starts = [pairs.motion, fit.least_costly(few, torch.stack(known)), *starts]
 
-    def found(rival: Rival, n: Tensor, changed: Pairs, motion: Tensor) -> _Found:
+    def fitted(rival: Rival, n: Tensor, changed: Pairs, motion: Tensor) -> _Fit:
         error = apart(changed, changed.motion, motion) if has_poses else none.new_zeros(len(none))
         n = n.nanmedian(0).values
-        return _Found(rival, n, changed, motion, error, px_of(residual(changed, motion)))
+        return _Fit(rival, n, changed, motion, error, px_of(residual(changed, motion)))
 
     as_it_is = Rival("poses", "", "", lambda pairs, n: pairs)
-    recorded, others = found(as_it_is, none, pairs, best_motion(pairs, *starts, steps=8)), []
+    recorded, others = fitted(as_it_is, none, pairs, best_motion(pairs, *starts, steps=8)), []
     if has_poses and recorded.left < _EXACT_PX:
         return recorded, []
     left = median(px_of(residual(few, pairs.motion if has_poses else recorded.motion)))
@@ -267,7 +268,7 @@ def _explanations(
             if not median(px_of(few_left)) <= left:
                 continue
             motion = best_motion(changed, changed.motion)
-        others.append(found(rival, n, changed, motion))
+        others.append(fitted(rival, n, changed, motion))
     return recorded, others
 
 
@@ -294,9 +295,9 @@ def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
         follows = (few.path[1:, 1] == few.path[:-1, 2]).flatten(1).all(1)
         if not follows.any():
             return None
-        own, n = n, n.clone()
-        n[:-1, 0] = torch.where(follows, own[1:, 1], own[:-1, 0])
-        n[1:, 1] = torch.where(follows, own[:-1, 0], own[1:, 1])
+        fitted, n = n, n.clone()
+        n[:-1, 0] = torch.where(follows, fitted[1:, 1], fitted[:-1, 0])
+        n[1:, 1] = torch.where(follows, fitted[:-1, 0], fitted[1:, 1])
     else:
         halves = [min(tries, key=lambda tried: tried[1][i])[0][i] for i in half.unique()]
         n = torch.stack(halves)[half.max() - half]
@@ -307,7 +308,7 @@ def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
     return n if bool(((factors > 1 / most) & (factors < most)).all()) else None
 
 
-def _able(others: Sequence[_Found], before: Tensor, noise: Tensor, raw_px: float) -> list[_Found]:
+def _able(others: Sequence[_Fit], before: Tensor, noise: Tensor, raw_px: float) -> list[_Fit]:
     """Returns the rivals that explain errors, the best first."""
     after = {id(each): median(each.beyond(noise)) for each in others}
     error, ranked = median(before), sorted(others, key=lambda each: after[id(each)])
@@ -323,7 +324,7 @@ def _able(others: Sequence[_Found], before: Tensor, noise: Tensor, raw_px: float
     return [each for each in able if len(each.n) == fewest[each.rival.of]]
 
 
-def _other_times(recorded: _Found, raw_px: float) -> str:
+def _other_times(recorded: _Fit, raw_px: float) -> str:
     """Returns in which way successive maps of depth tell of another motion than flow, or ""."""
     of_depth = recorded.pairs._replace(by_flow=False, scale_px=0.5)
     still = EYE.expand_as(recorded.motion)
@@ -350,7 +351,7 @@ def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, .
 def _blocks(pairs: Pairs, across: int, down: int) -> Tensor:
     """Returns which pixels `[P, N]` are in every other block of the picture."""
     height, width = pairs.now.shape[-2:]
-    block = pairs.place.nan_to_num() / torch.tensor([[width / across], [height / down]])
+    block = pairs.pixel.nan_to_num() / torch.tensor([[width / across], [height / down]])
     return block.floor().sum(1) % 2 == 0
 
 
@@ -370,8 +371,8 @@ def _mapped(pairs: Pairs, best: Tensor) -> Tensor:
     b = x.mT @ y - x.unsqueeze(-1) * y.unsqueeze(-2)
     size, errors = A.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] / len(x), []
     for damping in (0.03, 0.3, 3.0):
-        told = torch.linalg.solve_ex(A + damping * size * torch.eye(7), b)[0]
-        correction = (x.unsqueeze(-2) @ told).squeeze(-2) / unit
+        learnt = torch.linalg.solve_ex(A + damping * size * torch.eye(7), b)[0]
+        correction = (x.unsqueeze(-2) @ learnt).squeeze(-2) / unit
         errors.append(apart(pairs, fit.small_motion(recorded + correction), best))
     return min(errors, key=median)
 
@@ -379,11 +380,11 @@ def _mapped(pairs: Pairs, best: Tensor) -> Tensor:
 def _smoothed(pairs: Pairs, best: Tensor) -> Tensor:
     """Returns what the best motion leaves without its structure over picture and depth, px `[P]`.
 
-    A polynomial of the pixel's place and inverse depth, fitted to every other block of the picture,
+    A polynomial of the pixel's pixel and inverse depth, fitted to every other block of the picture,
     is subtracted in the others. Where K, depth and flow fit each other, noise alone is left.
     """
     left, (height, width) = residual(pairs, best), pairs.now.shape[-2:]
-    x, y = (2 * pairs.place.nan_to_num() / torch.tensor([[width], [height]]) - 1).unbind(1)
+    x, y = (2 * pairs.pixel.nan_to_num() / torch.tensor([[width], [height]]) - 1).unbind(1)
     q = pairs.depth.reciprocal().nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
     q = (q / q.median(-1, keepdim=True).values.clamp(min=1e-9)).clamp(max=3.0) - 1
     powers = [(a, b, c) for a in range(4) for b in range(4 - a) for c in range(3)]
