@@ -11,19 +11,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from flowrep import geometry
+from flowrep.diagnosis.fit import EYE, median, px_of, sampled
 from flowrep.diagnosis.recordings import nothing, why_not
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed
-from flowrep.diagnosis.witness import (
-    EYE,
-    LEAST_MOVEMENT_PX,
-    LEAST_PIXELS,
-    median,
-    px_of,
-    sampled,
-)  # fmt: skip
 
 _PAIRS = 8
+_MOVED_PX, _FEW_PIXELS = 0.25, 16  # bodies that show
 _SAME_PX, _SAME_SHARE = 0.02, 0.01  # of flow that was computed twice
 _SAME_DEPTH = 0.03  # relative
 _ONE_SEES, _BETTER = 0.3, 0.03  # shares of bodies' pixels: the least, and a lead that tells
@@ -70,13 +64,12 @@ def diagnose(
         why = "depth is negative: give its opposite"
         return Diagnosis("wrong", why, suspects=("depth times -1",))
     first, second = EYE.expand_as(seen.motion), seen.motion
-    absolute = now.get(("sensor", "world_from_cam"), None) is not None
-    if absolute:
-        first, second = (x["sensor", "world_from_cam"].double() for x in (seen.previous, seen.now))
+    if is_absolute := seen.poses is not None:
+        first, second = seen.poses
     path = [first @ torch.linalg.inv_ex(earlier[kept])[0], first, second, second @ later[kept]]
     static = torch.where(seen.is_static, seen.depth, math.nan).squeeze(1)
     raw, picture = None, None
-    if not seen.is_derived:
+    if is_measured := not seen.is_derived:
         raw, picture = seen.raw, seen.now["sensor"].get("rgb", None)
     maps = (static, seen.before, seen.K, seen.prev_K, torch.stack(path, 1), picture)
     pairs = sampled(raw, *maps)
@@ -85,19 +78,19 @@ def diagnose(
     if not len(able):
         return nothing(reasons)
     able = able[_spread(len(able), _PAIRS)]
-    rivals = rivals_of({}, of_flow=raw is not None, absolute=absolute)
+    rivals = rivals_of({}, by_flow=is_measured, of_flow=is_measured, absolute=is_absolute)
     names = [str(index) for index in kept[able].tolist()]
-    found = diagnosed(pairs.of(able), [], rivals, names, _call)
+    result = diagnosed(pairs.of(able), [], rivals, names, _call)
     faults, odd = _recomputed(seen, ego_key, obj_key)
-    fault, unseen, doubt = _bodies(seen, pairs.depth_step)
-    faults, notes = [*faults, *fault], (*found.notes, *odd, *unseen)
-    if doubt and found.is_right:
-        found = replace(found, verdict="can't tell", words=f"{doubt[0]}; else {found.words}")
-    if not faults:
-        return replace(found, notes=notes)
-    words = "; ".join([found.words, *faults] if found.is_wrong else faults)
-    verdict = found.verdict if found.is_wrong else "wrong"
-    return replace(found, verdict=verdict, words=words, notes=notes)
+    fault, untested, doubt = _bodies(seen, pairs.depth_step)
+    result = replace(result, notes=(*result.notes, *odd, *untested))
+    if faults := [*faults, *fault]:
+        words = "; ".join([result.words, *faults] if result.is_wrong else faults)
+        verdict = result.verdict if result.is_wrong else "wrong"
+        return replace(result, verdict=verdict, words=words)
+    if doubt and result.is_right:
+        return replace(result, verdict="can't tell", words=f"{doubt[0]}; else {result.words}")
+    return result
 
 
 def _spread(count: int, most: int) -> Tensor:
@@ -118,6 +111,7 @@ def _successive(frames: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase,
     if frames.get(("next", "sensor", "depth"), None) is not None:
         frames = frames if frames.ndim else frames.unsqueeze(0)
         before, now = frames.exclude("next"), frames["next"]
+        # A step that begins with the depth that the one before ended with goes on from there.
         depths = (x["sensor", "depth"].flatten(now.ndim) for x in (before[..., 1:], now[..., :-1]))
         goes_on = torch.stack([z.nan_to_num(-1.0) for z in depths]).diff(dim=0)[0] == 0
         kept, goes_on = torch.ones(now.shape, dtype=torch.bool), goes_on.all(-1)
@@ -139,16 +133,14 @@ class _Seen:
     """What an env recorded of P frames and of those before them, and the flow that follows."""
 
     def __init__(self, now: Any, previous: Any, K: Tensor, prev_K: Tensor, raw_key: str) -> None:
-        self.now, self.previous, self.K, self.prev_K = now, previous, K.double(), prev_K.double()
-        sensor, self.motion, both = now["sensor"], _motion(now), (now["sensor"], previous["sensor"])
-        self.depth, self.before = (
-            sensor["depth"].double(),
-            previous["sensor", "depth"][:, 0].double(),
-        )
+        self.now, self.K, self.prev_K, self.motion = now, K.double(), prev_K.double(), _motion(now)
+        both = now["sensor"], previous["sensor"]
+        self.depth, self.before = both[0]["depth"].double(), both[1]["depth"][:, 0].double()
         nobody = torch.zeros_like(self.depth, dtype=torch.long)
-        self.ids, self.ids_before = (x.get("instance", nobody).long()[:, 0] for x in both)
-        self.ids = self.ids.unsqueeze(1)
-        self.rows = sensor.get("instance_motion", self.motion.unsqueeze(1)).double()
+        self.ids, self.ids_before = (x.get("instance", nobody).long() for x in both)
+        poses = [x.get("world_from_cam", None) for x in both[::-1]]
+        self.poses = None if poses[0] is None else [pose.double() for pose in poses]
+        self.rows = both[0].get("instance_motion", self.motion.unsqueeze(1)).double()
         rows = self.ids.clamp(0, self.rows.shape[1] - 1)
         # Many simulators number what stands still, too.
         stands = (self.rows - self.rows[:, :1]).abs().flatten(2).amax(-1) < 1e-6
@@ -171,25 +163,24 @@ def _recomputed(seen: _Seen, ego_key: str, obj_key: str) -> tuple[list[str], lis
     """Returns what is wrong with what an env or its transforms computed, and what is odd."""
     faults, odd, ego = [], [], torch.where(seen.ego.valid, seen.ego.flow, math.nan)
     of_poses, raw = ego, seen.flow.flow if seen.raw is None else seen.raw
-    if seen.now.get(("sensor", "world_from_cam"), None) is not None:
-        poses = (x["sensor", "world_from_cam"] for x in (seen.previous, seen.now))
-        of_poses = seen.flow_of(geometry.relative_motion(*poses, dtype=torch.float64)).flow
-    for says, found, right in (
+    if seen.poses is not None:
+        of_poses = seen.flow_of(geometry.relative_motion(*seen.poses, dtype=torch.float64)).flow
+    for says, given, right in (
         ("row 0 of instance_motion isn't prev_from_curr", seen.flow_of(seen.rows[:, 0]).flow, ego),
         ("prev_from_curr isn't the motion of world_from_cam", ego, of_poses),
         (f"{ego_key} isn't the flow of depth, K and prev_from_curr", seen.now.get(ego_key), ego),
         (f"{obj_key} isn't raw flow without ego flow", seen.now.get(obj_key), raw - ego),
     ):
-        if found is None:
+        if given is None:
             continue
-        right, found = (x.double().movedim(1, -1).flatten(0, -2) for x in (right, found))
-        counts = (right.norm(dim=-1) > 0.05) & right.isfinite().all(-1) & found.isfinite().all(-1)
-        right, found = right[counts], found[counts]
-        if not len(right):
+        right, given = (x.double().movedim(1, -1).flatten(0, -2) for x in (right, given))
+        counts = (right.norm(dim=-1) > 0.05) & right.isfinite().all(-1) & given.isfinite().all(-1)
+        if not counts.any():
             continue
-        factor = float((found * right).sum() / right.square().sum())
+        right, given = right[counts], given[counts]
+        factor = float((given * right).sum() / right.square().sum())
         px, as_factor_px, size_px = (
-            float(x.norm(dim=-1).median()) for x in (found - right, found - factor * right, right)
+            float(x.norm(dim=-1).median()) for x in (given - right, given - factor * right, right)
         )
         if px <= _SAME_PX + _SAME_SHARE * size_px:
             continue
@@ -204,32 +195,32 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     """Returns what is wrong with ids and motions of bodies, what isn't tested, what is in doubt."""
     count, ids = seen.rows.shape[1], seen.ids[:, 0]
     if int(ids.min()) < 0 or int(ids.max()) >= count:
-        found = f"{int(ids.min())} to {int(ids.max())}"
-        return [f"instance has ids {found}, but instance_motion rows 0 to {count - 1}"], [], []
+        given = f"{int(ids.min())} to {int(ids.max())}"
+        return [f"instance has ids {given}, but instance_motion rows 0 to {count - 1}"], [], []
     moved = (seen.rows - seen.motion.unsqueeze(1)).abs().flatten(2).amax(-1) > 1e-4
     moving = moved.any(0).nonzero()[:, 0].tolist()  # rows that are nan don't count
     if moving and not (ids > 0).any():
         doubt = f"bodies {moving[0]} to {moving[-1]} move, but no pixel of instance has their ids"
         return [], [], [doubt]
     shift = (seen.flow.flow - seen.ego.flow).norm(dim=1)
-    known = seen.flow.valid & seen.ego.valid & seen.depth.isfinite()
-    of = ((ids > 0) & known[:, 0] & (shift > LEAST_MOVEMENT_PX)).nonzero()
-    if len(of) < LEAST_PIXELS // 4:
+    known = (seen.flow.valid & seen.ego.valid & seen.depth.isfinite())[:, 0]
+    of = ((ids > 0) & known & (shift > _MOVED_PX)).nonzero()
+    if len(of) < _FEW_PIXELS:
         return [], ["no moving body is seen: ids and motions of bodies are not tested"], []
-    frame, own, z = of[:, 0], ids[*of.T], seen.depth[:, 0][*of.T]
+    frame, body, z = of[:, 0], ids[*of.T], seen.depth[:, 0][*of.T]
     points = geometry.unproject(seen.depth, seen.K)[*of.T].unsqueeze(-1)
-    rows, size = seen.rows[frame, own], torch.tensor(seen.before.shape[:0:-1])
+    rows, size = seen.rows[frame, body], torch.tensor(seen.before.shape[:0:-1])
     tries = {"as recorded": rows, "inverted": geometry.invert_rigid(rows)}
     tries["if they stand still"], shares = seen.motion[frame], {}
     for says, motions in tries.items():  # shares of pixels that show a body, and are right then
         then = (motions[:, :3, :3] @ points).squeeze(-1) + motions[:, :3, 3]
-        place = seen.prev_K[frame] @ (then / then[:, 2:].clamp(1e-6)).unsqueeze(-1)
-        place = place[:, :2, 0].nan_to_num(-1.0).long().minimum(size - 1).clamp(min=0)
-        at = (frame, place[:, 1], place[:, 0])
+        pixel = seen.prev_K[frame] @ (then / then[:, 2:].clamp(1e-6)).unsqueeze(-1)
+        pixel = pixel[:, :2, 0].nan_to_num(-1.0).long().minimum(size - 1).clamp(min=0)
+        at = (frame, pixel[:, 1], pixel[:, 0])
         fits = (then[:, 2] / seen.before[at] - 1).abs() < _SAME_DEPTH + 1.5 * depth_step / z
-        shares[says] = float((fits & (seen.ids_before[at] == own)).double().mean())
-    share, best = shares["as recorded"], max(shares.values())
-    if share >= _ONE_SEES and best <= share + _BETTER:
+        shares[says] = float((fits & (seen.ids_before[:, 0][at] == body)).double().mean())
+    share = shares["as recorded"]
+    if share >= _ONE_SEES and max(shares.values()) <= share + _BETTER:
         return [], [], []
     listing = ", ".join(f"{part:.0%} {says}" for says, part in shares.items())
     says = "instance_motion or ids don't fit the bodies: pixels that were where these say"

@@ -11,17 +11,11 @@ import torch
 from torch import Tensor
 
 from flowrep import geometry
+from flowrep.diagnosis.fit import EYE, Pairs, px_of, sampled, seen_before
 from flowrep.diagnosis.rivals import rivals_of
 from flowrep.diagnosis.verdict import Diagnosis, diagnosed
-from flowrep.diagnosis.witness import (
-    EYE,
-    LEAST_MOVEMENT_PX,
-    LEAST_PIXELS,
-    Pairs,
-    px_of,
-    sampled,
-    seen_before,
-)  # fmt: skip
+
+_LEAST_PIXELS, _LEAST_MOVEMENT_PX = 64, 0.25  # pairs with less say nothing
 
 
 @dataclass
@@ -85,7 +79,8 @@ class Examination:
         maps = [torch.cat(parts) for parts in zip(*(part[:10] for part in self._parts))]
         pairs = Pairs._make([*maps, *first[10:]])
         pairs = pairs._replace(depth_step=max(part.depth_step for part in self._parts))
-        rivals = rivals_of(self.conventions, of_flow=self.flow_is_recorded, absolute=True)
+        options = {"by_flow": True, "of_flow": self.flow_is_recorded, "absolute": True}
+        rivals = rivals_of(self.conventions, **options)
         return diagnosed(pairs, [torch.cat(self._starts)], rivals, self._names, self._remedy)
 
     def _remedy(self, typed: str) -> str:
@@ -103,11 +98,11 @@ class Examination:
 
 def why_not(pairs: Pairs) -> list[str]:
     """Returns why each pair tells nothing, "" if it does."""
-    ego = px_of(pairs.place - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
-    moves = torch.maximum(px_of(pairs.raw).nan_to_num(0.0), ego) >= LEAST_MOVEMENT_PX
+    ego = px_of(pairs.pixel - seen_before(pairs, pairs.motion)[0]).nan_to_num(0.0)
+    moves = torch.maximum(px_of(pairs.raw).nan_to_num(0.0), ego) >= _LEAST_MOVEMENT_PX
     number, has_depth = (~pairs.depth.isnan()).sum(-1), pairs.now.isfinite().flatten(1).any(1)
     return [
-        "depth is nowhere known" if not d else "too few pixels are known" if n < LEAST_PIXELS else
+        "depth is nowhere known" if not d else "too few pixels are known" if n < _LEAST_PIXELS else
         "" if m else "hardly anything moves"
         for d, n, m in zip(has_depth.tolist(), number.tolist(), moves.tolist())
     ]  # fmt: skip

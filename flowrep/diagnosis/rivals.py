@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from flowrep import geometry
-from flowrep.diagnosis.witness import (
+from flowrep.diagnosis.fit import (
     EYE,
     Change,
     Pairs,
@@ -25,11 +25,18 @@ from flowrep.diagnosis.witness import (
 
 
 class Rival(NamedTuple):
-    """A mistake.
+    """A mistake, and the change that undoes it.
 
-    `typed` is the option that mends it, or what to do; both texts may hold the numbers that are
-    learnt, by Gauss-Newton steps from each `start`. `each` pair may have its own. `usual` are the
-    numbers of a mistake that should show.
+    Attributes:
+        of: what it is a mistake of.
+        typed: the option that mends it, or what to do; with the fitted numbers in braces.
+        says: the mistake in words, likewise.
+        change: corrects pairs, given numbers `[P, k]`.
+        start: where the fit of the numbers starts; the best end counts.
+        usual: numbers of a typical mistake, to see whether it would show.
+        each: the numbers differ from pair to pair.
+        in_pixels: the numbers are shares of the width, rounded to whole pixels after the fit.
+            Interpolated depth would have less noise, and the rival would win for that.
     """
 
     of: Literal["poses", "flow", "camera", "depth"]
@@ -39,14 +46,31 @@ class Rival(NamedTuple):
     start: tuple[tuple[float, ...], ...] = ((),)
     usual: tuple[float, ...] = ()
     each: bool = False
+    in_pixels: bool = False
+
+    def texts(self, numbers: Tensor, width: int) -> tuple[str, str]:
+        """Returns what mends the mistake, and what it is, with the numbers that were learnt."""
+        n, values = [*numbers.tolist(), 0.0, 0.0], {}
+        values["inverse"] = f"{1 / n[0] if n[0] else math.inf:.3g}"
+        values["far"] = f"{1 / max(n[0] + n[1], 1e-6):.3g}"
+        if len(numbers) >= 2:  # the last two of some are shares of the width
+            values["px"] = f"({width * n[-4]:+.1f}, {width * n[-3]:+.1f}) px"
+        if len(numbers) == 6:
+            values["degrees"] = f"{math.degrees(math.hypot(*n[:3])):.1f}"
+            rows = small_motion(numbers)[:3].flatten().tolist()
+            values["matrix"] = f"[{','.join(f'{x:.4g}' for x in rows)}]"
+        return self.typed.format(*n, **values), self.says.format(*n, **values)
 
 
-def rivals_of(given: Mapping[str, str], *, of_flow: bool, absolute: bool) -> list[Rival]:
+def rivals_of(
+    given: Mapping[str, str], *, by_flow: bool, of_flow: bool, absolute: bool
+) -> list[Rival]:
     """Returns the table, relative to the options in force.
 
     Args:
         given: these options, see `Recording.conventions`.
-        of_flow: whether raw flow is the data's.
+        by_flow: whether raw flow is the witness.
+        of_flow: whether it is the data's, and may be wrong itself.
         absolute: whether poses in the world are known, not the motions alone.
     """
     given = {"pose_direction": "camera_to_world", "pose_axes": "opencv", "depth_kind": "z",
@@ -74,14 +98,14 @@ def rivals_of(given: Mapping[str, str], *, of_flow: bool, absolute: bool) -> lis
            _path(lambda path: path[:, [0, 0, 1, 2]])),
         of("poses", "poses {0:.2f} frames later", "the times of poses are {0:.2f} frames late",
            _later, ((0.0,),), (0.5,)),
-        of("poses", "marker_from_cam={matrix}", "poses are a marker's, {degrees:.1f} degrees off",
+        of("poses", "marker_from_cam={matrix}", "poses are a marker's, {degrees} degrees off",
            lambda p, n: p._replace(path=p.path @ small_motion(n)[:, None]),
            ((0.0,) * 6,), (0.1,) * 6),
         of("camera", "K's numbers in another order", "K's numbers are fx, cx, fy, cy",
            _camera(lambda fx, cx, fy, cy, w, h, n: (fx, fy, cx, cy))),
         of("camera", "K in pixels", "K is in widths and heights",
            _camera(lambda fx, cx, fy, cy, w, h, n: (w * fx, w * cx, h * fy, h * cy))),
-        of("camera", "K times {0:.3g}", "K is of pictures {inverse:.3g} times as large",
+        of("camera", "K times {0:.3g}", "K is of pictures {inverse} times as large",
            _camera(lambda *k: [k[-1][0] * x for x in k[:4]]), ((1.0,), (0.5,), (2.0,)), (1.25,)),
         of("camera", "cx and cy moved by {px}", "the pictures were cropped, K was not",
            _camera(lambda fx, cx, fy, cy, w, h, n: (fx, cx + w * n[0], fy, cy + w * n[1])),
@@ -94,21 +118,17 @@ def rivals_of(given: Mapping[str, str], *, of_flow: bool, absolute: bool) -> lis
            _zoomed, ((1.0, 1.0),), (1.01, 1.0), each=True),
         of("camera", "distortion=[{0:.2g},0,0,0]", "the lens bends the picture (calibrate it)",
            lambda p, n: p._replace(distortion=n), ((0.0,),), (-0.2,)),
-        of("depth", "depth times {inverse:.3g}", "depth is {0:.3g} times as long as poses say",
+        of("depth", "depth times {inverse}", "depth is {0:.3g} times as long as poses say",
            _depth(lambda z, n: z / n.clamp(1e-6)), ((1.0,), (1e-3,), (1e3,)), (2.0,)),
         of("depth", "{0:.3g} / depth", "depth is {0:.3g} / z, a disparity",
            _depth(lambda d, n: n.clamp(1e-6) / d), ((1.0,), (100.0,))),
-        of("depth", "depth_kind=z_buffer near_m={inverse:.3g} far_m={far:.3g}",
+        of("depth", "depth_kind=z_buffer near_m={inverse} far_m={far}",
            "depth is a buffer's", _depth(_from_buffer), ((5.0, -5.0),)),
     ]  # fmt: skip
-    if given["depth_kind"] == "ray_length":
-        says, change = {"depth_kind=z": "depth is z, not the ray's length"}, partial(_along_ray, 1)
-    else:
-        says, change = (
-            {"depth_kind=ray_length": "depth is the ray's length"},
-            partial(_along_ray, -1),
-        )
-    table += [of("depth", typed, text, change) for typed, text in says.items()]
+    is_z = given["depth_kind"] != "ray_length"
+    kind, what = ("ray_length", "the ray's length") if is_z else ("z", "z, not the ray's length")
+    change = partial(_along_ray, -1 if is_z else 1)
+    table.append(of("depth", f"depth_kind={kind}", f"depth is {what}", change))
     if absolute:
         first, last = (_path(partial(_rolled, places)) for places in (-1, 1))
         table += [
@@ -116,6 +136,16 @@ def rivals_of(given: Mapping[str, str], *, of_flow: bool, absolute: bool) -> lis
             of("poses", "pose_layout=xyz_xyzw", "quaternions have w last", last),
             of("poses", "rotations transposed", "rotations are by columns", _path(_transposed)),
         ]
+    table += [
+        of("depth", "depth upside down", "depth has its lowest row first", partial(_turned, 1)),
+        of("depth", "depth mirrored", "depth has its last column first", partial(_turned, 0)),
+    ]
+    if by_flow:
+        table += [
+            of("depth", "depth moved by {px}", "depth isn't registered to the pictures",
+               _moved_depth, ((0.0, 0.0), (0.06, 0.0), (-0.06, 0.0)), (0.05, 0.0), in_pixels=True),
+            of("depth", "depth of the next frame", "depth is a frame late", _late_depth),
+        ]  # fmt: skip
     if of_flow:
         other = {"backward": "forward", "forward": "backward"}[given["flow_direction"]]
         order = {"uv": "row_column", "row_column": "uv"}[given["flow_channels"]]
@@ -129,12 +159,9 @@ def rivals_of(given: Mapping[str, str], *, of_flow: bool, absolute: bool) -> lis
             of("flow", "flow times the size", "flow is divided by the size", partial(_in_sizes, 1)),
             of("flow", "flow times half the size", "flow is in half sizes", partial(_in_sizes, 2)),
             of("flow", "flow divided by {0:.3g}", "flow is of pictures {0:.3g} times as large",
-               lambda p, n: p._replace(gain=p.gain * n.median()), ((1.0,),), (1.5,)),
+               lambda p, n: p._replace(gain=p.gain * n.unsqueeze(-1)), ((1.0,),), (1.5,)),
             of("flow", "flow_to=next backwards=true", "flow leads to the next frame", _to_next),
             of("flow", "flow on this frame's grid", "flow is on the previous one's", _of_previous),
-            of("depth", "depth moved by {px}", "depth isn't registered to the pictures",
-               _moved_depth, ((0.0, 0.0), (0.06, 0.0), (-0.06, 0.0)), (0.05, 0.0)),
-            of("depth", "depth of the next frame", "depth is a frame late", _late_depth),
         ]  # fmt: skip
     return table
 
@@ -167,7 +194,7 @@ def _transposed(path: Tensor) -> Tensor:
 
 
 def _rolled(places: int, path: Tensor) -> Tensor:
-    """Poses whose quaternion's numbers are moved by one place."""
+    """Poses whose quaternion's numbers are shifted by one."""
     known = path.isfinite().flatten(-2).all(-1)[..., None, None]
     R = torch.where(known, path, EYE)[..., :3, :3]
     # A rotation's quaternion, but for its sign, is the last eigenvector of this.
@@ -236,20 +263,31 @@ def _from_buffer(buffer: Tensor, line: Tensor) -> Tensor:
 def _along_ray(power: int, pairs: Pairs, n: Tensor) -> Pairs:
     """Depth times the length of the ray per metre of z, or divided by it."""
 
-    def per_z(K: Tensor, place: Tensor) -> Tensor:
-        return (torch.linalg.inv_ex(K)[0] @ homogeneous(place)).norm(dim=1) ** power
+    def per_z(K: Tensor, pixel: Tensor) -> Tensor:
+        return (torch.linalg.inv_ex(K)[0] @ homogeneous(pixel)).norm(dim=1) ** power
 
     before, (height, width) = pairs.before, pairs.now.shape[-2:]
     if not pairs.by_flow:
         v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
         everywhere = torch.stack([u, v]).double().flatten(1)
         before = before / per_z(pairs.prev_K, everywhere).unflatten(-1, (height, width))
-    return pairs._replace(depth=pairs.depth * per_z(pairs.K, pairs.place), before=before)
+    return pairs._replace(depth=pairs.depth * per_z(pairs.K, pairs.pixel), before=before)
 
 
 def _moved_depth(pairs: Pairs, shares: Tensor) -> Pairs:
-    place = pairs.place + (shares * pairs.now.shape[-1]).unsqueeze(-1)
-    return pairs._replace(depth=looked_up(pairs.now, place).reciprocal())
+    pixel = pairs.pixel + (shares * pairs.now.shape[-1]).unsqueeze(-1)
+    return pairs._replace(depth=looked_up(pairs.now, pixel).reciprocal())
+
+
+def _turned(axis: int, pairs: Pairs, n: Tensor) -> Pairs:
+    """Depth the other way round along x (0) or y (1) of the picture."""
+    if not pairs.by_flow:  # of both frames, which is as if the focal length was negative
+        turn = torch.eye(3, dtype=torch.float64)
+        turn[axis, axis], turn[axis, 2] = -1.0, pairs.now.shape[2 - axis]
+        return pairs._replace(K=turn @ pairs.K, prev_K=turn @ pairs.prev_K)
+    pixel = pairs.pixel.clone()
+    pixel[:, axis] = pairs.now.shape[2 - axis] - pixel[:, axis]
+    return pairs._replace(depth=looked_up(pairs.now, pixel).reciprocal())
 
 
 def _gain(uu: float, uv: float, vu: float, vv: float) -> Change:
@@ -266,16 +304,17 @@ def _to_next(pairs: Pairs, n: Tensor) -> Pairs:
     return pairs._replace(path=pairs.path[:, [3, 3, 2, 1]], gain=-pairs.gain)
 
 
-def _reversed(pairs: Pairs, place: Tensor, maps: Tensor) -> Pairs:
+def _reversed(pairs: Pairs, pixel: Tensor, maps: Tensor) -> Pairs:
     """Flow from the frame before to this one, at places there, as if time ran back."""
     other: Any = {"path": pairs.path.flip(1), "K": pairs.prev_K, "prev_K": pairs.K}
     other["gain"] = -pairs.gain
-    return pairs._replace(place=place, depth=looked_up(maps, place).reciprocal(), **other)
+    depth = looked_up(maps, pixel, "nearest").reciprocal()
+    return pairs._replace(pixel=pixel, depth=depth, **other)
 
 
 def _of_previous(pairs: Pairs, n: Tensor) -> Pairs:
-    return _reversed(pairs, pairs.place, pairs.before)
+    return _reversed(pairs, pairs.pixel, pairs.before)
 
 
 def _late_depth(pairs: Pairs, n: Tensor) -> Pairs:
-    return _reversed(pairs, pairs.place - torch.linalg.solve(pairs.gain, pairs.raw), pairs.now)
+    return _reversed(pairs, pairs.pixel - torch.linalg.solve(pairs.gain, pairs.raw), pairs.now)

@@ -1,27 +1,35 @@
-"""The verdict on pairs of frames."""
+"""The verdict on pairs of frames: what they leave, as they are and as each rival corrects them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from flowrep.diagnosis.explanation import CLEARLY, SEVERAL, Found, explanations, is_better
+from flowrep.diagnosis import fit
+from flowrep.diagnosis.fit import EYE, Pairs, apart, best_motion, median, px_of, residual
 from flowrep.diagnosis.rivals import Rival
-from flowrep.diagnosis.witness import Pairs, median, px_of, residual, seen_before, small_motion
 
+# No error: rounding, a share of the noise, and of flow that was estimated, which is too short.
+_EXACT_PX, _OF_NOISE, _OF_ESTIMATED = 2e-3, 0.3, 0.03
+# What explains an error leaves several times less, or clearly less in most of many pairs.
+_SEVERAL, _CLEARLY, _MANY_PAIRS = 3.0, 1.7, 8
+_STRUCTURED = 0.1  # of raw flow: more structure than an estimator's own
 # Shares of raw flow. Noise of poses reaches `_ROUGH` and a number of pixels that grows with the
 # picture, unless the flow is nearly free of noise.
 _LARGE = 0.04  # errors that may be explained if something leaves clearly less, not several times
 _EXPLAINED = 0.25  # what an explanation leaves at most
 _ROUGH, _ROUGH_WIDTHS, _TIMES_THE_NOISE, _LITTLE = 0.25, 1 / 1280, 20.0, 0.02
-_UNSURE = 0.2  # right data would be right to that alone
+_UNSURE = 0.15  # right data would be right to that alone
 _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's estimator failed
-_STRAY = 6.0  # times what the median pair leaves
+_STRAY, _MANY_STRAYS = 6.0, 0.25  # times what the median pair leaves; a share of pairs
+_FARTHEST = 0.03  # a share of pixels at exactly the largest depth that means something
+_LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
 
 @dataclass(frozen=True)
@@ -89,20 +97,19 @@ def diagnosed(
         names: the frames'.
         remedy: makes what the user types of `Rival.typed`.
     """
-    recorded, others = explanations(pairs, starts, rivals)
+    recorded, others = _explanations(pairs, starts, rivals)
     width, motion = pairs.now.shape[-1], pairs.motion if pairs.has_poses else recorded.motion
-    ego = pairs.place - seen_before(pairs, motion)[0]
+    ego = pairs.pixel - fit.seen_before(pairs, motion)[0]
     raw_px = median(px_of(pairs.raw if pairs.by_flow else ego))
-    spreads = torch.stack([each.spread for each in (recorded, *others)])
-    noise = spreads.nan_to_num(math.inf).amin(0)
+    noise = torch.stack([e.spread for e in (recorded, *others)]).nan_to_num(math.inf).amin(0)
     errors, least = recorded.beyond(noise), recorded.least
     error, best_px = median(errors), median(px_of(residual(pairs, recorded.motion, plain=True)))
     able = _able(others, errors, noise, raw_px) if error > least else []
-    texts = [_texts(each, width) for each in able]
+    texts = [each.rival.texts(each.n, width) for each in able]
     numbers: dict[str, Any] = {
         "pairs": len(errors), "raw_px": raw_px, "best_px": best_px, "error_px": error,
         "left_px": median(px_of(residual(pairs, motion, plain=True))),
-        "rivals_px": {_texts(each, width)[0]: each.left for each in others},
+        "rivals_px": {each.rival.texts(each.n, width)[0]: each.left for each in others},
         "suspects": tuple(typed for typed, _ in texts),
     }  # fmt: skip
     ways = " or ".join(
@@ -110,14 +117,13 @@ def diagnosed(
         for each, (typed, says) in zip(able, texts)
     )
     size = f"{error:.2g} px of {max(raw_px, median(px_of(ego))):.2g} px"
-    is_learnt = not able or len(able[0].n) > 0
-    if pairs.is_estimated and best_px > _DOUBTFUL * raw_px + _DOUBTFUL_PX and is_learnt:
+    is_doubtful = pairs.is_estimated and best_px > _DOUBTFUL * raw_px + _DOUBTFUL_PX
+    if is_doubtful and (not able or len(able[0].n)):  # to learn from such flow is no explanation
         why = f"flow estimated from the pictures fits no motion: {best_px:.2g} px are left"
         return Diagnosis("can't tell", why, **numbers)
-    if able and not able[0].is_unexplained:
-        after = median(able[0].beyond(noise))
-        if after < max(2 * able[0].least, error / SEVERAL):
-            return Diagnosis("wrong", f"{ways}; now {size} are left", **numbers)
+    enough = max(2 * able[0].least, error / _SEVERAL) if able else 0.0
+    if able and median(able[0].beyond(noise)) < enough and not able[0].is_unexplained:
+        return Diagnosis("wrong", f"{ways}; now {size} are left", **numbers)
     is_rough = error > _ROUGH * raw_px + _ROUGH_WIDTHS * width
     is_rough |= error > max(_TIMES_THE_NOISE * median(recorded.spread), _LITTLE * raw_px)
     if able or recorded.is_unexplained or is_rough:
@@ -125,75 +131,275 @@ def diagnosed(
         why += f"; a motion exists that would leave {best_px:.2g} px" if pairs.has_poses else ""
         why += f"; nearest: {ways}" if able else ""
         return Diagnosis("something is wrong", why, **numbers)
+    if pairs.by_flow and (why := _other_times(recorded, raw_px)):
+        return Diagnosis("something is wrong", why, **numbers)
+    most = max(_STRAY * recorded.left, _ROUGH * raw_px)
+    stray = [name for name, px in zip(names, recorded.beyond(0 * noise).tolist()) if px > most]
+    if len(stray) > max(2, _MANY_STRAYS * len(names)):
+        why = f"poses of {len(stray)} in {len(names)} pairs don't fit: {', '.join(stray)}"
+        return Diagnosis("something is wrong", why, **numbers)
     if not pairs.by_flow:
         hidden = median(pairs.K[:, 0, 0] * px_of(pairs.coarseness.unsqueeze(1), 0.5))
         error = numbers["error_px"] = max(error, hidden)
         size = f"{error:.2g} px of {raw_px:.2g} px"
-    if error > _UNSURE * raw_px and pairs.is_coarse:
-        why = f"depth's steps of {pairs.depth_step:.2g} m hide errors of {size}: give flow, too"
-        return Diagnosis("can't tell", why, **numbers)
+    steps = f"depth's steps of {pairs.depth_step:.2g} m hide"
     if error > _UNSURE * raw_px:
-        why = (
-            f"{size} are left, by rough poses or a mistake that doesn't show in {len(errors)} pairs"
-        )
+        why = f"{steps} errors of {size}: give flow, too"
+        if not pairs.is_coarse:
+            why = f"{size} are left, by rough poses or a mistake that {len(errors)} pairs hide"
         return Diagnosis("can't tell", why, **numbers)
-    notes = []
-    if pairs.is_coarse:
-        notes.append(f"depth has steps of {pairs.depth_step:.2g} m, which hide smaller errors")
-    alone = recorded.beyond(torch.zeros_like(noise))
-    most = max(_STRAY * median(alone), _ROUGH * raw_px)
-    stray = [name for name, px in zip(names, alone.tolist()) if px > most]
+    notes = [f"{steps} smaller errors"] if pairs.is_coarse else []
+    known = pairs.now[pairs.now > 0].reciprocal()
+    share = float((known == known.amax()).double().mean()) if len(known) else 0.0
+    if share > _FARTHEST:
+        notes.append(f"{share:.0%} of depth is {known.amax():.4g} m: if that is no surface, say so")
     if stray:
         notes.append(f"poses that don't fit the others: {', '.join(stray)}")
     if not pairs.has_poses:
         notes.append("poses and the unit of depth are not tested")
     elif best_px < numbers["left_px"] / 2 and error > raw_px / 10:
         notes.append("the poses are rough: motion estimated from flow and depth leaves less")
-    parts = (
-        ["raw flow"] * pairs.by_flow + ["depth", "K"] + ["the camera's motion"] * pairs.has_poses
-    )
-    agree = f"{', '.join(parts)} agree to {size}, beside noise of {best_px:.2g} px"
+    parts = "raw flow, " * pairs.by_flow + "depth, K" + ", the camera's motion" * pairs.has_poses
+    agree = f"{parts} agree to {size}, beside noise of {best_px:.2g} px"
     unseen = _unseen(pairs, rivals, max(least, error)) if pairs.has_poses else ()
     return Diagnosis("right", agree, **numbers, unseen=unseen, notes=tuple(notes))
 
 
-def _able(others: Sequence[Found], before: Tensor, noise: Tensor, raw_px: float) -> list[Found]:
+@dataclass(frozen=True)
+class _Fit:
+    """What the data leave, as they are or as a rival corrects them, px `[P]`.
+
+    `error` is what the recorded motion leaves beyond the best one, `spread` what that leaves.
+    """
+
+    rival: Rival
+    n: Tensor  # [k]
+    pairs: Pairs
+    motion: Tensor  # the best
+    error: Tensor
+    spread: Tensor
+
+    def beyond(self, noise: Tensor) -> Tensor:
+        """Returns what is left beyond noise."""
+        return (self.error.square() + (self.spread.square() - noise.square()).clamp(min=0)).sqrt()
+
+    @property
+    def left(self) -> float:
+        """The median of all that is left."""
+        return median(self.beyond(0 * self.spread))
+
+    @property
+    def least(self) -> float:
+        """The error below which there is none."""
+        pairs = self.pairs
+        bias = _OF_ESTIMATED * median(px_of(pairs.raw)) if pairs.is_estimated else 0.0
+        return max(self.floor, bias)
+
+    @cached_property
+    def floor(self) -> float:
+        """The error below which errors are alike, by how far two halves of the picture differ.
+
+        The halves are every other block of it, since neighbouring pixels err alike.
+        """
+        pairs, is_even = self.pairs, _blocks(self.pairs, 6, 4)
+        halves = [
+            best_motion(pairs._replace(depth=pairs.depth.masked_fill(half, math.nan)), self.motion)
+            for half in (is_even, ~is_even)
+        ]
+        halves_px = _SEVERAL * median(apart(pairs, *halves)) / 2
+        return max(_EXACT_PX, halves_px, _OF_NOISE * median(self.spread))
+
+    @property
+    def is_unexplained(self) -> bool:
+        """Whether what is left can be predicted, and so is no noise."""
+        least, smooth = self.least, _smoothed(self.pairs, self.motion)
+        structure = median((self.spread.square() - smooth.square()).clamp(min=0).sqrt())
+        if structure > least:
+            is_large = structure > _STRUCTURED * median(px_of(self.pairs.raw))
+            share = median(smooth) / max(median(self.spread), 1e-12)
+            if share < 1 / _SEVERAL or (is_large and _is_better(smooth, self.spread)):
+                return True
+        if len(smooth) < _MANY_PAIRS or not median(self.error) > least:
+            return False
+        return _is_better(_mapped(self.pairs, self.motion), self.error)
+
+
+def _is_better(after: Tensor, before: Tensor) -> bool:
+    """Whether errors `[P]` are several times less than others, or clearly less in most pairs."""
+    share = median(after) / max(median(before), 1e-12)
+    better = int((after < before / 1.1).sum())
+    # By chance in one of 200 cases: 8 of 8 pairs, 16 of 19.
+    by_no_chance = 2 * better - len(after) > 2.6 * len(after) ** 0.5
+    return share < 1 / _SEVERAL or (share < 1 / _CLEARLY and by_no_chance)
+
+
+def _explanations(
+    pairs: Pairs, starts: Sequence[Tensor], rivals: Sequence[Rival]
+) -> tuple[_Fit, list[_Fit]]:
+    """Returns what the data leave, as they are and as each rival that may help corrects them."""
+    few, none, has_poses = pairs.of(pixels=slice(fit.FITTED)), pairs.depth[:, :0], pairs.has_poses
+    still = EYE.expand(len(none), 4, 4)
+    starts = [*starts, still]
+    if has_poses:
+        known = [r.change(pairs, none).motion for r in rivals if r.of == "poses" and not r.start[0]]
+        known = [pairs.motion, *known]
+        starts = [pairs.motion, fit.least_costly(few, torch.stack(known)), *starts]
+
+    def fitted(rival: Rival, n: Tensor, changed: Pairs, motion: Tensor) -> _Fit:
+        error = apart(changed, changed.motion, motion) if has_poses else none.new_zeros(len(none))
+        n = n.nanmedian(0).values
+        return _Fit(rival, n, changed, motion, error, px_of(residual(changed, motion)))
+
+    as_it_is = Rival("poses", "", "", lambda pairs, n: pairs)
+    recorded, others = fitted(as_it_is, none, pairs, best_motion(pairs, *starts, steps=8)), []
+    if has_poses and recorded.left < _EXACT_PX:
+        return recorded, []
+    left = median(px_of(residual(few, pairs.motion if has_poses else recorded.motion)))
+    for rival in rivals if has_poses else [rival for rival in rivals if rival.of != "poses"]:
+        n = _learnt(few, rival, recorded.motion)
+        if n is None:
+            continue
+        changed, motion = rival.change(pairs, n), recorded.motion
+        if not has_poses:
+            motion = best_motion(changed, still, motion)
+        elif rival.of != "poses":
+            # Beside poses, what leaves more than the data do is no explanation.
+            few_left = residual(changed.of(pixels=slice(fit.FITTED)), changed.motion)
+            if not median(px_of(few_left)) <= left:
+                continue
+            motion = best_motion(changed, changed.motion)
+        others.append(fitted(rival, n, changed, motion))
+    return recorded, others
+
+
+def _learnt(few: Pairs, rival: Rival, best: Tensor) -> Tensor | None:
+    """Returns a rival's numbers `[P, k]`, learnt from the other half of the pairs.
+
+    None if there are too few, or if they are no camera's.
+    """
+    count, k = len(best), len(rival.start[0])
+    if not k:
+        return best.new_zeros(count, 0)
+    if count < 4 and k > 2:
+        return None
+    every, tries = torch.arange(count), []
+    half = every % 2 if count >= 4 else 0 * every
+    group = every if rival.each else half
+    for start in rival.start:
+        n = best.new_tensor(start).expand(int(group.max()) + 1, k)
+        known = None if few.has_poses else best
+        motion, n = fit.descended(few, known, rival.change, n, group, steps=7)
+        left = px_of(residual(rival.change(few, n[group]), motion)).nan_to_num(math.inf)
+        tries.append((n, [float(left[half == i].median()) for i in half.unique()]))
+    if rival.each:  # (of the frame, of the one before): each from the other pair that it is in
+        follows = (few.path[1:, 1] == few.path[:-1, 2]).flatten(1).all(1)
+        if not follows.any():
+            return None
+        fitted, n = n, n.clone()
+        n[:-1, 0] = torch.where(follows, fitted[1:, 1], fitted[:-1, 0])
+        n[1:, 1] = torch.where(follows, fitted[:-1, 0], fitted[1:, 1])
+    else:
+        halves = [min(tries, key=lambda tried: tried[1][i])[0][i] for i in half.unique()]
+        n = torch.stack(halves)[half.max() - half]
+    if rival.in_pixels:
+        n = (n * few.now.shape[-1]).round() / few.now.shape[-1]
+    first, most = best.new_tensor(rival.start[0]), _LARGEST_FACTORS.get(rival.of, math.inf)
+    factors = n[:, first != 0] / first[first != 0]
+    return n if bool(((factors > 1 / most) & (factors < most)).all()) else None
+
+
+def _able(others: Sequence[_Fit], before: Tensor, noise: Tensor, raw_px: float) -> list[_Fit]:
     """Returns the rivals that explain errors, the best first."""
     after = {id(each): median(each.beyond(noise)) for each in others}
     error, ranked = median(before), sorted(others, key=lambda each: after[id(each)])
-    most = min(error, _EXPLAINED * raw_px) if error > _LARGE * raw_px else error / SEVERAL
+    most = min(error, _EXPLAINED * raw_px) if error > _LARGE * raw_px else error / _SEVERAL
     able = [each for each in ranked if after[id(each)] < most]
-    able = [each for each in able if is_better(each.beyond(noise), before)]
+    able = [each for each in able if _is_better(each.beyond(noise), before)]
     if not able:
         return []
-    enough = min(CLEARLY * after[id(able[0])] + able[0].floor, error / CLEARLY)
+    enough = min(_CLEARLY * after[id(able[0])] + able[0].floor, error / _CLEARLY)
     able = [each for each in ranked if after[id(each)] <= enough]
     # One that learns more numbers than another of its kind says the same with more words.
     fewest = {each.rival.of: len(each.n) for each in sorted(able, key=lambda e: -len(e.n))}
     return [each for each in able if len(each.n) == fewest[each.rival.of]]
 
 
+def _other_times(recorded: _Fit, raw_px: float) -> str:
+    """Returns in which way successive maps of depth tell of another motion than flow, or ""."""
+    of_depth = recorded.pairs._replace(by_flow=False, scale_px=0.5)
+    still = EYE.expand_as(recorded.motion)
+    motion = best_motion(of_depth, recorded.motion, still)
+    px = median(apart(recorded.pairs, motion, recorded.motion))
+    before, after = (px_of(residual(of_depth, each), 0.5) for each in (recorded.motion, motion))
+    if px < _UNSURE * raw_px or not _is_better(after, before):
+        return ""
+    return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
+
+
 def _unseen(pairs: Pairs, rivals: Sequence[Rival], least: float) -> tuple[str, ...]:
     """Returns what mends the mistakes of a usual size that change nothing here."""
-    unseen, now = [], residual(pairs, pairs.motion, plain=True)
+    pairs, unseen = pairs.of(pixels=slice(fit.FITTED)), []
+    now = residual(pairs, pairs.motion, plain=True)
     for rival in rivals:
         if len(rival.usual) == len(rival.start[0]):
-            usual = torch.tensor(rival.usual, dtype=torch.float64).expand(len(now), -1)
-            other = rival.change(pairs, usual)
+            other = rival.change(pairs, now.new_tensor(rival.usual).expand(len(now), -1))
             if median(px_of(residual(other, other.motion, plain=True) - now)) <= least:
                 unseen.append(rival.typed.partition("={")[0].partition("=[")[0].partition(" {")[0])
     return tuple(unseen)
 
 
-def _texts(found: Found, width: int) -> tuple[str, str]:
-    """Returns what mends a mistake, and what it is, with the numbers that were learnt."""
-    n = [*found.n.tolist(), 0.0, 0.0]
-    values: dict[str, Any] = {"inverse": 1 / n[0] if n[0] else math.inf}
-    values["far"] = 1 / max(n[0] + n[1], 1e-6)
-    if len(found.n) >= 2:  # the last two of some are shares of the width
-        values["px"] = f"({width * n[-4]:+.1f}, {width * n[-3]:+.1f}) px"
-    if len(found.n) == 6:
-        values["degrees"] = math.degrees(math.hypot(*n[:3]))
-        rows = small_motion(found.n)[:3].flatten().tolist()
-        values["matrix"] = f"[{','.join(f'{x:.4g}' for x in rows)}]"
-    return found.rival.typed.format(*n, **values), found.rival.says.format(*n, **values)
+def _blocks(pairs: Pairs, across: int, down: int) -> Tensor:
+    """Returns which pixels `[P, N]` are in every other block of the picture."""
+    height, width = pairs.now.shape[-2:]
+    block = pairs.pixel.nan_to_num() / torch.tensor([[width / across], [height / down]])
+    return block.floor().sum(1) % 2 == 0
+
+
+def _mapped(pairs: Pairs, best: Tensor) -> Tensor:
+    """Returns the errors of poses that are corrected as the other pairs tell, px `[P]`.
+
+    Each motion is corrected by a linear function of it. Whatever distorts poses in one and the same
+    way, a convention that nobody listed too, is mended by it; noise of poses isn't.
+    """
+    recorded, wanted = fit.motion_vector(pairs.motion), fit.motion_vector(best)
+    focal, inverse = pairs.K[:, 0, 0].median(), pairs.depth.reciprocal().nanmedian()
+    unit = torch.cat([focal.expand(3), (focal * inverse).expand(3)])  # all in pixels
+    x, y = recorded * unit, (wanted - recorded) * unit
+    x = torch.cat([x, x.norm(dim=-1).median().expand(len(x), 1) / 2.4], 1)
+    # The normal equations of all pairs but one, for each.
+    A = x.mT @ x - x.unsqueeze(-1) * x.unsqueeze(-2)
+    b = x.mT @ y - x.unsqueeze(-1) * y.unsqueeze(-2)
+    size, errors = A.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] / len(x), []
+    for damping in (0.03, 0.3, 3.0):
+        learnt = torch.linalg.solve_ex(A + damping * size * torch.eye(7), b)[0]
+        correction = (x.unsqueeze(-2) @ learnt).squeeze(-2) / unit
+        errors.append(apart(pairs, fit.small_motion(recorded + correction), best))
+    return min(errors, key=median)
+
+
+def _smoothed(pairs: Pairs, best: Tensor) -> Tensor:
+    """Returns what the best motion leaves without its structure over picture and depth, px `[P]`.
+
+    A polynomial of the pixel's pixel and inverse depth, fitted to every other block of the picture,
+    is subtracted in the others. Where K, depth and flow fit each other, noise alone is left.
+    """
+    left, (height, width) = residual(pairs, best), pairs.now.shape[-2:]
+    x, y = (2 * pairs.pixel.nan_to_num() / torch.tensor([[width], [height]]) - 1).unbind(1)
+    q = pairs.depth.reciprocal().nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
+    q = (q / q.median(-1, keepdim=True).values.clamp(min=1e-9)).clamp(max=3.0) - 1
+    powers = [(a, b, c) for a in range(4) for b in range(4 - a) for c in range(3)]
+    terms = torch.stack([x**a * y**b * q**c for a, b, c in powers], -1)
+    is_even, out = _blocks(pairs, 5, 4), left
+    for half in (is_even, ~is_even):
+        known = half & left.isfinite().all(1)
+        weight = known.double()
+        for _ in range(4):
+            weighted = terms * weight.unsqueeze(-1)
+            A, b = weighted.mT @ terms, weighted.mT @ left.nan_to_num().mT
+            A = A + torch.diag_embed(1e-3 * A.diagonal(dim1=-2, dim2=-1) + 1e-9)
+            rest = left - (terms @ torch.linalg.solve_ex(A, b)[0]).mT
+            squared = torch.where(known, rest.square().sum(1), math.nan)
+            scale = fit.scale_of(squared, pairs).square().unsqueeze(-1)
+            weight = (1 + squared / scale).square().reciprocal().nan_to_num()
+        out = torch.where(half.unsqueeze(1), out, rest)
+    return px_of(out)

@@ -1,7 +1,13 @@
-"""What flowrep's diagnosis says of right data and of every mistake in them, cell by cell."""
+"""What flowrep's diagnosis says of right data and of every mistake in them, cell by cell.
+
+`python -m tests.injected.matrix [source ...]` writes the table in docs/diagnosis.md, or the columns
+of these sources. A column takes a minute.
+"""
 
 from __future__ import annotations
 
+import sys
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -18,6 +24,20 @@ from flowrep.sequences import EstimatedFlowSource, Frame
 from flowrep.transforms import DIS
 from tests.injected.mistakes import LISTED, UNLISTED
 from tests.injected.sources import ENVS, RECORDINGS, Shots, ego_flow
+
+PAGE = Path(__file__).parents[2] / "docs/diagnosis.md"
+MARKS = "<!-- table -->\n", "<!-- end -->"
+KINDS = {  # what comes out of a cell, and what that means
+    "right": "right data, called right",
+    "named": "wrong, and the mistake is named",
+    "noticed": "something is wrong, or, of a mistake that no table lists, what would mend it",
+    "another": "wrong, but another mistake is named",
+    "can't tell": "can't tell",
+    "small": "right, to more pixels than the mistake adds",
+    "said": "right, and what mends the mistake is among what would not show",
+    "passed": "**passed as right**",
+    "false alarm": "**right data called wrong**",
+}
 
 
 def frames_of(shots: Shots, *, raw: bool) -> list[Frame]:
@@ -158,3 +178,37 @@ def cells(
                     wrong = with_estimated_flow(wrong) if of_pictures else same
                 effect_px = np.sqrt(max(left_px(wrong) ** 2 - least**2, 0.0))
                 yield Cell(source, seed, name, found, named, float(effect_px))
+
+
+def table_of(page: str) -> dict[str, dict[str, str]]:
+    """Returns the kinds that a page's table has, by mistake and source."""
+    lines = page.partition(MARKS[0])[2].partition(MARKS[1])[0].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if "|" in line]
+    return {row[0]: dict(zip(rows[0][1:], row[1:])) for row in rows[2:] if row[1:]}
+
+
+def written(table: dict[str, dict[str, str]]) -> str:
+    """Returns the table as Markdown, and how often each kind came out."""
+    sources = [name for name in RECORDINGS | ENVS if any(name in row for row in table.values())]
+    lines = [["mistake", *sources], ["---"] * (1 + len(sources))]
+    lines += [[name, *(row.get(source, "") for source in sources)] for name, row in table.items()]
+    counts = Counter(kind for row in table.values() for kind in row.values())
+    text = "".join(f"| {' | '.join(line)} |\n" for line in lines) + "\n"
+    return text + "".join(f"- {kind}: {counts[kind]} ({KINDS[kind]})\n" for kind in KINDS)
+
+
+def main(sources: list[str]) -> None:
+    """Writes the columns of some sources, or of all."""
+    torch.set_num_threads(1)
+    page = PAGE.read_text("utf-8")
+    table = {name: table_of(page).get(name, {}) for name in ("right", *LISTED, *UNLISTED)}
+    for cell in cells(sources or None):
+        table[cell.mistake][cell.source] = cell.kind
+        said = f"{cell.source} | {cell.mistake} | {cell.kind} | {cell.effect_px:.3g} px"
+        print(said, cell.found.words, sep=" | ", flush=True)
+    start, end = page.index(MARKS[0]) + len(MARKS[0]), page.index(MARKS[1])
+    PAGE.write_text(f"{page[:start]}\n{written(table)}{page[end:]}", "utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -10,22 +10,21 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from flowrep import geometry
 from flowrep.geometry.egomotion import structure_tensor
 from flowrep.geometry.pose import rotation_from_vector
 
 EYE = torch.eye(4, dtype=torch.float64)
 PIXELS, FITTED = 1000, 400  # of a pair, and of these, those that motions and numbers are fitted to
-LEAST_PIXELS, LEAST_MOVEMENT_PX = 64, 0.25  # pairs with less say nothing
 _LEAST_TEXTURE = 0.25  # of a structure tensor's trace, 0 to 2
 _BEHIND_PX = 1e3  # left of a point that a motion puts behind the camera
 _STEP = 1e-6  # of numeric derivatives
+_SETTLED = 0.01  # a step that is too small to matter, in scales of all pixels' root of squares
 
 
 class Pairs(NamedTuple):
     """P pairs of frames as N pixels each, float64, nan where unknown."""
 
-    place: Tensor  # [P, 2, N], centres
+    pixel: Tensor  # [P, 2, N], centres
     raw: Tensor  # [P, 2, N]
     depth: Tensor  # [P, N], of the current frame
     texture: Tensor  # [P, 3, N], the root of the structure tensor: xx, xy, yy
@@ -39,7 +38,7 @@ class Pairs(NamedTuple):
     is_estimated: bool  # from pictures
     depth_step: float  # of coarse depth, metres
     scale_px: float  # the least scale of what is left
-    gain: Tensor = torch.eye(2, dtype=torch.float64)  # raw is this times flow
+    gain: Tensor = torch.eye(2, dtype=torch.float64)  # [(P,) 2, 2], raw is this times flow
     distortion: Tensor = torch.zeros(1, 1, dtype=torch.float64)  # [P, 1], of the radius' square
 
     def of(self, pairs: Any = slice(None), pixels: Any = slice(None)) -> Pairs:
@@ -50,12 +49,14 @@ class Pairs(NamedTuple):
     @property
     def motion(self) -> Tensor:
         """The recorded one, `prev_from_curr` [P, 4, 4]."""
-        return geometry.relative_motion(self.path[:, 1], self.path[:, 2], dtype=torch.float64)
+        before, now = self.path[:, 1], self.path[:, 2]
+        turned = before[:, :3, :3].mT @ torch.cat([now[:, :3, :3], (now - before)[:, :3, 3:]], -1)
+        return torch.cat([turned, EYE[3:].expand(len(now), 1, 4)], 1)
 
     @property
     def has_poses(self) -> bool:
         """Whether the recorded motions are known."""
-        return bool(self.motion.isfinite().all())
+        return bool(self.path[:, 1:3].isfinite().all())
 
     @property
     def is_coarse(self) -> bool:
@@ -76,7 +77,7 @@ def sampled(
     while math.gcd(step, size) > 1:
         step += 1
     index = torch.arange(min(size, 8 * PIXELS)) * step % size
-    place = torch.stack([index % width, index // width]).double() + 0.5
+    pixel = torch.stack([index % width, index // width]).double() + 0.5
 
     def at(maps: Tensor) -> Tensor:
         return maps.flatten(-2)[..., index].double()
@@ -102,7 +103,7 @@ def sampled(
     is_coarse = 1 < len(values) < 0.1 * depth.numel()
     depth_step = float(values.diff().median()) if is_coarse else 0.0
     z = first(depth.unsqueeze(1)).squeeze(1)
-    maps = [first(place.expand(count, -1, -1)), first(flow), z, first(texture), depth_step / z]
+    maps = [first(pixel.expand(count, -1, -1)), first(flow), z, first(texture), depth_step / z]
     whole = [K.double(), prev_K.double(), path.double()]
     whole += [depths.double().reciprocal() for depths in (now, before)]
     scale_px = 0.5 if raw is None else 1e-4
@@ -113,7 +114,7 @@ def sampled(
 
 def seen_before(pairs: Pairs, motion: Tensor) -> tuple[Tensor, Tensor]:
     """Returns where pixels were before, `[..., P, 2, N]`, and their depth then over that now."""
-    rays = torch.linalg.inv_ex(pairs.K)[0] @ homogeneous(pairs.place)
+    rays = torch.linalg.inv_ex(pairs.K)[0] @ homogeneous(pairs.pixel)
     bent, by = bool(pairs.distortion.any()), pairs.distortion[..., None]
     if bent:
         straight = rays[:, :2]
@@ -131,7 +132,7 @@ def seen_before(pairs: Pairs, motion: Tensor) -> tuple[Tensor, Tensor]:
 
 def homogeneous(points: Tensor) -> Tensor:
     """Returns points `[..., 2, N]` with a third coordinate of 1."""
-    return torch.cat([points, torch.ones_like(points[..., :1, :])], -2)
+    return functional.pad(points, (0, 0, 0, 1), value=1.0)
 
 
 def residual(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
@@ -140,31 +141,31 @@ def residual(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
     Of flow, along the directions that have texture unless `plain`. Of depth, beyond its steps, how
     far a surface at 45 degrees would have to move to be as near as the frame before shows it.
     """
-    place, ratio = seen_before(pairs, motion)
-    is_motion = motion.isfinite().flatten(-2).all(-1)[..., None, None]
+    pixel, ratio = seen_before(pairs, motion)
+    known = ~pairs.depth.isnan() & motion.isfinite().flatten(-2).all(-1, keepdim=True)
     if not pairs.by_flow:
-        left = looked_up(pairs.before, place) * pairs.depth * ratio - 1
+        left = looked_up(pairs.before, pixel) * pairs.depth * ratio - 1
         left = left.sign() * (left.abs() - pairs.coarseness).clamp(min=0.0)
-        left = pairs.K[:, 0, :1] * left
-        left = left.masked_fill(ratio.isnan() & pairs.depth.isfinite(), _BEHIND_PX).unsqueeze(-2)
-        return torch.where(is_motion, left, math.nan)
-    left = (pairs.raw - pairs.gain @ (pairs.place - place)).nan_to_num(nan=_BEHIND_PX)
-    known = pairs.raw.isfinite() & ~pairs.depth.isnan().unsqueeze(-2) & is_motion
-    if not plain:  # the texture is the picture's, whatever axes the flow has
+        left = (pairs.K[:, 0, :1] * left).masked_fill(ratio.isnan(), _BEHIND_PX)
+        return torch.where(known & pairs.depth.isfinite(), left, math.nan).unsqueeze(-2)
+    left = (pairs.raw - pairs.gain @ (pairs.pixel - pixel)).nan_to_num(nan=_BEHIND_PX)
+    known = known & pairs.raw.isfinite().all(-2)
+    if pairs.is_estimated and not plain:  # the texture is the picture's, whatever axes the flow has
         xx, xy, yy = pairs.texture.unbind(1)
         u, v = (torch.linalg.inv(pairs.gain) @ left).unbind(-2)
-        left = torch.stack([xx * u + xy * v, xy * u + yy * v], -2) * pairs.gain.det().abs().sqrt()
-    return torch.where(known, left, math.nan)
+        left = torch.stack([xx * u + xy * v, xy * u + yy * v], -2)
+        left = left * pairs.gain.det().abs().sqrt()[..., None, None]
+    return torch.where(known.unsqueeze(-2), left, math.nan)
 
 
-def looked_up(maps: Tensor, place: Tensor) -> Tensor:
-    """Returns maps `[P, H, W]` at places `[..., P, 2, N]`, bilinear, nan outside."""
+def looked_up(maps: Tensor, pixel: Tensor, mode: str = "bilinear") -> Tensor:
+    """Returns maps `[P, H, W]` at places `[..., P, 2, N]`, nan outside."""
     size = torch.tensor([maps.shape[-1], maps.shape[-2]], dtype=torch.float64).unsqueeze(-1)
-    inside = ((place >= 0.5) & (place <= size - 0.5)).all(-2)
-    grid = torch.where(inside.unsqueeze(-2), 2 * place / size - 1, 0.0)
+    inside = ((pixel >= 0.5) & (pixel <= size - 0.5)).all(-2)
+    grid = torch.where(inside.unsqueeze(-2), 2 * pixel / size - 1, 0.0)
     grid = grid.reshape(-1, *grid.shape[-3:]).permute(1, 0, 3, 2)  # [P, ..., N, 2]
-    found = functional.grid_sample(maps.unsqueeze(1), grid, align_corners=False)
-    return torch.where(inside, found[:, 0].transpose(0, 1).reshape(inside.shape), math.nan)
+    values = functional.grid_sample(maps.unsqueeze(1), grid, mode, align_corners=False)
+    return torch.where(inside, values[:, 0].transpose(0, 1).reshape(inside.shape), math.nan)
 
 
 def px_of(left: Tensor, share: float | None = None) -> Tensor:
@@ -173,10 +174,8 @@ def px_of(left: Tensor, share: float | None = None) -> Tensor:
     Of flow the median, since half of the picture may move by itself. Of depth, of what is known to
     stand still, 0.8: roads and walls along the way are as far wherever the camera is on them.
     """
-    lengths = left.square().sum(-2).sqrt().sort(-1).values  # nan comes last
     share = share or (0.5 if left.shape[-2] == 2 else 0.8)
-    rank = (share * (~lengths.isnan()).sum(-1, keepdim=True)).long().clamp(max=left.shape[-1] - 1)
-    return lengths.gather(-1, rank).squeeze(-1)
+    return left.square().sum(-2).sqrt().nanquantile(share, -1, interpolation="lower")
 
 
 def apart(pairs: Pairs, one: Tensor, other: Tensor) -> Tensor:
@@ -216,82 +215,77 @@ Change = Callable[[Pairs, Tensor], Pairs]  # of pairs, with numbers [P, k]
 
 
 def descended(
-    pairs: Pairs,
-    motion: Tensor | None,
-    change: Change,
-    n: Tensor,
-    *,
-    steps: int,
-    each: bool = False,
-) -> tuple[Tensor | None, Tensor]:
-    """Returns motions, and the numbers n [P, k] of a change, that leave less: Gauss-Newton steps.
+    pairs: Pairs, motion: Tensor | None, change: Change, n: Tensor, group: Tensor, *, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Returns motions, and the numbers `[G, k]` of a change, that leave less: Gauss-Newton steps.
 
-    Weights are Geman and McClure's. Without `motion` the recorded ones are kept. The numbers are
-    the same for all pairs unless `each`.
+    Weights are Geman and McClure's. Without `motion` those are kept that are recorded.
+
+    Args:
+        group: `[P]`, the row of n that is a pair's.
     """
+    count, (_, k) = len(group), n.shape
+    free = 0 if motion is None else 6
+    # The unknowns are six of each motion, then the numbers; `index` has those of each pair.
+    of_motion, of_group = torch.arange(free * count).view(count, free), k * group.unsqueeze(1)
+    index = torch.cat([of_motion, free * count + of_group + torch.arange(k)], 1)
+    size = free * count + n.numel()
     tries = small_motion(_STEP * torch.cat([torch.zeros(1, 6), torch.eye(6)]).double()).unsqueeze(1)
     for _ in range(steps):
-        changed = change(pairs, n)
+        changed = change(pairs, n[group])
         moved = changed.motion.unsqueeze(0) if motion is None else tries @ motion
         left, *columns = residual(changed, moved)
-        for one in _STEP * torch.eye(n.shape[-1], dtype=torch.float64):
-            changed = change(pairs, n + one)
+        for one in _STEP * torch.eye(k, dtype=torch.float64):
+            changed = change(pairs, n[group] + one)
             columns.append(residual(changed, changed.motion if motion is None else motion))
-        J = (torch.stack(columns, -1) - left.unsqueeze(-1)) / _STEP  # [P, C, N, 6 + k]
+        J = (torch.stack(columns, -1) - left.unsqueeze(-1)) / _STEP  # [P, C, N, free + k]
         known = (left.isfinite() & J.isfinite().all(-1)).all(-2)
-        squared = torch.where(known, left.square().sum(-2), math.inf)
+        squared = torch.where(known, left.square().sum(-2), math.nan)
         scale = scale_of(squared, pairs).square().unsqueeze(-1)
         root = (scale.rsqrt() / (1 + squared / scale)).unsqueeze(1)
         left = torch.where(known.unsqueeze(1), left * root, 0.0).flatten(1)
         J = torch.where(known[:, None, :, None], J * root.unsqueeze(-1), 0.0).flatten(1, 2)
-        A, b = J.mT @ J, (J.mT @ left.unsqueeze(-1)).squeeze(-1)
-        # In units of what each parameter moves, and damped where the pixels tell nothing.
-        unit = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-12).rsqrt()
-        A = A * unit.unsqueeze(-1) * unit.unsqueeze(-2) + 1e-6 * torch.eye(A.shape[-1])
-        d, b = A.shape[-1] - n.shape[-1], (b * unit).unsqueeze(-1)
-        solved = torch.linalg.solve_ex(A[:, :d, :d], torch.cat([b[:, :d], A[:, :d, d:]], -1))[0]
-        step, across = solved[..., :1], solved[..., 1:]
-        if n.shape[-1]:
-            # Schur's complement: the equations of the numbers alone, for all pairs together.
-            S, g = A[:, d:, d:] - A[:, d:, :d] @ across, b[:, d:] - A[:, d:, :d] @ step
-            back = unit[:, d:].reciprocal().unsqueeze(-1)
-            S, g = S * back * back.mT, g * back
-            S, g = (S, g) if each else (S.sum(0, keepdim=True), g.sum(0, keepdim=True))
-            S = S + torch.diag_embed(1e-6 * S.diagonal(dim1=-2, dim2=-1) + 1e-12)
-            further = torch.linalg.solve_ex(S, g)[0]
-            n, step = n - further.squeeze(-1), step - across @ (further * back)
+        A, b = torch.zeros(size, size).double(), torch.zeros(size).double()
+        A.index_put_((index.unsqueeze(2), index.unsqueeze(1)), J.mT @ J, accumulate=True)
+        b.index_put_((index,), (J.mT @ left.unsqueeze(-1)).squeeze(-1), accumulate=True)
+        # In units of what each unknown moves, and damped where the pixels tell nothing.
+        unit = A.diagonal().clamp(min=1e-12).rsqrt()
+        A = A * unit * unit.unsqueeze(-1) + 1e-6 * torch.eye(size)
+        in_units = torch.linalg.solve_ex(A, b * unit)[0].nan_to_num()
+        step = unit * in_units
+        n = n - step[free * count :].view_as(n)
         if motion is not None:
-            step = (unit[:, :d] * step.squeeze(-1)).nan_to_num()
-            motion = small_motion(-step.clamp(-0.5, 0.5)) @ motion
-    return motion, n
+            motion = small_motion(-step[: free * count].view(count, 6).clamp(-0.5, 0.5)) @ motion
+        if in_units.abs().amax() < _SETTLED:
+            break
+    return change(pairs, n[group]).motion if motion is None else motion, n
 
 
 def scale_of(squared: Tensor, pairs: Pairs) -> Tensor:
-    """Returns 1.5 standard deviations of residuals by their lower third, inf where unknown."""
-    rank = squared.isfinite().sum(-1, keepdim=True) // 3
-    third = squared.sort(-1).values.gather(-1, rank.clamp(max=squared.shape[-1] - 1)).squeeze(-1)
+    """Returns 1.5 standard deviations of residuals by their lower third, their squares given."""
+    third = squared.nanquantile(1 / 3, -1, interpolation="lower")
     scale = 1.5 * (third / (-2 * math.log(2 / 3))).sqrt()
     return scale.nan_to_num(1.0, 1.0).clamp(pairs.scale_px, 1e4)
 
 
 def best_motion(pairs: Pairs, *starts: Tensor, steps: int = 5) -> Tensor:
     """Returns the motions that leave least, from whichever start each is reached."""
-    few, none, motions = pairs.of(pixels=slice(FITTED)), pairs.depth[:, :0], [*starts]
+    few, motions = pairs.of(pixels=slice(FITTED)), [*starts]
+    nothing, nobody = torch.zeros(1, 0).double(), torch.zeros(len(few.K), dtype=torch.long)
     # Edges of depth first tell the way, and then, being interpolated, don't count any more.
     rounds = [few] if pairs.by_flow else [few, few._replace(scale_px=1e-3)]
     for end in starts:
         for each in rounds:
-            found, _ = descended(each, end, lambda p, n: p, none, steps=steps)
-            end = end if found is None else found
+            end, _ = descended(each, end, lambda p, n: p, nothing, nobody, steps=steps)
         motions.append(end)
     return least_costly(few, torch.stack(motions))
 
 
 def least_costly(few: Pairs, motions: Tensor) -> Tensor:
     """Returns that of motions `[M, P, 4, 4]` with which most pixels of each pair agree."""
-    squared = residual(few, motions).square().sum(-2).nan_to_num(math.inf)
+    squared = residual(few, motions).square().sum(-2)
     scale = torch.stack([scale_of(each, few) for each in squared]).amin(0).square().unsqueeze(-1)
-    agreement = (1 / (1 + squared / scale)).mean(-1)
+    agreement = (1 / (1 + squared / scale)).nan_to_num(0.0).mean(-1)
     if not few.by_flow:  # no interpolated edge is a reason to leave the first
         agreement[0] += 0.01
     return motions[agreement.argmax(0), torch.arange(squared.shape[1])]
