@@ -113,7 +113,7 @@ def test_a_step_can_be_begun_and_asked_for_later_or_dropped_by_a_reset(make):
     ours.step_async(actions)
     with pytest.raises(RuntimeError, match="a step is under way"):
         ours.step_async(actions)
-    with pytest.raises(ValueError, match=r"began a step with \[5 6 0\], step got \[0 6 5\]"):
+    with pytest.raises(ValueError, match=r"\[5 6 0\].*\[0 6 5\]"):
         ours.step(actions[::-1])
     assert_same(ours.reset(seed=4), theirs.reset(seed=4))
     assert_same(ours.step(actions), theirs.step(actions))
@@ -132,7 +132,7 @@ def test_every_environment_can_be_asked_and_told(make):
     ("action", "told"),
     [
         (13, r"(?s)environments 2 to 3 failed.*unlucky environment 3"),
-        (17, r"environments 2 to 3 is gone \(exit code -9\).*memory"),
+        (17, r"environments 2 to 3 .*-9.*memory"),
     ],
 )
 def test_a_worker_that_failed_or_was_killed_is_told(make, action, told):

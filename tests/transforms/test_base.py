@@ -91,7 +91,7 @@ def test_without_a_compiler_compiled_flow_is_refused(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setenv("CXX", "clang++-19")
-    with pytest.raises(ValueError, match=r"needs a C\+\+ compiler, and clang\+\+-19 is not"):
+    with pytest.raises(ValueError, match=r"C\+\+.*clang\+\+-19"):
         T.RawFlow(INTRINSICS, compiled=True)
 
 
@@ -118,13 +118,13 @@ def test_moves_to_another_device_and_type(make):
 def test_missing_key_is_named_with_what_the_env_offers_before_the_first_step():
     env = TransformedEnv(FakeSensorEnv(), T.Depth(in_keys=["range"]))
     # KeyError would quote the sentence.
-    with pytest.raises(KeyError, match=r"^representation 'depth' needs key 'range'.*'depth'\)"):
+    with pytest.raises(KeyError, match=r"^\w.*'depth'.*'range'.*'depth'\)"):
         env.observation_spec  # noqa: B018
 
 
 def test_missing_key_is_named_on_a_batch_with_all_that_need_it():
     td = moments(2).exclude(("sensor", "depth"))
-    with pytest.raises(KeyError, match=r"'ego' and 'obj' needs key \('sensor', 'depth'\)"):
+    with pytest.raises(KeyError, match=r"'ego'.*'obj'.*\('sensor', 'depth'\)"):
         T.FlowFactorize(INTRINSICS, outputs=["ego", "obj"])(td)
 
 

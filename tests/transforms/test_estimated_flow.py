@@ -179,7 +179,7 @@ def past_a_wall(pair, estimate, depth=2.0):
 
 def test_pictures_that_are_no_multiple_of_the_maps_are_refused():
     pair = shifted_pair(20, 28, right=0, down=0)
-    with pytest.raises(ValueError, match=r"20x28 are not picture_scale=2 times .* maps of 10x13"):
+    with pytest.raises(ValueError, match=r"20x28.*picture_scale=2.*10x13"):
         past_a_wall(pair, [0.0, 0.0], torch.ones(1, 10, 13))
 
 
@@ -298,7 +298,7 @@ def test_flow_of_larger_pictures_is_averaged_to_the_maps():
     # the mean of two columns, in pixels twice as large; rival: every second one, 0 and -1 and -2
     assert torch.equal(raw[0], torch.tensor([[-0.25, -1.25, -2.25]]).expand(2, 3))
     assert torch.equal(raw[1], torch.tensor([[-2.5], [-12.5]]).expand(2, 3))
-    with pytest.raises(ValueError, match="pictures of 5x6 are not picture_scale=2 times"):
+    with pytest.raises(ValueError, match=r"5x6.*picture_scale=2"):
         flow.output_specs(Unbounded((6, 5, 6)))
 
 
@@ -312,13 +312,13 @@ def test_without_opencv_one_line_says_what_to_install(monkeypatch):
     ("options", "message"),
     [
         ({"estimator": "farneback"}, r"one of \['dis', 'raft_small', 'raft_large'\].*'farneback'"),
-        ({"estimator": "raft_small"}, "'raft_small' needs weights="),
-        ({"weights": "w.pth"}, "weights= are RAFT's; estimator 'dis' has none"),
+        ({"estimator": "raft_small"}, "'raft_small'.*weights="),
+        ({"weights": "w.pth"}, "weights=.*'dis'"),
         ({"preset": "slow"}, r"preset must be one of .*'fine'\], got 'slow'"),
-        ({"min_side_px": 0}, "min_side_px must be at least 1, got 0"),
-        ({"picture_scale": 0}, "picture_scale must be at least 1, got 0"),
-        ({"estimator": brightening, "preset": "slow"}, "preset='slow' .* not read .* function"),
-        ({"estimator": T.DIS(), "min_side_px": 96}, r"min_side_px=96 are not read .*DIS\(preset"),
+        ({"min_side_px": 0}, "min_side_px.* 0"),
+        ({"picture_scale": 0}, "picture_scale.* 0"),
+        ({"estimator": brightening, "preset": "slow"}, "preset='slow'.*function"),
+        ({"estimator": T.DIS(), "min_side_px": 96}, r"min_side_px=96.*DIS\("),
         ({"outputs": ["valid"]}, r"some of \['raw', 'unscaled'\]"),
     ],
 )
@@ -411,7 +411,7 @@ def test_what_is_no_weights_is_refused_by_name(weights, tmp_path):
         T.RAFT(tmp_path / "nowhere.pth")
     other = tmp_path / "other.pth"
     torch.save({"bias": torch.zeros(1)}, other)
-    with pytest.raises(ValueError, match=r"other\.pth does not hold the weights of raft_small"):
+    with pytest.raises(ValueError, match=r"other\.pth.*raft_small"):
         T.RAFT(other)
     with pytest.raises(ValueError, match="raft_tiny"):
         T.RAFT(weights, "raft_tiny")

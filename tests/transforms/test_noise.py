@@ -164,10 +164,10 @@ def test_noise_by_frame_is_in_no_state_and_the_same_at_the_root_and_under_next()
     ("options", "expected"),
     [
         ({"sensors": ["deep"]}, r"some of \['depth', 'motion', 'flow'\], each once"),
-        ({"depth_sigma_per_m": -0.1}, "depth_sigma_per_m must be a finite number of at least 0"),
-        ({"drift_m": math.inf}, "drift_m must be a finite number"),
-        ({"depth_dropout": 1.5}, r"depth_dropout must be a probability, got 1\.5"),
-        ({"flow_sigma_px": 1.0}, "flow_sigma_px needs 'flow' among sensors"),
+        ({"depth_sigma_per_m": -0.1}, "depth_sigma_per_m.* -0.1"),
+        ({"drift_m": math.inf}, "drift_m.* inf"),
+        ({"depth_dropout": 1.5}, r"depth_dropout.* 1\.5"),
+        ({"flow_sigma_px": 1.0}, "flow_sigma_px.*'flow'"),
         ({"out_keys": ["only"]}, "writes 2 keys"),
     ],
 )
@@ -196,7 +196,7 @@ def test_envs_of_one_function_draw_noise_of_their_own(batched):
 
 def test_noise_by_frame_needs_the_frame_s_name():
     noise = SensorNoise(drift_m=0.1, frame_key=["sensor", "frame"])  # as YAML has it
-    with pytest.raises(MissingKey, match=r"needs key \('sensor', 'frame'\); the env offers"):
+    with pytest.raises(MissingKey, match=r"\('sensor', 'frame'\)"):
         TransformedEnv(FakeSensorEnv((2,)), noise).rollout(1)
 
 
