@@ -23,7 +23,7 @@ def never_turn(env: StreetEnv) -> int:
 
 
 class RandomActions:
-    """Draws actions uniformly from `seed` and the episode's; earlier episodes play no part."""
+    """Draws actions uniformly, seeded by `seed` and the episode's own seed."""
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed

@@ -117,7 +117,7 @@ class Episode:
         self._ahead_from, self._ahead = 0, self.poses[:0, None]
 
     def status(self) -> dict[str, int]:
-        """Returns outcome, hit, seed and path as numbers, as TensorDicts hold them."""
+        """Returns outcome, hit, seed and path as numbers, for TensorDicts."""
         return {
             "outcome": int(self.outcome),
             "hit": CATEGORY_ID[self.hit] if self.hit else NOTHING_HIT,

@@ -80,7 +80,7 @@ class RepresentationObservation(gym.Wrapper):
         return self._maps(), info
 
     def step(self, action: Any) -> tuple[Maps, float, bool, bool, dict[str, Any]]:
-        """Acts."""
+        """Takes a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._now = self._stack._step(self._now, _sensed(observation))
         return self._maps(), float(reward), terminated, truncated, info
@@ -181,7 +181,7 @@ def _sensed(observation: Mapping[str, NDArray[Any]]) -> TensorDict:
 
 
 def _joined(maps: Iterable[NDArray[Any]]) -> NDArray[Any]:
-    """Returns maps [C, H, W] along their channels: float32, with bytes divided by 255."""
+    """Returns maps [C, H, W] joined along the channels: float32, bytes divided by 255."""
     maps = list(maps)
     if any(each.dtype != np.uint8 for each in maps):
         maps = [m.astype(np.float32) / (255.0 if m.dtype == np.uint8 else 1.0) for m in maps]

@@ -29,7 +29,7 @@ class StreetEnv(gym.Env):
     | key | shape | dtype | meaning |
     | --- | --- | --- | --- |
     | `depth` | [1, H, W] | float32 | metres along z; sky is inf |
-    | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.scenes.scene.CATEGORY_ID` |
+    | `semantic` | [1, H, W] | uint8 | class id, see `flowrep.scenes.CATEGORY_ID` |
     | `instance` | [1, H, W] | uint8 | 0: static world; 1, 2, 3: first person's body and legs, ... |
     | `prev_from_curr` | [4, 4] | float32 | current camera to previous camera |
     | `instance_motion` | [1 + 3·P, 4, 4] | float32 | the same by instance; row 0: static world |

@@ -24,7 +24,7 @@ from flowrep.transforms.stack import FLOWS, DropKeys
 
 
 def usable_device(device: str | torch.device) -> torch.device:
-    """Returns a device, once a tensor could be created on it.
+    """Returns a device, after a check that tensors can be created on it.
 
     Raises:
         ValueError: there is no such device, or this PyTorch can't use it.

@@ -98,7 +98,7 @@ class StreetVectorEnv(SyncVectorEnv):
         return self._observe(driven), rewards, ended, np.zeros_like(ended), {}
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Closes the environments, with the last of which the street's simulator goes."""
+        """Closes the environments; a street's simulator closes with its last one."""
         super().close_extras(**kwargs)
         del self._sensing
 

@@ -232,7 +232,7 @@ class _Worker:
 
 
 def _end(workers: list[_Worker]) -> None:
-    """Closes the pipes, upon which workers end, and waits for that."""
+    """Closes the pipes, which ends the workers, and waits for them."""
     for worker in workers:
         worker.pipe.close()
     deadline = time.monotonic() + 5.0
@@ -288,7 +288,7 @@ def write_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: Any) 
 
 @contextmanager
 def sheltered() -> Iterator[None]:
-    """Within it, processes start with signals blocked and without running the main module again."""
+    """Starts processes with signals blocked, and keeps them from running the main module again."""
     # A process inherits the mask of blocked signals. If it blocked them itself, Ctrl-C in the
     # moment before would print a traceback from each worker, or end multiprocessing's resource
     # tracker.

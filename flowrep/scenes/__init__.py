@@ -5,6 +5,6 @@ from flowrep.extras import require
 require("flowrep.scenes", "sim", "shapely", "yaml", "pydantic")
 
 from flowrep.scenes.load import load_scene, scene_names  # noqa: E402 - after the check above
-from flowrep.scenes.scene import Scene, SceneError  # noqa: E402
+from flowrep.scenes.scene import CATEGORY_ID, Scene, SceneError  # noqa: E402
 
-__all__ = ["Scene", "SceneError", "load_scene", "scene_names"]
+__all__ = ["CATEGORY_ID", "Scene", "SceneError", "load_scene", "scene_names"]

@@ -110,7 +110,7 @@ def check_path(layout: Layout, path: Path) -> None:
 
 
 def check_walks(layout: Layout) -> None:
-    """Checks that no draw of an episode puts a person into a box, a person or the vehicle."""
+    """Checks that no episode can put a person into a box, another person or the vehicle."""
     reach, least = pedestrians.RADIUS_M, pedestrians.APART_M
     grounds = {group.name: _ground(layout, group) for group in layout.scene.pedestrian_groups}
     boxes = [*layout.buildings, *layout.obstacles, *layout.closures.values()]

@@ -184,7 +184,7 @@ class Layout:
         return shapely.Polygon(footprint_corners(self.start_state(zone_name), self.scene.vehicle))
 
     def boxes(self, path: Path) -> list[Box]:
-        """Returns all that stands in the episodes of a path, its closures included."""
+        """Returns all boxes in the episodes of a path, closures included."""
         closures = [self.closures[name] for name in path.closures]
         return [*self.buildings, *self.obstacles, *closures]
 

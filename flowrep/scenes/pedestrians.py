@@ -59,7 +59,7 @@ def quaternions_of_parts(poses: Array) -> Array:
 
 
 def keeps_its_stretches(points: Array, aside_m: float) -> bool:
-    """Returns whether a line moved aside keeps every stretch, with none reversed."""
+    """Returns whether a line that is moved aside keeps all its stretches, none reversed."""
     # A stretch's length is linear in `aside_m`: what holds at two distances holds between them.
     steps = np.diff(points, axis=0)
     moved = np.diff(parallel(points, aside_m), axis=0)
@@ -67,7 +67,7 @@ def keeps_its_stretches(points: Array, aside_m: float) -> bool:
 
 
 def keeps_lanes_apart(points: Array, spread_m: float) -> bool:
-    """Returns whether lanes up to half of `spread_m` to either side stay as far apart as drawn."""
+    """Returns whether lanes within `spread_m` keep their distances all along a walk."""
     # They do if the strip of all lanes, widened by half a person's room, does not overlap itself:
     # the only way from one lane to another is then across all lanes between them, or out of the
     # strip and in again.
@@ -90,7 +90,7 @@ def covered_ground(points: Array, spread_m: float) -> list[shapely.Geometry]:
 
 
 def least_spread_m(count: int) -> float:
-    """Returns the least width in metres that the lanes of `count` people take."""
+    """Returns the least `spread_m` that the lanes of `count` people need."""
     return round((count - 1) * LANE_M, 6)
 
 
@@ -117,7 +117,7 @@ class Crowd:
 
     Args:
         lines: everyone's line, points [M, 2] in metres.
-        speeds_mps: [P]; who has 0 stands.
+        speeds_mps: [P]; people with 0 stand.
         phases: [P].
     """
 
@@ -153,7 +153,7 @@ class Crowd:
         poses[..., 2] = headings + self._facing(along)
         walked = self._start + self._speeds * time_s
         step = walked * (2 * math.pi / _STRIDE_M) + self._out_of_step
-        # Who stands has one foot in front of the other.
+        # People who stand have one foot in front of the other.
         poses[..., 3] = _SWING_RAD * np.where(self._speeds > 0, np.sin(step), 1.0)
         return poses
 

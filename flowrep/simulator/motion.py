@@ -38,7 +38,7 @@ def rigid_inverse(a_from_b: Array) -> Array:
 def relative_motion(world_from_prev: Array, world_from_curr: Array) -> Array:
     """Returns prev_from_curr [..., 4, 4]; exactly the identity if the camera did not move."""
     motion = rigid_inverse(world_from_prev) @ world_from_curr
-    # The product of a matrix and its inverse is off by rounding, and flow by a little more than 0.
+    # A matrix times its inverse is the identity only up to rounding, and flow would not be 0.
     motion[(world_from_prev == world_from_curr).all(axis=(-2, -1))] = np.eye(4)
     return motion
 
@@ -55,10 +55,10 @@ def instance_motion(
     previous camera's frame.
     """
     static = relative_motion(world_from_prev, world_from_curr)[..., None, :, :]
-    # now: body ← world ← camera; then: camera ← world ← body, in which the point has stayed
+    # Now body ← world ← camera, before camera ← world ← body: the point stays fixed to the body.
     body_from_curr = rigid_inverse(world_from_curr_body) @ world_from_curr[..., None, :, :]
     prev_from_world = rigid_inverse(world_from_prev)[..., None, :, :]
     carried = prev_from_world @ world_from_prev_body @ body_from_curr
-    # Who kept their pose has exactly the numbers of row 0, so that their object flow is exactly 0.
+    # Bodies that kept their pose get exactly row 0, so that their object flow is exactly 0.
     moved = (world_from_curr_body != world_from_prev_body).any(axis=(-2, -1))
     return np.concatenate([static, np.where(moved[..., None, None], carried, static)], axis=-3)

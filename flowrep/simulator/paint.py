@@ -80,7 +80,7 @@ def swatch(name: str) -> Patch:
 
 
 def front(variant: int) -> Patch:
-    """Returns a house front of the `NUM_FRONTS`; variants beyond repeat them."""
+    """Returns a variant's house front; there are `NUM_FRONTS`, which repeat."""
     row, column = divmod(variant % NUM_FRONTS, len(_WALLS))
     (height, width), (top, left) = _FRONT_PX, _corner(row, column)
     # Half a texel within its border, or neighbouring fronts would bleed in.
@@ -126,7 +126,7 @@ def _paint_front(image: NDArray[np.uint8], floors: int, rgb: tuple[int, int, int
 
 
 class Painted(NamedTuple):
-    """How T triangles look, in the frames of their bodies; the rasteriser shades with it."""
+    """The appearance of T triangles, in the frames of their bodies."""
 
     normals: NDArray[np.float32]  # [T, 3]
     colours: NDArray[np.float32]  # [T, 3], 0 to 255
@@ -142,7 +142,7 @@ def painted(
     semantic: NDArray[np.uint8],  # [T]
     instance: NDArray[np.uint8],  # [T], 0 for the static world
 ) -> Painted:
-    """Returns the look of triangles."""
+    """Returns the appearance of triangles."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normals = np.cross(a, b)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

@@ -72,7 +72,7 @@ class Rasteriser:
         *,
         rgb: bool = False,
     ) -> Maps:
-        """Returns N views of the same bodies at poses of their own."""
+        """Returns N views of the same bodies, each with its own poses."""
         # Tables of 4 MB are made when colours are first drawn.
         look = *self._look, *((paint.grain(), paint.front_levels()) if rgb else _NO_TABLES)
         views = len(cam_from_world)

@@ -87,7 +87,7 @@ class Street:
 
     @classmethod
     def shared(cls, scene: Scene) -> "Street":
-        """Returns the street of all environments of the process with this scene."""
+        """Returns the street that all environments of this process with this scene share."""
         # A PyBullet client takes 28 MB. Pickled, since a scene holds mappings and has no hash.
         key = pickle.dumps(scene)
         street = _STREETS.get(key)

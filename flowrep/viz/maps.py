@@ -36,7 +36,7 @@ CLASS_COLOURS: dict[str, tuple[int, int, int]] = {
     "car": (46, 64, 196),
     "traffic_light": (250, 214, 40),
 }
-"""Class name to colour, in the order of the class ids (`flowrep.scenes.scene.CATEGORY_ID`)."""
+"""Class name to colour, in the order of the class ids (`flowrep.scenes.CATEGORY_ID`)."""
 
 OUTCOME_COLOURS = {
     "success": "#0072b2",

@@ -65,7 +65,7 @@ class Video:
         self._partial.replace(self.path)
 
     def discard(self) -> None:
-        """Ends without a file."""
+        """Stops FFmpeg and deletes the partial file."""
         if self._ffmpeg is not None:
             self._ffmpeg.kill()
             self._end()
