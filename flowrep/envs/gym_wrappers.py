@@ -1,6 +1,6 @@
 """Representations as plain numpy maps, for gymnasium learners without TorchRL."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,8 +18,8 @@ from flowrep.envs.torchrl_env import sensors_read
 from flowrep.scenes.scene import Scene
 from flowrep.transforms import representation_stack
 from flowrep.transforms.flow import Intrinsics
+from flowrep.transforms.stack import Representations
 
-Representations = Sequence[str] | Mapping[str, Mapping[str, Any] | None]
 Maps = NDArray[Any] | dict[str, NDArray[Any]]
 
 
@@ -32,7 +32,7 @@ class RepresentationObservation(gym.Wrapper):
 
     Args:
         env: its observation is a dict of sensor maps and motions, as `StreetEnv`'s.
-        representations: names, or a mapping from name to options.
+        representations: see `flowrep.transforms.representation_stack`.
         intrinsics: K `[3, 3]` of the maps; the env's `K` by default.
         num_classes: the number of semantic classes; the env's `num_classes` by default.
 
@@ -166,14 +166,14 @@ def make_street(
     return env
 
 
-def _onehot(representations: Representations) -> dict[str, dict[str, Any]]:
+def _onehot(representations: Representations) -> dict[str, Any]:
     """Returns the representations with one-hot ids, as a class id is no intensity."""
-    given = representations if isinstance(representations, Mapping) else {}
-    onehot = {"encoding": "onehot"}
-    return {
-        name: (onehot if name in ("seg", "seg2") else {}) | dict(given.get(name) or {})
-        for name in representations
-    }
+    options: dict[str, Any] = dict.fromkeys(representations)
+    if isinstance(representations, Mapping):
+        options |= representations
+    for name in {"seg", "seg2"} & options.keys():
+        options[name] = {"encoding": "onehot"} | dict(options[name] or {})
+    return options
 
 
 def _sensed(observation: Mapping[str, NDArray[Any]]) -> TensorDict:

@@ -20,7 +20,7 @@ from flowrep.scenes.scene import Range, Scene, SpeedMode, num_classes
 from flowrep.scenes.vehicle import YAW_SIGN
 from flowrep.simulator.camera import choose_renderer, sensor_intrinsics
 from flowrep.transforms import Mirror, representation_stack
-from flowrep.transforms.stack import FLOWS, DropKeys
+from flowrep.transforms.stack import FLOWS, DropKeys, Representations
 
 
 def usable_device(device: str | torch.device) -> torch.device:
@@ -66,7 +66,7 @@ class VectorWrapper(GymWrapper):
 
 def make_env(
     scene: str | Path | Mapping[str, Any] | Scene = "straight_road",
-    representations: Sequence[str] | Mapping[str, Mapping[str, Any] | None] = (),
+    representations: Representations = (),
     *,
     num_envs: int = 1,
     num_workers: int = 0,
@@ -91,8 +91,9 @@ def make_env(
 
     Args:
         scene: a scene's name, YAML file, mapping, or `Scene`.
-        representations: names, or a mapping from name to options. Only the sensors that they need
-            are rendered, none for an empty list.
+        representations: names, or a mapping from name to options or transform, see
+            `flowrep.transforms.representation_stack`. Only the sensors that they need are rendered,
+            none for an empty list.
         num_envs: the batch size.
         num_workers: number of processes that step the envs, see `WorkerVectorEnv`; 0 steps them in
             this process. The results are the same.

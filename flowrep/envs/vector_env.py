@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from flowrep.envs.episode import NOTHING_HIT, Episode, Outcome, reward
-from flowrep.envs.workers import write_rows
+from flowrep.envs.workers import copy_into_rows
 
 _STATUS: dict[str, Any] = {
     "outcome": spaces.Box(0, len(Outcome) - 1, (1,), np.uint8),
@@ -112,7 +112,7 @@ class StreetVectorEnv(SyncVectorEnv):
         if len(rows) < self.num_envs:
             # The arrays belong to the caller of an earlier step: copy them before writing to them.
             self._latest = deepcopy(self._latest)
-            write_rows(observation, self._latest, rows)
+            copy_into_rows(observation, self._latest, rows)
         else:
             self._latest = observation
         return dict(self._latest)

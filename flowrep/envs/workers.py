@@ -266,7 +266,7 @@ def _work(
                 result = ()  # which gymnasium's vector env refuses
             else:
                 observation, *result = getattr(vector, method)(**arguments)
-                write_rows(observation, shared, rows)
+                copy_into_rows(observation, shared, rows)
             pipe.send((result, None))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the caller has closed, or is gone
@@ -277,11 +277,11 @@ def _work(
             vector.close()
 
 
-def write_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: Any) -> None:
-    """Writes arrays nested in mappings into some rows of those in `target`."""
+def copy_into_rows(source: Mapping[str, Any], target: Mapping[str, Any], rows: Any) -> None:
+    """Copies arrays nested in mappings into some rows of those in `target`."""
     for name, value in source.items():
         if isinstance(value, Mapping):
-            write_rows(value, target[name], rows)
+            copy_into_rows(value, target[name], rows)
         else:
             target[name][rows] = value
 

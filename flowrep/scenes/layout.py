@@ -62,7 +62,7 @@ def stretch(line: shapely.LineString, from_m: float, to_m: float) -> shapely.Lin
     return shapely.ops.substring(line, first, last)
 
 
-def without_repeats(points: Array) -> Array:
+def distinct_points(points: Array) -> Array:
     """Returns points [M, 2] without those within about a millimetre of the previous one."""
     kept = [points[0]]
     for point in points[1:]:
@@ -191,7 +191,7 @@ class Layout:
     def walk_line(self, walk: Walk, lateral_m: float = 0.0) -> Array:
         """Returns the points [M, 2] of a walk, moved `lateral_m` to the left of its direction."""
         if walk not in self._walks:
-            self._walks[walk] = without_repeats(self._walk_points(walk))
+            self._walks[walk] = distinct_points(self._walk_points(walk))
         return parallel(self._walks[walk], lateral_m)
 
     def _walk_points(self, walk: Walk) -> Array:
@@ -200,7 +200,7 @@ class Layout:
             return np.array(given.points_m)
         if walk.kind == "along":
             part = stretch(self.lines[given.road], given.from_m, given.to_m)
-            return parallel(without_repeats(np.array(part.coords)), given.offset_m)
+            return parallel(distinct_points(np.array(part.coords)), given.offset_m)
         road = self.roads[given.road]
         # Keep a stride away from the house fronts.
         reach = road.width_m / 2 + road.sidewalk_m - 0.5

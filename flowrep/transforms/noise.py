@@ -26,7 +26,7 @@ class _Sensor(NamedTuple):
     options: tuple[str, ...]
 
 
-SENSORS = {
+NOISY_SENSORS = {
     "depth": _Sensor(base.DEPTH, ("sensor", "depth"), ("depth_sigma_per_m", "depth_dropout")),
     "motion": _Sensor(base.MOTION, ("sensor", "prev_from_curr"), ("drift_m", "drift_rad")),
     "flow": _Sensor(base.FLOW, "raw", ("flow_sigma_px",)),
@@ -115,12 +115,14 @@ class SensorNoise(MapTransform):
             "drift_rad": drift_rad,
             "flow_sigma_px": flow_sigma_px,
         }
-        check_choice("sensors", sensors, SENSORS)
+        check_choice("sensors", sensors, NOISY_SENSORS)
         _check_options(sensors, options)
-        read = [SENSORS[name].key for name in sensors] if in_keys is None else as_keys(in_keys)
+        read = (
+            [NOISY_SENSORS[name].key for name in sensors] if in_keys is None else as_keys(in_keys)
+        )
         frame = [] if frame_key is None else as_keys([frame_key])
         super().__init__(
-            [SENSORS[name].reads for name in sensors] + [FRAME] * len(frame),
+            [NOISY_SENSORS[name].reads for name in sensors] + [FRAME] * len(frame),
             read + frame,
             read if out_keys is None else out_keys,
             writes=len(sensors),
@@ -136,7 +138,7 @@ class SensorNoise(MapTransform):
         return tuple(self._noisy(sensor, x, frame) for sensor, x in zip(self.sensors, maps))
 
     def _noisy(self, sensor: str, value: Tensor, frame: Tensor | None) -> Tensor:
-        options = [self.options[name] for name in SENSORS[sensor].options]
+        options = [self.options[name] for name in NOISY_SENSORS[sensor].options]
         if not any(options):
             return value
         normals, uniforms = self._numbers(sensor, value, frame)
@@ -149,12 +151,12 @@ class SensorNoise(MapTransform):
 
     def _numbers(self, sensor: str, value: Tensor, frame: Tensor | None) -> tuple[Tensor, Tensor]:
         """Returns normal numbers, one per pixel or six per motion, and uniform ones for depth."""
-        rank, device = len(SENSORS[sensor].reads.shape), value.device
+        rank, device = len(NOISY_SENSORS[sensor].reads.shape), value.device
         batch = value.shape[: value.ndim - rank]
         shape = (6,) if sensor == "motion" else tuple(value.shape[-rank:])
         uniforms = torch.empty(0, device=device)
         if frame is not None:
-            stream = list(SENSORS).index(sensor)
+            stream = list(NOISY_SENSORS).index(sensor)
             bits = frame_bits(frame, shape, seed=self.seed or 0, stream=stream)
             return normal(bits), uniform(bits) if sensor == "depth" else uniforms
         # A new generator in each call, and its state is replaced, never changed in place: copies of
@@ -225,7 +227,7 @@ def _check_options(sensors: Sequence[str], options: dict[str, float]) -> None:
     for name, value in options.items():
         if not 0.0 <= value < math.inf:
             raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
-        (sensor,) = (sensor for sensor in SENSORS if name in SENSORS[sensor].options)
+        (sensor,) = (sensor for sensor in NOISY_SENSORS if name in NOISY_SENSORS[sensor].options)
         if value and sensor not in sensors:
             raise ValueError(f"{name} needs {sensor!r} among sensors, got {list(sensors)}")
     if options["depth_dropout"] > 1.0:

@@ -17,7 +17,7 @@ from flowrep.transforms.flow import FlowFactorize, Intrinsics, RawFlow
 from flowrep.transforms.frame_stack import FrameStack
 from flowrep.transforms.maps import Depth, Rgb, Segmentation
 from flowrep.transforms.motion import EstimateCameraMotion
-from flowrep.transforms.noise import SENSORS, SensorNoise
+from flowrep.transforms.noise import NOISY_SENSORS, SensorNoise
 
 Representations = Sequence[str] | Mapping[str, Mapping[str, Any] | Transform | None]
 Options = dict[str, Any]
@@ -122,7 +122,7 @@ def representation_stack(
     estimates_motion = motion == "estimated" and not {"ego", "obj"}.isdisjoint(flows)
 
     noisy = _noise(noise, chosen, reads_motion=motion == "exact")
-    keys = {name: SENSORS[name].key for name in _NOISY_KEYS}
+    keys = {name: NOISY_SENSORS[name].key for name in _NOISY_KEYS}
     keys |= {name: key for name, key in _NOISY_KEYS.items() if noisy and key in noisy[0].out_keys}
     camera = _Camera(
         k={"intrinsics": intrinsics, "prev_intrinsics": prev_intrinsics},
@@ -220,7 +220,7 @@ def _noise(
     The exact values keep their keys, so that raw flow and a second pass over the same frames start
     from them.
     """
-    options = {sensor: SENSORS[sensor].options for sensor in _NOISY_KEYS}
+    options = {sensor: NOISY_SENSORS[sensor].options for sensor in _NOISY_KEYS}
     known = dict.fromkeys((name for names in options.values() for name in names), 0.0)
     _check_known("option of noise:", noise or {}, known)
     given: Options = known | dict(noise or {})

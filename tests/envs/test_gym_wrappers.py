@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from flowrep.envs import Outcome, RepresentationObservation, make_env
-from flowrep.transforms import REPRESENTATIONS
+from flowrep.transforms import REPRESENTATIONS, Depth
 
 ID = "flowrep/StraightRoad-v0"
 ALL = [name for name in REPRESENTATIONS if name != "rgb"]
@@ -134,6 +134,8 @@ def test_an_env_of_ones_own_is_wrapped_by_its_camera():
     np.testing.assert_allclose(observation[0], -40 * 0.1 / 2)  # u; fy would give -2.5
     np.testing.assert_array_equal(observation[1], 0)
     np.testing.assert_allclose(observation[2], 0.02)
+    near = RepresentationObservation(Wall(), {"near": Depth(range_m=4.0, out_keys="near")})
+    np.testing.assert_array_equal(near.reset()[0], np.full((1, 3, 5), 0.5))
     with pytest.raises(KeyError, match=r"needs key .*'instance'"):
         RepresentationObservation(Wall(), ["raw"], intrinsics=K)
     with pytest.raises(ValueError, match="need intrinsics="):
