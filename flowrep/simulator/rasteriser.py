@@ -90,9 +90,11 @@ def _draw(
     K, near_m, far_m, look, cam_from_world, world_from_body, is_shown,
     depth, semantic, instance, rgb,
 ):  # fmt: skip
-    # `inverse` is a z-buffer of inverse depths: nearer is larger. It starts with the far plane's,
-    # and `number`, the triangle that a pixel shows, with the sky's -1. Each triangle takes the
-    # pixels where it is nearer; ids and colours are looked up once, when all triangles are drawn.
+    # The arrays are those of `Triangles`, `Rasteriser.__call__` and `Maps`, with their shapes
+    # there. `inverse` is a z-buffer of inverse depths: nearer is larger. It starts with the far
+    # plane's, and `number`, the triangle that a pixel shows, with the sky's -1. Each triangle takes
+    # the pixels where it is nearer; ids and colours are looked up once, when all triangles are
+    # drawn.
     views, height, width = depth.shape
     planes = _side_planes(K, height, width)
     most = (point_bounds[1:] - point_bounds[:-1]).max()
