@@ -49,35 +49,26 @@ class AlgorithmOptions(Options):
 class LearnerOptions(AlgorithmOptions):
     """Options that flowrep's algorithms have in common."""
 
-    precision: Literal["auto", "bf16", "fp32"] = "auto"
-    """Of activations; weights are float32 in each case."""
-    learning_rate: Positive = 3e-4
-    """Adam's, which falls linearly to 0 at the end of the training."""
-    gamma: Share = 0.99
-    """Discount a frame."""
-    hidden_size: Count = 512
-    """Width of the single hidden layer after the embeddings."""
-    batch_size: Count = 1024
-    """Steps an update."""
+    precision: Literal["auto", "bf16", "fp32"] = "auto"  # of activations; weights are float32
+    learning_rate: Positive = 3e-4  # Adam's, falls linearly to 0 at the end of the training
+    gamma: Share = 0.99  # discount a frame
+    hidden_size: Count = 512  # of the single hidden layer after the embeddings
+    batch_size: Count = 1024  # steps an update
 
 
 class OffPolicyOptions(LearnerOptions):
-    """Options of algorithms with a replay memory."""
+    """Options of algorithms with a replay memory.
 
-    tau: PositiveShare = 0.005
-    """Share of the online weights in each move of the target weights."""
-    replay_capacity: Count = 10_240
-    """Frames that the memory holds."""
-    frames_per_update: Count = 10
-    """Frames of all environments for a gradient step."""
-    learning_starts: Count | None = None
-    """Frames before the first update; None for one batch."""
+    A transition spans `n_steps` frames: r is the discounted sum of their rewards, and γ becomes γⁿ.
+    """
+
+    tau: PositiveShare = 0.005  # share of the online weights in each move of the target weights
+    replay_capacity: Count = 10_240  # frames
+    frames_per_update: Count = 10  # of all environments
+    learning_starts: Count | None = None  # frames before the first update; None: one batch
     n_steps: Count = 1
-    """Frames that a transition spans: r is the discounted sum of its rewards, γ becomes γⁿ."""
-    layer_norm: bool = False
-    """Normalise each map's embedding, see `flowrep.agent.networks.Encoder`."""
-    mirror: bool = False
-    """Replace half of each batch by its left-right images."""
+    layer_norm: bool = False  # of each map's embedding, see `flowrep.agent.networks.Encoder`
+    mirror: bool = False  # half of each batch is replaced by its left-right images
 
     def first_update(self, num_envs: int) -> tuple[str, int]:
         """Returns the frames until the memory holds enough for an update."""
@@ -94,12 +85,9 @@ class OffPolicyOptions(LearnerOptions):
 class SoftActorCriticOptions(OffPolicyOptions):
     """Options of algorithms that reward entropy."""
 
-    initial_alpha: Positive = 0.5
-    """Entropy coefficient α before the first update."""
-    target_entropy_weight: Share = 0.2
-    """Target entropy as a share of the largest, log n."""
-    alpha_rate_factor: NotNegative = 1.0
-    """Learning rate of log α relative to that of the weights."""
+    initial_alpha: Positive = 0.5  # entropy coefficient α before the first update
+    target_entropy_weight: Share = 0.2  # target entropy as a share of the largest, log n
+    alpha_rate_factor: NotNegative = 1.0  # learning rate of log α over that of the weights
 
 
 class DiscreteSACWithValueOptions(SoftActorCriticOptions):
@@ -107,44 +95,35 @@ class DiscreteSACWithValueOptions(SoftActorCriticOptions):
 
 
 class DiscreteSACOptions(SoftActorCriticOptions):
-    """Options of `algorithm=dsac`."""
+    """Options of `algorithm=dsac`.
+
+    With a shared encoder, policy and Q-functions read one set of encoders, trained by L_Q alone. In
+    y both read its target, so that each observation is encoded once. Separate encoders are one set
+    each, and π(·|s') in y reads the policy's.
+    """
 
     encoder: Literal["shared", "separate"] = "shared"
-    """With "shared", policy and Q-functions read one set of encoders, trained by L_Q alone, and in
-    y both read its target, so that each observation is encoded once. With "separate", each has its
-    own, and π(·|s') in y reads the policy's."""
 
 
 class DoubleDQNOptions(OffPolicyOptions):
     """Options of `algorithm=dqn`."""
 
-    initial_epsilon: Share = 1.0
-    """Probability ε of a random action at the start, from which it falls linearly."""
-    final_epsilon: Share = 0.05
-    """ε after `exploration_share` of the frames."""
+    initial_epsilon: Share = 1.0  # probability ε of a random action, falls linearly
+    final_epsilon: Share = 0.05  # ε after `exploration_share` of the frames
     exploration_share: Share = 0.2
-    """Share of the frames over which ε falls."""
 
 
 class PPOOptions(LearnerOptions):
     """Options of `algorithm=ppo`."""
 
-    batch_size: Count = 256
-    """Steps an update; an incomplete last batch is left out of its pass."""
-    rollout_length: Count = 64
-    """Steps of each environment between two rounds of learning."""
-    epochs: Count = 4
-    """Passes over them."""
-    gae_lambda: Share = 0.95
-    """GAE's λ, from 0 (relies on V) to 1 (relies on the rewards)."""
-    clip: PositiveShare = 0.2
-    """Distance of ρ from 1 beyond which the objective no longer rewards moving it."""
-    value_weight: NotNegative = 0.5
-    """Weight of L_V."""
-    entropy_weight: NotNegative = 0.01
-    """Weight of L_H."""
-    max_grad_norm: Positive = 0.5
-    """The norm over all gradients is scaled down to this maximum."""
+    batch_size: Count = 256  # steps an update; an incomplete last batch is left out of its pass
+    rollout_length: Count = 64  # steps of each environment between two rounds of learning
+    epochs: Count = 4  # passes over them
+    gae_lambda: Share = 0.95  # GAE's λ, from 0 (relies on V) to 1 (relies on the rewards)
+    clip: PositiveShare = 0.2  # ρ farther than this from 1 brings no more
+    value_weight: NotNegative = 0.5  # of L_V
+    entropy_weight: NotNegative = 0.01  # of L_H
+    max_grad_norm: Positive = 0.5  # of all gradients together, which are scaled down to it
 
     def first_update(self, num_envs: int) -> tuple[str, int]:
         """Returns the frames of a rollout."""

@@ -116,6 +116,14 @@ def test_what_the_user_typed_is_used(config, folder):
         command(EvaluateConfig, "evaluate", "run=x", TYPED, "+representations.edges.factor=1.0")
 
 
+def test_a_stored_representation_of_flowreps_names_no_code(config, folder):
+    run = RunFolder(folder / "run")
+    own = {"depth": {"range_m": 100.0, "missing": 0.0, "_target_": "mine.Edges"}}
+    run.write_config(config.plain() | {"representations": own})
+    with pytest.raises(UsageError, match=r"representations\.depth\._target_: there is no such key"):
+        run.config(["mine.Edges"])
+
+
 @pytest.mark.parametrize("name", ["a b", "x;y", "\x1b[2J"])
 def test_a_name_that_is_none_is_never_printed_to_be_pasted(config, folder, name):
     run = RunFolder(folder / "run")

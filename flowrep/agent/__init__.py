@@ -2,7 +2,7 @@
 
 from flowrep.extras import require
 
-require("flowrep.agent", "train", "safetensors")
+require("flowrep.agent", "train", "safetensors", "pydantic")
 
 from flowrep.agent.algorithm import Algorithm, DivergenceError
 from flowrep.agent.checkpoint import CheckpointError, load_checkpoint, save_checkpoint

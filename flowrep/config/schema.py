@@ -8,16 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Collection, Mapping
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    Literal,
-    TypeVar,
-    Union,
-    get_args,
-    get_type_hints,
-)
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_type_hints
 
 from pydantic import (
     BaseModel,
@@ -84,10 +75,9 @@ class Command(Options):
     @property
     def trusted(self) -> list[str]:
         """The classes outside of flowrep that it names; a stored run may name these, too."""
-        named = getattr(self, "algorithm", None), getattr(self, "representations", None)
-        targets = [getattr(named[0], "target", None)]
-        targets += [options.get("_target_") for options in (named[1] or {}).values()]
-        return [target for target in targets if target]
+        plain = self.plain()
+        sections = [plain.get("algorithm") or {}, *(plain.get("representations") or {}).values()]
+        return [section["_target_"] for section in sections if section.get("_target_")]
 
 
 def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
@@ -112,9 +102,10 @@ class ForeignAlgorithm(AlgorithmOptions):
 
 def _kind(section: Any) -> str:
     """Returns which options an algorithm's section holds."""
-    target = (
-        section.get("_target_") if isinstance(section, Mapping) else getattr(section, "target", "")
-    )
+    if isinstance(section, Mapping):
+        target = section.get("_target_")
+    else:  # a model, or what is none
+        target = getattr(section, "target", None)
     return target if isinstance(target, str) and target in ALGORITHMS else "foreign"
 
 

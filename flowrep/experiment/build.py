@@ -61,7 +61,7 @@ def agent(config: TrainConfig, env: EnvBase) -> Algorithm:
     maker, options = algorithm(config.algorithm)
     images = {}
     if getattr(options, "mirror", False):
-        images["mirror_image"] = make_mirror(config.scene, config.representations)
+        images["mirror_image"] = make_mirror(env.base_env.scene, config.representations)
     return maker(*_specs(config, env), options, **_run(config), **images)
 
 
