@@ -85,7 +85,7 @@ def candidates_of(config: EvaluateConfig) -> list[Candidate]:
         folder = Path(config.output or f"outputs/evaluate/{folder_name(name)}")
         if (folder / "config.yaml").exists():
             raise UsageError(f"output={folder} is a run's folder; give another")
-        load = partial(Agent.load, name, **maps, **machine)
+        load = partial(Agent.load, name, trusted=config.trusted, **maps, **machine)
         candidates.append(Candidate(RunFolder(folder), load, [name]))
     return candidates
 

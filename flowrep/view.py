@@ -56,10 +56,11 @@ def run(config: ViewConfig) -> None:
 
 
 def agent_of(config: ViewConfig, is_scene_given: bool) -> Agent:
-    """Returns what drives: a run's agent in the scene of its training, unless one was given."""
+    """Returns what drives: a trained agent in the scene of its training, unless one was given."""
     from flowrep.experiment.agents import Agent
 
-    keeps_scene = Path(config.policy).is_dir() and not is_scene_given
+    is_trained = Path(config.policy).is_dir() or config.policy.endswith(".safetensors")
+    keeps_scene = is_trained and not is_scene_given
     return Agent.load(
         config.policy,
         scene=None if keeps_scene else config.scene,

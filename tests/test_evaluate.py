@@ -343,6 +343,15 @@ def test_an_agent_of_stable_baselines3_drives(tmp_path, monkeypatch):
     assert len(episodes(rows, name)) == 1
 
 
+def test_an_agent_in_a_file_drives_as_in_its_run(untouched, tmp_path):
+    Agent.load(untouched.path, device="cpu").save(tmp_path / "agent.safetensors")
+    name = str(tmp_path / "agent.safetensors")
+    rows = own(name, tmp_path / "out", SHORT, "episodes=3")
+    evaluate(asked(f"run={untouched.path}", "scene=straight_road", SHORT, "episodes=3"))
+    mine = episodes(untouched.read_episodes(), "greedy")
+    assert episodes(rows, name) == mine
+
+
 def test_an_exported_agent_drives_as_it_did_in_flowrep(tmp_path):
     given = ["algorithm.precision=fp32", "representations=[ego,obj]"]
     run = saved(tmp_path / "run", *given)

@@ -226,17 +226,18 @@ class EvaluateConfig(Command):
 
     @property
     def own_policies(self) -> list[str]:
-        """The policies that are not a run's: path.py:make, package.module:make or path.pt2."""
+        """The policies that are not a run's: scripts, modules, programs and trained agents."""
         return [name for name in self.policy if name not in get_args(Acting)]
 
     @model_validator(mode="after")
     def _fits_together(self) -> EvaluateConfig:
         own = self.own_policies
         for name in own:
-            if ":" not in name and not name.endswith(".pt2") and name != "pretrained":
+            is_file = name.endswith((".pt2", ".safetensors"))
+            if ":" not in name and not is_file and name != "pretrained":
                 raise ValueError(
                     f"policy={name}: should be greedy, sampled, pretrained, path.py:make, "
-                    "package.module:make or path.pt2"
+                    "package.module:make, path.pt2 or path.safetensors"
                 )
         if own and len(own) < len(self.policy):
             raise ValueError("policy: greedy and sampled are a run's; evaluate your own apart")
@@ -244,10 +245,11 @@ class EvaluateConfig(Command):
             raise ValueError(f"run= and policy={own[0]} can't be combined: give one of them")
         if not own and self.run is None:
             raise ValueError("run needs a value: run=<a run's or a sweep's folder>")
-        needed = ("scene",) if own == ["pretrained"] else ("scene", "representations")
-        for key in needed if own else ():
-            if getattr(self, key) is None:
-                raise ValueError(f"{key} needs a value for policy={own[0]}")
+        for name in own:
+            is_trained = name == "pretrained" or name.endswith(".safetensors")
+            for key in ("scene",) if is_trained else ("scene", "representations"):
+                if getattr(self, key) is None:
+                    raise ValueError(f"{key} needs a value for policy={name}")
         maps = (self.representations or {}).values()
         for key in ("representations", "flow", "motion", "noise", "output"):
             if key == "representations" and all(options.keys() == {"_target_"} for options in maps):

@@ -115,8 +115,14 @@ class Agent(Driver):
         machine = {"device": "auto", "num_workers": 0, **machine}
         if isinstance(scene, str):
             scene = asdict(load_scene(scene))
-        is_folder = Path(name).is_dir()  # of a run, whose name may hold a colon
-        is_external = not is_folder and (":" in name or name.endswith(".pt2"))
+        # a run's folder may have a colon in its name
+        is_external = (":" in name or name.endswith(".pt2")) and not Path(name).is_dir()
+        # `representations.edges._target_=my.Edges` alone says that a run may use the class
+        options = (representations or {}).values()
+        maps = [each for each in options if [*each] != ["_target_"]]
+        given = {"representations": maps, "flow": flow, "motion": motion, "noise": noise}
+        for key in [key for key, value in given.items() if value and not is_external]:
+            raise UsageError(f"{key}= is for policies from other projects, not for {name}")
         if name in BASELINES or is_external:
             if is_external and not representations:
                 raise UsageError(f"representations needs a value for policy={name}")
@@ -133,18 +139,7 @@ class Agent(Driver):
                 **{"num_envs": 1, **machine},
             )
             return cls(_external(name, config) if is_external else name, config)
-        if name == "pretrained" or name.endswith(".safetensors"):
-            path = _pretrained(scene) if name == "pretrained" else Path(name)
-            trained, frames, weights = _of_file(path, trusted)
-            about = f"the agent in {path.name}"
-        elif is_folder:
-            trained, frames, weights = _of_run(RunFolder.existing(name), trusted)
-            about = f"the agent of {name}"
-        else:
-            raise UsageError(
-                f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
-                "a .safetensors file, path.py:make, package.module:make or path.pt2"
-            )
+        trained, frames, weights = _stored(name, scene, trusted)
         section = trained.algorithm
         if precision is not None and hasattr(build.algorithm(section)[1], "precision"):
             machine["algorithm"] = section.model_copy(update={"precision": precision})
@@ -158,8 +153,8 @@ class Agent(Driver):
         except RuntimeError as error:
             reason = str(error).splitlines()[-1].strip()
             raise CheckpointError(
-                f"{about} can't be used in scene '{config.scene['name']}', whose classes are not "
-                f"those of its training ({reason})"
+                f"the agent of {name} can't be used in scene '{config.scene['name']}', whose "
+                f"classes are not those of its training ({reason})"
             ) from error
         return cls(policy, config, frames, trained.scene["name"])
 
@@ -202,17 +197,25 @@ class Agent(Driver):
         save_checkpoint(path, state | {"policy": packed(weights) if small else weights})
 
 
-def _of_run(run: RunFolder, trusted: Collection[str]) -> tuple[TrainConfig, int, dict[str, Tensor]]:
+def _stored(
+    name: str, scene: Mapping[str, Any] | None, trusted: Collection[str]
+) -> tuple[TrainConfig, int, dict[str, Tensor]]:
+    """Returns config, frames and weights of a trained agent."""
+    if name == "pretrained" or name.endswith(".safetensors"):
+        path = _pretrained(scene) if name == "pretrained" else Path(name)
+        stored = load_checkpoint(path)
+        config = validated_run(stored["config"], path.name, trusted)
+        return config, stored["frames"], unpacked(stored["policy"])
+    if not Path(name).is_dir():
+        raise UsageError(
+            f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
+            "path.safetensors, path.py:make, package.module:make or path.pt2"
+        )
+    run = RunFolder.existing(name)
     config, path = run.config(trusted), run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(config.plain()), path)
     return config, state["frames"], state["policy"]
-
-
-def _of_file(path: Path, trusted: Collection[str]) -> tuple[TrainConfig, int, dict[str, Tensor]]:
-    stored = load_checkpoint(path)
-    config = validated_run(stored["config"], path.name, trusted)
-    return config, stored["frames"], unpacked(stored["policy"])
 
 
 def _pretrained(scene: Mapping[str, Any] | None) -> Path:

@@ -193,7 +193,8 @@ class Runner:
             print(f"video: {path}")
 
     def close(self) -> None:
-        """Ends the processes of the environments."""
+        """Ends the worker processes of the envs, and writes what loggers still hold."""
+        self.folder.loggers.flush()
         if not self.env.is_closed:
             self.env.close()
 

@@ -126,6 +126,12 @@ def test_what_has_no_weights_is_not_saved(tmp_path):
         Agent.load("never_turn", scene="s_turn").save(tmp_path / "x.safetensors")
 
 
+def test_maps_given_to_what_has_its_maps_are_not_ignored():
+    for name in ("pretrained", "planner"):
+        with pytest.raises(UsageError, match=f"representations=.*{name}"):
+            Agent.load(name, scene="s_turn", representations={"obj": {}})
+
+
 def test_the_package_has_it_by_name():
     assert flowrep.Agent is Agent
 
