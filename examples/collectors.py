@@ -20,7 +20,7 @@ from torchrl.envs import TransformedEnv
 
 from flowrep.envs import make_env
 
-NUM_ENVS, STEPS, BATCHES = 16, 16, 8
+NUM_ENVS, STEPS, BATCHES = 16, 16, 16
 
 
 def streets(seed: int) -> TransformedEnv:

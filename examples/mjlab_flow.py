@@ -3,8 +3,8 @@
     pip install '.[examples]' mjlab
     python examples/mjlab_flow.py strip.png
 
-mjlab 1.6 runs on a CPU as well ("for development"), where Warp compiles kernels for some minutes at
-the first start.
+It runs on a CPU, which mjlab has "for development". At the first start Warp compiles its kernels,
+for some minutes.
 
 A group of mjlab's observations holds what flow needs; TorchRL's `MJLabWrapper` passes it on, and
 `sensors_from("mjlab")` has its conventions. What else has to be known:
@@ -67,7 +67,7 @@ def geom_poses(env: Any, name: str) -> Tensor:
     return getattr(env.sim.data, name)[:, bodies.long()]
 
 
-def make_env(num_envs: int = 2, device: str = "cpu") -> TransformedEnv:
+def make_env(num_envs: int = 2) -> TransformedEnv:
     """Returns the task as a TorchRL env that writes raw, ego and obj of its cameras' maps."""
     config = load_env_cfg(TASK)
     config.scene.num_envs = num_envs
@@ -91,7 +91,7 @@ def make_env(num_envs: int = 2, device: str = "cpu") -> TransformedEnv:
         {name: ObservationTermCfg(func=function) for name, function in terms.items()},
         concatenate_terms=False,
     )
-    env = ManagerBasedRlEnv(config, device=device)
+    env = ManagerBasedRlEnv(config, device="cpu")
     K, geoms, ids = intrinsics(env), moving_geoms(env), ("eye", "segmentation")
     flow = Compose(
         DTypeCastTransform(torch.float32, torch.int32, in_keys=[ids], out_keys=[ids]),

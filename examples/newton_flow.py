@@ -5,7 +5,7 @@ In each world a ball flies by and a crate tumbles, before a camera that moves th
     pip install '.[examples]' newton
     python examples/newton_flow.py strip.png
 
-Newton runs on a CPU as well. At the first start Warp compiles its kernels, for a minute or more.
+It runs on a CPU. At the first start Warp compiles Newton's kernels, for a minute or more.
 
 `sensors_from("newton")` has Newton's conventions. What else has to be known:
 
@@ -42,8 +42,8 @@ FLOOR = 0  # the first shape
 class Yard(EnvBase):
     """Worlds in which a camera drives ahead; the action, -1 to 1, is how fast it turns."""
 
-    def __init__(self, num_worlds: int = 2, device: str = "cpu") -> None:
-        super().__init__(device=device, batch_size=[num_worlds])
+    def __init__(self, num_worlds: int = 2) -> None:
+        super().__init__(batch_size=[num_worlds])
         world = newton.ModelBuilder(gravity=(0, 0, -1))
         ball = world.add_body(xform=wp.transform((-1.5, 3.0, 1.0), wp.quat_identity()))
         world.add_shape_sphere(ball, radius=0.35)
@@ -52,7 +52,7 @@ class Yard(EnvBase):
         yard = newton.ModelBuilder(gravity=(0, 0, -1))
         yard.add_ground_plane()
         yard.replicate(world, num_worlds)
-        self.model = yard.finalize(device=device)
+        self.model = yard.finalize(device="cpu")
         self.solver = newton.solvers.SolverSemiImplicit(self.model)
         self.now, self.after = self.model.state(), self.model.state()
         self.sensor = SensorCamera(self.model)
@@ -62,7 +62,7 @@ class Yard(EnvBase):
             "shape_index_image": self.sensor.allocate_image_shape_index(*size),
         }
         self.rays = SensorCamera.compute_camera_rays_pinhole(
-            WIDTH, HEIGHT, camera_fov=math.radians(FOV_DEG), device=device
+            WIDTH, HEIGHT, camera_fov=math.radians(FOV_DEG), device="cpu"
         )
         self.position, self.yaw = torch.zeros(num_worlds, 3), torch.zeros(num_worlds)
         buffers = {name: Unbounded(x.shape, dtype=x.dtype) for name, x in self.observe().items()}
