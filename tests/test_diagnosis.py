@@ -106,7 +106,7 @@ def test_a_value_of_depth_that_fills_much_of_the_picture_is_named():
 def test_the_table_of_the_docs_has_every_mistake_and_none_that_passed():
     table = matrix.table_of(matrix.PAGE.read_text("utf-8"))
     assert [*table] == ["right", *mistakes.LISTED, *mistakes.UNLISTED]
-    assert len(table["right"]) >= 3
+    assert len(table["right"]) >= 2
     kinds = {kind for row in table.values() for kind in row.values()}
     assert kinds <= {"", *matrix.KINDS} - {"passed", "false alarm"}
 
