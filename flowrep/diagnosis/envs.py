@@ -227,7 +227,7 @@ def _bodies(seen: _Seen, depth_step: float) -> tuple[list[str], list[str], list[
     return [f"{says}: {listing}"], [], []
 
 
-def _call(typed: str) -> str:
+def _call(typed: str, corrected: Any) -> str:
     """Returns the transform that an option is one of."""
     transforms = {"pose": "AdaptPose", "depth": "AdaptDepth", "flow": "AdaptFlow"}
     keys = {"direction", "axes", "layout", "kind", "channels"}

@@ -83,8 +83,13 @@ class Examination:
         rivals = rivals_of(self.conventions, **options)
         return diagnosed(pairs, [torch.cat(self._starts)], rivals, self._names, self._remedy)
 
-    def _remedy(self, typed: str) -> str:
+    def _remedy(self, typed: str, corrected: Pairs) -> str:
         words, given = typed.split(" "), self.conventions
+        numbers = corrected.K[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+        is_one = bool((numbers.amax(0) - numbers.amin(0) < 0.05 * numbers.amax()).all())
+        if typed.startswith(("K ", "K's", "cx", "fx")) and is_one:
+            listing = ",".join(f"{number:.5g}" for number in numbers.median(0).values.tolist())
+            typed = f"intrinsics=[{listing}] first_pixel_centre=0.5"
         if typed.startswith("depth times ") and "depth_unit_m" in given:
             typed = f"depth_unit_m={float(words[-1]) * float(given['depth_unit_m']):.3g}"
         elif typed.endswith(" frames later") and self._intervals_s:

@@ -88,14 +88,14 @@ class Diagnosis:
 
 def diagnosed(
     pairs: Pairs, starts: Sequence[Tensor], rivals: Sequence[Rival], names: Sequence[str],
-    remedy: Callable[[str], str],
+    remedy: Callable[[str, Pairs], str],
 ) -> Diagnosis:  # fmt: skip
     """Returns the verdict on pairs that move.
 
     Args:
         starts: motions `[P, 4, 4]` that the best one may be near to.
         names: the frames'.
-        remedy: makes what the user types of `Rival.typed`.
+        remedy: makes what the user types of `Rival.typed` and the pairs as they are then.
     """
     recorded, others = _explanations(pairs, starts, rivals)
     width, motion = pairs.now.shape[-1], pairs.motion if pairs.has_poses else recorded.motion
@@ -113,7 +113,7 @@ def diagnosed(
         "suspects": tuple(typed for typed, _ in texts),
     }  # fmt: skip
     ways = " or ".join(
-        f"{says} ({remedy(typed)} would leave {median(each.beyond(noise)):.2g} px)"
+        f"{says} ({remedy(typed, each.pairs)} would leave {median(each.beyond(noise)):.2g} px)"
         for each, (typed, says) in zip(able, texts)
     )
     size = f"{error:.2g} px of {max(raw_px, median(px_of(ego))):.2g} px"

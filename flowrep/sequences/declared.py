@@ -183,11 +183,11 @@ class DeclaredRecording(Recording):
     def _match_depth(self, depths: dict[str, Path], times_s: Floats | None) -> LeftOut:
         """Finds the depth map of each frame; returns the frames that have none."""
         if self.depth_by == "time" and self._times_s is not None and times_s is not None:
-            places = nearest(times_s, self._times_s, self.tolerance_s)
+            rows = nearest(times_s, self._times_s, self.tolerance_s)
             # Two pictures may be nearest to one depth map: it belongs to the nearer of them.
             frames = nearest(self._times_s, times_s, self.tolerance_s)
-            self._depths = [[*depths.values()][place] for place in places]
-            lacking = (places < 0) | (frames[places] != np.arange(len(places)))
+            self._depths = [[*depths.values()][row] for row in rows]
+            lacking = (rows < 0) | (frames[rows] != np.arange(len(rows)))
             return {f"without depth within {self.tolerance_s} s": lacking}
         by_order = self.depth_by == "order"
         ours, theirs = (range(len(x)) if by_order else x for x in (self._names, depths))
@@ -263,9 +263,9 @@ class DeclaredRecording(Recording):
         before, after = (np.where(lacking, 0, rows + lag) for rows in (before, after))
         is_lost = ~lacking & (lost[before] | lost[after])
         if not lost.all():
-            places = zip(poses[before], poses[after], share)
+            ends = zip(poses[before], poses[after], share)
             self._poses = (
-                [interpolated_pose(*p) for p in places] if self.interpolate else poses[before]
+                [interpolated_pose(*end) for end in ends] if self.interpolate else poses[before]
             )
         near = f" within {self.tolerance_s} s" if self.rows_by == "time" else ""
         return {f"without a pose{near}": lacking, f"lost (nan, inf, 0) in {path.name}": is_lost}
@@ -293,8 +293,8 @@ class DeclaredRecording(Recording):
             numbers = self._numbers_in(given)
         camera_matrix(numbers[0], (2, 2), self.first_pixel_centre, source)  # or an error, early
         self._K_numbers = numbers.repeat(len(lacking) // len(numbers), axis=0)
-        own = self.depth_intrinsics
-        self._depth_numbers = None if own is None else self._numbers_in(own)
+        depth = self.depth_intrinsics
+        self._depth_numbers = None if depth is None else self._numbers_in(depth)
         shift = np.array(self.colour_from_depth or 3 * [0.0])
         if len(shift) == 3:
             shift = np.column_stack([np.eye(3), shift]).ravel()
@@ -324,7 +324,7 @@ class DeclaredRecording(Recording):
         values = self._times_s
         if values is None:
             values = np.array([float(_number(name)) for name in self._names])
-        # The place of each frame in a recording without gaps.
+        # The number of each frame if none was missing.
         steps = np.diff(values)
         usual = np.median(steps) if len(steps) and (steps > 0).all() else np.inf
         self._positions = np.append(0, np.rint(steps / usual).clip(1).cumsum()).astype(int)
@@ -374,8 +374,8 @@ class DeclaredRecording(Recording):
             is_next = abs(self._positions[i] - self._positions[other]) == 1
             since = self._names[other] if is_next else None
         time_s = None if self._times_s is None else float(self._times_s[i])
-        places: Any = {"clip": int(self._clips[i]), "position": int(self._positions[i])}
-        return Frame(name, source, pose, K, depth, rgb, time_s, raw, since, **places)
+        position: Any = {"clip": int(self._clips[i]), "position": int(self._positions[i])}
+        return Frame(name, source, pose, K, depth, rgb, time_s, raw, since, **position)
 
     def _once(self, make: Any, *arguments: Any) -> Any:
         """Returns what `make` makes of arguments, the same while they don't change."""
@@ -430,8 +430,8 @@ def nearest(times_s: Floats, wanted_s: Floats, tolerance_s: float) -> Indices:
     after = np.searchsorted(times_s, wanted_s).clip(0, len(times_s) - 1)
     before = (after - 1).clip(0)
     gap_after, gap_before = (np.abs(times_s[index] - wanted_s) for index in (after, before))
-    found = np.where(gap_before <= gap_after, before, after)
-    return np.where(np.minimum(gap_before, gap_after) <= tolerance_s, found, -1)
+    closest = np.where(gap_before <= gap_after, before, after)
+    return np.where(np.minimum(gap_before, gap_after) <= tolerance_s, closest, -1)
 
 
 def between(

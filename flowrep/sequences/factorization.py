@@ -91,7 +91,7 @@ class EstimatedFlowSource:
     Args:
         estimator: see `flowrep.transforms.EstimatedFlow`.
         check_consistency: whether flow is estimated both ways and marked as unknown where a pixel
-            does not return to its place: at occlusions and at errors.
+            does not return to where it was: at occlusions and at errors.
     """
 
     estimator: Estimator
@@ -117,7 +117,7 @@ class EstimatedFlowSource:
 
 
 def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
-    """Returns where a pixel that goes back and then forth returns to its place, `[H, W]`.
+    """Returns where a pixel that goes back and then forth returns to where it was, `[H, W]`.
 
     Each flow `[2, H, W]` is on the grid of the picture that it starts from.
     """
@@ -126,9 +126,9 @@ def consistent(back: Flow, forth: Flow) -> NDArray[np.bool_]:
     x, y = column + back[0], row + back[1]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     options: Any = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
-    found = np.stack([cv2.remap(plane, x, y, **options) for plane in forth])
-    missed = np.square(found + back).sum(0)
-    length = np.square(found).sum(0) + np.square(back).sum(0)
+    returned = np.stack([cv2.remap(plane, x, y, **options) for plane in forth])
+    missed = np.square(returned + back).sum(0)
+    length = np.square(returned).sum(0) + np.square(back).sum(0)
     return inside & (missed < _CONSISTENT_SHARE * length + _CONSISTENT_PX2)
 
 
@@ -149,11 +149,11 @@ def pairs(frames: Iterable[Frame]) -> Iterator[tuple[Frame | None, Frame]]:
         if previous is not None and previous.clip != current.clip:
             previous = None
         if previous is not None and previous.size != current.size:
-            (height, width), (own_height, own_width) = previous.size, current.size
-            cause = f"is {own_width} x {own_height}, the frame before {width} x {height}"
+            (height, width), (new_height, new_width) = previous.size, current.size
+            cause = f"is {new_width} x {new_height}, the frame before {width} x {height}"
             raise SequenceError(current.source, cause)
         yield previous, current
-        # A repeated picture's own pose is that of the frame in which it first appeared.
+        # A repeated picture has the pose of the frame in which it first appeared.
         if previous is None or not repeats(previous, current):
             previous = current
 
@@ -174,10 +174,11 @@ def estimated_motion(previous: Frame, current: Frame, raw: Flow) -> Motion:
     if current.rgb is not None and raw is not current.raw:
         picture = torch.from_numpy(current.rgb).permute(2, 0, 1)
     prev_K = _previous_K(previous, current)
-    found = camera_motion(torch.from_numpy(raw), depth, K, prev_K=prev_K, picture=picture)
-    if not found.valid:
+    estimate = camera_motion(torch.from_numpy(raw), depth, K, prev_K=prev_K, picture=picture)
+    if not estimate.valid:
         return Motion(known=False, inlier_share=0.0)
-    return Motion(found.prev_from_curr.double().numpy(), inlier_share=float(found.inlier_share))
+    inlier_share = float(estimate.inlier_share)
+    return Motion(estimate.prev_from_curr.double().numpy(), inlier_share=inlier_share)
 
 
 def _previous_K(previous: Frame, current: Frame) -> Tensor | None:
@@ -218,5 +219,5 @@ def factorize_pair(
     )
     is_known = ego_valid[0].numpy() & motion.known
     valid = is_known & measured
-    own = np.where(valid, obj.numpy(), np.float32(0))
-    return FactorizedFrame(current, previous, raw, ego.numpy(), own, valid, is_known, motion)
+    obj_flow = np.where(valid, obj.numpy(), np.float32(0))
+    return FactorizedFrame(current, previous, raw, ego.numpy(), obj_flow, valid, is_known, motion)

@@ -49,7 +49,7 @@ class Job:
             return None
         is_recorded = self.flow_source is factorization.recorded_flow
         uses_poses = self.motion_source is factorization.recorded_motion
-        found = Examination(self.stream.conventions, flow_is_recorded=is_recorded)
+        examination = Examination(self.stream.conventions, flow_is_recorded=is_recorded)
         used = self._indices
         ends = np.linspace(0, len(used), EXAMINED_RUNS + 1).astype(int).tolist()
         with self.clock("diagnosis"):
@@ -65,8 +65,8 @@ class Job:
                     if previous is not None and not factorization.repeats(previous, current):
                         raw = self.flow_source(previous, current)
                         earlier, later = around[previous.name][0], around[current.name][1]
-                        found.add(previous, current, raw, earlier, later)
-            return found.diagnosis()
+                        examination.add(previous, current, raw, earlier, later)
+            return examination.diagnosis()
 
     def run(self) -> int:
         """Factorises all frames; returns 0, or the exit code for the signal that stopped it."""
@@ -81,9 +81,9 @@ class Job:
                     with self.clock("motion"):
                         motion = self.motion_source(previous, current, raw)
                     with self.clock("factorising"):
-                        made = factorization.factorize_pair(previous, current, raw, motion)
+                        factorized = factorization.factorize_pair(previous, current, raw, motion)
                     with self.clock("writing"):
-                        self.output.append(index, made)
+                        self.output.append(index, factorized)
                 bar.update()
                 if interrupted:
                     break

@@ -133,8 +133,8 @@ def _pose_from_oxts(packet: NDArray[np.float64], latitude_deg: float) -> Pose:
 
 
 def _matrices(path: Path, **shapes: tuple[int, int]) -> list[NDArray[np.float64]]:
-    found = dict(line.partition(":")[::2] for line in files.read_lines(path))
+    texts = dict(line.partition(":")[::2] for line in files.read_lines(path))
     try:
-        return [np.array(found[n].split(), np.float64).reshape(s) for n, s in shapes.items()]
+        return [np.array(texts[n].split(), np.float64).reshape(s) for n, s in shapes.items()]
     except (KeyError, ValueError) as error:
         raise SequenceError(path, f"lacks one of {', '.join(shapes)}: {error}") from None

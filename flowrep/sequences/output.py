@@ -59,7 +59,7 @@ class Output:
         for folder in (self.path, self.partial):
             if folder.exists():
                 raise SequenceError(folder, "exists already; remove it, or give another output")
-        if rerun:  # told before there is a folder
+        if rerun:  # an error before there is a folder
             require("rerun=true", "rerun", "rerun")
         self.flow_files, self.pictures_every, self.moving_px = flow_files, pictures_every, moving_px
         self.scale_px = scale_px or dict.fromkeys(FLOW_NAMES, 20.0)
@@ -70,20 +70,20 @@ class Output:
         self._video = viz.Video(self.partial / "strip.mp4", fps=video_fps) if video_fps else None
         self._rerun = RerunExport(self.partial / "scene.rrd", self.scale_px) if rerun else None
 
-    def append(self, index: int, made: FactorizedFrame) -> None:
+    def append(self, index: int, result: FactorizedFrame) -> None:
         """Writes a frame's files, then its row."""
-        self._write_flow(index, made)
+        self._write_flow(index, result)
         if self.masks:
-            code = np.where(moves(made, self.moving_px), 255, 0)
-            mask = np.where(made.valid, code, 127).astype(np.uint8)
-            write_picture(self._place(f"moving/{made.frame.name}.png"), mask)
-        pose = self._write_pose(index, made)
+            code = np.where(moves(result, self.moving_px), 255, 0)
+            mask = np.where(result.valid, code, 127).astype(np.uint8)
+            write_picture(self._file(f"moving/{result.frame.name}.png"), mask)
+        pose = self._write_pose(index, result)
         if self._video is not None:
             scales: Any = {"flow_scale_px": self.scale_px, "depth_range_m": self.depth_range_m}
-            self._video.append(video_frame(made, **scales))
+            self._video.append(video_frame(result, **scales))
         if self._rerun is not None:
-            self._rerun.append(index, made, pose)
-        self.rows.append(score(index, made, moving_px=self.moving_px))
+            self._rerun.append(index, result, pose)
+        self.rows.append(score(index, result, moving_px=self.moving_px))
         append_rows(self.partial / "frames.csv", self.rows[-1:])  # a killed job leaves what is done
 
     def close(self) -> None:
@@ -108,46 +108,48 @@ class Output:
             medians[name] = float(np.median(values)) if values else None
         return medians
 
-    def _write_flow(self, index: int, made: FactorizedFrame) -> None:
-        name = made.frame.name
+    def _write_flow(self, index: int, result: FactorizedFrame) -> None:
+        name = result.frame.name
         for kind in FLOW_NAMES:
-            flow = shown(kind, made)
+            flow = shown(kind, result)
             if "flo" in self.flow_files:
-                write_flo(self._place(f"flow/{kind}/{name}.flo"), flow)
+                write_flo(self._file(f"flow/{kind}/{name}.flo"), flow)
             if "kitti" in self.flow_files:
-                write_kitti_flow(self._place(f"flow/{kind}/{name}.png"), flow)
+                write_kitti_flow(self._file(f"flow/{kind}/{name}.png"), flow)
             if self.pictures_every and index % self.pictures_every == 0:
                 label, scale_px = f"{kind} flow", self.scale_px[kind]
                 colours, notes = viz.flow_to_rgb(flow, scale_px), {label: viz.flow_note(scale_px)}
                 picture = viz.strip({label: colours}, wheel_for=[label], notes=notes)
-                write_picture(self._place(f"pictures/{kind}/{name}.png"), picture)
+                write_picture(self._file(f"pictures/{kind}/{name}.png"), picture)
         if "npz" in self.flow_files:
-            contents: Any = {key: getattr(made, key) for key in (*FLOW_NAMES, "valid", "ego_valid")}
-            contents |= {"K": made.frame.K, "prev_K": made.previous.K}
-            contents |= {"prev_from_curr": made.motion.prev_from_curr}
-            np.savez(self._place(f"flow/{name}.npz"), **contents)
+            contents: Any = {
+                key: getattr(result, key) for key in (*FLOW_NAMES, "valid", "ego_valid")
+            }
+            contents |= {"K": result.frame.K, "prev_K": result.previous.K}
+            contents |= {"prev_from_curr": result.motion.prev_from_curr}
+            np.savez(self._file(f"flow/{name}.npz"), **contents)
 
-    def _write_pose(self, index: int, made: FactorizedFrame) -> Pose:
+    def _write_pose(self, index: int, result: FactorizedFrame) -> Pose:
         """Adds a frame's pose to trajectory.txt and returns it: the recorded one, or estimated.
 
         Estimated motions are chained from the first frame of a clip, from its recorded pose if it
         has one. Frames without a time have their number.
         """
-        frame, before, lines = made.frame, made.previous, []
+        frame, before, lines = result.frame, result.previous, []
         if before.name not in self._poses:
             start = np.eye(4) if before.world_from_cam is None else before.world_from_cam
             self._poses[before.name] = start
             lines.append(tum_line(_stamp(before, index - 1), start))
         pose = frame.world_from_cam
-        if pose is None or made.motion.is_estimated:
-            pose = self._poses[before.name] @ made.motion.prev_from_curr
+        if pose is None or result.motion.is_estimated:
+            pose = self._poses[before.name] @ result.motion.prev_from_curr
         self._poses[frame.name] = pose
         lines.append(tum_line(_stamp(frame, index), pose))
         with (self.partial / "trajectory.txt").open("a", encoding="utf-8") as file:
             file.writelines(lines)
         return pose
 
-    def _place(self, name: str) -> Path:
+    def _file(self, name: str) -> Path:
         path = self.partial / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
@@ -156,14 +158,15 @@ class Output:
         (self.partial / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, Any]:
+def score(index: int, result: FactorizedFrame, *, moving_px: float) -> dict[str, Any]:
     """Returns a row of frames.csv: medians over valid pixels, shares in [0, 1]."""
-    frame, truth = made.frame, made.frame.raw
-    before_s, now_s = made.previous.timestamp_s, frame.timestamp_s
+    frame, truth = result.frame, result.frame.raw
+    before_s, now_s = result.previous.timestamp_s, frame.timestamp_s
     seconds = math.nan if before_s is None or now_s is None else abs(now_s - before_s) or math.nan
-    before, now = made.previous.position, frame.position
-    medians_px = {name: _median(np.hypot(*getattr(made, name))[made.valid]) for name in FLOW_NAMES}
-    moving = moves(made, moving_px)[made.valid]
+    before, now = result.previous.position, frame.position
+    lengths_px = {name: np.hypot(*getattr(result, name))[result.valid] for name in FLOW_NAMES}
+    medians_px = {name: _median(lengths) for name, lengths in lengths_px.items()}
+    moving = moves(result, moving_px)[result.valid]
     row: dict[str, Any] = {
         "index": index,
         "name": frame.name,
@@ -171,22 +174,22 @@ def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, A
         "gap": "" if before is None or now is None else abs(now - before) - 1,
         **{f"{name}_median_px": px for name, px in medians_px.items()},
         **{f"{name}_median_px_per_s": px / seconds for name, px in medians_px.items()},
-        "valid_share": float(made.valid.mean()),
+        "valid_share": float(result.valid.mean()),
         "moving_share": float(moving.mean()) if len(moving) else math.nan,
         "epe_px": math.nan,
-        "inlier_share": made.motion.inlier_share,
+        "inlier_share": result.motion.inlier_share,
         "recorded_obj_median_px": math.nan,
         "rotation_off_deg": math.nan,
         "translation_off_m": math.nan,
     }
-    if truth is not None and frame.raw_since == made.previous.name:
-        error_px = np.hypot(*(made.raw - truth))
+    if truth is not None and frame.raw_since == result.previous.name:
+        error_px = np.hypot(*(result.raw - truth))
         known_px = error_px[np.isfinite(error_px)]
         row["epe_px"] = float(known_px.mean()) if len(known_px) else math.nan
-    has_poses = not any(f.world_from_cam is None for f in (made.previous, frame))
-    if has_poses and made.motion.known and made.motion.is_estimated:  # beside the recorded motion
-        recorded = factorize_pair(made.previous, frame, made.raw)
-        off = np.linalg.inv(recorded.motion.prev_from_curr) @ made.motion.prev_from_curr
+    has_poses = not any(f.world_from_cam is None for f in (result.previous, frame))
+    if has_poses and result.motion.known and result.motion.is_estimated:
+        recorded = factorize_pair(result.previous, frame, result.raw)
+        off = np.linalg.inv(recorded.motion.prev_from_curr) @ result.motion.prev_from_curr
         turn_rad = float(np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]))
         row["recorded_obj_median_px"] = _median(np.hypot(*recorded.obj)[recorded.valid])
         row["rotation_off_deg"] = math.degrees(turn_rad)
@@ -197,16 +200,16 @@ def score(index: int, made: FactorizedFrame, *, moving_px: float) -> dict[str, A
     return row
 
 
-def moves(made: FactorizedFrame, moving_px: float) -> NDArray[np.bool_]:
+def moves(result: FactorizedFrame, moving_px: float) -> NDArray[np.bool_]:
     """Returns the pixels that move by themselves `[H, W]`: beyond `moving_px` and the error.
 
     Where most of the picture is static, the median of object flow is the error of estimated flow
     and of poses: 1.18 s, if x and y err by a deviation of s, and one length in 500 exceeds 3.5 s.
     """
-    lengths_px = np.hypot(*made.obj)
-    least_px = np.nanmax([moving_px, _MOVING_SPREAD * _median(lengths_px[made.valid])])
-    found: NDArray[np.bool_] = made.valid & (lengths_px > least_px)
-    return found
+    lengths_px = np.hypot(*result.obj)
+    least_px = np.nanmax([moving_px, _MOVING_SPREAD * _median(lengths_px[result.valid])])
+    moving: NDArray[np.bool_] = result.valid & (lengths_px > least_px)
+    return moving
 
 
 def _stamp(frame: Frame, index: int) -> float:
@@ -231,17 +234,17 @@ def _median(values: NDArray[np.float32]) -> float:
     return float(np.median(values)) if len(values) else math.nan
 
 
-def shown(kind: str, made: FactorizedFrame) -> Flow:
+def shown(kind: str, result: FactorizedFrame) -> Flow:
     """Returns a flow with nan, which is drawn in grey, where it is unknown."""
     if kind == "raw":
-        return made.raw
-    known = made.ego_valid if kind == "ego" else made.valid
-    return np.where(known, getattr(made, kind), np.float32(np.nan))
+        return result.raw
+    known = result.ego_valid if kind == "ego" else result.valid
+    return np.where(known, getattr(result, kind), np.float32(np.nan))
 
 
-def video_frame(made: FactorizedFrame, **scales: Any) -> viz.Image:
+def video_frame(result: FactorizedFrame, **scales: Any) -> viz.Image:
     """Returns RGB and depth above raw, ego and obj; scales are `representation_strip`'s."""
-    frame = made.frame
+    frame = result.frame
     height, width = frame.size
     shrink = min(1.0, _TILE_PX / max(height, width))
     size = round(height * shrink), round(width * shrink)
@@ -254,7 +257,7 @@ def video_frame(made: FactorizedFrame, **scales: Any) -> viz.Image:
     if frame.rgb is not None:
         small = cv2.resize(frame.rgb, size[::-1], interpolation=cv2.INTER_AREA)
         above["rgb"] = np.moveaxis(small, -1, 0)
-    below = {kind: shown(kind, made)[places] for kind in FLOW_NAMES}
+    below = {kind: shown(kind, result)[places] for kind in FLOW_NAMES}
     return viz.contact_sheet([viz.representation_strip(m, **scales) for m in (above, below)])
 
 
@@ -269,9 +272,9 @@ class RerunExport:
         self._stream.save(str(path))
         self._scale_px = scale_px
 
-    def append(self, index: int, made: FactorizedFrame, pose: Pose) -> None:
+    def append(self, index: int, result: FactorizedFrame, pose: Pose) -> None:
         """Logs one frame."""
-        rr, frame, log = self._rerun, made.frame, self._stream.log
+        rr, frame, log = self._rerun, result.frame, self._stream.log
         self._stream.set_time("frame", sequence=index)
         if frame.timestamp_s is not None:
             self._stream.set_time("time", duration=frame.timestamp_s)
@@ -285,7 +288,7 @@ class RerunExport:
         depth = np.where(np.isfinite(frame.depth), frame.depth, 0.0).astype(np.float32)
         log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
         for name, scale_px in self._scale_px.items():
-            colours = viz.flow_to_rgb(shown(name, made), scale_px)
+            colours = viz.flow_to_rgb(shown(name, result), scale_px)
             log(f"flow/{name}", rr.Image(colours).compress(jpeg_quality=_JPEG_QUALITY))
 
     def close(self) -> None:

@@ -42,7 +42,7 @@ class Frame:
         raw: `[2, H, W]`, the recording's own p_t - p_t'; nan where unknown.
         raw_since: the name of the frame t' that `raw` is measured from, None if it is missing.
         clip: the number of its shot. There is no flow from one clip to another.
-        position: its place in the recording, counted with the frames that are missing in it.
+        position: its number in the recording, in which missing frames count.
     """
 
     name: str

@@ -179,7 +179,7 @@ def test_flow_of_ones_own_has_to_be_of_this_pair():
     raw = np.ones((2, 40, 60), np.float32)
     now = frame("c", raw=raw, raw_since="b")
     assert sequences.recorded_flow(frame("b"), now) is raw
-    with pytest.raises(sequences.SequenceError, match=r"^c\.png: .* frame b, and here follows a"):
+    with pytest.raises(sequences.SequenceError, match=r"^c\.png: .*frame b"):
         sequences.recorded_flow(frame("a"), now)
     with pytest.raises(sequences.SequenceError, match=r"^b\.png: has no flow of its own"):
         sequences.recorded_flow(frame("a"), frame("b"))
