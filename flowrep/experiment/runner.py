@@ -6,6 +6,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from statistics import fmean
 from typing import Any
 
@@ -194,9 +195,10 @@ class Runner:
 
     def close(self) -> None:
         """Ends the worker processes of the envs, and writes what loggers still hold."""
-        self.folder.loggers.flush()
         if not self.env.is_closed:
             self.env.close()
+        with suppress(OSError):  # of TensorBoard alone: the tables have the same numbers
+            self.folder.loggers.flush()
 
     def check(self) -> None:
         """Checks that losses and metrics are finite; the error names the last good checkpoint."""
