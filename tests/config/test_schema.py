@@ -54,6 +54,8 @@ def refusal(command, model, line):
         "wandb=true",
         "representations.ego.scale=nan",
         "representations=[]",
+        "representations.ego=null",
+        "+representations.rgb=null",
         "noise.depth_dropout=1.5",
         "flow.estimator=abc flow=estimated",
         # keys
@@ -153,7 +155,7 @@ def test_what_is_wrong_in_a_run_folder_is_named_with_the_file():
         ("evaluate", EvaluateConfig, [
             "policy=a.py:make", "scene=s_turn", "flow=exact", "noise=none", "representations=[ego]",
         ]),
-        ("export", ExportConfig, ["run=x"]),
+        ("export", ExportConfig, ["run=x", "representations=[ego]"]),
         ("view", ViewConfig, ["representations=[ego]"]),
         ("factorize", FactorizeConfig, ["format=tum", "input=x", "output=y"]),
         ("report", ReportConfig, ["run=x"]),
