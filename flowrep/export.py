@@ -23,7 +23,13 @@ def run(config: ExportConfig) -> None:
 
     run = RunFolder.existing(config.run)
     folder = Path(config.output or run.path / "export")
-    agent = Agent.load(run.path, trusted=config.trusted, precision="fp32", device="cpu")
+    agent = Agent.load(
+        run.path,
+        representations=config.representations,
+        trusted=config.trusted,
+        precision="fp32",
+        device="cpu",
+    )
     export(agent, folder)
     print(f"the agent is in {folder}; load_agent.py there shows how to run it")
 

@@ -22,6 +22,7 @@ from flowrep.config.cli import OF_THE_MACHINE, checked, end_with, exit_with, lin
 from flowrep.config.schema import TrainConfig
 from flowrep.experiment import sweep
 from flowrep.experiment.outcomes import is_finished, success_of
+from flowrep.options import ALGORITHMS
 from flowrep.progress import StopRequest
 
 if TYPE_CHECKING:
@@ -43,10 +44,12 @@ class EarlyCheck(Callback):
             from flowrep.scenes import load_scene
 
             load_scene(model.scene)
-            if model.device not in ("auto", "cpu"):
+            has_own_classes = {*model.trusted} - {*ALGORITHMS}
+            if has_own_classes or model.device not in ("auto", "cpu"):
                 from flowrep.experiment import build
 
                 build.device(model.device)
+                build.check_classes(model)
         except Exception as error:  # Hydra would print a warning and go on
             end_with(error, TrainConfig)
 

@@ -97,10 +97,10 @@ def test_depth_of_another_time_is_noticed_though_flow_is_noisy():
 
 def test_a_value_of_depth_that_fills_much_of_the_picture_is_named():
     depth = shots().depth.copy()
-    depth[:, :40] = 65.535  # a third of 120 rows
+    depth[:, :40] = 65  # a third of 120 rows
     (note,) = examined(shots().with_(depth=depth), {}).notes
     assert "33%" in note
-    assert "65.53" in note
+    assert "65 m" in note
 
 
 def test_the_table_of_the_docs_has_every_mistake_and_none_that_passed():

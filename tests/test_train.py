@@ -65,11 +65,15 @@ def test_help_and_refusals_need_no_pytorch_and_no_folder(tmp_path, line, code):
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_device_that_is_not_there_leaves_no_folder(tmp_path):
-    line = [sys.executable, "-m", "flowrep.train", "device=cuda:93"]
+@pytest.mark.parametrize(
+    "missing",
+    ["device=cuda:93", "algorithm._target_=sys.path", "+representations.x._target_=sys.path"],
+)
+def test_a_device_or_class_that_is_not_there_leaves_no_folder(tmp_path, missing):
+    line = [sys.executable, "-m", "flowrep.train", missing]
     result = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, env=ENVIRONMENT)
     assert result.returncode == 2
-    assert "device=cuda:93" in result.stderr
+    assert missing.lstrip("+") in result.stderr
     assert not [*tmp_path.iterdir()]
 
 

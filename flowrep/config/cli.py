@@ -86,7 +86,7 @@ def composed(
         with hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             config = hydra.compose(config_name, typed, return_hydra_config=True)
         return checked(config, schema), str(config.hydra.run.dir), typed
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise UsageError(explained(error, schema)) from None
 
 
@@ -94,10 +94,13 @@ def _overrides(values: Mapping[str, Any], section: str = "") -> Iterator[str]:
     for key, value in values.items():
         if isinstance(value, Mapping):
             yield from _overrides(value, f"{section}{key}.")
-        elif isinstance(value, str):
-            yield override(f"{section}{key}", value)
+        elif isinstance(value, str | Path):
+            yield override(f"{section}{key}", str(value))
         else:
-            yield f"{section}{key}={json.dumps(value)}"
+            try:
+                yield f"{section}{key}={json.dumps(value)}"
+            except TypeError as error:  # numpy's numbers and the like
+                raise UsageError(f"{section}{key}: {error}") from None
 
 
 def end_with(error: Exception, schema: type[Command]) -> NoReturn:

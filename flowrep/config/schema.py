@@ -87,6 +87,8 @@ def _in_their_order(value: Any, check: Any) -> dict[str, Any]:
     check(value)
     if not value:
         raise ValueError("is empty; choose at least one: representations=[ego,obj]")
+    if empty := [name for name, options in value.items() if options is None]:
+        raise ValueError(f"{empty[0]} is null; leave it out instead")
     return {name: dict(options) for name, options in value.items()}
 
 
@@ -173,6 +175,17 @@ class Evaluation(Options):
         """The number of episodes of the final evaluation."""
         policies = len(self.policies) + len(self.baselines)
         return len(self.speeds) * len(self.fps) * policies * self.final_episodes
+
+
+class Episodes(BaseModel):
+    """Arguments of `Agent.evaluate`."""
+
+    episodes: Count
+    speeds: Annotated[list[SpeedMode], Field(min_length=1), Distinct]
+    fps: Annotated[list[FrameRate], Field(min_length=1), Distinct]
+    seed: Seed
+    policies: Annotated[list[Acting], Field(min_length=1), Distinct]
+    baselines: Annotated[list[BaselineName], Distinct]
 
 
 class TrainConfig(EnvConfig):

@@ -16,7 +16,15 @@ from flowrep.agent import CheckpointError, load_checkpoint, save_checkpoint
 from flowrep.baselines import BASELINES
 from flowrep.config import UsageError
 from flowrep.config.cli import composed
-from flowrep.config.schema import EnvConfig, ExactFlow, Noise, TrainConfig, validated_run
+from flowrep.config.schema import (
+    EnvConfig,
+    Episodes,
+    ExactFlow,
+    Noise,
+    TrainConfig,
+    validated,
+    validated_run,
+)
 from flowrep.envs import street_envs
 from flowrep.experiment import build
 from flowrep.experiment.evaluation import Driver, PairedEvaluation
@@ -84,60 +92,73 @@ class Agent(Driver):
         name: str | Path,
         *,
         scene: str | Mapping[str, Any] | None = None,
-        representations: Mapping[str, Any] | None = None,
+        representations: Mapping[str, Any] | Sequence[str] | None = None,
         flow: Any = None,
         motion: str | None = None,
         noise: Noise | None = None,
         trusted: Collection[str] = (),
         precision: str | None = None,
-        **machine: Any,
+        device: str = "auto",
+        num_envs: int | None = None,
+        num_workers: int | str = 0,
     ) -> Agent:
         """Returns an agent, to act in a scene, or in the one of its training if None.
 
         Args:
-            name: the folder of a run, a file that `save` wrote, "pretrained" (the agent of the
-                scene that comes with flowrep), a baseline, or a policy from another project:
-                path.py:make, package.module:make or path.pt2.
+            name: the folder of a run, a .safetensors file that `save` wrote, "pretrained" (the
+                agent of the scene that comes with flowrep), a baseline, or a policy from another
+                project: path.py:make, package.module:make or path.pt2.
             scene: its name, or its definition; the camera remains that of the training.
-            representations: the maps of a policy from another project, options by name.
+            representations: the maps of a policy from another project, names or options by name.
             flow: where they come from, as in conf/flow; exact flow if None.
             motion: of the camera, "exact" or "estimated".
             noise: of its sensors; none if None.
             trusted: classes outside of flowrep that a run may name; their code then runs.
             precision: the number format of its networks, instead of the run's.
-            machine: `device`, `num_envs` and `num_workers` of its envs.
+            device: of its networks and envs.
+            num_envs: side by side; by default those of its training.
+            num_workers: processes that step them, or "auto".
 
         Raises:
             UsageError: there is no such agent.
             CheckpointError: a file is damaged, or the agent can't act in this scene.
         """
         name = str(name)
-        machine = {"device": "auto", "num_workers": 0, **machine}
+        machine: dict[str, Any] = {"device": device, "num_workers": num_workers}
+        machine |= {} if num_envs is None else {"num_envs": num_envs}
         if isinstance(scene, str):
             scene = asdict(load_scene(scene))
-        # a run's folder may have a colon in its name
-        is_external = (":" in name or name.endswith(".pt2")) and not Path(name).is_dir()
-        # `representations.edges._target_=my.Edges` alone says that a run may use the class
-        options = (representations or {}).values()
-        maps = [each for each in options if [*each] != ["_target_"]]
-        given = {"representations": maps, "flow": flow, "motion": motion, "noise": noise}
-        for key in [key for key, value in given.items() if value and not is_external]:
-            raise UsageError(f"{key}= is for policies from other projects, not for {name}")
+        is_folder = Path(name).is_dir()  # of a run, whose name may hold a colon
+        is_saved = not is_folder and name.endswith(".safetensors")
+        is_external = not (is_folder or is_saved) and (":" in name or name.endswith(".pt2"))
+        if representations is not None and not isinstance(representations, Mapping):
+            names = {"representations": [*representations]}
+            representations = composed("train", names, TrainConfig)[0].representations
+        if not is_external:
+            # of a run's own transform, `trusted` has the class
+            options = (representations or {}).values()
+            own = [each for each in options if each.keys() != {"_target_"}] or None
+            given = {"representations": own, "flow": flow, "motion": motion, "noise": noise}
+            for key, value in given.items():
+                if value is not None:
+                    raise UsageError(f"{key}= is for a policy of your own, not for policy={name}")
         if name in BASELINES or is_external:
             if is_external and not representations:
                 raise UsageError(f"representations needs a value for policy={name}")
-            # not checked again: the values are of a command's config
-            config = EnvConfig.model_construct(
-                scene=scene or asdict(load_scene("straight_road")),
-                representations=representations if is_external else {},
-                flow=flow or ExactFlow(source="exact"),
-                motion=motion or "exact",
-                noise=noise or Noise(**dict.fromkeys(Noise.model_fields, 0.0)),
-                speed="normal",
-                renderer="auto",
-                seed=0,
-                **{"num_envs": 1, **machine},
-            )
+            asked: dict[str, Any] = {
+                "scene": scene or asdict(load_scene("straight_road")),
+                "representations": {"rgb": {}},  # replaced: options that are left out have defaults
+                "flow": flow or ExactFlow(),
+                "motion": motion or "exact",
+                "noise": noise or Noise(),
+                "speed": "normal",
+                "renderer": "auto",
+                "seed": 0,
+                "num_envs": 1,
+            }
+            maps = representations if is_external else {}
+            config = validated(EnvConfig, asked | machine)
+            config = config.model_copy(update={"representations": maps})
             return cls(_external(name, config) if is_external else name, config)
         trained, frames, weights = _stored(name, scene, trusted)
         section = trained.algorithm
@@ -178,10 +199,18 @@ class Agent(Driver):
             policies: "greedy" takes the likeliest action, "sampled" draws one.
             baselines: such as "planner", "never_turn" and "random", on the same episodes.
         """
-        rates = fps or [load_scene(self.config.scene).frame_rate_hz]
-        names = [self.policy] if isinstance(self.policy, str) else policies
-        asked = speeds or [self.config.speed], rates, episodes, seed, names, baselines
-        evaluation = PairedEvaluation(*asked)
+        asked = {
+            "episodes": episodes,
+            "speeds": speeds or [self.config.speed],
+            "fps": fps or [load_scene(self.config.scene).frame_rate_hz],
+            "seed": seed,
+            "policies": policies,
+            "baselines": baselines,
+        }
+        checked = dict(validated(Episodes, asked))
+        if isinstance(self.policy, str):
+            checked["policies"] = [self.policy]
+        evaluation = PairedEvaluation(**checked)
         evaluation.run(self.make_env, self.policy, EVALUATION_ENVS)
         return evaluation.records(**self.origin("evaluate"))
 
@@ -192,6 +221,8 @@ class Agent(Driver):
         """
         if not isinstance(self.config, TrainConfig) or isinstance(self.policy, str):
             raise UsageError("only an agent that flowrep trained has weights to save")
+        if Path(path).suffix != ".safetensors":
+            raise UsageError(f"save to a file whose name ends in .safetensors, not to '{path}'")
         weights = dict(self.policy.state_dict())  # type: ignore[attr-defined]
         state = {"frames": self.frames, "config": self.config.plain()}
         save_checkpoint(path, state | {"policy": packed(weights) if small else weights})
@@ -201,12 +232,13 @@ def _stored(
     name: str, scene: Mapping[str, Any] | None, trusted: Collection[str]
 ) -> tuple[TrainConfig, int, dict[str, Tensor]]:
     """Returns config, frames and weights of a trained agent."""
-    if name == "pretrained" or name.endswith(".safetensors"):
+    is_folder = Path(name).is_dir()
+    if name == "pretrained" or (name.endswith(".safetensors") and not is_folder):
         path = _pretrained(scene) if name == "pretrained" else Path(name)
-        stored = load_checkpoint(path)
+        stored = load_checkpoint(path, ["config", "frames", "policy"])
         config = validated_run(stored["config"], path.name, trusted)
-        return config, stored["frames"], unpacked(stored["policy"])
-    if not Path(name).is_dir():
+        return config, stored["frames"], unpacked(_weights(stored, path))
+    if not is_folder:
         raise UsageError(
             f"policy={name}: give {', '.join(BASELINES)}, pretrained, a run's folder, "
             "path.safetensors, path.py:make, package.module:make or path.pt2"
@@ -215,12 +247,22 @@ def _stored(
     config, path = run.config(trusted), run.checkpoint_path
     state = load_checkpoint(path, ["origin", "frames", "policy"])
     check_origin(state["origin"], origin_of(config.plain()), path)
-    return config, state["frames"], state["policy"]
+    return config, state["frames"], _weights(state, path)
+
+
+def _weights(state: Mapping[str, Any], path: Path) -> dict[str, Tensor]:
+    weights = state["policy"]
+    are_tensors = isinstance(weights, dict) and all(isinstance(w, Tensor) for w in weights.values())
+    if not (are_tensors and isinstance(state["frames"], int)):
+        raise CheckpointError(f"{path} is a checkpoint, but not of an agent")
+    return weights
 
 
 def _pretrained(scene: Mapping[str, Any] | None) -> Path:
+    if scene is None:
+        raise UsageError("scene needs a value for policy=pretrained")
     files = {file.stem: file for file in PRETRAINED.glob("*.safetensors")}
-    name = (scene or {}).get("name")
+    name = scene.get("name")
     if name not in files:
         there = ", ".join(sorted(files))
         raise UsageError(f"no agent for scene '{name}' comes with flowrep; there are: {there}")
@@ -269,7 +311,7 @@ def unpacked(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
             [ 0.0000,  0.0000]])
     """
     weights = dict(stored)
-    for name in [key for key in stored if key.endswith(_SCALE)]:
-        scale, whole = weights.pop(name), name.removesuffix(_SCALE)
+    for whole in [key for key in stored if key + _SCALE in stored]:
+        scale = weights.pop(whole + _SCALE)
         weights[whole] = stored[whole] * scale.view(-1, *[1] * (stored[whole].ndim - 1))
     return weights

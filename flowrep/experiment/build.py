@@ -88,6 +88,13 @@ def algorithm(section: AlgorithmOptions) -> tuple[Any, Any]:
     return maker, validated(whole, {"algorithm": section.plain()}).algorithm
 
 
+def check_classes(config: TrainConfig) -> None:
+    """Checks that the classes which a config names exist and take their options."""
+    algorithm(config.algorithm)
+    for name, options in config.representations.items():
+        _options(name, options)
+
+
 def _options(name: str, options: Mapping[str, Any] | None) -> Mapping[str, Any] | Transform | None:
     """Returns a representation's options, or the transform if it is one of the user's own."""
     if not options or "_target_" not in options:

@@ -121,6 +121,7 @@ def _module(name: str) -> Any:
 
 
 def _program(path: str, task: Task) -> Callable[[TensorDictBase], Tensor]:
+    Path(path).resolve(strict=True)  # torch would log a traceback of a missing file
     # moving the module alone would leave the devices that are written in its graph
     program = move_to_device_pass(torch.export.load(path), task.device).module()
     card = _card(path)

@@ -54,6 +54,8 @@ def refusal(command, model, line):
         "wandb=true",
         "representations.ego.scale=nan",
         "representations=[]",
+        "representations.ego=null",
+        "+representations.rgb=null",
         "noise.depth_dropout=1.5",
         "flow.estimator=abc flow=estimated",
         # keys

@@ -2,12 +2,14 @@
 
 import signal
 
+import numpy as np
 import pytest
 import torch
 
 pytest.importorskip("pybullet", reason="agents drive in the simulated street")
 
 import flowrep
+from flowrep.agent import CheckpointError, save_checkpoint
 from flowrep.config import UsageError, group_choices
 from flowrep.experiment.agents import PRETRAINED, Agent, packed, unpacked
 from flowrep.experiment.run import RunFolder
@@ -98,6 +100,8 @@ def test_baselines_drive_the_same_episodes(trained):
         ({"scene": "t_turn"}, "t_turn"),
         ({"algorithm.tua": 0.1}, "algorithm.tua"),
         ({"resume": "outputs/first"}, "resume="),
+        ({"representations": None}, "group"),
+        ({"total_frames": np.int64(128)}, "total_frames"),
     ],
 )
 def test_a_wrong_key_or_value_is_named_before_a_folder_is_made(tmp_path, given, named):
@@ -119,6 +123,69 @@ def test_the_folder_of_another_run_is_refused(trained):
     _, folder, _ = trained
     with pytest.raises(ValueError, match="holds a run already"):
         Agent.train(folder=folder, debug="smoke")
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"episodes": 0}, "episodes"),
+        ({"speeds": ["fast"]}, "speeds"),
+        ({"speeds": "low"}, "speeds"),
+        ({"fps": [0]}, "fps"),
+        ({"seed": -1}, "seed"),
+        ({"policies": ["best"]}, "policies"),
+        ({"baselines": ["plan"]}, "baselines"),
+    ],
+)
+def test_an_evaluation_that_can_not_be_is_refused(given, named):
+    agent = Agent.load("never_turn", scene="s_turn")
+    with pytest.raises(UsageError, match=rf"^{named}\b"):
+        agent.evaluate(**{"episodes": 1, **given})
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "named"),
+    [
+        # what a baseline or an agent of flowrep's would ignore
+        ("planner", {"flow": {"source": "exact"}}, "flow="),
+        ("pretrained", {"scene": "s_turn", "motion": "exact"}, "motion="),
+        ("pretrained", {"scene": "s_turn", "representations": ["ego"]}, "representations="),
+        ("pretrained", {}, "scene"),
+        ("missing:make", {"representations": ["eog"]}, "eog"),
+        ("missing:make", {"representations": ["ego"], "motion": "extact"}, "motion"),
+        ("missing.safetensors", {}, "missing.safetensors"),
+        ("12:00.safetensors", {}, "12:00.safetensors"),  # a colon, as in module:make
+    ],
+)
+def test_what_can_not_be_loaded_is_refused(name, given, named):
+    with pytest.raises((UsageError, CheckpointError), match=named):
+        Agent.load(name, **given)
+
+
+def test_names_of_maps_stand_for_their_options_in_conf(tmp_path):
+    script = tmp_path / "mine.py"
+    script.write_text("make = lambda task: lambda maps: [len(task.representations)] * len(maps)")
+    agent = Agent.load(f"{script}:make", scene="s_turn", representations=["ego", "obj"])
+    assert agent.config.representations == composed("representations=[ego,obj]").representations
+
+
+@pytest.mark.parametrize("change", [{"policy": [1]}, {"policy": {"a": "b"}}, {"frames": "many"}])
+def test_a_checkpoint_of_something_else_is_no_agent(trained, tmp_path, change):
+    path = tmp_path / "other.safetensors"
+    state = {"config": trained[0].config.plain(), "frames": 1, "policy": {}}
+    save_checkpoint(path, state | change)
+    with pytest.raises(CheckpointError, match=path.name):
+        Agent.load(path)
+    save_checkpoint(path, {"frames": 1})
+    with pytest.raises(CheckpointError, match="config"):
+        Agent.load(path)
+
+
+def test_a_file_that_load_would_not_know_is_not_written(trained, tmp_path):
+    for path in (tmp_path, tmp_path / "agent"):
+        with pytest.raises(UsageError, match=r"\.safetensors"):
+            trained[0].save(path)
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_what_has_no_weights_is_not_saved(tmp_path):
