@@ -27,7 +27,9 @@ _EXPLAINED = 0.25  # what an explanation leaves at most
 _ROUGH, _ROUGH_WIDTHS, _TIMES_THE_NOISE, _LITTLE = 0.25, 1 / 1280, 20.0, 0.02
 _UNSURE = 0.15  # right data would be right to that alone
 _DOUBTFUL, _DOUBTFUL_PX = 0.15, 0.15  # left by the best motion: the flow's estimator failed
-_STRAY, _MANY_STRAYS = 6.0, 0.25  # times what the median pair leaves; a share of pairs
+# Pairs that don't fit the others err by these times the median, and this share of their flow; as
+# this share of all pairs they are a mistake in a part of the recording.
+_STRAY, _STRAY_SHARE, _MANY_STRAYS = 4.0, 0.1, 0.25
 _FARTHEST = 0.03  # a share of pixels at exactly the largest depth that means something
 _LARGEST_FACTORS = {"camera": 30.0, "depth": 1e5}
 
@@ -100,7 +102,8 @@ def diagnosed(
     recorded, others = _explanations(pairs, starts, rivals)
     width, motion = pairs.now.shape[-1], pairs.motion if pairs.has_poses else recorded.motion
     ego = pairs.pixel - fit.seen_before(pairs, motion)[0]
-    raw_px = median(px_of(pairs.raw if pairs.by_flow else ego))
+    flow_px = px_of(pairs.raw if pairs.by_flow else ego)
+    raw_px = median(flow_px)
     noise = torch.stack([e.spread for e in (recorded, *others)]).nan_to_num(math.inf).amin(0)
     errors, least = recorded.beyond(noise), recorded.least
     error, best_px = median(errors), median(px_of(residual(pairs, recorded.motion, plain=True)))
@@ -133,8 +136,8 @@ def diagnosed(
         return Diagnosis("something is wrong", why, **numbers)
     if pairs.by_flow and (why := _other_times(recorded, raw_px)):
         return Diagnosis("something is wrong", why, **numbers)
-    most = max(_STRAY * recorded.left, _ROUGH * raw_px)
-    stray = [name for name, px in zip(names, recorded.beyond(0 * noise).tolist()) if px > most]
+    most = (_STRAY_SHARE * flow_px).clamp(min=_STRAY * max(median(recorded.error), least))
+    stray = [name for name, is_off in zip(names, (recorded.error > most).tolist()) if is_off]
     if len(stray) > max(2, _MANY_STRAYS * len(names)):
         why = f"poses of {len(stray)} in {len(names)} pairs don't fit: {', '.join(stray)}"
         return Diagnosis("something is wrong", why, **numbers)

@@ -135,7 +135,7 @@ class Cell:
             if is_right:
                 return "false alarm"
             names = " ".join(found.suspects)
-            if self.mistake in UNLISTED or found.verdict == "something is wrong":
+            if self.mistake in UNLISTED or found.verdict == "something is wrong" or not names:
                 return "noticed"
             return "named" if any(part in names for part in self.named) else "another"
         if found.verdict == "can't tell":
