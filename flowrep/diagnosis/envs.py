@@ -48,9 +48,9 @@ def diagnose(
     >>> K = torch.tensor([[50.0, 0.0, 30.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]])
     >>> slope, prev_from_curr = 1 + (torch.arange(60) + 0.5 - 30) / 100, torch.eye(4)
     >>> prev_from_curr[2, 3] = 0.1  # the camera moves ahead, to a wall that is oblique
-    >>> depth = torch.stack([(2 - 0.1 * t) / slope.expand(1, 40, 60) for t in range(4)])
-    >>> sensor = {"depth": depth, "prev_from_curr": prev_from_curr.repeat(4, 1, 1)}
-    >>> diagnose(TensorDict({"sensor": sensor}, [4]), K).verdict
+    >>> depth = torch.stack([(4 - 0.1 * t) / slope.expand(1, 40, 60) for t in range(16)])
+    >>> sensor = {"depth": depth, "prev_from_curr": prev_from_curr.repeat(16, 1, 1)}
+    >>> diagnose(TensorDict({"sensor": sensor}, [16]), K).verdict
     'right'
     """
     now, before, earlier, later = _successive(frames)

@@ -131,19 +131,20 @@ class Agent(Driver):
         is_folder = Path(name).is_dir()  # of a run, whose name may hold a colon
         is_saved = not is_folder and name.endswith(".safetensors")
         is_external = not (is_folder or is_saved) and (":" in name or name.endswith(".pt2"))
-        if representations is not None and not isinstance(representations, Mapping):
+        if representations is None or isinstance(representations, Mapping):
+            maps = dict(representations or {})
+        else:
             names = {"representations": [*representations]}
-            representations = composed("train", names, TrainConfig)[0].representations
+            maps = composed("train", names, TrainConfig)[0].representations
         if not is_external:
             # of a run's own transform, `trusted` has the class
-            options = (representations or {}).values()
-            own = [each for each in options if each.keys() != {"_target_"}] or None
+            own = [each for each in maps.values() if each.keys() != {"_target_"}] or None
             given = {"representations": own, "flow": flow, "motion": motion, "noise": noise}
             for key, value in given.items():
                 if value is not None:
                     raise UsageError(f"{key}= is for a policy of your own, not for policy={name}")
         if name in BASELINES or is_external:
-            if is_external and not representations:
+            if is_external and not maps:
                 raise UsageError(f"representations needs a value for policy={name}")
             asked: dict[str, Any] = {
                 "scene": scene or asdict(load_scene("straight_road")),
@@ -156,9 +157,8 @@ class Agent(Driver):
                 "seed": 0,
                 "num_envs": 1,
             }
-            maps = representations if is_external else {}
             config = validated(EnvConfig, asked | machine)
-            config = config.model_copy(update={"representations": maps})
+            config = config.model_copy(update={"representations": maps if is_external else {}})
             return cls(_external(name, config) if is_external else name, config)
         trained, frames, weights = _stored(name, scene, trusted)
         section = trained.algorithm
