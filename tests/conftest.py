@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from flowrep.extras import is_installed
+
 
 def pytest_configure():
     """Lets signals be heard that a shell in the background, or `nohup`, has ignored."""
@@ -36,6 +38,31 @@ def pytest_collection_finish():
     """Has the garbage collector leave alone what is there for good: some 650,000 objects."""
     gc.collect()
     gc.freeze()
+
+
+LACKS_PYBULLET = not is_installed("pybullet")  # Python 3.14 has no wheels of it
+NEEDS_PYBULLET = "needs the simulated streets, and PyBullet is not installed"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Skips files that can't be imported without PyBullet."""
+    report = yield
+    if LACKS_PYBULLET and report.failed and "pybullet" in str(report.longrepr):
+        report.outcome = "skipped"
+        report.longrepr = (str(collector.path), 0, f"Skipped: {NEEDS_PYBULLET}")
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Skips tests that import PyBullet as they run, where it is missing."""
+    report = yield
+    error = call.excinfo and call.excinfo.value
+    if LACKS_PYBULLET and isinstance(error, ModuleNotFoundError) and error.name == "pybullet":
+        report.outcome = "skipped"
+        report.longrepr = (str(item.path), 0, f"Skipped: {NEEDS_PYBULLET}")
+    return report
 
 
 @pytest.fixture(scope="session")
