@@ -107,7 +107,7 @@ def _motion(frames: TensorDictBase) -> Tensor:
 def _successive(frames: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase, Tensor, Tensor]:
     """Returns frames, those before them, and the motions before and after, nan where unknown."""
     if frames.get(("sensor", "depth"), None) is None:
-        raise ValueError('frames lack ("sensor", "depth")')
+        raise ValueError('frames lack ("sensor", "depth"), which make_env(keep_sensor=True) keeps')
     if frames.get(("next", "sensor", "depth"), None) is not None:
         frames = frames if frames.ndim else frames.unsqueeze(0)
         before, now = frames.exclude("next"), frames["next"]
