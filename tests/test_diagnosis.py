@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 pytest.importorskip("cv2", reason="recordings need OpenCV")
 
@@ -355,3 +356,28 @@ def test_every_mistake_changes_the_data():
         same = [np.array_equal(getattr(wrong, n), getattr(room(0), n), equal_nan=True)
                 for n in ("depth", "poses", "K", "flow")]  # fmt: skip
         assert not all(same), name
+
+
+def test_round_bodies_between_whose_pixels_depth_is_not_exact_are_right():
+    v, u = torch.meshgrid(torch.arange(36) + 0.5, torch.arange(52) + 0.5, indexing="ij")
+    rays = torch.stack([(u - 24.5) / 44, (v - 17.2) / 46, torch.ones_like(u)], -1).double()
+    balls = [((0.9, 0.4, 7.0), 2.5), ((-2.4, -0.9, 8.0), 2.2), ((-0.9, 1.3, 5.5), 1.2)]
+    depths = []
+    for t in range(20):
+        ahead = 0.12 * t  # before a wall at 8 m, which the camera nears
+        z = torch.full((36, 52), 8 - ahead, dtype=torch.float64)
+        for (x, y, far), radius in balls:
+            centre = torch.tensor([x, y, far - ahead], dtype=torch.float64)
+            a, b = rays.square().sum(-1), rays @ centre
+            root = b * b - a * (centre @ centre - radius**2)
+            hit = (b - root.clamp(min=0).sqrt()) / a
+            z = torch.where((root > 0) & (hit < z), hit, z)
+        depths.append(z.float()[None])
+    motion = torch.eye(4).repeat(20, 1, 1)
+    motion[:, 2, 3] = 0.12
+    sensor = {"depth": torch.stack(depths), "prev_from_curr": motion}
+    K = torch.tensor([[44.0, 0, 24.5], [0, 46.0, 17.2], [0, 0, 1]])
+    assert diagnose(TensorDict({"sensor": sensor}, [20]), K).is_right
+    sensor["prev_from_curr"] = motion.clone()
+    sensor["prev_from_curr"][:, 2, 3] = 0.156
+    assert diagnose(TensorDict({"sensor": sensor}, [20]), K).verdict == "wrong"

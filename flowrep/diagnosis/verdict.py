@@ -17,6 +17,8 @@ from flowrep.diagnosis.rivals import Rival
 
 # No error: rounding, a share of the noise, and of flow that was estimated, which is too short.
 _EXACT_PX, _OF_NOISE, _OF_ESTIMATED = 2e-3, 0.3, 0.03
+# Depth between pixels is exact on planes alone: round bodies leave 0.02 px of right data.
+_INTERPOLATED_PX = 0.04
 # What explains an error leaves several times less, or clearly less in most of many pairs.
 _SEVERAL, _CLEARLY, _MANY_PAIRS = 3.0, 1.7, 8
 _STRUCTURED = 0.1  # of raw flow: more structure than an estimator's own
@@ -196,7 +198,7 @@ class _Fit:
         """The error below which there is none."""
         pairs = self.pairs
         bias = _OF_ESTIMATED * median(px_of(pairs.raw)) if pairs.is_estimated else 0.0
-        return max(self.floor, bias)
+        return max(self.floor, bias, 0.0 if pairs.by_flow else _INTERPOLATED_PX)
 
     @cached_property
     def floor(self) -> float:
