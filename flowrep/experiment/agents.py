@@ -138,7 +138,7 @@ class Agent(Driver):
             maps = composed("train", names, TrainConfig)[0].representations
         if not is_external:
             # of a run's own transform, `trusted` has the class
-            own = [each for each in maps.values() if each.keys() != {"_target_"}] or None
+            own = [each for each in maps.values() if {*(each or {})} != {"_target_"}] or None
             given = {"representations": own, "flow": flow, "motion": motion, "noise": noise}
             for key, value in given.items():
                 if value is not None:

@@ -150,6 +150,7 @@ def test_an_evaluation_that_can_not_be_is_refused(given, named):
         ("planner", {"flow": {"source": "exact"}}, "flow="),
         ("pretrained", {"scene": "s_turn", "motion": "exact"}, "motion="),
         ("pretrained", {"scene": "s_turn", "representations": ["ego"]}, "representations="),
+        ("planner", {"representations": {"rgb": None}}, "representations="),
         ("pretrained", {}, "scene"),
         ("missing:make", {"representations": ["eog"]}, "eog"),
         ("missing:make", {"representations": ["ego"], "motion": "extact"}, "motion"),
