@@ -6,8 +6,10 @@ Some cells of docs/diagnosis.md's table are computed again here, `tests.injected
 from __future__ import annotations
 
 import dataclasses
+import math
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ pytest.importorskip("cv2", reason="recordings need OpenCV")
 
 from flowrep import diagnose, geometry
 from flowrep.diagnosis import Examination
+from flowrep.geometry.pose import rotation_from_vector
 from tests.injected import matrix, mistakes
 from tests.injected.sources import ENVS, RECORDINGS, realsense, room
 
@@ -381,3 +384,68 @@ def test_round_bodies_between_whose_pixels_depth_is_not_exact_are_right():
     sensor["prev_from_curr"] = motion.clone()
     sensor["prev_from_curr"][:, 2, 3] = 0.156
     assert diagnose(TensorDict({"sensor": sensor}, [20]), K).verdict == "wrong"
+
+
+def test_noise_of_depth_is_no_mistake_of_the_focal_length():
+    v, u = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    rays = torch.stack([(u - 32) / 47, (v - 24) / 47, torch.ones_like(u)]).double()
+    generator, depths, poses = torch.Generator().manual_seed(0), [], []
+    for t in range(20):  # someone walks through a room with a box in it
+        pose = torch.eye(4).double()
+        turn = [0.01 * math.sin(0.9 * t) - 0.1, 0.03 * math.sin(0.3 * t), 0.015 * math.sin(1.1 * t)]
+        pose[:3, :3] = rotation_from_vector(torch.tensor(turn).double())
+        pose[:3, 3] = torch.tensor([0.02 * math.sin(1.1 * t), 0.0, 0.06 * t])
+        at, ahead = pose[:3, 3, None, None], torch.einsum("ij,jhw->ihw", pose[:3, :3], rays)
+        walls = torch.tensor([[-5.0, 5.0], [-1.7, 1.5], [-2.0, 10.0]])[:, :, None, None]
+        z = ((walls - at[:, None]) / ahead[:, None]).amax(1).amin(0)
+        near = (6.0 - at[2]) / ahead[2]
+        z = torch.where(((at + near * ahead)[:2] - 0.6).abs().lt(0.8).all(0), near, z)
+        noise = torch.randn(z.shape, generator=generator, dtype=torch.float64)
+        depths.append((z + 0.0006 * z.square() * noise).float()[None])
+        poses.append(pose)
+    motion = torch.stack([before.inverse() @ now for before, now in pairwise(poses)]).float()
+    motion = torch.cat([torch.eye(4)[None], motion])
+    sensor = {"depth": torch.stack(depths), "prev_from_curr": motion}
+    K = torch.tensor([[47.0, 0, 32], [0, 47, 24], [0, 0, 1]])
+    assert diagnose(TensorDict({"sensor": sensor}, [20]), K).is_right
+    sensor["prev_from_curr"] = motion.clone()
+    sensor["prev_from_curr"][:, 2, 3] *= 2
+    assert diagnose(TensorDict({"sensor": sensor}, [20]), K).is_wrong
+
+
+def test_depth_of_a_floor_that_agrees_with_poses_is_of_one_time():
+    v, u = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    K, generator = (
+        np.array([[46.0, 0, 32], [0, 46, 24], [0, 0, 1]]),
+        torch.Generator().manual_seed(0),
+    )
+    pixel, rays = (
+        torch.stack([u, v]).double(),
+        torch.stack([(u - 32) / 46, (v - 24) / 46, 0 * u + 1]),
+    )
+    # A camera 1.5 m above a floor, tilted down by 0.25 rad, moves 0.12 m along it.
+    along = torch.tensor([0, -math.sin(0.25), math.cos(0.25)]).double()
+    down = rays[1].double() * math.cos(0.25) + math.sin(0.25)
+    depth = torch.where(down > 0.01, 1.5 / down, math.inf)
+    x, y, z = rays.double() + 0.12 * along[:, None, None] / depth
+    c, s = math.cos(8e-4), math.sin(8e-4)  # flow is off by 0.04 px, and noisy
+    y, z = c * y - s * z, s * y + c * z
+    flow = pixel - torch.stack([46 * x / z + 32, 46 * y / z + 24])
+
+    def found(longer):
+        examination = Examination()
+        for t in range(8):
+            noise = 0.15 * torch.randn(flow.shape, generator=generator, dtype=torch.float64)
+            poses = [np.eye(4) for _ in range(4)]
+            for i, pose in enumerate(poses):
+                pose[:3, 3] = 0.12 * (t + i) * along.numpy()
+            previous, current = (
+                SimpleNamespace(name=str(t + i), K=K, depth=z.numpy(), world_from_cam=poses[i + 1],
+                                rgb=None, raw=None, timestamp_s=None)
+                for i, z in enumerate((depth, depth * longer))
+            )  # fmt: skip
+            examination.add(previous, current, (flow + noise).numpy(), poses[0], poses[3])
+        return examination.diagnosis()
+
+    assert found(1.0).is_right
+    assert found(1.05).is_wrong  # the floor of another time, when the camera was higher

@@ -38,6 +38,7 @@ class Pairs(NamedTuple):
     is_estimated: bool  # from pictures
     depth_step: float  # of coarse depth, metres
     scale_px: float  # the least scale of what is left
+    focal_px: float  # the recorded one: errors of depth are in it, whatever K a rival tries
     gain: Tensor = torch.eye(2, dtype=torch.float64)  # [(P,) 2, 2], raw is this times flow
     distortion: Tensor = torch.zeros(1, 1, dtype=torch.float64)  # [P, 1], of the radius' square
 
@@ -107,7 +108,8 @@ def sampled(
     whole = [K.double(), prev_K.double(), path.double()]
     whole += [depths.double().reciprocal() for depths in (now, before)]
     scale_px = 0.5 if raw is None else 1e-4
-    numbers = (raw is not None, picture is not None, depth_step, scale_px)
+    focal_px = float(K[:, 0, 0].median())
+    numbers = (raw is not None, picture is not None, depth_step, scale_px, focal_px)
     given = Pairs._field_defaults
     return Pairs._make([*maps, *whole, *numbers, given["gain"], given["distortion"]])
 
@@ -146,7 +148,7 @@ def residual(pairs: Pairs, motion: Tensor, *, plain: bool = False) -> Tensor:
     if not pairs.by_flow:
         left = looked_up(pairs.before, pixel) * pairs.depth * ratio - 1
         left = left.sign() * (left.abs() - pairs.coarseness).clamp(min=0.0)
-        left = (pairs.K[:, 0, :1] * left).masked_fill(ratio.isnan(), _BEHIND_PX)
+        left = (pairs.focal_px * left).masked_fill(ratio.isnan(), _BEHIND_PX)
         return torch.where(known & pairs.depth.isfinite(), left, math.nan).unsqueeze(-2)
     left = (pairs.raw - pairs.gain @ (pairs.pixel - pixel)).nan_to_num(nan=_BEHIND_PX)
     known = known & pairs.raw.isfinite().all(-2)

@@ -335,8 +335,12 @@ def _other_times(recorded: _Fit, raw_px: float) -> str:
     still = EYE.expand_as(recorded.motion)
     motion = best_motion(of_depth, recorded.motion, still)
     px = median(apart(recorded.pairs, motion, recorded.motion))
-    before, after = (px_of(residual(of_depth, each), 0.5) for each in (recorded.motion, motion))
-    if px < _UNSURE * raw_px or not _is_better(after, before):
+    known = (recorded.motion, motion, recorded.pairs.motion)
+    by_flow, after, by_poses = (px_of(residual(of_depth, each), 0.5) for each in known)
+    # The flow's own noise is amplified where depth hardly tells motions apart, as on a floor. If
+    # depth agrees with poses that flow agrees with, it is of one time.
+    before = by_flow.minimum(by_poses.nan_to_num(math.inf))
+    if px < _UNSURE * raw_px or median(before) < _INTERPOLATED_PX or not _is_better(after, before):
         return ""
     return f"depth moves otherwise than flow, by {px:.2g} px of {raw_px:.2g} px: is it of one time?"
 
