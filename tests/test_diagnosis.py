@@ -419,10 +419,8 @@ def test_depth_of_a_floor_that_agrees_with_poses_is_of_one_time():
         np.array([[46.0, 0, 32], [0, 46, 24], [0, 0, 1]]),
         torch.Generator().manual_seed(0),
     )
-    pixel, rays = (
-        torch.stack([u, v]).double(),
-        torch.stack([(u - 32) / 46, (v - 24) / 46, 0 * u + 1]),
-    )
+    pixel = torch.stack([u, v]).double()
+    rays = torch.stack([(u - 32) / 46, (v - 24) / 46, 0 * u + 1])
     # A camera 1.5 m above a floor, tilted down by 0.25 rad, moves 0.12 m along it.
     along = torch.tensor([0, -math.sin(0.25), math.cos(0.25)]).double()
     down = rays[1].double() * math.cos(0.25) + math.sin(0.25)
