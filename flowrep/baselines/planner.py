@@ -32,9 +32,8 @@ _CELL = np.array([0.5, 0.5, 4.0, 6.0])
 # and at all of it, so that a vehicle which faces the right way is ahead of one which does not.
 _LOOK_AHEAD_M = 6.0
 _TURNING_M_PER_DPS = 0.02  # added to the cost: of two equal ways the straighter one wins
-_OFF_ROAD_M = (
-    1e6  # most that a cost counts; off the road it is inf, beside which turning is nothing
-)
+# The most that a way counts. Off the road it is inf, to which turning would add nothing.
+_OFF_ROAD_M = 1e6
 _GRID_M = 0.5  # cells of the distances to the ending zone
 _NEIGHBOURS = [(i, j, math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 

@@ -27,8 +27,8 @@ _DRAWN = _MAPS | {"rgb"}
 class Sensing:
     """The camera of a street and the requested sensors; it draws any number of episodes at once.
 
-    It has no state of an episode, so all environments of a process with one street and the same
-    options share it.
+    It holds nothing of an episode. All environments of a process with the same street and options
+    can therefore share one, see `shared`.
     """
 
     @classmethod

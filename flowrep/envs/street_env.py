@@ -53,7 +53,7 @@ class StreetEnv(gym.Env):
 
     Raises:
         SceneError: the scene is invalid.
-        ValueError: another argument is.
+        ValueError: another argument is invalid.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 12}  # noqa: RUF012

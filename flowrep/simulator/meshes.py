@@ -15,7 +15,8 @@ from flowrep.scenes.scene import Kind
 from flowrep.simulator.paint import SHIRTS, Painted, Patch, front, painted, swatch, upper_storeys
 
 Array = NDArray[np.float64]
-_CHUNK_TRIANGLES = 24  # fewer need more tests of spheres, more project corners out of view
+# Smaller chunks have more bounding spheres to test, larger ones project more that is out of view.
+_CHUNK_TRIANGLES = 24
 
 
 @dataclass(frozen=True)

@@ -51,11 +51,12 @@ def instance_motion(
 ) -> Array:
     """Returns prev_from_curr by instance [..., 1 + M, 4, 4]; row 0 is the static world's.
 
-    Row i maps a point fixed to body i from the current camera's frame to its position in the
-    previous camera's frame.
+    Row 1 + i takes a point fixed to body i from the current camera's frame into the previous
+    camera's, at the previous step.
     """
     static = relative_motion(world_from_prev, world_from_curr)[..., None, :, :]
-    # Now body ← world ← camera, before camera ← world ← body: the point stays fixed to the body.
+    # A point keeps its position in the body's frame, which joins the two steps: from the current
+    # camera to the body as it is now, then from the body as it was to the previous camera.
     body_from_curr = rigid_inverse(world_from_curr_body) @ world_from_curr[..., None, :, :]
     prev_from_world = rigid_inverse(world_from_prev)[..., None, :, :]
     carried = prev_from_world @ world_from_prev_body @ body_from_curr

@@ -139,7 +139,7 @@ def _side_planes(K, height, width):
 @_compiled
 def _compose(cam_from_world, world_from_body, pose, into):
     # cam_from_body [3, 4]; pose -1 is the static world, whose points are in world axes already.
-    # Written out, since numba's `@` calls the BLAS of scipy, which isn't installed here.
+    # Written out, since numba's `@` calls scipy's BLAS, and streets don't need scipy otherwise.
     for i in range(3):
         for j in range(4):
             if pose < 0:

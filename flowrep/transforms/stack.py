@@ -103,7 +103,11 @@ def representation_stack(
         noise: errors of the depth camera and of odometry: `depth_sigma_per_m`, `depth_dropout`,
             `drift_m` and `drift_rad` of `SensorNoise`, 0 by default. Depth, ego and obj are
             computed from the noisy values; raw flow and classes don't use these sensors. The noise
-            depends on the frame that `("sensor", "frame")` names.
+            depends on the frame that `("sensor", "frame")` identifies.
+
+    Raises:
+        ValueError: a name, an option or a source is unknown, a value can't be used, or
+            `intrinsics` or `num_classes` is missing.
 
     Example:
         >>> K = [[42.0, 0.0, 42.0], [0.0, 42.0, 42.0], [0.0, 0.0, 1.0]]

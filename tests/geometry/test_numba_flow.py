@@ -63,11 +63,13 @@ def assert_same_bits(ours, theirs):
     assert torch.equal(ours.valid, theirs.valid)
 
 
-@pytest.mark.parametrize("dt", [1.0, 0.3, torch.tensor([0.5, math.nan, 0.1])])
+@pytest.mark.parametrize("dt", [1.0, 0.3, [0.5, math.nan, 0.1], [0.5, 0.25, 0.1]])
 @pytest.mark.parametrize("zooms", [False, True])
 @pytest.mark.parametrize("ids", [None, torch.uint8, torch.int32, torch.int64])
 def test_flow_of_bodies_and_of_a_camera(calls, ids, zooms, dt):
     depth, instance, Ks, motions = scene()
+    is_known = not zooms and dt != [0.5, math.nan, 0.1]  # the second map
+    dt = torch.tensor(dt) if isinstance(dt, list) else dt
     before = 1.2 * Ks if zooms else None
     if zooms:
         before[1, 0, 0] = math.nan  # the second map's K isn't known
@@ -78,7 +80,7 @@ def test_flow_of_bodies_and_of_a_camera(calls, ids, zooms, dt):
     assert_same_bits(flow, by_torch(compute, *inputs, dt=dt, prev_K=before))
     assert len(calls) == 1
     assert flow.valid[0, 0, 4].tolist() == [True, False, False, False, True, False, True]
-    assert bool(flow.valid[1].any()) == (not zooms and isinstance(dt, float))
+    assert bool(flow.valid[1].any()) == is_known
 
 
 def test_factors_and_what_they_share(calls):

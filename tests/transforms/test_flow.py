@@ -419,4 +419,5 @@ def test_crops_and_telephoto_and_wide_lenses_are_cameras(share):
     # A crop that lost up to four ninths of the picture on one side; lenses of 2.9 and 136 degrees.
     for focal in (1.5, 139.0):
         K = torch.tensor([[focal, 0.5, 7 * share], [0.0, focal, 5 * share], [0.0, 0.0, 1.0]])
-        TransformedEnv(FakeSensorEnv(), RawFlow(K)).rollout(2)
+        frames = TransformedEnv(FakeSensorEnv(), RawFlow(K)).rollout(2)["next"]
+        assert frames["raw_valid"].flatten(-2).any(-1).all()

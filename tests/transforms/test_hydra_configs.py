@@ -60,6 +60,7 @@ def test_composed_by_a_project_s_own_config_beside_torchrl_s(tmp_path):
     raw, split = hydra.utils.instantiate(config.stack)
     assert (raw.outputs, raw.scales) == (("raw", "valid"), {"raw": 0.5})
     assert (split.outputs, split.in_keys[-1]) == (("obj",), ("sensor", "K"))
+    assert split.scales == {"obj": 1.0}  # the constructor's default
 
 
 def test_each_representation_s_file_spells_its_options_with_their_defaults():

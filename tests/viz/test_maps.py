@@ -61,7 +61,10 @@ def test_flow_wheel_is_its_own_legend():
 
 def test_classes_have_a_colour_each_in_the_order_of_their_ids():
     scene = pytest.importorskip("flowrep.scenes.scene", exc_type=ImportError)
+    from flowrep.simulator import paint
+
     assert list(CLASS_COLOURS) == list(scene.CATEGORY_ID)
+    assert CLASS_COLOURS["sky"] == paint.SKY
     assert len(set(CLASS_COLOURS.values())) == len(CLASS_COLOURS)
 
 
